@@ -1,0 +1,135 @@
+//! What every capture becomes, whatever its layout.
+
+use std::path::PathBuf;
+
+use cif_geometry::{LensDistortion, PinholeCamera, PixelGrid};
+use serde::{Deserialize, Serialize};
+
+/// The layouts that can be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Layout {
+    /// `dataset.json`, `metadata.json`, `scene.json`, `camera/`, `rgb/`.
+    HyperNerf,
+    /// `poses_bounds.npy` with `camXX/images` or `camXX.mp4`.
+    Neu3d,
+    /// `transforms_train.json` and its siblings.
+    DNerf,
+    /// One `transforms.json`.
+    Nerfstudio,
+    /// `sparse/0` and `images/`.
+    Colmap,
+}
+
+/// Whether a frame is trained on or held out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Split {
+    /// Used for training.
+    Train,
+    /// Held out by the capture's own lists.
+    Val,
+}
+
+/// How a capture is opened.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct OpenOptions {
+    /// Mask folder: a name inside the capture (`masks_tracker`) or a path; `None` takes `masks` where present.
+    pub masks: Option<PathBuf>,
+    /// Ignore masks altogether.
+    pub without_masks: bool,
+    /// Image reduction: 1, 2, 4, ...; `None` takes the largest images stored.
+    pub downscale: Option<u32>,
+    /// Place the principal point in the image centre, as the base code of the method does.
+    pub centre_principal_point: bool,
+    /// Forces a layout where two fit.
+    pub layout: Option<Layout>,
+}
+
+/// One image of a capture: where it is, and the ideal pinhole camera it has once loaded.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Unique name inside the capture, e.g. `000012` or `cam03/0007`.
+    pub name: String,
+    /// Camera the frame belongs to, e.g. `cam03`; moving cameras keep one name.
+    pub camera_name: String,
+    /// Camera after lens removal, at the resolution that [`Dataset::load_frame`] returns.
+    pub camera: PinholeCamera,
+    /// Lens removed on loading; identity for ideal cameras.
+    pub lens: LensDistortion,
+    /// Normalised time in [0, 1].
+    pub time: f64,
+    /// Index into [`Dataset::times`].
+    pub time_index: usize,
+    /// Train or val.
+    pub split: Split,
+    /// Named group inside the split (`interp`, `novel`), where the capture has them.
+    pub group: Option<String>,
+    /// Image file.
+    pub image: PathBuf,
+    /// Mask file, where this frame has one.
+    pub mask: Option<PathBuf>,
+}
+
+/// An instance named by the capture, or found only in its masks.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct InstanceLabel {
+    /// Value in the masks, 1 to 65 535.
+    pub id: u16,
+    /// Human name; `instance_12` when the capture names none.
+    pub label: String,
+    /// Class, where given; else equal to `label`.
+    pub category: String,
+}
+
+/// Where the initial points come from.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum PointSource {
+    /// A file of the capture.
+    File(PathBuf),
+    /// Drawn at random in the box that the cameras see.
+    Random,
+}
+
+/// Initial points.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PointCloud {
+    /// World positions, metres, `[P]`.
+    pub positions: Vec<[f32; 3]>,
+    /// Colours, `[P]`; mid grey where the source has none.
+    pub colors: Vec<[u8; 3]>,
+    /// Origin of the points.
+    pub source: PointSource,
+}
+
+/// A capture, understood.
+#[derive(Clone, Debug)]
+pub struct Dataset {
+    /// Folder of the capture.
+    pub root: PathBuf,
+    /// Recognised layout.
+    pub layout: Layout,
+    /// All frames, ordered by camera and time.
+    pub frames: Vec<Frame>,
+    /// Distinct normalised times, ascending, of all frames.
+    pub times: Vec<f64>,
+    /// Frames per second of the capture, where it says so.
+    pub frames_per_second: Option<f64>,
+    /// Instances, ascending id; empty without masks.
+    pub instances: Vec<InstanceLabel>,
+    /// Initial points.
+    pub points: PointCloud,
+    /// Whether images carry alpha and are composited on the background when loaded.
+    pub has_alpha: bool,
+    /// Oddities met while reading, one sentence each, naming the file.
+    pub warnings: Vec<String>,
+}
+
+/// A loaded frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FrameData {
+    /// Colour as captured (display-referred), composited on the background where the image has alpha.
+    pub image: PixelGrid<[u8; 3]>,
+    /// Instance ids, 0 = unlabelled, at the size of `image`.
+    pub mask: Option<PixelGrid<u16>>,
+}

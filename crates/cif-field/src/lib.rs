@@ -1,0 +1,24 @@
+//! The dynamic Gaussian field.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`gaussians`] | what is stored per Gaussian |
+//! | [`deformation`] | how Gaussians move: hexplane and MLP parameters, and their evaluation |
+//! | [`identity`] | whose a Gaussian is |
+//! | [`instance`] | what the instances are called |
+//! | [`timeline`] | which times were captured, and from which cameras |
+//! | [`field`] | all of it together |
+
+pub mod deformation;
+pub mod field;
+pub mod gaussians;
+pub mod identity;
+pub mod instance;
+pub mod timeline;
+
+pub use deformation::{Deformation, DeformationConfig, Heads, TimeEncoding};
+pub use field::{Field, SortMetric};
+pub use gaussians::Gaussians;
+pub use identity::Identities;
+pub use instance::Instance;
+pub use timeline::{RecordedCamera, Timeline};

@@ -1,0 +1,109 @@
+//! Ideal pinhole cameras. Lenses and skew are removed when a capture is read (see [`crate::lens`]).
+
+use glam::{DVec2, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::RigidTransform;
+
+/// A pinhole camera without skew or distortion.
+///
+/// `pixel = focal_px * (x / z, y / z) + principal_px` for a point (x, y, z) in the camera frame.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct PinholeCamera {
+    /// Image width, pixels.
+    pub width: u32,
+    /// Image height, pixels.
+    pub height: u32,
+    /// Focal lengths (fx, fy), pixels.
+    pub focal_px: DVec2,
+    /// Principal point (cx, cy), pixels; the centre of the first pixel is (0.5, 0.5).
+    pub principal_px: DVec2,
+    /// World to camera, metres.
+    #[doc(alias = "viewmat")]
+    #[doc(alias = "w2c")]
+    pub camera_from_world: RigidTransform,
+}
+
+impl PinholeCamera {
+    /// Camera centre in the world.
+    #[must_use]
+    pub fn centre(&self) -> DVec3 {
+        self.camera_from_world.inverse().translation
+    }
+
+    /// Viewing direction (camera +z) in the world, unit.
+    #[must_use]
+    pub fn forward(&self) -> DVec3 {
+        self.camera_from_world.rotation.row(2)
+    }
+
+    /// Pixel position and depth z of a world point; `None` at or behind the camera plane.
+    #[must_use]
+    pub fn project(&self, point_in_world: DVec3) -> Option<(DVec2, f64)> {
+        let p = self.camera_from_world.apply(point_in_world);
+        (p.z > 0.0).then(|| (self.focal_px * DVec2::new(p.x, p.y) / p.z + self.principal_px, p.z))
+    }
+
+    /// World-space direction (not normalised, z = 1 in the camera frame) through a pixel position.
+    #[must_use]
+    pub fn ray(&self, pixel: DVec2) -> DVec3 {
+        let xy = (pixel - self.principal_px) / self.focal_px;
+        self.camera_from_world.rotation.transpose() * DVec3::new(xy.x, xy.y, 1.0)
+    }
+
+    /// The same view at another resolution; pixels are scaled, the field of view is kept.
+    #[must_use]
+    pub fn resized(&self, width: u32, height: u32) -> Self {
+        let factor =
+            DVec2::new(f64::from(width) / f64::from(self.width), f64::from(height) / f64::from(self.height));
+        Self {
+            width,
+            height,
+            focal_px: self.focal_px * factor,
+            principal_px: self.principal_px * factor,
+            camera_from_world: self.camera_from_world,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DMat3;
+
+    use super::*;
+
+    fn camera() -> PinholeCamera {
+        PinholeCamera {
+            width: 64,
+            height: 48,
+            focal_px: DVec2::new(50.0, 55.0),
+            principal_px: DVec2::new(30.0, 25.0),
+            camera_from_world: RigidTransform {
+                rotation: DMat3::from_rotation_y(0.3),
+                translation: DVec3::new(0.1, 0.2, 2.0),
+            },
+        }
+    }
+
+    #[test]
+    fn ray_passes_through_the_projected_point() {
+        let camera = camera();
+        let point = DVec3::new(0.4, -0.3, 1.5);
+        let (pixel, depth) = camera.project(point).unwrap();
+        assert!((camera.centre() + camera.ray(pixel) * depth - point).length() < 1e-12);
+    }
+
+    #[test]
+    fn resizing_scales_pixels() {
+        let camera = camera();
+        let point = DVec3::new(0.4, -0.3, 1.5);
+        let (pixel, _) = camera.project(point).unwrap();
+        let (half, _) = camera.resized(32, 24).project(point).unwrap();
+        assert!((pixel / 2.0 - half).length() < 1e-12);
+    }
+
+    #[test]
+    fn points_behind_do_not_project() {
+        assert!(camera().project(DVec3::new(0.0, 0.0, -5.0)).is_none());
+    }
+}

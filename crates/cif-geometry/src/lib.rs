@@ -1,0 +1,31 @@
+//! Pure geometry shared by every crate of cif: no I/O, no threads.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`scalar`] | which number type a formula runs in (`f32` or `f64`) |
+//! | [`transform`] | rigid transforms `a_from_b` |
+//! | [`quaternion`] | rotation of a (w, x, y, z) quaternion, with derivative |
+//! | [`spherical_harmonics`] | view-dependent colour basis, degrees 0 to 3, with derivative |
+//! | [`camera`] | ideal pinhole cameras |
+//! | [`lens`] | lens distortion and its removal |
+//! | [`grid`] | row-major pixel grids |
+//! | [`bounds`] | axis-aligned boxes |
+//!
+//! Conventions: right-handed world; camera frame x right, y down, z forward (OpenCV); pixel (i, j) has its
+//! centre at (i + 0.5, j + 0.5); quaternions are (w, x, y, z) in memory; matrices act on column vectors.
+
+pub mod bounds;
+pub mod camera;
+pub mod grid;
+pub mod lens;
+pub mod quaternion;
+pub mod scalar;
+pub mod spherical_harmonics;
+pub mod transform;
+
+pub use bounds::Bounds;
+pub use camera::PinholeCamera;
+pub use grid::PixelGrid;
+pub use lens::LensDistortion;
+pub use scalar::Real;
+pub use transform::RigidTransform;

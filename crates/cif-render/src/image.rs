@@ -1,0 +1,42 @@
+//! What comes out per pixel.
+
+use cif_geometry::PixelGrid;
+
+/// Label of pixels without instance. In label maps, value k + 1 stands for dense instance index k.
+pub const UNLABELLED: u16 = 0;
+
+/// Which outputs to compute.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Channels {
+    /// Expected depth.
+    pub depth: bool,
+    /// Instance argmax, probability, coverage and entropy; needs identities.
+    pub instances: bool,
+}
+
+/// A rendered view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RenderedImage {
+    /// Colour composited on the background, not clamped.
+    pub color: PixelGrid<[f32; 3]>,
+    /// Colour coverage 1 - T.
+    pub alpha: PixelGrid<f32>,
+    /// Expected camera depth z, metres; 0 where coverage is below 1e-3.
+    pub depth: Option<PixelGrid<f32>>,
+    /// Instance outputs.
+    pub instances: Option<InstanceImage>,
+}
+
+/// Instance outputs of a view.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InstanceImage {
+    /// Most probable instance: dense index + 1, or [`UNLABELLED`] where nothing covers the pixel. Ties go
+    /// to the lowest index.
+    pub label: PixelGrid<u16>,
+    /// Rendered probability M of that instance.
+    pub probability: PixelGrid<f32>,
+    /// Instance coverage A = sum of M over all instances.
+    pub coverage: PixelGrid<f32>,
+    /// Entropy of M / A, nats; 0 without coverage.
+    pub entropy: PixelGrid<f32>,
+}

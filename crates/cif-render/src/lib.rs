@@ -1,0 +1,21 @@
+//! Renders a dynamic Gaussian field, forward and backward.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`constants`] | thresholds of the blending rule, each with its derivation |
+//! | [`settings`] | what a render may vary |
+//! | [`gradients`] | where gradients of all parameters are kept |
+//! | [`image`] | what comes out per pixel |
+//! | [`reference`] | the readable oracle, generic over `f32` and `f64` |
+//! | [`cpu`] | the fast path: tiles, SIMD, threads |
+
+pub mod constants;
+pub mod cpu;
+pub mod gradients;
+pub mod image;
+pub mod reference;
+pub mod settings;
+
+pub use gradients::Gradients;
+pub use image::{Channels, RenderedImage, UNLABELLED};
+pub use settings::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};

@@ -1,0 +1,1 @@
+//! The readable oracle, generic over `f32` and `f64`.
