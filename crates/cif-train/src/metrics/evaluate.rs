@@ -1,0 +1,250 @@
+//! Renders the held-out frames of a capture and scores them.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use cif_dataset::{Dataset, Frame, FrameData, Split};
+use cif_field::Field;
+use cif_geometry::PixelGrid;
+use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::{Channels, RenderSettings, RenderedImage};
+use serde::Serialize;
+
+use super::image::{psnr, ssim, unit_color};
+use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
+
+/// What is scored, and how it is rendered.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EvaluationOptions {
+    /// Frames to score.
+    pub split: Split,
+    /// Render settings; [`RenderSettings::of_field`] where the training run asks for nothing else.
+    pub settings: RenderSettings,
+    /// Vector instructions.
+    pub simd: SimdLevel,
+    /// Also render depth, for pictures.
+    pub depth: bool,
+}
+
+impl EvaluationOptions {
+    /// The held-out frames, rendered as the field says.
+    #[must_use]
+    pub fn held_out(field: &Field) -> Self {
+        Self {
+            split: Split::Val,
+            settings: RenderSettings::of_field(field),
+            simd: SimdLevel::Auto,
+            depth: false,
+        }
+    }
+}
+
+/// What keeps a capture from being scored.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum EvaluationError {
+    /// A frame could not be read.
+    #[error(transparent)]
+    Dataset(#[from] cif_dataset::Error),
+    /// The split is empty.
+    #[error("{}: the {split} split holds no frame, so there is nothing to score", root.display())]
+    NoFrames {
+        /// Capture.
+        root: PathBuf,
+        /// Name of the split.
+        split: &'static str,
+    },
+}
+
+/// One frame with its truth and render, for pictures.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameView<'a> {
+    /// Frame of the capture.
+    pub frame: &'a Frame,
+    /// Captured image and mask.
+    pub truth: &'a FrameData,
+    /// Render of the same view and time.
+    pub rendered: &'a RenderedImage,
+    /// Predicted mask ids, where the field has identities.
+    pub predicted: Option<&'a PixelGrid<u16>>,
+    /// Scores.
+    pub scores: &'a FrameScores,
+}
+
+/// Scores of one frame.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct FrameScores {
+    /// Frame of the capture.
+    pub name: String,
+    /// Named group inside the split.
+    pub group: Option<String>,
+    /// Normalised time.
+    pub time: f64,
+    /// dB; `None` when the pictures agree exactly.
+    pub psnr: Option<f64>,
+    /// Structural similarity.
+    pub ssim: f64,
+    /// Percent of labelled pixels predicted right; `None` without labelled pixels or identities.
+    pub macc_pix: Option<f64>,
+    /// Wall time of the render, milliseconds.
+    pub render_ms: f64,
+}
+
+/// Scores of a set of frames.
+#[derive(Clone, Debug, Default, PartialEq, Serialize)]
+pub struct Scores {
+    /// Frames in the set.
+    pub frames: usize,
+    /// Mean over images with a finite value, dB.
+    pub psnr: Option<f64>,
+    /// Images left out of the mean because they agree exactly.
+    pub psnr_infinite: usize,
+    /// Mean over images.
+    pub ssim: Option<f64>,
+    /// Instance metrics over the frames that have a mask.
+    #[serde(flatten)]
+    pub instance: InstanceMetrics,
+}
+
+/// Scores of a field on a capture.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Evaluation {
+    /// All frames of the split.
+    pub overall: Scores,
+    /// The same per named group (`interp`, `novel`), where the capture has groups.
+    pub groups: BTreeMap<String, Scores>,
+    /// Every frame, in capture order.
+    pub frames: Vec<FrameScores>,
+    /// Gaussians of the field.
+    pub gaussians: usize,
+    /// Mean wall time of a render, milliseconds.
+    pub render_ms_per_frame: f64,
+}
+
+/// Renders and scores every frame of a split; `observe` sees each one.
+///
+/// # Errors
+/// When the split is empty, a frame cannot be read, or `observe` fails.
+pub fn evaluate<E: From<EvaluationError>>(
+    field: &Field,
+    dataset: &Dataset,
+    options: &EvaluationOptions,
+    mut observe: impl FnMut(FrameView<'_>) -> Result<(), E>,
+) -> Result<Evaluation, E> {
+    let mut renderer = Renderer::new(options.simd);
+    let channels = Channels { depth: options.depth, instances: options.settings.instances.is_some() };
+    let mut frames: Vec<FrameScores> = Vec::new();
+    let mut confusions: Vec<Option<FrameConfusion>> = Vec::new();
+    for (index, frame) in dataset.frames.iter().enumerate().filter(|(_, f)| f.split == options.split) {
+        let truth =
+            dataset.load_frame(index, options.settings.background).map_err(EvaluationError::Dataset)?;
+        let start = Instant::now();
+        let rendered = renderer.render(field, &frame.camera, frame.time, &options.settings, channels);
+        let render_ms = start.elapsed().as_secs_f64() * 1e3;
+        let predicted =
+            rendered.instances.as_ref().map(|instances| mask_ids(field, &instances.label));
+        let confusion = match (&truth.mask, &predicted) {
+            (Some(mask), Some(predicted)) => {
+                Some(FrameConfusion::new(&frame.camera_name, frame.time_index, mask, predicted))
+            }
+            _ => None,
+        };
+        let target = unit_color(&truth.image);
+        let scores = FrameScores {
+            name: frame.name.clone(),
+            group: frame.group.clone(),
+            time: frame.time,
+            psnr: Some(psnr(&rendered.color, &target)).filter(|value| *value != f64::INFINITY),
+            ssim: ssim(&rendered.color, &target),
+            macc_pix: confusion.as_ref().and_then(FrameConfusion::pixel_accuracy).map(|v| v * 100.0),
+            render_ms,
+        };
+        observe(FrameView {
+            frame,
+            truth: &truth,
+            rendered: &rendered,
+            predicted: predicted.as_ref(),
+            scores: &scores,
+        })?;
+        frames.push(scores);
+        confusions.push(confusion);
+    }
+    if frames.is_empty() {
+        let split = match options.split {
+            Split::Train => "train",
+            Split::Val => "val",
+        };
+        return Err(EvaluationError::NoFrames { root: dataset.root.clone(), split }.into());
+    }
+    let select = |group: Option<&str>| {
+        let chosen = |scores: &FrameScores| group.is_none() || scores.group.as_deref() == group;
+        let confusions: Vec<FrameConfusion> = frames
+            .iter()
+            .zip(&confusions)
+            .filter(|(scores, _)| chosen(scores))
+            .filter_map(|(_, confusion)| confusion.clone())
+            .collect();
+        scores_of(frames.iter().filter(|scores| chosen(scores)), &confusions)
+    };
+    let names: std::collections::BTreeSet<&str> = frames.iter().filter_map(|f| f.group.as_deref()).collect();
+    let groups = names.into_iter().map(|name| (name.to_owned(), select(Some(name)))).collect();
+    let overall = select(None);
+    let render_ms_per_frame = frames.iter().map(|f| f.render_ms).sum::<f64>() / frames.len() as f64;
+    Ok(Evaluation { overall, groups, gaussians: field.gaussians.len(), render_ms_per_frame, frames })
+}
+
+/// Mask ids of a label map (dense index + 1, 0 = unlabelled).
+#[must_use]
+pub fn mask_ids(field: &Field, labels: &PixelGrid<u16>) -> PixelGrid<u16> {
+    labels.map(|&label| match label {
+        cif_render::UNLABELLED => 0,
+        label => field.instances[usize::from(label) - 1].id,
+    })
+}
+
+fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[FrameConfusion]) -> Scores {
+    let frames: Vec<&FrameScores> = frames.collect();
+    let finite: Vec<f64> = frames.iter().filter_map(|f| f.psnr).collect();
+    let mean = |values: &[f64]| {
+        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+    };
+    Scores {
+        frames: frames.len(),
+        psnr: mean(&finite),
+        psnr_infinite: frames.len() - finite.len(),
+        ssim: mean(&frames.iter().map(|f| f.ssim).collect::<Vec<_>>()),
+        instance: instance_metrics(confusions),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn frame(psnr: Option<f64>, ssim: f64) -> FrameScores {
+        FrameScores {
+            name: "f".into(),
+            group: None,
+            time: 0.0,
+            psnr,
+            ssim,
+            macc_pix: None,
+            render_ms: 1.0,
+        }
+    }
+
+    #[test]
+    fn exact_pictures_are_counted_and_left_out_of_the_mean() {
+        let frames = [frame(Some(20.0), 0.5), frame(None, 1.0), frame(Some(30.0), 0.9)];
+        let scores = scores_of(frames.iter(), &[]);
+        assert_eq!((scores.psnr, scores.psnr_infinite, scores.frames), (Some(25.0), 1, 3));
+        assert!((scores.ssim.unwrap() - 0.8).abs() < 1e-12);
+        assert_eq!(scores.instance, InstanceMetrics::default());
+    }
+
+    #[test]
+    fn only_exact_pictures_leave_no_mean() {
+        assert_eq!(scores_of([frame(None, 1.0)].iter(), &[]).psnr, None);
+    }
+}

@@ -1,0 +1,16 @@
+//! How good a field is: image and instance metrics. Source: methods reference 9.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`image`] | PSNR and SSIM of one picture |
+//! | [`instance`] | every instance metric, from per-frame confusion counts |
+//! | [`evaluate`](mod@evaluate) | renders the held-out frames of a capture and fills both in |
+//!
+//! A metric without anything to measure is `None` (`n/a`), never 0 or 100.
+
+pub mod evaluate;
+pub mod image;
+pub mod instance;
+
+pub use evaluate::{Evaluation, EvaluationError, EvaluationOptions, FrameScores, FrameView, Scores, evaluate};
+pub use instance::{FrameConfusion, InstanceMetrics, InstanceScore, instance_metrics};
