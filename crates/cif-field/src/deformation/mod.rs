@@ -4,6 +4,13 @@
 //! plain slices; [`PlaneLayout`] and [`MlpLayout`] say what is where.
 
 pub mod evaluate;
+pub mod initialize;
+mod validate;
+
+pub use validate::{
+    ConfigError, MAX_CHANNELS, MAX_LEVELS, MAX_MULTIPLIER, MAX_PLANE_FLOATS, MAX_SPATIAL_RESOLUTION,
+    MAX_TIME_RESOLUTION, MAX_WIDTH,
+};
 
 use std::ops::Range;
 

@@ -1,0 +1,140 @@
+//! `.cif` files: one [safetensors](https://github.com/huggingface/safetensors) file per scene.
+//!
+//! The header's `__metadata__` holds strings:
+//!
+//! | key | holds |
+//! |---|---|
+//! | `cif.format` | [`FORMAT`], a decimal number |
+//! | `cif.version` | version of the cif that wrote the file |
+//! | `cif.field` | JSON of everything in a [`Field`] that is not a tensor |
+//! | `cif.training` | JSON of the [`TrainingState`]; absent in a scene without one |
+//!
+//! and the tensors are, little-endian, with N Gaussians and E identity entries:
+//!
+//! | tensor | type | shape |
+//! |---|---|---|
+//! | `gaussians.means`, `gaussians.log_scales` | F32 | `[N, 3]` |
+//! | `gaussians.quaternions` | F32 | `[N, 4]`, w x y z |
+//! | `gaussians.opacity_logits`, `gaussians.occupancy_logits` | F32 | `[N]` |
+//! | `gaussians.sh_coefficients` | F32 | `[N, 16, 3]` |
+//! | `deformation.planes`, `deformation.mlp` | F32 | `[floats]`; absent in a static scene |
+//! | `identities.row_offsets` | U32 | `[N + 1]`; absent without identities, as the next two |
+//! | `identities.labels` | U16 | `[E]` |
+//! | `identities.log_estimates`, `identities.log_calibrations` | F32 | `[E]` |
+//! | `training.<name>` | F32, F64, U32 or U64 | `[length]` |
+//!
+//! Floats survive bit by bit, in tensors and in JSON; equal fields give equal bytes. A file is written beside
+//! its destination and renamed, so a failed save leaves what was there. A reader trusts nothing: it allocates
+//! no more than a small multiple of the file's length, and checks everything that later code relies on.
+
+mod error;
+mod format;
+mod read;
+mod write;
+
+use std::collections::BTreeMap;
+use std::io::{Read, Seek, Write};
+use std::path::Path;
+
+pub use error::CheckpointError;
+pub use format::FORMAT;
+
+use crate::Field;
+
+/// A scene and, when its training may go on, where the training stood.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Checkpoint {
+    /// The scene.
+    pub field: Field,
+    /// State of the run; `None` in a finished scene.
+    pub training: Option<TrainingState>,
+}
+
+/// What a run needs beyond the field to go on exactly as if it had not been interrupted.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct TrainingState {
+    /// Counters, settings, random generators.
+    pub json: serde_json::Value,
+    /// Moments and other per-parameter state, by name.
+    pub tensors: BTreeMap<String, StateTensor>,
+}
+
+/// A flat tensor of a [`TrainingState`].
+#[derive(Clone, Debug, PartialEq)]
+pub enum StateTensor {
+    /// Single precision.
+    F32(Vec<f32>),
+    /// Double precision.
+    F64(Vec<f64>),
+    /// 32-bit counters.
+    U32(Vec<u32>),
+    /// 64-bit counters.
+    U64(Vec<u64>),
+}
+
+impl Checkpoint {
+    /// Writes the file, replacing an older one only once the new one is complete on disk.
+    ///
+    /// # Errors
+    /// When the field is not valid (see [`Field::validate`]) or the file cannot be written.
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
+        write::save(path.as_ref(), &self.field, self.training.as_ref())
+    }
+
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// When it cannot be read, is not a whole `.cif` file, or holds values that no cif writes.
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, CheckpointError> {
+        read::load(path.as_ref(), true)
+    }
+
+    /// Writes the bytes of a `.cif` file to any sink; `path` is only named in errors.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::save`].
+    pub fn write(&self, sink: &mut dyn Write, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
+        write::write(sink, path.as_ref(), &self.field, self.training.as_ref())
+    }
+
+    /// Reads the bytes of a `.cif` file from any source; `path` is only named in errors.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::load`].
+    pub fn read(source: &mut (impl Read + Seek), path: impl AsRef<Path>) -> Result<Self, CheckpointError> {
+        read::read(source, path.as_ref(), true)
+    }
+}
+
+impl Field {
+    /// Writes the scene alone as a `.cif` file (see [`crate::checkpoint`]).
+    ///
+    /// # Errors
+    /// As [`Checkpoint::save`].
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
+        write::save(path.as_ref(), self, None)
+    }
+
+    /// [`Checkpoint::save`] without taking the field.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::save`].
+    pub fn save_with_training(
+        &self,
+        training: &TrainingState,
+        path: impl AsRef<Path>,
+    ) -> Result<(), CheckpointError> {
+        write::save(path.as_ref(), self, Some(training))
+    }
+
+    /// Reads the scene of a `.cif` file and leaves a training state in it unread.
+    ///
+    /// # Errors
+    /// As [`Checkpoint::load`].
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, CheckpointError> {
+        Ok(read::load(path.as_ref(), false)?.field)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,267 @@
+//! Reading: the header is checked against the file's length before anything is allocated, tensors are read
+//! one by one straight into place.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+use safetensors::Dtype;
+use safetensors::tensor::{Metadata, TensorInfo};
+
+use super::format::{
+    FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES,
+    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, QUATERNIONS, ROW_OFFSETS,
+    SH_COEFFICIENTS, TRAINING_KEY, TRAINING_PREFIX, VERSION_KEY,
+};
+use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
+use crate::gaussians::SH_FLOATS;
+use crate::{Deformation, Field, Gaussians, Identities};
+
+pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
+    let failed = |source: io::Error| CheckpointError::Read { path: path.to_owned(), source };
+    let file = File::open(path).map_err(failed)?;
+    let metadata = file.metadata().map_err(failed)?;
+    if !metadata.is_file() {
+        let message = if metadata.is_dir() { "it is a folder" } else { "it is not a regular file" };
+        return Err(failed(io::Error::other(message)));
+    }
+    read(&mut BufReader::new(file), path, with_training)
+}
+
+pub(super) fn read<S: Read + Seek>(
+    source: &mut S,
+    path: &Path,
+    with_training: bool,
+) -> Result<Checkpoint, CheckpointError> {
+    let mut reader = Reader::open(source, path)?;
+    let metadata = reader.header.metadata().clone().unwrap_or_default();
+    reader.check_format(metadata.get(FORMAT_KEY), metadata.get(VERSION_KEY))?;
+    let json =
+        metadata.get(FIELD_KEY).ok_or_else(|| reader.damaged(format!("the header has no `{FIELD_KEY}`")))?;
+    let json: FieldJson =
+        serde_json::from_str(json).map_err(|error| reader.damaged(format!("`{FIELD_KEY}`: {error}")))?;
+
+    let field = read_field(&mut reader, json)?;
+    field.validate().map_err(|source| CheckpointError::InvalidField { path: path.to_owned(), source })?;
+    let training = match metadata.get(TRAINING_KEY) {
+        Some(json) if with_training => Some(read_training(&mut reader, json)?),
+        _ => None,
+    };
+    let unknown = reader
+        .header
+        .offset_keys()
+        .into_iter()
+        .find(|name| !reader.known.contains(name) && !name.starts_with(TRAINING_PREFIX));
+    if let Some(name) = unknown {
+        return Err(reader.tensor_error(&name, "is not part of a scene"));
+    }
+    Ok(Checkpoint { field, training })
+}
+
+fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Result<Field, CheckpointError> {
+    let n = match reader.info(MEANS, Dtype::F32)?.shape[..] {
+        [n, 3] => n,
+        ref other => return Err(reader.shape_error(MEANS, other, "[N, 3]")),
+    };
+    let gaussians = Gaussians {
+        means: reader.values(MEANS, Dtype::F32, n, &[3])?,
+        log_scales: reader.values(LOG_SCALES, Dtype::F32, n, &[3])?,
+        quaternions: reader.values(QUATERNIONS, Dtype::F32, n, &[4])?,
+        opacity_logits: reader.values(OPACITY_LOGITS, Dtype::F32, n, &[])?,
+        occupancy_logits: reader.values(OCCUPANCY_LOGITS, Dtype::F32, n, &[])?,
+        sh_coefficients: reader.values::<[f32; SH_FLOATS]>(SH_COEFFICIENTS, Dtype::F32, n, &[16, 3])?,
+    };
+    let deformation = match json.deformation {
+        None => None,
+        Some(shape) => {
+            // Layout arithmetic is safe only within the limits.
+            shape.config.validate().map_err(|source| CheckpointError::InvalidField {
+                path: reader.path.to_owned(),
+                source: source.into(),
+            })?;
+            let planes = shape.config.plane_layout().1;
+            let mlp = shape.config.mlp_layout().len;
+            Some(Deformation {
+                planes: reader.values(PLANES, Dtype::F32, planes, &[])?,
+                mlp: reader.values(MLP, Dtype::F32, mlp, &[])?,
+                config: shape.config,
+                bounds: shape.bounds,
+            })
+        }
+    };
+    let identities = if json.has_identities {
+        let entries = match reader.info(LABELS, Dtype::U16)?.shape[..] {
+            [entries] => entries,
+            ref other => return Err(reader.shape_error(LABELS, other, "[E]")),
+        };
+        Some(Identities {
+            // n counts rows of 12 bytes in this file, so n + 1 cannot overflow.
+            row_offsets: reader.values(ROW_OFFSETS, Dtype::U32, n + 1, &[])?,
+            labels: reader.values(LABELS, Dtype::U16, entries, &[])?,
+            log_estimates: reader.values(LOG_ESTIMATES, Dtype::F32, entries, &[])?,
+            log_calibrations: reader.values(LOG_CALIBRATIONS, Dtype::F32, entries, &[])?,
+        })
+    } else {
+        None
+    };
+    Ok(Field {
+        gaussians,
+        deformation,
+        identities,
+        instances: json.instances,
+        timeline: json.timeline,
+        cameras: json.cameras,
+        sh_degree: json.sh_degree,
+        background: json.background,
+        sort_metric: json.sort_metric,
+        extent: json.extent,
+        provenance: json.provenance,
+    })
+}
+
+fn read_training<S: Read + Seek>(
+    reader: &mut Reader<'_, S>,
+    json: &str,
+) -> Result<TrainingState, CheckpointError> {
+    let json =
+        serde_json::from_str(json).map_err(|error| reader.damaged(format!("`{TRAINING_KEY}`: {error}")))?;
+    let mut tensors = BTreeMap::new();
+    for name in reader.header.offset_keys() {
+        let Some(short) = name.strip_prefix(TRAINING_PREFIX) else { continue };
+        let Some(info) = reader.header.info(&name).cloned() else { continue };
+        let [length] = info.shape[..] else {
+            return Err(reader.shape_error(&name, &info.shape, "[length]"));
+        };
+        let tensor = match info.dtype {
+            Dtype::F32 => StateTensor::F32(reader.values(&name, info.dtype, length, &[])?),
+            Dtype::F64 => StateTensor::F64(reader.values(&name, info.dtype, length, &[])?),
+            Dtype::U32 => StateTensor::U32(reader.values(&name, info.dtype, length, &[])?),
+            Dtype::U64 => StateTensor::U64(reader.values(&name, info.dtype, length, &[])?),
+            other => return Err(reader.tensor_error(&name, &format!("has the type {other}"))),
+        };
+        tensors.insert(short.to_owned(), tensor);
+    }
+    Ok(TrainingState { json, tensors })
+}
+
+/// An open file whose header is known to agree with its length.
+struct Reader<'a, S> {
+    source: &'a mut S,
+    path: &'a Path,
+    header: Metadata,
+    /// First byte of tensor data.
+    data_start: u64,
+    /// Tensors asked for.
+    known: BTreeSet<String>,
+}
+
+impl<'a, S: Read + Seek> Reader<'a, S> {
+    fn open(source: &'a mut S, path: &'a Path) -> Result<Self, CheckpointError> {
+        let failed = |source: io::Error| CheckpointError::Read { path: path.to_owned(), source };
+        let not_safetensors = || CheckpointError::NotSafetensors { path: path.to_owned() };
+        let truncated =
+            |expected, found| CheckpointError::Truncated { path: path.to_owned(), expected, found };
+        let found = source.seek(SeekFrom::End(0)).map_err(failed)?;
+        source.seek(SeekFrom::Start(0)).map_err(failed)?;
+        if found < 9 {
+            return Err(if found == 0 { truncated(9, 0) } else { not_safetensors() });
+        }
+        let mut start = [0; 9];
+        source.read_exact(&mut start).map_err(failed)?;
+        let (length, brace) = start.split_at(8);
+        let header_length = u64::from_le_bytes(length.try_into().expect("split at 8"));
+        if !(2..=MAX_HEADER).contains(&header_length) || brace != b"{" {
+            return Err(not_safetensors());
+        }
+        let data_start = 8 + header_length;
+        if data_start > found {
+            return Err(truncated(data_start, found));
+        }
+        let mut text = vec![0; header_length as usize];
+        source.seek(SeekFrom::Start(8)).map_err(failed)?;
+        source.read_exact(&mut text).map_err(failed)?;
+        // Parsing also checks that the tensors lie end to end and that shapes and sizes agree, without overflow.
+        let header: Metadata = serde_json::from_slice(&text).map_err(|error| CheckpointError::Header {
+            path: path.to_owned(),
+            problem: format!("its header cannot be read ({error})"),
+        })?;
+        let expected = data_start.saturating_add(header.data_len() as u64);
+        if found < expected {
+            return Err(truncated(expected, found));
+        }
+        if found > expected {
+            return Err(CheckpointError::TrailingBytes { path: path.to_owned(), expected, found });
+        }
+        Ok(Self { source, path, header, data_start, known: BTreeSet::new() })
+    }
+
+    fn check_format(&self, format: Option<&String>, version: Option<&String>) -> Result<(), CheckpointError> {
+        let Some(format) = format else {
+            return Err(CheckpointError::NotAScene { path: self.path.to_owned() });
+        };
+        match format.parse::<u64>() {
+            Ok(found) if found > u64::from(FORMAT) => Err(CheckpointError::NewerFormat {
+                path: self.path.to_owned(),
+                found,
+                writer: version.map_or_else(
+                    || "of a later version".to_owned(),
+                    |text| text.chars().filter(|c| !c.is_control()).take(40).collect(),
+                ),
+            }),
+            Ok(found) if found > 0 => Ok(()),
+            _ => Err(self.damaged(format!("`{FORMAT_KEY}` is not a format number"))),
+        }
+    }
+
+    fn damaged(&self, problem: String) -> CheckpointError {
+        CheckpointError::Header { path: self.path.to_owned(), problem }
+    }
+
+    fn tensor_error(&self, tensor: &str, problem: &str) -> CheckpointError {
+        CheckpointError::Tensor {
+            path: self.path.to_owned(),
+            tensor: tensor.chars().filter(|c| !c.is_control()).take(80).collect(),
+            problem: problem.to_owned(),
+        }
+    }
+
+    fn shape_error(&self, tensor: &str, found: &[usize], expected: &str) -> CheckpointError {
+        self.tensor_error(tensor, &format!("has the shape {found:?}, expected {expected}"))
+    }
+
+    fn info(&self, name: &str, dtype: Dtype) -> Result<TensorInfo, CheckpointError> {
+        let info = self.header.info(name).ok_or_else(|| self.tensor_error(name, "is missing"))?;
+        if info.dtype != dtype {
+            let problem = format!("has the type {}, expected {dtype}", info.dtype);
+            return Err(self.tensor_error(name, &problem));
+        }
+        Ok(info.clone())
+    }
+
+    /// Reads a tensor of shape `[rows, ..row]` as `rows` values of `T`, which spans one row.
+    fn values<T: bytemuck::Pod>(
+        &mut self,
+        name: &str,
+        dtype: Dtype,
+        rows: usize,
+        row: &[usize],
+    ) -> Result<Vec<T>, CheckpointError> {
+        let info = self.info(name, dtype)?;
+        let (first, rest) = info.shape.split_first().unwrap_or((&usize::MAX, &[]));
+        if *first != rows || rest != row {
+            let mut expected = vec![rows];
+            expected.extend_from_slice(row);
+            return Err(self.shape_error(name, &info.shape, &format!("{expected:?}")));
+        }
+        // The header was checked: `rows` values are exactly the tensor's bytes, which the file has.
+        let mut values = vec![T::zeroed(); rows];
+        let failed = |source: io::Error| CheckpointError::Read { path: self.path.to_owned(), source };
+        self.source
+            .seek(SeekFrom::Start(self.data_start + info.data_offsets.0 as u64))
+            .and_then(|_| self.source.read_exact(bytemuck::cast_slice_mut(&mut values)))
+            .map_err(failed)?;
+        self.known.insert(name.to_owned());
+        Ok(values)
+    }
+}

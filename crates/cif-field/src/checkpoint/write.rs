@@ -1,0 +1,192 @@
+//! Writing: validated first, streamed, atomic.
+
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use safetensors::Dtype;
+use safetensors::tensor::TensorInfo;
+use serde::Serialize;
+
+use super::format::{
+    FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES,
+    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, QUATERNIONS, ROW_OFFSETS,
+    SH_COEFFICIENTS, TRAINING_KEY, TRAINING_PREFIX, VERSION_KEY,
+};
+use super::{CheckpointError, StateTensor, TrainingState};
+use crate::Field;
+
+/// A tensor about to be written.
+struct Tensor<'a> {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: &'a [u8],
+}
+
+/// Ordered twin of the safetensors crate's header, whose hash maps would shuffle the bytes.
+#[derive(Serialize)]
+struct Header<'a> {
+    #[serde(rename = "__metadata__")]
+    metadata: BTreeMap<&'a str, String>,
+    #[serde(flatten)]
+    tensors: BTreeMap<&'a str, TensorInfo>,
+}
+
+/// Writes a file beside `path` and renames it.
+pub(super) fn save(
+    path: &Path,
+    field: &Field,
+    training: Option<&TrainingState>,
+) -> Result<(), CheckpointError> {
+    replace_file(path, |file| write(file, path, field, training))
+}
+
+/// The folder that holds `path`.
+pub(super) fn folder_of(path: &Path) -> PathBuf {
+    match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
+        _ => PathBuf::from("."),
+    }
+}
+
+/// Runs `write` on a temporary file in the folder of `path`, and gives it that name once it is on disk.
+/// On failure the temporary file is removed and whatever `path` was stays.
+pub(super) fn replace_file(
+    path: &Path,
+    write: impl FnOnce(&mut dyn Write) -> Result<(), CheckpointError>,
+) -> Result<(), CheckpointError> {
+    let failed = |source: io::Error| CheckpointError::writing(path, source);
+    // A link keeps pointing where it points; its target is what is replaced.
+    let target = if path.is_symlink() { fs::canonicalize(path).map_err(failed)? } else { path.to_owned() };
+    match fs::metadata(&target) {
+        Ok(metadata) if !metadata.is_file() => {
+            let problem = if metadata.is_dir() { "it is a folder" } else { "it is not a regular file" };
+            return Err(CheckpointError::Write {
+                path: path.to_owned(),
+                problem: problem.to_owned(),
+                source: None,
+            });
+        }
+        _ => {}
+    }
+    let folder = folder_of(&target);
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".cif-").suffix(".tmp");
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        // As a plainly created file: the process's umask decides, not the private mode of temporary files.
+        builder.permissions(fs::Permissions::from_mode(0o666));
+    }
+    let temporary = builder.tempfile_in(&folder).map_err(failed)?;
+    {
+        let mut buffered = BufWriter::with_capacity(1 << 20, temporary.as_file());
+        write(&mut buffered)?;
+        buffered.flush().map_err(failed)?;
+    }
+    temporary.as_file().sync_all().map_err(failed)?;
+    temporary.persist(&target).map_err(|error| failed(error.error))?;
+    #[cfg(unix)]
+    if let Ok(folder) = File::open(&folder) {
+        // The rename survives a power cut only once the folder is synced; not every file system can.
+        let _ = folder.sync_all();
+    }
+    Ok(())
+}
+
+/// Writes the bytes of a file.
+pub(super) fn write(
+    sink: &mut dyn Write,
+    path: &Path,
+    field: &Field,
+    training: Option<&TrainingState>,
+) -> Result<(), CheckpointError> {
+    field.validate().map_err(|source| CheckpointError::Unsaveable { path: path.to_owned(), source })?;
+    let unsaveable =
+        |problem: String| CheckpointError::Write { path: path.to_owned(), problem, source: None };
+    let json = |value: serde_json::Result<String>| value.map_err(|error| unsaveable(error.to_string()));
+
+    let mut metadata = BTreeMap::from([
+        (FORMAT_KEY, FORMAT.to_string()),
+        (VERSION_KEY, env!("CARGO_PKG_VERSION").to_owned()),
+        (FIELD_KEY, json(serde_json::to_string(&FieldJson::of(field)))?),
+    ]);
+    let mut tensors = field_tensors(field);
+    if let Some(training) = training {
+        metadata.insert(TRAINING_KEY, json(serde_json::to_string(&training.json))?);
+        tensors.extend(training.tensors.iter().map(|(name, tensor)| state_tensor(name, tensor)));
+    }
+    // Widest elements first, so that every tensor is aligned in the file; names break ties.
+    tensors.sort_by(|a, b| b.dtype.bitsize().cmp(&a.dtype.bitsize()).then_with(|| a.name.cmp(&b.name)));
+
+    let mut offset = 0;
+    let mut infos = BTreeMap::new();
+    for tensor in &tensors {
+        let data_offsets = (offset, offset + tensor.bytes.len());
+        offset = data_offsets.1;
+        let info = TensorInfo { dtype: tensor.dtype, shape: tensor.shape.clone(), data_offsets };
+        infos.insert(tensor.name.as_str(), info);
+    }
+    let mut header = json(serde_json::to_string(&Header { metadata, tensors: infos }))?.into_bytes();
+    header.resize(header.len().next_multiple_of(8), b' ');
+    if header.len() as u64 > MAX_HEADER {
+        return Err(unsaveable(format!(
+            "its names, cameras and provenance take {} bytes, more than the {MAX_HEADER} that the format holds",
+            header.len()
+        )));
+    }
+    let mut put = |bytes: &[u8]| sink.write_all(bytes).map_err(|e| CheckpointError::writing(path, e));
+    put(&(header.len() as u64).to_le_bytes())?;
+    put(&header)?;
+    tensors.iter().try_for_each(|tensor| put(tensor.bytes))
+}
+
+fn field_tensors(field: &Field) -> Vec<Tensor<'_>> {
+    fn tensor<'a, T: bytemuck::NoUninit>(
+        name: &str,
+        dtype: Dtype,
+        values: &'a [T],
+        row: &[usize],
+    ) -> Tensor<'a> {
+        let mut shape = vec![values.len()];
+        shape.extend_from_slice(row);
+        Tensor { name: name.to_owned(), dtype, shape, bytes: bytemuck::cast_slice(values) }
+    }
+    let gaussians = &field.gaussians;
+    let mut tensors = vec![
+        tensor(MEANS, Dtype::F32, &gaussians.means, &[3]),
+        tensor(LOG_SCALES, Dtype::F32, &gaussians.log_scales, &[3]),
+        tensor(QUATERNIONS, Dtype::F32, &gaussians.quaternions, &[4]),
+        tensor(OPACITY_LOGITS, Dtype::F32, &gaussians.opacity_logits, &[]),
+        tensor(OCCUPANCY_LOGITS, Dtype::F32, &gaussians.occupancy_logits, &[]),
+        Tensor {
+            name: SH_COEFFICIENTS.to_owned(),
+            dtype: Dtype::F32,
+            shape: vec![gaussians.len(), 16, 3],
+            bytes: bytemuck::cast_slice(gaussians.sh_coefficients.as_flattened()),
+        },
+    ];
+    if let Some(deformation) = &field.deformation {
+        tensors.push(tensor(PLANES, Dtype::F32, &deformation.planes, &[]));
+        tensors.push(tensor(MLP, Dtype::F32, &deformation.mlp, &[]));
+    }
+    if let Some(identities) = &field.identities {
+        tensors.push(tensor(ROW_OFFSETS, Dtype::U32, &identities.row_offsets, &[]));
+        tensors.push(tensor(LABELS, Dtype::U16, &identities.labels, &[]));
+        tensors.push(tensor(LOG_ESTIMATES, Dtype::F32, &identities.log_estimates, &[]));
+        tensors.push(tensor(LOG_CALIBRATIONS, Dtype::F32, &identities.log_calibrations, &[]));
+    }
+    tensors
+}
+
+fn state_tensor<'a>(name: &str, tensor: &'a StateTensor) -> Tensor<'a> {
+    let (dtype, length, bytes): (Dtype, usize, &[u8]) = match tensor {
+        StateTensor::F32(values) => (Dtype::F32, values.len(), bytemuck::cast_slice(values)),
+        StateTensor::F64(values) => (Dtype::F64, values.len(), bytemuck::cast_slice(values)),
+        StateTensor::U32(values) => (Dtype::U32, values.len(), bytemuck::cast_slice(values)),
+        StateTensor::U64(values) => (Dtype::U64, values.len(), bytemuck::cast_slice(values)),
+    };
+    Tensor { name: format!("{TRAINING_PREFIX}{name}"), dtype, shape: vec![length], bytes }
+}

@@ -1,0 +1,306 @@
+//! Rules that every [`Field`] keeps, so that renderers and exporters need not check again.
+
+use cif_geometry::Bounds;
+
+use crate::deformation::ConfigError;
+use crate::{Deformation, Field, Gaussians, Identities, Instance, RecordedCamera, Timeline};
+
+/// Largest deviation of a camera rotation from orthonormality.
+const MAX_ORTHONORMALITY_ERROR: f64 = 1e-3;
+
+/// A broken rule of [`Field`].
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
+pub enum FieldError {
+    /// Arrays that must have the same length do not.
+    #[error("`{array}` has {found} entries, expected {expected}")]
+    Length {
+        /// The array.
+        array: &'static str,
+        /// Its length.
+        found: usize,
+        /// The length that follows from the rest.
+        expected: usize,
+    },
+    /// More Gaussians or entries than 32-bit indices address.
+    #[error("`{array}` has {found} entries, more than 32-bit indices can address")]
+    TooMany {
+        /// The array.
+        array: &'static str,
+        /// Its length.
+        found: usize,
+    },
+    /// A NaN or infinite parameter.
+    #[error("`{array}` holds {value} at row {row}, column {column}: the training diverged")]
+    NotFinite {
+        /// The array.
+        array: &'static str,
+        /// First such row.
+        row: usize,
+        /// Column in the row.
+        column: usize,
+        /// The value.
+        value: f32,
+    },
+    /// The shape of the deformation is out of range.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The box of the deformation is empty, flat or not finite.
+    #[error("the deformation's box {low:?} to {high:?} must be finite and have a volume")]
+    Bounds {
+        /// Smallest corner.
+        low: [f64; 3],
+        /// Largest corner.
+        high: [f64; 3],
+    },
+    /// An identity row is empty, out of order, or not inside the entries.
+    #[error("identity row {row} {problem}")]
+    IdentityRow {
+        /// The row.
+        row: usize,
+        /// What is wrong.
+        problem: String,
+    },
+    /// The instance table is inconsistent.
+    #[error("instance {index} ({label:?}) {problem}")]
+    Instance {
+        /// Position in the table.
+        index: usize,
+        /// Its label.
+        label: String,
+        /// What is wrong.
+        problem: String,
+    },
+    /// A captured time or rate is out of range.
+    #[error("the timeline is broken: {problem}")]
+    Timeline {
+        /// What is wrong.
+        problem: String,
+    },
+    /// A recorded camera is unusable.
+    #[error("camera {name:?} (record {index}) {problem}")]
+    Camera {
+        /// Position in the list.
+        index: usize,
+        /// Its name.
+        name: String,
+        /// What is wrong.
+        problem: String,
+    },
+    /// A single value is out of range.
+    #[error("`{name}` is {value}, expected {expected}")]
+    Value {
+        /// The value's name.
+        name: &'static str,
+        /// The value.
+        value: String,
+        /// The range.
+        expected: &'static str,
+    },
+}
+
+impl Field {
+    /// Checks every rule: lengths that belong together, index ranges, finite values, usable cameras.
+    ///
+    /// # Errors
+    /// The first broken rule, naming array and place.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        self.gaussians.validate()?;
+        if let Some(deformation) = &self.deformation {
+            deformation.validate()?;
+        }
+        validate_instances(&self.instances)?;
+        if let Some(identities) = &self.identities {
+            identities.validate(self.gaussians.len(), self.instances.len())?;
+        }
+        self.timeline.validate()?;
+        for (index, camera) in self.cameras.iter().enumerate() {
+            validate_camera(camera, self.timeline.times.len()).map_err(|problem| FieldError::Camera {
+                index,
+                name: camera.name.clone(),
+                problem,
+            })?;
+        }
+        let value = |name, value: String, expected| Err(FieldError::Value { name, value, expected });
+        if self.sh_degree > 3 {
+            return value("sh_degree", self.sh_degree.to_string(), "0 to 3");
+        }
+        if !self.background.iter().all(|channel| (0.0..=1.0).contains(channel)) {
+            return value("background", format!("{:?}", self.background), "three values in [0, 1]");
+        }
+        if !(self.extent.is_finite() && self.extent >= 0.0) {
+            return value("extent", self.extent.to_string(), "a finite length in metres");
+        }
+        Ok(())
+    }
+}
+
+impl Gaussians {
+    /// Checks that all arrays have N rows of finite values.
+    ///
+    /// # Errors
+    /// The first broken rule.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        let n = self.len();
+        if u32::try_from(n).is_err() {
+            return Err(FieldError::TooMany { array: "means", found: n });
+        }
+        let lengths = [
+            ("log_scales", self.log_scales.len()),
+            ("quaternions", self.quaternions.len()),
+            ("opacity_logits", self.opacity_logits.len()),
+            ("occupancy_logits", self.occupancy_logits.len()),
+            ("sh_coefficients", self.sh_coefficients.len()),
+        ];
+        for (array, found) in lengths {
+            same_length(array, found, n)?;
+        }
+        finite("means", self.means.as_flattened(), 3)?;
+        finite("log_scales", self.log_scales.as_flattened(), 3)?;
+        finite("quaternions", self.quaternions.as_flattened(), 4)?;
+        finite("opacity_logits", &self.opacity_logits, 1)?;
+        finite("occupancy_logits", &self.occupancy_logits, 1)?;
+        finite("sh_coefficients", self.sh_coefficients.as_flattened(), crate::gaussians::SH_FLOATS)
+    }
+}
+
+impl Deformation {
+    /// Checks the shape, the box, and that all parameters are there and finite.
+    ///
+    /// # Errors
+    /// The first broken rule.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        self.config.validate()?;
+        let Bounds { low, high } = self.bounds;
+        // Read in f32 too, where a thin box far from the origin may vanish.
+        let (thin_low, thin_high) = (low.as_vec3(), high.as_vec3());
+        if !(thin_low.is_finite() && thin_high.is_finite() && thin_low.cmplt(thin_high).all()) {
+            return Err(FieldError::Bounds { low: low.to_array(), high: high.to_array() });
+        }
+        same_length("deformation.planes", self.planes.len(), self.config.plane_layout().1)?;
+        same_length("deformation.mlp", self.mlp.len(), self.config.mlp_layout().len)?;
+        finite("deformation.planes", &self.planes, 1)?;
+        finite("deformation.mlp", &self.mlp, 1)
+    }
+}
+
+impl Identities {
+    /// Checks the rows against `gaussians` rows and labels below `instances`: offsets ascend from 0 to the
+    /// number of entries, rows are not empty, labels ascend strictly in a row, and values are finite.
+    ///
+    /// # Errors
+    /// The first broken rule.
+    pub fn validate(&self, gaussians: usize, instances: usize) -> Result<(), FieldError> {
+        let entries = self.labels.len();
+        if u32::try_from(entries).is_err() {
+            return Err(FieldError::TooMany { array: "identities.labels", found: entries });
+        }
+        same_length("identities.row_offsets", self.row_offsets.len(), gaussians + 1)?;
+        same_length("identities.log_estimates", self.log_estimates.len(), entries)?;
+        same_length("identities.log_calibrations", self.log_calibrations.len(), entries)?;
+        let broken = |row, problem: String| Err(FieldError::IdentityRow { row, problem });
+        if self.row_offsets[0] != 0 {
+            return broken(0, format!("starts at entry {}, expected 0", self.row_offsets[0]));
+        }
+        for row in 0..gaussians {
+            let (start, end) = (self.row_offsets[row] as usize, self.row_offsets[row + 1] as usize);
+            if end > entries || start > end {
+                return broken(row, format!("spans entries {start} to {end} of {entries}"));
+            }
+            if start == end {
+                return broken(row, "is empty".to_owned());
+            }
+            let labels = &self.labels[start..end];
+            if labels.windows(2).any(|pair| pair[0] >= pair[1]) {
+                return broken(row, "has labels that do not ascend".to_owned());
+            }
+            let last = labels[labels.len() - 1];
+            if usize::from(last) >= instances {
+                return broken(row, format!("has the label {last}, but there are {instances} instances"));
+            }
+        }
+        let used = self.row_offsets[gaussians] as usize;
+        if used != entries {
+            return Err(FieldError::Length { array: "identities.labels", found: entries, expected: used });
+        }
+        finite("identities.log_estimates", &self.log_estimates, 1)?;
+        finite("identities.log_calibrations", &self.log_calibrations, 1)
+    }
+}
+
+impl Timeline {
+    /// Checks that there is a time, that times ascend strictly in [0, 1], and that the rate is positive.
+    ///
+    /// # Errors
+    /// The first broken rule.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        let broken = |problem: String| Err(FieldError::Timeline { problem });
+        if self.times.is_empty() {
+            return broken("it has no times".to_owned());
+        }
+        if let Some(time) = self.times.iter().find(|time| !(0.0..=1.0).contains(*time)) {
+            return broken(format!("the time {time} is outside [0, 1]"));
+        }
+        if let Some(pair) = self.times.windows(2).find(|pair| pair[0] >= pair[1]) {
+            return broken(format!("the time {} does not come after {}", pair[1], pair[0]));
+        }
+        if !(self.frames_per_second.is_finite() && self.frames_per_second > 0.0) {
+            return broken(format!("{} frames per second", self.frames_per_second));
+        }
+        Ok(())
+    }
+}
+
+fn validate_instances(instances: &[Instance]) -> Result<(), FieldError> {
+    let broken = |index: usize, problem: String| {
+        Err(FieldError::Instance { index, label: instances[index].label.clone(), problem })
+    };
+    let mut owners = vec![None; 1 << 16];
+    for (index, instance) in instances.iter().enumerate() {
+        if instance.id == 0 {
+            return broken(index, "has the id 0, which means unlabelled".to_owned());
+        }
+        if let Some(other) = owners[usize::from(instance.id)].replace(index) {
+            return broken(index, format!("has the id {} of instance {other}", instance.id));
+        }
+    }
+    Ok(())
+}
+
+fn validate_camera(record: &RecordedCamera, times: usize) -> Result<(), String> {
+    let camera = &record.camera;
+    if record.time_index >= times {
+        return Err(format!("has the time index {}, but there are {times} times", record.time_index));
+    }
+    if camera.width == 0 || camera.height == 0 {
+        return Err(format!("has an image of {} x {} pixels", camera.width, camera.height));
+    }
+    if !(camera.focal_px.is_finite() && camera.focal_px.min_element() > 0.0) {
+        return Err(format!("has the focal lengths {}", camera.focal_px));
+    }
+    if !camera.principal_px.is_finite() {
+        return Err(format!("has the principal point {}", camera.principal_px));
+    }
+    if !camera.camera_from_world.translation.is_finite() {
+        return Err("has a position that is not finite".to_owned());
+    }
+    let error = camera.camera_from_world.orthonormality_error();
+    // A NaN fails the comparison too.
+    if !(error <= MAX_ORTHONORMALITY_ERROR) {
+        return Err(format!("has a rotation that is not orthonormal (deviation {error})"));
+    }
+    Ok(())
+}
+
+fn same_length(array: &'static str, found: usize, expected: usize) -> Result<(), FieldError> {
+    if found == expected { Ok(()) } else { Err(FieldError::Length { array, found, expected }) }
+}
+
+fn finite(array: &'static str, values: &[f32], columns: usize) -> Result<(), FieldError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        None => Ok(()),
+        Some(at) => {
+            Err(FieldError::NotFinite { array, row: at / columns, column: at % columns, value: values[at] })
+        }
+    }
+}
