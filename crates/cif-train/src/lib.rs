@@ -1,1 +1,46 @@
-//! placeholder
+//! Trains a field: from a capture to deformable Gaussians with occupancy and identity.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`config`] | every setting, and the presets |
+//! | [`trainer`] | how a run goes through its stages, stops and resumes |
+//! | [`events`] | what a run tells its observer |
+//! | [`schedule`] | learning rates, spherical-harmonics degree |
+//! | [`losses`] | colour losses and their gradients |
+//! | [`adam`] | the optimiser, and the regularisers of the planes |
+//! | [`densify`] | cloning, splitting, pruning |
+//! | [`estimate`] | whose each Gaussian is, from masks |
+//! | [`resample`] | instance-guided resampling with volume conservation |
+//! | [`metrics`] | how good a field is |
+//!
+//! ```no_run
+//! use cif_train::{Control, Preset, TrainConfig, Trainer};
+//!
+//! let dataset = cif_dataset::Dataset::open("captures/kitchen", &cif_dataset::OpenOptions::default())?;
+//! let config = TrainConfig::preset(Preset::Standard, dataset.layout);
+//! let mut trainer = Trainer::new(dataset, config)?;
+//! trainer.run(&mut |event, _view| {
+//!     println!("{event:?}");
+//!     Control::Continue
+//! })?;
+//! trainer.checkpoint(false).save("kitchen.cif")?;
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
+
+pub mod adam;
+pub mod config;
+pub mod densify;
+pub mod error;
+pub mod estimate;
+pub mod events;
+pub mod losses;
+pub mod metrics;
+mod random;
+pub mod resample;
+pub mod schedule;
+pub mod trainer;
+
+pub use config::{Ablation, Preset, TrainConfig};
+pub use error::TrainError;
+pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
+pub use trainer::Trainer;

@@ -1,0 +1,304 @@
+//! Every setting of a training run.
+//!
+//! "Default" below is the value of the `standard` preset; [`TrainConfig::preset`] gives the others. Codes
+//! such as A7 name the question of the methods reference (section 12) that a setting answers.
+
+mod options;
+mod presets;
+mod validate;
+
+use std::collections::BTreeSet;
+
+use cif_field::{Heads, SortMetric, TimeEncoding};
+use serde::{Deserialize, Serialize};
+
+pub use options::{
+    Ablation, InstanceGeometry, LabelShares, Normalisation, OccupancyStart, Preset, ScaleCorrection, WeakSet,
+};
+pub use validate::ConfigError;
+
+/// Settings of a run. Every table and key may be left out of a file.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Preset that the other values started from; recorded, and otherwise without effect.
+    pub preset: Preset,
+    /// Seed of every random choice, default 0. Same seed and settings: same result, bit for bit.
+    pub seed: u64,
+    /// Image reduction: 1, 2, 4, ...; default none, which takes the largest images stored. Applied where the
+    /// capture is opened.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub downscale: Option<u32>,
+    /// Colour behind everything, display-referred RGB in [0, 1], default white.
+    pub background: [f32; 3],
+    /// Gaussians nearer to the camera than this are not drawn, metres, default 0.2.
+    pub near: f32,
+    /// Compensates opacity for the 0.3 px low-pass filter, default off; viewers of exported files do not.
+    pub antialiased: bool,
+    /// Depth order, `z` or `distance`, default `z`.
+    pub sort_metric: SortMetric,
+    /// Memory for decoded training frames, MiB, default 1024; frames beyond it are decoded when needed.
+    pub frame_memory_mib: u32,
+    /// Length of the stages.
+    pub stages: StagesConfig,
+    /// Initial Gaussians and the deformation network.
+    pub model: ModelConfig,
+    /// Learning rates.
+    pub rates: RatesConfig,
+    /// Optimiser variants.
+    pub adam: AdamConfig,
+    /// Weights of the loss terms.
+    pub loss: LossConfig,
+    /// Cloning, splitting and pruning of Gaussians in the coarse and fine stages.
+    pub densify: DensifyConfig,
+    /// Identity estimation.
+    pub identity: IdentityConfig,
+    /// Instance stage.
+    pub instance: InstanceConfig,
+    /// Instance-guided resampling.
+    pub resample: ResampleConfig,
+    /// What is reported, evaluated and saved on the way.
+    pub report: ReportConfig,
+}
+
+/// Length of the stages, in optimiser steps.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct StagesConfig {
+    /// Coarse steps: one static set for all times, default 800. A capture with one time has no coarse stage:
+    /// its steps are added to the fine stage, which then has no deformation.
+    pub coarse: u32,
+    /// Fine steps: deformation and regularisers on, default 4500.
+    pub fine: u32,
+    /// Whether the coarse steps count towards `fine`, default no (A1).
+    pub fine_includes_coarse: bool,
+    /// Instance steps, default 1200; skipped without masks.
+    pub instance: u32,
+    /// Views per step, default 1 (A27: all stages alike).
+    pub batch: u32,
+}
+
+/// Initial Gaussians and the deformation network.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ModelConfig {
+    /// Most initial points kept; denser clouds are thinned by voxels. Default 20 000.
+    pub max_initial_points: u32,
+    /// Opacity of initial Gaussians, (0, 1), default 0.1.
+    pub initial_opacity: f32,
+    /// Nodes of the spatial planes along x, y, z at multiplier 1, default 32 each.
+    pub spatial_resolution: [u32; 3],
+    /// Nodes of the time planes over [-1, 1], of which times in [0, 1] use the upper half. Default 0: as many
+    /// as the capture has distinct times, within 8 and 150.
+    pub time_resolution: u32,
+    /// Spatial resolution factor of each level, default [1, 2].
+    pub multipliers: Vec<u32>,
+    /// Feature channels per plane, default 16.
+    pub channels: u32,
+    /// Width of the network, default 64.
+    pub width: u32,
+    /// What the network moves: position, scale, rotation by default; opacity and SH off.
+    pub heads: Heads,
+    /// Stored time rows: `compact` (default) or `compat`, all rows as the base code keeps them.
+    pub time_encoding: TimeEncoding,
+    /// Starts from exactly no motion, default off for parity with the base code.
+    pub zero_initial_heads: bool,
+    /// Highest spherical-harmonics degree, 0 to 3, default 3.
+    pub sh_degree: u8,
+    /// Steps between degree increases, counted per stage, default 400; 0 starts at the highest degree.
+    pub sh_interval: u32,
+}
+
+/// Learning rates. Those marked "x extent" are multiplied by the scene extent; pairs run log-linearly from
+/// the first to the second value over `schedule_steps`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RatesConfig {
+    /// Steps over which scheduled rates run from first to last, counted from the start of a reconstruction
+    /// stage. Default 0: fine plus instance steps.
+    pub schedule_steps: u32,
+    /// Whether the schedule restarts with the instance stage, default no: it continues (A29).
+    pub restart_in_instance_stage: bool,
+    /// Centres, x extent, default [1.6e-4, 1.6e-6].
+    pub means: [f32; 2],
+    /// Log-scales, default 5e-3.
+    pub log_scales: f32,
+    /// Quaternions, default 1e-3.
+    pub quaternions: f32,
+    /// Opacity logits, default 5e-2.
+    pub opacity: f32,
+    /// Spherical harmonics of degree 0, default 2.5e-3.
+    pub sh_base: f32,
+    /// Spherical harmonics of degrees 1 to 3, default 1.25e-4.
+    pub sh_rest: f32,
+    /// Hexplane features, x extent, default [1.6e-3, 1.6e-4].
+    pub planes: [f32; 2],
+    /// Network weights, x extent, default [1.6e-4, 1.6e-5].
+    pub mlp: [f32; 2],
+    /// Occupancy logits, default 1e-2.
+    pub occupancy: f32,
+    /// Log-calibrations, default 1e-2.
+    pub calibration: f32,
+}
+
+/// Variants of Adam (beta 0.9 and 0.999, epsilon 1e-15, no weight decay).
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct AdamConfig {
+    /// Rows made after the start correct their bias from their own first step, default off: they share the
+    /// group's step count, and their first step is 3.16 times the rate (methods reference 7, row 26).
+    pub fresh_row_bias_correction: bool,
+    /// Rows not visible in any view of a step keep still instead of moving by their momentum, default off.
+    pub visible_rows_only: bool,
+}
+
+/// Weights of the loss terms; the colour term is the mean absolute difference.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LossConfig {
+    /// Share of the structural dissimilarity in the colour loss, [0, 1], default 0.
+    pub lambda_dssim: f32,
+    /// Weight of the instance loss, default 0.01; 0.005 in the `paper` preset on Neu3D captures.
+    pub lambda_instance: f32,
+    /// Weight of the second difference of the spatial planes, default 1e-4.
+    pub plane_smoothness: f32,
+    /// Weight of the second difference of the time planes, default 1e-3.
+    pub time_smoothness: f32,
+    /// Weight of the distance of the time planes from 1, default 1e-4.
+    pub time_sparsity: f32,
+}
+
+/// Cloning, splitting and pruning (methods reference 1.5). Steps count from the start of each stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct DensifyConfig {
+    /// First step after which Gaussians are added, default 300.
+    pub from: u32,
+    /// Statistics are kept and Gaussians added before this step, default 3000; 0 never.
+    pub until: u32,
+    /// Steps between additions, default 100.
+    pub every: u32,
+    /// Mean screen gradient (normalised device coordinates) from which a Gaussian is cloned or split,
+    /// default 2e-4.
+    pub gradient_threshold: f32,
+    /// Largest scale, as a fraction of the extent, that is cloned rather than split, default 0.01.
+    pub split_scale: f32,
+    /// No additions beyond this many Gaussians, default 12 000; those with the largest gradient go first.
+    pub max_gaussians: u32,
+    /// Steps between prunings, default 100; 0 never.
+    pub prune_every: u32,
+    /// Pruning only above this many Gaussians, default 0; 200 000 in the base code.
+    pub prune_min_n: u32,
+    /// Gaussians of less opacity are pruned, default 0.005.
+    pub prune_opacity: f32,
+    /// Screen radius above which Gaussians are pruned once opacities were reset, pixels, default 20.
+    pub prune_radius_px: f32,
+    /// Scale above which Gaussians are pruned once opacities were reset, fraction of the extent, default 0.1.
+    pub prune_scale: f32,
+    /// Steps between opacity resets (before `until`), default 0: never.
+    pub opacity_reset_every: u32,
+    /// Opacity that a reset caps at, default 0.01.
+    pub opacity_reset_to: f32,
+}
+
+/// Identity estimation (methods reference 5).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct IdentityConfig {
+    /// Every how many training frames are counted, default 1.
+    pub stride: u32,
+    /// Entries below this probability are dropped and the row renormalised, default 1e-4.
+    pub truncation: f32,
+    /// Mass, in pixels, below which a Gaussian counts as unseen, default 1e-3.
+    pub min_mass: f32,
+    /// Seen neighbours that an unseen Gaussian takes its row from, default 8.
+    pub neighbours: u32,
+    /// Distance, as a fraction of the extent, beyond which neighbours do not count, default 0.05.
+    pub neighbour_distance: f32,
+    /// Occupancy of unseen Gaussians without neighbours, default 0.005.
+    pub unseen_occupancy: f32,
+    /// Estimates again every so many steps of the instance stage, folding calibration in; default 0: once
+    /// (A16).
+    pub refresh_every: u32,
+}
+
+/// Instance stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct InstanceConfig {
+    /// How occupancy starts, `constant` (default) or `copy_opacity` (A5).
+    pub occupancy_start: OccupancyStart,
+    /// Initial occupancy, (0, 1), default 0.02 (A5).
+    pub occupancy: f32,
+    /// Occupancy is kept within these limits, default [0.005, 0.999].
+    pub occupancy_limits: [f32; 2],
+    /// Log-calibrations are kept within plus and minus this, default 10.
+    pub calibration_limit: f32,
+    /// Loss normalisation, `none` (default) or `coverage` (A3).
+    pub normalisation: Normalisation,
+    /// Geometry that the instance loss trains, `full` (default), `means_only` or `off` (A6).
+    pub geometry: InstanceGeometry,
+    /// Whether the colour loss goes on, default yes (A15).
+    pub color_loss: bool,
+    /// Parts of the method switched off, default none.
+    pub ablate: BTreeSet<Ablation>,
+}
+
+/// Instance-guided resampling (methods reference 6). Steps count from the start of the instance stage.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ResampleConfig {
+    /// First event, default 100.
+    pub from: u32,
+    /// Last event, default 1000 (A7: none in the last sixth of the stage).
+    pub until: u32,
+    /// Steps between events, default 100.
+    pub every: u32,
+    /// Relocated Gaussians per event, as a fraction of all, default 0.01.
+    pub rate: f32,
+    /// Floor of occupancy x identity, (0, 1], default 1e-3 (A11).
+    pub gamma_floor: f32,
+    /// Candidates of weak draws, `members` (default) or `literal` (A10).
+    pub weak_set: WeakSet,
+    /// Scale correction, `off` (default) or `mcmc` (A13).
+    pub scale_correction: ScaleCorrection,
+    /// Shares of the instances, `equal` (default), `gamma` or `pixels` (A8).
+    pub label_shares: LabelShares,
+    /// Standard deviation of a replica's offset, in standard deviations of its source, default 0.5 (A12).
+    pub offset: f32,
+}
+
+/// What is reported, evaluated and saved on the way.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ReportConfig {
+    /// Steps between step events, default 10.
+    pub step_every: u32,
+    /// Steps between evaluations on held-out frames, default 0: never.
+    pub evaluate_every: u32,
+    /// Held-out frames per evaluation, evenly spread, default 8.
+    pub evaluate_frames: u32,
+    /// Steps between requests to save a checkpoint, default 0: never.
+    pub checkpoint_every: u32,
+}
+
+impl TrainConfig {
+    /// Steps of the fine stage.
+    #[must_use]
+    pub fn fine_iterations(&self) -> u32 {
+        if self.stages.fine_includes_coarse {
+            self.stages.fine.saturating_sub(self.stages.coarse)
+        } else {
+            self.stages.fine
+        }
+    }
+
+    /// Whether an ablation is on.
+    #[must_use]
+    pub fn ablates(&self, ablation: Ablation) -> bool {
+        self.instance.ablate.contains(&ablation)
+    }
+}
+
+#[cfg(test)]
+mod tests;

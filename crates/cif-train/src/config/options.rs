@@ -1,0 +1,120 @@
+//! Choices with names.
+
+use cif_render::{GeometryPath, InstanceNormalisation};
+use serde::{Deserialize, Serialize};
+
+/// A named set of settings.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Preset {
+    /// A quick look: about a quarter of the iterations of `standard`.
+    Draft,
+    /// Tuned for two processor cores and small images.
+    #[default]
+    Standard,
+    /// The values of the method's publication and of the base code it builds on, per dataset type.
+    Paper,
+}
+
+/// An ablation of the method (methods reference 8.7).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Ablation {
+    /// (i) Occupancy stays at its initial value.
+    ConstantOccupancy,
+    /// (ii) The colour opacity takes the place of occupancy.
+    OpacityOccupancy,
+    /// (iii) The identity estimate is never calibrated.
+    NoCalibration,
+    /// (iv) No instance-guided resampling.
+    NoResampling,
+}
+
+/// Which geometry the instance loss trains (A6; methods reference 4.5).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum InstanceGeometry {
+    /// Means, scales and rotations.
+    #[default]
+    Full,
+    /// Means only.
+    MeansOnly,
+    /// None.
+    Off,
+}
+
+impl From<InstanceGeometry> for GeometryPath {
+    fn from(value: InstanceGeometry) -> Self {
+        match value {
+            InstanceGeometry::Full => Self::Full,
+            InstanceGeometry::MeansOnly => Self::MeansOnly,
+            InstanceGeometry::Off => Self::Off,
+        }
+    }
+}
+
+/// Whether rendered identities are divided by coverage before the logarithm (A3; methods reference 4.3).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Normalisation {
+    /// `-log M_y`: also drives coverage up.
+    #[default]
+    None,
+    /// `-log (M_y / A)`: relative identity only.
+    Coverage,
+}
+
+impl From<Normalisation> for InstanceNormalisation {
+    fn from(value: Normalisation) -> Self {
+        match value {
+            Normalisation::None => Self::None,
+            Normalisation::Coverage => Self::Coverage,
+        }
+    }
+}
+
+/// How occupancy starts (A5).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum OccupancyStart {
+    /// Every Gaussian at `instance.occupancy`.
+    #[default]
+    Constant,
+    /// The opacity that the Gaussian has when the instance stage starts.
+    CopyOpacity,
+}
+
+/// Candidates of a weak draw (A10; methods reference 6.1).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum WeakSet {
+    /// Gaussians whose most probable instance is the one resampled.
+    #[default]
+    Members,
+    /// All Gaussians: the literal reading, which mostly relocates members of other instances.
+    Literal,
+}
+
+/// Correction of scales on relocation (A13; methods reference 6.4).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ScaleCorrection {
+    /// Replicas keep the scale of their source.
+    #[default]
+    Off,
+    /// Scales shrink so that the integrated footprint is conserved too.
+    Mcmc,
+}
+
+/// How an event's pairs are shared out among instances (A8).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LabelShares {
+    /// Equal shares.
+    #[default]
+    Equal,
+    /// In proportion to the summed occupancy x identity.
+    Gamma,
+    /// In proportion to labelled pixels.
+    Pixels,
+}

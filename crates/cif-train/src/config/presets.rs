@@ -1,0 +1,251 @@
+//! Values of the presets. Source of `paper`: methods reference 1.1 and 1.2.
+
+use cif_dataset::Layout;
+use cif_field::{Heads, SortMetric, TimeEncoding};
+
+use super::{
+    AdamConfig, DensifyConfig, IdentityConfig, InstanceConfig, LossConfig, ModelConfig, Preset, RatesConfig,
+    ReportConfig, ResampleConfig, StagesConfig, TrainConfig,
+};
+
+impl TrainConfig {
+    /// The settings of a preset; `paper` differs by the layout of the capture.
+    #[must_use]
+    pub fn preset(preset: Preset, layout: Layout) -> Self {
+        match preset {
+            Preset::Standard => Self::default(),
+            Preset::Draft => draft(),
+            Preset::Paper => paper(layout),
+        }
+    }
+}
+
+fn draft() -> TrainConfig {
+    let mut config = TrainConfig { preset: Preset::Draft, ..TrainConfig::default() };
+    config.stages = StagesConfig { coarse: 250, fine: 1100, instance: 300, ..config.stages };
+    config.model.max_initial_points = 8_000;
+    config.model.sh_interval = 150;
+    config.densify =
+        DensifyConfig { from: 150, until: 800, every: 75, max_gaussians: 8_000, ..config.densify };
+    config.resample = ResampleConfig { from: 50, until: 250, every: 50, ..config.resample };
+    config
+}
+
+fn paper(layout: Layout) -> TrainConfig {
+    let mut config = TrainConfig { preset: Preset::Paper, ..TrainConfig::default() };
+    config.stages =
+        StagesConfig { coarse: 3_000, fine: 10_000, fine_includes_coarse: false, instance: 3_000, batch: 1 };
+    config.model = ModelConfig {
+        max_initial_points: 40_000,
+        spatial_resolution: [64; 3],
+        time_resolution: 25,
+        multipliers: vec![1, 2, 4, 8],
+        channels: 32,
+        width: 64,
+        sh_interval: 1_000,
+        ..config.model
+    };
+    config.rates.schedule_steps = 20_000;
+    config.loss =
+        LossConfig { plane_smoothness: 1e-4, time_smoothness: 1e-2, time_sparsity: 1e-4, ..config.loss };
+    config.densify = DensifyConfig {
+        from: 500,
+        until: 15_000,
+        every: 100,
+        max_gaussians: 360_000,
+        prune_every: 100,
+        prune_min_n: 200_000,
+        opacity_reset_every: 3_000,
+        ..config.densify
+    };
+    config.resample = ResampleConfig { from: 100, until: 2_500, every: 100, ..config.resample };
+    match layout {
+        Layout::DNerf => {
+            config.model.multipliers = vec![1, 2];
+            config.rates.planes[1] = 1.6e-5;
+            config.rates.mlp[1] = 1.6e-6;
+            config.densify.prune_every = 8_000;
+        }
+        Layout::HyperNerf => {
+            config.downscale = Some(2);
+            config.stages.batch = 2;
+            config.model.time_resolution = 150;
+            config.model.multipliers = vec![1, 2, 4];
+            config.model.channels = 16;
+            config.model.width = 128;
+            config.loss.plane_smoothness = 2e-4;
+            config.loss.time_smoothness = 1e-3;
+            config.densify.until = 10_000;
+            config.densify.opacity_reset_every = 300_000;
+        }
+        Layout::Neu3d => {
+            config.downscale = Some(2);
+            config.stages.batch = 4;
+            config.model.time_resolution = 150;
+            config.model.multipliers = vec![1, 2];
+            config.model.channels = 16;
+            config.model.width = 128;
+            config.model.heads.opacity = true;
+            config.model.heads.sh = true;
+            config.loss.plane_smoothness = 2e-4;
+            config.loss.time_smoothness = 1e-3;
+            config.loss.lambda_instance = 0.005;
+            config.densify.until = 10_000;
+            config.densify.opacity_reset_every = 60_000;
+        }
+        Layout::Nerfstudio | Layout::Colmap => {}
+    }
+    config
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            preset: Preset::Standard,
+            seed: 0,
+            downscale: None,
+            background: [1.0; 3],
+            near: 0.2,
+            antialiased: false,
+            sort_metric: SortMetric::Z,
+            frame_memory_mib: 1_024,
+            stages: StagesConfig::default(),
+            model: ModelConfig::default(),
+            rates: RatesConfig::default(),
+            adam: AdamConfig::default(),
+            loss: LossConfig::default(),
+            densify: DensifyConfig::default(),
+            identity: IdentityConfig::default(),
+            instance: InstanceConfig::default(),
+            resample: ResampleConfig::default(),
+            report: ReportConfig::default(),
+        }
+    }
+}
+
+impl Default for StagesConfig {
+    fn default() -> Self {
+        Self { coarse: 800, fine: 4_500, fine_includes_coarse: false, instance: 1_200, batch: 1 }
+    }
+}
+
+impl Default for ModelConfig {
+    fn default() -> Self {
+        Self {
+            max_initial_points: 20_000,
+            initial_opacity: 0.1,
+            spatial_resolution: [32; 3],
+            time_resolution: 0,
+            multipliers: vec![1, 2],
+            channels: 16,
+            width: 64,
+            heads: Heads { position: true, scale: true, rotation: true, opacity: false, sh: false },
+            time_encoding: TimeEncoding::Compact,
+            zero_initial_heads: false,
+            sh_degree: 3,
+            sh_interval: 400,
+        }
+    }
+}
+
+impl Default for RatesConfig {
+    fn default() -> Self {
+        Self {
+            schedule_steps: 0,
+            restart_in_instance_stage: false,
+            means: [1.6e-4, 1.6e-6],
+            log_scales: 5e-3,
+            quaternions: 1e-3,
+            opacity: 5e-2,
+            sh_base: 2.5e-3,
+            sh_rest: 1.25e-4,
+            planes: [1.6e-3, 1.6e-4],
+            mlp: [1.6e-4, 1.6e-5],
+            occupancy: 1e-2,
+            calibration: 1e-2,
+        }
+    }
+}
+
+impl Default for LossConfig {
+    fn default() -> Self {
+        Self {
+            lambda_dssim: 0.0,
+            lambda_instance: 0.01,
+            plane_smoothness: 1e-4,
+            time_smoothness: 1e-3,
+            time_sparsity: 1e-4,
+        }
+    }
+}
+
+impl Default for DensifyConfig {
+    fn default() -> Self {
+        Self {
+            from: 300,
+            until: 3_000,
+            every: 100,
+            gradient_threshold: 2e-4,
+            split_scale: 0.01,
+            max_gaussians: 12_000,
+            prune_every: 100,
+            prune_min_n: 0,
+            prune_opacity: 0.005,
+            prune_radius_px: 20.0,
+            prune_scale: 0.1,
+            opacity_reset_every: 0,
+            opacity_reset_to: 0.01,
+        }
+    }
+}
+
+impl Default for IdentityConfig {
+    fn default() -> Self {
+        Self {
+            stride: 1,
+            truncation: 1e-4,
+            min_mass: 1e-3,
+            neighbours: 8,
+            neighbour_distance: 0.05,
+            unseen_occupancy: 0.005,
+            refresh_every: 0,
+        }
+    }
+}
+
+impl Default for InstanceConfig {
+    fn default() -> Self {
+        Self {
+            occupancy_start: super::OccupancyStart::Constant,
+            occupancy: 0.02,
+            occupancy_limits: [0.005, 0.999],
+            calibration_limit: 10.0,
+            normalisation: super::Normalisation::None,
+            geometry: super::InstanceGeometry::Full,
+            color_loss: true,
+            ablate: std::collections::BTreeSet::new(),
+        }
+    }
+}
+
+impl Default for ResampleConfig {
+    fn default() -> Self {
+        Self {
+            from: 100,
+            until: 1_000,
+            every: 100,
+            rate: 0.01,
+            gamma_floor: 1e-3,
+            weak_set: super::WeakSet::Members,
+            scale_correction: super::ScaleCorrection::Off,
+            label_shares: super::LabelShares::Equal,
+            offset: 0.5,
+        }
+    }
+}
+
+impl Default for ReportConfig {
+    fn default() -> Self {
+        Self { step_every: 10, evaluate_every: 0, evaluate_frames: 8, checkpoint_every: 0 }
+    }
+}

@@ -1,0 +1,178 @@
+//! Refuses settings that cannot work, naming the key.
+
+use thiserror::Error;
+
+use super::{Ablation, TrainConfig};
+
+/// A setting that cannot work.
+#[derive(Clone, Debug, PartialEq, Eq, Error)]
+#[error("setting `{key}` is {value}: {expected}")]
+pub struct ConfigError {
+    /// Dotted key, e.g. `resample.rate`.
+    pub key: &'static str,
+    /// What was given.
+    pub value: String,
+    /// What would be accepted.
+    pub expected: &'static str,
+}
+
+impl TrainConfig {
+    /// Checks every setting.
+    ///
+    /// # Errors
+    /// The first setting that cannot work, by key, with what it takes.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let (stages, model, rates) = (&self.stages, &self.model, &self.rates);
+        let (densify, identity, instance, resample) =
+            (&self.densify, &self.identity, &self.instance, &self.resample);
+
+        for (channel, value) in self.background.iter().enumerate() {
+            let key = ["background[0]", "background[1]", "background[2]"][channel];
+            within(key, *value, 0.0..=1.0, "expected a number in [0, 1]")?;
+        }
+        positive("near", self.near)?;
+        if let Some(downscale) = self.downscale {
+            at_least("downscale", downscale, 1, "expected 1, 2, 4, ...")?;
+        }
+        at_least("stages.batch", stages.batch, 1, "expected at least 1 view per step")?;
+        check(
+            stages.fine > 0 || stages.coarse > 0,
+            "stages.fine",
+            stages.fine,
+            "expected at least 1 step here or in stages.coarse",
+        )?;
+        check(
+            !stages.fine_includes_coarse || stages.fine >= stages.coarse,
+            "stages.fine_includes_coarse",
+            true,
+            "expected false, or stages.fine of at least stages.coarse",
+        )?;
+
+        at_least("model.max_initial_points", model.max_initial_points, 1, "expected at least 1")?;
+        open_unit("model.initial_opacity", model.initial_opacity)?;
+        for (axis, nodes) in model.spatial_resolution.iter().enumerate() {
+            let key =
+                ["model.spatial_resolution[0]", "model.spatial_resolution[1]", "model.spatial_resolution[2]"]
+                    [axis];
+            check((2..=1024).contains(nodes), key, nodes, "expected 2 to 1024 nodes")?;
+        }
+        check(
+            model.time_resolution == 0 || (3..=4096).contains(&model.time_resolution),
+            "model.time_resolution",
+            model.time_resolution,
+            "expected 0 (automatic) or 3 to 4096 nodes",
+        )?;
+        check(
+            !model.multipliers.is_empty()
+                && model.multipliers.len() <= 8
+                && model.multipliers.iter().all(|m| (1..=64).contains(m)),
+            "model.multipliers",
+            format!("{:?}", model.multipliers),
+            "expected 1 to 8 factors, each 1 to 64",
+        )?;
+        check((1..=128).contains(&model.channels), "model.channels", model.channels, "expected 1 to 128")?;
+        check((1..=1024).contains(&model.width), "model.width", model.width, "expected 1 to 1024")?;
+        check(model.sh_degree <= 3, "model.sh_degree", model.sh_degree, "expected 0 to 3")?;
+
+        let scheduled =
+            [("rates.means", rates.means), ("rates.planes", rates.planes), ("rates.mlp", rates.mlp)];
+        for (key, pair) in scheduled {
+            check(
+                pair.iter().all(|rate| rate.is_finite() && *rate > 0.0) || pair == [0.0; 2],
+                key,
+                format!("{pair:?}"),
+                "expected two positive rates, first and last, or [0, 0] to freeze",
+            )?;
+        }
+        for (key, rate) in [
+            ("rates.log_scales", rates.log_scales),
+            ("rates.quaternions", rates.quaternions),
+            ("rates.opacity", rates.opacity),
+            ("rates.sh_base", rates.sh_base),
+            ("rates.sh_rest", rates.sh_rest),
+            ("rates.occupancy", rates.occupancy),
+            ("rates.calibration", rates.calibration),
+            ("loss.lambda_instance", self.loss.lambda_instance),
+            ("loss.plane_smoothness", self.loss.plane_smoothness),
+            ("loss.time_smoothness", self.loss.time_smoothness),
+            ("loss.time_sparsity", self.loss.time_sparsity),
+            ("densify.gradient_threshold", densify.gradient_threshold),
+            ("densify.split_scale", densify.split_scale),
+            ("densify.prune_radius_px", densify.prune_radius_px),
+            ("densify.prune_scale", densify.prune_scale),
+            ("identity.min_mass", identity.min_mass),
+            ("identity.neighbour_distance", identity.neighbour_distance),
+            ("resample.offset", resample.offset),
+        ] {
+            check(rate.is_finite() && rate >= 0.0, key, rate, "expected a finite number of at least 0")?;
+        }
+        within("loss.lambda_dssim", self.loss.lambda_dssim, 0.0..=1.0, "expected a number in [0, 1]")?;
+
+        at_least("densify.every", densify.every, 1, "expected at least 1")?;
+        at_least("densify.max_gaussians", densify.max_gaussians, 1, "expected at least 1")?;
+        within("densify.prune_opacity", densify.prune_opacity, 0.0..=0.99, "expected a number in [0, 0.99]")?;
+        open_unit("densify.opacity_reset_to", densify.opacity_reset_to)?;
+
+        at_least("identity.stride", identity.stride, 1, "expected at least 1")?;
+        within("identity.truncation", identity.truncation, 0.0..=0.5, "expected a number in [0, 0.5]")?;
+        at_least("identity.neighbours", identity.neighbours, 1, "expected at least 1")?;
+        open_unit("identity.unseen_occupancy", identity.unseen_occupancy)?;
+
+        open_unit("instance.occupancy", instance.occupancy)?;
+        let [low, high] = instance.occupancy_limits;
+        check(
+            low > 0.0 && low < high && high < 1.0,
+            "instance.occupancy_limits",
+            format!("{:?}", instance.occupancy_limits),
+            "expected a lower and a higher number inside (0, 1)",
+        )?;
+        positive("instance.calibration_limit", instance.calibration_limit)?;
+        check(
+            !(self.ablates(Ablation::ConstantOccupancy) && self.ablates(Ablation::OpacityOccupancy)),
+            "instance.ablate",
+            "constant-occupancy with opacity-occupancy",
+            "expected at most one of the two",
+        )?;
+
+        at_least("resample.every", resample.every, 1, "expected at least 1")?;
+        within("resample.rate", resample.rate, 0.0..=0.5, "expected a number in [0, 0.5]")?;
+        check(
+            resample.gamma_floor > 0.0 && resample.gamma_floor <= 1.0,
+            "resample.gamma_floor",
+            resample.gamma_floor,
+            "expected a number in (0, 1]",
+        )?;
+        at_least("report.step_every", self.report.step_every, 1, "expected at least 1")?;
+        at_least("report.evaluate_frames", self.report.evaluate_frames, 1, "expected at least 1")
+    }
+}
+
+fn check(
+    accepted: bool,
+    key: &'static str,
+    value: impl std::fmt::Display,
+    expected: &'static str,
+) -> Result<(), ConfigError> {
+    if accepted { Ok(()) } else { Err(ConfigError { key, value: value.to_string(), expected }) }
+}
+
+fn at_least(key: &'static str, value: u32, least: u32, expected: &'static str) -> Result<(), ConfigError> {
+    check(value >= least, key, value, expected)
+}
+
+fn within(
+    key: &'static str,
+    value: f32,
+    range: std::ops::RangeInclusive<f32>,
+    expected: &'static str,
+) -> Result<(), ConfigError> {
+    check(range.contains(&value), key, value, expected)
+}
+
+fn open_unit(key: &'static str, value: f32) -> Result<(), ConfigError> {
+    check(value > 0.0 && value < 1.0, key, value, "expected a number inside (0, 1)")
+}
+
+fn positive(key: &'static str, value: f32) -> Result<(), ConfigError> {
+    check(value.is_finite() && value > 0.0, key, value, "expected a positive number")
+}

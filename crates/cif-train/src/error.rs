@@ -1,0 +1,80 @@
+//! What stops a run.
+
+use std::path::PathBuf;
+
+use thiserror::Error;
+
+use crate::Stage;
+use crate::config::ConfigError;
+
+/// Errors of training.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum TrainError {
+    /// A setting cannot work.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The deformation network cannot be made.
+    #[error("settings under `model`: {0}")]
+    Deformation(#[from] cif_field::deformation::ConfigError),
+    /// A frame cannot be read.
+    #[error(transparent)]
+    Dataset(#[from] cif_dataset::Error),
+    /// Nothing to train on.
+    #[error("{}: no training frame; check the split lists of the capture", root.display())]
+    NoTrainingFrames {
+        /// Folder of the capture.
+        root: PathBuf,
+    },
+    /// Nothing to start from.
+    #[error("{}: no initial point; give points.npy, a PLY file or a COLMAP model", root.display())]
+    NoPoints {
+        /// Folder of the capture.
+        root: PathBuf,
+    },
+    /// The optimisation left the finite numbers.
+    #[error(
+        "{stage} stage, step {iteration}: {tensor} is not finite; the field of the last finite step is kept. \
+         Try a smaller learning rate for it, or another seed"
+    )]
+    NotFinite {
+        /// Stage.
+        stage: Stage,
+        /// Step, from 1.
+        iteration: u32,
+        /// Loss or gradient, by name.
+        tensor: &'static str,
+    },
+    /// All Gaussians were pruned.
+    #[error(
+        "{stage} stage, step {iteration}: every Gaussian was pruned; the cameras may look past the initial \
+         points, or `densify.prune_opacity` is too high"
+    )]
+    NoGaussians {
+        /// Stage.
+        stage: Stage,
+        /// Step, from 1.
+        iteration: u32,
+    },
+    /// The checkpoint was written without training state.
+    #[error("the checkpoint holds a finished scene without training state, so the run cannot be resumed")]
+    NoState,
+    /// The training state does not fit.
+    #[error("the training state of the checkpoint is not usable: {reason}")]
+    BadState {
+        /// What is wrong.
+        reason: String,
+    },
+    /// The checkpoint belongs to another capture.
+    #[error("the checkpoint was trained on another capture: {what} was {expected}, and is {found} in {}", root.display())]
+    OtherCapture {
+        /// What differs.
+        what: &'static str,
+        /// In the checkpoint.
+        expected: String,
+        /// In the capture.
+        found: String,
+        /// Folder of the capture given.
+        root: PathBuf,
+    },
+}

@@ -1,0 +1,216 @@
+//! What a run tells its observer.
+
+use serde::{Deserialize, Serialize};
+
+use crate::Trainer;
+
+/// Parts of a run, in order (methods reference 1.3).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Stage {
+    /// One static set of Gaussians fits all times.
+    Coarse,
+    /// Deformation and regularisers on; without deformation when the capture has one time.
+    Fine,
+    /// One pass over the training frames without gradients: who covers which mask.
+    Identity,
+    /// Occupancy, calibration and resampling; everything is trained.
+    Instance,
+    /// Nothing left to do.
+    Done,
+}
+
+impl Stage {
+    /// Name as in logs: `coarse`, `fine`, `identity`, `instance`, `done`.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Coarse => "coarse",
+            Self::Fine => "fine",
+            Self::Identity => "identity",
+            Self::Instance => "instance",
+            Self::Done => "done",
+        }
+    }
+}
+
+impl std::fmt::Display for Stage {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// Something that happened. Serialises as one JSON object with the key `event`.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+#[serde(tag = "event", rename_all = "snake_case")]
+pub enum TrainEvent {
+    /// A stage begins, or goes on after a resume.
+    StageStarted {
+        /// Stage.
+        stage: Stage,
+        /// Steps already done in it.
+        iteration: u32,
+        /// Steps it has.
+        iterations: u32,
+        /// Gaussians.
+        gaussians: usize,
+    },
+    /// Steps were done; sent every `report.step_every` steps.
+    Step {
+        /// Stage.
+        stage: Stage,
+        /// Steps done in the stage.
+        iteration: u32,
+        /// Steps of the stage.
+        iterations: u32,
+        /// Loss of the last step: colour plus weighted instance loss, without regularisers.
+        loss: f64,
+        /// Colour loss.
+        color_loss: f64,
+        /// Instance loss before its weight; none outside the instance stage.
+        instance_loss: Option<f64>,
+        /// Fraction of labelled pixels whose label no covering Gaussian supports, last step.
+        unsupported_px: Option<f64>,
+        /// Gaussians.
+        gaussians: usize,
+        /// PSNR of training views, running mean, dB.
+        psnr: f64,
+        /// Steps per second, over the steps since the last event.
+        iterations_per_second: f64,
+        /// Estimated time to the end of the run, seconds.
+        eta_s: f64,
+    },
+    /// Gaussians were added or removed.
+    Densified {
+        /// Stage.
+        stage: Stage,
+        /// Steps done in the stage.
+        iteration: u32,
+        /// Duplicated.
+        cloned: usize,
+        /// Replaced by two.
+        split: usize,
+        /// Removed.
+        pruned: usize,
+        /// Gaussians afterwards.
+        gaussians: usize,
+    },
+    /// Identity rows were estimated.
+    IdentityEstimated {
+        /// Frames counted.
+        frames: usize,
+        /// Instances.
+        instances: usize,
+        /// Mean entries per row.
+        entries_per_row: f64,
+        /// Gaussians without mass, which took their neighbours' rows.
+        unseen: usize,
+        /// Of these, those without neighbours, which got uniform rows.
+        uniform: usize,
+        /// Probability dropped by truncation, mean per row.
+        dropped_mass: f64,
+        /// Instances that won no Gaussian, by mask id.
+        empty_instances: Vec<u16>,
+    },
+    /// Gaussians were relocated.
+    Resampled {
+        /// Steps done in the instance stage.
+        iteration: u32,
+        /// Relocated Gaussians.
+        pairs: usize,
+        /// Instances that took part.
+        labels: usize,
+        /// Gaussians that were split up.
+        sources: usize,
+        /// Occupancies raised to their floor.
+        floored: usize,
+    },
+    /// Held-out frames were scored.
+    Evaluated {
+        /// Stage.
+        stage: Stage,
+        /// Steps done in the stage.
+        iteration: u32,
+        /// Frames scored.
+        frames: usize,
+        /// Mean PSNR, dB; none without held-out frames.
+        psnr: Option<f64>,
+        /// Mean SSIM.
+        ssim: Option<f64>,
+        /// mIoU, percent; none before identities exist or without masks.
+        miou: Option<f64>,
+        /// mAcc-pix, percent.
+        macc_pix: Option<f64>,
+    },
+    /// Something that the user should know; the run goes on.
+    Warning {
+        /// One sentence.
+        message: String,
+    },
+    /// A checkpoint is wanted now: `report.checkpoint_every`, or [`Control::Save`] was returned.
+    CheckpointDue {
+        /// Stage.
+        stage: Stage,
+        /// Steps done in the stage.
+        iteration: u32,
+    },
+    /// The run is complete.
+    Finished {
+        /// Wall time of all stages, interruptions not counted, seconds.
+        wall_s: f64,
+        /// Optimiser steps of all stages.
+        iterations: u64,
+        /// Gaussians.
+        gaussians: usize,
+        /// PSNR of training views, running mean, dB.
+        psnr: f64,
+        /// Largest resident memory of the process, MB; none where the system does not tell.
+        peak_rss_mb: Option<f64>,
+    },
+}
+
+/// What the observer wants next.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Control {
+    /// Go on.
+    #[default]
+    Continue,
+    /// Send [`TrainEvent::CheckpointDue`] after this step, then go on.
+    Save,
+    /// Finish this step, then return [`Outcome::Interrupted`].
+    Stop,
+}
+
+/// How a run ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// All stages are done.
+    Finished,
+    /// The observer stopped it; [`Trainer::checkpoint`] with state can be resumed.
+    Interrupted,
+}
+
+/// What an observer may look at during an event.
+pub struct TrainerView<'a> {
+    pub(crate) trainer: &'a Trainer,
+}
+
+impl TrainerView<'_> {
+    /// The field as it is now.
+    #[must_use]
+    pub fn field(&self) -> &cif_field::Field {
+        self.trainer.field()
+    }
+
+    /// The run's settings.
+    #[must_use]
+    pub fn config(&self) -> &crate::TrainConfig {
+        self.trainer.config()
+    }
+
+    /// A checkpoint, see [`Trainer::checkpoint`].
+    #[must_use]
+    pub fn checkpoint(&self, with_state: bool) -> cif_field::checkpoint::Checkpoint {
+        self.trainer.checkpoint(with_state)
+    }
+}

@@ -1,0 +1,36 @@
+//! Random numbers without state: every random choice draws from a stream named by the seed, its purpose and
+//! a counter, so that a resumed run draws exactly what the uninterrupted one would have drawn.
+
+use rand::SeedableRng;
+use rand_pcg::Pcg64;
+
+/// What random numbers are drawn for.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Purpose {
+    /// Order of the training views.
+    Views = 1,
+    /// Positions of split Gaussians.
+    Split = 2,
+    /// Draws and offsets of resampling.
+    Resample = 3,
+    /// Parameters of the deformation.
+    Deformation = 4,
+}
+
+/// The stream of a purpose; `counter` tells its uses apart.
+pub(crate) fn stream(seed: u64, purpose: Purpose, counter: u64) -> Pcg64 {
+    Pcg64::seed_from_u64(derive(seed, purpose, counter))
+}
+
+/// A seed that depends on all three.
+pub(crate) fn derive(seed: u64, purpose: Purpose, counter: u64) -> u64 {
+    mix(mix(mix(seed) ^ purpose as u64) ^ counter)
+}
+
+/// SplitMix64 finaliser (Steele, Lea and Flood 2014).
+fn mix(value: u64) -> u64 {
+    let mut z = value.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
