@@ -15,6 +15,7 @@ pub mod field;
 pub mod gaussians;
 pub mod identity;
 pub mod instance;
+pub mod neighbours;
 pub mod timeline;
 pub mod validate;
 

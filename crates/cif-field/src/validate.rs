@@ -31,7 +31,7 @@ pub enum FieldError {
         found: usize,
     },
     /// A NaN or infinite parameter.
-    #[error("`{array}` holds {value} at row {row}, column {column}: the training diverged")]
+    #[error("`{array}` holds {value} at row {row}, column {column}, where a finite value must be")]
     NotFinite {
         /// The array.
         array: &'static str,
@@ -296,7 +296,7 @@ fn same_length(array: &'static str, found: usize, expected: usize) -> Result<(),
     if found == expected { Ok(()) } else { Err(FieldError::Length { array, found, expected }) }
 }
 
-fn finite(array: &'static str, values: &[f32], columns: usize) -> Result<(), FieldError> {
+pub(crate) fn finite(array: &'static str, values: &[f32], columns: usize) -> Result<(), FieldError> {
     match values.iter().position(|value| !value.is_finite()) {
         None => Ok(()),
         Some(at) => {
