@@ -1,0 +1,543 @@
+//! Moves the canonical Gaussians to one time, and carries gradients back. Source: methods reference 2.2, 2.3
+//! and 11 (ideas 3 and 4).
+//!
+//! All Gaussians of a view share its time, so the three time planes of each level are first interpolated to
+//! lines. Rows go through the network in blocks. The backward pass visits only rows with a gradient and
+//! recomputes their activations, which is cheaper than keeping everyone's.
+
+use cif_field::deformation::{HeadKind, MlpLayout, PLANES, PlaneLayout, is_time_plane};
+use cif_field::gaussians::SH_FLOATS;
+use cif_field::{Deformation, Gaussians};
+use fearless_simd::prelude::*;
+use fearless_simd::{Level, dispatch};
+use fearless_simd_macros::simd;
+use rayon::prelude::*;
+
+use super::matrix::{Operand, multiply_into};
+
+/// Rows that go through the network together; sized so that activations stay in the second-level cache.
+const BLOCK: usize = 256;
+
+/// Rows whose weight gradients are summed by one task, in blocks.
+const CHUNK: usize = 1024;
+
+/// The deformation at one time: shapes, and time planes interpolated to lines.
+pub(super) struct DeformationAtTime<'a> {
+    deformation: &'a Deformation,
+    levels: Vec<[PlaneLayout; PLANES]>,
+    mlp: MlpLayout,
+    channels: usize,
+    /// `[levels][3]` lines of the xt, yt and zt planes, each `[columns, channels]`.
+    lines: Vec<[Vec<f32>; 3]>,
+    /// Stored row below the time, and the fraction above it.
+    time_row: usize,
+    time_fraction: f32,
+}
+
+/// Position of a Gaussian along one axis of one level.
+#[derive(Clone, Copy, Default)]
+struct AxisTap {
+    node: usize,
+    fraction: f32,
+    /// d coordinate / d position; 0 where clamped.
+    slope: f32,
+}
+
+/// Spatial planes as (plane, column axis, row axis), and time planes as (plane, axis).
+const SPATIAL: [(usize, usize, usize); 3] = [(0, 0, 1), (1, 0, 2), (3, 1, 2)];
+const TEMPORAL: [(usize, usize); 3] = [(2, 0), (4, 1), (5, 2)];
+
+/// Activations of a block of rows.
+#[derive(Default)]
+struct Activations {
+    /// `[rows, levels, 6, channels]`; the backward pass turns it into the gradient by these values.
+    values: Vec<f32>,
+    /// `[rows, levels * channels]`.
+    features: Vec<f32>,
+    /// ReLU of the trunk, `[rows, width]`.
+    trunk: Vec<f32>,
+    /// ReLU of each head's hidden layer, `[heads][rows, width]`.
+    hidden: Vec<Vec<f32>>,
+    /// `[heads][rows, outputs]`.
+    outputs: Vec<Vec<f32>>,
+    // Backward only.
+    v_output: Vec<f32>,
+    v_hidden: Vec<f32>,
+    v_trunk: Vec<f32>,
+    v_features: Vec<f32>,
+}
+
+/// Raw parameters at the time of a view; arrays that no head moves are left empty.
+#[derive(Clone, Debug, Default)]
+pub(super) struct PosedArrays {
+    pub(super) means: Vec<[f32; 3]>,
+    pub(super) log_scales: Vec<[f32; 3]>,
+    pub(super) quaternions: Vec<[f32; 4]>,
+    pub(super) opacity_logits: Vec<f32>,
+    pub(super) sh_coefficients: Vec<[f32; SH_FLOATS]>,
+}
+
+/// Gradients by the posed parameters, `[N]` each; `sh_coefficients` is empty without an SH head.
+#[derive(Clone, Debug, Default)]
+pub(super) struct PosedArrayGradients {
+    pub(super) means: Vec<[f32; 3]>,
+    pub(super) log_scales: Vec<[f32; 3]>,
+    pub(super) quaternions: Vec<[f32; 4]>,
+    pub(super) opacity_logits: Vec<f32>,
+    pub(super) sh_coefficients: Vec<[f32; SH_FLOATS]>,
+}
+
+impl<'a> DeformationAtTime<'a> {
+    pub(super) fn new(deformation: &'a Deformation, time: f64) -> Self {
+        let config = &deformation.config;
+        let (levels, _) = config.plane_layout();
+        let channels = config.channels as usize;
+        let stored_rows = levels[0][2].rows;
+        let row = config.time_row(time).clamp(0.0, stored_rows as f64 - 1.0);
+        let time_row = (row.floor() as usize).min(stored_rows - 2);
+        let time_fraction = (row - time_row as f64) as f32;
+        let lines = levels
+            .iter()
+            .map(|planes| {
+                TEMPORAL.map(|(plane, _)| {
+                    let layout = &planes[plane];
+                    let row_len = layout.columns * channels;
+                    let start = layout.offset + time_row * row_len;
+                    let (below, above) = deformation.planes[start..start + 2 * row_len].split_at(row_len);
+                    below.iter().zip(above).map(|(b, a)| (1.0 - time_fraction) * b + time_fraction * a).collect()
+                })
+            })
+            .collect();
+        Self { deformation, mlp: config.mlp_layout(), levels, channels, lines, time_row, time_fraction }
+    }
+
+    fn axis_tap(&self, level: usize, axis: usize, position: f32) -> AxisTap {
+        let nodes = self.deformation.config.nodes(level, axis);
+        let low = self.deformation.bounds.low[axis];
+        let size = self.deformation.bounds.high[axis] - low;
+        let last = (nodes - 1) as f64;
+        let slope = last / size;
+        let coordinate = (f64::from(position) - low) * slope;
+        let inside = coordinate > 0.0 && coordinate < last;
+        let coordinate = coordinate.clamp(0.0, last);
+        let node = (coordinate as usize).min(nodes - 2);
+        AxisTap {
+            node,
+            fraction: (coordinate - node as f64) as f32,
+            slope: if inside { slope as f32 } else { 0.0 },
+        }
+    }
+
+    fn axis_taps(&self, level: usize, position: [f32; 3]) -> [AxisTap; 3] {
+        [0, 1, 2].map(|axis| self.axis_tap(level, axis, position[axis]))
+    }
+
+    /// First floats of the four nodes of a spatial plane, relative to all planes.
+    fn nodes(&self, layout: &PlaneLayout, column: AxisTap, row: AxisTap) -> [usize; 4] {
+        let node = layout.offset + (row.node * layout.columns + column.node) * self.channels;
+        let next_row = layout.columns * self.channels;
+        [node, node + self.channels, node + next_row, node + next_row + self.channels]
+    }
+
+    /// Plane values and features of a block of positions.
+    fn look_up(&self, level: Level, positions: &[[f32; 3]], block: &mut Activations) {
+        let (levels, channels) = (self.levels.len(), self.channels);
+        block.values.resize(positions.len() * levels * PLANES * channels, 0.0);
+        block.features.resize(positions.len() * levels * channels, 0.0);
+        dispatch!(level, simd => look_up_rows(simd, self, positions, &mut block.values, &mut block.features));
+    }
+
+    /// Whole network on a block of positions.
+    fn forward_block(&self, level: Level, positions: &[[f32; 3]], block: &mut Activations) {
+        self.look_up(level, positions, block);
+        let rows = positions.len();
+        let parameters = &self.deformation.mlp;
+        linear(&self.mlp.trunk, parameters, &block.features, rows, &mut block.trunk);
+        rectify(&mut block.trunk);
+        block.hidden.resize_with(self.mlp.heads.len(), Vec::new);
+        block.outputs.resize_with(self.mlp.heads.len(), Vec::new);
+        for (index, head) in self.mlp.heads.iter().enumerate() {
+            linear(&head.hidden, parameters, &block.trunk, rows, &mut block.hidden[index]);
+            rectify(&mut block.hidden[index]);
+            linear(&head.output, parameters, &block.hidden[index], rows, &mut block.outputs[index]);
+        }
+    }
+
+    /// Fills `posed` with raw parameters at the time, deltas added.
+    pub(super) fn forward(&self, level: Level, gaussians: &Gaussians, posed: &mut PosedArrays) {
+        posed.means.clone_from(&gaussians.means);
+        posed.log_scales.clone_from(&gaussians.log_scales);
+        posed.quaternions.clone_from(&gaussians.quaternions);
+        posed.opacity_logits.clone_from(&gaussians.opacity_logits);
+        let moves_sh = self.mlp.heads.iter().any(|head| head.kind == HeadKind::Sh);
+        if moves_sh {
+            posed.sh_coefficients.clone_from(&gaussians.sh_coefficients);
+        } else {
+            posed.sh_coefficients.clear();
+        }
+        let n = gaussians.len();
+        let sh_chunks: Vec<&mut [[f32; SH_FLOATS]]> = if moves_sh {
+            posed.sh_coefficients.chunks_mut(BLOCK).collect()
+        } else {
+            (0..n.div_ceil(BLOCK)).map(|_| Default::default()).collect()
+        };
+        gaussians
+            .means
+            .par_chunks(BLOCK)
+            .zip(posed.means.par_chunks_mut(BLOCK))
+            .zip(posed.log_scales.par_chunks_mut(BLOCK))
+            .zip(posed.quaternions.par_chunks_mut(BLOCK))
+            .zip(posed.opacity_logits.par_chunks_mut(BLOCK))
+            .zip(sh_chunks)
+            .for_each_init(
+                Activations::default,
+                |block, (((((positions, means), log_scales), quaternions), opacities), sh)| {
+                    self.forward_block(level, positions, block);
+                    for (head, output) in self.mlp.heads.iter().zip(&block.outputs) {
+                        let target = match head.kind {
+                            HeadKind::Position => means.as_flattened_mut(),
+                            HeadKind::Scale => log_scales.as_flattened_mut(),
+                            HeadKind::Rotation => quaternions.as_flattened_mut(),
+                            HeadKind::Opacity => &mut *opacities,
+                            HeadKind::Sh => sh.as_flattened_mut(),
+                        };
+                        for (value, delta) in target.iter_mut().zip(output) {
+                            *value += delta;
+                        }
+                    }
+                },
+            );
+    }
+
+    /// Adds gradients of planes, MLP and canonical centres (through the lookup) from the gradients of the
+    /// posed parameters of the `active` rows. The direct paths are not added here.
+    pub(super) fn backward(
+        &self,
+        level: Level,
+        gaussians: &Gaussians,
+        active: &[u32],
+        v: &PosedArrayGradients,
+        v_planes: &mut [f32],
+        v_mlp: &mut [f32],
+        v_means: &mut [[f32; 3]],
+    ) {
+        if active.is_empty() {
+            return;
+        }
+        let value_len = self.levels.len() * PLANES * self.channels;
+        let mut v_values = vec![0.0_f32; active.len() * value_len];
+        let mut v_positions = vec![[0.0_f32; 3]; active.len()];
+        let weight_gradients: Vec<Vec<f32>> = active
+            .par_chunks(CHUNK)
+            .zip(v_values.par_chunks_mut(CHUNK * value_len))
+            .zip(v_positions.par_chunks_mut(CHUNK))
+            .map_init(Activations::default, |block, ((rows, v_values), v_positions)| {
+                let mut v_mlp = vec![0.0; self.mlp.len];
+                for ((rows, v_values), v_positions) in rows
+                    .chunks(BLOCK)
+                    .zip(v_values.chunks_mut(BLOCK * value_len))
+                    .zip(v_positions.chunks_mut(BLOCK))
+                {
+                    let positions: Vec<[f32; 3]> = rows.iter().map(|row| gaussians.means[*row as usize]).collect();
+                    self.forward_block(level, &positions, block);
+                    self.backward_block(rows, v, block, &mut v_mlp);
+                    dispatch!(level, simd => look_up_rows_backward(
+                        simd, self, &positions, &block.values, &block.v_features, v_values, v_positions));
+                }
+                v_mlp
+            })
+            .collect();
+        for gradient in &weight_gradients {
+            for (total, value) in v_mlp.iter_mut().zip(gradient) {
+                *total += value;
+            }
+        }
+        for (row, v_position) in active.iter().zip(&v_positions) {
+            for axis in 0..3 {
+                v_means[*row as usize][axis] += v_position[axis];
+            }
+        }
+        self.scatter(level, gaussians, active, &v_values, v_planes);
+    }
+
+    /// Network gradients of a block; leaves `v_features` in the block.
+    fn backward_block(&self, rows: &[u32], v: &PosedArrayGradients, block: &mut Activations, v_mlp: &mut [f32]) {
+        let parameters = &self.deformation.mlp;
+        let count = rows.len();
+        let width = self.mlp.trunk.outputs;
+        block.v_trunk.clear();
+        block.v_trunk.resize(count * width, 0.0);
+        for (index, head) in self.mlp.heads.iter().enumerate() {
+            let outputs = head.kind.outputs();
+            block.v_output.clear();
+            for &row in rows {
+                let row = row as usize;
+                match head.kind {
+                    HeadKind::Position => block.v_output.extend_from_slice(&v.means[row]),
+                    HeadKind::Scale => block.v_output.extend_from_slice(&v.log_scales[row]),
+                    HeadKind::Rotation => block.v_output.extend_from_slice(&v.quaternions[row]),
+                    HeadKind::Opacity => block.v_output.push(v.opacity_logits[row]),
+                    HeadKind::Sh => block.v_output.extend_from_slice(&v.sh_coefficients[row]),
+                }
+            }
+            let v_output = Operand::new(&block.v_output, count, outputs);
+            let hidden = Operand::new(&block.hidden[index], count, width);
+            multiply_into(v_output.t(), hidden, 1.0, &mut v_mlp[head.output.weights.clone()]);
+            add_columns(&block.v_output, &mut v_mlp[head.output.biases.clone()]);
+            block.v_hidden.resize(count * width, 0.0);
+            let weights = Operand::new(&parameters[head.output.weights.clone()], outputs, width);
+            multiply_into(v_output, weights, 0.0, &mut block.v_hidden);
+            gate(&mut block.v_hidden, &block.hidden[index]);
+
+            let v_hidden = Operand::new(&block.v_hidden, count, width);
+            let trunk = Operand::new(&block.trunk, count, width);
+            multiply_into(v_hidden.t(), trunk, 1.0, &mut v_mlp[head.hidden.weights.clone()]);
+            add_columns(&block.v_hidden, &mut v_mlp[head.hidden.biases.clone()]);
+            let weights = Operand::new(&parameters[head.hidden.weights.clone()], width, width);
+            multiply_into(v_hidden, weights, 1.0, &mut block.v_trunk);
+        }
+        gate(&mut block.v_trunk, &block.trunk);
+        let features = self.mlp.trunk.inputs;
+        let v_trunk = Operand::new(&block.v_trunk, count, width);
+        multiply_into(
+            v_trunk.t(),
+            Operand::new(&block.features, count, features),
+            1.0,
+            &mut v_mlp[self.mlp.trunk.weights.clone()],
+        );
+        add_columns(&block.v_trunk, &mut v_mlp[self.mlp.trunk.biases.clone()]);
+        block.v_features.resize(count * features, 0.0);
+        let weights = Operand::new(&parameters[self.mlp.trunk.weights.clone()], width, features);
+        multiply_into(v_trunk, weights, 0.0, &mut block.v_features);
+    }
+
+    /// Adds `[active, levels, 6, channels]` gradients of plane values to the planes. One task per plane
+    /// visits the rows in order, so sums do not depend on the number of threads.
+    fn scatter(&self, level: Level, gaussians: &Gaussians, active: &[u32], v_values: &[f32], v_planes: &mut [f32]) {
+        let mut tasks = Vec::new();
+        let mut rest = v_planes;
+        for (index, planes) in self.levels.iter().enumerate() {
+            for (plane, layout) in planes.iter().enumerate() {
+                let (slice, tail) = rest.split_at_mut(layout.rows * layout.columns * self.channels);
+                rest = tail;
+                tasks.push((index, plane, slice));
+            }
+        }
+        tasks.into_par_iter().for_each(|(index, plane, v_plane)| {
+            dispatch!(level, simd => scatter_plane(
+                simd, self, (index, plane), &gaussians.means, active, v_values, v_plane));
+        });
+    }
+}
+
+fn linear(
+    layout: &cif_field::deformation::LinearLayout,
+    parameters: &[f32],
+    input: &[f32],
+    rows: usize,
+    output: &mut Vec<f32>,
+) {
+    output.clear();
+    for _ in 0..rows {
+        output.extend_from_slice(&parameters[layout.biases.clone()]);
+    }
+    let weights = Operand::new(&parameters[layout.weights.clone()], layout.outputs, layout.inputs);
+    multiply_into(Operand::new(input, rows, layout.inputs), weights.t(), 1.0, output);
+}
+
+fn rectify(values: &mut [f32]) {
+    for value in values {
+        *value = value.max(0.0);
+    }
+}
+
+/// Zeroes gradients where the rectified activation is 0.
+fn gate(gradients: &mut [f32], activations: &[f32]) {
+    for (gradient, activation) in gradients.iter_mut().zip(activations) {
+        *gradient = if *activation > 0.0 { *gradient } else { 0.0 };
+    }
+}
+
+fn add_columns(rows: &[f32], totals: &mut [f32]) {
+    for row in rows.chunks_exact(totals.len()) {
+        for (total, value) in totals.iter_mut().zip(row) {
+            *total += value;
+        }
+    }
+}
+
+#[simd]
+fn look_up_rows<S: Simd>(
+    simd: S,
+    at: &DeformationAtTime<'_>,
+    positions: &[[f32; 3]],
+    values: &mut [f32],
+    features: &mut [f32],
+) {
+    let _ = simd;
+    let channels = at.channels;
+    let planes = &at.deformation.planes;
+    let row_values = at.levels.len() * PLANES * channels;
+    let row_features = at.levels.len() * channels;
+    for ((position, values), features) in
+        positions.iter().zip(values.chunks_exact_mut(row_values)).zip(features.chunks_exact_mut(row_features))
+    {
+        for (level, layouts) in at.levels.iter().enumerate() {
+            let taps = at.axis_taps(level, *position);
+            let values = &mut values[level * PLANES * channels..(level + 1) * PLANES * channels];
+            let features = &mut features[level * channels..(level + 1) * channels];
+            features.fill(1.0);
+            for (plane, column, row) in SPATIAL {
+                let (f, g) = (taps[column].fraction, taps[row].fraction);
+                let weights = [(1.0 - f) * (1.0 - g), f * (1.0 - g), (1.0 - f) * g, f * g];
+                let nodes = at.nodes(&layouts[plane], taps[column], taps[row]);
+                let q = nodes.map(|node| &planes[node..node + channels]);
+                let out = &mut values[plane * channels..(plane + 1) * channels];
+                for c in 0..channels {
+                    let value =
+                        weights[0] * q[0][c] + weights[1] * q[1][c] + weights[2] * q[2][c] + weights[3] * q[3][c];
+                    out[c] = value;
+                    features[c] *= value;
+                }
+            }
+            for (line, (plane, axis)) in TEMPORAL.into_iter().enumerate() {
+                let tap = taps[axis];
+                let start = tap.node * channels;
+                let (below, above) =
+                    at.lines[level][line][start..start + 2 * channels].split_at(channels);
+                let out = &mut values[plane * channels..(plane + 1) * channels];
+                for c in 0..channels {
+                    let value = (1.0 - tap.fraction) * below[c] + tap.fraction * above[c];
+                    out[c] = value;
+                    features[c] *= value;
+                }
+            }
+        }
+    }
+}
+
+/// Gradient by each plane value (prefix and suffix products, never a division) and by the positions.
+#[simd]
+fn look_up_rows_backward<S: Simd>(
+    simd: S,
+    at: &DeformationAtTime<'_>,
+    positions: &[[f32; 3]],
+    values: &[f32],
+    v_features: &[f32],
+    v_values: &mut [f32],
+    v_positions: &mut [[f32; 3]],
+) {
+    let _ = simd;
+    let channels = at.channels;
+    let planes = &at.deformation.planes;
+    let row_values = at.levels.len() * PLANES * channels;
+    let mut prefix = vec![0.0_f32; channels];
+    for (row, position) in positions.iter().enumerate() {
+        let mut v_position = [0.0_f32; 3];
+        for (level, layouts) in at.levels.iter().enumerate() {
+            let start = row * row_values + level * PLANES * channels;
+            let values = &values[start..start + PLANES * channels];
+            let g = &mut v_values[start..start + PLANES * channels];
+            let feature = (row * at.levels.len() + level) * channels;
+            prefix.copy_from_slice(&v_features[feature..feature + channels]);
+            for plane in 0..PLANES {
+                let value = &values[plane * channels..(plane + 1) * channels];
+                let g = &mut g[plane * channels..(plane + 1) * channels];
+                for c in 0..channels {
+                    g[c] = prefix[c];
+                    prefix[c] *= value[c];
+                }
+            }
+            prefix.fill(1.0);
+            for plane in (0..PLANES).rev() {
+                let value = &values[plane * channels..(plane + 1) * channels];
+                let g = &mut g[plane * channels..(plane + 1) * channels];
+                for c in 0..channels {
+                    g[c] *= prefix[c];
+                    prefix[c] *= value[c];
+                }
+            }
+            let taps = at.axis_taps(level, *position);
+            for (plane, column, row) in SPATIAL {
+                let (f, h) = (taps[column].fraction, taps[row].fraction);
+                let q = at.nodes(&layouts[plane], taps[column], taps[row]).map(|n| &planes[n..n + channels]);
+                let g = &g[plane * channels..(plane + 1) * channels];
+                let (mut along_column, mut along_row) = (0.0, 0.0);
+                for c in 0..channels {
+                    along_column += g[c] * ((1.0 - h) * (q[1][c] - q[0][c]) + h * (q[3][c] - q[2][c]));
+                    along_row += g[c] * ((1.0 - f) * (q[2][c] - q[0][c]) + f * (q[3][c] - q[1][c]));
+                }
+                v_position[column] += along_column * taps[column].slope;
+                v_position[row] += along_row * taps[row].slope;
+            }
+            for (line, (plane, axis)) in TEMPORAL.into_iter().enumerate() {
+                let start = taps[axis].node * channels;
+                let (below, above) = at.lines[level][line][start..start + 2 * channels].split_at(channels);
+                let g = &g[plane * channels..(plane + 1) * channels];
+                let mut along = 0.0;
+                for c in 0..channels {
+                    along += g[c] * (above[c] - below[c]);
+                }
+                v_position[axis] += along * taps[axis].slope;
+            }
+        }
+        v_positions[row] = v_position;
+    }
+}
+
+/// Adds the value gradients of one plane to its nodes.
+#[simd]
+fn scatter_plane<S: Simd>(
+    simd: S,
+    at: &DeformationAtTime<'_>,
+    (level, plane): (usize, usize),
+    means: &[[f32; 3]],
+    active: &[u32],
+    v_values: &[f32],
+    v_plane: &mut [f32],
+) {
+    let _ = simd;
+    let channels = at.channels;
+    let layout = &at.levels[level][plane];
+    let row_values = at.levels.len() * PLANES * channels;
+    let offset = (level * PLANES + plane) * channels;
+    if is_time_plane(plane) {
+        let axis = TEMPORAL.iter().find(|(p, _)| *p == plane).expect("time planes are listed").1;
+        let mut line = vec![0.0_f32; layout.columns * channels];
+        for (row, v) in active.iter().zip(v_values.chunks_exact(row_values)) {
+            let tap = at.axis_tap(level, axis, means[*row as usize][axis]);
+            let v = &v[offset..offset + channels];
+            let start = tap.node * channels;
+            let (below, above) = line[start..start + 2 * channels].split_at_mut(channels);
+            for c in 0..channels {
+                below[c] += (1.0 - tap.fraction) * v[c];
+                above[c] += tap.fraction * v[c];
+            }
+        }
+        let start = at.time_row * line.len();
+        let (below, above) = v_plane[start..start + 2 * line.len()].split_at_mut(line.len());
+        for ((below, above), v) in below.iter_mut().zip(above).zip(&line) {
+            *below += (1.0 - at.time_fraction) * v;
+            *above += at.time_fraction * v;
+        }
+    } else {
+        let (_, column_axis, row_axis) =
+            *SPATIAL.iter().find(|(p, ..)| *p == plane).expect("spatial planes are listed");
+        for (row, v) in active.iter().zip(v_values.chunks_exact(row_values)) {
+            let mean = means[*row as usize];
+            let column = at.axis_tap(level, column_axis, mean[column_axis]);
+            let row = at.axis_tap(level, row_axis, mean[row_axis]);
+            let (f, g) = (column.fraction, row.fraction);
+            let v = &v[offset..offset + channels];
+            let node = (row.node * layout.columns + column.node) * channels;
+            let next = layout.columns * channels;
+            let (lower, upper) = v_plane[node..node + next + 2 * channels].split_at_mut(next);
+            for c in 0..channels {
+                lower[c] += (1.0 - f) * (1.0 - g) * v[c];
+                lower[channels + c] += f * (1.0 - g) * v[c];
+                upper[c] += (1.0 - f) * g * v[c];
+                upper[channels + c] += f * g * v[c];
+            }
+        }
+    }
+}

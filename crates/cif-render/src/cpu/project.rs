@@ -1,0 +1,484 @@
+//! Projects posed Gaussians to the image, and back. Source: methods reference 3.1 and 3.2, steps 1 to 9.
+//!
+//! Everything of a Gaussian that a pixel needs is one [`Splat`]; the backward pass recomputes the
+//! intermediate values instead of keeping them.
+
+use cif_field::SortMetric;
+use cif_field::gaussians::SH_FLOATS;
+use cif_geometry::scalar::sigmoid;
+use cif_geometry::{PinholeCamera, quaternion, spherical_harmonics};
+
+use crate::constants::{
+    JACOBIAN_MARGIN, LOG_SCALE_RANGE, LOW_PASS, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
+    MIN_ANTIALIASING,
+};
+use crate::{OccupancySource, RenderSettings};
+
+type Vector = [f32; 3];
+type Matrix = [[f32; 3]; 3];
+
+/// A camera and the settings of a render, in the form that projection reads.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ViewConstants {
+    rotation: Matrix,
+    translation: Vector,
+    centre: Vector,
+    focal: [f32; 2],
+    principal: [f32; 2],
+    /// Limits of x / z and y / z inside the Jacobian.
+    ratio_limits: [(f32, f32); 2],
+    pub(super) width: u32,
+    pub(super) height: u32,
+    near: f32,
+    sh_degree: u8,
+    antialiased: bool,
+    sort_metric: SortMetric,
+    /// Whether instances are drawn, and from what.
+    occupancy: Option<OccupancySource>,
+}
+
+impl ViewConstants {
+    pub(super) fn new(camera: &PinholeCamera, settings: &RenderSettings) -> Self {
+        let rows = [0, 1, 2].map(|row| camera.camera_from_world.rotation.row(row).as_vec3().to_array());
+        let focal = camera.focal_px.as_vec2().to_array();
+        let principal = camera.principal_px.as_vec2().to_array();
+        let size = [camera.width as f32, camera.height as f32];
+        let ratio_limits = [0, 1].map(|axis| {
+            let margin = JACOBIAN_MARGIN * 0.5 * size[axis] / focal[axis];
+            (-(principal[axis] / focal[axis] + margin), (size[axis] - principal[axis]) / focal[axis] + margin)
+        });
+        Self {
+            rotation: rows,
+            translation: camera.camera_from_world.translation.as_vec3().to_array(),
+            centre: camera.centre().as_vec3().to_array(),
+            focal,
+            principal,
+            ratio_limits,
+            width: camera.width,
+            height: camera.height,
+            near: settings.near,
+            sh_degree: settings.sh_degree,
+            antialiased: settings.antialiased,
+            sort_metric: settings.sort_metric,
+            occupancy: settings.instances.map(|instances| instances.occupancy),
+        }
+    }
+}
+
+/// Raw parameters of one Gaussian at the time of the view.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Posed<'a> {
+    pub(super) mean: Vector,
+    pub(super) log_scale: Vector,
+    pub(super) quaternion: [f32; 4],
+    pub(super) opacity_logit: f32,
+    pub(super) occupancy_logit: f32,
+    pub(super) sh: &'a [f32; SH_FLOATS],
+}
+
+/// A Gaussian as the raster loops see it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Splat {
+    /// Projected centre, pixels.
+    pub(super) mean: [f32; 2],
+    /// Conic X00, X01, X11, px^-2.
+    pub(super) conic: [f32; 3],
+    /// Blended colour.
+    pub(super) color: Vector,
+    /// Opacity o after antialiasing.
+    pub(super) opacity: f32,
+    /// Occupancy pi, or the opacity when instances blend with it.
+    pub(super) occupancy: f32,
+    /// Camera z.
+    pub(super) depth: f32,
+    /// Sort key.
+    pub(super) order: f32,
+    /// Largest sigma that any pass draws: `ln(255 max(o, pi))`.
+    pub(super) reach: f32,
+    /// Half-widths of the drawn ellipse, pixels.
+    pub(super) extent: [f32; 2],
+    /// 3 standard deviations of the larger axis, pixels.
+    pub(super) radius: f32,
+    /// Index of the Gaussian.
+    pub(super) gaussian: u32,
+}
+
+/// Intermediate values shared by both directions.
+struct Footprint {
+    in_camera: Vector,
+    /// R diag(exp s), world.
+    spread: Matrix,
+    scales: Vector,
+    clamped_scale: [bool; 3],
+    /// R_v R diag(exp s).
+    spread_in_camera: Matrix,
+    jacobian: [[f32; 3]; 2],
+    ratio_clamped: [bool; 2],
+    /// Clamped x and y of the Jacobian.
+    clamped_xy: [f32; 2],
+    covariance_in_camera: Matrix,
+    /// Before the low pass: C0 00, 01, 11.
+    sharp: [f32; 3],
+    /// After it.
+    blurred: [f32; 3],
+    conic: [f32; 3],
+    /// Antialiasing factor rho, and whether it sits on its floor.
+    compensation: f32,
+    compensation_floored: bool,
+}
+
+fn determinant([a, b, c]: [f32; 3]) -> f32 {
+    // Difference of products with the rounding error of the second product compensated in double: needles
+    // make both products nearly equal.
+    (f64::from(a) * f64::from(c) - f64::from(b) * f64::from(b)) as f32
+}
+
+fn transform(m: &Matrix, v: Vector) -> Vector {
+    [0, 1, 2].map(|r| m[r][0] * v[0] + m[r][1] * v[1] + m[r][2] * v[2])
+}
+
+fn multiply(a: &Matrix, b: &Matrix) -> Matrix {
+    let mut product = [[0.0; 3]; 3];
+    for r in 0..3 {
+        for c in 0..3 {
+            product[r][c] = a[r][0] * b[0][c] + a[r][1] * b[1][c] + a[r][2] * b[2][c];
+        }
+    }
+    product
+}
+
+fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
+    let rotated = transform(&view.rotation, posed.mean);
+    let in_camera = [0, 1, 2].map(|k| rotated[k] + view.translation[k]);
+    let [x, y, z] = in_camera;
+    // Written so that NaN is culled too.
+    if !(z >= view.near) || !x.is_finite() || !y.is_finite() || !z.is_finite() {
+        return None;
+    }
+    let unit = quaternion::try_normalize(posed.quaternion)?;
+    let unit_rotation = quaternion::to_rotation(unit);
+    let (low, high) = LOG_SCALE_RANGE;
+    if posed.log_scale.iter().any(|s| s.is_nan()) {
+        return None;
+    }
+    let clamped_scale = posed.log_scale.map(|s| s < low || s > high);
+    let scales = posed.log_scale.map(|s| s.clamp(low, high).exp());
+    let mut spread = unit_rotation;
+    for row in &mut spread {
+        for (entry, scale) in row.iter_mut().zip(scales) {
+            *entry *= scale;
+        }
+    }
+    let m = multiply(&view.rotation, &spread);
+    let mut covariance_in_camera = [[0.0; 3]; 3];
+    for r in 0..3 {
+        for c in 0..3 {
+            covariance_in_camera[r][c] = m[r][0] * m[c][0] + m[r][1] * m[c][1] + m[r][2] * m[c][2];
+        }
+    }
+    let mut ratio_clamped = [false; 2];
+    let clamped_xy = [0, 1].map(|axis| {
+        let ratio = in_camera[axis] / z;
+        let (low, high) = view.ratio_limits[axis];
+        ratio_clamped[axis] = ratio < low || ratio > high;
+        z * ratio.clamp(low, high)
+    });
+    let r = 1.0 / z;
+    let [fx, fy] = view.focal;
+    let jacobian = [
+        [fx * r, 0.0, -fx * clamped_xy[0] * r * r],
+        [0.0, fy * r, -fy * clamped_xy[1] * r * r],
+    ];
+    // J has two non-zero entries a row.
+    let v = &covariance_in_camera;
+    let [j0, j1] = &jacobian;
+    let jv0 = [0, 1, 2].map(|c| j0[0] * v[0][c] + j0[2] * v[2][c]);
+    let jv1 = [0, 1, 2].map(|c| j1[1] * v[1][c] + j1[2] * v[2][c]);
+    let mut sharp =
+        [jv0[0] * j0[0] + jv0[2] * j0[2], jv0[1] * j1[1] + jv0[2] * j1[2], jv1[1] * j1[1] + jv1[2] * j1[2]];
+    let largest = sharp[0].max(sharp[2]);
+    if largest > MAX_COVARIANCE {
+        sharp = sharp.map(|entry| entry * (MAX_COVARIANCE / largest));
+    }
+    let blurred = [sharp[0] + LOW_PASS, sharp[1], sharp[2] + LOW_PASS];
+    let det = determinant(blurred);
+    if !(det > 0.0) || !det.is_finite() {
+        return None;
+    }
+    let conic = [blurred[2] / det, -blurred[1] / det, blurred[0] / det];
+    let (compensation, compensation_floored) = if view.antialiased {
+        let squared = determinant(sharp).max(0.0) / det;
+        let floor = MIN_ANTIALIASING * MIN_ANTIALIASING;
+        (squared.max(floor).sqrt(), squared <= floor)
+    } else {
+        (1.0, true)
+    };
+    Some(Footprint {
+        in_camera,
+        spread,
+        scales,
+        clamped_scale,
+        spread_in_camera: m,
+        jacobian,
+        ratio_clamped,
+        clamped_xy,
+        covariance_in_camera,
+        sharp,
+        blurred,
+        conic,
+        compensation,
+        compensation_floored,
+    })
+}
+
+/// Unit direction from the camera to a point, and its distance.
+fn view_direction(view: &ViewConstants, mean: Vector) -> (Vector, f32) {
+    let offset = [0, 1, 2].map(|k| mean[k] - view.centre[k]);
+    let distance = (offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]).sqrt().max(1e-8);
+    (offset.map(|v| v / distance), distance)
+}
+
+/// Colour before the clamp at 0.
+fn color_unclamped(view: &ViewConstants, direction: Vector, sh: &[f32; SH_FLOATS]) -> Vector {
+    let basis = spherical_harmonics::basis(direction, view.sh_degree);
+    let mut color = [0.5; 3];
+    for (m, value) in basis.iter().enumerate().take(spherical_harmonics::coefficient_count(view.sh_degree)) {
+        for channel in 0..3 {
+            color[channel] += value * sh[m * 3 + channel];
+        }
+    }
+    color
+}
+
+/// Projects one Gaussian; `None` where it draws nothing.
+pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) -> Option<Splat> {
+    let footprint = footprint(view, posed)?;
+    let base_opacity = sigmoid(posed.opacity_logit);
+    let opacity = footprint.compensation * base_opacity;
+    let (occupancy, strongest) = match view.occupancy {
+        None => (0.0, opacity),
+        Some(OccupancySource::Own) => {
+            let occupancy = sigmoid(posed.occupancy_logit);
+            (occupancy, opacity.max(occupancy))
+        }
+        Some(OccupancySource::Opacity) => (opacity, opacity),
+    };
+    if !(strongest >= MIN_ALPHA) {
+        return None;
+    }
+    let reach = (strongest / MIN_ALPHA).ln();
+    let [x, y, z] = footprint.in_camera;
+    let mean = [
+        view.focal[0] * x / z + view.principal[0],
+        view.focal[1] * y / z + view.principal[1],
+    ];
+    let [c00, c01, c11] = footprint.blurred;
+    let extent = [(2.0 * reach * c00).sqrt(), (2.0 * reach * c11).sqrt()];
+    let inside = mean[0] + extent[0] > 0.0
+        && mean[1] + extent[1] > 0.0
+        && mean[0] - extent[0] < view.width as f32
+        && mean[1] - extent[1] < view.height as f32;
+    if !inside || !extent[0].is_finite() || !extent[1].is_finite() {
+        return None;
+    }
+    let half_trace = 0.5 * (c00 + c11);
+    let spread = (0.25 * (c00 - c11) * (c00 - c11) + c01 * c01).sqrt();
+    let (direction, distance) = view_direction(view, posed.mean);
+    let color = color_unclamped(view, direction, posed.sh).map(|c| c.max(0.0));
+    if !color.iter().all(|c| c.is_finite()) {
+        return None;
+    }
+    Some(Splat {
+        mean,
+        conic: footprint.conic,
+        color,
+        opacity,
+        occupancy,
+        depth: z,
+        order: match view.sort_metric {
+            SortMetric::Z => z,
+            SortMetric::Distance => distance,
+        },
+        reach,
+        extent,
+        radius: 3.0 * (half_trace + spread).sqrt(),
+        gaussian,
+    })
+}
+
+/// Gradient of the loss by what the raster loops read of a splat.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(super) struct SplatGradient {
+    pub(super) mean: [f32; 2],
+    /// By X00, X01 (the single off-diagonal parameter), X11.
+    pub(super) conic: [f32; 3],
+    pub(super) color: Vector,
+    pub(super) opacity: f32,
+    /// Sum of weighted q_i (methods reference 4.2), so that `dL/dh = -(1 - pi) q`.
+    pub(super) responsibility: f32,
+}
+
+/// Gradient of the loss by the raw parameters of a posed Gaussian.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct PosedGradient {
+    pub(super) mean: Vector,
+    pub(super) log_scale: Vector,
+    pub(super) quaternion: [f32; 4],
+    pub(super) opacity_logit: f32,
+    pub(super) occupancy_logit: f32,
+}
+
+/// Carries a splat's gradient to the raw parameters; spherical harmonics are added to `v_sh`.
+pub(super) fn project_backward(
+    view: &ViewConstants,
+    posed: &Posed<'_>,
+    splat: &Splat,
+    v: &SplatGradient,
+    v_sh: &mut [f32; SH_FLOATS],
+) -> PosedGradient {
+    let Some(f) = footprint(view, posed) else { return PosedGradient::default() };
+    let base_opacity = sigmoid(posed.opacity_logit);
+
+    // Steps 1 and 2: conic to blurred covariance, with the antialiasing term.
+    let [x00, x01, x11] = f.conic;
+    let (v00, v01, v11) = (v.conic[0], 0.5 * v.conic[1], v.conic[2]);
+    // X V_X X with symmetric factors.
+    let a00 = x00 * v00 + x01 * v01;
+    let a01 = x00 * v01 + x01 * v11;
+    let a10 = x01 * v00 + x11 * v01;
+    let a11 = x01 * v01 + x11 * v11;
+    let mut g = [-(a00 * x00 + a01 * x01), -(a00 * x01 + a01 * x11), -(a10 * x01 + a11 * x11)];
+    let v_opacity = v.opacity * f.compensation;
+    if !f.compensation_floored {
+        let det = determinant(f.sharp);
+        let v_compensation = v.opacity * base_opacity;
+        let factor = 0.5 * v_compensation * f.compensation;
+        g[0] += factor * (f.sharp[2] / det - x00);
+        g[1] += factor * (-f.sharp[1] / det - x01);
+        g[2] += factor * (f.sharp[0] / det - x11);
+    }
+
+    // Step 3: v_J = 2 G J V, v_V = J^T G J.
+    let j = &f.jacobian;
+    let gj = [
+        [0, 1, 2].map(|c| g[0] * j[0][c] + g[1] * j[1][c]),
+        [0, 1, 2].map(|c| g[1] * j[0][c] + g[2] * j[1][c]),
+    ];
+    let v_j = gj.map(|row| {
+        [0, 1, 2].map(|c| {
+            2.0 * (row[0] * f.covariance_in_camera[0][c]
+                + row[1] * f.covariance_in_camera[1][c]
+                + row[2] * f.covariance_in_camera[2][c])
+        })
+    });
+
+    // Step 4: camera-space point.
+    let [x, y, z] = f.in_camera;
+    let r = 1.0 / z;
+    let (r2, r3) = (r * r, r * r * r);
+    let [fx, fy] = view.focal;
+    let mut v_point = [
+        fx * r * v.mean[0],
+        fy * r * v.mean[1],
+        -(fx * x * v.mean[0] + fy * y * v.mean[1]) * r2,
+    ];
+    v_point[2] += -fx * r2 * v_j[0][0] - fy * r2 * v_j[1][1];
+    for (axis, focal) in [fx, fy].into_iter().enumerate() {
+        let slope = focal * f.clamped_xy[axis] * r3 * v_j[axis][2];
+        if f.ratio_clamped[axis] {
+            v_point[2] += slope;
+        } else {
+            v_point[axis] += -focal * r2 * v_j[axis][2];
+            v_point[2] += 2.0 * slope;
+        }
+    }
+    let norm = (v_point[0] * v_point[0] + v_point[1] * v_point[1] + v_point[2] * v_point[2]).sqrt();
+    if norm > MAX_POSITION_GRADIENT {
+        v_point = v_point.map(|value| value * (MAX_POSITION_GRADIENT / norm));
+    }
+
+    // Step 5: to the world. V = M M^T with M = R_v B, so v_M = 2 v_V M = 2 J^T (G J) M.
+    let rv = &view.rotation;
+    let mut v_mean = [0, 1, 2].map(|c| rv[0][c] * v_point[0] + rv[1][c] * v_point[1] + rv[2][c] * v_point[2]);
+    let gjm = gj.map(|row| {
+        [0, 1, 2].map(|c| {
+            row[0] * f.spread_in_camera[0][c] + row[1] * f.spread_in_camera[1][c] + row[2] * f.spread_in_camera[2][c]
+        })
+    });
+    let mut v_spread_in_camera = [[0.0; 3]; 3];
+    for row in 0..3 {
+        for c in 0..3 {
+            v_spread_in_camera[row][c] = 2.0 * (j[0][row] * gjm[0][c] + j[1][row] * gjm[1][c]);
+        }
+    }
+    let mut v_spread = [[0.0; 3]; 3];
+    for row in 0..3 {
+        for c in 0..3 {
+            v_spread[row][c] = rv[0][row] * v_spread_in_camera[0][c]
+                + rv[1][row] * v_spread_in_camera[1][c]
+                + rv[2][row] * v_spread_in_camera[2][c];
+        }
+    }
+
+    // Steps 6 and 7: scales and rotation.
+    let log_scale = [0, 1, 2].map(|c| {
+        if f.clamped_scale[c] {
+            0.0
+        } else {
+            f.spread[0][c] * v_spread[0][c] + f.spread[1][c] * v_spread[1][c] + f.spread[2][c] * v_spread[2][c]
+        }
+    });
+    let mut v_rotation = v_spread;
+    for row in &mut v_rotation {
+        for (entry, scale) in row.iter_mut().zip(f.scales) {
+            *entry *= scale;
+        }
+    }
+    let quaternion = quaternion::to_rotation_backward(posed.quaternion, v_rotation);
+
+    // Step 9: colour.
+    let (direction, distance) = view_direction(view, posed.mean);
+    let mut v_color = v.color;
+    for channel in 0..3 {
+        if splat.color[channel] <= 0.0 {
+            v_color[channel] = 0.0;
+        }
+    }
+    if v_color != [0.0; 3] {
+        let degree = view.sh_degree;
+        let basis = spherical_harmonics::basis(direction, degree);
+        let count = spherical_harmonics::coefficient_count(degree);
+        for m in 0..count {
+            for channel in 0..3 {
+                v_sh[m * 3 + channel] += basis[m] * v_color[channel];
+            }
+        }
+        if degree > 0 {
+            let gradient = spherical_harmonics::basis_gradient(direction, degree);
+            let mut v_direction = [0.0; 3];
+            for m in 1..count {
+                let along = posed.sh[m * 3] * v_color[0]
+                    + posed.sh[m * 3 + 1] * v_color[1]
+                    + posed.sh[m * 3 + 2] * v_color[2];
+                for axis in 0..3 {
+                    v_direction[axis] += gradient[m][axis] * along;
+                }
+            }
+            let radial = direction[0] * v_direction[0] + direction[1] * v_direction[1] + direction[2] * v_direction[2];
+            for axis in 0..3 {
+                v_mean[axis] += (v_direction[axis] - direction[axis] * radial) / distance;
+            }
+        }
+    }
+
+    // Step 8.
+    let mut opacity_logit = base_opacity * (1.0 - base_opacity) * v_opacity;
+    let mut occupancy_logit = 0.0;
+    match view.occupancy {
+        None => {}
+        Some(OccupancySource::Own) => occupancy_logit = -(1.0 - splat.occupancy) * v.responsibility,
+        // b = rho o P: db/da = b (1 - o), and db / drho = b / rho is part of the geometry the ablation ignores.
+        Some(OccupancySource::Opacity) => opacity_logit += -(1.0 - base_opacity) * v.responsibility,
+    }
+    PosedGradient { mean: v_mean, log_scale, quaternion, opacity_logit, occupancy_logit }
+}
