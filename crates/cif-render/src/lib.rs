@@ -8,6 +8,7 @@
 //! | [`image`] | what comes out per pixel |
 //! | [`reference`] | the readable oracle, generic over `f32` and `f64` |
 //! | [`cpu`] | the fast path: tiles, SIMD, threads |
+//! | [`synthetic`] | small random scenes for tests and benchmarks |
 
 pub mod constants;
 pub mod cpu;
@@ -15,6 +16,7 @@ pub mod gradients;
 pub mod image;
 pub mod reference;
 pub mod settings;
+pub mod synthetic;
 
 pub use gradients::Gradients;
 pub use image::{Channels, RenderedImage, UNLABELLED};
