@@ -3,6 +3,7 @@
 //! All parameters lie in two flat vectors (planes, MLP), so that optimisers, checkpoints and GPU uploads see
 //! plain slices; [`PlaneLayout`] and [`MlpLayout`] say what is where.
 
+mod apply;
 pub mod evaluate;
 pub mod initialize;
 mod validate;
@@ -249,3 +250,6 @@ pub struct Deformation {
     /// All weights and biases, see [`DeformationConfig::mlp_layout`].
     pub mlp: Vec<f32>,
 }
+
+#[cfg(test)]
+mod tests;
