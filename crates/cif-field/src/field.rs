@@ -41,3 +41,109 @@ pub struct Field {
     /// How the field came about (settings, dataset, seed, times, versions); free-form JSON object.
     pub provenance: serde_json::Value,
 }
+
+impl Field {
+    /// Number of Gaussians N.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.gaussians.len()
+    }
+
+    /// Whether there are no Gaussians.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.gaussians.is_empty()
+    }
+
+    /// The Gaussians at a normalised time in [0, 1], in raw form with the deformation's deltas added.
+    #[must_use]
+    pub fn deformed(&self, time: f64) -> Gaussians {
+        match &self.deformation {
+            Some(deformation) => deformation.apply(&self.gaussians, time),
+            None => self.gaussians.clone(),
+        }
+    }
+
+    /// Most probable instance of every Gaussian, `[N]`, as index into [`Field::instances`]; `None` without
+    /// identities.
+    #[must_use]
+    pub fn instance_of_gaussians(&self) -> Option<Vec<u16>> {
+        self.identities.as_ref().map(Identities::argmax)
+    }
+
+    /// Gaussians whose most probable instance is `instance` (an index into [`Field::instances`]), ascending;
+    /// none without identities.
+    #[must_use]
+    pub fn members(&self, instance: usize) -> Vec<u32> {
+        let of_gaussians = self.instance_of_gaussians().unwrap_or_default();
+        let rows = of_gaussians.iter().enumerate();
+        rows.filter(|(_, of)| usize::from(**of) == instance).map(|(row, _)| row as u32).collect()
+    }
+
+    /// Instances (indices into [`Field::instances`], ascending) whose label is `label`: those that match
+    /// exactly, or, when none does, those that match but for case.
+    #[must_use]
+    pub fn instances_by_label(&self, label: &str) -> Vec<usize> {
+        let matching = |same: &dyn Fn(&str) -> bool| -> Vec<usize> {
+            let all = self.instances.iter().enumerate();
+            all.filter(|(_, instance)| same(&instance.label)).map(|(index, _)| index).collect()
+        };
+        let exact = matching(&|other| other == label);
+        if exact.is_empty() {
+            let folded = label.to_lowercase();
+            matching(&|other| other.to_lowercase() == folded)
+        } else {
+            exact
+        }
+    }
+
+    /// Position in [`Field::instances`] of the instance with a mask value.
+    #[must_use]
+    pub fn instance_by_id(&self, id: u16) -> Option<usize> {
+        self.instances.iter().position(|instance| instance.id == id)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use crate::testing;
+
+    #[test]
+    fn labels_match_exactly_before_they_match_but_for_case() {
+        let mut field = testing::field(6, 1);
+        let template = field.instances[0].clone();
+        field.instances = ["mug", "Mug", "red mug", "MUG", "ÄPFEL"]
+            .iter()
+            .enumerate()
+            .map(|(index, label)| crate::Instance {
+                id: index as u16 + 1,
+                label: (*label).to_owned(),
+                ..template.clone()
+            })
+            .collect();
+        assert_eq!(field.instances_by_label("Mug"), [1]);
+        assert_eq!(field.instances_by_label("mUG"), [0, 1, 3]);
+        assert_eq!(field.instances_by_label("äpfel"), [4]);
+        assert!(field.instances_by_label("m*").is_empty());
+        assert_eq!(field.instance_by_id(3), Some(2));
+        assert_eq!(field.instance_by_id(9), None);
+    }
+
+    #[test]
+    fn members_partition_the_gaussians() {
+        let field = testing::field(200, 2);
+        let mut all: Vec<u32> = (0..field.instances.len()).flat_map(|k| field.members(k)).collect();
+        all.sort_unstable();
+        assert!(all.into_iter().eq(0..200));
+        let unlabelled = crate::Field { identities: None, ..field };
+        assert!(unlabelled.members(0).is_empty());
+    }
+
+    #[test]
+    fn a_static_field_does_not_move() {
+        let mut field = testing::field(20, 3);
+        assert_ne!(field.deformed(0.5).means, field.gaussians.means);
+        field.deformation = None;
+        assert_eq!(field.deformed(0.5), field.gaussians);
+    }
+}

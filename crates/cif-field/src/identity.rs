@@ -56,6 +56,37 @@ impl Identities {
         probabilities
     }
 
+    /// Most probable label of every row; the lowest one where several are. Rows must not be empty.
+    #[must_use]
+    pub fn argmax(&self) -> Vec<u16> {
+        (0..self.len())
+            .map(|row| {
+                let logit = |entry: usize| self.log_estimates[entry] + self.log_calibrations[entry];
+                let range = self.range(row);
+                let mut best = range.start;
+                for entry in range {
+                    if logit(entry) > logit(best) {
+                        best = entry;
+                    }
+                }
+                self.labels[best]
+            })
+            .collect()
+    }
+
+    /// Probability of one label in every row, `[N]`; 0 outside a row's support.
+    #[must_use]
+    pub fn probability_of(&self, label: u16) -> Vec<f32> {
+        let probabilities = self.probabilities();
+        (0..self.len())
+            .map(|row| {
+                let range = self.range(row);
+                let found = self.labels[range.clone()].binary_search(&label);
+                found.map_or(0.0, |at| probabilities[range.start + at])
+            })
+            .collect()
+    }
+
     /// Rows `sources[0], sources[1], ...` as a new set; rows may repeat.
     #[must_use]
     pub fn gather(&self, sources: &[u32]) -> Self {
@@ -73,5 +104,60 @@ impl Identities {
             gathered.row_offsets.push(gathered.labels.len() as u32);
         }
         gathered
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn identities() -> Identities {
+        Identities {
+            row_offsets: vec![0, 3, 4, 6],
+            labels: vec![0, 2, 5, 1, 2, 5],
+            log_estimates: [0.2_f32, 0.5, 0.3, 1.0, 0.5, 0.5].map(f32::ln).to_vec(),
+            log_calibrations: vec![0.0, -20.0, 0.1, 3.0, 0.0, 0.0],
+        }
+    }
+
+    #[test]
+    fn probabilities_are_a_softmax_over_the_support() {
+        let probabilities = identities().probabilities();
+        let weights = [0.2_f64, 0.5 * (-20.0_f64).exp(), 0.3 * 0.1_f64.exp()];
+        let sum: f64 = weights.iter().sum();
+        for (found, weight) in probabilities.iter().zip(weights) {
+            assert!((f64::from(*found) - weight / sum).abs() < 1e-7);
+        }
+        assert_eq!(probabilities[3..], [1.0, 0.5, 0.5]);
+    }
+
+    #[test]
+    fn a_common_shift_of_the_calibration_changes_nothing() {
+        let mut shifted = identities();
+        shifted.log_calibrations.iter_mut().for_each(|value| *value += 1000.0);
+        for (a, b) in shifted.probabilities().iter().zip(identities().probabilities()) {
+            assert!((a - b).abs() < 1e-4, "{a} vs {b}");
+        }
+    }
+
+    #[test]
+    fn argmax_prefers_the_lowest_of_equals() {
+        assert_eq!(identities().argmax(), [5, 1, 2]);
+    }
+
+    #[test]
+    fn probability_of_a_label_is_zero_outside_the_support() {
+        let probabilities = identities().probability_of(2);
+        assert!(probabilities[0] < 1e-8 && probabilities[0] > 0.0);
+        assert_eq!(probabilities[1..], [0.0, 0.5]);
+    }
+
+    #[test]
+    fn gathering_repeats_whole_rows() {
+        let gathered = identities().gather(&[2, 0, 2]);
+        gathered.validate(3, 6).unwrap();
+        assert_eq!(gathered.labels, [2, 5, 0, 2, 5, 2, 5]);
+        assert_eq!(gathered.row_offsets, [0, 2, 5, 7]);
+        assert_eq!(gathered.probabilities()[2..5], identities().probabilities()[..3]);
     }
 }

@@ -16,6 +16,9 @@ pub mod gaussians;
 pub mod identity;
 pub mod instance;
 pub mod neighbours;
+pub mod query;
+#[cfg(test)]
+mod testing;
 pub mod timeline;
 pub mod validate;
 
@@ -25,5 +28,6 @@ pub use field::{Field, SortMetric};
 pub use gaussians::Gaussians;
 pub use identity::Identities;
 pub use instance::Instance;
+pub use query::{FieldAtTime, QueryResult};
 pub use timeline::{RecordedCamera, Timeline};
 pub use validate::FieldError;
