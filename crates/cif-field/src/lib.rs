@@ -1,13 +1,51 @@
-//! The dynamic Gaussian field.
+//! The dynamic Gaussian field: what a trained scene is, where it is stored, and what can be asked of it.
 //!
 //! | module | answers |
 //! |---|---|
-//! | [`gaussians`] | what is stored per Gaussian |
+//! | [`gaussians`] | what is stored per Gaussian, and how fresh ones begin |
+//! | [`neighbours`] | which points are nearest, coincident ones included |
 //! | [`deformation`] | how Gaussians move: hexplane and MLP parameters, and their evaluation |
 //! | [`identity`] | whose a Gaussian is |
 //! | [`instance`] | what the instances are called |
 //! | [`timeline`] | which times were captured, and from which cameras |
 //! | [`field`] | all of it together |
+//! | [`validate`] | which rules every field keeps |
+//! | [`query`] | what exists at a place and time, and whose it is |
+//! | [`checkpoint`] | how `.cif` files are laid out, read and written |
+//!
+//! A scene of one red Gaussian, saved, read and asked:
+//!
+//! ```
+//! use cif_field::{Field, Gaussians, Identities, Instance, SortMetric, Timeline};
+//! use glam::DVec3;
+//!
+//! let field = Field {
+//!     gaussians: Gaussians::from_points(&[[0.0, 0.0, 1.0]], &[[0.9, 0.1, 0.1]])?,
+//!     deformation: None,
+//!     identities: Some(Identities {
+//!         row_offsets: vec![0, 1],
+//!         labels: vec![0],
+//!         log_estimates: vec![0.0],
+//!         log_calibrations: vec![0.0],
+//!     }),
+//!     instances: vec![Instance { id: 7, label: "red mug".into(), category: "mug".into() }],
+//!     timeline: Timeline { times: vec![0.0], frames_per_second: 24.0 },
+//!     cameras: Vec::new(),
+//!     sh_degree: 0,
+//!     background: [1.0; 3],
+//!     sort_metric: SortMetric::Z,
+//!     extent: 1.0,
+//!     provenance: serde_json::json!({ "made by": "hand" }),
+//! };
+//! let folder = tempfile::tempdir()?;
+//! field.save(folder.path().join("mug.cif"))?;
+//!
+//! let field = Field::load(folder.path().join("mug.cif"))?;
+//! let found = &field.query(&[DVec3::new(0.0, 0.0, 1.0)], 0.0)[0];
+//! assert_eq!(found.instance(), Some(0));
+//! assert!((found.existence - 0.02).abs() < 1e-6, "fresh Gaussians have an occupancy of 2 %");
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 pub mod checkpoint;
 pub mod deformation;

@@ -83,9 +83,7 @@ impl NearestNeighbours {
             let range = self.row_offsets[node_index] as usize..self.row_offsets[node_index + 1] as usize;
             let rows = self.rows[range].iter().filter(|&&row| Some(row) != without);
             // A node's rows ascend, so its first `count` are the ones that can be wanted.
-            found.extend(
-                rows.take(count).map(|&row| Neighbour { row, squared_distance: node.distance }),
-            );
+            found.extend(rows.take(count).map(|&row| Neighbour { row, squared_distance: node.distance }));
         }
         found.sort_by(|a, b| a.squared_distance.total_cmp(&b.squared_distance).then(a.row.cmp(&b.row)));
         found.truncate(count);
@@ -151,8 +149,7 @@ mod tests {
     fn ten_thousand_identical_points_are_at_distance_zero() {
         let index = NearestNeighbours::new(&vec![[1.5, -2.0, 0.25]; 10_000]);
         let found = index.nearest_to_row(1, 3);
-        let expected: Vec<Neighbour> =
-            [0, 2, 3].map(|row| Neighbour { row, squared_distance: 0.0 }).to_vec();
+        let expected: Vec<Neighbour> = [0, 2, 3].map(|row| Neighbour { row, squared_distance: 0.0 }).to_vec();
         assert_eq!(found, expected);
     }
 

@@ -161,7 +161,8 @@ impl FieldAtTime {
             total += weight;
             if let Some((rows, probabilities)) = &self.identities {
                 for entry in rows.range(footprint.row as usize) {
-                    *shares.entry(rows.labels[entry]).or_default() += weight * f64::from(probabilities[entry]);
+                    *shares.entry(rows.labels[entry]).or_default() +=
+                        weight * f64::from(probabilities[entry]);
                 }
             }
         }

@@ -6,8 +6,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
 use crate::{
-    Deformation, DeformationConfig, Field, Gaussians, Heads, Identities, Instance, RecordedCamera, SortMetric,
-    TimeEncoding, Timeline,
+    Deformation, DeformationConfig, Field, Gaussians, Heads, Identities, Instance, RecordedCamera,
+    SortMetric, TimeEncoding, Timeline,
 };
 
 /// A valid field with `n` Gaussians in a box of 2 m, four instances, motion, and odd values everywhere.

@@ -285,8 +285,7 @@ fn validate_camera(record: &RecordedCamera, times: usize) -> Result<(), String> 
         return Err("has a position that is not finite".to_owned());
     }
     let error = camera.camera_from_world.orthonormality_error();
-    // A NaN fails the comparison too.
-    if !(error <= MAX_ORTHONORMALITY_ERROR) {
+    if error.is_nan() || error > MAX_ORTHONORMALITY_ERROR {
         return Err(format!("has a rotation that is not orthonormal (deviation {error})"));
     }
     Ok(())

@@ -17,6 +17,9 @@ use super::format::{
 use super::{CheckpointError, StateTensor, TrainingState};
 use crate::Field;
 
+/// Deepest nesting of free-form JSON; the parser stops at 128, a few of which the file's own levels take.
+pub(super) const MAX_JSON_DEPTH: usize = 100;
+
 /// A tensor about to be written.
 struct Tensor<'a> {
     name: String,
@@ -107,6 +110,10 @@ pub(super) fn write(
     let unsaveable =
         |problem: String| CheckpointError::Write { path: path.to_owned(), problem, source: None };
     let json = |value: serde_json::Result<String>| value.map_err(|error| unsaveable(error.to_string()));
+    let free_form = [Some(&field.provenance), training.map(|training| &training.json)];
+    if free_form.into_iter().flatten().any(|value| deeper_than(value, MAX_JSON_DEPTH)) {
+        return Err(unsaveable("its provenance or training state is nested too deeply".to_owned()));
+    }
 
     let mut metadata = BTreeMap::from([
         (FORMAT_KEY, FORMAT.to_string()),
@@ -141,6 +148,15 @@ pub(super) fn write(
     put(&(header.len() as u64).to_le_bytes())?;
     put(&header)?;
     tensors.iter().try_for_each(|tensor| put(tensor.bytes))
+}
+
+fn deeper_than(value: &serde_json::Value, levels: usize) -> bool {
+    let inner = |value| levels == 0 || deeper_than(value, levels - 1);
+    match value {
+        serde_json::Value::Array(values) => values.iter().any(inner),
+        serde_json::Value::Object(values) => values.values().any(inner),
+        _ => false,
+    }
 }
 
 fn field_tensors(field: &Field) -> Vec<Tensor<'_>> {

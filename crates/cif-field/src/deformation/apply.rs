@@ -72,7 +72,8 @@ impl Deformation {
         }
         let mut trunk = linear(&mlp.trunk, &self.mlp, &features);
         rectify(&mut trunk);
-        let zero = Deltas { position: [0.0; 3], scale: [0.0; 3], rotation: [0.0; 4], opacity: 0.0, sh: [0.0; 48] };
+        let zero =
+            Deltas { position: [0.0; 3], scale: [0.0; 3], rotation: [0.0; 4], opacity: 0.0, sh: [0.0; 48] };
         let mut deltas = vec![zero; LANES];
         for head in &mlp.heads {
             let mut hidden = linear(&head.hidden, &self.mlp, &trunk);

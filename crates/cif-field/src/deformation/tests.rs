@@ -4,6 +4,9 @@ use super::initialize::widen_bounds;
 use super::*;
 use crate::Gaussians;
 
+/// Name of the setting that a change breaks.
+type Change = (&'static str, fn(&mut DeformationConfig));
+
 fn heads(on: bool) -> Heads {
     Heads { position: true, scale: true, rotation: true, opacity: on, sh: on }
 }
@@ -38,9 +41,7 @@ fn double(values: &[f32]) -> Vec<f64> {
 }
 
 fn features(deformation: &Deformation, position: [f64; 3], time: f64) -> Vec<f64> {
-    deformation
-        .evaluate(&double(&deformation.planes), &double(&deformation.mlp), position, time)
-        .features
+    deformation.evaluate(&double(&deformation.planes), &double(&deformation.mlp), position, time).features
 }
 
 fn close(a: f64, b: f64, tolerance: f64) {
@@ -108,8 +109,7 @@ fn fresh_parameters_have_the_initial_distribution() {
 fn zero_initial_heads_start_at_the_identity() {
     let still = Deformation::new(config(), bounds(), 3.0, 1, true).unwrap();
     let moving = Deformation::new(config(), bounds(), 3.0, 1, false).unwrap();
-    let gaussians =
-        Gaussians::from_points(&[[0.1, 0.2, 0.3], [-0.5, 1.0, 2.0]], &[[0.4; 3]; 2]).unwrap();
+    let gaussians = Gaussians::from_points(&[[0.1, 0.2, 0.3], [-0.5, 1.0, 2.0]], &[[0.4; 3]; 2]).unwrap();
     assert_eq!(still.apply(&gaussians, 0.4), gaussians);
     assert_ne!(moving.apply(&gaussians, 0.4), gaussians);
     // Only the output layers differ.
@@ -185,10 +185,8 @@ fn both_time_encodings_are_the_same_function() {
                 .copy_from_slice(&compact.planes[from.offset..][..floats]);
         }
         for time in [0.0, 0.013, 0.5, 0.77, 1.0] {
-            let (a, b) = (
-                features(&compact, [0.3, -0.4, 1.1], time),
-                features(&compat, [0.3, -0.4, 1.1], time),
-            );
+            let (a, b) =
+                (features(&compact, [0.3, -0.4, 1.1], time), features(&compat, [0.3, -0.4, 1.1], time));
             for (a, b) in a.iter().zip(&b) {
                 close(*a, *b, 1e-12);
             }
@@ -267,7 +265,7 @@ fn flat_boxes_are_widened() {
 
 #[test]
 fn settings_out_of_range_are_named() {
-    let broken: [(&str, fn(&mut DeformationConfig)); 9] = [
+    let broken: [Change; 9] = [
         ("spatial_resolution", |config| config.spatial_resolution[1] = 1),
         ("spatial_resolution", |config| config.spatial_resolution[2] = u32::MAX),
         ("time_resolution", |config| config.time_resolution = 1),

@@ -7,8 +7,7 @@ fn random(n: usize, seed: u64) -> Gaussians {
     let mut rng = Pcg64::seed_from_u64(seed);
     let positions: Vec<[f32; 3]> =
         (0..n).map(|_| std::array::from_fn(|_| rng.random_range(-1.0..1.0))).collect();
-    let colors: Vec<[f32; 3]> =
-        (0..n).map(|_| std::array::from_fn(|_| rng.random_range(0.0..1.0))).collect();
+    let colors: Vec<[f32; 3]> = (0..n).map(|_| std::array::from_fn(|_| rng.random_range(0.0..1.0))).collect();
     Gaussians::from_points(&positions, &colors).unwrap()
 }
 
@@ -33,8 +32,7 @@ fn fresh_gaussians_have_the_initial_values() {
 
 #[test]
 fn ten_thousand_identical_points_get_the_smallest_scale() {
-    let gaussians =
-        Gaussians::from_points(&vec![[0.3, 0.1, -2.0]; 10_000], &vec![[0.5; 3]; 10_000]).unwrap();
+    let gaussians = Gaussians::from_points(&vec![[0.3, 0.1, -2.0]; 10_000], &vec![[0.5; 3]; 10_000]).unwrap();
     let floor = (MIN_SQUARED_DISTANCE.ln() / 2.0) as f32;
     assert!(gaussians.log_scales.iter().all(|scale| *scale == [floor; 3]));
     gaussians.validate().unwrap();
@@ -51,10 +49,7 @@ fn one_point_and_huge_coordinates_stay_finite() {
 #[test]
 fn broken_points_are_named() {
     let error = Gaussians::from_points(&[[0.0; 3], [0.0, f32::NAN, 0.0]], &[[0.5; 3]; 2]).unwrap_err();
-    assert_eq!(
-        error.to_string(),
-        "`positions` holds NaN at row 1, column 1, where a finite value must be"
-    );
+    assert_eq!(error.to_string(), "`positions` holds NaN at row 1, column 1, where a finite value must be");
     let error = Gaussians::from_points(&[[0.0; 3]], &[]).unwrap_err();
     assert_eq!(error, FieldError::Length { array: "colors", found: 0, expected: 1 });
 }

@@ -16,8 +16,7 @@ fn brute_force(field: &Field, point: DVec3, time: f64) -> (f64, BTreeMap<u16, f6
         let r = quaternion::to_rotation(unit);
         let rotation = DMat3::from_cols_array_2d(&r).transpose();
         let variance = gaussians.log_scales[row].map(|s| (2.0 * f64::from(s)).exp());
-        let covariance =
-            rotation * DMat3::from_diagonal(DVec3::from_array(variance)) * rotation.transpose();
+        let covariance = rotation * DMat3::from_diagonal(DVec3::from_array(variance)) * rotation.transpose();
         let offset = point - DVec3::from_array(gaussians.means[row].map(f64::from));
         let density = (-0.5 * offset.dot(covariance.inverse() * offset)).exp();
         if density < 1.0 / 255.0 {
@@ -28,7 +27,8 @@ fn brute_force(field: &Field, point: DVec3, time: f64) -> (f64, BTreeMap<u16, f6
         nothing *= 1.0 - weight;
         total += weight;
         for entry in identities.range(row) {
-            *shares.entry(identities.labels[entry]).or_insert(0.0) += weight * f64::from(probabilities[entry]);
+            *shares.entry(identities.labels[entry]).or_insert(0.0) +=
+                weight * f64::from(probabilities[entry]);
         }
     }
     shares.values_mut().for_each(|share| *share /= total);
@@ -47,8 +47,9 @@ fn the_index_agrees_with_the_definition() {
             field.gaussians.log_scales[100 + row] = [-7.0, -7.0, 0.0];
         }
         let time = 0.3 * seed as f64;
-        let points: Vec<DVec3> =
-            (0..150).map(|_| DVec3::from_array(std::array::from_fn(|_| rng.random_range(-1.5..1.5)))).collect();
+        let points: Vec<DVec3> = (0..150)
+            .map(|_| DVec3::from_array(std::array::from_fn(|_| rng.random_range(-1.5..1.5))))
+            .collect();
         for (point, found) in points.iter().zip(field.query(&points, time)) {
             let (existence, identity, count) = brute_force(&field, *point, time);
             assert!((found.existence - existence).abs() < 1e-6, "{point}: {found:?} vs {existence}");
