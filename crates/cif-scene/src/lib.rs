@@ -1,1 +1,48 @@
-//! placeholder
+//! Turns a field into a format-neutral scene graph; the format crates only write down what stands here.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`options`] | what an export may vary |
+//! | [`graph`] | what a scene is made of: nodes, motion, splats, cameras, timeline |
+//! | [`assignment`] | which node a Gaussian belongs to |
+//! | [`source`] | where the moved Gaussians come from |
+//! | [`procrustes`] | robust rigid alignment of two point sets |
+//! | [`motion`] | static, rigid or dense: the cheapest model inside the tolerance |
+//! | [`extent`] | boxes that hold the 3-sigma ellipsoids |
+//! | [`proxy`] | a light point cloud standing in for the splats |
+//! | [`camera_tracks`] | recorded cameras as tracks over time |
+//! | [`naming`] | names that every format accepts |
+//! | [`report`] | what the chosen motion models cost and miss |
+//! | [`query`] | nodes by label |
+//!
+//! Frames: world as captured (right-handed, metres). A node's splats live in its local frame, whose axes are the
+//! world's and whose origin is the node's pivot at the reference time, so that no rotation is baked into splats
+//! and their spherical harmonics are stored as trained.
+
+pub mod assignment;
+pub mod build;
+pub mod camera_tracks;
+pub mod error;
+pub mod extent;
+pub mod graph;
+pub mod motion;
+pub mod naming;
+pub mod options;
+pub mod procrustes;
+pub mod proxy;
+pub mod query;
+pub mod report;
+pub mod source;
+#[cfg(test)]
+mod tests;
+
+pub use build::{build, build_from};
+pub use error::SceneError;
+pub use graph::{
+    CameraSample, CameraTrack, DenseMotion, DenseSample, Motion, MotionModel, Node, NodeKind, PointProxy,
+    PoseSample, SceneGraph, Splats, TimeCodes,
+};
+pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
+pub use query::{LabelMatch, LabelQuery, QueryError, query};
+pub use report::{MotionReport, ResidualStatistics};
+pub use source::MotionSource;

@@ -1,0 +1,177 @@
+//! Which node a Gaussian belongs to.
+//!
+//! 1. A Gaussian's instance is its most probable one (ties to the lowest index).
+//! 2. It is *background* when its instance mass gamma = pi p_max is below
+//!    [`SceneOptions::background_threshold`], or when it was seen on labelled pixels for less than half of its
+//!    image (where the estimates kept that share; see [`labelled_share`]). Pixels without a label give no loss,
+//!    so Gaussians outside all masks keep the occupancy at which training started, although they have identity
+//!    rows (methods reference 4.4, 5.4 and A2).
+//! 3. Gaussians inside an object are hardly ever seen, so that they too keep their first occupancy. One that
+//!    lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of that
+//!    instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
+//!
+//! Where occupancy is the same for all Gaussians (never trained, or an ablation), opacity takes its place.
+//! Without identities everything is background.
+
+use cif_field::Field;
+use cif_geometry::Bounds;
+use glam::DVec3;
+use kiddo::{ImmutableKdTree, SquaredEuclidean};
+use rayon::prelude::*;
+
+use crate::SceneOptions;
+
+/// Neighbours that vote on an enclosed Gaussian.
+const NEIGHBOURS: usize = 8;
+/// Votes that enclose.
+const ENCLOSING: usize = 6;
+/// Rounds of enclosing; each reaches about one Gaussian deeper.
+const ROUNDS: usize = 4;
+/// Occupancies that differ by less are the same.
+const SAME_OCCUPANCY: f32 = 1e-4;
+/// Share of its image on labelled pixels below which a Gaussian is background.
+const LABELLED_SHARE: f32 = 0.5;
+
+/// Most probable instance of a Gaussian.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Identity {
+    /// Dense instance index.
+    pub index: usize,
+    /// Its probability p_max.
+    pub probability: f32,
+    /// See [`labelled_share`].
+    pub labelled_share: f32,
+}
+
+/// Most probable instance of every row; `None` for rows without entries.
+#[must_use]
+pub fn most_probable(field: &Field) -> Vec<Option<Identity>> {
+    let Some(identities) = &field.identities else {
+        return vec![None; field.gaussians.len()];
+    };
+    let probabilities = identities.probabilities();
+    (0..identities.len())
+        .map(|row| {
+            let mut best: Option<Identity> = None;
+            for entry in identities.range(row) {
+                let probability = probabilities[entry];
+                // NaN never wins; labels ascend, so the lowest index wins ties.
+                if probability > best.map_or(0.0, |best| best.probability) {
+                    let index = usize::from(identities.labels[entry]);
+                    best = Some(Identity { index, probability, labelled_share: 1.0 });
+                }
+            }
+            best.map(|best| Identity {
+                labelled_share: labelled_share(&identities.log_estimates[identities.range(row)]),
+                ..best
+            })
+        })
+        .collect()
+}
+
+/// Share of a Gaussian's image that fell on labelled pixels: the sum of its identity estimates. It is 1 where
+/// the estimates were normalised; estimates over all pixels (methods reference 5.1, n_i^k / d_i) keep it.
+#[must_use]
+pub fn labelled_share(log_estimates: &[f32]) -> f32 {
+    log_estimates.iter().map(|log| log.exp()).sum::<f32>().min(1.0)
+}
+
+/// Owner of every row of `visible`: a dense instance index, or `None` for the background.
+#[must_use]
+pub fn assign(
+    field: &Field,
+    identities: &[Option<Identity>],
+    visible: &[u32],
+    options: &SceneOptions,
+) -> Vec<Option<usize>> {
+    let occupancy = occupancies(field, visible);
+    let candidate = |position: usize| identities[visible[position] as usize];
+    let mut owners: Vec<Option<usize>> = (0..visible.len())
+        .map(|position| {
+            let identity = candidate(position)?;
+            let mass = occupancy[position] * identity.probability;
+            (mass >= options.background_threshold && identity.labelled_share >= LABELLED_SHARE)
+                .then_some(identity.index)
+        })
+        .collect();
+    enclose(field, visible, &candidate, &mut owners);
+    owners
+}
+
+/// Occupancies of the visible rows, or opacities where occupancy tells nothing.
+fn occupancies(field: &Field, visible: &[u32]) -> Vec<f32> {
+    let sigmoid_of = |logits: &[f32]| -> Vec<f32> {
+        visible.iter().map(|&row| 1.0 / (1.0 + (-logits[row as usize]).exp())).collect()
+    };
+    let occupancy = sigmoid_of(&field.gaussians.occupancy_logits);
+    let lowest = occupancy.iter().copied().fold(f32::INFINITY, f32::min);
+    let highest = occupancy.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    if highest - lowest > SAME_OCCUPANCY { occupancy } else { sigmoid_of(&field.gaussians.opacity_logits) }
+}
+
+/// Gives enclosed background Gaussians back to their instance.
+fn enclose(
+    field: &Field,
+    visible: &[u32],
+    candidate: &(impl Fn(usize) -> Option<Identity> + Sync),
+    owners: &mut [Option<usize>],
+) {
+    let open: Vec<usize> = (0..visible.len())
+        .filter(|&position| {
+            owners[position].is_none()
+                && candidate(position).is_some_and(|identity| identity.labelled_share >= LABELLED_SHARE)
+        })
+        .collect();
+    if open.is_empty() || owners.iter().all(Option::is_none) {
+        return;
+    }
+    let centre = |position: usize| field.gaussians.means[visible[position] as usize].map(f64::from);
+    let mut boxes = vec![Bounds::EMPTY; field.instances.len()];
+    for (position, owner) in owners.iter().enumerate() {
+        if let Some(index) = owner {
+            boxes[*index] = boxes[*index].including(DVec3::from_array(centre(position)));
+        }
+    }
+    let points: Vec<[f64; 3]> = (0..visible.len()).map(centre).collect();
+    // Only degenerate point sets (thousands of equal centres) have no tree; nothing is enclosed then.
+    let Ok(tree) = ImmutableKdTree::<f64, 3>::new_from_slice(&points) else {
+        return;
+    };
+    let inside: Vec<(usize, usize, Vec<usize>)> = open
+        .par_iter()
+        .filter_map(|&position| {
+            let index = candidate(position)?.index;
+            let (bounds, point) = (boxes[index], points[position]);
+            let held = (0..3).all(|axis| (bounds.low[axis]..=bounds.high[axis]).contains(&point[axis]));
+            held.then(|| {
+                let wanted = std::num::NonZero::new(NEIGHBOURS + 1).expect("more than zero neighbours");
+                let neighbours = tree
+                    .query(&point)
+                    .nearest_n::<SquaredEuclidean<f64>>(wanted)
+                    .execute()
+                    .into_iter()
+                    .map(|found| found.item as usize)
+                    .filter(|&other| other != position)
+                    .take(NEIGHBOURS)
+                    .collect();
+                (position, index, neighbours)
+            })
+        })
+        .collect();
+    for _ in 0..ROUNDS {
+        let joined: Vec<(usize, usize)> = inside
+            .iter()
+            .filter(|(position, index, neighbours)| {
+                owners[*position].is_none()
+                    && neighbours.iter().filter(|&&other| owners[other] == Some(*index)).count() >= ENCLOSING
+            })
+            .map(|(position, index, _)| (*position, *index))
+            .collect();
+        if joined.is_empty() {
+            break;
+        }
+        for (position, index) in joined {
+            owners[position] = Some(index);
+        }
+    }
+}

@@ -1,0 +1,47 @@
+//! What can go wrong while a scene is built.
+
+/// Why a field cannot become a scene.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SceneError {
+    /// Nothing to export.
+    #[error(
+        "the field holds no Gaussian that can be seen (of {total}: {invisible} below opacity {min_opacity}, {invalid} not finite); train longer or lower the opacity cut"
+    )]
+    NoGaussians {
+        /// Gaussians in the field.
+        total: usize,
+        /// Below the opacity or occupancy cut.
+        invisible: usize,
+        /// With a value that is not finite or a scale of zero.
+        invalid: usize,
+        /// The cut.
+        min_opacity: f32,
+    },
+    /// The field's arrays do not fit together.
+    #[error("the field is inconsistent: {what}; the file was not written by cif or is damaged")]
+    Inconsistent {
+        /// Which arrays.
+        what: String,
+    },
+    /// No captured time in the range.
+    #[error("frames {first} to {last} hold no captured time; the field has frames 0 to {newest}")]
+    EmptyFrameRange {
+        /// First frame asked for.
+        first: usize,
+        /// Last frame asked for.
+        last: usize,
+        /// Last frame of the field.
+        newest: usize,
+    },
+    /// An option outside its range.
+    #[error("{option} is {value}, but must be {expected}")]
+    Option {
+        /// Name of the option.
+        option: &'static str,
+        /// Given value.
+        value: String,
+        /// Allowed values.
+        expected: &'static str,
+    },
+}

@@ -1,0 +1,325 @@
+//! What a scene is made of.
+
+use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
+use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::report::MotionReport;
+use crate::{UpAxis, extent};
+
+/// A scene, ready to be written in any format.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SceneGraph {
+    /// Declared up axis of the world.
+    pub up_axis: UpAxis,
+    /// Metres per world unit.
+    pub meters_per_unit: f64,
+    /// When the samples are.
+    pub time_codes: TimeCodes,
+    /// One node per instance in the order of the field's instance table, then the background where there is one.
+    pub nodes: Vec<Node>,
+    /// Recorded cameras.
+    pub cameras: Vec<CameraTrack>,
+    /// Colour behind everything, display-referred RGB in [0, 1].
+    pub background_color: [f32; 3],
+    /// Order in which the splats were blended in training.
+    pub sort_metric: cif_field::SortMetric,
+    /// Labels of instances that no visible Gaussian belongs to, so that they have no node.
+    pub omitted: Vec<String>,
+    /// What the user should know, one sentence each.
+    pub warnings: Vec<String>,
+}
+
+/// Captured frame numbers: frame `f` of the field's timeline is time code `f`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TimeCodes {
+    /// Sampled time codes, ascending, at least one.
+    pub samples: Vec<f64>,
+    /// Normalised time of every sample.
+    pub times: Vec<f64>,
+    /// Time codes per second.
+    pub frames_per_second: f64,
+}
+
+impl TimeCodes {
+    /// First time code.
+    #[must_use]
+    pub fn start(&self) -> f64 {
+        self.samples.first().copied().unwrap_or(0.0)
+    }
+
+    /// Last time code.
+    #[must_use]
+    pub fn end(&self) -> f64 {
+        self.samples.last().copied().unwrap_or(0.0)
+    }
+}
+
+/// Whether a node is an instance or everything else.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum NodeKind {
+    /// An instance of the field's table; `id` is its mask value and `index` its dense index.
+    Instance {
+        /// Mask value, 1 to 65 535.
+        id: u16,
+        /// Position in the instance table.
+        index: usize,
+    },
+    /// Everything that belongs to no instance.
+    Background,
+}
+
+/// One object of the scene.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Node {
+    /// Instance or background.
+    pub kind: NodeKind,
+    /// Unique name, `[A-Za-z0-9_]`, e.g. `red_mug_001`.
+    pub name: String,
+    /// Human name, e.g. `red mug`.
+    pub label: String,
+    /// Class, e.g. `mug`.
+    pub category: String,
+    /// Origin of the local frame at the reference time, world.
+    pub pivot: DVec3,
+    /// How the node moves.
+    pub motion: Motion,
+    /// Splats in the local frame.
+    pub splats: Splats,
+    /// Light stand-in for the splats; `None` when proxies were not asked for.
+    pub proxy: Option<PointProxy>,
+    /// Box of the 3-sigma ellipsoids of `splats`, local frame.
+    pub extent: Bounds,
+    /// Captured frames over which the node exists, first and last.
+    pub source_frames: (usize, usize),
+    /// Opacity-weighted mean occupancy of its Gaussians.
+    pub mean_occupancy: f32,
+    /// Which motion model was chosen, and what it misses.
+    pub report: MotionReport,
+}
+
+/// Motion models, cheapest first. Rigid parts are the next model to come between rigid and dense.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum MotionModel {
+    /// Stands still.
+    Static,
+    /// Turns and moves as one body.
+    Rigid,
+    /// Every Gaussian has its own path.
+    Dense,
+}
+
+impl std::fmt::Display for MotionModel {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(match self {
+            Self::Static => "static",
+            Self::Rigid => "rigid",
+            Self::Dense => "dense",
+        })
+    }
+}
+
+/// How a node moves.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Motion {
+    /// The local frame stays at the pivot.
+    Static,
+    /// The local frame moves; the splats are constant in it.
+    Rigid(Vec<PoseSample>),
+    /// The local frame moves and the splats deform in it.
+    Dense(DenseMotion),
+}
+
+/// Pose of a node's local frame in the world at a time code.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PoseSample {
+    /// Time code.
+    pub time_code: f64,
+    /// Origin of the local frame, world.
+    pub translation: DVec3,
+    /// Unit; successive samples lie in one hemisphere.
+    pub rotation: DQuat,
+}
+
+impl PoseSample {
+    /// The pose as `world_from_local`.
+    #[must_use]
+    pub fn transform(&self) -> RigidTransform {
+        RigidTransform { rotation: DMat3::from_quat(self.rotation), translation: self.translation }
+    }
+}
+
+/// Per-sample splats.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DenseMotion {
+    /// Best rigid fit, which carries the bulk of the motion; empty for the background, which stays put.
+    pub track: Vec<PoseSample>,
+    /// Splats at every sampled time code, in the local frame of that time.
+    pub samples: Vec<DenseSample>,
+}
+
+/// Splats of a node at one time code; arrays parallel to [`Node::splats`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct DenseSample {
+    /// Time code.
+    pub time_code: f64,
+    /// Centres, local frame of this time.
+    pub means: Vec<[f32; 3]>,
+    /// Unit quaternions (w, x, y, z), each in the hemisphere of the previous sample.
+    pub orientations: Vec<[f32; 4]>,
+    /// Standard deviations; `None` while they stay as in [`Node::splats`] over all samples.
+    pub scales: Option<Vec<[f32; 3]>>,
+    /// Box of the 3-sigma ellipsoids, local frame.
+    pub extent: Bounds,
+}
+
+/// Splats in post-activation form; every array has one entry per splat.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Splats {
+    /// Centres, local frame.
+    pub means: Vec<[f32; 3]>,
+    /// Unit quaternions (w, x, y, z).
+    pub orientations: Vec<[f32; 4]>,
+    /// Standard deviations along the axes, above 0, world units.
+    pub scales: Vec<[f32; 3]>,
+    /// Opacities in [0, 1].
+    pub opacities: Vec<f32>,
+    /// Spherical-harmonics degree, 0 to 3.
+    pub sh_degree: u8,
+    /// Coefficients `[N, (degree + 1)^2, 3]`, splat-major, DC first, RGB inner; raw (colour = 0.5 + 0.28209 c0).
+    pub sh_coefficients: Vec<f32>,
+    /// Occupancies in [0, 1].
+    pub occupancies: Vec<f32>,
+    /// Probability of the most probable instance; 0 without identities.
+    pub identity_probabilities: Vec<f32>,
+    /// Row of every splat in the field.
+    pub rows: Vec<u32>,
+}
+
+impl Splats {
+    /// Number of splats.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.means.is_empty()
+    }
+
+    /// View-independent colours `clamp(0.5 + 0.28209 c0)`, display-referred.
+    #[must_use]
+    pub fn base_colors(&self) -> Vec<[f32; 3]> {
+        let stride = 3 * cif_geometry::spherical_harmonics::coefficient_count(self.sh_degree);
+        let band_0 = cif_geometry::spherical_harmonics::BAND_0 as f32;
+        self.sh_coefficients
+            .chunks_exact(stride)
+            .map(|sh| std::array::from_fn(|c| (0.5 + band_0 * sh[c]).clamp(0.0, 1.0)))
+            .collect()
+    }
+}
+
+/// A light point cloud standing in for the splats.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct PointProxy {
+    /// Splats that the points sit on, ascending.
+    pub indices: Vec<u32>,
+    /// Diameters, world units.
+    pub widths: Vec<f32>,
+    /// Colours, display-referred.
+    pub colors: Vec<[f32; 3]>,
+}
+
+/// A camera over time.
+#[derive(Clone, Debug, PartialEq)]
+pub struct CameraTrack {
+    /// Unique name, `[A-Za-z0-9_]`.
+    pub name: String,
+    /// Name in the capture.
+    pub label: String,
+    /// Views, ascending time codes, at least one.
+    pub samples: Vec<CameraSample>,
+}
+
+/// A camera at a time code.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CameraSample {
+    /// Time code.
+    pub time_code: f64,
+    /// The view.
+    pub camera: PinholeCamera,
+}
+
+impl Node {
+    /// Path of the local frame: one sample per time code, or none where it stays at the pivot.
+    #[must_use]
+    pub fn track(&self) -> &[PoseSample] {
+        match &self.motion {
+            Motion::Static => &[],
+            Motion::Rigid(track) => track,
+            Motion::Dense(dense) => &dense.track,
+        }
+    }
+
+    /// Chosen motion model.
+    #[must_use]
+    pub fn model(&self) -> MotionModel {
+        match self.motion {
+            Motion::Static => MotionModel::Static,
+            Motion::Rigid(_) => MotionModel::Rigid,
+            Motion::Dense(_) => MotionModel::Dense,
+        }
+    }
+
+    /// `world_from_local` at a time code: linear in translation, spherical in rotation between samples, held
+    /// outside them.
+    #[must_use]
+    pub fn world_transform(&self, time_code: f64) -> RigidTransform {
+        let track = self.track();
+        let Some((first, last)) = track.first().zip(track.last()) else {
+            return RigidTransform { rotation: DMat3::IDENTITY, translation: self.pivot };
+        };
+        let after = track.partition_point(|sample| sample.time_code <= time_code);
+        if after == 0 {
+            return first.transform();
+        }
+        if after == track.len() {
+            return last.transform();
+        }
+        let (a, b) = (&track[after - 1], &track[after]);
+        let fraction = (time_code - a.time_code) / (b.time_code - a.time_code);
+        PoseSample {
+            time_code,
+            translation: a.translation.lerp(b.translation, fraction),
+            rotation: a.rotation.slerp(b.rotation, fraction),
+        }
+        .transform()
+    }
+
+    /// World box of the 3-sigma ellipsoids at a time code. Between dense samples the nearest one counts.
+    #[must_use]
+    pub fn bounds(&self, time_code: f64) -> Bounds {
+        let world_from_local = self.world_transform(time_code);
+        let (means, orientations, scales) = match &self.motion {
+            Motion::Dense(dense) => {
+                let nearest = dense.samples.iter().min_by(|a, b| {
+                    (a.time_code - time_code).abs().total_cmp(&(b.time_code - time_code).abs())
+                });
+                match nearest {
+                    Some(sample) => (
+                        &sample.means,
+                        &sample.orientations,
+                        sample.scales.as_ref().unwrap_or(&self.splats.scales),
+                    ),
+                    None => (&self.splats.means, &self.splats.orientations, &self.splats.scales),
+                }
+            }
+            _ => (&self.splats.means, &self.splats.orientations, &self.splats.scales),
+        };
+        extent::ellipsoid_bounds(&world_from_local, means, orientations, scales)
+    }
+}

@@ -1,0 +1,313 @@
+//! The cheapest motion model inside the tolerance.
+//!
+//! Two passes over the sampled times, so that no more than one time's Gaussians are in memory:
+//! 1. poses against the shape at the reference time, which give the mean shape (in the world for static, in
+//!    the moving frame for rigid): the noise of one time must not become the shape;
+//! 2. poses against the mean shape, and the residuals of both models.
+//!
+//! Nodes that need it then get their splats of every time in a third pass (see [`crate::build`]).
+
+use cif_field::Gaussians;
+use cif_geometry::{RigidTransform, quaternion};
+use glam::{DMat3, DQuat, DVec3};
+
+use crate::PoseSample;
+use crate::procrustes::{residuals, robust_procrustes, weighted_quantile};
+use crate::proxy::systematic;
+use crate::report::ResidualStatistics;
+
+/// Most points that a pose is fitted to; residuals are taken over all.
+const FIT_POINTS: usize = 4096;
+
+/// Gaussians of one node, and what is learnt about their motion.
+#[derive(Clone, Debug)]
+pub struct MovingGroup {
+    /// Rows of the field.
+    pub rows: Vec<u32>,
+    /// Weights: opacity times geometric-mean size.
+    pub weights: Vec<f64>,
+    /// Origin of the local frame at the reference time, world.
+    pub pivot: DVec3,
+    /// Whether one rigid body may be fitted; the background is not one body.
+    pub is_body: bool,
+    /// Share of the weight that may be outliers.
+    pub trim: f64,
+    /// Largest decisive residual allowed, world units.
+    pub tolerance: f64,
+    /// Mean shape, standing still: local frame with axes of the world.
+    pub static_shape: MeanShape,
+    /// Mean shape in the moving frame.
+    pub rigid_shape: MeanShape,
+    /// Poses `world_from_local` at the sampled times.
+    pub poses: Vec<RigidTransform>,
+    /// Residuals of standing still.
+    pub static_residual: ResidualSum,
+    /// Residuals of the rigid body.
+    pub rigid_residual: ResidualSum,
+    reference: Vec<DVec3>,
+    fit_points: Vec<u32>,
+}
+
+/// Splats in a local frame, averaged over time.
+#[derive(Clone, Debug, Default)]
+pub struct MeanShape {
+    /// Centres.
+    pub means: Vec<DVec3>,
+    /// Unit quaternions (w, x, y, z).
+    pub orientations: Vec<[f64; 4]>,
+    /// Log-scales.
+    pub log_scales: Vec<DVec3>,
+    count: f64,
+}
+
+/// Residuals, gathered time by time.
+#[derive(Clone, Debug, Default)]
+pub struct ResidualSum {
+    statistics: ResidualStatistics,
+    squares: f64,
+    turn_squares: f64,
+    weight: f64,
+    turn_weight: f64,
+}
+
+impl MeanShape {
+    /// Adds one time, seen from a local frame.
+    fn add(&mut self, local_from_world: &RigidTransform, rows: &[u32], gaussians: &Gaussians) {
+        let n = rows.len();
+        if self.means.is_empty() {
+            *self = Self {
+                means: vec![DVec3::ZERO; n],
+                orientations: vec![[0.0; 4]; n],
+                log_scales: vec![DVec3::ZERO; n],
+                count: 0.0,
+            };
+        }
+        let turn = quaternion_of(&local_from_world.rotation);
+        for (k, &row) in rows.iter().enumerate() {
+            let row = row as usize;
+            self.means[k] += local_from_world.apply(vector(gaussians.means[row]));
+            self.log_scales[k] += vector(gaussians.log_scales[row]);
+            if let Some(unit) = quaternion::try_normalize(gaussians.quaternions[row].map(f64::from)) {
+                let local = quaternion::multiply(turn, unit);
+                let sum = &mut self.orientations[k];
+                let sign = if dot(*sum, local) < 0.0 { -1.0 } else { 1.0 };
+                for (sum, component) in sum.iter_mut().zip(local) {
+                    *sum += sign * component;
+                }
+            }
+        }
+        self.count += 1.0;
+    }
+
+    fn finish(&mut self) {
+        for mean in self.means.iter_mut().chain(&mut self.log_scales) {
+            *mean /= self.count;
+        }
+        for orientation in &mut self.orientations {
+            *orientation = quaternion::try_normalize(*orientation).unwrap_or([1.0, 0.0, 0.0, 0.0]);
+        }
+    }
+
+    /// Moves the shape into another frame.
+    fn transform(&mut self, target_from_local: &RigidTransform) {
+        let turn = quaternion_of(&target_from_local.rotation);
+        for mean in &mut self.means {
+            *mean = target_from_local.apply(*mean);
+        }
+        for orientation in &mut self.orientations {
+            *orientation = quaternion::multiply(turn, *orientation);
+        }
+    }
+}
+
+impl ResidualSum {
+    /// Adds the residuals of one time.
+    fn add(&mut self, distances: &[f64], weights: &[f64], trim: f64, tolerance: f64) {
+        let total: f64 = weights.iter().sum();
+        if total <= 0.0 {
+            return;
+        }
+        let cut = weighted_quantile(distances, weights, 1.0 - trim);
+        let (mut inliers, mut inlier_weight, mut outliers) = (0.0, 0.0, 0.0);
+        for (distance, weight) in distances.iter().zip(weights) {
+            let square = weight * distance * distance;
+            self.squares += square;
+            if *distance <= cut {
+                inliers += square;
+                inlier_weight += weight;
+            }
+            if *distance > tolerance {
+                outliers += weight;
+            }
+            self.statistics.max = self.statistics.max.max(*distance);
+        }
+        self.weight += total;
+        let worst = &mut self.statistics;
+        worst.decisive = worst.decisive.max((inliers / inlier_weight).sqrt());
+        worst.percentile_95 = worst.percentile_95.max(weighted_quantile(distances, weights, 0.95));
+        worst.outlier_share = worst.outlier_share.max(outliers / total);
+    }
+
+    fn add_turn(&mut self, degrees: f64, weight: f64) {
+        self.turn_squares += weight * degrees * degrees;
+        self.turn_weight += weight;
+    }
+
+    /// The statistics of everything added.
+    #[must_use]
+    pub fn statistics(&self) -> ResidualStatistics {
+        let root = |squares: f64, weight: f64| if weight > 0.0 { (squares / weight).sqrt() } else { 0.0 };
+        ResidualStatistics {
+            rms: root(self.squares, self.weight),
+            orientation_rms_degrees: root(self.turn_squares, self.turn_weight),
+            ..self.statistics
+        }
+    }
+}
+
+impl MovingGroup {
+    /// A group of rows, with its shape at the reference time.
+    #[must_use]
+    pub fn new(
+        rows: Vec<u32>,
+        weights: Vec<f64>,
+        pivot: DVec3,
+        is_body: bool,
+        trim: f64,
+        tolerance: f64,
+        gaussians: &Gaussians,
+    ) -> Self {
+        let reference = rows.iter().map(|&row| vector(gaussians.means[row as usize]) - pivot).collect();
+        let order: Vec<u32> = (0..rows.len() as u32).collect();
+        let fit_points =
+            if rows.len() <= FIT_POINTS { order } else { systematic(&order, &weights, FIT_POINTS) };
+        Self {
+            rows,
+            weights,
+            pivot,
+            is_body,
+            trim,
+            tolerance,
+            static_shape: MeanShape::default(),
+            rigid_shape: MeanShape::default(),
+            poses: Vec::new(),
+            static_residual: ResidualSum::default(),
+            rigid_residual: ResidualSum::default(),
+            reference,
+            fit_points,
+        }
+    }
+
+    /// The local frame at the reference time.
+    #[must_use]
+    pub fn rest_pose(&self) -> RigidTransform {
+        RigidTransform { translation: self.pivot, ..RigidTransform::IDENTITY }
+    }
+
+    fn fit(&self, shape: &[DVec3], gaussians: &Gaussians, initial: RigidTransform) -> RigidTransform {
+        let pick = |points: &[DVec3]| -> Vec<DVec3> {
+            self.fit_points.iter().map(|&k| points[k as usize]).collect()
+        };
+        let target: Vec<DVec3> = self
+            .fit_points
+            .iter()
+            .map(|&k| vector(gaussians.means[self.rows[k as usize] as usize]))
+            .collect();
+        let weights: Vec<f64> = self.fit_points.iter().map(|&k| self.weights[k as usize]).collect();
+        robust_procrustes(&pick(shape), &target, &weights, initial)
+    }
+
+    /// First pass: one time.
+    pub fn gather_shape(&mut self, gaussians: &Gaussians) {
+        let rest = self.rest_pose();
+        self.static_shape.add(&rest.inverse(), &self.rows, gaussians);
+        if self.is_body {
+            let initial = self.poses.last().copied().unwrap_or(rest);
+            let pose = self.fit(&self.reference, gaussians, initial);
+            self.rigid_shape.add(&pose.inverse(), &self.rows, gaussians);
+            self.poses.push(pose);
+        }
+    }
+
+    /// Between the passes: finishes the mean shapes and puts the rigid one where it fits the reference time,
+    /// so that the pose there is the rest pose.
+    pub fn finish_shape(&mut self, reference: &Gaussians) {
+        self.static_shape.finish();
+        if self.is_body {
+            self.rigid_shape.finish();
+            let rest = self.rest_pose();
+            let pose = self.fit(&self.rigid_shape.means, reference, rest);
+            self.rigid_shape.transform(&rest.inverse().compose(&pose));
+        }
+        self.poses.clear();
+    }
+
+    /// Second pass: one time.
+    pub fn gather_residuals(&mut self, gaussians: &Gaussians) {
+        let target: Vec<DVec3> = self.rows.iter().map(|&row| vector(gaussians.means[row as usize])).collect();
+        let rest = self.rest_pose();
+        let distances = residuals(&rest, &self.static_shape.means, &target);
+        self.static_residual.add(&distances, &self.weights, self.trim, self.tolerance);
+        let shape = &self.static_shape.orientations;
+        add_turns(&mut self.static_residual, &rest, shape, &self.rows, &self.weights, gaussians);
+        if self.is_body {
+            let initial = self.poses.last().copied().unwrap_or(rest);
+            let pose = self.fit(&self.rigid_shape.means, gaussians, initial);
+            let distances = residuals(&pose, &self.rigid_shape.means, &target);
+            self.rigid_residual.add(&distances, &self.weights, self.trim, self.tolerance);
+            let shape = &self.rigid_shape.orientations;
+            add_turns(&mut self.rigid_residual, &pose, shape, &self.rows, &self.weights, gaussians);
+            self.poses.push(pose);
+        }
+    }
+
+    /// The poses as a track, quaternions in one hemisphere.
+    #[must_use]
+    pub fn track(&self, time_codes: &[f64]) -> Vec<PoseSample> {
+        let mut previous = DQuat::IDENTITY;
+        self.poses
+            .iter()
+            .zip(time_codes)
+            .map(|(pose, &time_code)| {
+                let rotation = DQuat::from_mat3(&pose.rotation).normalize();
+                let rotation = if rotation.dot(previous) < 0.0 { -rotation } else { rotation };
+                previous = rotation;
+                PoseSample { time_code, translation: pose.translation, rotation }
+            })
+            .collect()
+    }
+}
+
+/// Adds the turns between predicted and trained orientations; a Gaussian counts by how far from round it is.
+fn add_turns(
+    sum: &mut ResidualSum,
+    pose: &RigidTransform,
+    orientations: &[[f64; 4]],
+    rows: &[u32],
+    weights: &[f64],
+    gaussians: &Gaussians,
+) {
+    let turn = quaternion_of(&pose.rotation);
+    for ((&row, orientation), weight) in rows.iter().zip(orientations).zip(weights) {
+        let trained = gaussians.quaternions[row as usize].map(f64::from);
+        let Some(trained) = quaternion::try_normalize(trained) else { continue };
+        let cosine = dot(quaternion::multiply(turn, *orientation), trained).abs().min(1.0);
+        let scales = vector(gaussians.log_scales[row as usize]);
+        let flatness = 1.0 - (scales.min_element() - scales.max_element()).exp();
+        sum.add_turn(2.0 * cosine.acos().to_degrees(), weight * flatness);
+    }
+}
+
+pub(crate) fn vector(v: [f32; 3]) -> DVec3 {
+    DVec3::from_array(v.map(f64::from))
+}
+
+/// (w, x, y, z) of a rotation matrix.
+pub(crate) fn quaternion_of(rotation: &DMat3) -> [f64; 4] {
+    let q = DQuat::from_mat3(rotation).normalize();
+    [q.w, q.x, q.y, q.z]
+}
+
+pub(crate) fn dot(a: [f64; 4], b: [f64; 4]) -> f64 {
+    a.iter().zip(b).map(|(a, b)| a * b).sum()
+}

@@ -1,0 +1,70 @@
+//! Names that every format accepts: `[A-Za-z0-9_]`, not starting with a digit.
+
+/// Name of the node that holds everything outside the instances.
+pub const BACKGROUND: &str = "background";
+
+/// Name made from a label and an id: `red mug` and 1 give `red_mug_001`.
+///
+/// Characters other than ASCII letters and digits become single underscores; a label without any usable
+/// character becomes `instance`.
+#[must_use]
+pub fn instance_name(label: &str, id: u16) -> String {
+    format!("{}_{id:03}", identifier(label, "instance"))
+}
+
+/// `text` as an identifier; `fallback` where nothing usable is left.
+#[must_use]
+pub fn identifier(text: &str, fallback: &str) -> String {
+    let mut name = String::with_capacity(text.len());
+    for character in text.chars() {
+        if character.is_ascii_alphanumeric() {
+            name.push(character);
+        } else if !name.is_empty() && !name.ends_with('_') {
+            name.push('_');
+        }
+    }
+    let name = name.trim_end_matches('_');
+    if name.is_empty() {
+        return fallback.to_owned();
+    }
+    if name.starts_with(|first: char| first.is_ascii_digit()) { format!("_{name}") } else { name.to_owned() }
+}
+
+/// `name`, or `name_2`, `name_3`, ... where it is taken.
+#[must_use]
+pub fn unique(name: String, taken: impl Fn(&str) -> bool) -> String {
+    if !taken(&name) {
+        return name;
+    }
+    (2_u64..)
+        .map(|number| format!("{name}_{number}"))
+        .find(|candidate| !taken(candidate))
+        .expect("there are more numbers than names")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn labels_become_identifiers() {
+        let cases = [
+            ("red mug", 1, "red_mug_001"),
+            ("  Tasse (blau) ", 12, "Tasse_blau_012"),
+            ("3rd box", 7, "_3rd_box_007"),
+            ("杯子", 4, "instance_004"),
+            ("", 65_535, "instance_65535"),
+            ("__a--b__", 2, "a_b_002"),
+        ];
+        for (label, id, name) in cases {
+            assert_eq!(instance_name(label, id), name, "{label}");
+        }
+    }
+
+    #[test]
+    fn taken_names_are_numbered() {
+        let taken = ["a", "a_2"];
+        assert_eq!(unique("a".into(), |name| taken.contains(&name)), "a_3");
+        assert_eq!(unique("b".into(), |name| taken.contains(&name)), "b");
+    }
+}

@@ -1,0 +1,234 @@
+//! What an export may vary.
+
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{MotionModel, SceneError};
+
+/// Which world axis points up. The data is not turned: the axis is only declared.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum UpAxis {
+    /// +y.
+    Y,
+    /// +z.
+    #[default]
+    Z,
+}
+
+impl FromStr for UpAxis {
+    type Err = SceneError;
+
+    fn from_str(text: &str) -> Result<Self, SceneError> {
+        match text {
+            "y" | "Y" => Ok(Self::Y),
+            "z" | "Z" => Ok(Self::Z),
+            _ => Err(SceneError::Option { option: "up axis", value: text.to_owned(), expected: "y or z" }),
+        }
+    }
+}
+
+/// How far a simplified motion may be from the trained one.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Tolerance {
+    /// World units (metres).
+    Absolute(f64),
+    /// Percent of the size of the instance: the diagonal of the box of its centres at the reference time,
+    /// outermost 2 % of the weight left out on each side.
+    Percent(f64),
+}
+
+impl Default for Tolerance {
+    fn default() -> Self {
+        Self::Percent(1.0)
+    }
+}
+
+impl Tolerance {
+    /// The tolerance of an instance of this size, world units.
+    #[must_use]
+    pub fn in_world_units(self, size: f64) -> f64 {
+        match self {
+            Self::Absolute(distance) => distance,
+            Self::Percent(percent) => size * percent / 100.0,
+        }
+    }
+}
+
+impl FromStr for Tolerance {
+    type Err = SceneError;
+
+    /// `0.5%` is a percentage, `0.002` are world units.
+    fn from_str(text: &str) -> Result<Self, SceneError> {
+        let trimmed = text.trim();
+        let (number, percent) = match trimmed.strip_suffix('%') {
+            Some(number) => (number.trim_end(), true),
+            None => (trimmed, false),
+        };
+        match number.parse::<f64>() {
+            Ok(value) if value.is_finite() && value >= 0.0 => {
+                Ok(if percent { Self::Percent(value) } else { Self::Absolute(value) })
+            }
+            _ => Err(SceneError::Option {
+                option: "tolerance",
+                value: text.to_owned(),
+                expected: "a distance in world units (0.002) or a percentage of the instance size (1%)",
+            }),
+        }
+    }
+}
+
+/// Captured frame numbers, both ends included. Frame numbers index [`cif_field::Timeline::times`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FrameRange {
+    /// First frame.
+    pub first: usize,
+    /// Last frame.
+    pub last: usize,
+}
+
+impl FromStr for FrameRange {
+    type Err = SceneError;
+
+    /// `12` or `0:71`.
+    fn from_str(text: &str) -> Result<Self, SceneError> {
+        let parse = |part: &str| part.trim().parse::<usize>().ok();
+        let range = match text.split_once(':') {
+            Some((first, last)) => parse(first).zip(parse(last)),
+            None => parse(text).map(|frame| (frame, frame)),
+        };
+        match range {
+            Some((first, last)) if first <= last => Ok(Self { first, last }),
+            _ => Err(SceneError::Option {
+                option: "frame range",
+                value: text.to_owned(),
+                expected: "FIRST:LAST with FIRST <= LAST, or one frame number",
+            }),
+        }
+    }
+}
+
+/// Options of [`crate::build`].
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SceneOptions {
+    /// Largest residual of a simplified motion. Default 1 % of the instance size.
+    pub tolerance: Tolerance,
+    /// The most expensive motion model that may be chosen. `rigid` keeps every instance a rigid body and only
+    /// reports what is lost. Default dense.
+    pub most_expensive_motion: MotionModel,
+    /// Gaussians below this opacity are left out. Default 1/255: the blending rule never draws fainter ones.
+    pub min_opacity: f32,
+    /// Gaussians below this occupancy are left out. Default 0: none.
+    pub min_occupancy: f32,
+    /// Gaussians whose instance mass (occupancy times probability of the most probable instance) is below
+    /// this are background, unless they are enclosed by an instance (see [`crate::assignment`]). Default 0.05,
+    /// two and a half times the occupancy at which training starts: what the masks never spoke for stays near
+    /// its start.
+    pub background_threshold: f32,
+    /// Frames to export; `None` takes all.
+    pub frames: Option<FrameRange>,
+    /// Every how many frames motion and cameras are sampled; the last frame is always kept. Default 1.
+    pub frame_step: usize,
+    /// Declared up axis. Default z.
+    pub up_axis: UpAxis,
+    /// Metres per world unit. Default 1.
+    pub meters_per_unit: f64,
+    /// Most points of a node's proxy; 0 leaves proxies out. Default 2000.
+    pub proxy_points: usize,
+}
+
+impl Default for SceneOptions {
+    fn default() -> Self {
+        Self {
+            tolerance: Tolerance::default(),
+            most_expensive_motion: MotionModel::Dense,
+            min_opacity: 1.0 / 255.0,
+            min_occupancy: 0.0,
+            background_threshold: 0.05,
+            frames: None,
+            frame_step: 1,
+            up_axis: UpAxis::default(),
+            meters_per_unit: 1.0,
+            proxy_points: 2000,
+        }
+    }
+}
+
+impl SceneOptions {
+    /// Refuses values outside their range.
+    pub(crate) fn validate(&self) -> Result<(), SceneError> {
+        let unit = |option, value: f32| {
+            if (0.0..=1.0).contains(&value) {
+                Ok(())
+            } else {
+                Err(SceneError::Option { option, value: value.to_string(), expected: "between 0 and 1" })
+            }
+        };
+        unit("min_opacity", self.min_opacity)?;
+        unit("min_occupancy", self.min_occupancy)?;
+        unit("background_threshold", self.background_threshold)?;
+        let (Tolerance::Absolute(tolerance) | Tolerance::Percent(tolerance)) = self.tolerance;
+        if !(tolerance.is_finite() && tolerance >= 0.0) {
+            return Err(SceneError::Option {
+                option: "tolerance",
+                value: tolerance.to_string(),
+                expected: "0 or more",
+            });
+        }
+        if self.frame_step == 0 {
+            return Err(SceneError::Option {
+                option: "frame_step",
+                value: "0".into(),
+                expected: "1 or more",
+            });
+        }
+        if !(self.meters_per_unit.is_finite() && self.meters_per_unit > 0.0) {
+            return Err(SceneError::Option {
+                option: "meters_per_unit",
+                value: self.meters_per_unit.to_string(),
+                expected: "above 0",
+            });
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tolerances_parse_both_units() {
+        assert_eq!("0.5%".parse::<Tolerance>().unwrap(), Tolerance::Percent(0.5));
+        assert_eq!("0.002".parse::<Tolerance>().unwrap(), Tolerance::Absolute(0.002));
+        for bad in ["", "x%", "-1", "nan", "inf%"] {
+            assert!(bad.parse::<Tolerance>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn frame_ranges_parse() {
+        assert_eq!("3:9".parse::<FrameRange>().unwrap(), FrameRange { first: 3, last: 9 });
+        assert_eq!("4".parse::<FrameRange>().unwrap(), FrameRange { first: 4, last: 4 });
+        for bad in ["9:3", "a:b", ":", "-1:4"] {
+            assert!(bad.parse::<FrameRange>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn options_outside_their_range_are_refused() {
+        let bad = [
+            SceneOptions { frame_step: 0, ..SceneOptions::default() },
+            SceneOptions { min_opacity: f32::NAN, ..SceneOptions::default() },
+            SceneOptions { meters_per_unit: 0.0, ..SceneOptions::default() },
+            SceneOptions { tolerance: Tolerance::Percent(-1.0), ..SceneOptions::default() },
+        ];
+        for options in bad {
+            assert!(options.validate().is_err(), "{options:?}");
+        }
+        assert!(SceneOptions::default().validate().is_ok());
+    }
+}

@@ -1,0 +1,76 @@
+//! What the chosen motion models cost and miss.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{MotionModel, Node, SceneGraph};
+
+/// How far a motion model is from the trained motion, world units.
+///
+/// Residuals are distances between the centres that the model predicts and the trained ones, over all sampled
+/// times, weighted by opacity times size. Orientations are reported, but do not decide: the turn of a nearly
+/// round Gaussian cannot be seen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ResidualStatistics {
+    /// Root of the weighted mean squared residual, over all times and Gaussians, outliers included.
+    pub rms: f64,
+    /// As `rms`, at the worst time, without the outlying weight (5 %; background 1 %) that has the largest
+    /// residuals at that time. The tolerance is held against this value.
+    pub decisive: f64,
+    /// 95th weighted percentile at the worst time.
+    pub percentile_95: f64,
+    /// Largest residual of any Gaussian at any time.
+    pub max: f64,
+    /// Share of the weight whose residual is above the tolerance, at the worst time.
+    pub outlier_share: f64,
+    /// Weighted RMS turn between predicted and trained orientations, degrees; round Gaussians count less.
+    pub orientation_rms_degrees: f64,
+}
+
+/// Motion of one node, as chosen.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct MotionReport {
+    /// Chosen model.
+    pub model: MotionModel,
+    /// Gaussians of the node.
+    pub gaussians: usize,
+    /// Diagonal of the box of the centres at the reference time, outermost 2 % of the weight left out, world
+    /// units.
+    pub size: f64,
+    /// Largest `decisive` residual allowed, world units.
+    pub tolerance: f64,
+    /// Residual of the chosen model; zero for dense.
+    pub residual: ResidualStatistics,
+    /// What standing still would miss.
+    pub static_residual: ResidualStatistics,
+    /// What one rigid body would miss; `None` for the background, which is never one body.
+    pub rigid_residual: Option<ResidualStatistics>,
+    /// Time samples written.
+    pub samples: usize,
+    /// Bytes of the sampled values.
+    pub motion_bytes: usize,
+}
+
+/// One line of the table that a command prints.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct ReportRow {
+    /// Node name.
+    pub name: String,
+    /// Human name.
+    pub label: String,
+    /// Motion.
+    #[serde(flatten)]
+    pub motion: MotionReport,
+}
+
+impl SceneGraph {
+    /// The motion table, one row per node.
+    #[must_use]
+    pub fn motion_table(&self) -> Vec<ReportRow> {
+        let row = |node: &Node| ReportRow {
+            name: node.name.clone(),
+            label: node.label.clone(),
+            motion: node.report.clone(),
+        };
+        self.nodes.iter().map(row).collect()
+    }
+}

@@ -1,0 +1,49 @@
+//! Where the moved Gaussians come from.
+
+use cif_field::{Field, Gaussians};
+use cif_render::cpu::{Renderer, SimdLevel};
+
+/// Gives the Gaussians of a field at a time. Rows keep their order and number.
+pub trait MotionSource {
+    /// All Gaussians at a normalised time in [0, 1], raw form, deformation added.
+    fn gaussians_at(&mut self, time: f64) -> Gaussians;
+
+    /// Whether anything can move at all.
+    fn moves(&self) -> bool {
+        true
+    }
+}
+
+impl<F: FnMut(f64) -> Gaussians> MotionSource for F {
+    fn gaussians_at(&mut self, time: f64) -> Gaussians {
+        self(time)
+    }
+}
+
+/// The trained deformation of a field.
+pub struct FieldMotion<'a> {
+    field: &'a Field,
+    renderer: Option<Renderer>,
+}
+
+impl<'a> FieldMotion<'a> {
+    /// Motion of a field; a field without deformation stands still.
+    #[must_use]
+    pub fn new(field: &'a Field) -> Self {
+        let renderer = field.deformation.as_ref().map(|_| Renderer::new(SimdLevel::Auto));
+        Self { field, renderer }
+    }
+}
+
+impl MotionSource for FieldMotion<'_> {
+    fn gaussians_at(&mut self, time: f64) -> Gaussians {
+        match &mut self.renderer {
+            Some(renderer) => renderer.deform(self.field, time),
+            None => self.field.gaussians.clone(),
+        }
+    }
+
+    fn moves(&self) -> bool {
+        self.renderer.is_some()
+    }
+}

@@ -1,0 +1,344 @@
+use cif_field::{Field, Gaussians, Identities, Instance, SortMetric, Timeline};
+use cif_geometry::RigidTransform;
+use glam::{DMat3, DQuat, DVec3};
+
+use super::*;
+
+const FRAMES: usize = 9;
+
+fn logit(p: f32) -> f32 {
+    (p / (1.0 - p)).ln()
+}
+
+/// `objects` clouds of 60 Gaussians in a row along x, each its own instance, occupancy 0.9; plus 40
+/// background Gaussians with the occupancy of the start and stray identities.
+fn field(objects: usize) -> Field {
+    let mut gaussians = Gaussians::default();
+    let mut identities = Identities {
+        row_offsets: vec![0],
+        labels: Vec::new(),
+        log_estimates: Vec::new(),
+        log_calibrations: Vec::new(),
+    };
+    let steps = DVec3::new(0.819_172_5, 0.671_043_6, 0.549_700_5);
+    let mut push = |centre: DVec3, spread: f64, k: usize, occupancy: f32, owner: usize| {
+        let at = centre + ((steps * (k + 1) as f64).fract() - 0.5) * spread;
+        gaussians.means.push(at.to_array().map(|v| v as f32));
+        gaussians.log_scales.push([-5.0, -4.5, -4.0]);
+        gaussians.quaternions.push([1.0, 0.1 * k as f32, -0.2, 0.3]);
+        gaussians.opacity_logits.push(logit(0.8));
+        gaussians.occupancy_logits.push(logit(occupancy));
+        gaussians.sh_coefficients.push([0.25; 48]);
+        identities.labels.push(owner as u16);
+        identities.log_estimates.push(0.0);
+        identities.log_calibrations.push(0.0);
+        identities.row_offsets.push(identities.labels.len() as u32);
+    };
+    for object in 0..objects {
+        for k in 0..60 {
+            push(DVec3::X * object as f64, 0.4, k, 0.9, object);
+        }
+    }
+    for k in 0..40 {
+        push(DVec3::new(0.0, 3.0, 0.0), 2.0, k, 0.02, 0);
+    }
+    Field {
+        gaussians,
+        deformation: None,
+        identities: Some(identities),
+        instances: (0..objects)
+            .map(|k| Instance { id: k as u16 + 1, label: "red mug".into(), category: "mug".into() })
+            .collect(),
+        timeline: Timeline {
+            times: (0..FRAMES).map(|k| k as f64 / (FRAMES - 1) as f64).collect(),
+            frames_per_second: 24.0,
+        },
+        cameras: Vec::new(),
+        sh_degree: 2,
+        background: [1.0; 3],
+        sort_metric: SortMetric::Z,
+        extent: 1.0,
+        provenance: serde_json::Value::Null,
+    }
+}
+
+fn pose(time: f64) -> RigidTransform {
+    RigidTransform {
+        rotation: DMat3::from_axis_angle(DVec3::new(0.2, 1.0, -0.4).normalize(), 4.0 * time),
+        translation: DVec3::new(time, 0.5 * time * time, -0.3 * time),
+    }
+}
+
+/// Moves rows of a field.
+fn moved(field: &Field, rows: std::ops::Range<usize>, by: &RigidTransform) -> Gaussians {
+    let mut gaussians = field.gaussians.clone();
+    let turn = motion::quaternion_of(&by.rotation).map(|v| v as f32);
+    for row in rows {
+        let at = by.apply(motion::vector(gaussians.means[row]));
+        gaussians.means[row] = at.to_array().map(|v| v as f32);
+        gaussians.quaternions[row] = cif_geometry::quaternion::multiply(turn, gaussians.quaternions[row]);
+    }
+    gaussians
+}
+
+fn pseudo_noise(row: usize, time: f64, axis: usize) -> f32 {
+    (((row * 7919 + axis * 104_729) as f64 * 0.618 + time * 977.0).fract() - 0.5) as f32
+}
+
+#[test]
+fn a_rigid_instance_gets_its_track() {
+    let field = field(2);
+    let mut source = |time: f64| moved(&field, 60..120, &pose(time));
+    let graph = build_from(&field, &mut source, &SceneOptions::default()).unwrap();
+    let models: Vec<_> = graph.nodes.iter().map(|node| (node.name.as_str(), node.model())).collect();
+    assert_eq!(
+        models,
+        [
+            ("red_mug_001", MotionModel::Static),
+            ("red_mug_002", MotionModel::Rigid),
+            ("background", MotionModel::Static)
+        ]
+    );
+    let node = &graph.nodes[1];
+    for (frame, time) in graph.time_codes.times.iter().enumerate() {
+        let expected = pose(*time).compose(&RigidTransform { translation: node.pivot, ..pose(0.0) });
+        let found = node.world_transform(frame as f64);
+        assert!((found.translation - expected.translation).length() < 1e-6, "frame {frame}");
+        let turn = DQuat::from_mat3(&found.rotation).angle_between(DQuat::from_mat3(&expected.rotation));
+        assert!(turn < 1e-5, "frame {frame}: {turn}");
+    }
+    assert!(node.report.residual.max < 1e-6 && node.report.residual.orientation_rms_degrees < 0.1);
+    assert!(node.report.static_residual.rms > 0.1);
+    let track = node.track();
+    assert!(track.windows(2).all(|pair| pair[0].rotation.dot(pair[1].rotation) > 0.0), "one hemisphere");
+    let halfway = node.world_transform(0.5).translation;
+    assert!((halfway - track[0].translation.lerp(track[1].translation, 0.5)).length() < 1e-12);
+}
+
+#[test]
+fn stragglers_do_not_spoil_a_rigid_instance() {
+    let field = field(1);
+    let mut source = |time: f64| {
+        let mut gaussians = moved(&field, 0..60, &pose(time));
+        gaussians.means[7] = field.gaussians.means[7];
+        gaussians.means[31][2] += 5.0 * time as f32;
+        gaussians
+    };
+    let graph = build_from(&field, &mut source, &SceneOptions::default()).unwrap();
+    assert_eq!(graph.nodes[0].model(), MotionModel::Rigid);
+    let report = &graph.nodes[0].report;
+    assert!(report.residual.decisive < 1e-3 && report.residual.max > 1.0, "{report:?}");
+    assert!(report.residual.outlier_share > 0.02 && report.residual.outlier_share < 0.05, "{report:?}");
+    let found = graph.nodes[0].world_transform(8.0).translation;
+    assert!((found - pose(1.0).apply(graph.nodes[0].pivot)).length() < 1e-3);
+}
+
+#[test]
+fn noise_inside_the_tolerance_is_static_and_averaged() {
+    let field = field(1);
+    let mut source = |time: f64| {
+        let mut gaussians = field.gaussians.clone();
+        for row in 0..60 {
+            for axis in 0..3 {
+                gaussians.means[row][axis] += 0.004 * pseudo_noise(row, time, axis);
+            }
+        }
+        gaussians
+    };
+    let graph = build_from(&field, &mut source, &SceneOptions::default()).unwrap();
+    assert_eq!(graph.nodes[0].model(), MotionModel::Static);
+    let strict = SceneOptions { tolerance: Tolerance::Absolute(1e-4), ..SceneOptions::default() };
+    let graph = build_from(&field, &mut source, &strict).unwrap();
+    assert_eq!(graph.nodes[0].model(), MotionModel::Dense);
+    let limited = SceneOptions { most_expensive_motion: MotionModel::Rigid, ..strict };
+    let graph = build_from(&field, &mut source, &limited).unwrap();
+    assert_eq!(graph.nodes[0].model(), MotionModel::Rigid);
+    assert!(graph.nodes[0].report.residual.decisive > 1e-4, "the loss is told");
+}
+
+#[test]
+fn bending_is_dense_and_reproduces_the_trained_splats() {
+    let field = field(1);
+    let bend = |time: f64| {
+        let mut gaussians = moved(&field, 0..60, &pose(time));
+        for row in 0..60 {
+            gaussians.means[row][2] += (time as f32) * 4.0 * field.gaussians.means[row][0].powi(2);
+            gaussians.log_scales[row][0] += 0.2 * time as f32;
+        }
+        gaussians
+    };
+    let graph = build_from(&field, &mut { bend }, &SceneOptions::default()).unwrap();
+    let node = &graph.nodes[0];
+    let Motion::Dense(dense) = &node.motion else { panic!("{:?}", node.report) };
+    assert_eq!((dense.samples.len(), dense.track.len()), (FRAMES, FRAMES));
+    for (sample, time) in dense.samples.iter().zip(&graph.time_codes.times) {
+        let expected = bend(*time);
+        let world_from_local = node.world_transform(sample.time_code);
+        for (k, &row) in node.splats.rows.iter().enumerate() {
+            let at = world_from_local.apply(motion::vector(sample.means[k]));
+            assert!((at - motion::vector(expected.means[row as usize])).length() < 1e-5);
+        }
+        assert!(sample.scales.is_some(), "scales change");
+        let again = extent::ellipsoid_bounds(
+            &RigidTransform::IDENTITY,
+            &sample.means,
+            &sample.orientations,
+            sample.scales.as_ref().unwrap(),
+        );
+        assert_eq!(again, sample.extent);
+    }
+    assert_eq!(node.splats.means, dense.samples[0].means, "defaults are the first sample");
+}
+
+#[test]
+fn what_the_masks_never_spoke_for_is_background() {
+    let mut field = field(2);
+    // Inside the first object and never seen: enclosed. Without neighbours of its instance: background.
+    field.gaussians.means[5] = [0.0, 0.0, 0.0];
+    field.gaussians.occupancy_logits[5] = logit(0.02);
+    field.gaussians.occupancy_logits[50] = logit(0.02);
+    field.gaussians.means[50] = [0.0, 3.1, 0.0];
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    let counts: Vec<_> = graph.nodes.iter().map(|node| node.splats.len()).collect();
+    assert_eq!(counts, [59, 60, 41]);
+    assert!(graph.nodes[0].splats.rows.contains(&5));
+    assert_eq!(graph.nodes[2].kind, NodeKind::Background);
+    let all = SceneOptions { background_threshold: 0.0, ..SceneOptions::default() };
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &all).unwrap();
+    assert_eq!(graph.nodes.len(), 2, "threshold 0 leaves no background");
+
+    field.identities = None;
+    field.instances.clear();
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &all).unwrap();
+    assert_eq!(graph.nodes.len(), 1);
+    assert_eq!(graph.nodes[0].name, "background");
+}
+
+#[test]
+fn a_gaussian_mostly_seen_outside_masks_is_background() {
+    let mut field = field(1);
+    field.identities.as_mut().unwrap().log_estimates[3] = 0.2_f32.ln();
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    assert!(!graph.nodes[0].splats.rows.contains(&3));
+}
+
+#[test]
+fn untrained_occupancy_falls_back_to_opacity() {
+    let mut field = field(1);
+    field.gaussians.occupancy_logits.fill(logit(0.02));
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    assert_eq!(graph.nodes[0].splats.len(), 100);
+}
+
+#[test]
+fn unusable_gaussians_are_left_out_and_told() {
+    let mut field = field(1);
+    field.gaussians.means[0][1] = f32::NAN;
+    field.gaussians.log_scales[1] = [-200.0; 3];
+    field.gaussians.quaternions[2] = [0.0; 4];
+    field.gaussians.opacity_logits[3] = -20.0;
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    assert_eq!(graph.nodes[0].splats.len(), 56);
+    assert!(graph.warnings.iter().any(|warning| warning.starts_with("3 Gaussians")), "{:?}", graph.warnings);
+    field.gaussians.opacity_logits.fill(-20.0);
+    let error = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap_err();
+    assert!(matches!(error, SceneError::NoGaussians { invalid: 3, invisible: 97, .. }), "{error}");
+}
+
+#[test]
+fn damaged_fields_are_refused() {
+    let good = field(1);
+    let mut broken = Vec::new();
+    let mut damage = |change: &dyn Fn(&mut Field)| {
+        let mut field = good.clone();
+        change(&mut field);
+        broken.push(field);
+    };
+    damage(&|field| field.gaussians.log_scales.truncate(3));
+    damage(&|field| field.instances.clear());
+    damage(&|field| field.timeline.times.clear());
+    damage(&|field| field.timeline.times.reverse());
+    damage(&|field| field.sh_degree = 4);
+    damage(&|field| field.identities = field.identities.as_ref().map(|rows| rows.gather(&[0])));
+    for field in broken {
+        let error = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default());
+        assert!(matches!(error, Err(SceneError::Inconsistent { .. })), "{error:?}");
+    }
+}
+
+#[test]
+fn instances_without_gaussians_are_named() {
+    let mut field = field(1);
+    field.instances.push(Instance { id: 9, label: "ghost".into(), category: "ghost".into() });
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    assert_eq!(graph.omitted, ["ghost"]);
+    assert_eq!(graph.nodes.len(), 2);
+}
+
+#[test]
+fn frames_are_captured_numbers() {
+    let field = field(1);
+    let options = SceneOptions {
+        frames: Some(FrameRange { first: 2, last: 7 }),
+        frame_step: 3,
+        ..SceneOptions::default()
+    };
+    let mut asked = Vec::new();
+    let mut source = |time: f64| {
+        asked.push(time);
+        moved(&field, 0..60, &pose(time))
+    };
+    let graph = build_from(&field, &mut source, &options).unwrap();
+    assert_eq!(graph.time_codes.samples, [2.0, 5.0, 7.0]);
+    assert!(asked.contains(&0.25) && !asked.contains(&0.0));
+    assert_eq!(graph.nodes[0].source_frames, (2, 7));
+    assert_eq!(graph.nodes[0].track().len(), 3);
+    let beyond = SceneOptions { frames: Some(FrameRange { first: 9, last: 12 }), ..SceneOptions::default() };
+    assert!(build_from(&field, &mut |_| field.gaussians.clone(), &beyond).is_err());
+}
+
+#[test]
+fn splats_hold_the_degree_in_use_and_extents_hold_the_splats() {
+    let field = field(1);
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    let node = &graph.nodes[0];
+    assert_eq!(node.splats.sh_coefficients.len(), 60 * 9 * 3);
+    let world = node.bounds(0.0);
+    for (mean, scale) in node.splats.means.iter().zip(&node.splats.scales) {
+        let at = motion::vector(*mean) + node.pivot;
+        let reach = f64::from(3.0 * scale.iter().copied().fold(f32::INFINITY, f32::min)) * 0.999;
+        assert!((at - reach).cmpge(world.low).all() && (at + reach).cmple(world.high).all());
+    }
+    assert!(node.splats.means.iter().all(|mean| mean.iter().all(|v| v.abs() < 0.3)), "local frame");
+}
+
+#[test]
+fn labels_are_found_by_any_case_and_by_glob() {
+    let field = field(2);
+    let graph = build_from(&field, &mut |time| moved(&field, 60..120, &pose(time)), &SceneOptions::default());
+    let graph = graph.unwrap();
+    let ask = |pattern: &str, time_code| {
+        query(&graph, &LabelQuery { pattern: pattern.into(), time_code }, "scene.cif")
+    };
+    assert_eq!(ask("RED mug", None).unwrap().len(), 2);
+    assert_eq!(ask("red_mug_00[2]", None).unwrap()[0].instance, "red_mug_002");
+    assert_eq!(ask("mug", None).unwrap()[0].path, "/World/red_mug_001");
+    let later = ask("*_002", Some(8.0)).unwrap();
+    let expected = graph.nodes[1].world_transform(8.0).translation;
+    assert_eq!([0, 1, 2].map(|row| later[0].transform[row][3]), expected.to_array());
+    let error = ask("teapot", None).unwrap_err().to_string();
+    assert!(error.contains("teapot") && error.contains("scene.cif") && error.contains("red mug"), "{error}");
+    assert!(ask("[", None).is_err());
+}
+
+#[test]
+fn results_do_not_depend_on_the_number_of_threads() {
+    let field = field(3);
+    let run = |threads| {
+        rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap().install(|| {
+            build_from(&field, &mut |time| moved(&field, 60..180, &pose(time)), &SceneOptions::default())
+                .unwrap()
+        })
+    };
+    assert_eq!(run(1), run(4));
+}
