@@ -1,1 +1,66 @@
-//! placeholder
+//! The `cif` command as a library: [`run`] is what both the binary and the Python package call.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`commands`] | one file per subcommand |
+//! | [`settings`] | preset, file, flags: which value counts |
+//! | [`progress`] | bars, plain lines and JSON lines of a training run |
+//! | [`interrupt`] | what Ctrl-C does |
+//! | [`output`] | files written whole, never over existing ones |
+//! | [`pictures`] | instance, depth and error colours, panels, PNG files |
+//! | [`camera_file`] | views that no capture has |
+//! | [`ground_truth`] | exported motion against known motion |
+//! | [`error`] | what is reported, and the exit code |
+
+pub mod camera_file;
+pub mod commands;
+pub mod error;
+pub mod ground_truth;
+pub mod interrupt;
+pub mod output;
+pub mod pictures;
+pub mod progress;
+pub mod settings;
+
+use std::ffi::OsString;
+use std::io::IsTerminal;
+
+use clap::Parser;
+use miette::{GraphicalReportHandler, GraphicalTheme};
+
+pub use error::Error;
+
+/// Runs a command line, the first argument being the name of the program, and returns the exit code:
+/// 0 done, 1 failed, 2 not understood, 130 interrupted. Errors are written to stderr.
+pub fn run(arguments: Vec<OsString>) -> i32 {
+    let arguments = match commands::Arguments::try_parse_from(arguments) {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            // Nothing is left to be said when even stderr is closed.
+            let _ = error.print();
+            return error.exit_code();
+        }
+    };
+    match commands::run(arguments) {
+        Ok(()) => 0,
+        Err(error) => {
+            report(&error);
+            error.exit_code()
+        }
+    }
+}
+
+fn report(error: &Error) {
+    let theme = if std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none() {
+        GraphicalTheme::unicode()
+    } else {
+        GraphicalTheme::unicode_nocolor()
+    };
+    // Unwrapped, so that file names in messages stay whole.
+    let handler = GraphicalReportHandler::new_themed(theme).with_wrap_lines(false).with_links(false);
+    let mut text = String::new();
+    match handler.render_report(&mut text, error) {
+        Ok(()) => eprint!("Error:{text}"),
+        Err(_) => eprintln!("Error: {error}"),
+    }
+}

@@ -8,8 +8,10 @@ use cif_dataset::{Dataset, Frame, FrameData, Split};
 use cif_field::Field;
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{Renderer, SimdLevel};
-use cif_render::{Channels, RenderSettings, RenderedImage};
+use cif_render::{Channels, OccupancySource, RenderSettings, RenderedImage};
 use serde::Serialize;
+
+use crate::config::{Ablation, TrainConfig};
 
 use super::image::{psnr, ssim, unit_color};
 use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
@@ -19,7 +21,7 @@ use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
 pub struct EvaluationOptions {
     /// Frames to score.
     pub split: Split,
-    /// Render settings; [`RenderSettings::of_field`] where the training run asks for nothing else.
+    /// Render settings; usually [`trained_settings`].
     pub settings: RenderSettings,
     /// Vector instructions.
     pub simd: SimdLevel,
@@ -33,7 +35,7 @@ impl EvaluationOptions {
     pub fn held_out(field: &Field) -> Self {
         Self {
             split: Split::Val,
-            settings: RenderSettings::of_field(field),
+            settings: trained_settings(field),
             simd: SimdLevel::Auto,
             depth: false,
         }
@@ -192,6 +194,29 @@ pub fn evaluate<E: From<EvaluationError>>(
     let overall = select(None);
     let render_ms_per_frame = frames.iter().map(|f| f.render_ms).sum::<f64>() / frames.len() as f64;
     Ok(Evaluation { overall, groups, gaussians: field.gaussians.len(), render_ms_per_frame, frames })
+}
+
+/// The settings that a field was trained with; `None` for a field of other origin.
+#[must_use]
+pub fn training_config(field: &Field) -> Option<TrainConfig> {
+    serde_json::from_value(field.provenance.get("config")?.clone()).ok()
+}
+
+/// Render settings that repeat those of the training run: what the field itself says, plus near plane,
+/// antialiasing and the source of occupancy from its recorded settings.
+#[must_use]
+pub fn trained_settings(field: &Field) -> RenderSettings {
+    let mut settings = RenderSettings::of_field(field);
+    if let Some(config) = training_config(field) {
+        settings.near = config.near;
+        settings.antialiased = config.antialiased;
+        if let (Some(instances), true) =
+            (&mut settings.instances, config.ablates(Ablation::OpacityOccupancy))
+        {
+            instances.occupancy = OccupancySource::Opacity;
+        }
+    }
+    settings
 }
 
 /// Mask ids of a label map (dense index + 1, 0 = unlabelled).

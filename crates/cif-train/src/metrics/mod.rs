@@ -12,5 +12,8 @@ pub mod evaluate;
 pub mod image;
 pub mod instance;
 
-pub use evaluate::{Evaluation, EvaluationError, EvaluationOptions, FrameScores, FrameView, Scores, evaluate};
+pub use evaluate::{
+    Evaluation, EvaluationError, EvaluationOptions, FrameScores, FrameView, Scores, evaluate, mask_ids,
+    trained_settings, training_config,
+};
 pub use instance::{FrameConfusion, InstanceMetrics, InstanceScore, instance_metrics};

@@ -1,0 +1,224 @@
+//! `cif eval`: scores a scene on the held-out frames of a capture.
+
+use std::path::{Path, PathBuf};
+
+use cif_dataset::Split;
+use cif_field::Field;
+use cif_render::cpu::SimdLevel;
+use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, Scores, evaluate};
+use clap::{Args, ValueEnum};
+use serde_json::{Value, json};
+
+use super::{CaptureOptions, print_warnings, scene};
+use crate::error::Error;
+use crate::pictures::{
+    Picture, depth_picture, error_picture, instance_picture, rgb_picture, save_rgb, side_by_side,
+};
+use crate::{interrupt, output};
+
+/// Score a scene on the held-out frames of a capture
+#[derive(Debug, Args)]
+#[command(after_help = "\
+PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). Instance scores are percent over
+labelled pixels: mAcc-pix per frame, mAcc-inst per instance, mIoU per pair of instance and frame. The JSON
+also has the other definitions in use, per frame and per instance values. n/a (JSON null): nothing to measure.
+
+  cif eval table.cif captures/table
+  cif eval table.cif captures/table --masks masks --json scores.json --images pictures
+
+Pictures show, side by side: truth, render, instance map, error (brightest from a quarter of full range
+on), depth (near is bright).")]
+pub(super) struct Eval {
+    /// Trained scene
+    #[arg(value_name = "SCENE.cif")]
+    scene: PathBuf,
+    /// Folder of the capture
+    capture: PathBuf,
+    /// Frames to score
+    #[arg(long, default_value = "val", value_name = "SPLIT")]
+    split: SplitName,
+    /// Write all scores as JSON; - for stdout
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Write a picture per frame into this folder
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// Replace existing output
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+}
+
+/// Splits by name.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub(super) enum SplitName {
+    Train,
+    Val,
+}
+
+impl From<SplitName> for Split {
+    fn from(name: SplitName) -> Self {
+        match name {
+            SplitName::Train => Self::Train,
+            SplitName::Val => Self::Val,
+        }
+    }
+}
+
+pub(super) fn run(command: &Eval, simd: SimdLevel) -> Result<(), Error> {
+    let to_stdout = command.json.as_deref() == Some(Path::new("-"));
+    if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
+        output::check_file(path, command.force)?;
+    }
+    let field = scene::load(&command.scene)?;
+    let mut capture = command.capture_options.clone();
+    capture.downscale = capture.downscale.or(scene::trained_downscale(&field));
+    let dataset = capture.open(&command.capture)?;
+    print_warnings(&dataset);
+    if let Some(folder) = &command.images {
+        output::check_folder(folder, command.force)?;
+    }
+    let options = EvaluationOptions {
+        split: command.split.into(),
+        settings: scene::render_settings(&field),
+        simd,
+        depth: command.images.is_some(),
+    };
+    interrupt::watch();
+    let evaluation = evaluate(&field, &dataset, &options, |view| {
+        if interrupt::requested() {
+            return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
+        }
+        match &command.images {
+            Some(folder) => save_rgb(&folder.join(format!("{}.png", view.frame.name)), &panel(&view)),
+            None => Ok(()),
+        }
+    })?;
+    let report = to_json(&evaluation, &field);
+    if to_stdout {
+        println!("{report:#}");
+    } else {
+        print_table(&evaluation, &field);
+        if let Some(path) = &command.json {
+            output::write_file(path, format!("{report:#}\n").as_bytes())?;
+        }
+    }
+    if let Some(folder) = &command.images {
+        eprintln!("pictures in {}", folder.display());
+    }
+    Ok(())
+}
+
+impl From<EvaluationError> for Error {
+    fn from(error: EvaluationError) -> Self {
+        Self::plain(error)
+    }
+}
+
+fn panel(view: &FrameView<'_>) -> Picture {
+    let truth = &view.truth.image;
+    let mut pictures = vec![truth.clone(), rgb_picture(&view.rendered.color)];
+    pictures.extend(view.predicted.map(instance_picture));
+    pictures.push(error_picture(&view.rendered.color, truth));
+    pictures.extend(view.rendered.depth.as_ref().map(depth_picture));
+    side_by_side(&pictures)
+}
+
+fn to_json(evaluation: &Evaluation, field: &Field) -> Value {
+    let mut report = scores_json(&evaluation.overall, field);
+    let groups: serde_json::Map<String, Value> =
+        evaluation.groups.iter().map(|(name, scores)| (name.clone(), scores_json(scores, field))).collect();
+    let run = field.provenance.get("train").unwrap_or(&Value::Null);
+    let key = |name: &str| run.get(name).cloned().unwrap_or(Value::Null);
+    report["groups"] = Value::Object(groups);
+    report["per_frame"] = json!(evaluation.frames);
+    report["gaussians"] = json!(evaluation.gaussians);
+    report["render_ms_per_frame"] = json!(evaluation.render_ms_per_frame);
+    report["train"] = json!({
+        "wall_s": key("wall_s"),
+        "iterations": key("iterations"),
+        "preset": key("preset"),
+        "peak_rss_mb": key("peak_rss_mb"),
+        "seed": key("seed"),
+    });
+    report
+}
+
+fn scores_json(scores: &Scores, field: &Field) -> Value {
+    let instance = &scores.instance;
+    let instances: Vec<Value> = instance
+        .instances
+        .iter()
+        .map(|score| {
+            let mut value = json!(score);
+            value["label"] = json!(label(field, score.id));
+            value
+        })
+        .collect();
+    json!({
+        "frames": scores.frames,
+        "psnr": scores.psnr,
+        "ssim": scores.ssim,
+        "macc_pix": instance.macc_pix,
+        "macc_inst": instance.macc_inst,
+        "miou": instance.miou,
+        "variants": {
+            "psnr_infinite": scores.psnr_infinite,
+            "macc_pix_pooled": instance.macc_pix_pooled,
+            "macc_inst_pooled": instance.macc_inst_pooled,
+            "miou_per_instance_first": instance.miou_per_instance_first,
+            "miou_with_fp": instance.miou_with_fp,
+            "miou_all_pixels": instance.miou_all_pixels,
+            "tube_iou": instance.tube_iou,
+            "id_switches_per_100": instance.id_switches_per_100,
+            "association_quality": instance.association_quality,
+        },
+        "instances": instances,
+    })
+}
+
+fn label(field: &Field, id: u16) -> String {
+    let known = field.instances.iter().find(|instance| instance.id == id);
+    known.map_or_else(|| format!("instance_{id} (not trained)"), |instance| instance.label.clone())
+}
+
+fn print_table(evaluation: &Evaluation, field: &Field) {
+    let mut table = super::table(["", "frames", "PSNR", "SSIM", "mAcc-pix", "mAcc-inst", "mIoU"]);
+    let overall = std::iter::once(("all", &evaluation.overall));
+    for (name, scores) in overall.chain(evaluation.groups.iter().map(|(name, scores)| (name.as_str(), scores))) {
+        table.add_row([
+            name.to_owned(),
+            scores.frames.to_string(),
+            number(scores.psnr, 2),
+            number(scores.ssim, 4),
+            number(scores.instance.macc_pix, 2),
+            number(scores.instance.macc_inst, 2),
+            number(scores.instance.miou, 2),
+        ]);
+    }
+    println!("{table}");
+    if !evaluation.overall.instance.instances.is_empty() {
+        let mut table = super::table(["id", "instance", "frames", "IoU", "accuracy", "tube IoU", "switches"]);
+        for score in &evaluation.overall.instance.instances {
+            table.add_row([
+                score.id.to_string(),
+                label(field, score.id),
+                score.frames.to_string(),
+                number(score.iou, 2),
+                number(score.accuracy, 2),
+                number(score.tube_iou, 2),
+                score.id_switches.to_string(),
+            ]);
+        }
+        println!("{table}");
+    }
+    println!(
+        "{} Gaussians, {:.1} ms per frame",
+        evaluation.gaussians, evaluation.render_ms_per_frame
+    );
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("n/a".to_owned(), |value| format!("{value:.digits$}"))
+}

@@ -1,0 +1,219 @@
+//! `cif export`: a scene as USD.
+
+use std::path::{Path, PathBuf};
+
+use cif_scene::{FrameRange, MotionModel, SceneGraph, SceneOptions, Tolerance, UpAxis};
+use clap::{ArgGroup, Args, ValueEnum};
+use serde_json::json;
+
+use super::scene;
+use crate::error::Error;
+use crate::ground_truth::{self, MotionError};
+use crate::output;
+
+/// Export a scene as USD, one prim per object
+#[derive(Debug, Args)]
+#[command(
+    group = ArgGroup::new("result").required(true).multiple(true).args(["usd", "report"]),
+    after_help = "\
+Every object gets the cheapest motion that stays inside the tolerance: static, rigid, or dense (a path for
+every splat). The table tells which one, and what it misses.
+
+  cif export table.cif --usd table.usda
+  cif export table.cif --usd table.usdz --tolerance 0.5%
+  cif export table.cif --report --ground-truth motion.json"
+)]
+pub(super) struct Export {
+    /// Trained scene
+    #[arg(value_name = "SCENE.cif")]
+    scene: PathBuf,
+    /// Stage to write; the ending decides: .usda (text), .usdc (binary), .usdz (package)
+    #[arg(long, value_name = "OUT.usda|usdc|usdz")]
+    usd: Option<PathBuf>,
+    /// Largest error of a simplified motion: 1% of the object's size, or 0.002 in world units
+    #[arg(long, default_value = "1%", value_name = "TOLERANCE")]
+    tolerance: Tolerance,
+    /// Most expensive motion that may be chosen
+    #[arg(long, default_value = "dense", value_name = "MODEL")]
+    motion: Motion,
+    /// Frames to export, e.g. 0:71 [default: all]
+    #[arg(long, value_name = "FIRST:LAST")]
+    frames: Option<FrameRange>,
+    /// Sample every N-th frame
+    #[arg(long, default_value_t = 1, value_name = "N")]
+    frame_step: usize,
+    /// Up axis to declare; the data is not turned
+    #[arg(long, default_value = "z", value_name = "AXIS")]
+    up_axis: UpAxis,
+    /// Metres per world unit
+    #[arg(long, default_value_t = 1.0, value_name = "METRES")]
+    meters_per_unit: f64,
+    /// Leave out splats below this opacity [default: 1/255]
+    #[arg(long, value_name = "OPACITY")]
+    min_opacity: Option<f32>,
+    /// Splats with less instance mass are background
+    #[arg(long, value_name = "MASS")]
+    background_threshold: Option<f32>,
+    /// Most points of an object's stand-in; 0 for none
+    #[arg(long, value_name = "N")]
+    proxy_points: Option<usize>,
+    /// Print the motion table even when nothing is written
+    #[arg(long)]
+    report: bool,
+    /// Print tables as JSON
+    #[arg(long)]
+    json: bool,
+    /// Compare with known motion
+    #[arg(long, value_name = "motion.json")]
+    ground_truth: Option<PathBuf>,
+    /// Replace an existing stage
+    #[arg(long)]
+    force: bool,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Motion {
+    Static,
+    Rigid,
+    Dense,
+}
+
+pub(super) fn run(command: &Export) -> Result<(), Error> {
+    if let Some(path) = &command.usd {
+        check_stage_name(path)?;
+        output::check_file(path, command.force)?;
+        available(path)?;
+    }
+    let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
+    let field = scene::load(&command.scene)?;
+    let graph = cif_scene::build(&field, &options(command)).map_err(Error::plain)?;
+    for warning in &graph.warnings {
+        eprintln!("warning: {warning}");
+    }
+    if !graph.omitted.is_empty() {
+        eprintln!("warning: nothing visible belongs to {}", graph.omitted.join(", "));
+    }
+    if let Some(path) = &command.usd {
+        write(&graph, &field, path)?;
+    }
+    let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
+    if command.json {
+        println!("{:#}", json!({ "motion": graph.motion_table(), "ground_truth": errors }));
+    } else {
+        print_motion(&graph);
+        if let Some(errors) = &errors {
+            print_errors(errors);
+        }
+    }
+    if let Some(path) = &command.usd {
+        eprintln!("wrote {}", path.display());
+    }
+    Ok(())
+}
+
+fn options(command: &Export) -> SceneOptions {
+    let defaults = SceneOptions::default();
+    SceneOptions {
+        tolerance: command.tolerance,
+        most_expensive_motion: match command.motion {
+            Motion::Static => MotionModel::Static,
+            Motion::Rigid => MotionModel::Rigid,
+            Motion::Dense => MotionModel::Dense,
+        },
+        frames: command.frames,
+        frame_step: command.frame_step,
+        up_axis: command.up_axis,
+        meters_per_unit: command.meters_per_unit,
+        min_opacity: command.min_opacity.unwrap_or(defaults.min_opacity),
+        background_threshold: command.background_threshold.unwrap_or(defaults.background_threshold),
+        proxy_points: command.proxy_points.unwrap_or(defaults.proxy_points),
+        ..defaults
+    }
+}
+
+fn check_stage_name(path: &Path) -> Result<(), Error> {
+    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
+    if ["usda", "usdc", "usdz"].contains(&extension.as_str()) {
+        return Ok(());
+    }
+    Err(Error::usage(
+        format!("--usd {}: the ending decides the format", path.display()),
+        "end the name in .usda (text), .usdc (binary) or .usdz (package)",
+    ))
+}
+
+fn print_motion(graph: &SceneGraph) {
+    let mut table = super::table([
+        "object", "label", "splats", "motion", "size", "tolerance", "error RMS", "decisive", "max", "samples", "KB",
+    ]);
+    for row in graph.motion_table() {
+        let motion = &row.motion;
+        table.add_row([
+            row.name.clone(),
+            row.label.clone(),
+            motion.gaussians.to_string(),
+            motion.model.to_string(),
+            format!("{:.4}", motion.size),
+            format!("{:.5}", motion.tolerance),
+            format!("{:.5}", motion.residual.rms),
+            format!("{:.5}", motion.residual.decisive),
+            format!("{:.5}", motion.residual.max),
+            motion.samples.to_string(),
+            format!("{:.1}", motion.motion_bytes as f64 / 1e3),
+        ]);
+    }
+    println!("{table}");
+}
+
+fn print_errors(errors: &[MotionError]) {
+    if errors.is_empty() {
+        println!("no static or rigid object of the known motion is in the scene");
+        return;
+    }
+    let mut table = super::table([
+        "id", "label", "truth", "exported", "times", "translation RMS, mm", "max", "rotation RMS, deg", "max",
+    ]);
+    for error in errors {
+        table.add_row([
+            error.id.to_string(),
+            error.label.clone(),
+            error.truth.clone(),
+            error.model.to_string(),
+            error.samples.to_string(),
+            format!("{:.2}", error.translation_rms_mm),
+            format!("{:.2}", error.translation_max_mm),
+            format!("{:.2}", error.rotation_rms_deg),
+            format!("{:.2}", error.rotation_max_deg),
+        ]);
+    }
+    println!("{table}");
+}
+
+#[cfg(feature = "usd")]
+fn available(_path: &Path) -> Result<(), Error> {
+    Ok(())
+}
+
+#[cfg(not(feature = "usd"))]
+fn available(path: &Path) -> Result<(), Error> {
+    Err(without_usd(path))
+}
+
+#[cfg(feature = "usd")]
+fn write(graph: &SceneGraph, _field: &cif_field::Field, path: &Path) -> Result<(), Error> {
+    cif_usd::write_stage(graph, path).map_err(Error::plain)
+}
+
+#[cfg(not(feature = "usd"))]
+fn write(_graph: &SceneGraph, _field: &cif_field::Field, path: &Path) -> Result<(), Error> {
+    Err(without_usd(path))
+}
+
+/// The answer of a build without Python.
+#[cfg(not(feature = "usd"))]
+pub(super) fn without_usd(path: &Path) -> Error {
+    Error::failed(
+        format!("{}: this build of cif has no USD support, which lives in the Python package usd-core", path.display()),
+        "install the cif wheel (make build), and use its command: .venv/bin/cif",
+    )
+}

@@ -1,0 +1,177 @@
+//! `cif info`: what is in a capture or a scene.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
+
+use cif_dataset::{Dataset, PointSource, Split};
+use cif_field::{Checkpoint, Field};
+use cif_geometry::Bounds;
+use clap::Args;
+use glam::DVec3;
+use serde_json::{Value, json};
+
+use super::{CaptureOptions, scene};
+use crate::error::Error;
+
+/// Tell what is in a capture or a trained scene
+#[derive(Debug, Args)]
+pub(super) struct Info {
+    /// Folder of a capture, or a .cif file
+    #[arg(value_name = "CAPTURE|SCENE.cif")]
+    path: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+}
+
+pub(super) fn run(command: &Info) -> Result<(), Error> {
+    let facts = if command.path.is_file() {
+        let checkpoint = Checkpoint::load(&command.path).map_err(Error::plain)?;
+        scene_facts(&checkpoint)
+    } else if scene::is_scene(&command.path) {
+        return scene::load(&command.path).map(drop);
+    } else {
+        capture_facts(&command.capture_options.open(&command.path)?)?
+    };
+    if command.json {
+        println!("{:#}", Value::Object(facts.into_iter().collect()));
+    } else {
+        print(&facts);
+    }
+    Ok(())
+}
+
+/// Facts in the order they are told.
+type Facts = Vec<(String, Value)>;
+
+fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
+    let frames = &dataset.frames;
+    let count = |split| frames.iter().filter(|frame| frame.split == split).count();
+    let mut groups: BTreeMap<&str, usize> = BTreeMap::new();
+    for group in frames.iter().filter_map(|frame| frame.group.as_deref()) {
+        *groups.entry(group).or_default() += 1;
+    }
+    let cameras: BTreeSet<&str> = frames.iter().map(|frame| frame.camera_name.as_str()).collect();
+    let sizes: BTreeSet<String> =
+        frames.iter().map(|frame| format!("{} x {}", frame.camera.width, frame.camera.height)).collect();
+    let focal: Vec<f64> = frames.iter().map(|frame| frame.camera.focal_px.x).collect();
+    let masks = frames.iter().filter(|frame| frame.mask.is_some()).count();
+    let lenses = frames.iter().filter(|frame| !frame.lens.is_identity()).count();
+    let centres = Bounds::around(frames.iter().map(|frame| frame.camera.centre()));
+    let points = Bounds::around(dataset.points.positions.iter().map(|p| DVec3::from(p.map(f64::from))));
+    let source = match &dataset.points.source {
+        PointSource::File(path) => path.display().to_string(),
+        PointSource::Random => "random, in the box that the cameras see".to_owned(),
+    };
+    Ok(vec![
+        ("capture".to_owned(), json!(dataset.root.display().to_string())),
+        ("layout".to_owned(), json!(dataset.layout)),
+        ("frames".to_owned(), json!(frames.len())),
+        ("train".to_owned(), json!(count(Split::Train))),
+        ("val".to_owned(), json!(count(Split::Val))),
+        ("groups".to_owned(), json!(groups)),
+        ("cameras".to_owned(), json!(cameras)),
+        ("times".to_owned(), json!(dataset.times.len())),
+        ("frames_per_second".to_owned(), json!(dataset.frames_per_second)),
+        ("resolution".to_owned(), json!(sizes)),
+        ("focal_px".to_owned(), json!(range(&focal))),
+        ("frames_with_lens_distortion".to_owned(), json!(lenses)),
+        ("alpha".to_owned(), json!(dataset.has_alpha)),
+        ("frames_with_masks".to_owned(), json!(masks)),
+        ("instances".to_owned(), json!(dataset.instances)),
+        ("points".to_owned(), json!(dataset.points.positions.len())),
+        ("points_from".to_owned(), json!(source)),
+        ("points_box".to_owned(), corners(&points)),
+        ("camera_box".to_owned(), corners(&centres)),
+        ("warnings".to_owned(), json!(dataset.warnings)),
+    ])
+}
+
+fn scene_facts(checkpoint: &Checkpoint) -> Facts {
+    let field: &Field = &checkpoint.field;
+    let means = Bounds::around(field.gaussians.means.iter().map(|p| DVec3::from(p.map(f64::from))));
+    let mut owned: BTreeMap<u16, usize> = BTreeMap::new();
+    if let Some(identities) = &field.identities {
+        let probabilities = identities.probabilities();
+        for row in 0..identities.len() {
+            let best = identities.range(row).max_by(|a, b| probabilities[*a].total_cmp(&probabilities[*b]));
+            if let Some(best) = best {
+                *owned.entry(identities.labels[best]).or_default() += 1;
+            }
+        }
+    }
+    let instances: Vec<Value> = field
+        .instances
+        .iter()
+        .enumerate()
+        .map(|(index, instance)| {
+            let count = owned.get(&(index as u16)).copied().unwrap_or(0);
+            json!({ "id": instance.id, "label": instance.label, "category": instance.category, "gaussians": count })
+        })
+        .collect();
+    let cameras: BTreeSet<&str> = field.cameras.iter().map(|camera| camera.name.as_str()).collect();
+    vec![
+        ("gaussians".to_owned(), json!(field.gaussians.len())),
+        ("moving".to_owned(), json!(field.deformation.is_some())),
+        ("sh_degree".to_owned(), json!(field.sh_degree)),
+        ("times".to_owned(), json!(field.timeline.times.len())),
+        ("frames_per_second".to_owned(), json!(field.timeline.frames_per_second)),
+        ("cameras".to_owned(), json!(cameras)),
+        ("box".to_owned(), corners(&means)),
+        ("extent".to_owned(), json!(field.extent)),
+        ("instances".to_owned(), json!(instances)),
+        ("resumable".to_owned(), json!(checkpoint.training.is_some())),
+        ("provenance".to_owned(), field.provenance.clone()),
+    ]
+}
+
+fn range(values: &[f64]) -> [f64; 2] {
+    values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], v| [low.min(*v), high.max(*v)])
+}
+
+fn corners(bounds: &Bounds) -> Value {
+    if bounds.is_empty() { Value::Null } else { json!([bounds.low.to_array(), bounds.high.to_array()]) }
+}
+
+fn print(facts: &Facts) {
+    for (name, value) in facts {
+        let name = name.replace('_', " ");
+        match value {
+            Value::Array(items) if items.is_empty() => println!("{name:>28}  none"),
+            Value::Array(items) if items.iter().all(Value::is_object) => {
+                println!("{name:>28}  {}", items.len());
+                for item in items {
+                    println!("{:>28}  {}", "", one_line(item));
+                }
+            }
+            Value::Array(items) if name == "warnings" => {
+                for item in items {
+                    println!("{:>28}  {}", "warning", one_line(item));
+                }
+            }
+            Value::Object(items) if items.is_empty() => println!("{name:>28}  none"),
+            Value::Object(items) if name == "provenance" => {
+                println!("{name:>28}  {}", items.keys().cloned().collect::<Vec<_>>().join(", "));
+            }
+            value => println!("{name:>28}  {}", one_line(value)),
+        }
+    }
+}
+
+fn one_line(value: &Value) -> String {
+    match value {
+        Value::String(text) => text.clone(),
+        Value::Null => "n/a".to_owned(),
+        Value::Bool(value) => if *value { "yes" } else { "no" }.to_owned(),
+        Value::Number(number) => match number.as_f64() {
+            Some(float) if number.is_f64() => format!("{float:.4}"),
+            _ => number.to_string(),
+        },
+        Value::Array(items) => items.iter().map(one_line).collect::<Vec<_>>().join(", "),
+        Value::Object(items) => {
+            items.iter().map(|(key, value)| format!("{key} {}", one_line(value))).collect::<Vec<_>>().join(", ")
+        }
+    }
+}

@@ -1,0 +1,169 @@
+//! The subcommands, one file each.
+
+mod eval;
+mod export;
+mod info;
+mod query;
+mod render;
+mod scene;
+mod train;
+
+use clap::{Args, Parser, Subcommand, ValueEnum};
+use cif_render::cpu::SimdLevel;
+
+use crate::error::Error;
+
+/// From captured images to an editable, segmented 3D scene.
+#[derive(Debug, Parser)]
+#[command(
+    name = "cif",
+    version,
+    max_term_width = 110,
+    arg_required_else_help = true,
+    subcommand_required = true,
+    after_help = TOUR
+)]
+pub struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    machine: Machine,
+}
+
+const TOUR: &str = "\
+A short tour:
+  cif info captures/table                                what is in this folder?
+  cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
+  cif eval table.cif captures/table --images pictures    score the held-out views, and look at them
+  cif export table.cif --usd table.usda                  one prim per object, moving as it was filmed
+  cif query table.usda --label 'red mug' --time 0.5      which prim is it, and where?
+
+A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with instance
+masks (PNG, value = instance id, 0 = unlabelled) in its folder masks/.
+Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
+`cif COMMAND --help` explains one command.";
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Train(train::Train),
+    Eval(eval::Eval),
+    Render(render::Render),
+    Export(export::Export),
+    Query(query::Query),
+    Info(info::Info),
+}
+
+/// How the machine is used; results never depend on the number of threads.
+#[derive(Clone, Copy, Debug, Args)]
+#[command(next_help_heading = "Machine")]
+struct Machine {
+    /// Threads to use; all processors by default. Results do not depend on it
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
+    threads: Option<u32>,
+    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are
+    #[arg(long, global = true, value_name = "LEVEL", default_value = "auto")]
+    simd: Simd,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Simd {
+    Auto,
+    Portable,
+}
+
+impl From<Simd> for SimdLevel {
+    fn from(simd: Simd) -> Self {
+        match simd {
+            Simd::Auto => Self::Auto,
+            Simd::Portable => Self::Portable,
+        }
+    }
+}
+
+/// Runs one command.
+///
+/// # Errors
+/// Whatever keeps the command from doing what was asked.
+pub fn run(arguments: Arguments) -> Result<(), Error> {
+    let simd = arguments.machine.simd.into();
+    let run = || match arguments.command {
+        Command::Train(command) => train::run(&command, simd),
+        Command::Eval(command) => eval::run(&command, simd),
+        Command::Render(command) => render::run(&command, simd),
+        Command::Export(command) => export::run(&command),
+        Command::Query(command) => query::run(&command),
+        Command::Info(command) => info::run(&command),
+    };
+    match arguments.machine.threads {
+        None => run(),
+        // A pool of its own, because the command may run several times in one process.
+        Some(threads) => rayon::ThreadPoolBuilder::new()
+            .num_threads(threads as usize)
+            .build()
+            .map_err(|error| Error::plain(format!("cannot start {threads} threads: {error}")))?
+            .install(run),
+    }
+}
+
+/// Which capture, and how it is read.
+#[derive(Clone, Debug, Args)]
+struct CaptureOptions {
+    /// Mask folder: a name inside the capture, such as masks_tracker, or a path [default: masks]
+    #[arg(long, value_name = "NAME")]
+    masks: Option<std::path::PathBuf>,
+    /// Read no masks
+    #[arg(long, conflicts_with = "masks")]
+    no_masks: bool,
+    /// Reduce images by 1, 2, 4, ... [default: the largest images stored]
+    #[arg(long, value_name = "FACTOR", value_parser = clap::value_parser!(u32).range(1..=64))]
+    downscale: Option<u32>,
+    /// Put the principal point into the image centre instead of where the capture says
+    #[arg(long)]
+    center_principal_point: bool,
+    /// Read the folder as this layout where two fit
+    #[arg(long, value_name = "LAYOUT")]
+    layout: Option<LayoutName>,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum LayoutName {
+    HyperNerf,
+    Neu3d,
+    DNerf,
+    Nerfstudio,
+    Colmap,
+}
+
+impl CaptureOptions {
+    fn open(&self, capture: &std::path::Path) -> Result<cif_dataset::Dataset, Error> {
+        use cif_dataset::{Dataset, Layout, OpenOptions};
+        let options = OpenOptions {
+            masks: self.masks.clone(),
+            without_masks: self.no_masks,
+            downscale: self.downscale,
+            centre_principal_point: self.center_principal_point,
+            layout: self.layout.map(|layout| match layout {
+                LayoutName::HyperNerf => Layout::HyperNerf,
+                LayoutName::Neu3d => Layout::Neu3d,
+                LayoutName::DNerf => Layout::DNerf,
+                LayoutName::Nerfstudio => Layout::Nerfstudio,
+                LayoutName::Colmap => Layout::Colmap,
+            }),
+        };
+        Dataset::open(capture, &options).map_err(Error::plain)
+    }
+}
+
+/// Prints the oddities of a capture.
+fn print_warnings(dataset: &cif_dataset::Dataset) {
+    for warning in &dataset.warnings {
+        eprintln!("warning: {warning}");
+    }
+}
+
+/// A plain table with a heading.
+fn table<const N: usize>(heading: [&str; N]) -> comfy_table::Table {
+    let mut table = comfy_table::Table::new();
+    table.load_style(comfy_table::presets::NOTHING).set_header(heading);
+    table
+}

@@ -1,0 +1,177 @@
+//! `cif render`: pictures of a scene from captured or new views.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use cif_field::Field;
+use cif_geometry::PixelGrid;
+use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::{Channels, RenderedImage};
+use cif_train::metrics::mask_ids;
+use clap::{ArgGroup, Args, ValueEnum};
+
+use super::eval::SplitName;
+use super::{CaptureOptions, print_warnings, scene};
+use crate::camera_file::{self, FORMAT_HELP, View};
+use crate::error::Error;
+use crate::pictures::{depth_picture, instance_picture, rgb_picture, save_grey, save_rgb};
+use crate::{interrupt, output};
+
+/// Render a scene from captured or new views
+#[derive(Debug, Args)]
+#[command(
+    group = ArgGroup::new("views").required(true).args(["capture", "camera"]),
+    after_help = after_help(),
+)]
+pub(super) struct Render {
+    /// Trained scene
+    #[arg(value_name = "SCENE.cif")]
+    scene: PathBuf,
+    /// Render the views of a capture
+    #[arg(long, value_name = "CAPTURE")]
+    capture: Option<PathBuf>,
+    /// Frames of the capture
+    #[arg(long, default_value = "val", value_name = "SPLIT", conflicts_with = "camera")]
+    split: SplitName,
+    /// Render the views of a camera file
+    #[arg(long, value_name = "FILE.json")]
+    camera: Option<PathBuf>,
+    /// Time of all views, from 0 to 1, instead of their own
+    #[arg(long, value_name = "T")]
+    time: Option<f64>,
+    /// Folder to write into: DIR/WHAT/VIEW.png
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// What to write, comma separated
+    #[arg(long, value_delimiter = ',', default_value = "rgb", value_name = "WHAT")]
+    what: Vec<What>,
+    /// Write into a folder that holds files already
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+}
+
+/// Layers that can be written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
+enum What {
+    /// Colour, 8-bit RGB
+    Rgb,
+    /// Mask id of the most probable instance, 16-bit grey, 0 = none
+    Instance,
+    /// The same in colours, 8-bit RGB
+    InstanceColor,
+    /// Expected depth along the viewing axis, 16-bit grey, millimetres for scenes in metres, 0 = none
+    Depth,
+    /// Depth in colours, 8-bit RGB
+    DepthColor,
+    /// Colour coverage, 16-bit grey, 65535 = 1
+    Alpha,
+    /// Instance coverage, 16-bit grey, 65535 = 1
+    Coverage,
+    /// Probability of the most probable instance, 16-bit grey, 65535 = 1
+    Probability,
+    /// Entropy of the instance distribution, 16-bit grey, thousandths of a nat
+    Entropy,
+}
+
+impl What {
+    fn of_instances(self) -> bool {
+        matches!(
+            self,
+            Self::Instance | Self::InstanceColor | Self::Coverage | Self::Probability | Self::Entropy
+        )
+    }
+}
+
+fn after_help() -> String {
+    format!(
+        "Values beyond what 16 bits hold are written as 65535.\n\n  \
+         cif render table.cif --capture captures/table --split val -o out --what rgb,instance,depth\n  \
+         cif render table.cif --camera views.json --time 0.5 -o out\n\n{FORMAT_HELP}"
+    )
+}
+
+pub(super) fn run(command: &Render, simd: SimdLevel) -> Result<(), Error> {
+    scene::check_time(command.time)?;
+    let field = scene::load(&command.scene)?;
+    let what: BTreeSet<What> = command.what.iter().copied().collect();
+    let instances = what.iter().any(|what| what.of_instances());
+    if instances && field.identities.is_none() {
+        return Err(Error::failed(
+            format!("{} was trained without masks, so it has no instances to show", command.scene.display()),
+            "leave instance, coverage, probability and entropy out of --what, or train with masks",
+        ));
+    }
+    let views = views(command, &field)?;
+    output::check_folder(&command.output, command.force)?;
+    let depth = what.contains(&What::Depth) || what.contains(&What::DepthColor);
+    let settings = scene::render_settings(&field);
+    let mut renderer = Renderer::new(simd);
+    interrupt::watch();
+    for view in &views {
+        if interrupt::requested() {
+            return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
+        }
+        let time = command.time.or(view.time).unwrap_or(0.0);
+        let image = renderer.render(&field, &view.camera, time, &settings, Channels { depth, instances });
+        for what in &what {
+            write(*what, &field, &image, &command.output, &view.name)?;
+        }
+    }
+    eprintln!("rendered {} views into {}", views.len(), command.output.display());
+    Ok(())
+}
+
+fn views(command: &Render, field: &Field) -> Result<Vec<View>, Error> {
+    if let Some(path) = &command.camera {
+        return camera_file::read(path);
+    }
+    let Some(capture) = &command.capture else {
+        return Err(Error::usage("no views", "give --capture or --camera"));
+    };
+    let mut options = command.capture_options.clone();
+    options.no_masks = options.masks.is_none();
+    options.downscale = options.downscale.or(scene::trained_downscale(field));
+    let dataset = options.open(capture)?;
+    print_warnings(&dataset);
+    let split = command.split.into();
+    let views: Vec<View> = dataset
+        .frames
+        .iter()
+        .filter(|frame| frame.split == split)
+        .map(|frame| View { name: frame.name.clone(), time: Some(frame.time), camera: frame.camera })
+        .collect();
+    if views.is_empty() {
+        return Err(Error::failed(
+            format!("{}: the split has no frame", capture.display()),
+            "try the other one: --split train or --split val",
+        ));
+    }
+    Ok(views)
+}
+
+fn write(what: What, field: &Field, image: &RenderedImage, folder: &Path, name: &str) -> Result<(), Error> {
+    let layer = what.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default();
+    let path = folder.join(layer).join(format!("{name}.png"));
+    let unit = |values: &PixelGrid<f32>| scaled(values, 65_535.0);
+    match (what, &image.depth, &image.instances) {
+        (What::Rgb, ..) => save_rgb(&path, &rgb_picture(&image.color)),
+        (What::Alpha, ..) => save_grey(&path, &unit(&image.alpha)),
+        (What::Depth, Some(depth), _) => save_grey(&path, &scaled(depth, 1000.0)),
+        (What::DepthColor, Some(depth), _) => save_rgb(&path, &depth_picture(depth)),
+        (What::Instance, _, Some(layers)) => save_grey(&path, &mask_ids(field, &layers.label)),
+        (What::InstanceColor, _, Some(layers)) => {
+            save_rgb(&path, &instance_picture(&mask_ids(field, &layers.label)))
+        }
+        (What::Coverage, _, Some(layers)) => save_grey(&path, &unit(&layers.coverage)),
+        (What::Probability, _, Some(layers)) => save_grey(&path, &unit(&layers.probability)),
+        (What::Entropy, _, Some(layers)) => save_grey(&path, &scaled(&layers.entropy, 1000.0)),
+        (_, None, _) | (_, _, None) => unreachable!("the layers asked for were rendered"),
+    }
+}
+
+/// Values times `factor`, rounded, kept within 16 bits.
+fn scaled(values: &PixelGrid<f32>, factor: f32) -> PixelGrid<u16> {
+    values.map(|value| (value * factor).round().clamp(0.0, 65_535.0) as u16)
+}

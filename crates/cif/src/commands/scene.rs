@@ -1,0 +1,51 @@
+//! Trained scenes as commands take them.
+
+use std::path::Path;
+
+use cif_field::Field;
+use cif_render::RenderSettings;
+
+use crate::error::Error;
+
+/// Loads a `.cif` file.
+///
+/// # Errors
+/// When it is missing, truncated or not a scene.
+pub(super) fn load(path: &Path) -> Result<Field, Error> {
+    if path.is_dir() {
+        return Err(Error::failed(
+            format!("{} is a folder; a trained scene (.cif) is expected here", path.display()),
+            "train one first: cif train CAPTURE -o scene.cif",
+        ));
+    }
+    Field::load(path).map_err(Error::plain)
+}
+
+/// Whether a path names a trained scene rather than a stage or a capture.
+pub(super) fn is_scene(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("cif"))
+}
+
+/// The settings that a scene is to be rendered with: those of its training.
+pub(super) fn render_settings(field: &Field) -> RenderSettings {
+    cif_train::metrics::trained_settings(field)
+}
+
+/// Image reduction that a scene was trained with.
+pub(super) fn trained_downscale(field: &Field) -> Option<u32> {
+    cif_train::metrics::training_config(field)?.downscale
+}
+
+/// Checks a normalised time.
+///
+/// # Errors
+/// Outside [0, 1].
+pub(super) fn check_time(time: Option<f64>) -> Result<(), Error> {
+    match time {
+        Some(time) if !(0.0..=1.0).contains(&time) => Err(Error::usage(
+            format!("--time {time}: times are normalised"),
+            "give a number from 0 (first captured time) to 1 (last)",
+        )),
+        _ => Ok(()),
+    }
+}

@@ -1,0 +1,332 @@
+//! `cif train`: from a capture to a scene.
+
+use std::path::{Path, PathBuf};
+
+use cif_dataset::Layout;
+use cif_field::Checkpoint;
+use cif_render::cpu::SimdLevel;
+use cif_train::{Control, Outcome, Preset, TrainConfig, TrainEvent, Trainer};
+use clap::{Args, ValueEnum};
+
+use super::{CaptureOptions, print_warnings, scene};
+use crate::error::Error;
+use crate::progress::Progress;
+use crate::settings::Layers;
+use crate::{interrupt, output};
+
+/// Train a scene on a capture
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Settings come from the preset, then the --config file, then what is typed here; the result is written
+beside the scene as SCENE.train.toml, which --config accepts again.
+
+  cif train captures/table -o table.cif --preset draft
+  cif train captures/table -o table.cif --masks masks_tracker --iterations-fine 8000 --seed 3
+  cif train captures/table -o table.cif --config mine.toml --set densify.max_gaussians=30000
+
+Ctrl-C saves and stops; the same command with --resume goes on as if nothing had happened.")]
+pub(super) struct Train {
+    /// Folder of the capture
+    capture: PathBuf,
+    /// Scene to write
+    #[arg(short, long, value_name = "SCENE.cif")]
+    output: PathBuf,
+    /// Replace an existing scene
+    #[arg(long)]
+    force: bool,
+    /// Go on where SCENE.cif was interrupted; settings come from it
+    #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings")]
+    resume: bool,
+    /// Stop at the first report at or after N steps, saving so that --resume goes on
+    #[arg(long, value_name = "N")]
+    stop_after: Option<u64>,
+    /// Write every event as a line of JSON
+    #[arg(long, value_name = "FILE.jsonl")]
+    log: Option<PathBuf>,
+    /// Show no progress
+    #[arg(short, long)]
+    quiet: bool,
+    /// Named settings: draft, standard or paper [default: standard]
+    #[arg(long, value_name = "NAME")]
+    preset: Option<String>,
+    /// Settings file; only what differs needs to be in it
+    #[arg(long, value_name = "FILE.toml")]
+    config: Option<PathBuf>,
+    /// Any setting by its key in SCENE.train.toml, e.g. --set rates.opacity=0.02
+    #[arg(long, value_name = "TABLE.KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+    #[command(flatten)]
+    settings: Settings,
+}
+
+/// Settings with a flag of their own.
+#[derive(Debug, Args)]
+#[group(id = "settings", multiple = true)]
+#[command(next_help_heading = "Settings")]
+struct Settings {
+    /// Seed of every random choice; same seed, same scene
+    #[arg(long, value_name = "N")]
+    seed: Option<u32>,
+    /// Steps without motion
+    #[arg(long, value_name = "N")]
+    iterations_coarse: Option<u32>,
+    /// Steps with motion
+    #[arg(long, value_name = "N")]
+    iterations_fine: Option<u32>,
+    /// Steps with instances
+    #[arg(long, value_name = "N")]
+    iterations_instance: Option<u32>,
+    /// Views per step
+    #[arg(long, value_name = "N")]
+    batch: Option<u32>,
+    /// Most Gaussians
+    #[arg(long, value_name = "N")]
+    max_gaussians: Option<u32>,
+    /// Highest spherical-harmonics degree, 0 to 3
+    #[arg(long, value_name = "DEGREE")]
+    sh_degree: Option<u8>,
+    /// Weight of the instance loss
+    #[arg(long, value_name = "WEIGHT")]
+    lambda_instance: Option<f64>,
+    /// Share of structural dissimilarity in the colour loss, 0 to 1
+    #[arg(long, value_name = "SHARE")]
+    lambda_dssim: Option<f64>,
+    /// Fraction of Gaussians relocated per resampling event
+    #[arg(long, value_name = "FRACTION")]
+    resampling_rate: Option<f64>,
+    /// Switch a part of the method off; may be repeated
+    #[arg(long, value_name = "PART")]
+    ablate: Vec<AblationName>,
+    /// Compensate opacity for the low-pass filter
+    #[arg(long)]
+    antialiased: bool,
+    /// Steps between evaluations on held-out frames; 0 for never
+    #[arg(long, value_name = "N")]
+    evaluate_every: Option<u32>,
+    /// Steps between saved states on the way; 0 for never
+    #[arg(long, value_name = "N")]
+    checkpoint_every: Option<u32>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
+enum AblationName {
+    ConstantOccupancy,
+    OpacityOccupancy,
+    NoCalibration,
+    NoResampling,
+}
+
+pub(super) fn run(command: &Train, simd: SimdLevel) -> Result<(), Error> {
+    // Everything that can be refused is refused before the first image is read.
+    output::check_file(&command.output, command.force || command.resume)?;
+    let settings_path = command.output.with_extension("train.toml");
+    if let Some(log) = &command.log {
+        output::check_file(log, command.force || command.resume)?;
+    }
+    let checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
+    if checkpoint.is_none() {
+        output::check_file(&settings_path, command.force)?;
+        // Typing errors show before a long look at the capture; the layout only shifts preset values.
+        resolve(command, Layout::HyperNerf)?;
+    }
+
+    let mut capture = command.capture_options.clone();
+    let wanted = match &checkpoint {
+        Some(checkpoint) => scene::trained_downscale(&checkpoint.field),
+        None => resolve(command, Layout::HyperNerf)?.downscale,
+    };
+    capture.downscale = capture.downscale.or(wanted);
+    let dataset = capture.open(&command.capture)?;
+    print_warnings(&dataset);
+    if dataset.frames.iter().all(|frame| frame.mask.is_none()) {
+        eprintln!("note: the capture has no masks, so colour and motion are trained, but no instances");
+    }
+
+    let mut trainer = match checkpoint {
+        Some(checkpoint) => Trainer::resume(dataset, checkpoint),
+        None => {
+            let config = resolve(command, dataset.layout)?;
+            let text = toml::to_string_pretty(&config).expect("settings serialise to TOML");
+            let trainer = Trainer::new(dataset, config);
+            if trainer.is_ok() {
+                output::write_file(&settings_path, text.as_bytes())?;
+            }
+            trainer
+        }
+    }
+    .map_err(Error::plain)?;
+    let _ = simd;
+
+    let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
+    interrupt::watch();
+    let (outcome, failure) = train(&mut trainer, command, &mut progress);
+    let logged = progress.finish();
+    if let Some(failure) = failure {
+        return Err(failure);
+    }
+    let outcome = outcome.map_err(Error::plain)?;
+    save(&trainer.checkpoint(outcome == Outcome::Interrupted), &command.output)?;
+    let saved = command.output.display();
+    match outcome {
+        Outcome::Finished => eprintln!("saved {saved}"),
+        Outcome::Interrupted => {
+            let help = Some(format!("go on with: cif train {} -o {saved} --resume", command.capture.display()));
+            if interrupt::requested() {
+                return Err(Error::Interrupted { message: format!("interrupted; saved {saved}"), help });
+            }
+            eprintln!("stopped; saved {saved}; {}", help.unwrap_or_default());
+        }
+    }
+    logged
+}
+
+/// Runs to the end or to a request to stop. The second value is a state that could not be saved on the way.
+fn train(
+    trainer: &mut Trainer,
+    command: &Train,
+    progress: &mut Progress,
+) -> (Result<Outcome, cif_train::TrainError>, Option<Error>) {
+    let mut failure = None;
+    let mut steps_done = StepCount::default();
+    let outcome = trainer.run(&mut |event, view| {
+        progress.event(event);
+        if matches!(event, TrainEvent::CheckpointDue { .. }) {
+            if let Err(error) = save(&view.checkpoint(true), &command.output) {
+                failure = Some(error);
+                return Control::Stop;
+            }
+        }
+        let enough = command.stop_after.is_some_and(|limit| steps_done.after(event) >= limit);
+        if interrupt::requested() || enough { Control::Stop } else { Control::Continue }
+    });
+    (outcome, failure)
+}
+
+/// Optimiser steps over all stages of this process and, after a resume, of the present stage before it.
+#[derive(Default)]
+struct StepCount {
+    earlier_stages: u64,
+    stage: u64,
+}
+
+impl StepCount {
+    fn after(&mut self, event: &TrainEvent) -> u64 {
+        match event {
+            TrainEvent::StageStarted { iteration, .. } => {
+                self.earlier_stages += self.stage;
+                self.stage = u64::from(*iteration);
+            }
+            TrainEvent::Step { iteration, .. } => self.stage = u64::from(*iteration),
+            _ => {}
+        }
+        self.earlier_stages + self.stage
+    }
+}
+
+/// Saves a scene; where its place refuses it, saves it in the folder for temporary files instead, because
+/// hours of training may be in it.
+fn save(checkpoint: &Checkpoint, path: &Path) -> Result<(), Error> {
+    let Err(error) = checkpoint.save(path) else { return Ok(()) };
+    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    let rescue = std::env::temp_dir().join(format!("rescued-{}-{name}", std::process::id()));
+    Err(match checkpoint.save(&rescue) {
+        Ok(()) => Error::failed(
+            error.to_string(),
+            format!("the scene was saved as {} instead; move it where there is space", rescue.display()),
+        ),
+        Err(_) => Error::failed(error.to_string(), "make space, then train again"),
+    })
+}
+
+fn load_state(path: &Path) -> Result<Checkpoint, Error> {
+    if !path.exists() {
+        return Err(Error::failed(
+            format!("{} does not exist, so there is nothing to resume", path.display()),
+            "leave --resume away to start a new run",
+        ));
+    }
+    let checkpoint = Checkpoint::load(path).map_err(Error::plain)?;
+    if checkpoint.training.is_none() {
+        return Err(Error::failed(
+            format!("{} is finished: it holds no training state to resume", path.display()),
+            "train again with --force, or to another file",
+        ));
+    }
+    Ok(checkpoint)
+}
+
+/// Preset, file, flags.
+fn resolve(command: &Train, layout: Layout) -> Result<TrainConfig, Error> {
+    let typed = command.preset.as_deref().map(|name| preset(name, "--preset")).transpose()?;
+    let from_file = command.config.as_deref().map(preset_in_file).transpose()?.flatten();
+    let base = typed.or(from_file).unwrap_or_default();
+    let mut layers = Layers::new(TrainConfig::preset(base, layout));
+    if let Some(path) = &command.config {
+        layers.file(path)?;
+    }
+    if let Some(name) = &command.preset {
+        layers.typed("--preset", "preset", name.as_str())?;
+    }
+    let settings = &command.settings;
+    let integers = [
+        ("--seed", "seed", settings.seed),
+        ("--iterations-coarse", "stages.coarse", settings.iterations_coarse),
+        ("--iterations-fine", "stages.fine", settings.iterations_fine),
+        ("--iterations-instance", "stages.instance", settings.iterations_instance),
+        ("--batch", "stages.batch", settings.batch),
+        ("--max-gaussians", "densify.max_gaussians", settings.max_gaussians),
+        ("--sh-degree", "model.sh_degree", settings.sh_degree.map(u32::from)),
+        ("--evaluate-every", "report.evaluate_every", settings.evaluate_every),
+        ("--checkpoint-every", "report.checkpoint_every", settings.checkpoint_every),
+        ("--downscale", "downscale", command.capture_options.downscale),
+    ];
+    for (flag, key, value) in integers {
+        if let Some(value) = value {
+            layers.typed(flag, key, i64::from(value))?;
+        }
+    }
+    let numbers = [
+        ("--lambda-instance", "loss.lambda_instance", settings.lambda_instance),
+        ("--lambda-dssim", "loss.lambda_dssim", settings.lambda_dssim),
+        ("--resampling-rate", "resample.rate", settings.resampling_rate),
+    ];
+    for (flag, key, value) in numbers {
+        if let Some(value) = value {
+            layers.typed(flag, key, value)?;
+        }
+    }
+    if settings.antialiased {
+        layers.typed("--antialiased", "antialiased", true)?;
+    }
+    if !settings.ablate.is_empty() {
+        let names: Vec<toml::Value> = settings
+            .ablate
+            .iter()
+            .filter_map(|ablation| ablation.to_possible_value())
+            .map(|value| toml::Value::String(value.get_name().to_owned()))
+            .collect();
+        layers.typed("--ablate", "instance.ablate", names)?;
+    }
+    for assignment in &command.set {
+        layers.assignment(assignment)?;
+    }
+    let config = layers.finish();
+    config.validate().map_err(Error::plain)?;
+    Ok(config)
+}
+
+fn preset(name: &str, place: &str) -> Result<Preset, Error> {
+    serde_json::from_value(serde_json::Value::String(name.to_owned())).map_err(|_| {
+        Error::failed(format!("{place}: there is no preset `{name}`"), "presets: draft, standard, paper")
+    })
+}
+
+/// The preset that a settings file starts from; other problems of the file are found when it is applied.
+fn preset_in_file(path: &Path) -> Result<Option<Preset>, Error> {
+    let text = std::fs::read_to_string(path).map_err(Error::io("read the settings", path))?;
+    let Ok(table) = text.parse::<toml::Table>() else { return Ok(None) };
+    let place = format!("{}: key `preset`", path.display());
+    table.get("preset").and_then(toml::Value::as_str).map(|name| preset(name, &place)).transpose()
+}

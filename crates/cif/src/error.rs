@@ -1,0 +1,119 @@
+//! What the command line reports, and the exit code it ends with.
+
+use std::path::{Path, PathBuf};
+
+use miette::{Diagnostic, NamedSource, SourceSpan};
+
+/// Any failure of a command.
+#[derive(Debug, thiserror::Error, Diagnostic)]
+#[non_exhaustive]
+pub enum Error {
+    /// The arguments do not fit together (exit code 2).
+    #[error("{message}")]
+    Usage {
+        /// What does not fit.
+        message: String,
+        /// What to type instead.
+        #[help]
+        help: Option<String>,
+    },
+    /// A failure that one sentence and one piece of advice describe.
+    #[error("{message}")]
+    Failed {
+        /// What went wrong, naming the file or object.
+        message: String,
+        /// How to fix it.
+        #[help]
+        help: Option<String>,
+    },
+    /// A place in a text file.
+    #[error("{}:{line}: {message}", path.display())]
+    InText {
+        /// The file.
+        path: PathBuf,
+        /// Line, from 1.
+        line: usize,
+        /// What is wrong there.
+        message: String,
+        /// How to fix it.
+        #[help]
+        help: Option<String>,
+        /// The text.
+        #[source_code]
+        source_code: NamedSource<String>,
+        /// The place.
+        #[label("here")]
+        span: SourceSpan,
+    },
+    /// The file system refused.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was being done.
+        action: &'static str,
+        /// To which file or folder.
+        path: PathBuf,
+        /// Why not.
+        source: std::io::Error,
+    },
+    /// Ctrl-C, after saving (exit code 130).
+    #[error("{message}")]
+    Interrupted {
+        /// What was saved.
+        message: String,
+        /// How to go on.
+        #[help]
+        help: Option<String>,
+    },
+}
+
+impl Error {
+    /// A failure with advice.
+    pub fn failed(message: impl Into<String>, help: impl Into<String>) -> Self {
+        Self::Failed { message: message.into(), help: Some(help.into()) }
+    }
+
+    /// A failure whose message carries its own advice.
+    pub fn plain(error: impl std::fmt::Display) -> Self {
+        Self::Failed { message: error.to_string(), help: None }
+    }
+
+    /// Arguments that do not fit together.
+    pub fn usage(message: impl Into<String>, help: impl Into<String>) -> Self {
+        Self::Usage { message: message.into(), help: Some(help.into()) }
+    }
+
+    /// Turns an I/O error into one that names the file.
+    pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Io { action, path, source }
+    }
+
+    /// A place in a text file, given as a byte range.
+    pub fn in_text(
+        path: &Path,
+        text: &str,
+        span: std::ops::Range<usize>,
+        message: impl Into<String>,
+        help: Option<String>,
+    ) -> Self {
+        let start = span.start.min(text.len());
+        Self::InText {
+            path: path.to_owned(),
+            line: text.as_bytes()[..start].iter().filter(|byte| **byte == b'\n').count() + 1,
+            message: message.into(),
+            help,
+            source_code: NamedSource::new(path.display().to_string(), text.to_owned()),
+            span: (start, span.end.clamp(start, text.len()) - start).into(),
+        }
+    }
+
+    /// Exit code of the process.
+    #[must_use]
+    pub fn exit_code(&self) -> i32 {
+        match self {
+            Self::Usage { .. } => 2,
+            Self::Interrupted { .. } => 130,
+            _ => 1,
+        }
+    }
+}

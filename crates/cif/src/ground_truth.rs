@@ -1,0 +1,207 @@
+//! Exported motion against known motion.
+//!
+//! Known motion comes as `motion.json`: `frames` (normalised `time` of every step) and, per mask id in
+//! `instances`, `label`, `motion` (`static`, `rigid`, ...), `matrix` (object to world, 4 x 4, row by row, one
+//! per step), `aabb_min` and `aabb_max` (world box, one per step).
+//!
+//! An exported object has a frame of its own, so the two are aligned at the first exported time; what is
+//! compared is how they move from there. Translation is compared at the centre of the object's box, so that a
+//! wrong turn far from the object's origin is not counted twice.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use cif_geometry::RigidTransform;
+use cif_scene::{MotionModel, NodeKind, SceneGraph};
+use glam::{DMat3, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::error::Error;
+
+/// Largest difference between an exported time and a known one that still counts as the same.
+const SAME_TIME: f64 = 1e-4;
+
+/// Known motion of a capture.
+#[derive(Debug, Deserialize)]
+pub struct GroundTruth {
+    frames: Vec<TimeStep>,
+    instances: BTreeMap<u16, KnownMotion>,
+}
+
+#[derive(Debug, Deserialize)]
+struct TimeStep {
+    time: f64,
+}
+
+#[derive(Debug, Deserialize)]
+struct KnownMotion {
+    label: String,
+    motion: String,
+    matrix: Vec<[[f64; 4]; 4]>,
+    aabb_min: Vec<[f64; 3]>,
+    aabb_max: Vec<[f64; 3]>,
+}
+
+/// How far an exported object strays from its known motion.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct MotionError {
+    /// Mask id.
+    pub id: u16,
+    /// Human name.
+    pub label: String,
+    /// What the object does in truth: `static`, `rigid`, ...
+    pub truth: String,
+    /// Exported motion model.
+    pub model: MotionModel,
+    /// Times compared.
+    pub samples: usize,
+    /// Root mean square over the times, millimetres.
+    pub translation_rms_mm: f64,
+    /// Largest, millimetres.
+    pub translation_max_mm: f64,
+    /// Root mean square over the times, degrees.
+    pub rotation_rms_deg: f64,
+    /// Largest, degrees.
+    pub rotation_max_deg: f64,
+}
+
+/// Reads `motion.json`.
+///
+/// # Errors
+/// When it cannot be read, or is not in the format.
+pub fn read(path: &Path) -> Result<GroundTruth, Error> {
+    let text = std::fs::read_to_string(path).map_err(Error::io("read the known motion", path))?;
+    let truth: GroundTruth = serde_json::from_str(&text).map_err(|error| {
+        Error::failed(
+            format!("{}: {error}", path.display()),
+            "expected `frames` with times, and `instances` with `label`, `motion`, `matrix`, `aabb_min` and \
+             `aabb_max`",
+        )
+    })?;
+    for (id, known) in &truth.instances {
+        let lengths = [known.matrix.len(), known.aabb_min.len(), known.aabb_max.len()];
+        if lengths != [truth.frames.len(); 3] {
+            return Err(Error::plain(format!(
+                "{}: instance {id} has {lengths:?} matrices and boxes for {} time steps",
+                path.display(),
+                truth.frames.len()
+            )));
+        }
+    }
+    Ok(truth)
+}
+
+/// Compares every exported instance that is static or rigid in truth, in the order of the scene.
+///
+/// `meters_per_unit` of the scene turns world units into millimetres.
+#[must_use]
+pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
+    graph
+        .nodes
+        .iter()
+        .filter_map(|node| {
+            let NodeKind::Instance { id, .. } = node.kind else { return None };
+            let known = truth.instances.get(&id)?;
+            if known.motion != "rigid" && known.motion != "static" {
+                return None;
+            }
+            // (exported pose, index of the known time), in time order, where the object exists.
+            let (first, last) = node.source_frames;
+            let pairs: Vec<(RigidTransform, usize)> = graph
+                .time_codes
+                .samples
+                .iter()
+                .zip(&graph.time_codes.times)
+                .filter(|(code, _)| (first as f64..=last as f64).contains(*code))
+                .filter_map(|(code, time)| Some((node.world_transform(*code), step_at(truth, *time)?)))
+                .collect();
+            let mut error = MotionError {
+                id,
+                label: known.label.clone(),
+                truth: known.motion.clone(),
+                model: node.model(),
+                samples: pairs.len(),
+                translation_rms_mm: 0.0,
+                translation_max_mm: 0.0,
+                rotation_rms_deg: 0.0,
+                rotation_max_deg: 0.0,
+            };
+            let to_mm = 1000.0 * graph.meters_per_unit;
+            let &(world_from_local, step) = pairs.first()?;
+            let world_from_object = known.pose(step);
+            let local_from_object = world_from_local.inverse().compose(&world_from_object);
+            let centre_in_object = world_from_object.inverse().apply(known.centre(step));
+            for (world_from_local, step) in &pairs {
+                let expected = known.pose(*step);
+                let exported = world_from_local.compose(&local_from_object);
+                let distance =
+                    (exported.apply(centre_in_object) - expected.apply(centre_in_object)).length() * to_mm;
+                let degrees = angle_between(&exported.rotation, &expected.rotation).to_degrees();
+                error.translation_rms_mm += distance * distance / pairs.len() as f64;
+                error.rotation_rms_deg += degrees * degrees / pairs.len() as f64;
+                error.translation_max_mm = error.translation_max_mm.max(distance);
+                error.rotation_max_deg = error.rotation_max_deg.max(degrees);
+            }
+            error.translation_rms_mm = error.translation_rms_mm.sqrt();
+            error.rotation_rms_deg = error.rotation_rms_deg.sqrt();
+            Some(error)
+        })
+        .collect()
+}
+
+impl KnownMotion {
+    fn pose(&self, step: usize) -> RigidTransform {
+        let rows = &self.matrix[step];
+        let row = |index: usize| DVec3::new(rows[index][0], rows[index][1], rows[index][2]);
+        let mut columns = DMat3::from_cols(row(0), row(1), row(2)).transpose();
+        // A scale belongs to the object, not to its motion.
+        columns.x_axis = columns.x_axis.normalize_or_zero();
+        columns.y_axis = columns.y_axis.normalize_or_zero();
+        columns.z_axis = columns.z_axis.normalize_or_zero();
+        RigidTransform {
+            rotation: columns,
+            translation: DVec3::new(rows[0][3], rows[1][3], rows[2][3]),
+        }
+    }
+
+    fn centre(&self, step: usize) -> DVec3 {
+        (DVec3::from(self.aabb_min[step]) + DVec3::from(self.aabb_max[step])) / 2.0
+    }
+}
+
+fn step_at(truth: &GroundTruth, time: f64) -> Option<usize> {
+    truth.frames.iter().position(|step| (step.time - time).abs() < SAME_TIME)
+}
+
+/// Angle of the rotation that turns one into the other, radians; exact near zero, where the arc cosine of
+/// the trace is not.
+fn angle_between(a: &DMat3, b: &DMat3) -> f64 {
+    let chord = (*a - *b).to_cols_array().iter().map(|value| value * value).sum::<f64>().sqrt();
+    2.0 * (chord / 8.0_f64.sqrt()).min(1.0).asin()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn angles_are_exact_small_and_large() {
+        let a = DMat3::from_axis_angle(DVec3::new(1.0, 2.0, -1.0).normalize(), 0.4);
+        for angle in [0.0, 1e-9, 0.3, 2.0, std::f64::consts::PI] {
+            let b = a * DMat3::from_rotation_z(angle);
+            assert!((angle_between(&a, &b) - angle).abs() < 1e-7 * angle.max(1e-3), "{angle}");
+        }
+    }
+
+    #[test]
+    fn files_of_another_kind_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("motion.json");
+        std::fs::write(&path, r#"{"frames": []}"#).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("instances"));
+        let short = r#"{"frames": [{"time": 0}], "instances": {"1": {"label": "a", "motion": "rigid",
+            "matrix": [], "aabb_min": [], "aabb_max": []}}}"#;
+        std::fs::write(&path, short).unwrap();
+        assert!(read(&path).unwrap_err().to_string().contains("instance 1"));
+    }
+}
