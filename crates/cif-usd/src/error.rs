@@ -1,0 +1,90 @@
+//! What can go wrong between a scene and a stage.
+
+use std::path::PathBuf;
+
+/// Why a stage cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum UsdError {
+    /// The crate was built without the feature `python`.
+    #[error(
+        "this build of cif has no USD: install the Python wheel (`make build`, then .venv/bin/cif), which brings usd-core with it"
+    )]
+    NotBuilt,
+    /// No interpreter runs in this process.
+    #[error(
+        "USD needs a running Python interpreter: start cif through its Python wheel (the `cif` script or `python -m cif`)"
+    )]
+    NoInterpreter,
+    /// `pxr` cannot be imported.
+    #[error("usd-core cannot be imported ({reason}): pip install \"usd-core>=26.3\"")]
+    Missing {
+        /// What Python says.
+        reason: String,
+    },
+    /// `pxr` is older than the splat schema.
+    #[error("usd-core {found} has no Gaussian splats: pip install --upgrade \"usd-core>=26.3\"")]
+    TooOld {
+        /// Version found.
+        found: String,
+    },
+    /// Not a file name that USD knows.
+    #[error(
+        "{path}: the extension decides the kind of file; use .usda (text), .usdc (binary) or .usdz (package)"
+    )]
+    Extension {
+        /// Given path.
+        path: PathBuf,
+    },
+    /// The folder of the output is missing.
+    #[error("{folder}: no such folder; create it first (for {path})")]
+    NoFolder {
+        /// Missing folder.
+        folder: PathBuf,
+        /// Output in it.
+        path: PathBuf,
+    },
+    /// A file that cif did not write is in the way.
+    #[error("{path} exists and was not written by cif; choose another name, or replace it with --force")]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A folder is in the way.
+    #[error("{path} is a folder; give a file name")]
+    IsFolder {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The file to read is missing.
+    #[error("{path}: no such file")]
+    NotFound {
+        /// Given path.
+        path: PathBuf,
+    },
+    /// The file to read is no stage.
+    #[error("{path} cannot be opened as a USD stage: {reason}")]
+    Unreadable {
+        /// Given path.
+        path: PathBuf,
+        /// What USD says.
+        reason: String,
+    },
+    /// Writing failed.
+    #[error("{path} could not be written: {reason}; nothing was changed")]
+    Write {
+        /// Output.
+        path: PathBuf,
+        /// What the system or USD says.
+        reason: String,
+    },
+    /// usd-core did something unexpected.
+    #[error("usd-core failed: {reason}")]
+    Python {
+        /// What Python says.
+        reason: String,
+    },
+    /// Bad pattern or unknown label.
+    #[error(transparent)]
+    Query(#[from] cif_scene::QueryError),
+}

@@ -1,0 +1,174 @@
+//! The Python modules of usd-core, and arrays handed over as buffers.
+
+use numpy::{PyArray1, PyArrayMethods};
+use pyo3::BoundObject;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyTuple};
+
+use crate::{UsdError, conventions, tokens};
+
+/// The modules that stages are written and read with.
+pub(crate) struct Pxr<'py> {
+    pub(crate) py: Python<'py>,
+    pub(crate) gf: Bound<'py, PyModule>,
+    pub(crate) sdf: Bound<'py, PyModule>,
+    pub(crate) usd: Bound<'py, PyModule>,
+    pub(crate) usd_geom: Bound<'py, PyModule>,
+    pub(crate) usd_semantics: Bound<'py, PyModule>,
+    pub(crate) usd_utils: Bound<'py, PyModule>,
+    pub(crate) usd_vol: Bound<'py, PyModule>,
+    pub(crate) vt: Bound<'py, PyModule>,
+    pub(crate) version: String,
+}
+
+/// Runs `body` with usd-core; attaches to the interpreter.
+pub(crate) fn with<T>(body: impl FnOnce(&Pxr<'_>) -> Result<T, UsdError>) -> Result<T, UsdError> {
+    Python::try_attach(|py| body(&Pxr::import(py)?)).unwrap_or(Err(UsdError::NoInterpreter))
+}
+
+/// What Python says, without the source locations of usd-core's messages.
+pub(crate) fn reason(py: Python<'_>, error: &PyErr) -> String {
+    let text = error.value(py).to_string();
+    let messages: Vec<&str> = text
+        .split(" : '")
+        .skip(1)
+        .filter_map(|part| part.split('\n').next())
+        .map(|part| part.trim_end().trim_end_matches('\''))
+        .filter(|part| !part.is_empty())
+        .collect();
+    if messages.is_empty() { error.to_string() } else { messages.join("; ") }
+}
+
+impl<'py> Pxr<'py> {
+    fn import(py: Python<'py>) -> Result<Self, UsdError> {
+        let missing = |error: PyErr| UsdError::Missing { reason: reason(py, &error) };
+        let usd = py.import("pxr.Usd").map_err(missing)?;
+        let parts: Vec<u32> = usd
+            .call_method0("GetVersion")
+            .and_then(|version| version.extract())
+            .map_err(|error| UsdError::Python { reason: reason(py, &error) })?;
+        // (0, 26, 8) is release 26.8.
+        let (year, month) = match parts[..] {
+            [_, year, month, ..] => (year, month),
+            _ => (0, 0),
+        };
+        let version = format!("{year}.{month}");
+        if (year, month) < tokens::MINIMUM_USD {
+            return Err(UsdError::TooOld { found: version });
+        }
+        let module = |name: &str| py.import(name).map_err(missing);
+        Ok(Self {
+            py,
+            gf: module("pxr.Gf")?,
+            sdf: module("pxr.Sdf")?,
+            usd,
+            usd_geom: module("pxr.UsdGeom")?,
+            usd_semantics: module("pxr.UsdSemantics")?,
+            usd_utils: module("pxr.UsdUtils")?,
+            usd_vol: module("pxr.UsdVol")?,
+            vt: module("pxr.Vt")?,
+            version,
+        })
+    }
+
+    fn array(&self, class: &str, flat: &[f32], columns: usize) -> PyResult<Bound<'py, PyAny>> {
+        let array = PyArray1::from_slice(self.py, flat);
+        let array = if columns == 1 {
+            array.into_any()
+        } else {
+            array.reshape([flat.len() / columns, columns])?.into_any()
+        };
+        self.vt.getattr(class)?.call_method1("FromNumpy", (array,))
+    }
+
+    /// `VtVec3fArray`.
+    pub(crate) fn vec3f_array(&self, values: &[[f32; 3]]) -> PyResult<Bound<'py, PyAny>> {
+        self.array("Vec3fArray", values.as_flattened(), 3)
+    }
+
+    /// `VtVec3fArray` of flat triples.
+    pub(crate) fn vec3f_array_flat(&self, values: &[f32]) -> PyResult<Bound<'py, PyAny>> {
+        self.array("Vec3fArray", values, 3)
+    }
+
+    /// `VtFloatArray`.
+    pub(crate) fn float_array(&self, values: &[f32]) -> PyResult<Bound<'py, PyAny>> {
+        self.array("FloatArray", values, 1)
+    }
+
+    /// `VtQuatfArray` of (w, x, y, z) quaternions.
+    pub(crate) fn quatf_array(&self, values: &[[f32; 4]]) -> PyResult<Bound<'py, PyAny>> {
+        self.array("QuatfArray", conventions::quaternion_memory_order(values).as_flattened(), 4)
+    }
+
+    /// `GfVec3d`.
+    pub(crate) fn vec3d(&self, v: glam::DVec3) -> PyResult<Bound<'py, PyAny>> {
+        self.gf.call_method1("Vec3d", (v.x, v.y, v.z))
+    }
+
+    /// `GfQuatf`.
+    pub(crate) fn quatf(&self, q: glam::DQuat) -> PyResult<Bound<'py, PyAny>> {
+        self.gf.call_method1("Quatf", (q.w, q.x, q.y, q.z))
+    }
+
+    /// `UsdTimeCode`; the default time for `None`.
+    pub(crate) fn time_code(&self, time_code: Option<f64>) -> PyResult<Bound<'py, PyAny>> {
+        let class = self.usd.getattr("TimeCode")?;
+        match time_code {
+            Some(value) => class.call1((value,)),
+            None => class.call_method0("Default"),
+        }
+    }
+
+    /// `SdfValueTypeNames.<name>`.
+    pub(crate) fn value_type(&self, name: &str) -> PyResult<Bound<'py, PyAny>> {
+        self.sdf.getattr("ValueTypeNames")?.getattr(name)
+    }
+
+    /// `Schema.Define(stage, path)` of a schema class.
+    pub(crate) fn define(
+        &self,
+        module: &Bound<'py, PyModule>,
+        schema: &str,
+        stage: &Bound<'py, PyAny>,
+        path: &str,
+    ) -> PyResult<Bound<'py, PyAny>> {
+        module.getattr(schema)?.call_method1("Define", (stage, path))
+    }
+
+    /// A dictionary of simple values.
+    pub(crate) fn dictionary(&self) -> Bound<'py, PyDict> {
+        PyDict::new(self.py)
+    }
+}
+
+/// `object.CreateXAttr().Set(value)`: the default value of a schema attribute.
+pub(crate) fn set_default<'py>(
+    object: &Bound<'py, PyAny>,
+    create: &str,
+    value: impl IntoPyObject<'py>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let attribute = object.call_method0(create)?;
+    set(&attribute, value, None)?;
+    Ok(attribute)
+}
+
+/// `attribute.Set(value[, time])`; an attribute that refuses is an error, not a missing value.
+pub(crate) fn set<'py>(
+    attribute: &Bound<'py, PyAny>,
+    value: impl IntoPyObject<'py>,
+    time_code: Option<f64>,
+) -> PyResult<()> {
+    let py = attribute.py();
+    let value = value.into_pyobject(py).map_err(Into::into)?.into_any().unbind();
+    let arguments = match time_code {
+        Some(time_code) => PyTuple::new(py, [value, time_code.into_pyobject(py)?.into_any().unbind()])?,
+        None => PyTuple::new(py, [value])?,
+    };
+    if attribute.call_method1("Set", arguments)?.is_truthy()? {
+        Ok(())
+    } else {
+        let name: String = attribute.call_method0("GetName")?.extract()?;
+        Err(pyo3::exceptions::PyRuntimeError::new_err(format!("{name} does not take its value")))
+    }
+}

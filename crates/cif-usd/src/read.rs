@@ -1,0 +1,134 @@
+//! Prims by label.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use cif_scene::{LabelMatch, LabelQuery};
+use globset::GlobMatcher;
+use pyo3::prelude::*;
+
+use crate::pxr::{self, Pxr, reason};
+use crate::{UsdError, conventions, tokens};
+
+pub(crate) fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdError> {
+    let matcher = query.matcher()?;
+    pxr::with(|pxr| {
+        if !path.is_file() {
+            return Err(UsdError::NotFound { path: path.to_owned() });
+        }
+        let stage = pxr.usd.getattr("Stage").and_then(|class| class.call_method1("Open", (path,))).map_err(
+            |error| UsdError::Unreadable { path: path.to_owned(), reason: reason(pxr.py, &error) },
+        )?;
+        let (found, known) = search(pxr, &stage, query, &matcher)
+            .map_err(|error| UsdError::Python { reason: reason(pxr.py, &error) })?;
+        if found.is_empty() {
+            return Err(query.unknown(&path.display().to_string(), known).into());
+        }
+        Ok(found)
+    })
+}
+
+/// Matching prims, and all labels of the stage.
+fn search<'py>(
+    pxr: &Pxr<'py>,
+    stage: &Bound<'py, PyAny>,
+    query: &LabelQuery,
+    matcher: &GlobMatcher,
+) -> PyResult<(Vec<LabelMatch>, Vec<String>)> {
+    let time = pxr.time_code(query.time_code)?;
+    let labels_api = pxr.usd_semantics.getattr("LabelsAPI")?;
+    let transforms = pxr.usd_geom.getattr("XformCache")?.call1((&time,))?;
+    let purposes = vec![pxr.usd_geom.getattr("Tokens")?.getattr("default_")?];
+    let boxes = pxr.usd_geom.getattr("BBoxCache")?.call1((&time, purposes))?;
+    // A query caches what it has seen: one per taxonomy.
+    let mut queries: BTreeMap<String, Bound<'py, PyAny>> = BTreeMap::new();
+    let (mut found, mut known) = (Vec::new(), Vec::new());
+    for prim in stage.call_method0("Traverse")?.try_iter()? {
+        let prim = prim?;
+        let taxonomies: Vec<String> = labels_api
+            .call_method1("GetDirectTaxonomies", (&prim,))?
+            .try_iter()?
+            .map(|taxonomy| taxonomy?.str()?.extract())
+            .collect::<PyResult<_>>()?;
+        let mut by_taxonomy: BTreeMap<String, Vec<String>> = BTreeMap::new();
+        for taxonomy in taxonomies {
+            let labels_query = match queries.get(&taxonomy) {
+                Some(labels_query) => labels_query.clone(),
+                None => {
+                    let class = pxr.usd_semantics.getattr("LabelsQuery")?;
+                    let labels_query = class.call1((&taxonomy, &time))?;
+                    queries.insert(taxonomy.clone(), labels_query.clone());
+                    labels_query
+                }
+            };
+            let mut labels: Vec<String> = labels_query
+                .call_method1("ComputeUniqueDirectLabels", (&prim,))?
+                .try_iter()?
+                .map(|label| label?.str()?.extract())
+                .collect::<PyResult<_>>()?;
+            labels.sort();
+            by_taxonomy.insert(taxonomy, labels);
+        }
+        if by_taxonomy.values().flatten().any(|label| matcher.is_match(label)) {
+            found.push(describe(&prim, &by_taxonomy, &time, &labels_api, &transforms, &boxes)?);
+        }
+        known.extend(by_taxonomy.into_values().flatten());
+    }
+    Ok((found, known))
+}
+
+fn describe<'py>(
+    prim: &Bound<'py, PyAny>,
+    by_taxonomy: &BTreeMap<String, Vec<String>>,
+    time: &Bound<'py, PyAny>,
+    labels_api: &Bound<'py, PyAny>,
+    transforms: &Bound<'py, PyAny>,
+    boxes: &Bound<'py, PyAny>,
+) -> PyResult<LabelMatch> {
+    let first = |taxonomy: &str| {
+        by_taxonomy.get(taxonomy).and_then(|labels| labels.first()).cloned().unwrap_or_default()
+    };
+    // The class stands first in the attribute, before the human label; the query itself gives a set.
+    let authored = labels_api
+        .call_method1("Get", (prim, tokens::TAXONOMY_CLASS))?
+        .call_method0("GetLabelsAttr")?
+        .call_method1("Get", (time,));
+    let class = match authored {
+        Ok(labels) if labels.is_truthy()? => labels.get_item(0)?.str()?.extract()?,
+        _ => first(tokens::TAXONOMY_CLASS),
+    };
+    let attribute = prim.call_method1("GetAttribute", (tokens::USER_LABEL,))?;
+    let label = if attribute.is_truthy()? {
+        attribute.call_method1("Get", (time,))?.extract::<Option<String>>()?
+    } else {
+        None
+    };
+    let matrix = transforms.call_method1("GetLocalToWorldTransform", (prim,))?;
+    let mut rows = [[0.0; 4]; 4];
+    for (index, row) in rows.iter_mut().enumerate() {
+        *row = numbers(&matrix.call_method1("GetRow", (index,))?)?;
+    }
+    let range = boxes.call_method1("ComputeWorldBound", (prim,))?.call_method0("ComputeAlignedRange")?;
+    let (low, high) = if range.call_method0("IsEmpty")?.is_truthy()? {
+        (None, None)
+    } else {
+        (Some(numbers(&range.call_method0("GetMin")?)?), Some(numbers(&range.call_method0("GetMax")?)?))
+    };
+    Ok(LabelMatch {
+        path: prim.call_method0("GetPath")?.str()?.extract()?,
+        label: label.unwrap_or_else(|| class.clone()),
+        class,
+        instance: first(tokens::TAXONOMY_INSTANCE),
+        transform: conventions::column_vector_matrix(rows),
+        low,
+        high,
+    })
+}
+
+fn numbers<const N: usize>(vector: &Bound<'_, PyAny>) -> PyResult<[f64; N]> {
+    let mut values = [0.0; N];
+    for (index, value) in values.iter_mut().enumerate() {
+        *value = vector.get_item(index)?.extract()?;
+    }
+    Ok(values)
+}
