@@ -26,7 +26,9 @@ pub(super) struct TileLists {
 /// Sorts splats front to back; ties keep the order of the Gaussians.
 pub(super) fn sort_by_depth(splats: &mut [Splat]) {
     // Positive floats order like their bits; the index breaks ties.
-    splats.par_sort_unstable_by_key(|splat| (u64::from(splat.order.to_bits()) << 32) | u64::from(splat.gaussian));
+    splats.par_sort_unstable_by_key(|splat| {
+        (u64::from(splat.order.to_bits()) << 32) | u64::from(splat.gaussian)
+    });
 }
 
 /// Smallest sigma of a splat over a tile's pixel centres' bounding rectangle.
@@ -91,7 +93,8 @@ impl TileLists {
         let chunks: Vec<(Vec<u32>, Vec<u32>)> = splats
             .par_chunks(CHUNK)
             .map(|chunk| {
-                let (mut counts, mut reached) = (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
+                let (mut counts, mut reached) =
+                    (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
                 for splat in chunk {
                     let before = reached.len();
                     visit_tiles(splat, columns, rows, |tile| reached.push(tile));

@@ -13,6 +13,7 @@ use fearless_simd::{Level, dispatch};
 use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
+use super::channels::{add_scaled, blend, running_product, slope};
 use super::matrix::{Operand, multiply_into};
 
 /// Rows that go through the network together; sized so that activations stay in the second-level cache.
@@ -27,11 +28,20 @@ pub(super) struct DeformationAtTime<'a> {
     levels: Vec<[PlaneLayout; PLANES]>,
     mlp: MlpLayout,
     channels: usize,
+    /// `[levels][3]` maps from positions to node coordinates.
+    axes: Vec<[AxisScale; 3]>,
     /// `[levels][3]` lines of the xt, yt and zt planes, each `[columns, channels]`.
     lines: Vec<[Vec<f32>; 3]>,
     /// Stored row below the time, and the fraction above it.
     time_row: usize,
     time_fraction: f32,
+}
+
+/// `coordinate = (position - low) * slope`, in [0, last].
+struct AxisScale {
+    low: f64,
+    slope: f64,
+    last: f64,
 }
 
 /// Position of a Gaussian along one axis of one level.
@@ -104,28 +114,47 @@ impl<'a> DeformationAtTime<'a> {
                     let row_len = layout.columns * channels;
                     let start = layout.offset + time_row * row_len;
                     let (below, above) = deformation.planes[start..start + 2 * row_len].split_at(row_len);
-                    below.iter().zip(above).map(|(b, a)| (1.0 - time_fraction) * b + time_fraction * a).collect()
+                    below
+                        .iter()
+                        .zip(above)
+                        .map(|(b, a)| (1.0 - time_fraction) * b + time_fraction * a)
+                        .collect()
                 })
             })
             .collect();
-        Self { deformation, mlp: config.mlp_layout(), levels, channels, lines, time_row, time_fraction }
+        let bounds = &deformation.bounds;
+        let axes = (0..levels.len())
+            .map(|level| {
+                [0, 1, 2].map(|axis| {
+                    let last = (config.nodes(level, axis) - 1) as f64;
+                    let slope = last / (bounds.high[axis] - bounds.low[axis]);
+                    AxisScale { low: bounds.low[axis], slope, last }
+                })
+            })
+            .collect();
+        Self { deformation, axes, mlp: config.mlp_layout(), levels, channels, lines, time_row, time_fraction }
     }
 
+    #[inline(always)]
     fn axis_tap(&self, level: usize, axis: usize, position: f32) -> AxisTap {
-        let nodes = self.deformation.config.nodes(level, axis);
-        let low = self.deformation.bounds.low[axis];
-        let size = self.deformation.bounds.high[axis] - low;
-        let last = (nodes - 1) as f64;
-        let slope = last / size;
-        let coordinate = (f64::from(position) - low) * slope;
-        let inside = coordinate > 0.0 && coordinate < last;
-        let coordinate = coordinate.clamp(0.0, last);
-        let node = (coordinate as usize).min(nodes - 2);
+        let scale = &self.axes[level][axis];
+        // In double precision, so that a far-off-centre box costs no accuracy.
+        let coordinate = (f64::from(position) - scale.low) * scale.slope;
+        let inside = coordinate > 0.0 && coordinate < scale.last;
+        let coordinate = coordinate.clamp(0.0, scale.last);
+        let node = (coordinate as usize).min(scale.last as usize - 1);
         AxisTap {
             node,
             fraction: (coordinate - node as f64) as f32,
-            slope: if inside { slope as f32 } else { 0.0 },
+            slope: if inside { scale.slope as f32 } else { 0.0 },
         }
+    }
+
+    /// The two nodes of a time line around a tap.
+    #[inline(always)]
+    fn line_nodes(&self, level: usize, line: usize, tap: AxisTap) -> (&[f32], &[f32]) {
+        let start = tap.node * self.channels;
+        self.lines[level][line][start..start + 2 * self.channels].split_at(self.channels)
     }
 
     fn axis_taps(&self, level: usize, position: [f32; 3]) -> [AxisTap; 3] {
@@ -238,7 +267,8 @@ impl<'a> DeformationAtTime<'a> {
                     .zip(v_values.chunks_mut(BLOCK * value_len))
                     .zip(v_positions.chunks_mut(BLOCK))
                 {
-                    let positions: Vec<[f32; 3]> = rows.iter().map(|row| gaussians.means[*row as usize]).collect();
+                    let positions: Vec<[f32; 3]> =
+                        rows.iter().map(|row| gaussians.means[*row as usize]).collect();
                     self.forward_block(level, &positions, block);
                     self.backward_block(rows, v, block, &mut v_mlp);
                     dispatch!(level, simd => look_up_rows_backward(
@@ -261,7 +291,13 @@ impl<'a> DeformationAtTime<'a> {
     }
 
     /// Network gradients of a block; leaves `v_features` in the block.
-    fn backward_block(&self, rows: &[u32], v: &PosedArrayGradients, block: &mut Activations, v_mlp: &mut [f32]) {
+    fn backward_block(
+        &self,
+        rows: &[u32],
+        v: &PosedArrayGradients,
+        block: &mut Activations,
+        v_mlp: &mut [f32],
+    ) {
         let parameters = &self.deformation.mlp;
         let count = rows.len();
         let width = self.mlp.trunk.outputs;
@@ -313,7 +349,14 @@ impl<'a> DeformationAtTime<'a> {
 
     /// Adds `[active, levels, 6, channels]` gradients of plane values to the planes. One task per plane
     /// visits the rows in order, so sums do not depend on the number of threads.
-    fn scatter(&self, level: Level, gaussians: &Gaussians, active: &[u32], v_values: &[f32], v_planes: &mut [f32]) {
+    fn scatter(
+        &self,
+        level: Level,
+        gaussians: &Gaussians,
+        active: &[u32],
+        v_values: &[f32],
+        v_planes: &mut [f32],
+    ) {
         let mut tasks = Vec::new();
         let mut rest = v_planes;
         for (index, planes) in self.levels.iter().enumerate() {
@@ -374,7 +417,6 @@ fn look_up_rows<S: Simd>(
     values: &mut [f32],
     features: &mut [f32],
 ) {
-    let _ = simd;
     let channels = at.channels;
     let planes = &at.deformation.planes;
     let row_values = at.levels.len() * PLANES * channels;
@@ -390,27 +432,17 @@ fn look_up_rows<S: Simd>(
             for (plane, column, row) in SPATIAL {
                 let (f, g) = (taps[column].fraction, taps[row].fraction);
                 let weights = [(1.0 - f) * (1.0 - g), f * (1.0 - g), (1.0 - f) * g, f * g];
-                let nodes = at.nodes(&layouts[plane], taps[column], taps[row]);
-                let q = nodes.map(|node| &planes[node..node + channels]);
+                let nodes = at
+                    .nodes(&layouts[plane], taps[column], taps[row])
+                    .map(|node| &planes[node..node + channels]);
                 let out = &mut values[plane * channels..(plane + 1) * channels];
-                for c in 0..channels {
-                    let value =
-                        weights[0] * q[0][c] + weights[1] * q[1][c] + weights[2] * q[2][c] + weights[3] * q[3][c];
-                    out[c] = value;
-                    features[c] *= value;
-                }
+                blend(simd, weights, nodes, out, features);
             }
             for (line, (plane, axis)) in TEMPORAL.into_iter().enumerate() {
                 let tap = taps[axis];
-                let start = tap.node * channels;
-                let (below, above) =
-                    at.lines[level][line][start..start + 2 * channels].split_at(channels);
+                let (below, above) = at.line_nodes(level, line, tap);
                 let out = &mut values[plane * channels..(plane + 1) * channels];
-                for c in 0..channels {
-                    let value = (1.0 - tap.fraction) * below[c] + tap.fraction * above[c];
-                    out[c] = value;
-                    features[c] *= value;
-                }
+                blend(simd, [1.0 - tap.fraction, tap.fraction], [below, above], out, features);
             }
         }
     }
@@ -427,11 +459,10 @@ fn look_up_rows_backward<S: Simd>(
     v_values: &mut [f32],
     v_positions: &mut [[f32; 3]],
 ) {
-    let _ = simd;
     let channels = at.channels;
     let planes = &at.deformation.planes;
     let row_values = at.levels.len() * PLANES * channels;
-    let mut prefix = vec![0.0_f32; channels];
+    let mut running = vec![0.0_f32; channels];
     for (row, position) in positions.iter().enumerate() {
         let mut v_position = [0.0_f32; 3];
         for (level, layouts) in at.levels.iter().enumerate() {
@@ -439,46 +470,29 @@ fn look_up_rows_backward<S: Simd>(
             let values = &values[start..start + PLANES * channels];
             let g = &mut v_values[start..start + PLANES * channels];
             let feature = (row * at.levels.len() + level) * channels;
-            prefix.copy_from_slice(&v_features[feature..feature + channels]);
+            running.copy_from_slice(&v_features[feature..feature + channels]);
+            let of = |plane: usize| plane * channels..(plane + 1) * channels;
             for plane in 0..PLANES {
-                let value = &values[plane * channels..(plane + 1) * channels];
-                let g = &mut g[plane * channels..(plane + 1) * channels];
-                for c in 0..channels {
-                    g[c] = prefix[c];
-                    prefix[c] *= value[c];
-                }
+                running_product(simd, false, &values[of(plane)], &mut running, &mut g[of(plane)]);
             }
-            prefix.fill(1.0);
+            running.fill(1.0);
             for plane in (0..PLANES).rev() {
-                let value = &values[plane * channels..(plane + 1) * channels];
-                let g = &mut g[plane * channels..(plane + 1) * channels];
-                for c in 0..channels {
-                    g[c] *= prefix[c];
-                    prefix[c] *= value[c];
-                }
+                running_product(simd, true, &values[of(plane)], &mut running, &mut g[of(plane)]);
             }
             let taps = at.axis_taps(level, *position);
             for (plane, column, row) in SPATIAL {
                 let (f, h) = (taps[column].fraction, taps[row].fraction);
-                let q = at.nodes(&layouts[plane], taps[column], taps[row]).map(|n| &planes[n..n + channels]);
-                let g = &g[plane * channels..(plane + 1) * channels];
-                let (mut along_column, mut along_row) = (0.0, 0.0);
-                for c in 0..channels {
-                    along_column += g[c] * ((1.0 - h) * (q[1][c] - q[0][c]) + h * (q[3][c] - q[2][c]));
-                    along_row += g[c] * ((1.0 - f) * (q[2][c] - q[0][c]) + f * (q[3][c] - q[1][c]));
-                }
-                v_position[column] += along_column * taps[column].slope;
-                v_position[row] += along_row * taps[row].slope;
+                let q = at
+                    .nodes(&layouts[plane], taps[column], taps[row])
+                    .map(|node| &planes[node..node + channels]);
+                let g = &g[of(plane)];
+                v_position[column] +=
+                    slope(simd, g, [(q[1], q[0], 1.0 - h), (q[3], q[2], h)]) * taps[column].slope;
+                v_position[row] += slope(simd, g, [(q[2], q[0], 1.0 - f), (q[3], q[1], f)]) * taps[row].slope;
             }
             for (line, (plane, axis)) in TEMPORAL.into_iter().enumerate() {
-                let start = taps[axis].node * channels;
-                let (below, above) = at.lines[level][line][start..start + 2 * channels].split_at(channels);
-                let g = &g[plane * channels..(plane + 1) * channels];
-                let mut along = 0.0;
-                for c in 0..channels {
-                    along += g[c] * (above[c] - below[c]);
-                }
-                v_position[axis] += along * taps[axis].slope;
+                let (below, above) = at.line_nodes(level, line, taps[axis]);
+                v_position[axis] += slope(simd, &g[of(plane)], [(above, below, 1.0)]) * taps[axis].slope;
             }
         }
         v_positions[row] = v_position;
@@ -496,7 +510,6 @@ fn scatter_plane<S: Simd>(
     v_values: &[f32],
     v_plane: &mut [f32],
 ) {
-    let _ = simd;
     let channels = at.channels;
     let layout = &at.levels[level][plane];
     let row_values = at.levels.len() * PLANES * channels;
@@ -509,17 +522,13 @@ fn scatter_plane<S: Simd>(
             let v = &v[offset..offset + channels];
             let start = tap.node * channels;
             let (below, above) = line[start..start + 2 * channels].split_at_mut(channels);
-            for c in 0..channels {
-                below[c] += (1.0 - tap.fraction) * v[c];
-                above[c] += tap.fraction * v[c];
-            }
+            add_scaled(simd, 1.0 - tap.fraction, v, below);
+            add_scaled(simd, tap.fraction, v, above);
         }
         let start = at.time_row * line.len();
         let (below, above) = v_plane[start..start + 2 * line.len()].split_at_mut(line.len());
-        for ((below, above), v) in below.iter_mut().zip(above).zip(&line) {
-            *below += (1.0 - at.time_fraction) * v;
-            *above += at.time_fraction * v;
-        }
+        add_scaled(simd, 1.0 - at.time_fraction, &line, below);
+        add_scaled(simd, at.time_fraction, &line, above);
     } else {
         let (_, column_axis, row_axis) =
             *SPATIAL.iter().find(|(p, ..)| *p == plane).expect("spatial planes are listed");
@@ -532,12 +541,10 @@ fn scatter_plane<S: Simd>(
             let node = (row.node * layout.columns + column.node) * channels;
             let next = layout.columns * channels;
             let (lower, upper) = v_plane[node..node + next + 2 * channels].split_at_mut(next);
-            for c in 0..channels {
-                lower[c] += (1.0 - f) * (1.0 - g) * v[c];
-                lower[channels + c] += f * (1.0 - g) * v[c];
-                upper[c] += (1.0 - f) * g * v[c];
-                upper[channels + c] += f * g * v[c];
-            }
+            add_scaled(simd, (1.0 - f) * (1.0 - g), v, &mut lower[..channels]);
+            add_scaled(simd, f * (1.0 - g), v, &mut lower[channels..2 * channels]);
+            add_scaled(simd, (1.0 - f) * g, v, &mut upper[..channels]);
+            add_scaled(simd, f * g, v, &mut upper[channels..]);
         }
     }
 }

@@ -1,6 +1,9 @@
 //! Row-major matrix products through `matrixmultiply`, with their lengths checked.
 
-#![allow(unsafe_code, reason = "the one door to matrixmultiply's pointer interface; lengths are checked here")]
+#![allow(
+    unsafe_code,
+    reason = "the one door to matrixmultiply's pointer interface; lengths are checked here"
+)]
 
 /// A row-major matrix, possibly read transposed.
 #[derive(Clone, Copy)]
@@ -43,11 +46,20 @@ pub(super) fn multiply_into(a: Operand<'_>, b: Operand<'_>, beta: f32, out: &mut
     // inside its slice; `out` is borrowed mutably, so it overlaps neither input.
     unsafe {
         matrixmultiply::sgemm(
-            m, k, n, 1.0,
-            a.values.as_ptr(), row_a, column_a,
-            b.values.as_ptr(), row_b, column_b,
+            m,
+            k,
+            n,
+            1.0,
+            a.values.as_ptr(),
+            row_a,
+            column_a,
+            b.values.as_ptr(),
+            row_b,
+            column_b,
             beta,
-            out.as_mut_ptr(), n as isize, 1,
+            out.as_mut_ptr(),
+            n as isize,
+            1,
         );
     }
 }

@@ -13,6 +13,7 @@
 //! order fixed by the data.
 
 mod bin;
+mod channels;
 mod deform;
 mod dense;
 mod identity;

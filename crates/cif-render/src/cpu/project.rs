@@ -185,10 +185,7 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
     });
     let r = 1.0 / z;
     let [fx, fy] = view.focal;
-    let jacobian = [
-        [fx * r, 0.0, -fx * clamped_xy[0] * r * r],
-        [0.0, fy * r, -fy * clamped_xy[1] * r * r],
-    ];
+    let jacobian = [[fx * r, 0.0, -fx * clamped_xy[0] * r * r], [0.0, fy * r, -fy * clamped_xy[1] * r * r]];
     // J has two non-zero entries a row.
     let v = &covariance_in_camera;
     let [j0, j1] = &jacobian;
@@ -268,10 +265,7 @@ pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) ->
     }
     let reach = (strongest / MIN_ALPHA).ln();
     let [x, y, z] = footprint.in_camera;
-    let mean = [
-        view.focal[0] * x / z + view.principal[0],
-        view.focal[1] * y / z + view.principal[1],
-    ];
+    let mean = [view.focal[0] * x / z + view.principal[0], view.focal[1] * y / z + view.principal[1]];
     let [c00, c01, c11] = footprint.blurred;
     let extent = [(2.0 * reach * c00).sqrt(), (2.0 * reach * c11).sqrt()];
     let inside = mean[0] + extent[0] > 0.0
@@ -377,11 +371,8 @@ pub(super) fn project_backward(
     let r = 1.0 / z;
     let (r2, r3) = (r * r, r * r * r);
     let [fx, fy] = view.focal;
-    let mut v_point = [
-        fx * r * v.mean[0],
-        fy * r * v.mean[1],
-        -(fx * x * v.mean[0] + fy * y * v.mean[1]) * r2,
-    ];
+    let mut v_point =
+        [fx * r * v.mean[0], fy * r * v.mean[1], -(fx * x * v.mean[0] + fy * y * v.mean[1]) * r2];
     v_point[2] += -fx * r2 * v_j[0][0] - fy * r2 * v_j[1][1];
     for (axis, focal) in [fx, fy].into_iter().enumerate() {
         let slope = focal * f.clamped_xy[axis] * r3 * v_j[axis][2];
@@ -402,7 +393,9 @@ pub(super) fn project_backward(
     let mut v_mean = [0, 1, 2].map(|c| rv[0][c] * v_point[0] + rv[1][c] * v_point[1] + rv[2][c] * v_point[2]);
     let gjm = gj.map(|row| {
         [0, 1, 2].map(|c| {
-            row[0] * f.spread_in_camera[0][c] + row[1] * f.spread_in_camera[1][c] + row[2] * f.spread_in_camera[2][c]
+            row[0] * f.spread_in_camera[0][c]
+                + row[1] * f.spread_in_camera[1][c]
+                + row[2] * f.spread_in_camera[2][c]
         })
     });
     let mut v_spread_in_camera = [[0.0; 3]; 3];
@@ -425,7 +418,9 @@ pub(super) fn project_backward(
         if f.clamped_scale[c] {
             0.0
         } else {
-            f.spread[0][c] * v_spread[0][c] + f.spread[1][c] * v_spread[1][c] + f.spread[2][c] * v_spread[2][c]
+            f.spread[0][c] * v_spread[0][c]
+                + f.spread[1][c] * v_spread[1][c]
+                + f.spread[2][c] * v_spread[2][c]
         }
     });
     let mut v_rotation = v_spread;
@@ -464,7 +459,8 @@ pub(super) fn project_backward(
                     v_direction[axis] += gradient[m][axis] * along;
                 }
             }
-            let radial = direction[0] * v_direction[0] + direction[1] * v_direction[1] + direction[2] * v_direction[2];
+            let radial =
+                direction[0] * v_direction[0] + direction[1] * v_direction[1] + direction[2] * v_direction[2];
             for axis in 0..3 {
                 v_mean[axis] += (v_direction[axis] - direction[axis] * radial) / distance;
             }

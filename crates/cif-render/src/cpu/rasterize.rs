@@ -93,7 +93,8 @@ impl IdentityRows<'_> {
         let labels = &self.labels[range.clone()];
         let probabilities = &self.probabilities[range];
         for (slot, wanted) in tile_labels.iter().enumerate() {
-            out[slot] = labels.iter().position(|label| label == wanted).map_or(0.0, |entry| probabilities[entry]);
+            out[slot] =
+                labels.iter().position(|label| label == wanted).map_or(0.0, |entry| probabilities[entry]);
         }
     }
 }
@@ -210,8 +211,9 @@ impl<S: Simd> SplatInTile<S> {
     /// Footprint P and the mask of pixels where it is valid (sigma >= 0).
     #[inline(always)]
     pub(super) fn footprint(&self, simd: S, dx: f32x8<S>, dy: f32) -> (f32x8<S>, fearless_simd::mask32x8<S>) {
-        let exponent =
-            dx.mul_add(splat(simd, self.a), splat(simd, self.b * dy)).mul_add(dx, splat(simd, self.c * dy * dy));
+        let exponent = dx
+            .mul_add(splat(simd, self.a), splat(simd, self.b * dy))
+            .mul_add(dx, splat(simd, self.c * dy * dy));
         (exp2(simd, exponent), exponent.simd_le(splat(simd, 0.0)))
     }
 }
@@ -266,7 +268,10 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
             continue;
         }
         image.evaluated += u64::from(groups.count_ones()) * LANES as u64;
-        if INSTANCES && let Some((tile_labels, rows)) = labels && groups & live_instances != 0 {
+        if INSTANCES
+            && let Some((tile_labels, rows)) = labels
+            && groups & live_instances != 0
+        {
             rows.at_labels(s.gaussian, &tile_labels.labels, &mut slot_probabilities);
         }
         let opacity = splat(simd, s.opacity);
@@ -287,7 +292,9 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
                 let weight = blends.select(t * alpha, zero);
                 for channel in 0..3 {
                     let c = load(simd, &image.color[channel][group]);
-                    weight.mul_add(splat(simd, s.color[channel]), c).store_array(&mut image.color[channel][group]);
+                    weight
+                        .mul_add(splat(simd, s.color[channel]), c)
+                        .store_array(&mut image.color[channel][group]);
                 }
                 if DEPTH {
                     let d = load(simd, &image.depth[group]);
@@ -300,7 +307,10 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
                 }
             }
 
-            if INSTANCES && live_instances >> group & 1 == 1 && let Some((tile_labels, _)) = labels {
+            if INSTANCES
+                && live_instances >> group & 1 == 1
+                && let Some((tile_labels, _)) = labels
+            {
                 let b = (occupancy * p).min(max_alpha);
                 let t = load(simd, &image.instance_transmittance[group]);
                 let draws = valid & b.simd_ge(min_alpha) & t.simd_gt(zero);

@@ -67,7 +67,8 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     if INSTANCES && let Some(instances) = instances {
         for group in 0..GROUPS {
             for lane in 0..LANES {
-                if instances.labels.labelled[group] >> lane & 1 == 1 && cotangents.weight[group][lane] != 0.0 {
+                if instances.labels.labelled[group] >> lane & 1 == 1 && cotangents.weight[group][lane] != 0.0
+                {
                     instance_transmittance[group][lane] = 1.0;
                     live_instances |= 1 << group;
                 }
@@ -147,7 +148,10 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
                 }
             }
 
-            if INSTANCES && live_instances >> group & 1 == 1 && let Some(instances) = instances {
+            if INSTANCES
+                && live_instances >> group & 1 == 1
+                && let Some(instances) = instances
+            {
                 let unclamped = occupancy * p;
                 let b = unclamped.min(max_alpha);
                 let t = load(simd, &instance_transmittance[group]);
@@ -160,8 +164,10 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
                     let identity = slot_values(simd, instances.labels, group, &slot_probabilities);
                     let weight = load(simd, &cotangents.weight[group]);
                     // The pixel's loss weight times r_i.
-                    let r = blends
-                        .select(t * b * identity * load(simd, &cotangents.weight_over_probability[group]), zero);
+                    let r = blends.select(
+                        t * b * identity * load(simd, &cotangents.weight_over_probability[group]),
+                        zero,
+                    );
                     let remainder = load(simd, &instance_remainder[group]);
                     // 1 - c_i, in units of the loss weight on use; clamped against rounding at the tail.
                     let share = weight.simd_gt(zero).select(r / weight, zero);

@@ -107,7 +107,10 @@ pub struct Renderer {
 
 impl std::fmt::Debug for Renderer {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Renderer").field("level", &self.level).field("times", &self.times).finish_non_exhaustive()
+        f.debug_struct("Renderer")
+            .field("level", &self.level)
+            .field("times", &self.times)
+            .finish_non_exhaustive()
     }
 }
 
@@ -119,7 +122,12 @@ impl Renderer {
             SimdLevel::Auto => Level::new(),
             SimdLevel::Portable => Level::baseline(),
         };
-        Self { level, times: StageTimes::default(), statistics: ViewStatistics::default(), tape: Tape::default() }
+        Self {
+            level,
+            times: StageTimes::default(),
+            statistics: ViewStatistics::default(),
+            tape: Tape::default(),
+        }
     }
 
     /// Name of the vector instructions in use.
@@ -163,7 +171,8 @@ impl Renderer {
         self.prepare(field, camera, time, &settings);
         self.rasterize(None, channels.depth);
         let (width, height) = (camera.width, camera.height);
-        let alpha = self.gather_image(width, height, |tile, group, lane| 1.0 - tile.transmittance[group][lane]);
+        let alpha =
+            self.gather_image(width, height, |tile, group, lane| 1.0 - tile.transmittance[group][lane]);
         let depth = channels.depth.then(|| {
             self.gather_image(width, height, |tile, group, lane| {
                 let coverage = 1.0 - tile.transmittance[group][lane];
@@ -419,7 +428,9 @@ impl Renderer {
         height: u32,
         value: impl Fn(&TileImage, usize, usize) -> T + Sync,
     ) -> PixelGrid<T> {
-        gather_tiles(&self.tape.lists, width, height, |tile, group, lane| value(&self.tape.tiles[tile], group, lane))
+        gather_tiles(&self.tape.lists, width, height, |tile, group, lane| {
+            value(&self.tape.tiles[tile], group, lane)
+        })
     }
 
     fn render_instances(&self, identities: &Identities, width: u32, height: u32) -> InstanceImage {
@@ -439,8 +450,12 @@ impl Renderer {
             .collect();
         InstanceImage {
             label: gather_tiles(lists, width, height, |tile, group, lane| tiles[tile].label[group][lane]),
-            probability: gather_tiles(lists, width, height, |tile, group, lane| tiles[tile].probability[group][lane]),
-            coverage: gather_tiles(lists, width, height, |tile, group, lane| tiles[tile].coverage[group][lane]),
+            probability: gather_tiles(lists, width, height, |tile, group, lane| {
+                tiles[tile].probability[group][lane]
+            }),
+            coverage: gather_tiles(lists, width, height, |tile, group, lane| {
+                tiles[tile].coverage[group][lane]
+            }),
             entropy: gather_tiles(lists, width, height, |tile, group, lane| tiles[tile].entropy[group][lane]),
         }
     }

@@ -1,7 +1,7 @@
 //! Vector helpers: one vector holds eight horizontally adjacent pixels.
 
-use fearless_simd::prelude::*;
 use fearless_simd::f32x8;
+use fearless_simd::prelude::*;
 
 /// Pixels per vector.
 pub(super) const LANES: usize = 8;
