@@ -68,7 +68,7 @@ fn visit_tiles(splat: &Splat, columns: u32, rows: u32, mut visit: impl FnMut(u32
     let (first_column, last_column) = range(0, columns);
     let (first_row, last_row) = range(1, rows);
     // A hair more than the gate, so that rounding never drops a tile that holds a drawn pixel.
-    let reach = splat.reach * 1.000_01 + 1e-5;
+    let reach = splat.reach[0].max(splat.reach[1]) * 1.000_01 + 1e-5;
     for row in i64::from(first_row)..=last_row {
         for column in i64::from(first_column)..=last_column {
             let low = [column as f32 * tile + 0.5, row as f32 * tile + 0.5];

@@ -68,8 +68,8 @@ pub(super) fn instance_tile<S: Simd>(
         if s.occupancy < MIN_ALPHA {
             continue;
         }
-        let prepared = prepare(simd, s, place);
-        let mut groups = prepared.groups & live;
+        let prepared = prepare::<S, true>(simd, s, place);
+        let mut groups = prepared.groups[1] & live;
         if groups == 0 {
             continue;
         }

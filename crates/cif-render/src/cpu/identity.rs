@@ -42,8 +42,8 @@ pub(super) fn label_mass_tile<S: Simd>(
             break;
         }
         let s = &splats[rank as usize];
-        let prepared = prepare(simd, s, place);
-        let mut groups = prepared.groups & live;
+        let prepared = prepare::<S, false>(simd, s, place);
+        let mut groups = prepared.groups[0] & live;
         let opacity = splat(simd, s.opacity);
         let out = &mut mass[pair * columns..(pair + 1) * columns];
         while groups != 0 {

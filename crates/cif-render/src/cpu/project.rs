@@ -93,8 +93,9 @@ pub(super) struct Splat {
     pub(super) depth: f32,
     /// Sort key.
     pub(super) order: f32,
-    /// Largest sigma that any pass draws: `ln(255 max(o, pi))`.
-    pub(super) reach: f32,
+    /// Largest sigma that the colour and the instance pass draw: `ln(255 o)`, `ln(255 pi)`; negative where a
+    /// pass draws nothing.
+    pub(super) reach: [f32; 2],
     /// Half-widths of the drawn ellipse, pixels.
     pub(super) extent: [f32; 2],
     /// 3 standard deviations of the larger axis, pixels.
@@ -263,11 +264,12 @@ pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) ->
     if !(strongest >= MIN_ALPHA) {
         return None;
     }
-    let reach = (strongest / MIN_ALPHA).ln();
+    let reach = [opacity, occupancy].map(|weight| (weight / MIN_ALPHA).ln());
+    let furthest = reach[0].max(reach[1]);
     let [x, y, z] = footprint.in_camera;
     let mean = [view.focal[0] * x / z + view.principal[0], view.focal[1] * y / z + view.principal[1]];
     let [c00, c01, c11] = footprint.blurred;
-    let extent = [(2.0 * reach * c00).sqrt(), (2.0 * reach * c11).sqrt()];
+    let extent = [(2.0 * furthest * c00).sqrt(), (2.0 * furthest * c11).sqrt()];
     let inside = mean[0] + extent[0] > 0.0
         && mean[1] + extent[1] > 0.0
         && mean[0] - extent[0] < view.width as f32

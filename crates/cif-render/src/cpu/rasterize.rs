@@ -161,13 +161,17 @@ pub(super) struct SplatInTile<S: Simd> {
     a: f32,
     b: f32,
     c: f32,
-    /// Groups that the drawn ellipse may touch.
-    pub(super) groups: u32,
+    /// Groups that the drawn ellipse of the colour and of the instance pass may touch.
+    pub(super) groups: [u32; 2],
 }
 
-/// Bits of a row mask that belong to groups.
+/// Prepares a splat for a tile; the instance pass's groups stay empty unless `INSTANCES`.
 #[inline(always)]
-pub(super) fn prepare<S: Simd>(simd: S, s: &Splat, place: &TilePlace) -> SplatInTile<S> {
+pub(super) fn prepare<S: Simd, const INSTANCES: bool>(
+    simd: S,
+    s: &Splat,
+    place: &TilePlace,
+) -> SplatInTile<S> {
     let [x00, x01, x11] = s.conic;
     let first = s.mean[0] - (place.x as f32 + 0.5);
     let lanes = f32x8::load_array(simd, [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0]);
@@ -178,23 +182,26 @@ pub(super) fn prepare<S: Simd>(simd: S, s: &Splat, place: &TilePlace) -> SplatIn
     // wider than exact, so that rounding never hides a drawn pixel; the gate itself decides.
     let inverse = 1.0 / x00;
     let slope = x01 * inverse;
-    let reach = splat(simd, s.reach * 2.0 * 1.000_02 + 2e-5);
     let curvature = splat(simd, -(x11 - x01 * slope));
-    let mut groups = 0_u32;
+    let mut groups = [0_u32; 2];
     for block in 0..2 {
         let row_dy = splat(simd, dy - (block * LANES) as f32) - lanes;
-        let discriminant = (row_dy * row_dy).mul_add(curvature, reach) * splat(simd, inverse);
-        let reaches = discriminant.simd_gt(splat(simd, 0.0));
-        let half_width = discriminant.max(splat(simd, 0.0)).sqrt() + splat(simd, 1e-3);
+        let squared = row_dy * row_dy;
         // Position of the drawn interval's centre, in pixels from the tile's first pixel centre.
         let centre = row_dy.mul_add(splat(simd, slope), splat(simd, first));
-        let (low, high) = (centre - half_width, centre + half_width);
-        for half in 0..2 {
-            let start = (half * LANES) as f32;
-            let hits = reaches
-                & high.simd_ge(splat(simd, start))
-                & low.simd_le(splat(simd, start + (LANES - 1) as f32));
-            groups |= (hits.to_bitmask() as u32) << (half * ROWS + block * LANES);
+        for pass in 0..1 + usize::from(INSTANCES) {
+            let reach = splat(simd, s.reach[pass] * 2.0 * 1.000_02 + 2e-5);
+            let discriminant = squared.mul_add(curvature, reach) * splat(simd, inverse);
+            let reaches = discriminant.simd_gt(splat(simd, 0.0));
+            let half_width = discriminant.max(splat(simd, 0.0)).sqrt() + splat(simd, 1e-3);
+            let (low, high) = (centre - half_width, centre + half_width);
+            for half in 0..2 {
+                let start = (half * LANES) as f32;
+                let hits = reaches
+                    & high.simd_ge(splat(simd, start))
+                    & low.simd_le(splat(simd, start + (LANES - 1) as f32));
+                groups[pass] |= (hits.to_bitmask() as u32) << (half * ROWS + block * LANES);
+            }
         }
     }
     let scale = -std::f32::consts::LOG2_E;
@@ -257,20 +264,21 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
     }
 
     for &rank in ranks {
-        let live = live_color | live_instances;
-        if live == 0 {
+        if live_color | live_instances == 0 {
             break;
         }
         let s = &splats[rank as usize];
-        let prepared = prepare(simd, s, place);
-        let mut groups = prepared.groups & live;
+        let prepared = prepare::<S, INSTANCES>(simd, s, place);
+        let color_groups = prepared.groups[0] & live_color;
+        let instance_groups = prepared.groups[1] & live_instances;
+        let mut groups = color_groups | instance_groups;
         if groups == 0 {
             continue;
         }
         image.evaluated += u64::from(groups.count_ones()) * LANES as u64;
         if INSTANCES
             && let Some((tile_labels, rows)) = labels
-            && groups & live_instances != 0
+            && instance_groups != 0
         {
             rows.at_labels(s.gaussian, &tile_labels.labels, &mut slot_probabilities);
         }
@@ -308,7 +316,7 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
             }
 
             if INSTANCES
-                && live_instances >> group & 1 == 1
+                && instance_groups >> group & 1 == 1
                 && let Some((tile_labels, _)) = labels
             {
                 let b = (occupancy * p).min(max_alpha);

@@ -84,17 +84,17 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     };
 
     for (pair, &rank) in ranks.iter().enumerate() {
-        let live = live_color | live_instances;
-        if live == 0 {
+        if live_color | live_instances == 0 {
             break;
         }
         let s = &splats[rank as usize];
-        let prepared = prepare(simd, s, place);
-        let mut groups = prepared.groups & live;
+        let prepared = prepare::<S, INSTANCES>(simd, s, place);
+        let instance_groups = prepared.groups[1] & live_instances;
+        let mut groups = prepared.groups[0] & live_color | instance_groups;
         if groups == 0 {
             continue;
         }
-        let touches_instances = INSTANCES && groups & live_instances != 0;
+        let touches_instances = INSTANCES && instance_groups != 0;
         if touches_instances && let Some(instances) = instances {
             instances.rows.at_labels(s.gaussian, &instances.labels.labels, &mut slot_probabilities);
             slot_mass.fill([0.0; LANES]);
@@ -149,7 +149,7 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
             }
 
             if INSTANCES
-                && live_instances >> group & 1 == 1
+                && instance_groups >> group & 1 == 1
                 && let Some(instances) = instances
             {
                 let unclamped = occupancy * p;
