@@ -153,6 +153,31 @@ fn row_13_needles_keep_their_determinant() {
 }
 
 #[test]
+fn row_13_images_of_needles_agree_in_both_precisions() {
+    // Up to 600 px long and a fraction of a pixel wide, before the low pass.
+    for growth in [1.5, 3.5, 6.0] {
+        let config =
+            SyntheticConfig { seed: 11, gaussians: 50, screen_size: (0.01, 0.08), ..Default::default() };
+        let mut synthetic = generate(&config);
+        for log_scale in synthetic.field.gaussians.log_scales.iter_mut().step_by(5) {
+            *log_scale = [log_scale[0] + growth, -9.0, -9.0];
+        }
+        let single = common::render(&Scene::<f32>::from_field(&synthetic.field), &synthetic, &settings());
+        let double = common::render(&Scene::<f64>::from_field(&synthetic.field), &synthetic, &settings());
+        assert_eq!(single.order, double.order);
+        let mut differences: Vec<f64> = (0..single.color.pixels.len())
+            .map(|position| {
+                (f64::from(single.color.pixels[position][1]) - double.color.pixels[position][1]).abs()
+            })
+            .collect();
+        differences.sort_by(f64::total_cmp);
+        // Not the maximum: single pixels may lie on a threshold.
+        let high = differences[differences.len() * 99 / 100];
+        assert!(high < 1e-4, "growth {growth}: {high}");
+    }
+}
+
+#[test]
 fn row_14_huge_scales_are_clamped() {
     let mut field = one();
     for scale in [60.0, 1e30, f32::MAX] {

@@ -123,7 +123,7 @@ fn compare_with_dense(config: &SyntheticConfig, instances: InstanceSettings) {
     let scene = Scene::<f64>::from_field(&synthetic.field);
     let settings = RenderSettings { instances: Some(instances), ..RenderSettings::default() };
     let forward = common::render(&scene, &synthetic, &settings);
-    let identities = forward.identities.as_ref().unwrap();
+    let identities = forward.identities.as_ref().expect("the scene has identities");
     let (splats, order, labels) = (&forward.splats, &forward.order, &synthetic.labels);
     let target = InstanceTarget { labels, identities, normalisation: instances.normalisation };
     let (loss, sparse) = instance_backward(splats, order, target, instances.geometry);

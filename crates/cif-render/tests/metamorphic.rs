@@ -35,7 +35,8 @@ fn what_cannot_be_seen_changes_nothing() {
     let scene = generate(&SyntheticConfig::default());
     let before = image(&scene.field, &scene);
     let n = scene.field.gaussians.len();
-    let edits: [(&str, &dyn Fn(&mut Gaussians)); 5] = [
+    type Edit<'a> = &'a dyn Fn(&mut Gaussians);
+    let edits: [(&str, Edit<'_>); 5] = [
         ("behind the camera", &|g| {
             let behind = scene.camera.centre() - scene.camera.forward() * 2.0;
             g.means[n] = behind.as_vec3().to_array();

@@ -179,33 +179,37 @@ fn near_projection_discontinuity(
 }
 
 fn near_pixel_discontinuity(forward: &Forward<f64>) -> Option<&'static str> {
-    let near = |value: f64, threshold: f32| (value / f64::from(threshold)).ln().abs() < 5e-4;
-    for (position, state) in forward.pixels.pixels.iter().enumerate() {
-        let pixel = [position as u32 % forward.pixels.width, position as u32 / forward.pixels.width];
-        let label = forward.labels.as_ref().map_or(0, |labels| labels.pixels[position]);
-        if label != 0 && near(state.label_probability, MIN_LABEL_PROBABILITY) {
-            return Some("label probability floor");
-        }
-        for instance in [false, true] {
-            let mut transmittance = 1.0;
-            for &index in &forward.order {
-                let Some(splat) = &forward.splats[index as usize] else { continue };
-                let Some(footprint) = footprint(splat, pixel) else { continue };
-                let strength = if instance { splat.occupancy } else { splat.opacity };
-                if near(strength * footprint.peak, MIN_ALPHA) {
-                    return Some("weight 1/255");
-                }
-                if near(strength * footprint.peak, MAX_ALPHA) {
-                    return Some("weight 0.99");
-                }
-                let Some(weight) = weight(strength, footprint.peak) else { continue };
-                transmittance *= 1.0 - weight.value;
-                if near(transmittance, MIN_TRANSMITTANCE) {
-                    return Some("transmittance 1e-4");
-                }
-                if transmittance < f64::from(MIN_TRANSMITTANCE) {
-                    break;
-                }
+    (0..forward.pixels.pixels.len()).find_map(|position| pixel_discontinuity(forward, position, 5e-4))
+}
+
+/// The threshold that a weight or a transmittance of a pixel meets to within a relative `margin`, if any.
+pub fn pixel_discontinuity(forward: &Forward<f64>, position: usize, margin: f64) -> Option<&'static str> {
+    let near = |value: f64, threshold: f32| (value / f64::from(threshold)).ln().abs() < margin;
+    let state = &forward.pixels.pixels[position];
+    let pixel = [position as u32 % forward.pixels.width, position as u32 / forward.pixels.width];
+    let label = forward.labels.as_ref().map_or(0, |labels| labels.pixels[position]);
+    if label != 0 && near(state.label_probability, MIN_LABEL_PROBABILITY) {
+        return Some("label probability floor");
+    }
+    for instance in [false, true] {
+        let mut transmittance = 1.0;
+        for &index in &forward.order {
+            let Some(splat) = &forward.splats[index as usize] else { continue };
+            let Some(footprint) = footprint(splat, pixel) else { continue };
+            let strength = if instance { splat.occupancy } else { splat.opacity };
+            if near(strength * footprint.peak, MIN_ALPHA) {
+                return Some("weight 1/255");
+            }
+            if near(strength * footprint.peak, MAX_ALPHA) {
+                return Some("weight 0.99");
+            }
+            let Some(weight) = weight(strength, footprint.peak) else { continue };
+            transmittance *= 1.0 - weight.value;
+            if near(transmittance, MIN_TRANSMITTANCE) {
+                return Some("transmittance 1e-4");
+            }
+            if transmittance < f64::from(MIN_TRANSMITTANCE) {
+                break;
             }
         }
     }
@@ -242,7 +246,9 @@ impl Mismatches {
         self.compared += 1;
         self.nonzero += usize::from(expected != 0.0);
         let tolerance = relative * expected.abs().max(actual.abs()) + absolute;
-        if !((expected - actual).abs() <= tolerance) {
+        let difference = (expected - actual).abs();
+        // A NaN must not pass.
+        if difference.is_nan() || difference > tolerance {
             self.rows.push(format!(
                 "{what:>20} {index:>6} {expected:>20.12e} {actual:>20.12e} {tolerance:>10.1e}"
             ));
