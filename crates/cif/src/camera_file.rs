@@ -60,7 +60,8 @@ struct Entry {
 pub fn read(path: &Path) -> Result<Vec<View>, Error> {
     let text = std::fs::read_to_string(path).map_err(Error::io("read the camera file", path))?;
     let entries: Vec<Entry> = serde_json::from_str(&text).map_err(|error| {
-        let start = text.split_inclusive('\n').take(error.line().saturating_sub(1)).map(str::len).sum::<usize>();
+        let start =
+            text.split_inclusive('\n').take(error.line().saturating_sub(1)).map(str::len).sum::<usize>();
         let at = start + error.column().saturating_sub(1);
         Error::in_text(path, &text, at..at + 1, error.to_string(), Some(FORMAT_HELP.to_owned()))
     })?;
@@ -181,7 +182,10 @@ mod tests {
             (r#""focal_px": [5, 5], "position": [0,0,0], "look_at": [0,0,0]"#, "direction"),
             (r#""focal_px": [5, 5], "position": [0,0,0], "look_at": [0,0,1]"#, "direction"),
             (r#""focal_px": [5, 5]"#, "world_from_camera"),
-            (r#""focal_px": [5, 5], "world_from_camera": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"#, "rotation"),
+            (
+                r#""focal_px": [5, 5], "world_from_camera": [[2,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"#,
+                "rotation",
+            ),
             (r#""focal_px": [5, 5], "position": [0,0,0], "look_at": [1,0,0], "time": 2"#, "0 to 1"),
         ] {
             let error = parse(&format!("[{{{base}, {rest}}}]")).unwrap_err().to_string();

@@ -158,10 +158,7 @@ impl KnownMotion {
         columns.x_axis = columns.x_axis.normalize_or_zero();
         columns.y_axis = columns.y_axis.normalize_or_zero();
         columns.z_axis = columns.z_axis.normalize_or_zero();
-        RigidTransform {
-            rotation: columns,
-            translation: DVec3::new(rows[0][3], rows[1][3], rows[2][3]),
-        }
+        RigidTransform { rotation: columns, translation: DVec3::new(rows[0][3], rows[1][3], rows[2][3]) }
     }
 
     fn centre(&self, step: usize) -> DVec3 {
@@ -182,7 +179,135 @@ fn angle_between(a: &DMat3, b: &DMat3) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use cif_geometry::Bounds;
+    use cif_scene::{Motion, MotionReport, Node, PoseSample, ResidualStatistics, Splats, TimeCodes, UpAxis};
+    use glam::DQuat;
+
     use super::*;
+
+    /// A scene of one instance with mask id 4 that follows `track`.
+    fn scene(track: Vec<PoseSample>) -> SceneGraph {
+        let count = track.len();
+        let report = MotionReport {
+            model: MotionModel::Rigid,
+            gaussians: 0,
+            size: 1.0,
+            tolerance: 0.01,
+            residual: ResidualStatistics::default(),
+            static_residual: ResidualStatistics::default(),
+            rigid_residual: None,
+            samples: count,
+            motion_bytes: 0,
+        };
+        let node = Node {
+            kind: NodeKind::Instance { id: 4, index: 0 },
+            name: "box_004".into(),
+            label: "box".into(),
+            category: "box".into(),
+            pivot: DVec3::ZERO,
+            motion: Motion::Rigid(track),
+            splats: Splats::default(),
+            proxy: None,
+            extent: Bounds::EMPTY,
+            source_frames: (0, count - 1),
+            mean_occupancy: 1.0,
+            report,
+        };
+        SceneGraph {
+            up_axis: UpAxis::Z,
+            meters_per_unit: 1.0,
+            time_codes: TimeCodes {
+                samples: (0..count).map(|frame| frame as f64).collect(),
+                times: (0..count).map(|frame| frame as f64 / (count - 1) as f64).collect(),
+                frames_per_second: 24.0,
+            },
+            nodes: vec![node],
+            cameras: Vec::new(),
+            background_color: [1.0; 3],
+            sort_metric: cif_field::SortMetric::Z,
+            omitted: Vec::new(),
+            warnings: Vec::new(),
+        }
+    }
+
+    /// Turns 0.2 rad and moves 0.1 per step.
+    fn object_pose(step: usize) -> RigidTransform {
+        RigidTransform {
+            rotation: DMat3::from_rotation_z(0.2 * step as f64),
+            translation: DVec3::new(0.1 * step as f64, 1.0, 0.0),
+        }
+    }
+
+    fn truth(motion: &str) -> GroundTruth {
+        let rows = |pose: &RigidTransform| {
+            let (r, t) = (pose.rotation.transpose().to_cols_array_2d(), pose.translation);
+            std::array::from_fn(|i| match i {
+                3 => [0.0, 0.0, 0.0, 1.0],
+                i => [r[i][0], r[i][1], r[i][2], t[i]],
+            })
+        };
+        let poses: Vec<RigidTransform> = (0..3).map(object_pose).collect();
+        // The box is centred half a metre beside the object's origin.
+        let centres: Vec<DVec3> = poses.iter().map(|pose| pose.apply(DVec3::X * 0.5)).collect();
+        let known = KnownMotion {
+            label: "box".into(),
+            motion: motion.into(),
+            matrix: poses.iter().map(rows).collect(),
+            aabb_min: centres.iter().map(|c| (*c - DVec3::splat(0.1)).to_array()).collect(),
+            aabb_max: centres.iter().map(|c| (*c + DVec3::splat(0.1)).to_array()).collect(),
+        };
+        let frames = (0..3).map(|step| TimeStep { time: f64::from(step) / 2.0 }).collect();
+        GroundTruth { frames, instances: BTreeMap::from([(4, known)]) }
+    }
+
+    /// The true motion, seen from a local frame that is turned and moved against the object's own; at the
+    /// last step `shift` is added and `turn` applied about the centre of the box.
+    fn exported(shift: DVec3, turn: f64) -> SceneGraph {
+        let object_from_local =
+            RigidTransform { rotation: DMat3::from_rotation_x(1.1), translation: DVec3::new(0.3, -0.2, 0.4) };
+        let track = (0..3).map(|step| {
+            let mut world_from_object = object_pose(step);
+            if step == 2 {
+                let centre = world_from_object.apply(DVec3::X * 0.5);
+                let rotation = DMat3::from_rotation_y(turn);
+                world_from_object = RigidTransform {
+                    rotation: rotation * world_from_object.rotation,
+                    translation: rotation * (world_from_object.translation - centre) + centre + shift,
+                };
+            }
+            let pose = world_from_object.compose(&object_from_local);
+            PoseSample {
+                time_code: step as f64,
+                translation: pose.translation,
+                rotation: DQuat::from_mat3(&pose.rotation),
+            }
+        });
+        scene(track.collect())
+    }
+
+    #[test]
+    fn true_motion_has_no_error_whatever_the_local_frame() {
+        let errors = compare(&exported(DVec3::ZERO, 0.0), &truth("rigid"));
+        assert_eq!((errors.len(), errors[0].samples), (1, 3));
+        assert!(errors[0].translation_max_mm < 1e-9, "{errors:?}");
+        assert!(errors[0].rotation_max_deg < 1e-6, "{errors:?}");
+    }
+
+    #[test]
+    fn shifts_and_turns_are_told_apart() {
+        let shifted = &compare(&exported(DVec3::new(0.0, 0.0, 0.003), 0.0), &truth("rigid"))[0];
+        assert!((shifted.translation_max_mm - 3.0).abs() < 1e-9, "{shifted:?}");
+        assert!((shifted.translation_rms_mm - (9.0_f64 / 3.0).sqrt()).abs() < 1e-9, "{shifted:?}");
+        assert!(shifted.rotation_max_deg < 1e-6, "{shifted:?}");
+        let turned = &compare(&exported(DVec3::ZERO, 2.0_f64.to_radians()), &truth("rigid"))[0];
+        assert!((turned.rotation_max_deg - 2.0).abs() < 1e-6, "{turned:?}");
+        assert!(turned.translation_max_mm < 1e-9, "{turned:?}");
+    }
+
+    #[test]
+    fn objects_that_deform_have_no_pose_to_compare() {
+        assert!(compare(&exported(DVec3::ZERO, 0.0), &truth("deforming")).is_empty());
+    }
 
     #[test]
     fn angles_are_exact_small_and_large() {

@@ -32,7 +32,8 @@ impl Progress {
     pub fn new(quiet: bool, log: Option<&Path>, append: bool) -> Result<Self, Error> {
         let log = log
             .map(|path| {
-                let file = OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path);
+                let file =
+                    OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path);
                 file.map(|file| (path.to_owned(), file)).map_err(Error::io("open the log", path))
             })
             .transpose()?;
@@ -42,15 +43,7 @@ impl Progress {
             bar.set_style(style.expect("the template is valid").progress_chars("=> "));
             bar
         });
-        Ok(Self {
-            bar,
-            quiet,
-            last_line: None,
-            miou: None,
-            start: Instant::now(),
-            log,
-            log_failure: None,
-        })
+        Ok(Self { bar, quiet, last_line: None, miou: None, start: Instant::now(), log, log_failure: None })
     }
 
     /// Takes one event.
@@ -65,9 +58,21 @@ impl Progress {
                     bar.set_position(u64::from(*iteration));
                     bar.set_message("");
                 }
-                self.plain(&format!("{stage}: {iterations} steps from step {iteration}, {gaussians} Gaussians"));
+                self.plain(&format!(
+                    "{stage}: {iterations} steps from step {iteration}, {gaussians} Gaussians"
+                ));
             }
-            TrainEvent::Step { stage, iteration, iterations, loss, gaussians, psnr, iterations_per_second, eta_s, .. } => {
+            TrainEvent::Step {
+                stage,
+                iteration,
+                iterations,
+                loss,
+                gaussians,
+                psnr,
+                iterations_per_second,
+                eta_s,
+                ..
+            } => {
                 let miou = self.miou.map_or(String::new(), |miou| format!("  mIoU {miou:.1}"));
                 let text = format!(
                     "{iterations_per_second:.1} it/s  ETA {}  loss {loss:.4}  {gaussians} Gaussians  PSNR {psnr:.2}{miou}",
@@ -76,7 +81,9 @@ impl Progress {
                 if let Some(bar) = &self.bar {
                     bar.set_position(u64::from(*iteration));
                     bar.set_message(text);
-                } else if self.last_line.is_none_or(|last| last.elapsed() >= LINE_EVERY) || iteration == iterations {
+                } else if self.last_line.is_none_or(|last| last.elapsed() >= LINE_EVERY)
+                    || iteration == iterations
+                {
                     self.last_line = Some(Instant::now());
                     self.plain(&format!("{stage} {iteration}/{iterations}  {text}"));
                 }
@@ -105,7 +112,9 @@ impl Progress {
                     duration(*wall_s)
                 ));
             }
-            TrainEvent::Densified { .. } | TrainEvent::Resampled { .. } | TrainEvent::CheckpointDue { .. } => {}
+            TrainEvent::Densified { .. }
+            | TrainEvent::Resampled { .. }
+            | TrainEvent::CheckpointDue { .. } => {}
         }
     }
 
@@ -180,9 +189,13 @@ mod tests {
 
     #[test]
     fn durations_read_well() {
-        for (seconds, text) in
-            [(11.6, "12 s"), (200.0, "3 min 20 s"), (7500.0, "2 h 05 min"), (f64::INFINITY, "?"), (-1.0, "0 s")]
-        {
+        for (seconds, text) in [
+            (11.6, "12 s"),
+            (200.0, "3 min 20 s"),
+            (7500.0, "2 h 05 min"),
+            (f64::INFINITY, "?"),
+            (-1.0, "0 s"),
+        ] {
             assert_eq!(duration(seconds), text);
         }
     }

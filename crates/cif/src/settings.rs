@@ -307,6 +307,9 @@ mod tests {
         assert!(error.to_string().starts_with("--set fine.itertions: unknown key"), "{error}");
         assert!(layers.assignment("fine.iterations").is_err());
         let config = layers.finish();
-        assert_eq!((config.fine.iterations, config.fine.mode, config.limit), (77, Mode::OpacityOnly, Some(4)));
+        assert_eq!(
+            (config.fine.iterations, config.fine.mode, config.limit),
+            (77, Mode::OpacityOnly, Some(4))
+        );
     }
 }

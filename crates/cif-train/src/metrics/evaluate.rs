@@ -33,12 +33,7 @@ impl EvaluationOptions {
     /// The held-out frames, rendered as the field says.
     #[must_use]
     pub fn held_out(field: &Field) -> Self {
-        Self {
-            split: Split::Val,
-            settings: trained_settings(field),
-            simd: SimdLevel::Auto,
-            depth: false,
-        }
+        Self { split: Split::Val, settings: trained_settings(field), simd: SimdLevel::Auto, depth: false }
     }
 }
 
@@ -144,8 +139,7 @@ pub fn evaluate<E: From<EvaluationError>>(
         let start = Instant::now();
         let rendered = renderer.render(field, &frame.camera, frame.time, &options.settings, channels);
         let render_ms = start.elapsed().as_secs_f64() * 1e3;
-        let predicted =
-            rendered.instances.as_ref().map(|instances| mask_ids(field, &instances.label));
+        let predicted = rendered.instances.as_ref().map(|instances| mask_ids(field, &instances.label));
         let confusion = match (&truth.mask, &predicted) {
             (Some(mask), Some(predicted)) => {
                 Some(FrameConfusion::new(&frame.camera_name, frame.time_index, mask, predicted))
@@ -210,8 +204,7 @@ pub fn trained_settings(field: &Field) -> RenderSettings {
     if let Some(config) = training_config(field) {
         settings.near = config.near;
         settings.antialiased = config.antialiased;
-        if let (Some(instances), true) =
-            (&mut settings.instances, config.ablates(Ablation::OpacityOccupancy))
+        if let (Some(instances), true) = (&mut settings.instances, config.ablates(Ablation::OpacityOccupancy))
         {
             instances.occupancy = OccupancySource::Opacity;
         }
@@ -231,9 +224,8 @@ pub fn mask_ids(field: &Field, labels: &PixelGrid<u16>) -> PixelGrid<u16> {
 fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[FrameConfusion]) -> Scores {
     let frames: Vec<&FrameScores> = frames.collect();
     let finite: Vec<f64> = frames.iter().filter_map(|f| f.psnr).collect();
-    let mean = |values: &[f64]| {
-        (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-    };
+    let mean =
+        |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
     Scores {
         frames: frames.len(),
         psnr: mean(&finite),
@@ -248,15 +240,7 @@ mod tests {
     use super::*;
 
     fn frame(psnr: Option<f64>, ssim: f64) -> FrameScores {
-        FrameScores {
-            name: "f".into(),
-            group: None,
-            time: 0.0,
-            psnr,
-            ssim,
-            macc_pix: None,
-            render_ms: 1.0,
-        }
+        FrameScores { name: "f".into(), group: None, time: 0.0, psnr, ssim, macc_pix: None, render_ms: 1.0 }
     }
 
     #[test]

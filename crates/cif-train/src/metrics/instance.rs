@@ -50,9 +50,10 @@ impl FrameConfusion {
     /// Pixels of V, and those of them where the prediction is right.
     #[must_use]
     pub fn labelled(&self) -> (u64, u64) {
-        self.counts.iter().filter(|((truth, _), _)| *truth != 0).fold((0, 0), |sum, ((g, q), n)| {
-            (sum.0 + n, sum.1 + if g == q { *n } else { 0 })
-        })
+        self.counts
+            .iter()
+            .filter(|((truth, _), _)| *truth != 0)
+            .fold((0, 0), |sum, ((g, q), n)| (sum.0 + n, sum.1 + if g == q { *n } else { 0 }))
     }
 
     /// Fraction of V predicted right (0 to 1); `None` when V is empty.
@@ -208,9 +209,7 @@ pub fn instance_metrics(frames: &[FrameConfusion]) -> InstanceMetrics {
             frames: tally.iou.count,
             iou: tally.iou.percent(),
             accuracy: tally.accuracy.percent(),
-            tube_iou: Some(
-                100.0 * tally.right as f64 / (tally.truth + tally.predicted - tally.right) as f64,
-            ),
+            tube_iou: Some(100.0 * tally.right as f64 / (tally.truth + tally.predicted - tally.right) as f64),
             association_quality: Some(100.0 * association_quality(tally, &predicted)),
             id_switches: tally.switches,
         })

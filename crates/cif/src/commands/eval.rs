@@ -19,15 +19,16 @@ use crate::{interrupt, output};
 /// Score a scene on the held-out frames of a capture
 #[derive(Debug, Args)]
 #[command(after_help = "\
-PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). Instance scores are percent over
-labelled pixels: mAcc-pix per frame, mAcc-inst per instance, mIoU per pair of instance and frame. The JSON
-also has the other definitions in use, per frame and per instance values. n/a (JSON null): nothing to measure.
+PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). Instance scores are
+percent over labelled pixels: mAcc-pix per frame, mAcc-inst per instance, mIoU per pair of instance
+and frame. The JSON also has the other definitions in use, and values per frame and per instance.
+n/a (JSON null) means that there is nothing to measure.
 
   cif eval table.cif captures/table
   cif eval table.cif captures/table --masks masks --json scores.json --images pictures
 
-Pictures show, side by side: truth, render, instance map, error (brightest from a quarter of full range
-on), depth (near is bright).")]
+Pictures show, side by side: truth, render, instance map, error (brightest from a quarter of full
+range on), depth (near is bright).")]
 pub(super) struct Eval {
     /// Trained scene
     #[arg(value_name = "SCENE.cif")]
@@ -186,7 +187,9 @@ fn label(field: &Field, id: u16) -> String {
 fn print_table(evaluation: &Evaluation, field: &Field) {
     let mut table = super::table(["", "frames", "PSNR", "SSIM", "mAcc-pix", "mAcc-inst", "mIoU"]);
     let overall = std::iter::once(("all", &evaluation.overall));
-    for (name, scores) in overall.chain(evaluation.groups.iter().map(|(name, scores)| (name.as_str(), scores))) {
+    for (name, scores) in
+        overall.chain(evaluation.groups.iter().map(|(name, scores)| (name.as_str(), scores)))
+    {
         table.add_row([
             name.to_owned(),
             scores.frames.to_string(),
@@ -213,10 +216,7 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
         }
         println!("{table}");
     }
-    println!(
-        "{} Gaussians, {:.1} ms per frame",
-        evaluation.gaussians, evaluation.render_ms_per_frame
-    );
+    println!("{} Gaussians, {:.1} ms per frame", evaluation.gaussians, evaluation.render_ms_per_frame);
 }
 
 fn number(value: Option<f64>, digits: usize) -> String {

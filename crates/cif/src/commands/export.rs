@@ -16,8 +16,8 @@ use crate::output;
 #[command(
     group = ArgGroup::new("result").required(true).multiple(true).args(["usd", "report"]),
     after_help = "\
-Every object gets the cheapest motion that stays inside the tolerance: static, rigid, or dense (a path for
-every splat). The table tells which one, and what it misses.
+Every object gets the cheapest motion that stays inside the tolerance: static, rigid, or dense (a
+path for every splat). The table tells which one, and what it misses.
 
   cif export table.cif --usd table.usda
   cif export table.cif --usd table.usdz --tolerance 0.5%
@@ -82,7 +82,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     if let Some(path) = &command.usd {
         check_stage_name(path)?;
         output::check_file(path, command.force)?;
-        available(path)?;
+        cif_usd::check_target(path, writing(command)).map_err(Error::plain)?;
     }
     let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
     let field = scene::load(&command.scene)?;
@@ -93,9 +93,10 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     if !graph.omitted.is_empty() {
         eprintln!("warning: nothing visible belongs to {}", graph.omitted.join(", "));
     }
-    if let Some(path) = &command.usd {
-        write(&graph, &field, path)?;
-    }
+    let written = match &command.usd {
+        Some(path) => Some(cif_usd::export(&graph, path, writing(command)).map_err(Error::plain)?),
+        None => None,
+    };
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
     if command.json {
         println!("{:#}", json!({ "motion": graph.motion_table(), "ground_truth": errors }));
@@ -105,10 +106,22 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
             print_errors(errors);
         }
     }
-    if let Some(path) = &command.usd {
-        eprintln!("wrote {}", path.display());
+    if let Some(written) = written {
+        eprintln!(
+            "wrote {}: {} prims, {} splats, {} time samples, {:.1} MB (usd-core {})",
+            written.path.display(),
+            written.nodes,
+            written.splats,
+            written.samples,
+            written.bytes as f64 / 1e6,
+            written.usd_version
+        );
     }
     Ok(())
+}
+
+fn writing(command: &Export) -> cif_usd::ExportOptions {
+    cif_usd::ExportOptions { force: command.force }
 }
 
 fn options(command: &Export) -> SceneOptions {
@@ -144,7 +157,17 @@ fn check_stage_name(path: &Path) -> Result<(), Error> {
 
 fn print_motion(graph: &SceneGraph) {
     let mut table = super::table([
-        "object", "label", "splats", "motion", "size", "tolerance", "error RMS", "decisive", "max", "samples", "KB",
+        "object",
+        "label",
+        "splats",
+        "motion",
+        "size",
+        "tolerance",
+        "error RMS",
+        "decisive",
+        "max",
+        "samples",
+        "KB",
     ]);
     for row in graph.motion_table() {
         let motion = &row.motion;
@@ -171,7 +194,15 @@ fn print_errors(errors: &[MotionError]) {
         return;
     }
     let mut table = super::table([
-        "id", "label", "truth", "exported", "times", "translation RMS, mm", "max", "rotation RMS, deg", "max",
+        "id",
+        "label",
+        "truth",
+        "exported",
+        "times",
+        "translation RMS, mm",
+        "max",
+        "rotation RMS, deg",
+        "max",
     ]);
     for error in errors {
         table.add_row([
@@ -187,33 +218,4 @@ fn print_errors(errors: &[MotionError]) {
         ]);
     }
     println!("{table}");
-}
-
-#[cfg(feature = "usd")]
-fn available(_path: &Path) -> Result<(), Error> {
-    Ok(())
-}
-
-#[cfg(not(feature = "usd"))]
-fn available(path: &Path) -> Result<(), Error> {
-    Err(without_usd(path))
-}
-
-#[cfg(feature = "usd")]
-fn write(graph: &SceneGraph, _field: &cif_field::Field, path: &Path) -> Result<(), Error> {
-    cif_usd::write_stage(graph, path).map_err(Error::plain)
-}
-
-#[cfg(not(feature = "usd"))]
-fn write(_graph: &SceneGraph, _field: &cif_field::Field, path: &Path) -> Result<(), Error> {
-    Err(without_usd(path))
-}
-
-/// The answer of a build without Python.
-#[cfg(not(feature = "usd"))]
-pub(super) fn without_usd(path: &Path) -> Error {
-    Error::failed(
-        format!("{}: this build of cif has no USD support, which lives in the Python package usd-core", path.display()),
-        "install the cif wheel (make build), and use its command: .venv/bin/cif",
-    )
 }

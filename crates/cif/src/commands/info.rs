@@ -170,8 +170,10 @@ fn one_line(value: &Value) -> String {
             _ => number.to_string(),
         },
         Value::Array(items) => items.iter().map(one_line).collect::<Vec<_>>().join(", "),
-        Value::Object(items) => {
-            items.iter().map(|(key, value)| format!("{key} {}", one_line(value))).collect::<Vec<_>>().join(", ")
-        }
+        Value::Object(items) => items
+            .iter()
+            .map(|(key, value)| format!("{key} {}", one_line(value)))
+            .collect::<Vec<_>>()
+            .join(", "),
     }
 }

@@ -8,8 +8,8 @@ mod render;
 mod scene;
 mod train;
 
-use clap::{Args, Parser, Subcommand, ValueEnum};
 use cif_render::cpu::SimdLevel;
+use clap::{Args, Parser, Subcommand, ValueEnum};
 
 use crate::error::Error;
 
@@ -17,6 +17,7 @@ use crate::error::Error;
 #[derive(Debug, Parser)]
 #[command(
     name = "cif",
+    bin_name = "cif",
     version,
     max_term_width = 110,
     arg_required_else_help = true,
@@ -35,8 +36,8 @@ A short tour:
   cif info captures/table                                what is in this folder?
   cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
   cif eval table.cif captures/table --images pictures    score the held-out views, and look at them
-  cif export table.cif --usd table.usda                  one prim per object, moving as it was filmed
-  cif query table.usda --label 'red mug' --time 0.5      which prim is it, and where?
+  cif export table.cif --usd table.usda                  one moving prim per object
+  cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
 
 A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with instance
 masks (PNG, value = instance id, 0 = unlabelled) in its folder masks/.

@@ -15,10 +15,12 @@ use crate::error::Error;
 #[command(
     group = ArgGroup::new("question").required(true).args(["label", "at"]),
     after_help = "\
-Labels match the name, class or unique name of an object; case does not matter, * and ? are wildcards.
-Times run from 0 (first captured time) to 1 (last). Boxes hold the splats to three standard deviations.
+Labels match the name, class or unique name of an object; case does not matter, * and ? are
+wildcards. Boxes hold the splats to three standard deviations.
+Time in a stage is its time code, which counts captured frames; in a .cif it runs from 0 (first
+captured time) to 1 (last).
 
-  cif query table.usda --label 'red mug' --time 0.5
+  cif query table.usda --label 'red mug' --time 36
   cif query table.cif --label '*box' --json
   cif query table.cif --at 0.1,0.2,0.05 --time 0.5"
 )]
@@ -32,8 +34,8 @@ pub(super) struct Query {
     /// Place in the world; needs a .cif
     #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', num_args = 1, allow_hyphen_values = true)]
     at: Option<Vec<f64>>,
-    /// Time from 0 to 1 [default: the first]
-    #[arg(long, value_name = "T")]
+    /// Time: time code of a stage, 0 to 1 in a .cif [default: the first]
+    #[arg(long, value_name = "T", allow_hyphen_values = true)]
     time: Option<f64>,
     /// Print JSON
     #[arg(long)]
@@ -41,7 +43,9 @@ pub(super) struct Query {
 }
 
 pub(super) fn run(command: &Query) -> Result<(), Error> {
-    scene::check_time(command.time)?;
+    if scene::is_scene(&command.path) {
+        scene::check_time(command.time)?;
+    }
     if let Some(place) = &command.at {
         return at(command, place);
     }
@@ -49,7 +53,8 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     let matches = if scene::is_scene(&command.path) {
         in_scene(&command.path, pattern, command.time)?
     } else {
-        in_stage(&command.path, pattern, command.time)?
+        let query = LabelQuery { pattern, time_code: command.time };
+        cif_usd::query(&command.path, &query).map_err(Error::plain)?
     };
     if command.json {
         println!("{:#}", json!(matches));
@@ -129,7 +134,10 @@ fn at(command: &Query, place: &[f64]) -> Result<(), Error> {
 }
 
 fn print_match(found: &LabelMatch) {
-    println!("{}  label '{}'  class '{}'  instance '{}'", found.path, found.label, found.class, found.instance);
+    println!(
+        "{}  label '{}'  class '{}'  instance '{}'",
+        found.path, found.label, found.class, found.instance
+    );
     for row in &found.transform {
         println!("  [{:>10.5} {:>10.5} {:>10.5} {:>10.5}]", row[0], row[1], row[2], row[3]);
     }
@@ -141,16 +149,6 @@ fn print_match(found: &LabelMatch) {
 
 fn point(p: &[f64; 3]) -> String {
     format!("({:.4}, {:.4}, {:.4})", p[0], p[1], p[2])
-}
-
-#[cfg(feature = "usd")]
-fn in_stage(path: &Path, pattern: String, time: Option<f64>) -> Result<Vec<LabelMatch>, Error> {
-    cif_usd::query_stage(path, &pattern, time).map_err(Error::plain)
-}
-
-#[cfg(not(feature = "usd"))]
-fn in_stage(path: &Path, _pattern: String, _time: Option<f64>) -> Result<Vec<LabelMatch>, Error> {
-    Err(super::export::without_usd(path))
 }
 
 #[cfg(test)]

@@ -17,8 +17,8 @@ use crate::{interrupt, output};
 /// Train a scene on a capture
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Settings come from the preset, then the --config file, then what is typed here; the result is written
-beside the scene as SCENE.train.toml, which --config accepts again.
+Settings come from the preset, then the --config file, then what is typed here; the result is
+written beside the scene as SCENE.train.toml, which --config accepts again.
 
   cif train captures/table -o table.cif --preset draft
   cif train captures/table -o table.cif --masks masks_tracker --iterations-fine 8000 --seed 3
@@ -172,7 +172,7 @@ pub(super) fn run(command: &Train, simd: SimdLevel) -> Result<(), Error> {
     match outcome {
         Outcome::Finished => eprintln!("saved {saved}"),
         Outcome::Interrupted => {
-            let help = Some(format!("go on with: cif train {} -o {saved} --resume", command.capture.display()));
+            let help = Some(format!("go on with: {}", resume_command(command)));
             if interrupt::requested() {
                 return Err(Error::Interrupted { message: format!("interrupted; saved {saved}"), help });
             }
@@ -238,6 +238,25 @@ fn save(checkpoint: &Checkpoint, path: &Path) -> Result<(), Error> {
         ),
         Err(_) => Error::failed(error.to_string(), "make space, then train again"),
     })
+}
+
+/// The command line that goes on with this run.
+fn resume_command(command: &Train) -> String {
+    let capture = &command.capture_options;
+    let mut line = format!("cif train {} -o {}", command.capture.display(), command.output.display());
+    if let Some(masks) = &capture.masks {
+        line += &format!(" --masks {}", masks.display());
+    }
+    if capture.no_masks {
+        line += " --no-masks";
+    }
+    if capture.center_principal_point {
+        line += " --center-principal-point";
+    }
+    if let Some(layout) = capture.layout.and_then(|layout| layout.to_possible_value()) {
+        line += &format!(" --layout {}", layout.get_name());
+    }
+    line + " --resume"
 }
 
 fn load_state(path: &Path) -> Result<Checkpoint, Error> {

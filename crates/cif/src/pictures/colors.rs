@@ -53,8 +53,9 @@ pub fn error_picture(rendered: &PixelGrid<[f32; 3]>, truth: &Picture) -> Picture
         .iter()
         .zip(&truth.pixels)
         .map(|(a, b)| {
-            let difference: f32 =
-                (0..3).map(|channel| (a[channel].clamp(0.0, 1.0) - f32::from(b[channel]) / 255.0).abs()).sum();
+            let difference: f32 = (0..3)
+                .map(|channel| (a[channel].clamp(0.0, 1.0) - f32::from(b[channel]) / 255.0).abs())
+                .sum();
             map_color(colorous::INFERNO, difference / 3.0 / BRIGHTEST_ERROR)
         })
         .collect();

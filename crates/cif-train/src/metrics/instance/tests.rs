@@ -53,10 +53,10 @@ fn variants_by_hand() {
 #[test]
 fn scores_per_instance() {
     let metrics = instance_metrics(&two_frames());
-    assert_eq!(metrics.instances.iter().map(|score| (score.id, score.frames)).collect::<Vec<_>>(), [
-        (1, 2),
-        (2, 1)
-    ]);
+    assert_eq!(
+        metrics.instances.iter().map(|score| (score.id, score.frames)).collect::<Vec<_>>(),
+        [(1, 2), (2, 1)]
+    );
     close(metrics.instances[0].iou, 77.5);
     close(metrics.instances[1].accuracy, 100.0);
 }
@@ -133,6 +133,9 @@ fn confusion_counts_pixels() {
     let truth = PixelGrid::from_pixels(3, 2, vec![0, 1, 1, 1, 2, 0]);
     let predicted = PixelGrid::from_pixels(3, 2, vec![0, 1, 1, 2, 2, 1]);
     let confusion = FrameConfusion::new("a", 4, &truth, &predicted);
-    assert_eq!(confusion.counts, frame("a", 4, &[(0, 0, 1), (1, 1, 2), (1, 2, 1), (2, 2, 1), (0, 1, 1)]).counts);
+    assert_eq!(
+        confusion.counts,
+        frame("a", 4, &[(0, 0, 1), (1, 1, 2), (1, 2, 1), (2, 2, 1), (0, 1, 1)]).counts
+    );
     assert_eq!(confusion.labelled(), (4, 3));
 }

@@ -1,0 +1,85 @@
+"""Files that are there, missing, foreign or broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cif
+import pytest
+from pxr import Usd
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("suffix", ["usda", "usdc", "usdz"])
+def test_our_own_files_are_replaced(field: cif.Field, tmp_path: Path, suffix: str) -> None:
+    path = tmp_path / f"scene.{suffix}"
+    first = field.export(path)
+    again = field.export(path, proxy_points=0)
+    assert again["bytes"] < first["bytes"] and path.stat().st_size == again["bytes"]
+    assert list(contents(tmp_path)) == [path.name], "nothing is left behind"
+
+
+def test_foreign_files_are_kept(field: cif.Field, tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "theirs.usda"))
+    stage.DefinePrim("/Precious")
+    stage.Save()
+    (tmp_path / "broken.usdc").write_bytes(b"no stage at all")
+    before = contents(tmp_path)
+    for name in before:
+        with pytest.raises(cif.CifError, match=rf"{name} exists and was not written by cif"):
+            field.export(tmp_path / name)
+    assert contents(tmp_path) == before
+    field.export(tmp_path / "broken.usdc", force=True)
+    assert Usd.Stage.Open(str(tmp_path / "broken.usdc")).GetDefaultPrim()
+
+
+def test_outputs_that_cannot_be(field: cif.Field, tmp_path: Path) -> None:
+    (tmp_path / "folder.usda").mkdir()
+    for name, message in [
+        ("scene.obj", r"use \.usda"),
+        ("scene", r"use \.usda"),
+        ("missing/scene.usda", "no such folder"),
+        ("folder.usda", "is a folder"),
+    ]:
+        with pytest.raises(cif.CifError, match=message):
+            field.export(tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == ["folder.usda"]
+
+
+def test_inputs_that_are_not_there(tmp_path: Path) -> None:
+    with pytest.raises(cif.CifError, match=r"none\.usda: no such file"):
+        cif.query_stage(tmp_path / "none.usda", "mug")
+    (tmp_path / "text.usda").write_text("hello")
+    with pytest.raises(cif.CifError, match=r"text\.usda cannot be opened"):
+        cif.query_stage(tmp_path / "text.usda", "mug")
+    with pytest.raises(cif.CifError, match=r"none\.cif"):
+        cif.Field.load(tmp_path / "none.cif")
+    with pytest.raises(cif.CifError, match="nowhere"):
+        cif.open_dataset(tmp_path / "nowhere")
+
+
+def test_stages_of_others_can_be_queried(tmp_path: Path) -> None:
+    text = """#usda 1.0
+    def Xform "Car" (prepend apiSchemas = ["SemanticsLabelsAPI:kind"]) {
+        token[] semantics:labels:kind = ["sedan"]
+    }
+    """
+    (tmp_path / "theirs.usda").write_text(text)
+    (found,) = cif.query_stage(tmp_path / "theirs.usda", "sedan")
+    assert found["path"] == "/Car" and found["low"] is None
+
+
+def test_motion_errors_stop_an_export(field: cif.Field, tmp_path: Path) -> None:
+    def broken(time: float) -> None:
+        raise KeyError(f"no frame at {time}")
+
+    with pytest.raises(KeyError, match="no frame"):
+        field.export(tmp_path / "scene.usda", motion=broken)
+    with pytest.raises(ValueError, match="must return float32"):
+        field.export(tmp_path / "scene.usda", motion=lambda _: (field.means[:3], field.quaternions))
+    with pytest.raises(cif.CifError, match="tolerance"):
+        field.export(tmp_path / "scene.usda", tolerance="much")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,60 @@
+//! The command, run as people run it.
+
+use std::ffi::OsStr;
+use std::path::Path;
+use std::process::{Command, Output};
+
+/// What a run of the command left behind.
+#[derive(Debug)]
+pub struct Run {
+    /// Exit code; `None` when killed.
+    pub code: Option<i32>,
+    /// Everything on stdout.
+    pub stdout: String,
+    /// Everything on stderr.
+    pub stderr: String,
+}
+
+impl Run {
+    fn from(output: &Output) -> Self {
+        Self {
+            code: output.status.code(),
+            stdout: String::from_utf8_lossy(&output.stdout).into_owned(),
+            stderr: String::from_utf8_lossy(&output.stderr).into_owned(),
+        }
+    }
+
+    /// Asserts success.
+    ///
+    /// # Panics
+    /// When the command failed.
+    #[must_use]
+    #[track_caller]
+    pub fn succeeds(self) -> Self {
+        assert_eq!(self.code, Some(0), "expected success:\n{}\n{}", self.stdout, self.stderr);
+        self
+    }
+
+    /// Asserts an exit code and that stderr holds every one of `words`.
+    ///
+    /// # Panics
+    /// When it does not.
+    #[track_caller]
+    pub fn fails(self, code: i32, words: &[&str]) {
+        assert_eq!(self.code, Some(code), "expected exit code {code}:\n{}\n{}", self.stdout, self.stderr);
+        for word in words {
+            assert!(self.stderr.contains(word), "expected {word:?} in:\n{}", self.stderr);
+        }
+    }
+}
+
+/// Runs `program` with arguments in `folder`, nothing of a terminal around it.
+///
+/// # Panics
+/// When the program cannot be started.
+#[must_use]
+pub fn run<S: AsRef<OsStr>>(program: &str, folder: &Path, arguments: impl IntoIterator<Item = S>) -> Run {
+    let mut command = Command::new(program);
+    command.args(arguments).current_dir(folder).env("NO_COLOR", "1");
+    Run::from(&command.output().expect("the program starts"))
+}

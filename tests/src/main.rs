@@ -1,0 +1,5 @@
+//! The `cif` command, for the tests of this package.
+
+fn main() {
+    std::process::exit(cif::run(std::env::args_os().collect()));
+}

@@ -1,0 +1,192 @@
+//! The command as people meet it: help, exit codes, and what it says to wrong input.
+
+use std::fs;
+use std::path::Path;
+
+use cif_test::capture;
+use cif_test::command::{Run, run};
+
+const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
+
+/// Runs the command in a folder; arguments are split at blanks.
+fn cif(folder: &Path, line: &str) -> Run {
+    run(CIF, folder, line.split_whitespace())
+}
+
+fn folder() -> tempfile::TempDir {
+    tempfile::tempdir().expect("a temporary folder")
+}
+
+/// A folder with a capture of four frames in `table/`.
+fn with_capture() -> tempfile::TempDir {
+    let folder = folder();
+    capture::write(&folder.path().join("table"), 4);
+    folder
+}
+
+/// Everything in a folder and below, for proofs that nothing was written.
+fn listing(folder: &Path) -> Vec<String> {
+    let mut found = Vec::new();
+    let mut open = vec![folder.to_owned()];
+    while let Some(folder) = open.pop() {
+        for entry in fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                open.push(path.clone());
+            }
+            found.push(path.display().to_string());
+        }
+    }
+    found.sort();
+    found
+}
+
+#[test]
+fn help_teaches_the_tool() {
+    let folder = folder();
+    let help = cif(folder.path(), "--help").succeeds().stdout;
+    for word in ["train", "eval", "render", "export", "query", "info", "A short tour", "Exit code"] {
+        assert!(help.contains(word), "{word} in {help}");
+    }
+    for command in ["train", "eval", "render", "export", "query", "info"] {
+        let help = cif(folder.path(), &format!("{command} --help")).succeeds().stdout;
+        assert!(help.contains("Usage: cif"), "{help}");
+    }
+    let version = cif(folder.path(), "--version").succeeds().stdout;
+    assert_eq!(version.trim(), concat!("cif ", env!("CARGO_PKG_VERSION")));
+}
+
+#[test]
+fn what_is_not_understood_ends_with_2() {
+    let folder = folder();
+    cif(folder.path(), "tran").fails(2, &["train"]);
+    cif(folder.path(), "").fails(2, &["Usage"]);
+    cif(folder.path(), "train table").fails(2, &["--output"]);
+    cif(folder.path(), "train table -o a.cif --resume --seed 3").fails(2, &["--resume"]);
+    cif(folder.path(), "train table -o a.cif --ablate everything").fails(2, &["no-resampling"]);
+    cif(folder.path(), "train table -o a.cif --set seed").fails(2, &["KEY=VALUE"]);
+    cif(folder.path(), "render a.cif -o out").fails(2, &["--capture"]);
+    cif(folder.path(), "render a.cif --capture table -o out --time 3").fails(2, &["from 0"]);
+    cif(folder.path(), "query a.cif").fails(2, &["--label"]);
+    cif(folder.path(), "query a.cif --at 1,2").fails(2, &["three"]);
+    cif(folder.path(), "query a.usda --at 1,2,3").fails(2, &["--label"]);
+    cif(folder.path(), "export a.cif").fails(2, &["--usd"]);
+    cif(folder.path(), "export a.cif --usd out.glb").fails(2, &[".usda"]);
+    cif(folder.path(), "export a.cif --usd out.usda --tolerance much").fails(2, &["1%"]);
+}
+
+#[test]
+fn missing_captures_and_scenes_are_named() {
+    let folder = folder();
+    cif(folder.path(), "train nowhere -o a.cif").fails(1, &["nowhere"]);
+    cif(folder.path(), "info nowhere").fails(1, &["nowhere"]);
+    cif(folder.path(), "info nowhere.cif").fails(1, &["nowhere.cif"]);
+    cif(folder.path(), "eval nowhere.cif table").fails(1, &["nowhere.cif"]);
+    fs::create_dir(folder.path().join("empty")).unwrap();
+    cif(folder.path(), "train empty -o a.cif").fails(1, &["empty", "dataset.json"]);
+    cif(folder.path(), "eval empty empty").fails(1, &["cif train"]);
+    assert_eq!(listing(folder.path()).len(), 1, "nothing was written");
+}
+
+#[test]
+fn settings_that_cannot_be_are_refused_before_anything_is_read() {
+    let folder = folder();
+    let path = folder.path();
+    cif(path, "train nowhere -o a.cif --preset fast").fails(1, &["fast", "draft, standard, paper"]);
+    cif(path, "train nowhere -o a.cif --set stages.fien=3").fails(1, &["stages.fien", "stages.fine"]);
+    cif(path, "train nowhere -o a.cif --set stages.fine=many").fails(1, &["stages.fine"]);
+    cif(path, "train nowhere -o a.cif --batch 0").fails(1, &["stages.batch"]);
+    cif(path, "train nowhere -o a.cif --config none.toml").fails(1, &["none.toml"]);
+    fs::write(path.join("mine.toml"), "seed = 3\n\n[stages]\nfien = 20\n").unwrap();
+    cif(path, "train nowhere -o a.cif --config mine.toml").fails(1, &["mine.toml:4", "fien", "stages.fine"]);
+    fs::write(path.join("mine.toml"), "seed = 3\n[stages\n").unwrap();
+    cif(path, "train nowhere -o a.cif --config mine.toml").fails(1, &["mine.toml:2"]);
+    fs::write(path.join("mine.toml"), "preset = \"quick\"\n").unwrap();
+    cif(path, "train nowhere -o a.cif --config mine.toml").fails(1, &["quick", "standard"]);
+    assert_eq!(listing(path).len(), 1, "nothing was written");
+}
+
+#[test]
+fn outputs_are_checked_before_training() {
+    let folder = with_capture();
+    let path = folder.path();
+    cif(path, "train table -o no/where/a.cif").fails(1, &["no/where", "mkdir -p"]);
+    cif(path, "train table -o table").fails(1, &["is a folder"]);
+    cif(path, "train table -o a.cif --resume").fails(1, &["a.cif", "nothing to resume"]);
+    fs::write(path.join("kept.cif"), "precious").unwrap();
+    cif(path, "train table -o kept.cif").fails(1, &["kept.cif exists", "--force"]);
+    cif(path, "train table -o a.cif --log kept.cif").fails(1, &["kept.cif exists"]);
+    fs::write(path.join("b.train.toml"), "# mine").unwrap();
+    cif(path, "train table -o b.cif").fails(1, &["b.train.toml exists"]);
+    assert_eq!(fs::read_to_string(path.join("kept.cif")).unwrap(), "precious");
+    assert_eq!(fs::read_to_string(path.join("b.train.toml")).unwrap(), "# mine");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_folder_that_cannot_be_written_is_refused_before_training() {
+    // /proc refuses new files even to the superuser.
+    let folder = with_capture();
+    cif(folder.path(), "train table -o /proc/a.cif").fails(1, &["/proc"]);
+}
+
+#[test]
+fn files_that_are_no_scenes_are_refused() {
+    let folder = with_capture();
+    let path = folder.path();
+    fs::write(path.join("text.cif"), "hello").unwrap();
+    cif(path, "eval text.cif table").fails(1, &["text.cif", "not a cif scene"]);
+    // A header that announces more than there is must not be believed.
+    let mut bytes = u64::MAX.to_le_bytes().to_vec();
+    bytes.extend(b"{}");
+    fs::write(path.join("large.cif"), &bytes).unwrap();
+    cif(path, "info large.cif").fails(1, &["large.cif"]);
+    // A foreign safetensors file.
+    let header = br#"{"__metadata__":{"format":"pt"}}"#;
+    let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+    bytes.extend(header);
+    fs::write(path.join("foreign.cif"), &bytes).unwrap();
+    cif(path, "query foreign.cif --label x").fails(1, &["foreign.cif", "cif.format"]);
+}
+
+#[test]
+fn captures_are_described() {
+    let folder = with_capture();
+    let text = cif(folder.path(), "info table").succeeds().stdout;
+    for word in ["hyper-nerf", "40 x 30", "red ball", "blue ball", "points.npy"] {
+        assert!(text.contains(word), "{word} in {text}");
+    }
+    let json = cif(folder.path(), "info table --json").succeeds().stdout;
+    let facts: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&facts["frames"], &facts["train"], &facts["val"]), (&4.into(), &3.into(), &1.into()));
+    assert_eq!(facts["instances"][0]["id"], capture::ROLLING);
+}
+
+#[test]
+fn damaged_captures_are_refused_with_the_file() {
+    let folder = with_capture();
+    let table = folder.path().join("table");
+    let train = |words: &[&str]| {
+        cif(folder.path(), "train table -o a.cif --iterations-coarse 1 --iterations-fine 1").fails(1, words);
+        assert!(!folder.path().join("a.cif").exists());
+        // The settings are written only once the run can begin.
+        let _ = fs::remove_file(folder.path().join("a.train.toml"));
+    };
+    let camera = table.join("camera/000001.json");
+    let good = fs::read_to_string(&camera).unwrap();
+    capture::edit(&camera, |camera| camera["focal_length"] = (-3.0).into());
+    train(&["000001.json", "focal"]);
+    fs::write(&camera, &good).unwrap();
+    capture::edit(&camera, |camera| camera["orientation"][0][0] = 7.0.into());
+    train(&["000001.json"]);
+    fs::write(&camera, "{").unwrap();
+    train(&["000001.json"]);
+    fs::write(&camera, &good).unwrap();
+
+    let image = table.join("rgb/1x/000001.png");
+    let bytes = fs::read(&image).unwrap();
+    fs::write(&image, &bytes[..bytes.len() / 2]).unwrap();
+    train(&["000001.png"]);
+    fs::remove_file(&image).unwrap();
+    train(&["000001"]);
+}
