@@ -43,6 +43,16 @@ impl DensifyStatistics {
         }
     }
 
+    /// Follows a change of the set: rows that stay keep what was seen of them.
+    pub fn gather(&mut self, origins: &[Option<u32>]) {
+        fn pick<T: Copy + Default>(values: &[T], origins: &[Option<u32>]) -> Vec<T> {
+            origins.iter().map(|origin| origin.map_or(T::default(), |row| values[row as usize])).collect()
+        }
+        self.gradient = pick(&self.gradient, origins);
+        self.count = pick(&self.count, origins);
+        self.radius = pick(&self.radius, origins);
+    }
+
     fn mean_gradient(&self, row: usize) -> f32 {
         if self.count[row] == 0 { 0.0 } else { self.gradient[row] / self.count[row] as f32 }
     }

@@ -17,6 +17,9 @@ pub enum TrainError {
     /// The deformation network cannot be made.
     #[error("settings under `model`: {0}")]
     Deformation(#[from] cif_field::deformation::ConfigError),
+    /// The initial points are not usable.
+    #[error("the initial points of the capture: {0}")]
+    Points(#[from] cif_field::FieldError),
     /// A frame cannot be read.
     #[error(transparent)]
     Dataset(#[from] cif_dataset::Error),

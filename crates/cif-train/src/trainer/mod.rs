@@ -1,58 +1,172 @@
 //! A run, from a capture to a trained field.
+//!
+//! | file | answers |
+//! |---|---|
+//! | `initialize` | what a run starts from |
+//! | `progress` | which stages there are, and where the run stands |
+//! | `step` | what one step does |
+//! | `optimiser` | which parameter groups there are, and how fast they move |
+//! | `identity` | how identity rows come about |
+//! | `state` | what is saved, and how a run resumes |
+//!
+//! Random choices depend on the seed and the step alone (see `random`), and all sums have a fixed order: a
+//! run that was interrupted and resumed ends bit for bit where an uninterrupted one ends, on any number of
+//! threads.
+
+mod evaluate;
+mod frames;
+mod identity;
+mod initialize;
+mod optimiser;
+mod progress;
+mod provenance;
+mod state;
+mod step;
+
+use std::time::Instant;
 
 use cif_dataset::Dataset;
 use cif_field::Field;
-use cif_field::checkpoint::Checkpoint;
+use cif_render::Gradients;
+use cif_render::cpu::{Renderer, SimdLevel};
 
+use self::frames::FrameStore;
+use self::optimiser::Optimiser;
+use self::progress::{Plan, Progress};
+use self::step::{Scratch, StepLoss};
 use crate::config::TrainConfig;
+use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
-use crate::events::{Control, Outcome, TrainEvent, TrainerView};
+use crate::events::{Control, Outcome, Stage, TrainEvent, TrainerView};
+use crate::schedule::falls_on;
+
+/// Observer of a run.
+type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
+
+/// Share of unsupported pixels from which the user is told (methods reference 4.4).
+const MANY_UNSUPPORTED: f64 = 0.01;
 
 /// Trains one field on one capture.
 pub struct Trainer {
     dataset: Dataset,
     config: TrainConfig,
     field: Field,
+    frames: FrameStore,
+    plan: Plan,
+    progress: Progress,
+    optimiser: Optimiser,
+    statistics: DensifyStatistics,
+    /// Gaussians whose identity row is not from their own label mass.
+    unseen: Vec<bool>,
+    /// Labelled pixels per instance, of the frames that identities were estimated from.
+    label_pixels: Vec<f64>,
+    renderer: Renderer,
+    gradients: Gradients,
+    scratch: Scratch,
+    /// Warnings not sent yet.
+    warnings: Vec<String>,
+}
+
+/// What the observer asked for since it was last obeyed.
+#[derive(Default)]
+struct Requests {
+    save: bool,
+    stop: bool,
+}
+
+impl Requests {
+    fn add(&mut self, control: Control) {
+        match control {
+            Control::Continue => {}
+            Control::Save => self.save = true,
+            Control::Stop => self.stop = true,
+        }
+    }
 }
 
 impl Trainer {
-    /// A run at its start.
+    /// A run at its start; training frames are decoded into memory.
     ///
     /// # Errors
-    /// When a setting cannot work, or the capture has no training frame or no initial point.
-    pub fn new(_dataset: Dataset, _config: TrainConfig) -> Result<Self, TrainError> {
-        todo!()
+    /// When a setting cannot work, the capture has no training frame or no initial point, or a frame cannot
+    /// be read.
+    pub fn new(dataset: Dataset, config: TrainConfig) -> Result<Self, TrainError> {
+        config.validate()?;
+        let field = initialize::initial_field(&dataset, &config)?;
+        let mut trainer = Self::assemble(dataset, config, field, None)?;
+        trainer.warn_of_capture();
+        let first = trainer.plan.from(&trainer.config, Stage::Coarse);
+        trainer.progress = Progress::at(first);
+        trainer.enter(first)?;
+        Ok(trainer)
     }
 
-    /// A run where a checkpoint with state left it; settings come from the checkpoint.
-    ///
-    /// # Errors
-    /// When the checkpoint has no training state, or belongs to another capture.
-    pub fn resume(_dataset: Dataset, _checkpoint: Checkpoint) -> Result<Self, TrainError> {
-        todo!()
+    /// Everything but the state of the optimiser.
+    fn assemble(
+        dataset: Dataset,
+        config: TrainConfig,
+        field: Field,
+        progress: Option<Progress>,
+    ) -> Result<Self, TrainError> {
+        let budget = u64::from(config.frame_memory_mib) << 20;
+        let frames = FrameStore::open(&dataset, config.background, budget)?;
+        let has_instances = !dataset.instances.is_empty() && frames.has_labels(&dataset);
+        let n = field.gaussians.len();
+        Ok(Self {
+            plan: Plan { is_dynamic: dataset.times.len() > 1, has_instances },
+            progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
+            optimiser: Optimiser::new(&field, config.adam.fresh_row_bias_correction),
+            statistics: DensifyStatistics::zeros(n),
+            unseen: Vec::new(),
+            label_pixels: Vec::new(),
+            renderer: Renderer::new(SimdLevel::Auto),
+            gradients: Gradients::zeros(&field),
+            scratch: Scratch::new(),
+            warnings: Vec::new(),
+            dataset,
+            config,
+            field,
+            frames,
+        })
     }
 
-    /// Runs all stages that are left; `observer` sees every event and may stop the run.
-    ///
-    /// # Errors
-    /// When a frame cannot be read, or a loss or gradient is not finite; the field is the last finite one.
-    pub fn run(
-        &mut self,
-        _observer: &mut dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control,
-    ) -> Result<Outcome, TrainError> {
-        todo!()
+    fn warn_of_capture(&mut self) {
+        if !self.plan.has_instances {
+            let why = if self.dataset.instances.is_empty() {
+                "the capture has no masks"
+            } else {
+                "no training mask has a labelled pixel"
+            };
+            self.warnings.push(format!("{why}: colour only, without identity and instance stages"));
+        }
+        if !self.plan.is_dynamic {
+            self.warnings.push("the capture has a single time: trained without deformation".into());
+        }
+        if self.frames.len() == 1 {
+            self.warnings.push("one training frame: depth and occluded parts are not determined".into());
+        }
+        let not_kept = self.frames.not_kept();
+        if not_kept > 0 {
+            self.warnings.push(format!(
+                "{not_kept} of {} training frames do not fit into frame_memory_mib = {} and are decoded \
+                 whenever they are needed",
+                self.frames.len(),
+                self.config.frame_memory_mib
+            ));
+        }
     }
 
-    /// The field as it is now; with state, what [`Trainer::resume`] needs as well.
-    #[must_use]
-    pub fn checkpoint(&self, _with_state: bool) -> Checkpoint {
-        todo!()
-    }
-
-    /// The field as it is now.
+    /// The field as it is now; its provenance is up to date once a run has returned.
     #[must_use]
     pub fn field(&self) -> &Field {
         &self.field
+    }
+
+    /// The trained field, once a run has returned.
+    #[must_use]
+    pub fn into_field(mut self) -> Field {
+        self.field.provenance = self.provenance();
+        self.field
     }
 
     /// The run's settings.
@@ -65,5 +179,177 @@ impl Trainer {
     #[must_use]
     pub fn dataset(&self) -> &Dataset {
         &self.dataset
+    }
+
+    /// Stage of the run.
+    #[must_use]
+    pub fn stage(&self) -> Stage {
+        self.progress.stage
+    }
+
+    /// Steps done in the stage.
+    #[must_use]
+    pub fn iteration(&self) -> u32 {
+        self.progress.iteration
+    }
+
+    /// Steps left in all stages.
+    #[must_use]
+    pub fn steps_left(&self) -> u64 {
+        self.plan.steps_left(&self.config, self.progress.stage, self.progress.iteration)
+    }
+
+    /// Runs all stages that are left; `observer` sees every event and may stop the run.
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or a loss or gradient is not finite; the field then still is finite.
+    pub fn run(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
+        let result = self.run_stages(observer);
+        self.field.provenance = self.provenance();
+        result
+    }
+
+    fn run_stages(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
+        let mut requests = Requests::default();
+        for message in std::mem::take(&mut self.warnings) {
+            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+        }
+        loop {
+            let stage = self.progress.stage;
+            if stage == Stage::Done {
+                break;
+            }
+            let iterations = self.plan.iterations(&self.config, stage);
+            let started = TrainEvent::StageStarted {
+                stage,
+                iteration: self.progress.iteration,
+                iterations,
+                gaussians: self.field.gaussians.len(),
+            };
+            requests.add(self.emit(observer, &started));
+            if stage == Stage::Identity {
+                if requests.stop {
+                    return Ok(Outcome::Interrupted);
+                }
+                let start = Instant::now();
+                let event = self.estimate_identities(true)?;
+                self.progress.add_wall(stage, start.elapsed().as_secs_f64());
+                requests.add(self.emit(observer, &event));
+                if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
+                    && !empty_instances.is_empty()
+                {
+                    let message = format!(
+                        "no Gaussian is most probably of instance {empty_instances:?}: too small, or hidden \
+                         in the frames with masks"
+                    );
+                    requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+                }
+            } else if self.run_steps(stage, iterations, observer, &mut requests)? == Outcome::Interrupted {
+                return Ok(Outcome::Interrupted);
+            }
+            self.enter(self.plan.after(&self.config, stage))?;
+            if requests.stop && self.progress.stage != Stage::Done {
+                return Ok(Outcome::Interrupted);
+            }
+        }
+        let finished = TrainEvent::Finished {
+            wall_s: self.progress.total_wall_s(),
+            iterations: self.progress.total_steps,
+            gaussians: self.field.gaussians.len(),
+            psnr: self.progress.psnr.unwrap_or(0.0),
+            peak_rss_mb: provenance::peak_rss_mb(),
+        };
+        self.emit(observer, &finished);
+        Ok(Outcome::Finished)
+    }
+
+    /// Steps of the current stage until its end or a stop.
+    fn run_steps(
+        &mut self,
+        stage: Stage,
+        iterations: u32,
+        observer: &mut Observer<'_>,
+        requests: &mut Requests,
+    ) -> Result<Outcome, TrainError> {
+        let mut events = Vec::new();
+        let (mut lap, mut lap_steps) = (0.0, 0);
+        while self.progress.iteration < iterations {
+            if requests.stop {
+                return Ok(Outcome::Interrupted);
+            }
+            let start = Instant::now();
+            let loss = self.step(&mut events)?;
+            let seconds = start.elapsed().as_secs_f64();
+            self.progress.add_wall(stage, seconds);
+            (lap, lap_steps) = (lap + seconds, lap_steps + 1);
+            for event in events.drain(..) {
+                requests.add(self.emit(observer, &event));
+            }
+            let iteration = self.progress.iteration;
+            if falls_on(iteration, self.config.report.step_every) || iteration == iterations {
+                let rate = f64::from(lap_steps) / lap.max(1e-9);
+                let event = self.step_event(stage, iterations, &loss, rate);
+                requests.add(self.emit(observer, &event));
+                (lap, lap_steps) = (0.0, 0);
+            }
+            if let Some(share) = loss.unsupported.filter(|share| *share > MANY_UNSUPPORTED)
+                && !self.progress.warned_of_unsupported
+            {
+                self.progress.warned_of_unsupported = true;
+                let message = format!(
+                    "{:.1} % of the labelled pixels of step {iteration} are covered by no Gaussian of their \
+                     instance; more Gaussians or a longer fine stage may help",
+                    100.0 * share
+                );
+                requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+            }
+            let total = (self.progress.total_steps % u64::from(u32::MAX)) as u32;
+            if falls_on(total, self.config.report.evaluate_every) {
+                let event = self.evaluate(stage)?;
+                requests.add(self.emit(observer, &event));
+            }
+            if falls_on(total, self.config.report.checkpoint_every) || requests.save {
+                requests.save = false;
+                requests.add(self.emit(observer, &TrainEvent::CheckpointDue { stage, iteration }));
+            }
+        }
+        Ok(Outcome::Finished)
+    }
+
+    fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, rate: f64) -> TrainEvent {
+        TrainEvent::Step {
+            stage,
+            iteration: self.progress.iteration,
+            iterations,
+            loss: loss.total,
+            color_loss: loss.color,
+            instance_loss: loss.instance,
+            unsupported_px: loss.unsupported,
+            gaussians: self.field.gaussians.len(),
+            psnr: self.progress.psnr.unwrap_or(0.0),
+            iterations_per_second: rate,
+            eta_s: self.steps_left() as f64 / rate,
+        }
+    }
+
+    fn emit(&self, observer: &mut Observer<'_>, event: &TrainEvent) -> Control {
+        observer(event, &TrainerView { trainer: self })
+    }
+
+    /// Begins a stage: the fine stage gets its deformation and a new optimiser (methods reference 1.3).
+    fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
+        self.progress.stage = stage;
+        self.progress.iteration = 0;
+        self.progress.sh_start = self.field.sh_degree;
+        self.progress.opacities_were_reset = false;
+        if stage == Stage::Fine {
+            if self.plan.is_dynamic {
+                self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
+            }
+            self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
+            self.gradients = Gradients::zeros(&self.field);
+        }
+        self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
+        Ok(())
     }
 }

@@ -1,0 +1,108 @@
+//! Training frames in memory: decoded once, as bytes, up to a budget.
+
+use std::sync::Arc;
+
+use cif_dataset::{Dataset, Split};
+use cif_geometry::PixelGrid;
+use cif_render::UNLABELLED;
+use rayon::prelude::*;
+
+use crate::error::TrainError;
+
+/// A decoded frame.
+pub(super) struct TrainFrame {
+    /// Target colours.
+    pub image: PixelGrid<[u8; 3]>,
+    /// Dense instance index + 1, 0 = unlabelled; `None` without a mask.
+    pub labels: Option<PixelGrid<u16>>,
+    /// Labelled pixels.
+    pub labelled: usize,
+}
+
+/// All training frames of a capture.
+pub(super) struct FrameStore {
+    /// Index in the capture, and the frame where it fits into memory.
+    frames: Vec<(usize, Option<Arc<TrainFrame>>)>,
+    label_of_id: Vec<u16>,
+    background: [f32; 3],
+}
+
+/// Frames decoded together before the budget is looked at again.
+const BATCH: usize = 32;
+
+impl FrameStore {
+    /// Decodes frames until the budget is used.
+    pub(super) fn open(dataset: &Dataset, background: [f32; 3], budget: u64) -> Result<Self, TrainError> {
+        let mut label_of_id = vec![UNLABELLED; usize::from(u16::MAX) + 1];
+        for (k, instance) in dataset.instances.iter().enumerate() {
+            label_of_id[usize::from(instance.id)] = k as u16 + 1;
+        }
+        let training = dataset.frames.iter().enumerate().filter(|(_, f)| f.split == Split::Train);
+        let frames = training.map(|(index, _)| (index, None)).collect();
+        let mut store = Self { frames, label_of_id, background };
+        if store.frames.is_empty() {
+            return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
+        }
+        let mut used = 0;
+        for start in (0..store.frames.len()).step_by(BATCH) {
+            let end = (start + BATCH).min(store.frames.len());
+            if used > budget {
+                break;
+            }
+            let decoded: Vec<_> =
+                (start..end).into_par_iter().map(|k| store.load(dataset, k)).collect::<Result<_, _>>()?;
+            for (k, frame) in (start..end).zip(decoded) {
+                used += frame.bytes();
+                if used <= budget {
+                    store.frames[k].1 = Some(Arc::new(frame));
+                }
+            }
+        }
+        Ok(store)
+    }
+
+    /// Number of training frames.
+    pub(super) fn len(&self) -> usize {
+        self.frames.len()
+    }
+
+    /// Frames that are decoded again whenever they are needed.
+    pub(super) fn not_kept(&self) -> usize {
+        self.frames.iter().filter(|(_, frame)| frame.is_none()).count()
+    }
+
+    /// Index in the capture of training frame `k`.
+    pub(super) fn index(&self, k: usize) -> usize {
+        self.frames[k].0
+    }
+
+    /// Training frame `k`.
+    pub(super) fn get(&self, dataset: &Dataset, k: usize) -> Result<Arc<TrainFrame>, TrainError> {
+        match &self.frames[k].1 {
+            Some(frame) => Ok(Arc::clone(frame)),
+            None => Ok(Arc::new(self.load(dataset, k)?)),
+        }
+    }
+
+    /// Whether any frame has a labelled pixel; frames not kept count by having a mask.
+    pub(super) fn has_labels(&self, dataset: &Dataset) -> bool {
+        self.frames.iter().any(|(index, frame)| match frame {
+            Some(frame) => frame.labelled > 0,
+            None => dataset.frames[*index].mask.is_some(),
+        })
+    }
+
+    fn load(&self, dataset: &Dataset, k: usize) -> Result<TrainFrame, TrainError> {
+        let data = dataset.load_frame(self.frames[k].0, self.background)?;
+        let labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
+        let labelled =
+            labels.as_ref().map_or(0, |grid| grid.pixels.iter().filter(|l| **l != UNLABELLED).count());
+        Ok(TrainFrame { image: data.image, labels, labelled })
+    }
+}
+
+impl TrainFrame {
+    fn bytes(&self) -> u64 {
+        (self.image.pixels.len() * 3 + self.labels.as_ref().map_or(0, |grid| grid.pixels.len() * 2)) as u64
+    }
+}

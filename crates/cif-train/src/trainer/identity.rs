@@ -1,0 +1,82 @@
+//! The identity stage: counts label mass over the training frames and makes identity rows of it.
+
+use cif_geometry::scalar::{logit, sigmoid};
+use cif_render::{Gradients, UNLABELLED};
+
+use super::Trainer;
+use crate::config::{Ablation, OccupancyStart};
+use crate::error::TrainError;
+use crate::estimate::{RowSource, empty_counts, estimate};
+use crate::events::TrainEvent;
+
+impl Trainer {
+    /// Estimates the rows of all Gaussians; `starts` also sets occupancy to where the instance stage begins.
+    pub(super) fn estimate_identities(&mut self, starts: bool) -> Result<TrainEvent, TrainError> {
+        let settings = self.color_settings();
+        let k = self.field.instances.len();
+        let mut counts = empty_counts(self.field.gaussians.len(), k);
+        let mut frames = 0;
+        self.label_pixels = vec![0.0; k];
+        for view in (0..self.frames.len()).step_by(self.config.identity.stride as usize) {
+            let data = self.frames.get(&self.dataset, view)?;
+            let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
+            let frame = &self.dataset.frames[self.frames.index(view)];
+            self.renderer.count_identities(
+                &self.field,
+                &frame.camera,
+                frame.time,
+                &settings,
+                labels,
+                &mut counts,
+            );
+            for label in labels.pixels.iter().filter(|label| **label != UNLABELLED) {
+                self.label_pixels[usize::from(*label) - 1] += 1.0;
+            }
+            frames += 1;
+        }
+        let extent = f64::from(self.field.extent);
+        let estimated = estimate(&counts, &self.field.gaussians, extent, &self.config.identity);
+        if starts {
+            self.start_occupancy(&estimated.sources);
+        }
+        let n = estimated.identities.len().max(1);
+        let empty = estimated.empty_instances();
+        let event = TrainEvent::IdentityEstimated {
+            frames,
+            instances: k,
+            entries_per_row: estimated.identities.labels.len() as f64 / n as f64,
+            unseen: n - estimated.count(RowSource::Counted),
+            uniform: estimated.count(RowSource::Uniform),
+            dropped_mass: estimated.dropped_mass,
+            empty_instances: empty.iter().map(|k| self.field.instances[usize::from(*k)].id).collect(),
+        };
+        self.unseen = estimated.sources.iter().map(|source| *source != RowSource::Counted).collect();
+        self.field.identities = Some(estimated.identities);
+        self.optimiser.start_identities(&self.field, self.config.adam.fresh_row_bias_correction);
+        self.gradients = Gradients::zeros(&self.field);
+        Ok(event)
+    }
+
+    /// Occupancy at the start of the instance stage (A5); Gaussians that nothing is known of start lower.
+    fn start_occupancy(&mut self, sources: &[RowSource]) {
+        let settings = &self.config.instance;
+        let [low, high] = settings.occupancy_limits.map(logit);
+        let unseen = logit(self.config.identity.unseen_occupancy);
+        let constant = self.config.ablates(Ablation::ConstantOccupancy);
+        let gaussians = &mut self.field.gaussians;
+        for (row, source) in sources.iter().enumerate() {
+            gaussians.occupancy_logits[row] = match (settings.occupancy_start, source) {
+                _ if constant => logit(settings.occupancy),
+                (_, RowSource::Uniform) => unseen,
+                (OccupancyStart::CopyOpacity, _) => {
+                    // Through the probability, so that infinite logits cannot come out.
+                    logit(sigmoid(gaussians.opacity_logits[row]).clamp(1e-6, 1.0 - 1e-6)).clamp(low, high)
+                }
+                (OccupancyStart::Constant, _) => logit(settings.occupancy),
+            };
+        }
+        self.optimiser.occupancy.reset_all();
+        self.optimiser.occupancy.steps = 0;
+        self.optimiser.occupancy.births.fill(0);
+    }
+}

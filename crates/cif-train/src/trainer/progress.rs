@@ -1,0 +1,158 @@
+//! Where a run stands.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+
+use crate::config::TrainConfig;
+use crate::events::Stage;
+
+/// Counters of a run; saved with its state.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Progress {
+    /// Current stage.
+    pub stage: Stage,
+    /// Steps done in it.
+    pub iteration: u32,
+    /// Steps done in all stages.
+    pub total_steps: u64,
+    /// Steps done per finished or current stage.
+    pub steps: BTreeMap<String, u64>,
+    /// Wall time per stage, seconds.
+    pub wall_s: BTreeMap<String, f64>,
+    /// Spherical-harmonics degree at the start of the stage.
+    pub sh_start: u8,
+    /// Whether opacities were reset in this stage.
+    pub opacities_were_reset: bool,
+    /// Running mean PSNR of training views, dB.
+    pub psnr: Option<f64>,
+    /// Whether the user was told about unsupported pixels.
+    pub warned_of_unsupported: bool,
+}
+
+/// Weight of the newest view in the running PSNR.
+const PSNR_SHARE: f64 = 0.02;
+
+/// PSNR that equal images count as, dB.
+const MAX_PSNR: f64 = 100.0;
+
+impl Progress {
+    pub(super) fn at(stage: Stage) -> Self {
+        Self {
+            stage,
+            iteration: 0,
+            total_steps: 0,
+            steps: BTreeMap::new(),
+            wall_s: BTreeMap::new(),
+            sh_start: 0,
+            opacities_were_reset: false,
+            psnr: None,
+            warned_of_unsupported: false,
+        }
+    }
+
+    pub(super) fn add_psnr(&mut self, psnr: f64) {
+        let psnr = psnr.min(MAX_PSNR);
+        self.psnr = Some(self.psnr.map_or(psnr, |mean| mean + PSNR_SHARE * (psnr - mean)));
+    }
+
+    pub(super) fn add_wall(&mut self, stage: Stage, seconds: f64) {
+        *self.wall_s.entry(stage.name().to_owned()).or_default() += seconds;
+    }
+
+    pub(super) fn total_wall_s(&self) -> f64 {
+        self.wall_s.values().sum()
+    }
+}
+
+/// What decides which stages a run has.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Plan {
+    /// More than one time.
+    pub is_dynamic: bool,
+    /// Masks with labelled pixels.
+    pub has_instances: bool,
+}
+
+impl Plan {
+    /// Steps of a stage.
+    pub(super) fn iterations(self, config: &TrainConfig, stage: Stage) -> u32 {
+        match stage {
+            Stage::Coarse if self.is_dynamic => config.stages.coarse,
+            Stage::Fine if self.is_dynamic => config.fine_iterations(),
+            Stage::Fine => config.stages.coarse + config.fine_iterations(),
+            Stage::Instance if self.has_instances => config.stages.instance,
+            _ => 0,
+        }
+    }
+
+    /// The first stage with something to do from `stage` on.
+    pub(super) fn from(self, config: &TrainConfig, stage: Stage) -> Stage {
+        [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]
+            .into_iter()
+            .filter(|candidate| *candidate >= stage)
+            .find(|candidate| match candidate {
+                Stage::Identity => self.has_instances,
+                _ => self.iterations(config, *candidate) > 0,
+            })
+            .unwrap_or(Stage::Done)
+    }
+
+    /// The stage after `stage`.
+    pub(super) fn after(self, config: &TrainConfig, stage: Stage) -> Stage {
+        let next = match stage {
+            Stage::Coarse => Stage::Fine,
+            Stage::Fine => Stage::Identity,
+            Stage::Identity => Stage::Instance,
+            Stage::Instance | Stage::Done => Stage::Done,
+        };
+        self.from(config, next)
+    }
+
+    /// Steps left after `iteration` steps of `stage`.
+    pub(super) fn steps_left(self, config: &TrainConfig, stage: Stage, iteration: u32) -> u64 {
+        [Stage::Coarse, Stage::Fine, Stage::Instance]
+            .into_iter()
+            .filter(|other| *other >= stage)
+            .map(|other| u64::from(self.iterations(config, other)))
+            .sum::<u64>()
+            .saturating_sub(u64::from(iteration))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_follow_what_the_capture_has() {
+        let config = TrainConfig::default();
+        let walk = |plan: Plan| {
+            let mut stages = vec![plan.from(&config, Stage::Coarse)];
+            while stages[stages.len() - 1] != Stage::Done {
+                stages.push(plan.after(&config, stages[stages.len() - 1]));
+            }
+            stages
+        };
+        use Stage::{Coarse, Done, Fine, Identity, Instance};
+        assert_eq!(
+            walk(Plan { is_dynamic: true, has_instances: true }),
+            [Coarse, Fine, Identity, Instance, Done]
+        );
+        assert_eq!(walk(Plan { is_dynamic: true, has_instances: false }), [Coarse, Fine, Done]);
+        let still = Plan { is_dynamic: false, has_instances: true };
+        assert_eq!(walk(still), [Fine, Identity, Instance, Done]);
+        assert_eq!(still.iterations(&config, Fine), config.stages.coarse + config.stages.fine);
+    }
+
+    #[test]
+    fn steps_left_count_later_stages() {
+        let mut config = TrainConfig::default();
+        (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 20, 5);
+        let plan = Plan { is_dynamic: true, has_instances: true };
+        assert_eq!(plan.steps_left(&config, Stage::Coarse, 4), 31);
+        assert_eq!(plan.steps_left(&config, Stage::Fine, 4), 21);
+        assert_eq!(plan.steps_left(&config, Stage::Done, 0), 0);
+    }
+}

@@ -1,0 +1,179 @@
+//! Saving and resuming: everything that the next step depends on.
+
+use std::collections::BTreeMap;
+
+use cif_dataset::{Dataset, Split};
+use cif_field::checkpoint::{Checkpoint, StateTensor, TrainingState};
+use serde::{Deserialize, Serialize};
+
+use super::Trainer;
+use super::progress::Progress;
+use crate::config::TrainConfig;
+use crate::densify::DensifyStatistics;
+use crate::error::TrainError;
+
+/// Version of the state.
+const VERSION: u32 = 1;
+
+/// The JSON part of the state.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct State {
+    version: u32,
+    config: TrainConfig,
+    progress: Progress,
+    capture: Capture,
+    /// Steps per parameter group.
+    adam_steps: BTreeMap<String, u32>,
+}
+
+/// What must be equal for a run to go on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Capture {
+    layout: String,
+    training_frames: usize,
+    times: usize,
+    image_size: [u32; 2],
+    instance_ids: Vec<u16>,
+}
+
+impl Capture {
+    pub(super) fn of(dataset: &Dataset) -> Self {
+        let first = dataset.frames.iter().find(|f| f.split == Split::Train);
+        Self {
+            layout: format!("{:?}", dataset.layout),
+            training_frames: dataset.frames.iter().filter(|f| f.split == Split::Train).count(),
+            times: dataset.times.len(),
+            image_size: first.map_or([0; 2], |frame| [frame.camera.width, frame.camera.height]),
+            instance_ids: dataset.instances.iter().map(|instance| instance.id).collect(),
+        }
+    }
+
+    /// Refuses another capture.
+    fn check(&self, found: &Self, dataset: &Dataset) -> Result<(), TrainError> {
+        let differs = |what, expected: String, found: String| {
+            if expected == found {
+                return Ok(());
+            }
+            Err(TrainError::OtherCapture { what, expected, found, root: dataset.root.clone() })
+        };
+        let show = |size: [u32; 2]| format!("{} x {}", size[0], size[1]);
+        let ids = |ids: &[u16]| format!("{ids:?}");
+        differs("the layout", self.layout.clone(), found.layout.clone())?;
+        let frames = |count: usize| count.to_string();
+        differs(
+            "the number of training frames",
+            frames(self.training_frames),
+            frames(found.training_frames),
+        )?;
+        differs("the number of times", frames(self.times), frames(found.times))?;
+        differs("the image size", show(self.image_size), show(found.image_size))?;
+        differs("the list of instance ids", ids(&self.instance_ids), ids(&found.instance_ids))
+    }
+}
+
+fn unusable(reason: impl Into<String>) -> TrainError {
+    TrainError::BadState { reason: reason.into() }
+}
+
+impl Trainer {
+    /// The field as it is now; with state, what [`Trainer::resume`] needs as well.
+    #[must_use]
+    pub fn checkpoint(&self, with_state: bool) -> Checkpoint {
+        let mut field = self.field.clone();
+        field.provenance = self.provenance();
+        Checkpoint { field, training: with_state.then(|| self.training_state()) }
+    }
+
+    fn training_state(&self) -> TrainingState {
+        let mut tensors = BTreeMap::new();
+        let mut adam_steps = BTreeMap::new();
+        for (name, moments) in self.optimiser.groups() {
+            tensors.insert(format!("adam.{name}.first"), StateTensor::F32(moments.first.clone()));
+            tensors.insert(format!("adam.{name}.second"), StateTensor::F32(moments.second.clone()));
+            tensors.insert(format!("adam.{name}.births"), StateTensor::U32(moments.births.clone()));
+            adam_steps.insert(name.to_owned(), moments.steps);
+        }
+        let statistics = &self.statistics;
+        tensors.insert("densify.gradient".into(), StateTensor::F32(statistics.gradient.clone()));
+        tensors.insert("densify.count".into(), StateTensor::U32(statistics.count.clone()));
+        tensors.insert("densify.radius".into(), StateTensor::F32(statistics.radius.clone()));
+        let unseen = self.unseen.iter().map(|unseen| u32::from(*unseen)).collect();
+        tensors.insert("identity.unseen".into(), StateTensor::U32(unseen));
+        tensors.insert("identity.label_pixels".into(), StateTensor::F64(self.label_pixels.clone()));
+        let state = State {
+            version: VERSION,
+            config: self.config.clone(),
+            progress: self.progress.clone(),
+            capture: Capture::of(&self.dataset),
+            adam_steps,
+        };
+        let json = serde_json::to_value(state).expect("the state holds only strings, numbers and lists");
+        TrainingState { json, tensors }
+    }
+
+    /// A run where a checkpoint with state left it; settings come from the checkpoint.
+    ///
+    /// # Errors
+    /// When the checkpoint has no training state, is damaged, or belongs to another capture; or when a frame
+    /// cannot be read.
+    pub fn resume(dataset: Dataset, checkpoint: Checkpoint) -> Result<Self, TrainError> {
+        let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
+        if json.get("version").and_then(serde_json::Value::as_u64) != Some(u64::from(VERSION)) {
+            return Err(unusable("it was written by another version of the trainer"));
+        }
+        let state: State = serde_json::from_value(json).map_err(|error| unusable(error.to_string()))?;
+        state.config.validate()?;
+        state.capture.check(&Capture::of(&dataset), &dataset)?;
+        let mut trainer = Self::assemble(dataset, state.config, checkpoint.field, Some(state.progress))?;
+
+        let n = trainer.field.gaussians.len();
+        for (name, moments) in trainer.optimiser.groups_mut() {
+            let len = moments.first.len();
+            moments.first = floats(&mut tensors, &format!("adam.{name}.first"), len)?;
+            moments.second = floats(&mut tensors, &format!("adam.{name}.second"), len)?;
+            moments.births = counters(&mut tensors, &format!("adam.{name}.births"), moments.births.len())?;
+            moments.steps = *state
+                .adam_steps
+                .get(name)
+                .ok_or_else(|| unusable(format!("the step count of {name} is missing")))?;
+        }
+        trainer.statistics = DensifyStatistics {
+            gradient: floats(&mut tensors, "densify.gradient", n)?,
+            count: counters(&mut tensors, "densify.count", n)?,
+            radius: floats(&mut tensors, "densify.radius", n)?,
+        };
+        let has_rows = trainer.field.identities.is_some();
+        let unseen = counters(&mut tensors, "identity.unseen", if has_rows { n } else { 0 })?;
+        trainer.unseen = unseen.into_iter().map(|flag| flag != 0).collect();
+        let instances = if has_rows { trainer.field.instances.len() } else { 0 };
+        trainer.label_pixels = match tensors.remove("identity.label_pixels") {
+            Some(StateTensor::F64(values)) if values.len() == instances => values,
+            _ => return Err(unusable("tensor identity.label_pixels is missing or has the wrong shape")),
+        };
+        Ok(trainer)
+    }
+}
+
+fn floats(
+    tensors: &mut BTreeMap<String, StateTensor>,
+    name: &str,
+    len: usize,
+) -> Result<Vec<f32>, TrainError> {
+    match tensors.remove(name) {
+        Some(StateTensor::F32(values)) if values.len() == len => Ok(values),
+        _ => Err(unusable(format!("tensor {name} is missing or does not hold {len} floats"))),
+    }
+}
+
+fn counters(
+    tensors: &mut BTreeMap<String, StateTensor>,
+    name: &str,
+    len: usize,
+) -> Result<Vec<u32>, TrainError> {
+    match tensors.remove(name) {
+        Some(StateTensor::U32(values)) if values.len() == len => Ok(values),
+        _ => Err(unusable(format!("tensor {name} is missing or does not hold {len} counters"))),
+    }
+}

@@ -1,0 +1,297 @@
+//! One optimiser step.
+
+use cif_geometry::scalar::logit;
+use cif_geometry::{PixelGrid, quaternion};
+use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
+use rand::seq::SliceRandom;
+
+use super::Trainer;
+use super::optimiser::StepRates;
+use crate::adam::PlaneWeights;
+use crate::config::Ablation;
+use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, reset_opacities};
+use crate::error::TrainError;
+use crate::events::{Stage, TrainEvent};
+use crate::losses::{SsimScratch, color_loss};
+use crate::random::{Purpose, stream};
+use crate::resample::{ResampleContext, apply, plan};
+use crate::schedule::{falls_on, sh_degree};
+
+/// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
+const RENORMALISE_EVERY: u64 = 1_000;
+
+/// Memory kept between steps.
+pub(super) struct Scratch {
+    v_color: PixelGrid<[f32; 3]>,
+    ssim: SsimScratch,
+    /// Order of the training views of an epoch, by stage and epoch.
+    order: Option<((Stage, u64), Vec<u32>)>,
+}
+
+impl Scratch {
+    pub(super) fn new() -> Self {
+        Self { v_color: PixelGrid::filled(0, 0, [0.0; 3]), ssim: SsimScratch::default(), order: None }
+    }
+}
+
+/// What a step measured.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct StepLoss {
+    pub color: f64,
+    pub instance: Option<f64>,
+    pub unsupported: Option<f64>,
+    pub total: f64,
+}
+
+impl Trainer {
+    /// Settings of the instance pass.
+    pub(super) fn instance_settings(&self) -> InstanceSettings {
+        InstanceSettings {
+            occupancy: if self.config.ablates(Ablation::OpacityOccupancy) {
+                OccupancySource::Opacity
+            } else {
+                OccupancySource::Own
+            },
+            geometry: self.config.instance.geometry.into(),
+            normalisation: self.config.instance.normalisation.into(),
+        }
+    }
+
+    /// Settings of a view without instances.
+    pub(super) fn color_settings(&self) -> RenderSettings {
+        RenderSettings {
+            sh_degree: self.field.sh_degree,
+            background: self.config.background,
+            near: self.config.near,
+            antialiased: self.config.antialiased,
+            sort_metric: self.config.sort_metric,
+            deform: self.field.deformation.is_some(),
+            instances: None,
+        }
+    }
+
+    /// Training view `position` of a stage: every epoch visits all views, in its own order.
+    fn view_at(&mut self, stage: Stage, position: u64) -> usize {
+        let count = self.frames.len() as u64;
+        let key = (stage, position / count);
+        if self.scratch.order.as_ref().is_none_or(|(at, _)| *at != key) {
+            let mut order: Vec<u32> = (0..count as u32).collect();
+            let counter = (stage as u64) << 48 | key.1;
+            order.shuffle(&mut stream(self.config.seed, Purpose::Views, counter));
+            self.scratch.order = Some((key, order));
+        }
+        let order = self.scratch.order.as_ref().map_or(&[][..], |(_, order)| order);
+        order[(position % count) as usize] as usize
+    }
+
+    /// Renders the step's views forward and backward, then moves the parameters.
+    pub(super) fn step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
+        let stage = self.progress.stage;
+        let iteration = self.progress.iteration + 1;
+        let batch = self.config.stages.batch;
+        if matches!(stage, Stage::Coarse | Stage::Fine) {
+            self.field.sh_degree = sh_degree(&self.config, self.progress.sh_start, iteration);
+        }
+        let mut views = Vec::with_capacity(batch as usize);
+        for k in 0..batch {
+            let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));
+            views.push((self.frames.index(view), self.frames.get(&self.dataset, view)?));
+        }
+        let settings = RenderSettings {
+            instances: (stage == Stage::Instance).then(|| self.instance_settings()),
+            ..self.color_settings()
+        };
+        let labelled: usize = views.iter().map(|(_, frame)| frame.labelled).sum();
+        let weight = 1.0 / batch as f32;
+        let mut loss = StepLoss::default();
+        let (mut instance_loss, mut unsupported) = (0.0, 0);
+        for (index, data) in &views {
+            let frame = &self.dataset.frames[*index];
+            let labels = data.labels.as_ref().filter(|_| data.labelled > 0);
+            let with_instances = settings.instances.is_some() && labels.is_some();
+            let settings =
+                RenderSettings { instances: settings.instances.filter(|_| with_instances), ..settings };
+            let labels = labels.filter(|_| with_instances);
+            let pass = self.renderer.forward(&self.field, &frame.camera, frame.time, &settings, labels);
+            let color = color_loss(
+                &pass.color,
+                &data.image,
+                self.config.loss.lambda_dssim,
+                weight,
+                &mut self.scratch.v_color,
+                &mut self.scratch.ssim,
+            );
+            loss.color += color.loss * f64::from(weight);
+            self.progress.add_psnr(color.psnr());
+            if stage == Stage::Instance && !self.config.instance.color_loss {
+                self.scratch.v_color.pixels.fill([0.0; 3]);
+            }
+            // The mean is over the labelled pixels of all views of the step (A4).
+            let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
+            instance_loss += share * pass.instance_loss;
+            unsupported += pass.unsupported_pixels;
+            self.check_finite(color.loss, "the colour loss")?;
+            self.check_finite(pass.instance_loss, "the instance loss")?;
+            let instance_weight = (share * f64::from(self.config.loss.lambda_instance)) as f32;
+            self.renderer.backward(&self.field, &self.scratch.v_color, instance_weight, &mut self.gradients);
+        }
+        loss.total = loss.color;
+        if stage == Stage::Instance && labelled > 0 {
+            loss.instance = Some(instance_loss);
+            loss.unsupported = Some(unsupported as f64 / labelled as f64);
+            loss.total += f64::from(self.config.loss.lambda_instance) * instance_loss;
+        }
+        if matches!(stage, Stage::Coarse | Stage::Fine) && iteration < self.config.densify.until {
+            self.statistics.add(&self.gradients);
+        }
+        let rates = StepRates::at(&self.config, stage, iteration, self.field.extent);
+        let weights = PlaneWeights {
+            smoothness: self.config.loss.plane_smoothness,
+            time_smoothness: self.config.loss.time_smoothness,
+            time_sparsity: self.config.loss.time_sparsity,
+        };
+        self.optimiser
+            .step(&mut self.field, &mut self.gradients, &rates, &weights, self.config.adam.visible_rows_only)
+            .map_err(|tensor| self.not_finite(tensor))?;
+        self.gradients.screen.fill([0.0; 2]);
+        self.gradients.radii.fill(0.0);
+
+        self.progress.iteration = iteration;
+        self.progress.total_steps += 1;
+        *self.progress.steps.entry(stage.name().to_owned()).or_default() += 1;
+        self.keep_in_range(stage);
+        match stage {
+            Stage::Instance => self.instance_events(iteration, events)?,
+            _ => self.densify(stage, iteration, events)?,
+        }
+        Ok(loss)
+    }
+
+    fn check_finite(&mut self, value: f64, tensor: &'static str) -> Result<(), TrainError> {
+        if value.is_finite() { Ok(()) } else { Err(self.not_finite(tensor)) }
+    }
+
+    fn not_finite(&mut self, tensor: &'static str) -> TrainError {
+        // Leftovers of the failed step must not reach another one.
+        self.gradients.reset();
+        TrainError::NotFinite { stage: self.progress.stage, iteration: self.progress.iteration + 1, tensor }
+    }
+
+    /// Limits of occupancy (row 42) and calibration (5.3), and unit quaternions now and then (row 18).
+    fn keep_in_range(&mut self, stage: Stage) {
+        if stage == Stage::Instance {
+            let [low, high] = self.config.instance.occupancy_limits.map(logit);
+            if !self.config.ablates(Ablation::ConstantOccupancy) {
+                for value in &mut self.field.gaussians.occupancy_logits {
+                    *value = value.clamp(low, high);
+                }
+            }
+            let limit = self.config.instance.calibration_limit;
+            if let Some(identities) = &mut self.field.identities {
+                for value in &mut identities.log_calibrations {
+                    *value = value.clamp(-limit, limit);
+                }
+            }
+        }
+        if self.progress.total_steps % RENORMALISE_EVERY == 0 {
+            for raw in &mut self.field.gaussians.quaternions {
+                if let Some(unit) = quaternion::try_normalize(*raw) {
+                    *raw = unit;
+                }
+            }
+        }
+    }
+
+    /// Pruning, additions and opacity resets that fall on this step.
+    fn densify(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        let config = self.config.densify.clone();
+        if iteration >= config.until {
+            return Ok(());
+        }
+        let extent = self.field.extent;
+        let (mut cloned, mut split, mut pruned) = (0, 0, 0);
+        if iteration > config.from && falls_on(iteration, config.prune_every) {
+            let reset = self.progress.opacities_were_reset;
+            if let Some(change) = prune(&self.field.gaussians, &self.statistics, &config, extent, reset) {
+                if change.gaussians.is_empty() {
+                    return Err(TrainError::NoGaussians { stage, iteration });
+                }
+                pruned = change.pruned;
+                self.rearrange(change);
+            }
+        }
+        if iteration > config.from && falls_on(iteration, config.every) {
+            let mut rng = stream(self.config.seed, Purpose::Split, self.progress.total_steps);
+            let change = add_gaussians(&self.field.gaussians, &self.statistics, &config, extent, &mut rng);
+            if let Some(change) = change {
+                (cloned, split) = (change.cloned, change.split);
+                self.rearrange(change);
+            }
+            self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
+        }
+        if falls_on(iteration, config.opacity_reset_every) {
+            reset_opacities(&mut self.field.gaussians, config.opacity_reset_to);
+            self.optimiser.opacity.reset_all();
+            self.progress.opacities_were_reset = true;
+        }
+        if cloned + split + pruned > 0 {
+            let gaussians = self.field.gaussians.len();
+            events.push(TrainEvent::Densified { stage, iteration, cloned, split, pruned, gaussians });
+        }
+        Ok(())
+    }
+
+    /// Replaces the set of Gaussians, and everything that has a row per Gaussian.
+    fn rearrange(&mut self, change: Rearrangement) {
+        self.optimiser.gather(&change.origins);
+        self.statistics.gather(&change.origins);
+        self.field.gaussians = change.gaussians;
+        self.gradients = Gradients::zeros(&self.field);
+    }
+
+    /// Refreshed estimates and relocations that fall on this step.
+    fn instance_events(&mut self, iteration: u32, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
+        let last = self.plan.iterations(&self.config, Stage::Instance);
+        if falls_on(iteration, self.config.identity.refresh_every) && iteration < last {
+            let event = self.estimate_identities(false)?;
+            events.push(event);
+        }
+        let config = &self.config.resample;
+        let falls = falls_on(iteration, config.every) && (config.from..=config.until).contains(&iteration);
+        if !falls || iteration >= last || self.config.ablates(Ablation::NoResampling) {
+            return Ok(());
+        }
+        let context = ResampleContext {
+            config,
+            unseen: &self.unseen,
+            label_pixels: &self.label_pixels,
+            opacity_is_occupancy: self.config.ablates(Ablation::OpacityOccupancy),
+            occupancy_is_constant: self.config.ablates(Ablation::ConstantOccupancy),
+            occupancy_floor: self.config.instance.occupancy_limits[0],
+        };
+        let mut rng = stream(self.config.seed, Purpose::Resample, u64::from(iteration));
+        let plan = plan(&self.field, &context, &mut rng);
+        if plan.pairs.is_empty() {
+            return Ok(());
+        }
+        let relocated = apply(&mut self.field, &plan, &context, &mut rng);
+        self.optimiser.relocate(&relocated.weak, &relocated.sources, &relocated.entry_origins);
+        for pair in &plan.pairs {
+            self.unseen[pair.weak as usize] = self.unseen[pair.source as usize];
+        }
+        self.gradients = Gradients::zeros(&self.field);
+        events.push(TrainEvent::Resampled {
+            iteration,
+            pairs: plan.pairs.len(),
+            labels: plan.labels,
+            sources: relocated.sources.len(),
+            floored: relocated.floored,
+        });
+        Ok(())
+    }
+}

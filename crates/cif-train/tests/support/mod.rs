@@ -1,0 +1,172 @@
+//! A tiny capture: three shaded balls, of which one may move, ray-cast with exact masks.
+#![allow(dead_code)] // Each test binary uses its own part.
+
+use std::path::Path;
+
+use cif_dataset::{Dataset, Frame, InstanceLabel, Layout, PointCloud, PointSource, Split};
+use cif_geometry::{LensDistortion, PinholeCamera, RigidTransform};
+use cif_train::{Control, Outcome, TrainConfig, Trainer};
+use glam::{DMat3, DVec2, DVec3};
+
+/// Size of the images.
+pub(crate) const WIDTH: u32 = 48;
+/// Size of the images.
+pub(crate) const HEIGHT: u32 = 36;
+
+/// What the capture looks like.
+#[derive(Clone, Copy)]
+pub(crate) struct Scene {
+    /// Times; one for a static scene.
+    pub(crate) times: usize,
+    /// Training views per time.
+    pub(crate) views: usize,
+    /// Masks are written.
+    pub(crate) masks: bool,
+    /// Masks are written, but empty.
+    pub(crate) empty_masks: bool,
+}
+
+impl Default for Scene {
+    fn default() -> Self {
+        Self { times: 5, views: 4, masks: true, empty_masks: false }
+    }
+}
+
+/// Centre, radius, colour of the balls at a time; mask ids are 4, 7, 9.
+fn balls(time: f64) -> [(DVec3, f64, [f64; 3], u8); 3] {
+    [
+        (DVec3::new(-0.55, 0.0, 0.0), 0.4, [0.85, 0.2, 0.15], 4),
+        (DVec3::new(0.5, 0.1, 0.3), 0.35, [0.2, 0.65, 0.25], 7),
+        (DVec3::new(0.1, -0.5 + 0.5 * time, -0.45), 0.25, [0.2, 0.3, 0.85], 9),
+    ]
+}
+
+fn camera(angle: f64) -> PinholeCamera {
+    let centre = DVec3::new(3.0 * angle.sin(), -0.6, -3.0 * angle.cos());
+    let forward = (-centre).normalize();
+    let right = DVec3::new(0.0, 1.0, 0.0).cross(forward).normalize();
+    let down = forward.cross(right);
+    let rotation = DMat3::from_cols(right, down, forward).transpose();
+    PinholeCamera {
+        width: WIDTH,
+        height: HEIGHT,
+        focal_px: DVec2::splat(52.0),
+        principal_px: DVec2::new(24.0, 18.0),
+        camera_from_world: RigidTransform { rotation, translation: -(rotation * centre) },
+    }
+}
+
+fn write_frame(camera: &PinholeCamera, time: f64, image: &Path, mask: Option<&Path>) {
+    let mut rgb = image::RgbImage::from_pixel(WIDTH, HEIGHT, image::Rgb([255; 3]));
+    let mut ids = image::GrayImage::new(WIDTH, HEIGHT);
+    let world_from_camera = camera.camera_from_world.inverse();
+    for y in 0..HEIGHT {
+        for x in 0..WIDTH {
+            let pixel = DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+            let ray = ((pixel - camera.principal_px) / camera.focal_px).extend(1.0);
+            let direction = (world_from_camera.rotation * ray).normalize();
+            let origin = world_from_camera.translation;
+            let mut nearest = f64::INFINITY;
+            for (centre, radius, color, id) in balls(time) {
+                let to = centre - origin;
+                let along = to.dot(direction);
+                let squared = radius * radius - (to.length_squared() - along * along);
+                if squared > 0.0 && along - squared.sqrt() < nearest {
+                    nearest = along - squared.sqrt();
+                    let normal = (origin + direction * nearest - centre) / radius;
+                    let light = 0.6 + 0.4 * normal.dot(DVec3::new(0.3, -0.8, -0.5).normalize()).max(0.0);
+                    rgb.put_pixel(x, y, image::Rgb(color.map(|c| (c * light * 255.0) as u8)));
+                    ids.put_pixel(x, y, image::Luma([id]));
+                }
+            }
+        }
+    }
+    rgb.save(image).unwrap();
+    if let Some(mask) = mask {
+        ids.save(mask).unwrap();
+    }
+}
+
+/// Writes a capture into `folder`.
+pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
+    let times: Vec<f64> = (0..scene.times).map(|k| k as f64 / (scene.times.max(2) - 1) as f64).collect();
+    let mut frames = Vec::new();
+    for view in 0..=scene.views {
+        for (time_index, time) in times.iter().enumerate() {
+            // The last view is held out, between the others.
+            let held_out = view == scene.views;
+            let turn = if held_out { 0.5 } else { view as f64 };
+            let camera = camera((turn / scene.views as f64 - 0.4) * 2.4);
+            let name = format!("{view}_{time_index}");
+            let image = folder.join(format!("{name}.png"));
+            let mask = scene.masks.then(|| folder.join(format!("{name}_mask.png")));
+            write_frame(&camera, *time, &image, mask.as_deref());
+            if let Some(mask) = mask.as_ref().filter(|_| scene.empty_masks) {
+                image::GrayImage::new(WIDTH, HEIGHT).save(mask).unwrap();
+            }
+            frames.push(Frame {
+                name,
+                camera_name: format!("cam{view}"),
+                camera,
+                lens: LensDistortion::default(),
+                time: *time,
+                time_index,
+                split: if held_out { Split::Val } else { Split::Train },
+                group: None,
+                image,
+                mask,
+            });
+        }
+    }
+    let label = |id| InstanceLabel { id, label: format!("ball {id}"), category: "ball".into() };
+    let (mut positions, mut colors) = (Vec::new(), Vec::new());
+    for (centre, radius, color, _) in balls(0.0) {
+        for k in 0..150 {
+            let z = 1.0 - (2.0 * f64::from(k) + 1.0) / 150.0;
+            let (s, c) = (f64::from(k) * 2.399_963).sin_cos();
+            let r = (1.0 - z * z).sqrt();
+            positions.push((centre + radius * DVec3::new(r * c, r * s, z)).as_vec3().to_array());
+            colors.push(color.map(|c| (c * 200.0) as u8));
+        }
+    }
+    Dataset {
+        root: folder.to_owned(),
+        layout: Layout::HyperNerf,
+        frames,
+        times,
+        frames_per_second: Some(10.0),
+        instances: if scene.masks { [4, 7, 9].map(label).to_vec() } else { Vec::new() },
+        points: PointCloud { positions, colors, source: PointSource::Random },
+        has_alpha: false,
+        warnings: Vec::new(),
+    }
+}
+
+/// Settings that train the capture in seconds.
+pub(crate) fn small_config() -> TrainConfig {
+    let mut config = TrainConfig::default();
+    config.seed = 3;
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (100, 250, 120);
+    config.model.spatial_resolution = [8; 3];
+    config.model.multipliers = vec![1, 2];
+    config.model.channels = 4;
+    config.model.width = 16;
+    config.model.sh_interval = 100;
+    config.densify.from = 40;
+    config.densify.until = 200;
+    config.densify.every = 40;
+    config.densify.prune_every = 60;
+    config.densify.max_gaussians = 800;
+    config.resample.from = 20;
+    config.resample.every = 20;
+    config.resample.until = 100;
+    config.resample.rate = 0.05;
+    config
+}
+
+/// Runs to the end without looking.
+pub(crate) fn train(dataset: Dataset, config: TrainConfig) -> Trainer {
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+    trainer
+}

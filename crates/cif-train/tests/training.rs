@@ -1,0 +1,254 @@
+//! Whole runs on a tiny capture.
+
+mod support;
+
+use cif_field::Field;
+use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
+use cif_train::{Control, Outcome, Stage, TrainError, TrainEvent, Trainer};
+use support::{Scene, capture, small_config, train};
+
+/// A field without its record, which holds wall times.
+fn without_record(field: &Field) -> Field {
+    Field { provenance: serde_json::Value::Null, ..field.clone() }
+}
+
+fn assert_equal(a: &Field, b: &Field) {
+    assert_eq!(a.gaussians.len(), b.gaussians.len());
+    assert!(without_record(a) == without_record(b), "the fields differ");
+}
+
+#[test]
+fn a_run_reaches_its_quality_and_reports_its_stages() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene::default());
+    let mut config = small_config();
+    config.report.evaluate_every = 200;
+    let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
+    let (mut stages, mut names) = (Vec::new(), std::collections::BTreeSet::new());
+    let outcome = trainer
+        .run(&mut |event, view| {
+            let json = serde_json::to_value(event).unwrap();
+            names.insert(json["event"].as_str().unwrap().to_owned());
+            match event {
+                TrainEvent::StageStarted { stage, .. } => stages.push(*stage),
+                TrainEvent::Step { gaussians, loss, .. } => {
+                    assert_eq!(*gaussians, view.field().gaussians.len());
+                    assert!(loss.is_finite());
+                }
+                TrainEvent::IdentityEstimated { instances, empty_instances, .. } => {
+                    assert_eq!((*instances, empty_instances.len()), (3, 0));
+                }
+                _ => {}
+            }
+            Control::Continue
+        })
+        .unwrap();
+    assert_eq!(outcome, Outcome::Finished);
+    assert_eq!(stages, [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]);
+    for name in ["step", "densified", "resampled", "identity_estimated", "evaluated", "finished"] {
+        assert!(names.contains(name), "{name} missing in {names:?}");
+    }
+    let field = trainer.into_field();
+    field.validate().unwrap();
+    assert_eq!(field.provenance["train"]["complete"], true);
+    assert_eq!(field.provenance["train"]["iterations"], 470);
+    let scores =
+        evaluate::<EvaluationError>(&field, &dataset, &EvaluationOptions::held_out(&field), |_| Ok(()))
+            .unwrap()
+            .overall;
+    let (psnr, miou) = (scores.psnr.unwrap(), scores.instance.miou.unwrap());
+    assert!(psnr > 20.0, "PSNR {psnr}");
+    assert!(miou > 75.0, "mIoU {miou}");
+}
+
+#[test]
+fn a_resumed_run_ends_where_the_uninterrupted_one_ends() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (50, 90, 50);
+    (config.densify.from, config.densify.every, config.stages.batch) = (10, 20, 2);
+    config.densify.opacity_reset_every = 35;
+    let whole = train(dataset.clone(), config.clone());
+    // Interruptions inside every stage, and on both sides of a densification.
+    for stop_at in [7_u64, 59, 61, 139, 165] {
+        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+        let total = trainer.steps_left();
+        trainer_stop_after(&mut trainer, total, stop_at);
+        let path = folder.path().join("stopped.cif");
+        trainer.checkpoint(true).save(&path).unwrap();
+        let loaded = cif_field::Checkpoint::load(&path).unwrap();
+        let mut resumed = Trainer::resume(dataset.clone(), loaded).unwrap();
+        assert_eq!(resumed.steps_left(), total - stop_at);
+        assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+        assert_equal(resumed.field(), whole.field());
+    }
+}
+
+/// Stops after `stop_at` steps of all stages.
+fn trainer_stop_after(trainer: &mut Trainer, total: u64, stop_at: u64) {
+    let mut config = trainer.config().clone();
+    config.report.step_every = 1;
+    let mut steps = 0;
+    let mut fresh = Trainer::new(trainer.dataset().clone(), config).unwrap();
+    let outcome = fresh.run(&mut |event, _| {
+        if matches!(event, TrainEvent::Step { .. }) {
+            steps += 1;
+        }
+        if steps >= stop_at { Control::Stop } else { Control::Continue }
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+    assert_eq!(fresh.steps_left(), total - stop_at);
+    *trainer = fresh;
+}
+
+#[test]
+fn threads_do_not_change_the_result() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (50, 60, 40);
+    config.loss.lambda_dssim = 0.2;
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| train(dataset.clone(), config.clone()))
+    };
+    assert_equal(on(1).field(), on(2).field());
+}
+
+#[test]
+fn another_seed_gives_another_result() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (5, 5, 5);
+    let first = train(dataset.clone(), config.clone());
+    config.seed += 1;
+    assert!(first.field().gaussians != train(dataset, config).field().gaussians);
+}
+
+#[test]
+fn without_masks_it_trains_colour_only_and_says_so() {
+    for scene in [Scene { masks: false, ..Scene::default() }, Scene { empty_masks: true, ..Scene::default() }]
+    {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = Scene { times: 2, views: 2, ..scene };
+        let dataset = capture(folder.path(), scene);
+        let mut config = small_config();
+        (config.stages.coarse, config.stages.fine) = (10, 10);
+        let mut trainer = Trainer::new(dataset, config).unwrap();
+        let mut warnings = Vec::new();
+        trainer
+            .run(&mut |event, _| {
+                if let TrainEvent::Warning { message } = event {
+                    warnings.push(message.clone());
+                }
+                assert!(!matches!(event, TrainEvent::StageStarted { stage: Stage::Instance, .. }));
+                Control::Continue
+            })
+            .unwrap();
+        assert!(warnings.iter().any(|message| message.contains("colour only")), "{warnings:?}");
+        assert!(trainer.field().identities.is_none());
+        trainer.field().validate().unwrap();
+    }
+}
+
+#[test]
+fn one_frame_is_a_static_capture() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut dataset = capture(folder.path(), Scene { times: 1, views: 1, ..Scene::default() });
+    dataset.frames.truncate(1);
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 20, 10);
+    let trainer = train(dataset, config);
+    assert!(trainer.field().deformation.is_none());
+    assert_eq!(trainer.field().provenance["train"]["iterations_by_stage"]["fine"], 30);
+    assert!(trainer.field().identities.is_some());
+}
+
+#[test]
+fn an_observer_is_obeyed() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.report.step_every, config.report.checkpoint_every) = (1, 7);
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    let (mut steps, mut due) = (0, Vec::new());
+    let outcome = trainer.run(&mut |event, view| match event {
+        TrainEvent::CheckpointDue { iteration, .. } => {
+            assert!(view.checkpoint(true).training.is_some() && view.checkpoint(false).training.is_none());
+            due.push(*iteration);
+            Control::Continue
+        }
+        TrainEvent::Step { .. } => {
+            steps += 1;
+            match steps {
+                10 => Control::Save,
+                16 => Control::Stop,
+                _ => Control::Continue,
+            }
+        }
+        _ => Control::Continue,
+    });
+    assert_eq!((outcome.unwrap(), steps), (Outcome::Interrupted, 16));
+    assert_eq!(due, [7, 10, 14]);
+}
+
+#[test]
+fn a_checkpoint_is_refused_without_state_or_for_another_capture() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let trainer = Trainer::new(dataset.clone(), small_config()).unwrap();
+    let refuse = |dataset, checkpoint| Trainer::resume(dataset, checkpoint).err().unwrap();
+    assert!(matches!(refuse(dataset.clone(), trainer.checkpoint(false)), TrainError::NoState));
+    let mut other = dataset.clone();
+    other.frames.remove(0);
+    let error = refuse(other, trainer.checkpoint(true));
+    assert!(error.to_string().contains("training frames was 4, and is 3"), "{error}");
+    let mut damaged = trainer.checkpoint(true);
+    damaged.training.as_mut().unwrap().tensors.remove("adam.means.second");
+    let error = refuse(dataset.clone(), damaged);
+    assert!(error.to_string().contains("adam.means.second"), "{error}");
+    let mut newer = trainer.checkpoint(true);
+    newer.training.as_mut().unwrap().json["version"] = 99.into();
+    assert!(matches!(refuse(dataset, newer), TrainError::BadState { .. }));
+}
+
+#[test]
+fn captures_without_training_frames_or_points_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 1, views: 1, ..Scene::default() });
+    let mut no_points = dataset.clone();
+    no_points.points.positions.clear();
+    no_points.points.colors.clear();
+    let error = Trainer::new(no_points, small_config()).err().unwrap();
+    assert!(matches!(error, TrainError::NoPoints { .. }), "{error}");
+    let mut no_frames = dataset.clone();
+    no_frames.frames.retain(|frame| frame.split == cif_dataset::Split::Val);
+    let error = Trainer::new(no_frames, small_config()).err().unwrap();
+    assert!(matches!(error, TrainError::NoTrainingFrames { .. }), "{error}");
+    let mut config = small_config();
+    config.stages.batch = 0;
+    assert!(Trainer::new(dataset, config).err().unwrap().to_string().contains("stages.batch"));
+}
+
+#[test]
+fn numbers_that_are_not_finite_stop_the_run_by_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 1, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    config.rates.log_scales = 1e38;
+    config.rates.means = [1e38, 1e38];
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    // Absurd rates either scatter the Gaussians (all culled) or meet a value that is not finite; no panic.
+    match trainer.run(&mut |_, _| Control::Continue) {
+        Ok(_) => {}
+        Err(error) => {
+            assert!(
+                matches!(error, TrainError::NotFinite { .. } | TrainError::NoGaussians { .. }),
+                "{error}"
+            );
+            assert!(error.to_string().contains("step"), "{error}");
+        }
+    }
+}
