@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use cif_geometry::{LensDistortion, PinholeCamera, PixelGrid};
+use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 /// The layouts that can be read.
@@ -132,4 +133,47 @@ pub struct FrameData {
     pub image: PixelGrid<[u8; 3]>,
     /// Instance ids, 0 = unlabelled, at the size of `image`.
     pub mask: Option<PixelGrid<u16>>,
+}
+
+impl Dataset {
+    /// Indices of the frames to train on, ascending.
+    #[must_use]
+    pub fn train_frames(&self) -> Vec<usize> {
+        self.split_frames(Split::Train)
+    }
+
+    /// Indices of the held-out frames, ascending.
+    #[must_use]
+    pub fn val_frames(&self) -> Vec<usize> {
+        self.split_frames(Split::Val)
+    }
+
+    /// Indices of the frames of a split, ascending.
+    #[must_use]
+    pub fn split_frames(&self, split: Split) -> Vec<usize> {
+        (0..self.frames.len()).filter(|index| self.frames[*index].split == split).collect()
+    }
+
+    /// Scene extent in metres: 1.1 times the largest distance of a training camera's centre from the mean of
+    /// the centres; 1 when all centres coincide. Source: methods reference 0.
+    #[must_use]
+    pub fn extent(&self) -> f64 {
+        let spread = self.camera_spread();
+        if spread > 0.0 { 1.1 * spread } else { 1.0 }
+    }
+
+    /// Largest distance of a training camera's centre from their mean; 0 below rounding.
+    pub(crate) fn camera_spread(&self) -> f64 {
+        let centres: Vec<DVec3> =
+            self.train_frames().into_iter().map(|index| self.frames[index].camera.centre()).collect();
+        let mean = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
+        let spread = centres.iter().map(|centre| centre.distance(mean)).fold(0.0, f64::max);
+        if spread > 1e-9 * (1.0 + mean.length()) { spread } else { 0.0 }
+    }
+
+    /// Smallest box around the initial points.
+    #[must_use]
+    pub fn point_bounds(&self) -> Bounds {
+        Bounds::around(self.points.positions.iter().map(|p| DVec3::from_array(p.map(f64::from))))
+    }
 }

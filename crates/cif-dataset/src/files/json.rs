@@ -1,0 +1,32 @@
+//! JSON files, with the line of a mistake in its message.
+
+use std::path::Path;
+
+use serde::de::DeserializeOwned;
+
+use crate::Error;
+
+/// Larger JSON files are not captures; the bound keeps a stray file from filling memory.
+const MAX_BYTES: u64 = 1 << 30;
+
+/// Reads a JSON file.
+///
+/// # Errors
+/// When it cannot be read, or its text does not fit `T`; the message has line and column.
+pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Error> {
+    let size = std::fs::metadata(path).map_err(Error::read(path))?.len();
+    if size > MAX_BYTES {
+        return Err(Error::invalid(path, format!("{size} bytes are too many for a JSON file of a capture")));
+    }
+    let text = std::fs::read(path).map_err(Error::read(path))?;
+    serde_json::from_slice(&text).map_err(|error| Error::Json {
+        path: path.to_owned(),
+        line: error.line(),
+        column: error.column(),
+        problem: {
+            let text = error.to_string();
+            let end = text.rfind(" at line").unwrap_or(text.len());
+            text[..end].to_owned()
+        },
+    })
+}

@@ -1,0 +1,194 @@
+//! Instance masks: PNG files whose pixel values are instance ids.
+
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use cif_geometry::PixelGrid;
+use png::{BitDepth, ColorType, Decoder, Limits, Transformations};
+
+use crate::Error;
+
+/// Larger masks than this are refused before anything is allocated.
+const MAX_PIXELS: u64 = 1 << 28;
+
+/// What the header of a mask says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct MaskHeader {
+    pub(crate) width: u32,
+    pub(crate) height: u32,
+    /// Largest id that the file can hold.
+    pub(crate) largest_id: u16,
+}
+
+fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
+    let file = File::open(path).map_err(Error::read(path))?;
+    let mut decoder = Decoder::new_with_limits(BufReader::new(file), Limits { bytes: 1 << 31 });
+    // Palette indices and 16-bit values must arrive as they are stored.
+    decoder.set_transformations(Transformations::IDENTITY);
+    let reader = decoder
+        .read_info()
+        .map_err(|error| Error::mask(path, format!("not a readable PNG file ({error}); export it again")))?;
+    let info = reader.info();
+    match info.color_type {
+        ColorType::Grayscale | ColorType::Indexed => {}
+        ColorType::Rgb | ColorType::Rgba | ColorType::GrayscaleAlpha => {
+            return Err(Error::mask(
+                path,
+                format!(
+                    "it is a {} image; a mask is an 8- or 16-bit grey or palette PNG whose pixel values are \
+                     instance ids, 0 for unlabelled",
+                    match info.color_type {
+                        ColorType::GrayscaleAlpha => "grey and alpha",
+                        ColorType::Rgba => "RGBA",
+                        _ => "RGB",
+                    }
+                ),
+            ));
+        }
+    }
+    if u64::from(info.width) * u64::from(info.height) > MAX_PIXELS {
+        return Err(Error::mask(path, format!("{} x {} pixels are too many", info.width, info.height)));
+    }
+    Ok(reader)
+}
+
+/// Reads the header of a mask.
+///
+/// # Errors
+/// When the file is missing, no PNG, or a colour image.
+pub(crate) fn probe(path: &Path) -> Result<MaskHeader, Error> {
+    let reader = open(path)?;
+    let info = reader.info();
+    Ok(MaskHeader {
+        width: info.width,
+        height: info.height,
+        largest_id: if info.bit_depth == BitDepth::Sixteen {
+            u16::MAX
+        } else {
+            (1_u16 << (info.bit_depth as u8)) - 1
+        },
+    })
+}
+
+/// Decodes a mask: the stored value of every pixel.
+///
+/// # Errors
+/// When the file is missing, truncated, no PNG, or a colour image.
+pub(crate) fn decode(path: &Path) -> Result<PixelGrid<u16>, Error> {
+    let mut reader = open(path)?;
+    let damaged =
+        |problem: String| Error::mask(path, format!("it cannot be decoded ({problem}); export it again"));
+    let size = reader.output_buffer_size().ok_or_else(|| damaged("too large".to_owned()))?;
+    let mut buffer = vec![0; size];
+    let frame = reader.next_frame(&mut buffer).map_err(|error| damaged(error.to_string()))?;
+    let (width, height) = (frame.width as usize, frame.height as usize);
+    let mut pixels = Vec::with_capacity(width * height);
+    for row in buffer.chunks_exact(frame.line_size).take(height) {
+        match frame.bit_depth {
+            BitDepth::Sixteen => {
+                pixels.extend(row.chunks_exact(2).take(width).map(|b| u16::from_be_bytes([b[0], b[1]])));
+            }
+            BitDepth::Eight => pixels.extend(row.iter().take(width).map(|value| u16::from(*value))),
+            depth => {
+                let bits = depth as usize;
+                let mask = (1_u8 << bits) - 1;
+                pixels.extend((0..width).map(|x| {
+                    let shift = 8 - bits - (x * bits) % 8;
+                    u16::from((row[x * bits / 8] >> shift) & mask)
+                }));
+            }
+        }
+    }
+    Ok(PixelGrid::from_pixels(frame.width, frame.height, pixels))
+}
+
+/// Nearest-neighbour resize: never invents an id (methods reference 7, row 39).
+pub(crate) fn nearest_resize(mask: &PixelGrid<u16>, width: u32, height: u32) -> PixelGrid<u16> {
+    if (mask.width, mask.height) == (width, height) {
+        return mask.clone();
+    }
+    let index = |k: u32, target: u32, source: u32| {
+        ((2 * u64::from(k) + 1) * u64::from(source) / (2 * u64::from(target))) as usize
+    };
+    let columns: Vec<usize> = (0..width).map(|x| index(x, width, mask.width)).collect();
+    let pixels = (0..height)
+        .flat_map(|y| {
+            let start = index(y, height, mask.height) * mask.width as usize;
+            columns.iter().map(move |x| mask.pixels[start + x])
+        })
+        .collect();
+    PixelGrid::from_pixels(width, height, pixels)
+}
+
+/// Writes ids as a grey PNG, 8 bits where they fit, else 16.
+///
+/// # Errors
+/// When the file cannot be written.
+pub(crate) fn write(path: &Path, mask: &PixelGrid<u16>) -> Result<(), Error> {
+    let wide = mask.pixels.iter().any(|id| *id > 255);
+    let file = File::create(path).map_err(Error::write(path))?;
+    let mut encoder = png::Encoder::new(std::io::BufWriter::new(file), mask.width, mask.height);
+    encoder.set_color(ColorType::Grayscale);
+    encoder.set_depth(if wide { BitDepth::Sixteen } else { BitDepth::Eight });
+    let bytes: Vec<u8> = if wide {
+        mask.pixels.iter().flat_map(|id| id.to_be_bytes()).collect()
+    } else {
+        mask.pixels.iter().map(|id| *id as u8).collect()
+    };
+    let encode = || -> Result<(), png::EncodingError> {
+        let mut writer = encoder.write_header()?;
+        writer.write_image_data(&bytes)?;
+        writer.finish()
+    };
+    encode().map_err(|error| Error::Write { path: path.to_owned(), source: error.into() })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn ids_after_a_resize_are_a_subset() {
+        let mask = PixelGrid::from_pixels(7, 5, (0..35).map(|k| (k * 37 % 11) as u16 * 100).collect());
+        let before: BTreeSet<u16> = mask.pixels.iter().copied().collect();
+        for (width, height) in [(3, 2), (14, 10), (17, 33), (1, 1)] {
+            let resized = nearest_resize(&mask, width, height);
+            assert_eq!((resized.width, resized.height), (width, height));
+            assert!(resized.pixels.iter().all(|id| before.contains(id)));
+        }
+    }
+
+    #[test]
+    fn halving_takes_a_pixel_of_each_block() {
+        let mask = PixelGrid::from_pixels(4, 1, vec![1, 1, 2, 2]);
+        assert_eq!(nearest_resize(&mask, 2, 1).pixels, vec![1, 2]);
+    }
+
+    #[test]
+    fn written_ids_come_back() {
+        let folder = tempfile::tempdir().unwrap();
+        for ids in [vec![0, 7, 255], vec![0, 256, 65_535]] {
+            let path = folder.path().join("mask.png");
+            let mask = PixelGrid::from_pixels(3, 1, ids);
+            write(&path, &mask).unwrap();
+            assert_eq!(decode(&path).unwrap(), mask);
+        }
+    }
+
+    #[test]
+    fn packed_palette_indices_are_read_as_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mask.png");
+        let mut encoder = png::Encoder::new(File::create(&path).unwrap(), 5, 2);
+        encoder.set_color(ColorType::Indexed);
+        encoder.set_depth(BitDepth::Four);
+        encoder.set_palette(vec![0; 48]);
+        encoder.write_header().unwrap().write_image_data(&[0x01, 0x23, 0x40, 0xFE, 0xDC, 0xB0]).unwrap();
+        let mask = decode(&path).unwrap();
+        assert_eq!(mask.pixels, vec![0, 1, 2, 3, 4, 15, 14, 13, 12, 11]);
+        assert_eq!(probe(&path).unwrap().largest_id, 15);
+    }
+}

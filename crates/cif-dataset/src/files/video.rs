@@ -1,0 +1,134 @@
+//! Frames of videos, extracted once by `ffmpeg` into a cache folder.
+
+use std::ffi::OsStr;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use super::listing;
+use crate::Error;
+
+/// Folder inside a capture that holds extracted frames.
+const CACHE: &str = ".cif_frames";
+
+/// The frames of a video as PNG files in order, extracted unless an earlier call did so.
+///
+/// They lie in `.cif_frames/<stem>` inside `root`, or in the system's temporary folder where `root` cannot be
+/// written. `images` is where a person would put extracted frames (for the message).
+///
+/// # Errors
+/// When ffmpeg is missing or fails.
+pub(crate) fn frames(root: &Path, video: &Path, images: &Path) -> Result<Vec<PathBuf>, Error> {
+    frames_with(OsStr::new("ffmpeg"), root, video, images)
+}
+
+fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Result<Vec<PathBuf>, Error> {
+    let name = listing::stem(video);
+    let caches =
+        [root.join(CACHE), std::env::temp_dir().join(format!("cif_frames_{:016x}", fingerprint(root)))];
+    let changed = |path: &Path| std::fs::metadata(path).and_then(|data| data.modified()).ok();
+    for cache in &caches {
+        let folder = cache.join(&name);
+        if folder.is_dir() && changed(&folder) >= changed(video) {
+            let found = listing::images(&folder)?;
+            if !found.is_empty() {
+                return Ok(found);
+            }
+        }
+    }
+    let (cache, partial) = match scratch(&caches[0]) {
+        Ok(partial) => (&caches[0], partial),
+        Err(_) => (&caches[1], scratch(&caches[1]).map_err(Error::write(&caches[1]))?),
+    };
+    let output = Command::new(ffmpeg)
+        .args(["-nostdin", "-v", "error", "-i"])
+        .arg(video)
+        .args(["-start_number", "0"])
+        .arg(partial.path().join("%06d.png"))
+        .output();
+    let output = match output {
+        Ok(output) => output,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            return Err(Error::FfmpegMissing { video: video.to_owned(), images: images.to_owned() });
+        }
+        Err(error) => return Err(Error::Ffmpeg { video: video.to_owned(), problem: error.to_string() }),
+    };
+    let words = String::from_utf8_lossy(&output.stderr);
+    let failed =
+        |problem: &str| Error::Ffmpeg { video: video.to_owned(), problem: problem.trim().to_owned() };
+    if !output.status.success() {
+        return Err(failed(words.lines().last().unwrap_or("it gave no reason")));
+    }
+    if listing::images(partial.path())?.is_empty() {
+        return Err(failed("it holds no frame"));
+    }
+    let folder = cache.join(&name);
+    if folder.is_dir() {
+        std::fs::remove_dir_all(&folder).map_err(Error::write(&folder))?;
+    }
+    std::fs::rename(partial.keep(), &folder).map_err(Error::write(&folder))?;
+    listing::images(&folder)
+}
+
+/// A folder beside the final one, removed again unless kept.
+fn scratch(cache: &Path) -> io::Result<tempfile::TempDir> {
+    std::fs::create_dir_all(cache)?;
+    tempfile::Builder::new().prefix(".partial").tempdir_in(cache)
+}
+
+/// FNV-1a of the path, so that captures do not share a cache.
+fn fingerprint(root: &Path) -> u64 {
+    let root = root.canonicalize().unwrap_or_else(|_| root.to_owned());
+    root.as_os_str()
+        .as_encoded_bytes()
+        .iter()
+        .fold(0xcbf2_9ce4_8422_2325, |hash, byte| (hash ^ u64::from(*byte)).wrapping_mul(0x0100_0000_01b3))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_missing_ffmpeg_is_named_with_the_way_out() {
+        let root = tempfile::tempdir().unwrap();
+        let video = root.path().join("cam00.mp4");
+        std::fs::write(&video, b"no video").unwrap();
+        let error = frames_with(
+            OsStr::new("no-such-program-on-any-path"),
+            root.path(),
+            &video,
+            &root.path().join("cam00/images"),
+        )
+        .unwrap_err()
+        .to_string();
+        assert!(error.contains("cam00.mp4") && error.contains("install ffmpeg"), "{error}");
+        assert!(error.contains("cam00/images") || error.contains("cam00\\images"), "{error}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn frames_are_extracted_once() {
+        use std::os::unix::fs::PermissionsExt;
+
+        let root = tempfile::tempdir().unwrap();
+        let video = root.path().join("cam00.mp4");
+        std::fs::write(&video, b"no video").unwrap();
+        // A stand-in that writes two frames where the last argument points.
+        let program = root.path().join("stand-in");
+        std::fs::write(
+            &program,
+            "#!/bin/sh\nfor last; do :; done\nfolder=$(dirname \"$last\")\necho a > \"$folder/000000.png\"\n\
+             echo b > \"$folder/000001.png\"\n",
+        )
+        .unwrap();
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let images = root.path().join("cam00/images");
+        let first = frames_with(program.as_os_str(), root.path(), &video, &images).unwrap();
+        assert_eq!(first.len(), 2);
+        assert!(first[0].ends_with(".cif_frames/cam00/000000.png"));
+        // The second call needs no program.
+        let second = frames_with(OsStr::new("no-such-program"), root.path(), &video, &images).unwrap();
+        assert_eq!(first, second);
+    }
+}

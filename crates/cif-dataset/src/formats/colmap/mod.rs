@@ -1,0 +1,148 @@
+//! COLMAP reconstructions: `sparse/0` with text or binary files, and `images/`.
+//!
+//! Static: all times are 0. Every eighth image in name order is held out. Poses are world-to-camera, as here;
+//! pixel (0, 0) has its centre at (0.5, 0.5), as here.
+
+mod binary;
+mod model;
+mod text;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use cif_geometry::RigidTransform;
+use glam::{DMat3, DQuat, DVec3};
+
+use super::{Draft, DraftFrame, Source, hold_out_every_eighth, transforms};
+use crate::files::listing;
+use crate::points::RawPoints;
+use crate::{Error, Split};
+
+/// A row of `cameras`.
+struct Camera {
+    model: String,
+    size: [f64; 2],
+    params: Vec<f64>,
+}
+
+/// A row of `images`.
+struct Image {
+    name: String,
+    /// (w, x, y, z), world to camera.
+    rotation: [f64; 4],
+    translation: [f64; 3],
+    camera: u32,
+}
+
+/// A reconstruction as its three files tell it.
+struct Reconstruction {
+    cameras: BTreeMap<u32, Camera>,
+    cameras_path: PathBuf,
+    images: Vec<Image>,
+    images_path: PathBuf,
+    points: RawPoints,
+    points_path: PathBuf,
+}
+
+/// Folder with the reconstruction, where the capture has one.
+pub(crate) fn sparse_folder(root: &Path) -> Option<PathBuf> {
+    ["sparse/0", "sparse", "colmap/sparse/0"]
+        .iter()
+        .map(|name| root.join(name))
+        .find(|folder| folder.join("cameras.bin").is_file() || folder.join("cameras.txt").is_file())
+        // A folder without cameras still marks the layout, so that the reader can say what is missing.
+        .or_else(|| Some(root.join("sparse/0")).filter(|folder| folder.is_dir()))
+}
+
+pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
+    let root = source.root;
+    let missing = |path: PathBuf, fix: &str| Error::MissingFile { path, fix: fix.to_owned() };
+    let folder = sparse_folder(root)
+        .ok_or_else(|| missing(root.join("sparse/0"), "a COLMAP capture keeps its reconstruction there"))?;
+    let reconstruction = if folder.join("cameras.bin").is_file() {
+        binary::read(&folder)?
+    } else if folder.join("cameras.txt").is_file() {
+        text::read(&folder)?
+    } else {
+        return Err(missing(
+            folder.join("cameras.bin"),
+            "export the reconstruction from COLMAP (cameras, images, points3D)",
+        ));
+    };
+    let Reconstruction { cameras, cameras_path, images, images_path, points, points_path } = reconstruction;
+    if images.is_empty() {
+        return Err(Error::invalid(&images_path, "it has no image; COLMAP registered none"));
+    }
+    let image_folder = root.join("images");
+    if !image_folder.is_dir() {
+        return Err(missing(image_folder, "a COLMAP capture keeps its images there"));
+    }
+    let mut frames = Vec::with_capacity(images.len());
+    for image in &images {
+        let relative = transforms::clean(Path::new(&image.name));
+        let name = transforms::frame_name(&relative);
+        let path = image_folder.join(&relative);
+        if !path.is_file() {
+            return Err(Error::CameraWithoutImage { frame: name, source_file: images_path, image: path });
+        }
+        let camera = cameras.get(&image.camera).ok_or_else(|| Error::Intrinsics {
+            path: images_path.clone(),
+            frame: name.clone(),
+            problem: format!(
+                "camera {} is not in {}; export both again",
+                image.camera,
+                cameras_path.display()
+            ),
+        })?;
+        let camera_from_world = pose(image).ok_or_else(|| Error::Pose {
+            path: images_path.clone(),
+            frame: name.clone(),
+            problem: "has a quaternion without length, or a value that is not finite".to_owned(),
+        })?;
+        frames.push(DraftFrame {
+            camera_name: if cameras.len() == 1 {
+                "camera".to_owned()
+            } else {
+                format!("camera_{}", image.camera)
+            },
+            time: 0.0,
+            split: Split::Train,
+            image: path,
+            mask: None,
+            camera: model::camera(camera, &cameras_path, &name, camera_from_world)?,
+            name,
+        });
+    }
+    frames.sort_by(|a, b| a.name.cmp(&b.name));
+    hold_out_every_eighth(&mut frames);
+    let mut warnings = Vec::new();
+    let unlisted = listing::count_images_below(&image_folder)?.saturating_sub(frames.len());
+    if unlisted > 0 {
+        warnings.push(format!(
+            "{}: {unlisted} images have no camera in {} and are not used",
+            image_folder.display(),
+            images_path.display()
+        ));
+    }
+    Ok(Draft {
+        frames,
+        stored_reduction: 1,
+        points: (!points.positions.is_empty()).then_some((points, points_path)),
+        warnings,
+        ..Draft::default()
+    })
+}
+
+/// World to camera; `None` for a quaternion that is no rotation.
+fn pose(image: &Image) -> Option<RigidTransform> {
+    let [w, x, y, z] = image.rotation;
+    let quaternion = DQuat::from_xyzw(x, y, z, w);
+    let length = quaternion.length();
+    if !(length.is_finite() && length > 1e-6) {
+        return None;
+    }
+    Some(RigidTransform {
+        rotation: DMat3::from_quat(quaternion * (1.0 / length)),
+        translation: DVec3::from_array(image.translation),
+    })
+}

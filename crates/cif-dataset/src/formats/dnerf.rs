@@ -1,0 +1,69 @@
+//! D-NeRF and Blender captures: `transforms_{train,val,test}.json`.
+//!
+//! Held out is `transforms_test.json`, as in the base code; `transforms_val.json` is read only where there is
+//! no test file. Without any time the capture is static.
+
+use super::{Draft, DraftFrame, Source, customary_points, transforms};
+use crate::{Error, Split};
+
+/// Half edge of the box for random points (methods reference 1.1).
+const BOX: f64 = 1.3;
+
+pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
+    let root = source.root;
+    let [train, val, test] =
+        ["train", "val", "test"].map(|split| root.join(format!("transforms_{split}.json")));
+    if !train.is_file() {
+        return Err(Error::MissingFile { path: train, fix: "it lists the frames to train on".to_owned() });
+    }
+    let mut warnings = Vec::new();
+    let held_out = if test.is_file() {
+        if val.is_file() {
+            warnings.push(format!(
+                "{}: not used; the frames of transforms_test.json are the held-out ones",
+                val.display()
+            ));
+        }
+        Some(test)
+    } else if val.is_file() {
+        Some(val)
+    } else {
+        warnings.push(format!(
+            "{}: there is neither transforms_test.json nor transforms_val.json; nothing is held out",
+            root.display()
+        ));
+        None
+    };
+
+    let mut frames = Vec::new();
+    let mut times = Vec::new();
+    let mut frames_per_second = None;
+    for (path, split) in [(Some(train.clone()), Split::Train), (held_out, Split::Val)] {
+        let Some(path) = path else { continue };
+        let file = transforms::read(&path)?;
+        frames_per_second = frames_per_second.or(file.fps);
+        for entry in &file.frames {
+            times.push(entry.time);
+            frames.push(DraftFrame {
+                name: transforms::frame_name(&entry.file_path),
+                camera_name: "camera".to_owned(),
+                time: 0.0,
+                split,
+                image: transforms::image(root, &path, entry)?,
+                mask: entry.mask_path.as_ref().map(|mask| root.join(transforms::clean(mask))),
+                camera: transforms::camera(&path, &file, entry)?,
+            });
+        }
+    }
+    for (frame, time) in frames.iter_mut().zip(transforms::normalised_times(&train, &times)?) {
+        frame.time = time;
+    }
+    Ok(Draft {
+        frames,
+        stored_reduction: 1,
+        points: customary_points(root)?,
+        random_box: Some(BOX),
+        frames_per_second,
+        warnings,
+    })
+}

@@ -1,0 +1,151 @@
+//! One module per capture layout.
+//!
+//! To add a layout: a variant of [`Layout`] with its name and marker, a module here with a function
+//! `read(&Source) -> Result<Draft, Error>`, one line in [`read`], and a capture in `tests/`. A reader turns
+//! files into a [`Draft`]: cameras in the pixels of their own files, poses converted to this project's axes
+//! (nothing after it swaps axes), raw names and splits. Probing images, scaling cameras, checking poses, masks,
+//! labels and points are common to all layouts (`crate::open`).
+
+mod colmap;
+mod dnerf;
+mod hypernerf;
+mod nerfstudio;
+mod neu3d;
+mod transforms;
+
+pub(crate) use colmap::sparse_folder as colmap_sparse_folder;
+
+use std::path::{Path, PathBuf};
+
+use cif_geometry::{LensDistortion, RigidTransform};
+use glam::{DMat3, DVec2, DVec3};
+
+use crate::points::RawPoints;
+use crate::{Error, Layout, OpenOptions, Split};
+
+/// What a reader is given.
+pub(crate) struct Source<'a> {
+    pub(crate) root: &'a Path,
+    pub(crate) options: &'a OpenOptions,
+}
+
+/// A capture as its files tell it.
+#[derive(Default)]
+pub(crate) struct Draft {
+    pub(crate) frames: Vec<DraftFrame>,
+    /// Reduction of the images named, relative to the largest ones of the capture.
+    pub(crate) stored_reduction: u32,
+    /// Points that the layout brings along, with the file.
+    pub(crate) points: Option<(RawPoints, PathBuf)>,
+    /// Half edge of the box for random points around the origin, for layouts that have a customary one.
+    pub(crate) random_box: Option<f64>,
+    pub(crate) frames_per_second: Option<f64>,
+    pub(crate) warnings: Vec<String>,
+}
+
+/// One frame as its files tell it.
+pub(crate) struct DraftFrame {
+    pub(crate) name: String,
+    pub(crate) camera_name: String,
+    /// Normalised.
+    pub(crate) time: f64,
+    pub(crate) split: Split,
+    pub(crate) image: PathBuf,
+    /// Mask that the layout itself names.
+    pub(crate) mask: Option<PathBuf>,
+    pub(crate) camera: DraftCamera,
+}
+
+/// A camera in the pixels of its own file.
+#[derive(Clone)]
+pub(crate) struct DraftCamera {
+    /// File that holds it.
+    pub(crate) source: PathBuf,
+    /// Image size that the pixels refer to; that of the stored image where `None`.
+    pub(crate) size: Option<DVec2>,
+    pub(crate) focal: DraftFocal,
+    /// Centre of the image where `None`.
+    pub(crate) principal_px: Option<DVec2>,
+    pub(crate) lens: LensDistortion,
+    pub(crate) camera_from_world: RigidTransform,
+}
+
+#[derive(Clone, Copy)]
+pub(crate) enum DraftFocal {
+    Pixels(DVec2),
+    /// Horizontal field of view in radians, square pixels.
+    HorizontalAngle(f64),
+}
+
+/// Reads a capture of a known layout.
+///
+/// # Errors
+/// As the layout's reader finds them; see [`Error`].
+pub(crate) fn read(layout: Layout, source: &Source<'_>) -> Result<Draft, Error> {
+    match layout {
+        Layout::HyperNerf => hypernerf::read(source),
+        Layout::Neu3d => neu3d::read(source),
+        Layout::DNerf => dnerf::read(source),
+        Layout::Nerfstudio => nerfstudio::read(source),
+        Layout::Colmap => colmap::read(source),
+    }
+}
+
+/// Every eighth frame is held out, from the first on, as 3D Gaussian splatting does; a single frame is trained
+/// on.
+pub(crate) fn hold_out_every_eighth(frames: &mut [DraftFrame]) {
+    if frames.len() < 2 {
+        return;
+    }
+    for (index, frame) in frames.iter_mut().enumerate() {
+        frame.split = if index % 8 == 0 { Split::Val } else { Split::Train };
+    }
+}
+
+/// Our camera from an OpenGL camera-to-world matrix (x right, y up, z backward), row by row.
+pub(crate) fn from_opengl(rows: &[[f64; 4]]) -> RigidTransform {
+    let column = |c: usize| DVec3::new(rows[0][c], rows[1][c], rows[2][c]);
+    world_to_camera(DMat3::from_cols(column(0), -column(1), -column(2)), column(3))
+}
+
+/// World to camera from the camera's axes (columns right, down, forward) and centre. The rotation is
+/// transposed, not inverted, and so must still be checked.
+pub(crate) fn world_to_camera(axes: DMat3, centre: DVec3) -> RigidTransform {
+    let rotation = axes.transpose();
+    RigidTransform { rotation, translation: -(rotation * centre) }
+}
+
+/// First few names of a list, for messages.
+pub(crate) fn some_of<'a>(names: impl ExactSizeIterator<Item = &'a str>) -> String {
+    let count = names.len();
+    let mut text = names.take(3).collect::<Vec<_>>().join(", ");
+    if count > 3 {
+        text.push_str(&format!(" and {} more", count - 3));
+    }
+    text
+}
+
+/// The first point file that exists, of the names that captures use.
+///
+/// # Errors
+/// When the file is damaged.
+pub(crate) fn customary_points(root: &Path) -> Result<Option<(RawPoints, PathBuf)>, Error> {
+    for name in [
+        "points3D_downsample2.ply",
+        "points3D.ply",
+        "points3d.ply",
+        "sparse_pc.ply",
+        "points.ply",
+        "fused.ply",
+    ] {
+        let path = root.join(name);
+        if path.is_file() {
+            return Ok(Some((crate::files::ply::read_points(&path)?, path)));
+        }
+    }
+    let path = root.join("points.npy");
+    if path.is_file() {
+        return Ok(Some((crate::points::read_npy(&path)?, path)));
+    }
+    Ok(None)
+}

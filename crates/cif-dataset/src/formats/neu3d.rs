@@ -1,0 +1,144 @@
+//! Neu3D / DyNeRF captures: fixed, synchronised cameras. Source: methods reference 2.1 (time) and 10.2 (poses).
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+use cif_geometry::LensDistortion;
+use glam::{DMat3, DVec2, DVec3};
+
+use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, customary_points, some_of, world_to_camera};
+use crate::files::{listing, npy, video};
+use crate::{Error, Split};
+
+/// One camera of the rig with its images in order.
+struct View {
+    name: String,
+    images: Vec<PathBuf>,
+}
+
+pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
+    let root = source.root;
+    let poses_path = root.join("poses_bounds.npy");
+    let poses = npy::read_matrix(&poses_path)?;
+    if poses.columns < 15 {
+        return Err(Error::invalid(
+            &poses_path,
+            format!(
+                "{} values per camera; 17 are expected: a 3 x 5 pose (down, right, back, position, (H, W, f)) and \
+                 two depths",
+                poses.columns
+            ),
+        ));
+    }
+    let views = views(root)?;
+    if views.len() != poses.rows {
+        return Err(Error::invalid(
+            &poses_path,
+            format!(
+                "it has {} cameras, but the capture has images of {} ({}): a camera without images or images \
+                 without a camera; rows belong to the camera folders in name order",
+                poses.rows,
+                views.len(),
+                some_of(views.iter().map(|view| view.name.as_str()))
+            ),
+        ));
+    }
+
+    // Frames of different cameras belong together by name; a step that some camera lacks still counts.
+    let steps: BTreeSet<String> =
+        views.iter().flat_map(|view| view.images.iter().map(|image| listing::stem(image))).collect();
+    let steps: Vec<String> = steps.into_iter().collect();
+    let mut warnings = Vec::new();
+    let mut frames = Vec::new();
+    let held_out =
+        if views.iter().any(|view| view.name == "cam00") { "cam00" } else { views[0].name.as_str() };
+    if held_out != "cam00" {
+        warnings.push(format!("{}: there is no cam00; {held_out} is held out instead", root.display()));
+    }
+    for (row, view) in views.iter().enumerate() {
+        if view.images.len() < steps.len() {
+            warnings.push(format!(
+                "{}: {} of {} frames are missing",
+                root.join(&view.name).display(),
+                steps.len() - view.images.len(),
+                steps.len()
+            ));
+        }
+        let camera = camera(&poses_path, &poses.values[row * poses.columns..][..15]);
+        for image in &view.images {
+            let stem = listing::stem(image);
+            let step = steps.binary_search(&stem).expect("every stem was collected");
+            frames.push(DraftFrame {
+                name: format!("{}/{stem}", view.name),
+                camera_name: view.name.clone(),
+                time: step as f64 / steps.len() as f64,
+                split: if view.name == held_out && views.len() > 1 { Split::Val } else { Split::Train },
+                image: image.clone(),
+                mask: None,
+                camera: camera.clone(),
+            });
+        }
+    }
+    Ok(Draft { frames, stored_reduction: 1, points: customary_points(root)?, warnings, ..Draft::default() })
+}
+
+/// Whether a name is that of a camera: `cam` and digits.
+fn is_camera(name: &str) -> bool {
+    name.strip_prefix("cam").is_some_and(|rest| !rest.is_empty() && rest.chars().all(|c| c.is_ascii_digit()))
+}
+
+/// Cameras in name order: images where there are any, else the video.
+fn views(root: &Path) -> Result<Vec<View>, Error> {
+    let names: BTreeSet<String> = listing::entries(root)?
+        .iter()
+        .filter(|path| path.is_dir() || listing::has_extension(path, &["mp4"]))
+        .map(|path| listing::stem(path))
+        .filter(|name| is_camera(name))
+        .collect();
+    let mut views = Vec::new();
+    for name in names {
+        let folder = root.join(&name);
+        let mut images = listing::images(&folder.join("images"))?;
+        if images.is_empty() {
+            images = listing::images(&folder)?;
+        }
+        let movie = root.join(format!("{name}.mp4"));
+        if images.is_empty() && movie.is_file() {
+            images = video::frames(root, &movie, &folder.join("images"))?;
+        }
+        if images.is_empty() {
+            return Err(Error::MissingFile {
+                path: folder.join("images"),
+                fix: format!("give the images of this camera there, or {name}.mp4 beside it"),
+            });
+        }
+        if let Some(pair) = images.windows(2).find(|pair| listing::stem(&pair[0]) == listing::stem(&pair[1]))
+        {
+            return Err(Error::DuplicateFrame { path: folder, frame: listing::stem(&pair[0]) });
+        }
+        views.push(View { name, images });
+    }
+    if views.is_empty() {
+        return Err(Error::MissingFile {
+            path: root.join("cam00"),
+            fix: "poses_bounds.npy needs camXX/images or camXX.mp4 beside it; for a static capture of one image \
+                  per camera use the COLMAP or nerfstudio layout"
+                .to_owned(),
+        });
+    }
+    Ok(views)
+}
+
+/// A 3 x 5 pose, row by row: columns down, right, back, position, (H, W, f).
+fn camera(path: &Path, pose: &[f64]) -> DraftCamera {
+    let column = |c: usize| DVec3::new(pose[c], pose[5 + c], pose[10 + c]);
+    let [down, right, back, centre, size] = [0, 1, 2, 3, 4].map(column);
+    DraftCamera {
+        source: path.to_owned(),
+        size: Some(DVec2::new(size.y, size.x)),
+        focal: DraftFocal::Pixels(DVec2::splat(size.z)),
+        principal_px: None,
+        lens: LensDistortion::default(),
+        camera_from_world: world_to_camera(DMat3::from_cols(right, down, -back), centre),
+    }
+}

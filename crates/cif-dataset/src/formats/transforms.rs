@@ -1,0 +1,173 @@
+//! The `transforms*.json` files of NeRF, D-NeRF, instant-ngp and nerfstudio.
+
+use std::path::{Path, PathBuf};
+
+use cif_geometry::LensDistortion;
+use glam::DVec2;
+use serde::Deserialize;
+
+use super::{DraftCamera, DraftFocal, from_opengl};
+use crate::Error;
+use crate::files::{json, listing};
+
+/// A whole file.
+#[derive(Deserialize)]
+pub(super) struct TransformsFile {
+    #[serde(flatten)]
+    pub(super) intrinsics: Intrinsics,
+    pub(super) frames: Vec<FrameEntry>,
+    pub(super) ply_file_path: Option<PathBuf>,
+    pub(super) train_filenames: Option<Vec<PathBuf>>,
+    pub(super) val_filenames: Option<Vec<PathBuf>>,
+    pub(super) test_filenames: Option<Vec<PathBuf>>,
+    pub(super) fps: Option<f64>,
+}
+
+/// One frame of a file.
+#[derive(Deserialize)]
+pub(super) struct FrameEntry {
+    pub(super) file_path: PathBuf,
+    pub(super) transform_matrix: Vec<[f64; 4]>,
+    pub(super) time: Option<f64>,
+    pub(super) mask_path: Option<PathBuf>,
+    #[serde(flatten)]
+    pub(super) intrinsics: Intrinsics,
+}
+
+/// Intrinsics of a file or of one frame, which overrides the file.
+#[derive(Deserialize, Default)]
+pub(super) struct Intrinsics {
+    camera_model: Option<String>,
+    camera_angle_x: Option<f64>,
+    fl_x: Option<f64>,
+    fl_y: Option<f64>,
+    cx: Option<f64>,
+    cy: Option<f64>,
+    w: Option<f64>,
+    h: Option<f64>,
+    k1: Option<f64>,
+    k2: Option<f64>,
+    k3: Option<f64>,
+    k4: Option<f64>,
+    p1: Option<f64>,
+    p2: Option<f64>,
+    is_fisheye: Option<bool>,
+}
+
+/// Reads a file.
+///
+/// # Errors
+/// When it does not parse or lists no frame.
+pub(super) fn read(path: &Path) -> Result<TransformsFile, Error> {
+    let file: TransformsFile = json::read(path)?;
+    if file.frames.is_empty() {
+        return Err(Error::invalid(path, "`frames` is empty; list the frames there"));
+    }
+    Ok(file)
+}
+
+/// The image of a frame, with the extension where the file leaves it out.
+///
+/// # Errors
+/// When there is no such image.
+pub(super) fn image(root: &Path, path: &Path, entry: &FrameEntry) -> Result<PathBuf, Error> {
+    let image = root.join(clean(&entry.file_path));
+    listing::with_image_extension(&image).ok_or_else(|| Error::CameraWithoutImage {
+        frame: frame_name(&entry.file_path),
+        source_file: path.to_owned(),
+        image,
+    })
+}
+
+/// A relative path without `./`.
+pub(super) fn clean(path: &Path) -> PathBuf {
+    path.components().filter(|part| !matches!(part, std::path::Component::CurDir)).collect()
+}
+
+/// Path of an image without `./` and extension, with `/` between its parts.
+pub(super) fn frame_name(path: &Path) -> String {
+    let path = clean(path);
+    let path = if listing::is_image(&path) { path.with_extension("") } else { path };
+    path.components().map(|part| part.as_os_str().to_string_lossy()).collect::<Vec<_>>().join("/")
+}
+
+/// The camera of a frame.
+///
+/// # Errors
+/// When the matrix is not 3 x 4 or 4 x 4, no focal length is given, or the lens model is not known.
+pub(super) fn camera(path: &Path, file: &TransformsFile, entry: &FrameEntry) -> Result<DraftCamera, Error> {
+    let name = || frame_name(&entry.file_path);
+    let intrinsics = |problem: String| Error::Intrinsics { path: path.to_owned(), frame: name(), problem };
+    let rows = &entry.transform_matrix;
+    if !(3..=4).contains(&rows.len()) || rows.get(3).is_some_and(|row| *row != [0.0, 0.0, 0.0, 1.0]) {
+        return Err(Error::Pose {
+            path: path.to_owned(),
+            frame: name(),
+            problem: "is not a 4 x 4 camera-to-world matrix with last row 0 0 0 1".to_owned(),
+        });
+    }
+    let (own, all) = (&entry.intrinsics, &file.intrinsics);
+    macro_rules! value {
+        ($field:ident) => {
+            own.$field.or(all.$field)
+        };
+    }
+    let model = own.camera_model.as_deref().or(all.camera_model.as_deref()).unwrap_or("OPENCV");
+    if value!(is_fisheye).unwrap_or(false)
+        || !["OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"].contains(&model)
+    {
+        let model = if value!(is_fisheye).unwrap_or(false) { "fisheye" } else { model };
+        return Err(intrinsics(format!(
+            "camera model {model} is not supported; undistort the images to PINHOLE or OPENCV first"
+        )));
+    }
+    let size = value!(w).zip(value!(h)).map(|(w, h)| DVec2::new(w, h));
+    let focal = match (value!(fl_x), value!(fl_y), value!(camera_angle_x)) {
+        (Some(x), y, _) => DraftFocal::Pixels(DVec2::new(x, y.unwrap_or(x))),
+        (None, Some(y), _) => DraftFocal::Pixels(DVec2::splat(y)),
+        (None, None, Some(angle)) => DraftFocal::HorizontalAngle(angle),
+        (None, None, None) => {
+            return Err(intrinsics("neither fl_x nor camera_angle_x is given; add one".to_owned()));
+        }
+    };
+    let principal = match (value!(cx), value!(cy)) {
+        (Some(x), Some(y)) => Some(DVec2::new(x, y)),
+        (None, None) => None,
+        _ => return Err(intrinsics("only one of cx and cy is given; add the other".to_owned())),
+    };
+    Ok(DraftCamera {
+        source: path.to_owned(),
+        size,
+        focal,
+        principal_px: principal,
+        lens: LensDistortion {
+            radial: [value!(k1), value!(k2), value!(k3), value!(k4)].map(|k| k.unwrap_or(0.0)),
+            tangential: [value!(p1), value!(p2)].map(|p| p.unwrap_or(0.0)),
+            skew_px: 0.0,
+        },
+        camera_from_world: from_opengl(rows),
+    })
+}
+
+/// Normalises times to [0, 1] by the largest: `t = time / max time`; all zero when the capture has no times.
+///
+/// # Errors
+/// When only some frames have a time, or one is negative or not finite.
+pub(super) fn normalised_times(path: &Path, times: &[Option<f64>]) -> Result<Vec<f64>, Error> {
+    if times.iter().all(Option::is_none) {
+        return Ok(vec![0.0; times.len()]);
+    }
+    let values: Vec<f64> = times
+        .iter()
+        .map(|time| {
+            time.filter(|time| time.is_finite() && *time >= 0.0).ok_or_else(|| {
+                Error::invalid(
+                    path,
+                    "some frames have no `time`, or one that is negative; give every frame a time from 0 on, or none",
+                )
+            })
+        })
+        .collect::<Result<_, _>>()?;
+    let last = values.iter().copied().fold(0.0, f64::max);
+    Ok(values.iter().map(|time| if last > 0.0 { time / last } else { 0.0 }).collect())
+}

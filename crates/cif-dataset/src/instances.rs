@@ -1,0 +1,125 @@
+//! Labels of instances: `instances.json`, completed from the masks.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use serde::Deserialize;
+
+use crate::files::json;
+use crate::{Error, InstanceLabel};
+
+#[derive(Deserialize)]
+#[serde(untagged)]
+enum InstancesFile {
+    List(Vec<Entry>),
+    Object { instances: Vec<Entry> },
+}
+
+#[derive(Deserialize)]
+struct Entry {
+    id: i64,
+    #[serde(default)]
+    label: Option<String>,
+    #[serde(default)]
+    category: Option<String>,
+}
+
+/// Labels named by a file, ascending id.
+///
+/// # Errors
+/// When the file does not parse, an id is outside 1 to 65 535 (0 is left out with a warning), or twice.
+pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u16, InstanceLabel>, Error> {
+    // Syntax first: the message of an untagged enum has no line.
+    let value: serde_json::Value = json::read(path)?;
+    let file: InstancesFile = serde_json::from_value(value).map_err(|_| {
+        Error::invalid(
+            path,
+            "a list of {\"id\": 1, \"label\": \"red mug\", \"category\": \"mug\"} is expected, or {\"instances\": [...]}",
+        )
+    })?;
+    let (InstancesFile::List(entries) | InstancesFile::Object { instances: entries }) = file;
+    let mut labels = BTreeMap::new();
+    for entry in entries {
+        if entry.id == 0 {
+            warnings.push(format!(
+                "{}: id 0 is the unlabelled part of a mask; its entry is not used",
+                path.display()
+            ));
+            continue;
+        }
+        let id = u16::try_from(entry.id).map_err(|_| {
+            Error::invalid(
+                path,
+                format!("id {} is outside 1 to 65535; give the instance a smaller id", entry.id),
+            )
+        })?;
+        let text = |text: Option<String>| text.filter(|text| !text.trim().is_empty());
+        let label = text(entry.label).unwrap_or_else(|| default_label(id));
+        let category = text(entry.category).unwrap_or_else(|| label.clone());
+        if labels.insert(id, InstanceLabel { id, label, category }).is_some() {
+            return Err(Error::invalid(path, format!("id {id} is listed twice; keep one entry")));
+        }
+    }
+    Ok(labels)
+}
+
+/// Name of an instance that nobody named.
+fn default_label(id: u16) -> String {
+    format!("instance_{id}")
+}
+
+/// Labels for a capture's masks: the file in the mask folder, else the one of the capture.
+pub(crate) fn file_for(root: &Path, mask_folder: Option<&Path>) -> Option<PathBuf> {
+    mask_folder
+        .into_iter()
+        .chain([root])
+        .map(|folder| folder.join("instances.json"))
+        .find(|path| path.is_file())
+}
+
+/// The instances that occur in the masks, ascending id, named by the file where it names them.
+pub(crate) fn complete(
+    found: &BTreeSet<u16>,
+    largest_id: u16,
+    mut named: BTreeMap<u16, InstanceLabel>,
+    file: Option<&Path>,
+    warnings: &mut Vec<String>,
+) -> Vec<InstanceLabel> {
+    let list = |ids: Vec<u16>| {
+        let shown = ids.iter().take(10).map(u16::to_string).collect::<Vec<_>>().join(", ");
+        if ids.len() > 10 { format!("{shown} and {} more", ids.len() - 10) } else { shown }
+    };
+    let unnamed: Vec<u16> = found.iter().copied().filter(|id| !named.contains_key(id)).collect();
+    if let Some(file) = file {
+        if !unnamed.is_empty() {
+            warnings.push(format!(
+                "{}: the masks hold ids it does not name, called instance_<id> here: {}",
+                file.display(),
+                list(unnamed)
+            ));
+        }
+        let (too_large, absent): (Vec<u16>, Vec<u16>) =
+            named.keys().copied().filter(|id| !found.contains(id)).partition(|id| *id > largest_id);
+        if !too_large.is_empty() {
+            warnings.push(format!(
+                "{}: the masks are 8-bit or less and cannot hold ids above {largest_id}: {}; export them as \
+                 16-bit grey PNG",
+                file.display(),
+                list(too_large)
+            ));
+        }
+        if !absent.is_empty() {
+            warnings.push(format!("{}: no mask shows: {}", file.display(), list(absent)));
+        }
+    }
+    found
+        .iter()
+        .map(|id| {
+            named.remove(id).unwrap_or_else(|| InstanceLabel {
+                id: *id,
+                label: default_label(*id),
+                category: default_label(*id),
+            })
+        })
+        .collect()
+}

@@ -1,0 +1,115 @@
+//! Frames and masks as the trainer sees them: decoded, reduced, without lens.
+
+use std::path::Path;
+
+use cif_geometry::{PinholeCamera, PixelGrid};
+
+use crate::files::{image, mask};
+use crate::lens_removal::{undistort_image, undistort_mask};
+use crate::{Dataset, Error, FrameData};
+
+impl Dataset {
+    /// Loads image and mask of a frame.
+    ///
+    /// The image is decoded, its alpha composited on `background` (display-referred, 0 to 1), reduced to the
+    /// size of the frame's camera by area averages, and freed of lens distortion and skew by bilinear
+    /// resampling. The mask goes the same way by nearest neighbour only, with its original ids.
+    ///
+    /// # Errors
+    /// When a file is missing, truncated, or a mask has another aspect than its image.
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_frame(&self, index: usize, background: [f32; 3]) -> Result<FrameData, Error> {
+        Ok(FrameData { image: self.load_image(index, background)?, mask: self.load_mask(index)? })
+    }
+
+    /// Loads the image of a frame; see [`Dataset::load_frame`].
+    ///
+    /// # Errors
+    /// When the file is missing or truncated.
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_image(&self, index: usize, background: [f32; 3]) -> Result<PixelGrid<[u8; 3]>, Error> {
+        let frame = &self.frames[index];
+        let stored = image::composite(&image::decode(&frame.image)?, background);
+        let reduced = image::box_resize(&stored, frame.camera.width, frame.camera.height);
+        if frame.lens.is_identity() {
+            return Ok(image::to_bytes(&reduced));
+        }
+        Ok(image::to_bytes(&undistort_image(&reduced, &frame.camera, &frame.lens)))
+    }
+
+    /// Loads the mask of a frame, where it has one; see [`Dataset::load_frame`].
+    ///
+    /// # Errors
+    /// When the file is missing, truncated, no mask, or has another aspect than its image.
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_mask(&self, index: usize) -> Result<Option<PixelGrid<u16>>, Error> {
+        self.frames[index].mask.as_deref().map(|path| self.load_mask_file(index, path)).transpose()
+    }
+
+    /// Loads a mask file as the mask of a frame, for masks of another folder (see [`Dataset::mask_paths`]).
+    ///
+    /// # Errors
+    /// When the file is missing, truncated, no mask, or has another aspect than the frame.
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_mask_file(&self, index: usize, path: &Path) -> Result<PixelGrid<u16>, Error> {
+        let frame = &self.frames[index];
+        let stored = mask::decode(path)?;
+        let (width, height) = (frame.camera.width, frame.camera.height);
+        if !same_aspect((stored.width, stored.height), (width, height)) {
+            return Err(Error::MaskSize {
+                mask: path.to_owned(),
+                mask_size: (stored.width, stored.height),
+                image: frame.image.clone(),
+                image_size: (width, height),
+            });
+        }
+        let resized = mask::nearest_resize(&stored, width, height);
+        Ok(if frame.lens.is_identity() {
+            resized
+        } else {
+            undistort_mask(&resized, &frame.camera, &frame.lens)
+        })
+    }
+}
+
+/// Whether two sizes have one aspect, up to the rounding of either to whole pixels.
+pub(crate) fn same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
+    let [aw, ah, bw, bh] = [a.0, a.1, b.0, b.1].map(f64::from);
+    let slack = 1.0 / aw.min(ah).max(1.0) + 1.0 / bw.min(bh).max(1.0);
+    ((aw * bh) / (ah * bw)).ln().abs() <= slack.min(0.1)
+}
+
+/// Size of an image after a reduction.
+pub(crate) fn reduced_size(width: u32, height: u32, reduction: u32) -> (u32, u32) {
+    let reduce = |size: u32| ((f64::from(size) / f64::from(reduction)).round() as u32).max(1);
+    (reduce(width), reduce(height))
+}
+
+/// The principal point in the middle of the image.
+pub(crate) fn centred(camera: PinholeCamera) -> PinholeCamera {
+    PinholeCamera {
+        principal_px: glam::DVec2::new(f64::from(camera.width), f64::from(camera.height)) / 2.0,
+        ..camera
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn aspects_allow_for_rounding_only() {
+        assert!(same_aspect((256, 192), (128, 96)));
+        assert!(same_aspect((1352, 1014), (451, 338)));
+        assert!(!same_aspect((256, 192), (192, 256)));
+        assert!(!same_aspect((256, 192), (256, 180)));
+    }
+}

@@ -1,0 +1,155 @@
+//! Which mask belongs to which frame, and which ids the masks hold.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use rayon::prelude::*;
+
+use crate::files::{listing, mask};
+use crate::load::same_aspect;
+use crate::{Error, Frame, Layout};
+
+/// Mask folder that is taken where none is asked for.
+pub(crate) const DEFAULT_FOLDER: &str = "masks";
+
+/// Pixels of each id of one mask, without 0.
+pub(crate) type PixelCounts = BTreeMap<u16, u64>;
+
+/// Mask files of a folder by frame.
+pub(crate) struct MaskListing {
+    /// `[frames]`.
+    pub(crate) paths: Vec<Option<PathBuf>>,
+    /// Folder that holds `instances.json` for these masks, if it has one of its own.
+    pub(crate) folder: Option<PathBuf>,
+    /// PNG files in the folder that belong to no frame.
+    pub(crate) strangers: usize,
+}
+
+/// Finds the masks of a folder: a name inside the capture, or a path.
+///
+/// Looked for, in this order: `<camera>/<folder>/<stem>.png` (Neu3D), `<folder>/<frame>.png`,
+/// `<folder>/<frame>.<image extension>.png` and, where stems are unique, `<folder>/<stem>.png`.
+pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Path) -> MaskListing {
+    let inside = root.join(folder);
+    // A path relative to the working folder, where the capture has no such folder.
+    let base = if inside.is_dir() || !folder.is_dir() { inside } else { folder.to_owned() };
+    let stems: Vec<String> = frames.iter().map(|frame| listing::stem(&frame.image)).collect();
+    let mut occurrences: BTreeMap<&str, usize> = BTreeMap::new();
+    for stem in &stems {
+        *occurrences.entry(stem).or_default() += 1;
+    }
+    let paths: Vec<Option<PathBuf>> = frames
+        .iter()
+        .zip(&stems)
+        .map(|(frame, stem)| {
+            let mut candidates = Vec::new();
+            if layout == Layout::Neu3d && folder.is_relative() {
+                candidates.push(root.join(&frame.camera_name).join(folder).join(format!("{stem}.png")));
+            }
+            candidates.push(base.join(format!("{}.png", frame.name)));
+            if let Some(extension) = frame.image.extension() {
+                candidates.push(base.join(format!("{}.{}.png", frame.name, extension.to_string_lossy())));
+            }
+            if occurrences[stem.as_str()] == 1 {
+                candidates.push(base.join(format!("{stem}.png")));
+            }
+            candidates.into_iter().find(|candidate| candidate.is_file())
+        })
+        .collect();
+    let strangers =
+        count_png(&base).saturating_sub(paths.iter().flatten().filter(|p| p.starts_with(&base)).count());
+    MaskListing { paths, folder: base.is_dir().then_some(base), strangers }
+}
+
+/// PNG files in a folder and its subfolders.
+fn count_png(folder: &Path) -> usize {
+    if !folder.is_dir() {
+        return 0;
+    }
+    let entries = listing::entries(folder).unwrap_or_default();
+    entries
+        .iter()
+        .map(|path| {
+            if path.is_dir() { count_png(path) } else { usize::from(listing::has_extension(path, &["png"])) }
+        })
+        .sum()
+}
+
+/// Folders of a capture that could hold masks, for messages.
+pub(crate) fn folders_like_masks(root: &Path) -> Vec<String> {
+    let mut names = BTreeSet::new();
+    for entry in listing::entries(root).unwrap_or_default() {
+        let inner = if entry.is_dir() { listing::entries(&entry).unwrap_or_default() } else { Vec::new() };
+        for path in std::iter::once(entry).chain(inner) {
+            let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+            if path.is_dir() && name.to_lowercase().contains("mask") {
+                names.insert(name);
+            }
+        }
+    }
+    names.into_iter().collect()
+}
+
+/// What the headers of all masks say together.
+pub(crate) struct MaskHeaders {
+    /// Largest id that any of the files can hold.
+    pub(crate) largest_id: u16,
+    /// Masks of another size than their image, with one example.
+    pub(crate) resized: Option<(usize, PathBuf, (u32, u32), (u32, u32))>,
+}
+
+/// Checks the headers of all masks against the sizes of the images as stored.
+///
+/// # Errors
+/// When a mask is no PNG, a colour image, or has another aspect than its image.
+pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Result<MaskHeaders, Error> {
+    let headers: Vec<Option<Result<mask::MaskHeader, Error>>> =
+        frames.par_iter().map(|frame| frame.mask.as_deref().map(mask::probe)).collect();
+    let mut result = MaskHeaders { largest_id: 0, resized: None };
+    for ((frame, header), stored) in frames.iter().zip(headers).zip(stored_sizes) {
+        let (Some(header), Some(path)) = (header, &frame.mask) else { continue };
+        let header = header?;
+        let size = (header.width, header.height);
+        if size.0 == 0 || size.1 == 0 || !same_aspect(size, *stored) {
+            return Err(Error::MaskSize {
+                mask: path.clone(),
+                mask_size: size,
+                image: frame.image.clone(),
+                image_size: *stored,
+            });
+        }
+        result.largest_id = result.largest_id.max(header.largest_id);
+        if size != *stored && size != (frame.camera.width, frame.camera.height) {
+            match &mut result.resized {
+                Some((count, ..)) => *count += 1,
+                None => result.resized = Some((1, path.clone(), size, *stored)),
+            }
+        }
+    }
+    Ok(result)
+}
+
+/// Decodes every mask as stored and counts the pixels of each id. `[frames]`, `None` without mask.
+///
+/// # Errors
+/// When a mask cannot be decoded; the first in frame order is reported.
+pub(crate) fn count_pixels(frames: &[Frame]) -> Result<Vec<Option<(PixelCounts, u64)>>, Error> {
+    let counts: Vec<_> = frames
+        .par_iter()
+        .map(|frame| {
+            frame.mask.as_deref().map(|path| {
+                mask::decode(path).map(|mask| {
+                    let mut counts = PixelCounts::new();
+                    // Runs of one id are long: one look-up per run.
+                    for run in mask.pixels.chunk_by(|a, b| a == b) {
+                        if run[0] != 0 {
+                            *counts.entry(run[0]).or_default() += run.len() as u64;
+                        }
+                    }
+                    (counts, mask.pixels.len() as u64)
+                })
+            })
+        })
+        .collect();
+    counts.into_iter().map(Option::transpose).collect()
+}

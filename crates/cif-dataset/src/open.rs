@@ -1,0 +1,388 @@
+//! Opens a capture: recognise the layout, read it, check it, find masks, labels and points.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use cif_geometry::PinholeCamera;
+use rayon::prelude::*;
+
+use crate::files::{image, json};
+use crate::formats::{self, Draft, Source, some_of};
+use crate::load::{centred, reduced_size};
+use crate::{
+    Dataset, Error, Frame, InstanceLabel, OpenOptions, PointCloud, PointSource, Split, camera_check,
+    instances, layout, mask_files, points,
+};
+
+impl Dataset {
+    /// Opens a capture of any layout (see [`crate::Layout`]).
+    ///
+    /// Image headers are read, and every mask is decoded once, to know the instances; images are decoded by
+    /// [`Dataset::load_frame`].
+    ///
+    /// # Errors
+    /// When the folder is no capture, or something in it is missing or wrong; the message names file and fix.
+    pub fn open(root: impl AsRef<Path>, options: &OpenOptions) -> Result<Self, Error> {
+        let root = root.as_ref();
+        let mut warnings = Vec::new();
+        if options.downscale == Some(0) {
+            return Err(Error::invalid(root, "images cannot be reduced by 0; give 1, 2, 4, ..."));
+        }
+        let layout = layout::recognise(root, options.layout, &mut warnings)?;
+        let draft = formats::read(layout, &Source { root, options })?;
+        warnings.extend(draft.warnings.iter().cloned());
+        let (frames, has_alpha, stored_sizes) = frames(root, &draft, options, &mut warnings)?;
+
+        let mut times: Vec<f64> = frames.iter().map(|frame| frame.time).collect();
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        let mut dataset = Self {
+            root: root.to_owned(),
+            layout,
+            frames,
+            times,
+            frames_per_second: draft.frames_per_second.filter(|rate| rate.is_finite() && *rate > 0.0),
+            instances: Vec::new(),
+            points: PointCloud { positions: Vec::new(), colors: Vec::new(), source: PointSource::Random },
+            has_alpha,
+            warnings,
+        };
+        for frame in &mut dataset.frames {
+            frame.time_index = dataset
+                .times
+                .binary_search_by(|time| time.total_cmp(&frame.time))
+                .expect("times hold every time");
+        }
+        dataset.read_groups()?;
+        dataset.note_poor_coverage();
+        if options.without_masks {
+            for frame in &mut dataset.frames {
+                frame.mask = None;
+            }
+        } else {
+            dataset.attach_masks(options.masks.as_deref(), &stored_sizes)?;
+        }
+        dataset.points = dataset.initial_points(draft.points, draft.random_box)?;
+        Ok(dataset)
+    }
+
+    /// The same capture with the masks of another folder (a name inside the capture, or a path) and the
+    /// instances found there, e.g. to score on `masks` what was trained on `masks_tracker`.
+    ///
+    /// # Errors
+    /// When the folder holds no mask of this capture, or one that does not fit.
+    pub fn with_masks(&self, folder: &Path) -> Result<Self, Error> {
+        let mut dataset = self.clone();
+        dataset.warnings.clear();
+        let sizes = dataset
+            .frames
+            .iter()
+            .map(|frame| image::probe(&frame.image).map(|header| (header.width, header.height)))
+            .collect::<Result<Vec<_>, _>>()?;
+        dataset.attach_masks(Some(folder), &sizes)?;
+        Ok(dataset)
+    }
+
+    /// Mask file of every frame in another mask folder; `[frames]`, `None` where it has none.
+    ///
+    /// # Errors
+    /// When the folder holds no mask of this capture.
+    pub fn mask_paths(&self, folder: &Path) -> Result<Vec<Option<PathBuf>>, Error> {
+        let listing = mask_files::locate(&self.root, self.layout, &self.frames, folder);
+        if listing.paths.iter().all(Option::is_none) {
+            let known = mask_files::folders_like_masks(&self.root);
+            let known = if known.is_empty() {
+                "the capture has no folder of masks".to_owned()
+            } else {
+                format!("the capture has {}", known.join(", "))
+            };
+            let example = self.frames.first().map(|frame| frame.name.as_str()).unwrap_or_default();
+            return Err(Error::MaskFolder {
+                folder: folder.to_owned(),
+                problem: if listing.folder.is_some() {
+                    format!(
+                        "no mask in it belongs to a frame; masks are PNG files named as the frames, e.g. {example}.png"
+                    )
+                } else {
+                    format!("there is no such mask folder in {}; {known}", self.root.display())
+                },
+            });
+        }
+        Ok(listing.paths)
+    }
+
+    /// Groups of `splits.json` (`interp`, `novel`, ...) for held-out frames.
+    fn read_groups(&mut self) -> Result<(), Error> {
+        let path = self.root.join("splits.json");
+        if !path.is_file() {
+            return Ok(());
+        }
+        let groups: BTreeMap<String, Vec<String>> = json::read(&path)?;
+        let index: BTreeMap<String, usize> =
+            self.frames.iter().enumerate().map(|(index, frame)| (frame.name.clone(), index)).collect();
+        for (group, names) in
+            groups.into_iter().filter(|(group, _)| !["train", "val"].contains(&group.as_str()))
+        {
+            let mut unknown = Vec::new();
+            let mut trained = Vec::new();
+            for name in &names {
+                match index.get(name) {
+                    None => unknown.push(name.as_str()),
+                    Some(k) if self.frames[*k].split == Split::Train => trained.push(name.as_str()),
+                    Some(k) => self.frames[*k].group = Some(group.clone()),
+                }
+            }
+            for (names, what) in
+                [(unknown, "names frames that the capture lacks"), (trained, "names training frames")]
+            {
+                if !names.is_empty() {
+                    self.warnings.push(format!(
+                        "{}: group {group} {what}: {}",
+                        path.display(),
+                        some_of(names.into_iter())
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Says what a capture is too poor for.
+    fn note_poor_coverage(&mut self) {
+        let root = self.root.display().to_string();
+        let train = self.train_frames();
+        if self.frames.len() == 1 {
+            self.warnings.push(format!(
+                "{root}: one frame only: nothing is held out, and neither depth nor motion can be recovered"
+            ));
+            return;
+        }
+        if self.val_frames().is_empty() {
+            self.warnings.push(format!("{root}: no frame is held out, so there is nothing to score"));
+        }
+        if train.len() > 1 && self.camera_spread() == 0.0 {
+            self.warnings.push(format!(
+                "{root}: all training frames share one camera centre: depth cannot be recovered from parallax"
+            ));
+        }
+        let names = |split: &[usize]| -> BTreeSet<&str> {
+            split.iter().map(|index| self.frames[*index].camera_name.as_str()).collect()
+        };
+        let only_held_out = names(&self.val_frames()).difference(&names(&train)).count();
+        if train.len() == 1 && only_held_out == 0 {
+            self.warnings.push(format!("{root}: one training frame only: depth cannot be recovered"));
+        }
+    }
+
+    fn attach_masks(&mut self, folder: Option<&Path>, stored_sizes: &[(u32, u32)]) -> Result<(), Error> {
+        let name = folder.unwrap_or(Path::new(mask_files::DEFAULT_FOLDER));
+        let listing = mask_files::locate(&self.root, self.layout, &self.frames, name);
+        if folder.is_some() {
+            self.mask_paths(name)?;
+        }
+        if listing.paths.iter().any(Option::is_some) {
+            for (frame, path) in self.frames.iter_mut().zip(listing.paths) {
+                frame.mask = path;
+            }
+        } else if listing.folder.is_some() && listing.strangers > 0 {
+            self.warnings.push(format!(
+                "{}: none of its {} PNG files is named as a frame, e.g. {}.png",
+                self.root.join(name).display(),
+                listing.strangers,
+                self.frames[0].name
+            ));
+        }
+        for frame in &self.frames {
+            if let Some(mask) = frame.mask.as_ref().filter(|mask| !mask.is_file()) {
+                return Err(Error::MissingFile {
+                    path: mask.clone(),
+                    fix: format!(
+                        "it is named as the mask of frame {}; restore it or remove mask_path",
+                        frame.name
+                    ),
+                });
+            }
+        }
+        let masked = self.frames.iter().filter(|frame| frame.mask.is_some()).count();
+        if masked == 0 {
+            self.warnings.push(format!(
+                "{}: no masks: only colour can be trained; give instance masks in {}/ or name their folder",
+                self.root.display(),
+                mask_files::DEFAULT_FOLDER
+            ));
+            return Ok(());
+        }
+        if masked < self.frames.len() {
+            self.warnings.push(format!(
+                "{}: {masked} of {} frames have a mask",
+                self.root.join(name).display(),
+                self.frames.len()
+            ));
+        }
+        if listing.strangers > 0 && masked > 0 {
+            self.warnings.push(format!(
+                "{}: {} PNG files belong to no frame",
+                self.root.join(name).display(),
+                listing.strangers
+            ));
+        }
+        let headers = mask_files::check_headers(&self.frames, stored_sizes)?;
+        if let Some((count, path, mask, image)) = headers.resized {
+            self.warnings.push(format!(
+                "{}: {} x {} pixels where the image has {} x {}: resized by nearest neighbour ({count} masks)",
+                path.display(),
+                mask.0,
+                mask.1,
+                image.0,
+                image.1
+            ));
+        }
+        let counts = mask_files::count_pixels(&self.frames)?;
+        let found: BTreeSet<u16> =
+            counts.iter().flatten().flat_map(|(counts, _)| counts.keys().copied()).collect();
+        if found.is_empty() {
+            self.warnings.push(format!(
+                "{}: the masks hold no labelled pixel; only colour can be trained",
+                self.root.join(name).display()
+            ));
+        } else if found.iter().eq([255_u16].iter()) {
+            self.warnings.push(format!(
+                "{}: every labelled pixel is 255: the files look like masks of valid pixels, not of instances",
+                self.root.join(name).display()
+            ));
+        }
+        let labelled_train = self.frames.iter().zip(&counts).any(|(frame, counts)| {
+            frame.split == Split::Train && counts.as_ref().is_some_and(|c| !c.0.is_empty())
+        });
+        if !found.is_empty() && !labelled_train {
+            self.warnings.push(format!(
+                "{}: no training frame has a labelled pixel; only colour can be trained",
+                self.root.join(name).display()
+            ));
+        }
+        let file = instances::file_for(&self.root, listing.folder.as_deref());
+        let named: BTreeMap<u16, InstanceLabel> = match &file {
+            Some(file) => instances::read(file, &mut self.warnings)?,
+            None => {
+                if !found.is_empty() {
+                    self.warnings.push(format!(
+                        "{}: there is no instances.json, so instances are called instance_<id>",
+                        self.root.display()
+                    ));
+                }
+                BTreeMap::new()
+            }
+        };
+        self.instances =
+            instances::complete(&found, headers.largest_id, named, file.as_deref(), &mut self.warnings);
+        Ok(())
+    }
+
+    /// Points of the capture, else random ones; colours are sampled from the images where the source has none.
+    fn initial_points(
+        &mut self,
+        file: Option<(points::RawPoints, PathBuf)>,
+        random_box: Option<f64>,
+    ) -> Result<PointCloud, Error> {
+        if let Some((mut raw, path)) = file {
+            let dropped = raw.retain_finite();
+            if dropped > 0 {
+                self.warnings
+                    .push(format!("{}: {dropped} points are not finite and are left out", path.display()));
+            }
+            if raw.positions.is_empty() {
+                self.warnings.push(format!("{}: it holds no point; random ones are taken", path.display()));
+            } else {
+                let colors = match raw.colors {
+                    Some(colors) => colors,
+                    None => points::sample_colors(self, &raw.positions)?,
+                };
+                return Ok(PointCloud { positions: raw.positions, colors, source: PointSource::File(path) });
+            }
+        }
+        let cameras: Vec<PinholeCamera> =
+            self.train_frames().into_iter().map(|index| self.frames[index].camera).collect();
+        let positions = points::draw(&cameras, random_box);
+        let colors = points::sample_colors(self, &positions)?;
+        Ok(PointCloud { positions, colors, source: PointSource::Random })
+    }
+}
+
+/// Frames with checked cameras in order of camera, time and name; whether any image has alpha; the sizes of the
+/// images as stored, in the same order.
+#[allow(clippy::type_complexity, reason = "one caller")]
+fn frames(
+    root: &Path,
+    draft: &Draft,
+    options: &OpenOptions,
+    warnings: &mut Vec<String>,
+) -> Result<(Vec<Frame>, bool, Vec<(u32, u32)>), Error> {
+    let mut names = BTreeSet::new();
+    for frame in &draft.frames {
+        if !names.insert(frame.name.as_str()) {
+            return Err(Error::DuplicateFrame {
+                path: frame.camera.source.clone(),
+                frame: frame.name.clone(),
+            });
+        }
+    }
+    if !draft.frames.iter().any(|frame| frame.split == Split::Train) {
+        return Err(Error::invalid(root, "no frame is left to train on; add frames to the training list"));
+    }
+    // `stored_reduction` divides what is asked for, unless the capture has no such images.
+    let wanted = options.downscale.unwrap_or(draft.stored_reduction);
+    let reduction = if wanted.is_multiple_of(draft.stored_reduction) {
+        wanted / draft.stored_reduction
+    } else {
+        warnings.push(format!(
+            "{}: images are stored reduced by {}, so a reduction by {wanted} is not to be had; they are read as they \
+             are",
+            root.display(),
+            draft.stored_reduction
+        ));
+        1
+    };
+    let headers: Vec<Result<image::ImageHeader, Error>> =
+        draft.frames.par_iter().map(|frame| image::probe(&frame.image)).collect();
+    let mut has_alpha = false;
+    let mut uncovered = Vec::new();
+    let mut frames = Vec::with_capacity(draft.frames.len());
+    for (frame, header) in draft.frames.iter().zip(headers) {
+        let header = header?;
+        has_alpha |= header.has_alpha;
+        let stored = (header.width, header.height);
+        let loaded = reduced_size(header.width, header.height, reduction);
+        let (camera, lens) = camera_check::finish(&frame.camera, &frame.name, stored, loaded)?;
+        let camera = if options.centre_principal_point { centred(camera) } else { camera };
+        if !lens.is_identity() && !camera_check::lens_covers_image(&camera, &lens) {
+            uncovered.push(frame.name.as_str());
+        }
+        frames.push((
+            Frame {
+                name: frame.name.clone(),
+                camera_name: frame.camera_name.clone(),
+                camera,
+                lens,
+                time: frame.time,
+                time_index: 0,
+                split: frame.split,
+                group: None,
+                image: frame.image.clone(),
+                mask: frame.mask.clone(),
+            },
+            stored,
+        ));
+    }
+    if !uncovered.is_empty() {
+        warnings.push(format!(
+            "{}: the lens model does not reach the corners of the image for {}; their corners repeat other pixels",
+            root.display(),
+            some_of(uncovered.into_iter())
+        ));
+    }
+    frames.sort_by(|(a, _), (b, _)| {
+        a.camera_name.cmp(&b.camera_name).then(a.time.total_cmp(&b.time)).then(a.name.cmp(&b.name))
+    });
+    let (frames, sizes) = frames.into_iter().unzip();
+    Ok((frames, has_alpha, sizes))
+}
