@@ -1,4 +1,29 @@
 //! Reads captures (images, cameras, masks, times) into one [`Dataset`].
+//!
+//! | layout | marked by | held out |
+//! |---|---|---|
+//! | HyperNeRF, Nerfies | `dataset.json` | `val_ids`, else every fourth frame from the third on |
+//! | Neu3D, DyNeRF | `poses_bounds.npy` | `cam00` |
+//! | D-NeRF, Blender | `transforms_train.json` | `transforms_test.json` |
+//! | nerfstudio, instant-ngp | `transforms.json` | its lists, else every eighth frame |
+//! | COLMAP | `sparse/0` | every eighth image |
+//!
+//! Masks are PNG files of instance ids, 0 for unlabelled; labels come from `instances.json`, which may also lie
+//! in the mask folder. Named groups of held-out frames come from `splits.json`. All cameras are ideal pinholes
+//! in this project's axes once a frame is loaded; times are normalised to [0, 1].
+//!
+//! ```no_run
+//! use cif_dataset::{Dataset, OpenOptions};
+//!
+//! let dataset = Dataset::open("captures/kitchen", &OpenOptions::default())?;
+//! for warning in &dataset.warnings {
+//!     eprintln!("warning: {warning}");
+//! }
+//! let first = dataset.train_frames()[0];
+//! let frame = dataset.load_frame(first, [1.0, 1.0, 1.0])?;
+//! println!("{} x {}", frame.image.width, frame.image.height);
+//! # Ok::<(), cif_dataset::Error>(())
+//! ```
 
 mod camera_check;
 mod dataset;
@@ -10,10 +35,13 @@ mod layout;
 mod lens_removal;
 mod load;
 mod mask_files;
+pub mod masks;
 mod open;
 mod points;
+mod summary;
 
 pub use dataset::{
     Dataset, Frame, FrameData, InstanceLabel, Layout, OpenOptions, PointCloud, PointSource, Split,
 };
 pub use error::Error;
+pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

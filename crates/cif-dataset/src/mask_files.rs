@@ -94,8 +94,17 @@ pub(crate) fn folders_like_masks(root: &Path) -> Vec<String> {
 pub(crate) struct MaskHeaders {
     /// Largest id that any of the files can hold.
     pub(crate) largest_id: u16,
-    /// Masks of another size than their image, with one example.
-    pub(crate) resized: Option<(usize, PathBuf, (u32, u32), (u32, u32))>,
+    /// Masks of another size than their image.
+    pub(crate) resized: Option<ResizedMasks>,
+}
+
+/// Masks that are resized on loading.
+pub(crate) struct ResizedMasks {
+    pub(crate) count: usize,
+    /// The first of them, its size, and that of its image.
+    pub(crate) example: PathBuf,
+    pub(crate) mask_size: (u32, u32),
+    pub(crate) image_size: (u32, u32),
 }
 
 /// Checks the headers of all masks against the sizes of the images as stored.
@@ -121,8 +130,15 @@ pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Re
         result.largest_id = result.largest_id.max(header.largest_id);
         if size != *stored && size != (frame.camera.width, frame.camera.height) {
             match &mut result.resized {
-                Some((count, ..)) => *count += 1,
-                None => result.resized = Some((1, path.clone(), size, *stored)),
+                Some(resized) => resized.count += 1,
+                None => {
+                    result.resized = Some(ResizedMasks {
+                        count: 1,
+                        example: path.clone(),
+                        mask_size: size,
+                        image_size: *stored,
+                    });
+                }
             }
         }
     }

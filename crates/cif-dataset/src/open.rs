@@ -117,12 +117,17 @@ impl Dataset {
         if !path.is_file() {
             return Ok(());
         }
-        let groups: BTreeMap<String, Vec<String>> = json::read(&path)?;
+        let groups: BTreeMap<String, serde_json::Value> = json::read(&path)?;
         let index: BTreeMap<String, usize> =
             self.frames.iter().enumerate().map(|(index, frame)| (frame.name.clone(), index)).collect();
-        for (group, names) in
-            groups.into_iter().filter(|(group, _)| !["train", "val"].contains(&group.as_str()))
-        {
+        for (group, names) in groups {
+            if ["train", "val"].contains(&group.as_str()) {
+                continue;
+            }
+            let Ok(names) = serde_json::from_value::<Vec<String>>(names) else {
+                self.warnings.push(format!("{}: {group} is no list of frame names", path.display()));
+                continue;
+            };
             let mut unknown = Vec::new();
             let mut trained = Vec::new();
             for name in &names {
@@ -165,12 +170,9 @@ impl Dataset {
                 "{root}: all training frames share one camera centre: depth cannot be recovered from parallax"
             ));
         }
-        let names = |split: &[usize]| -> BTreeSet<&str> {
-            split.iter().map(|index| self.frames[*index].camera_name.as_str()).collect()
-        };
-        let only_held_out = names(&self.val_frames()).difference(&names(&train)).count();
-        if train.len() == 1 && only_held_out == 0 {
-            self.warnings.push(format!("{root}: one training frame only: depth cannot be recovered"));
+        if train.len() == 1 {
+            self.warnings
+                .push(format!("{root}: one training frame only: depth and motion cannot be recovered"));
         }
     }
 
@@ -227,14 +229,15 @@ impl Dataset {
             ));
         }
         let headers = mask_files::check_headers(&self.frames, stored_sizes)?;
-        if let Some((count, path, mask, image)) = headers.resized {
+        if let Some(resized) = headers.resized {
             self.warnings.push(format!(
-                "{}: {} x {} pixels where the image has {} x {}: resized by nearest neighbour ({count} masks)",
-                path.display(),
-                mask.0,
-                mask.1,
-                image.0,
-                image.1
+                "{}: {} x {} pixels where the image has {} x {}: resized by nearest neighbour ({} masks)",
+                resized.example.display(),
+                resized.mask_size.0,
+                resized.mask_size.1,
+                resized.image_size.0,
+                resized.image_size.1,
+                resized.count
             ));
         }
         let counts = mask_files::count_pixels(&self.frames)?;

@@ -139,6 +139,28 @@ fn box_weights(source: u32, target: u32) -> Vec<(usize, Vec<f32>)> {
         .collect()
 }
 
+/// Writes RGB bytes as PNG.
+///
+/// # Errors
+/// When the file cannot be written.
+pub(crate) fn write_rgb(path: &Path, bytes: &[u8], width: u32, height: u32) -> Result<(), Error> {
+    image::save_buffer_with_format(
+        path,
+        bytes,
+        width,
+        height,
+        image::ColorType::Rgb8,
+        image::ImageFormat::Png,
+    )
+    .map_err(|error| Error::Write {
+        path: path.to_owned(),
+        source: match error {
+            image::ImageError::IoError(error) => error,
+            other => std::io::Error::other(other),
+        },
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

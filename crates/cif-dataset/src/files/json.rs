@@ -30,3 +30,14 @@ pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Error> {
         },
     })
 }
+
+/// Writes a JSON file, indented.
+///
+/// # Errors
+/// When it cannot be written.
+pub(crate) fn write<T: serde::Serialize>(path: &Path, value: &T) -> Result<(), Error> {
+    let mut text = serde_json::to_string_pretty(value)
+        .map_err(|error| Error::Write { path: path.to_owned(), source: error.into() })?;
+    text.push('\n');
+    std::fs::write(path, text).map_err(Error::write(path))
+}

@@ -1,0 +1,13 @@
+//! Masks from a video tracker: one sequence out of all views, and its ids back per view.
+//!
+//! Source: methods reference 10.1. The masks of every view, the held-out ones included, come from one tracker
+//! pass: scores on them measure agreement with a consistent tracker, not with human truth.
+
+mod folder;
+mod split;
+mod view_order;
+mod zigzag;
+
+pub use split::{KeptInstance, RemovedInstance, SplitReport, split_tracker_masks};
+pub use view_order::{ViewOrder, ordered_views};
+pub use zigzag::{INDEX_FILE, ZigzagEntry, ZigzagIndex, frame_of, position_of, write_zigzag, zigzag_order};
