@@ -1,4 +1,5 @@
 //! Properties of the method on a tiny capture (methods reference 13).
+#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod support;
 

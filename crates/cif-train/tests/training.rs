@@ -1,4 +1,5 @@
 //! Whole runs on a tiny capture.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod support;
 

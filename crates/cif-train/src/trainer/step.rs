@@ -193,7 +193,7 @@ impl Trainer {
                 }
             }
         }
-        if self.progress.total_steps % RENORMALISE_EVERY == 0 {
+        if self.progress.total_steps.is_multiple_of(RENORMALISE_EVERY) {
             for raw in &mut self.field.gaussians.quaternions {
                 if let Some(unit) = quaternion::try_normalize(*raw) {
                     *raw = unit;

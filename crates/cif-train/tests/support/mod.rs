@@ -1,5 +1,6 @@
 //! A tiny capture: three shaded balls, of which one may move, ray-cast with exact masks.
 #![allow(dead_code)] // Each test binary uses its own part.
+#![allow(clippy::unwrap_used)] // Only tests call these.
 
 use std::path::Path;
 
@@ -144,8 +145,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
 
 /// Settings that train the capture in seconds.
 pub(crate) fn small_config() -> TrainConfig {
-    let mut config = TrainConfig::default();
-    config.seed = 3;
+    let mut config = TrainConfig { seed: 3, ..TrainConfig::default() };
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (100, 250, 120);
     config.model.spatial_resolution = [8; 3];
     config.model.multipliers = vec![1, 2];
