@@ -1,1 +1,45 @@
-//! placeholder
+//! The native half of the Python package `cif`.
+//!
+//! | module | answers |
+//! |---|---|
+//! | `arrays` | numpy arrays in and out |
+//! | `camera` | pinhole cameras |
+//! | `dataset` | captures |
+//! | `field` | trained scenes: arrays, rendering, queries |
+//! | `export` | scenes as USD, and stages by label |
+//! | `error` | `cif.CifError` |
+//!
+//! Everything is documented for its users in `python/cif/_native.pyi`. Work in Rust runs without the lock of the
+//! interpreter; the USD writer takes it when it needs usd-core.
+
+mod arrays;
+mod camera;
+mod dataset;
+mod error;
+mod export;
+mod field;
+
+use std::ffi::OsString;
+
+use pyo3::prelude::*;
+
+/// Runs the command line in this process and returns its exit code. `arguments` start with the name of the
+/// program.
+#[pyfunction]
+fn run(py: Python<'_>, arguments: Vec<OsString>) -> i32 {
+    py.detach(|| cif::run(arguments))
+}
+
+#[pymodule]
+fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+    module.add("CifError", module.py().get_type::<error::CifError>())?;
+    module.add_class::<camera::Camera>()?;
+    module.add_class::<dataset::Dataset>()?;
+    module.add_class::<field::Field>()?;
+    module.add_function(wrap_pyfunction!(run, module)?)?;
+    module.add_function(wrap_pyfunction!(dataset::open_dataset, module)?)?;
+    module.add_function(wrap_pyfunction!(export::query_stage, module)?)?;
+    module.add_function(wrap_pyfunction!(export::usd_version, module)?)?;
+    Ok(())
+}

@@ -40,6 +40,9 @@ fn metadata(pxr: &Pxr<'_>, stage: &Bound<'_, PyAny>, graph: &SceneGraph) -> PyRe
     ours.set_item("layout", tokens::LAYOUT_VERSION)?;
     let [red, green, blue] = graph.background_color;
     ours.set_item("backgroundColor", pxr.gf.call_method1("Vec3f", (red, green, blue))?)?;
+    for (key, values) in [(tokens::SAMPLE_TIMES, &codes.times), (tokens::SAMPLE_CODES, &codes.samples)] {
+        ours.set_item(key, pxr.vt.call_method1("DoubleArray", (values.clone(),))?)?;
+    }
     let data = pxr.dictionary();
     data.set_item(tokens::CIF, ours)?;
     stage.call_method0("GetRootLayer")?.setattr("customLayerData", data)

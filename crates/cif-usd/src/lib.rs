@@ -108,6 +108,33 @@ pub fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdErro
     }
 }
 
+/// [`export`] for callers that have asked already whether a file there may go: replaces it.
+///
+/// # Errors
+/// As [`export`].
+pub fn write_stage(graph: &SceneGraph, path: &Path) -> Result<(), UsdError> {
+    export(graph, path, ExportOptions { force: true }).map(|_| ())
+}
+
+/// [`query`] by normalised time in [0, 1] instead of time code; a stage of ours knows when its samples are,
+/// others are taken to run evenly from their first to their last time code.
+///
+/// # Errors
+/// As [`query`].
+pub fn query_stage(path: &Path, pattern: &str, time: Option<f64>) -> Result<Vec<LabelMatch>, UsdError> {
+    let of = |time_code| LabelQuery { pattern: pattern.to_owned(), time_code };
+    #[cfg(feature = "python")]
+    return match time {
+        Some(time) => query(path, &of(Some(read::time_code(path, time)?))),
+        None => query(path, &of(None)),
+    };
+    #[cfg(not(feature = "python"))]
+    {
+        let _ = time;
+        query(path, &of(None))
+    }
+}
+
 /// Version of the usd-core in use, e.g. `26.11`.
 ///
 /// # Errors

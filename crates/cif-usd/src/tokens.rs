@@ -7,6 +7,10 @@ pub const MINIMUM_USD: (u32, u32) = (26, 3);
 pub const CIF: &str = "cif";
 /// Version of the layout described in the crate documentation.
 pub const LAYOUT_VERSION: i32 = 1;
+/// Normalised times of the sampled time codes, in `customLayerData`.
+pub const SAMPLE_TIMES: &str = "sampleTimes";
+/// The sampled time codes, in `customLayerData`.
+pub const SAMPLE_CODES: &str = "sampleCodes";
 
 /// Default prim.
 pub const WORLD: &str = "/World";

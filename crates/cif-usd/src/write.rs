@@ -36,8 +36,10 @@ fn folder_of(path: &Path) -> PathBuf {
 
 /// The root layer of a file, kept apart from layers that are open under the same name.
 fn is_ours(pxr: &Pxr<'_>, path: &Path) -> bool {
-    let opened =
-        pxr.sdf.getattr("Layer").and_then(|layer| layer.call_method1("OpenAsAnonymous", (path, true)));
+    let opened = pxr
+        .sdf
+        .getattr("Layer")
+        .and_then(|layer| layer.call_method1("OpenAsAnonymous", (path.as_os_str(), true)));
     opened
         .and_then(|layer| layer.getattr("customLayerData")?.contains(tokens::CIF))
         // What USD cannot read was not written by us.
@@ -95,7 +97,7 @@ pub(crate) fn export(
 /// Writes the stage into a folder; the path of the finished file.
 fn write(pxr: &Pxr<'_>, graph: &SceneGraph, kind: Kind, folder: &Path) -> PyResult<PathBuf> {
     let layer = folder.join(if kind == Kind::Text { "scene.usda" } else { "scene.usdc" });
-    let stage = pxr.usd.getattr("Stage")?.call_method1("CreateNew", (&layer,))?;
+    let stage = pxr.usd.getattr("Stage")?.call_method1("CreateNew", (layer.as_os_str(),))?;
     author::author(pxr, &stage, graph)?;
     let saved = stage.call_method0("GetRootLayer")?.call_method0("Save")?;
     let failure = |what: &str| Err(pyo3::exceptions::PyOSError::new_err(what.to_owned()));
@@ -107,7 +109,7 @@ fn write(pxr: &Pxr<'_>, graph: &SceneGraph, kind: Kind, folder: &Path) -> PyResu
         return Ok(layer);
     }
     let package = folder.join("scene.usdz");
-    let asset = pxr.sdf.call_method1("AssetPath", (&layer,))?;
-    let zipped = pxr.usd_utils.call_method1("CreateNewUsdzPackage", (asset, &package))?;
+    let asset = pxr.sdf.call_method1("AssetPath", (layer.as_os_str(),))?;
+    let zipped = pxr.usd_utils.call_method1("CreateNewUsdzPackage", (asset, package.as_os_str()))?;
     if zipped.is_truthy()? { Ok(package) } else { failure("the package could not be written") }
 }

@@ -1,0 +1,78 @@
+# Everything a person or a machine does with the project. Needs Rust, Python 3.10 or newer and a C toolchain.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+WHEELS := target/wheels
+OUT ?= out/demo
+DEMO_CAPTURE := examples/tabletop-mini
+DEMO_LABEL := red mug
+
+# Tools of the build; versions move only on purpose.
+MATURIN := maturin==1.16.0
+PYTEST := pytest==9.2.0
+RUFF := ruff==0.17.5
+
+.PHONY: help build demo test test-rust test-python lint format clean
+
+help:
+	@echo "make build   the command at $(BIN)/cif, from a release wheel"
+	@echo "make demo    train, evaluate, export, query and render the small capture into $(OUT)"
+	@echo "make test    all tests, Rust and Python"
+	@echo "make lint    formatting and lints, as in CI"
+	@echo "make format  put the formatting right"
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit("Python 3.10 or newer is needed; set PYTHON=" if sys.version_info < (3, 10) else 0)'
+	$(PYTHON) -m venv $(VENV)
+
+# Stamps hold the pinned version, so that a new pin installs anew.
+$(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF): | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(MATURIN) $(PYTEST) $(RUFF)
+	@rm -f $(VENV)/.tools-*
+	@touch "$@"
+
+build: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	@rm -rf $(WHEELS)
+	$(BIN)/maturin build --release --interpreter $(BIN)/python --out $(WHEELS)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(WHEELS)/*.whl
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(WHEELS)/*.whl
+	@echo "built: $(BIN)/cif"
+
+demo: build
+	@mkdir -p $(OUT)
+	$(BIN)/cif info $(DEMO_CAPTURE)
+	$(BIN)/cif train $(DEMO_CAPTURE) -o $(OUT)/scene.cif --preset draft --force
+	$(BIN)/cif eval $(OUT)/scene.cif $(DEMO_CAPTURE) --json $(OUT)/metrics.json --images $(OUT)/comparison --force
+	$(BIN)/cif export $(OUT)/scene.cif --usd $(OUT)/out.usda --force
+	$(BIN)/cif query $(OUT)/out.usda --label "$(DEMO_LABEL)" --time 0.5
+	$(BIN)/cif render $(OUT)/scene.cif --capture $(DEMO_CAPTURE) --split val --what rgb,instance,depth -o $(OUT)/views --force
+	@echo
+	@echo "$(OUT)/scene.cif    the trained scene"
+	@echo "$(OUT)/out.usda     the stage: one prim per object; try: $(BIN)/cif query $(OUT)/out.usda --label '*'"
+	@echo "$(OUT)/metrics.json how good it is"
+	@echo "$(OUT)/comparison/  truth, render, instance map, error and depth side by side"
+	@echo "$(OUT)/views/       the views that were held out"
+
+test: test-rust test-python
+
+test-rust:
+	cargo test --locked
+
+test-python: build
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	cargo fmt --all --check
+	cargo clippy --locked --all-targets -- -D warnings
+	cargo clippy --locked -p cif-python -- -D warnings
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+format: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	cargo fmt --all
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf target out $(VENV)

@@ -1,0 +1,41 @@
+"""Consistent Instance Field: captures in, segmented dynamic Gaussian scenes out.
+
+The command line of the package runs in this process: ``cif.run(["train", "captures/table", "-o", "table.cif"])``.
+Captures, trained scenes and stages are also here as objects with numpy arrays::
+
+    import cif
+
+    field = cif.Field.load("table.cif")
+    name, time_index, camera = field.cameras[0]
+    picture = field.render(camera, field.times[time_index])["color"]
+    field.export("table.usdc")
+    cif.query_stage("table.usdc", "red mug", time_code=12)
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+
+from . import _native
+from ._native import Camera, CifError, Dataset, Field, __version__, open_dataset, query_stage, usd_version
+
+__all__ = [
+    "Camera",
+    "CifError",
+    "Dataset",
+    "Field",
+    "__version__",
+    "open_dataset",
+    "query_stage",
+    "run",
+    "usd_version",
+]
+
+
+def run(arguments: Sequence[str | os.PathLike[str]]) -> int:
+    """Run a command line such as ``["info", "captures/table"]`` and return its exit code.
+
+    0 is success, 1 a failure that was explained on stderr, 2 a command line that was not understood.
+    """
+    return _native.run(["cif", *map(os.fspath, arguments)])

@@ -1,0 +1,196 @@
+"""Types and documentation of the native half of cif.
+
+Conventions: right-handed world in metres; cameras look along +z with x right and y down; quaternions are
+(w, x, y, z); times are normalised to [0, 1]; time codes are captured frame numbers; colours are as captured.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__version__: str
+
+class CifError(Exception):
+    """A file, capture, field or stage is not as it should be; the message names it and the way out."""
+
+class Camera:
+    """A pinhole camera; the centre of the first pixel is (0.5, 0.5)."""
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        focal: tuple[float, float],
+        principal: tuple[float, float] | None = None,
+        camera_from_world: NDArray[np.float64] | None = None,
+    ) -> None:
+        """Make a camera; pixels, [4, 4] world to camera. Principal point in the centre and identity by default."""
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+    @property
+    def focal(self) -> tuple[float, float]: ...
+    @property
+    def principal(self) -> tuple[float, float]: ...
+    @property
+    def camera_from_world(self) -> NDArray[np.float64]: ...
+    def resized(self, width: int, height: int) -> Camera:
+        """Return the same view at another resolution."""
+
+class Dataset:
+    """A capture, understood: frames, cameras, times, masks, instances, initial points."""
+
+    @property
+    def root(self) -> Path: ...
+    @property
+    def layout(self) -> str: ...
+    @property
+    def times(self) -> list[float]: ...
+    @property
+    def instances(self) -> list[dict[str, Any]]: ...
+    @property
+    def warnings(self) -> list[str]: ...
+    @property
+    def frames(self) -> list[dict[str, Any]]:
+        """name, camera_name, time, time_index, split, group, image and mask of every frame."""
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """Initial points [P, 3]."""
+    @property
+    def point_colors(self) -> NDArray[np.uint8]:
+        """Colours of the initial points [P, 3]."""
+    def __len__(self) -> int: ...
+    def camera(self, index: int) -> Camera:
+        """Return the camera of a frame."""
+    def load_frame(
+        self, index: int, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    ) -> dict[str, NDArray[Any] | None]:
+        """Load image uint8 [H, W, 3] and mask uint16 [H, W] (None without one); alpha goes onto background."""
+    def summary(self) -> dict[str, Any]:
+        """Return counts of everything, for a first look."""
+
+class Field:
+    """A dynamic Gaussian field with instances: N Gaussians, K instances."""
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> Field:
+        """Read a .cif file."""
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a .cif file, replacing an older one only once the new one is complete."""
+    @staticmethod
+    def from_arrays(
+        *,
+        means: NDArray[np.float32],
+        scales: NDArray[np.float32],
+        quaternions: NDArray[np.float32],
+        opacities: NDArray[np.float32],
+        colors: NDArray[np.float32],
+        occupancies: NDArray[np.float32] | None = None,
+        identities: NDArray[np.float32] | None = None,
+        instances: list[dict[str, Any]] | None = None,
+        times: Sequence[float] = (0.0,),
+        frames_per_second: float = 24.0,
+        cameras: Sequence[tuple[str, int, Camera]] | None = None,
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    ) -> Field:
+        """Make a static field.
+
+        [N, 3] means, standard deviations and colours, [N, 4] quaternions, [N] opacities and occupancies
+        (opacities by default), [N, K] identity probabilities; instances have id, label and category; cameras
+        are (name, index into times, camera).
+        """
+    def __len__(self) -> int: ...
+    @property
+    def means(self) -> NDArray[np.float32]:
+        """Canonical centres [N, 3]."""
+    @property
+    def scales(self) -> NDArray[np.float32]:
+        """Canonical standard deviations [N, 3]."""
+    @property
+    def quaternions(self) -> NDArray[np.float32]:
+        """Canonical quaternions [N, 4], not normalised."""
+    @property
+    def opacities(self) -> NDArray[np.float32]:
+        """Opacities [N]."""
+    @property
+    def occupancies(self) -> NDArray[np.float32]:
+        """Occupancies [N]."""
+    @property
+    def sh_coefficients(self) -> NDArray[np.float32]:
+        """Spherical harmonics [N, 16, 3]; those above sh_degree are not in use."""
+    @property
+    def sh_degree(self) -> int: ...
+    @property
+    def identities(self) -> NDArray[np.float32] | None:
+        """Identity probabilities [N, K]; None before identities were estimated."""
+    @property
+    def instances(self) -> list[dict[str, Any]]:
+        """id, label and category of every instance."""
+    @property
+    def times(self) -> list[float]:
+        """Normalised captured times."""
+    @property
+    def frames_per_second(self) -> float: ...
+    @property
+    def cameras(self) -> list[tuple[str, int, Camera]]:
+        """(name, index into times, camera) of every captured view."""
+    @property
+    def provenance(self) -> Any:
+        """How the field came about."""
+    def at(self, time: float) -> dict[str, NDArray[np.float32]]:
+        """Return means, scales, quaternions and opacities moved to a time."""
+    def render(
+        self, camera: Camera, time: float = 0.0, *, depth: bool = True, instances: bool = True
+    ) -> dict[str, NDArray[Any]]:
+        """Render a view.
+
+        color [H, W, 3] and alpha; depth in metres; label (index into instances plus 1, 0 for none),
+        probability, coverage and entropy where the field has identities.
+        """
+    def query(self, points: NDArray[np.float64], time: float = 0.0) -> dict[str, NDArray[Any]]:
+        """Tell what is at points [P, 3]: existence [P], instance [P] (-1 for none), probabilities [P, K]."""
+    def find(self, label: str, time_code: float | None = None) -> list[dict[str, Any]]:
+        """Return objects by label, class or name (globs, any case): path, transform, low and high of the box."""
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        tolerance: str = "1%",
+        motion: Callable[[float], tuple[NDArray[np.float32], NDArray[np.float32]]] | None = None,
+        most_expensive_motion: str = "dense",
+        frames: tuple[int, int] | None = None,
+        frame_step: int = 1,
+        up_axis: str = "z",
+        background_threshold: float | None = None,
+        proxy_points: int | None = None,
+        force: bool = False,
+    ) -> dict[str, Any]:
+        """Write a .usda, .usdc or .usdz stage with one prim per object.
+
+        motion replaces the trained deformation by a function of time that returns means [N, 3] and quaternions
+        [N, 4]. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
+        replaced with force.
+        """
+
+def run(arguments: Sequence[str | os.PathLike[str]]) -> int:
+    """Run the command line; the first argument is the name of the program."""
+
+def open_dataset(
+    path: str | os.PathLike[str],
+    masks: str | os.PathLike[str] | None = None,
+    downscale: int | None = None,
+) -> Dataset:
+    """Open a capture; masks name a folder inside it or anywhere."""
+
+def query_stage(
+    path: str | os.PathLike[str], label: str, time_code: float | None = None
+) -> list[dict[str, Any]]:
+    """Return the prims of a stage that carry a label (globs, any case); an unknown label lists the known ones."""
+
+def usd_version() -> str:
+    """Return the version of the usd-core in use, e.g. 26.11."""

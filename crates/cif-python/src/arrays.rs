@@ -1,0 +1,65 @@
+//! numpy arrays in and out.
+
+use numpy::{
+    Element, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
+};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+
+/// Rows of an `[N, C]` array; other shapes are refused by name.
+pub(crate) fn rows<T: Element + Copy, const C: usize>(
+    name: &str,
+    array: &PyReadonlyArrayDyn<'_, T>,
+) -> PyResult<Vec<[T; C]>> {
+    let shape = array.shape();
+    if shape.len() != 2 || shape[1] != C {
+        return Err(PyValueError::new_err(format!("{name} has the shape {shape:?}, but must be [N, {C}]")));
+    }
+    let flat = values(array);
+    Ok(flat.as_chunks().0.to_vec())
+}
+
+/// Values of an `[N]` array.
+pub(crate) fn column<T: Element + Copy>(name: &str, array: &PyReadonlyArrayDyn<'_, T>) -> PyResult<Vec<T>> {
+    if array.shape().len() != 1 {
+        let shape = array.shape();
+        return Err(PyValueError::new_err(format!("{name} has the shape {shape:?}, but must be [N]")));
+    }
+    Ok(values(array))
+}
+
+/// Values in row-major order, whatever the strides.
+pub(crate) fn values<T: Element + Copy>(array: &PyReadonlyArrayDyn<'_, T>) -> Vec<T> {
+    array.as_array().iter().copied().collect()
+}
+
+/// `[N, C]`.
+pub(crate) fn matrix<'py, T: Element + Copy, const C: usize>(
+    py: Python<'py>,
+    rows: &[[T; C]],
+) -> PyResult<Bound<'py, PyArray2<T>>> {
+    PyArray1::from_slice(py, rows.as_flattened()).reshape([rows.len(), C])
+}
+
+/// `[height, width]`.
+pub(crate) fn image<'py, T: Element + Copy>(
+    py: Python<'py>,
+    grid: &cif_geometry::PixelGrid<T>,
+) -> PyResult<Bound<'py, PyArray2<T>>> {
+    PyArray1::from_slice(py, &grid.pixels).reshape([grid.height as usize, grid.width as usize])
+}
+
+/// `[height, width, C]`.
+pub(crate) fn color_image<'py, T: Element + Copy, const C: usize>(
+    py: Python<'py>,
+    grid: &cif_geometry::PixelGrid<[T; C]>,
+) -> PyResult<Bound<'py, PyArray3<T>>> {
+    let shape = [grid.height as usize, grid.width as usize, C];
+    PyArray1::from_slice(py, grid.pixels.as_flattened()).reshape(shape)
+}
+
+/// A value as Python lists and dictionaries.
+pub(crate) fn to_python<'py>(py: Python<'py>, value: &impl serde::Serialize) -> PyResult<Bound<'py, PyAny>> {
+    let text = serde_json::to_string(value).map_err(crate::error::cif_error)?;
+    py.import("json")?.call_method1("loads", (text,))
+}

@@ -1,0 +1,145 @@
+//! Captures.
+
+use std::path::PathBuf;
+
+use numpy::PyArray2;
+use pyo3::exceptions::PyIndexError;
+use pyo3::prelude::*;
+use pyo3::types::{PyDict, PyList};
+
+use crate::arrays;
+use crate::camera::Camera;
+use crate::error::cif_error;
+
+/// A capture, understood.
+#[pyclass(frozen, module = "cif")]
+pub(crate) struct Dataset {
+    inner: cif_dataset::Dataset,
+}
+
+/// Opens a capture.
+#[pyfunction]
+#[pyo3(signature = (path, masks=None, downscale=None))]
+pub(crate) fn open_dataset(
+    py: Python<'_>,
+    path: PathBuf,
+    masks: Option<PathBuf>,
+    downscale: Option<u32>,
+) -> PyResult<Dataset> {
+    let options = cif_dataset::OpenOptions { masks, downscale, ..cif_dataset::OpenOptions::default() };
+    let inner = py.detach(|| cif_dataset::Dataset::open(&path, &options)).map_err(cif_error)?;
+    Ok(Dataset { inner })
+}
+
+impl Dataset {
+    fn frame_at(&self, index: usize) -> PyResult<&cif_dataset::Frame> {
+        self.inner.frames.get(index).ok_or_else(|| {
+            PyIndexError::new_err(format!("frame {index} of {} frames", self.inner.frames.len()))
+        })
+    }
+}
+
+#[pymethods]
+impl Dataset {
+    #[getter]
+    fn root(&self) -> PathBuf {
+        self.inner.root.clone()
+    }
+
+    #[getter]
+    fn layout<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        arrays::to_python(py, &self.inner.layout)
+    }
+
+    #[getter]
+    fn times(&self) -> Vec<f64> {
+        self.inner.times.clone()
+    }
+
+    #[getter]
+    fn instances<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        arrays::to_python(py, &self.inner.instances)
+    }
+
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.inner.warnings.clone()
+    }
+
+    #[getter]
+    fn frames<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
+        let frames = PyList::empty(py);
+        for frame in &self.inner.frames {
+            let entry = PyDict::new(py);
+            entry.set_item("name", &frame.name)?;
+            entry.set_item("camera_name", &frame.camera_name)?;
+            entry.set_item("time", frame.time)?;
+            entry.set_item("time_index", frame.time_index)?;
+            entry.set_item("split", arrays::to_python(py, &frame.split)?)?;
+            entry.set_item("group", frame.group.as_deref())?;
+            entry.set_item("image", &frame.image)?;
+            entry.set_item("mask", frame.mask.as_deref())?;
+            frames.append(entry)?;
+        }
+        Ok(frames)
+    }
+
+    fn __len__(&self) -> usize {
+        self.inner.frames.len()
+    }
+
+    fn camera(&self, index: usize) -> PyResult<Camera> {
+        Ok(Camera { inner: self.frame_at(index)?.camera })
+    }
+
+    #[pyo3(signature = (index, background=(1.0, 1.0, 1.0)))]
+    fn load_frame<'py>(
+        &self,
+        py: Python<'py>,
+        index: usize,
+        background: (f32, f32, f32),
+    ) -> PyResult<Bound<'py, PyDict>> {
+        self.frame_at(index)?;
+        let background = [background.0, background.1, background.2];
+        let data = py.detach(|| self.inner.load_frame(index, background)).map_err(cif_error)?;
+        let out = PyDict::new(py);
+        out.set_item("image", arrays::color_image(py, &data.image)?)?;
+        out.set_item("mask", data.mask.as_ref().map(|mask| arrays::image(py, mask)).transpose()?)?;
+        Ok(out)
+    }
+
+    #[getter]
+    fn points<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
+        arrays::matrix(py, &self.inner.points.positions)
+    }
+
+    #[getter]
+    fn point_colors<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<u8>>> {
+        arrays::matrix(py, &self.inner.points.colors)
+    }
+
+    fn summary<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let frames = &self.inner.frames;
+        let count = |split| frames.iter().filter(|frame| frame.split == split).count();
+        let mut cameras: Vec<&str> = frames.iter().map(|frame| frame.camera_name.as_str()).collect();
+        cameras.sort_unstable();
+        cameras.dedup();
+        let summary = PyDict::new(py);
+        summary.set_item("layout", arrays::to_python(py, &self.inner.layout)?)?;
+        summary.set_item("frames", frames.len())?;
+        summary.set_item("train", count(cif_dataset::Split::Train))?;
+        summary.set_item("val", count(cif_dataset::Split::Val))?;
+        summary.set_item("cameras", cameras.len())?;
+        summary.set_item("times", self.inner.times.len())?;
+        let size = frames.first().map(|frame| (frame.camera.width, frame.camera.height));
+        summary.set_item("resolution", size)?;
+        summary.set_item("masks", frames.iter().filter(|frame| frame.mask.is_some()).count())?;
+        summary.set_item("instances", self.inner.instances.len())?;
+        summary.set_item("points", self.inner.points.positions.len())?;
+        Ok(summary)
+    }
+
+    fn __repr__(&self) -> String {
+        format!("Dataset({}, {} frames)", self.inner.root.display(), self.inner.frames.len())
+    }
+}

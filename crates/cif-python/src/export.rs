@@ -1,0 +1,132 @@
+//! Scenes as USD, and stages by label.
+
+use std::path::{Path, PathBuf};
+
+use cif_scene::{LabelQuery, MotionModel, MotionSource, SceneGraph, SceneOptions};
+use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::arrays;
+use crate::error::cif_error;
+use crate::field::Field;
+
+/// Motion from a Python function `time -> (means, quaternions)`. The first error stops the export.
+struct CallableMotion<'a> {
+    field: &'a cif_field::Field,
+    function: Py<PyAny>,
+    error: Option<PyErr>,
+}
+
+impl CallableMotion<'_> {
+    fn call(&self, time: f64) -> PyResult<cif_field::Gaussians> {
+        Python::attach(|py| {
+            let answer = self.function.call1(py, (time,))?;
+            let (means, quaternions): (PyReadonlyArrayDyn<'_, f32>, PyReadonlyArrayDyn<'_, f32>) =
+                answer.extract(py)?;
+            let n = self.field.gaussians.len();
+            if means.shape() != [n, 3] || quaternions.shape() != [n, 4] {
+                let message = format!("motion({time}) must return float32 arrays [{n}, 3] and [{n}, 4]");
+                return Err(PyValueError::new_err(message));
+            }
+            let mut moved = self.field.gaussians.clone();
+            moved.means = arrays::rows("means", &means)?;
+            moved.quaternions = arrays::rows("quaternions", &quaternions)?;
+            Ok(moved)
+        })
+    }
+}
+
+impl MotionSource for CallableMotion<'_> {
+    fn gaussians_at(&mut self, time: f64) -> cif_field::Gaussians {
+        if self.error.is_none() {
+            match self.call(time) {
+                Ok(moved) => return moved,
+                Err(error) => self.error = Some(error),
+            }
+        }
+        self.field.gaussians.clone()
+    }
+}
+
+pub(crate) fn motion_model(name: &str) -> PyResult<MotionModel> {
+    match name {
+        "static" => Ok(MotionModel::Static),
+        "rigid" => Ok(MotionModel::Rigid),
+        "dense" => Ok(MotionModel::Dense),
+        _ => Err(PyValueError::new_err(format!("motion model '{name}': choose static, rigid or dense"))),
+    }
+}
+
+fn build(
+    py: Python<'_>,
+    field: &Field,
+    options: &SceneOptions,
+    motion: Option<Bound<'_, PyAny>>,
+) -> PyResult<SceneGraph> {
+    let Some(function) = motion else {
+        return py.detach(|| cif_scene::build(&field.inner, options)).map_err(cif_error);
+    };
+    let mut source = CallableMotion { field: &field.inner, function: function.unbind(), error: None };
+    let graph = py.detach(|| cif_scene::build_from(&field.inner, &mut source, options));
+    match source.error {
+        Some(error) => Err(error),
+        None => graph.map_err(cif_error),
+    }
+}
+
+pub(crate) fn export<'py>(
+    py: Python<'py>,
+    field: &Field,
+    path: &Path,
+    options: &SceneOptions,
+    motion: Option<Bound<'py, PyAny>>,
+    force: bool,
+) -> PyResult<Bound<'py, PyDict>> {
+    let export_options = cif_usd::ExportOptions { force };
+    cif_usd::check_target(path, export_options).map_err(cif_error)?;
+    let graph = build(py, field, options, motion)?;
+    let summary = py.detach(|| cif_usd::export(&graph, path, export_options)).map_err(cif_error)?;
+    let out = PyDict::new(py);
+    out.set_item("path", summary.path)?;
+    out.set_item("bytes", summary.bytes)?;
+    out.set_item("splats", summary.splats)?;
+    out.set_item("samples", summary.samples)?;
+    out.set_item("usd_version", summary.usd_version)?;
+    out.set_item("warnings", &graph.warnings)?;
+    out.set_item("motion", arrays::to_python(py, &graph.motion_table())?)?;
+    Ok(out)
+}
+
+pub(crate) fn find<'py>(
+    py: Python<'py>,
+    field: &Field,
+    label: String,
+    time_code: Option<f64>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let options = SceneOptions { proxy_points: 0, ..SceneOptions::default() };
+    let graph = build(py, field, &options, None)?;
+    let query = LabelQuery { pattern: label, time_code };
+    let found = cif_scene::query(&graph, &query, "the field").map_err(cif_error)?;
+    arrays::to_python(py, &found)
+}
+
+/// Prims of a stage by label.
+#[pyfunction]
+#[pyo3(signature = (path, label, time_code=None))]
+pub(crate) fn query_stage<'py>(
+    py: Python<'py>,
+    path: PathBuf,
+    label: String,
+    time_code: Option<f64>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let found = cif_usd::query(&path, &LabelQuery { pattern: label, time_code }).map_err(cif_error)?;
+    arrays::to_python(py, &found)
+}
+
+/// Version of the usd-core in use.
+#[pyfunction]
+pub(crate) fn usd_version() -> PyResult<String> {
+    cif_usd::usd_version().map_err(cif_error)
+}
