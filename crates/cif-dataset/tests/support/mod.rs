@@ -1,5 +1,10 @@
 //! Small captures of every layout, written into temporary folders.
-#![allow(dead_code, unreachable_pub, reason = "each test file uses its own part")]
+#![allow(
+    dead_code,
+    unreachable_pub,
+    clippy::unwrap_used,
+    reason = "test helpers; each test file uses its own part"
+)]
 
 use std::fs;
 use std::path::Path;

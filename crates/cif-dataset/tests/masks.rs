@@ -1,0 +1,181 @@
+//! The way to a tracker and back, and what is printed of a capture.
+
+mod support;
+
+use std::path::Path;
+
+use cif_dataset::masks::{ViewOrder, ZigzagIndex, split_tracker_masks, write_zigzag};
+use cif_dataset::{Dataset, OpenOptions};
+use serde_json::json;
+use support::*;
+
+/// Plays a tracker: a mask for every image of the sequence.
+fn track(index: &ZigzagIndex, folder: &Path, id: impl Fn(usize, &str, u32) -> u16) {
+    for entry in &index.images {
+        let path = folder.join(&entry.image);
+        write_wide_mask(&path, WIDTH, HEIGHT, |x, _| id(entry.view, &entry.frame, x));
+    }
+}
+
+#[test]
+fn the_sequence_turns_at_every_view() {
+    let folder = neu3d(3, 4);
+    let out = folder.path().join("zigzag");
+    let index = write_zigzag(&open(&folder), &out, ViewOrder::Name).unwrap();
+    let frames: Vec<&str> = index.images.iter().map(|entry| entry.frame.as_str()).collect();
+    assert_eq!(frames.len(), 12);
+    assert_eq!(frames[2..6], ["cam00/0002", "cam00/0003", "cam01/0003", "cam01/0002"]);
+    assert_eq!(frames[7..9], ["cam01/0000", "cam02/0000"]);
+    assert_eq!(index.views, ["cam00", "cam01", "cam02"]);
+    assert!(index.view_path_m > 2.0 && index.view_path_m < 3.0, "{}", index.view_path_m);
+    assert_eq!(ZigzagIndex::load(&out).unwrap(), index);
+    // Position 4 shows step 3.
+    let image = image::open(out.join("000004.png")).unwrap().to_rgb8();
+    assert_eq!((image.dimensions(), image.get_pixel(2, 1).0), ((WIDTH, HEIGHT), [14, 10, 30]));
+}
+
+#[test]
+fn cameras_without_common_times_are_one_sequence() {
+    let folder = hypernerf(5);
+    edit_json(&folder.path().join("metadata.json"), |value| value["000004"]["camera_id"] = json!(1));
+    let index = write_zigzag(&open(&folder), &folder.path().join("zigzag"), ViewOrder::Greedy).unwrap();
+    assert!(!index.is_multi_view());
+    let frames: Vec<&str> = index.images.iter().map(|entry| entry.frame.as_str()).collect();
+    assert_eq!(frames, ["000000", "000001", "000002", "000003", "000004"]);
+}
+
+#[test]
+fn ids_come_back_filtered_dense_and_with_their_table() {
+    let folder = neu3d(3, 2);
+    let root = folder.path();
+    let index = write_zigzag(&open(&folder), &root.join("zigzag"), ViewOrder::Name).unwrap();
+    // 40 is in every view; 700 in one frame of each; 9 is missing in view 1; 50 has too few pixels in view 2.
+    track(&index, &root.join("tracked"), |view, frame, x| match x {
+        0..8 => 40,
+        8..16 if frame.ends_with('1') => 700,
+        16..20 if view != 1 => 9,
+        20..24 => 50,
+        24 if view < 2 => 60,
+        24 if frame.ends_with('0') => 60,
+        _ => 0,
+    });
+    let out = root.join("masks_merged");
+    let report = split_tracker_masks(&index, &root.join("tracked"), &out, 30).unwrap();
+    let kept: Vec<_> = report.instances.iter().map(|kept| (kept.id, kept.tracker_id, kept.pixels)).collect();
+    let rows = u64::from(HEIGHT);
+    assert_eq!(kept, [(1, 40, 8 * 6 * rows), (2, 50, 4 * 6 * rows), (3, 700, 8 * 3 * rows)]);
+    let removed: Vec<_> =
+        report.removed.iter().map(|removed| (removed.tracker_id, removed.missing_in.len())).collect();
+    assert_eq!(removed, [(9, 1), (60, 3)]);
+    assert_eq!(report.removed[0].missing_in, ["cam01"]);
+
+    let options = OpenOptions { masks: Some("masks_merged".into()), ..OpenOptions::default() };
+    let dataset = Dataset::open(root, &options).unwrap();
+    assert_eq!(dataset.instances.iter().map(|i| i.id).collect::<Vec<_>>(), [1, 2, 3]);
+    assert_eq!(dataset.instances[2].label, "instance_3");
+    let frame = dataset.frames.iter().position(|frame| frame.name == "cam01/0001").unwrap();
+    let mask = dataset.load_mask(frame).unwrap().unwrap();
+    assert_eq!([0, 9, 17, 21, 24, 30].map(|x| *mask.at(x, 5)), [1, 3, 0, 2, 0, 0]);
+    assert!(dataset.warnings.is_empty(), "{:?}", dataset.warnings);
+}
+
+#[test]
+fn one_view_keeps_every_instance() {
+    let folder = hypernerf(4);
+    let root = folder.path();
+    let index = write_zigzag(&open(&folder), &root.join("zigzag"), ViewOrder::Name).unwrap();
+    track(&index, &root.join("tracked"), |_, frame, x| if frame == "000002" && x == 0 { 5 } else { 0 });
+    let report = split_tracker_masks(&index, &root.join("tracked"), &root.join("merged"), 1000).unwrap();
+    assert_eq!(report.instances.iter().map(|kept| (kept.id, kept.tracker_id)).collect::<Vec<_>>(), [(1, 5)]);
+    assert!(root.join("merged/000003.png").is_file());
+}
+
+#[test]
+fn nothing_existing_is_overwritten() {
+    let folder = neu3d(2, 2);
+    let root = folder.path();
+    let dataset = open(&folder);
+    let out = root.join("zigzag");
+    write(&out.join("mine.txt"), "keep");
+    holds(&write_zigzag(&dataset, &out, ViewOrder::Name).unwrap_err().to_string(), &["zigzag", "new folder"]);
+    assert_eq!(std::fs::read_to_string(out.join("mine.txt")).unwrap(), "keep");
+    std::fs::remove_file(out.join("mine.txt")).unwrap();
+    // An empty folder is taken.
+    let index = write_zigzag(&dataset, &out, ViewOrder::Name).unwrap();
+    holds(
+        &split_tracker_masks(&index, &root.join("nowhere"), &root.join("out"), 1).unwrap_err().to_string(),
+        &["nowhere"],
+    );
+    std::fs::create_dir(root.join("empty")).unwrap();
+    holds(
+        &split_tracker_masks(&index, &root.join("empty"), &root.join("out"), 1).unwrap_err().to_string(),
+        &["empty", "000000.png"],
+    );
+    assert!(!root.join("out").exists());
+    // No scratch folders stay behind.
+    assert!(
+        std::fs::read_dir(root)
+            .unwrap()
+            .all(|entry| { !entry.unwrap().file_name().to_string_lossy().starts_with(".partial") })
+    );
+}
+
+#[test]
+fn a_damaged_index_cannot_write_elsewhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("zigzag.json");
+    for frame in ["../../evil", "/evil", ""] {
+        write_json(
+            &path,
+            &json!({"views": ["a"], "view_path_m": 0.0, "images": [{"image": "0.png", "frame": frame, "view": 0}]}),
+        );
+        holds(&ZigzagIndex::load(&path).unwrap_err().to_string(), &["zigzag.json", "damaged"]);
+    }
+    holds(
+        &ZigzagIndex::load(&folder.path().join("no.json")).unwrap_err().to_string(),
+        &["no.json", "masks zigzag"],
+    );
+}
+
+#[test]
+fn the_summary_counts_what_was_understood() {
+    let folder = hypernerf(6);
+    write_json(&folder.path().join("splits.json"), &json!({"interp": ["000001", "000004"]}));
+    std::fs::remove_file(folder.path().join("masks/000005.png")).unwrap();
+    let dataset = open(&folder);
+    let summary = dataset.summary().unwrap();
+    assert_eq!((summary.frames, summary.train, summary.val, summary.times), (6, 4, 2, 6));
+    assert_eq!(summary.groups["interp"], 2);
+    let masks = summary.masks.as_ref().unwrap();
+    assert_eq!((masks.frames, masks.train), (5, 3));
+    assert!((masks.labelled - 21.0 / 32.0).abs() < 1e-12);
+    let mug = &summary.instances[0];
+    assert_eq!((mug.frames, mug.train_frames, mug.pixels), (5, 3, 5 * 11 * u64::from(HEIGHT)));
+    assert!(summary.cameras[0].moves);
+    assert_eq!(summary.resolutions, [(WIDTH, HEIGHT, 6)]);
+    let text = summary.to_string();
+    for words in
+        ["hyper-nerf", "4 train, 2 val: 2 interp", "red mug", "5 of 6 frames", "32 x 24", "warning: "]
+    {
+        assert!(text.contains(words), "`{words}` is not in:\n{text}");
+    }
+    assert!(serde_json::to_value(&summary).unwrap()["instances"][1]["label"] == "blue ball");
+}
+
+#[test]
+fn masks_of_another_folder_score_the_same_frames() {
+    let folder = hypernerf(3);
+    for k in 0..3 {
+        write_mask(&folder.path().join(format!("masks_tracker/{k:06}.png")), WIDTH, HEIGHT, |_, _| 4);
+    }
+    let options = OpenOptions { masks: Some("masks_tracker".into()), ..OpenOptions::default() };
+    let dataset = Dataset::open(folder.path(), &options).unwrap();
+    assert_eq!(dataset.instances.iter().map(|i| i.id).collect::<Vec<_>>(), [4]);
+    let exact = dataset.with_masks(Path::new("masks")).unwrap();
+    assert_eq!(exact.instances.iter().map(|i| i.id).collect::<Vec<_>>(), [1, 2]);
+    assert_eq!(exact.frames.len(), dataset.frames.len());
+    let paths = dataset.mask_paths(Path::new("masks")).unwrap();
+    let mask = dataset.load_mask_file(2, paths[2].as_ref().unwrap()).unwrap();
+    assert_eq!(Some(mask), exact.load_mask(2).unwrap());
+    holds(&dataset.with_masks(Path::new("mask_x")).unwrap_err().to_string(), &["mask_x", "masks_tracker"]);
+}
