@@ -28,7 +28,6 @@ impl Run {
     ///
     /// # Panics
     /// When the command failed.
-    #[must_use]
     #[track_caller]
     pub fn succeeds(self) -> Self {
         assert_eq!(self.code, Some(0), "expected success:\n{}\n{}", self.stdout, self.stderr);

@@ -45,10 +45,10 @@ fn listing(folder: &Path) -> Vec<String> {
 fn help_teaches_the_tool() {
     let folder = folder();
     let help = cif(folder.path(), "--help").succeeds().stdout;
-    for word in ["train", "eval", "render", "export", "query", "info", "A short tour", "Exit code"] {
+    for word in ["train", "eval", "render", "export", "query", "info", "masks", "A short tour", "Exit code"] {
         assert!(help.contains(word), "{word} in {help}");
     }
-    for command in ["train", "eval", "render", "export", "query", "info"] {
+    for command in ["train", "eval", "render", "export", "query", "info", "masks zigzag", "masks split"] {
         let help = cif(folder.path(), &format!("{command} --help")).succeeds().stdout;
         assert!(help.contains("Usage: cif"), "{help}");
     }
@@ -189,4 +189,34 @@ fn damaged_captures_are_refused_with_the_file() {
     train(&["000001.png"]);
     fs::remove_file(&image).unwrap();
     train(&["000001"]);
+}
+
+#[test]
+fn masks_go_through_a_tracker_and_come_back() {
+    let folder = with_capture();
+    let path = folder.path();
+    let text = cif(path, "masks zigzag table -o sequence").succeeds().stdout;
+    assert!(text.contains("4 images"), "{text}");
+    // A tracker that answers with the true masks, numbered as the sequence is.
+    fs::create_dir(path.join("tracked")).unwrap();
+    for frame in 0..4 {
+        let name = format!("{frame:06}.png");
+        assert!(path.join("sequence").join(&name).exists());
+        fs::copy(path.join("table/masks").join(&name), path.join("tracked").join(&name)).unwrap();
+    }
+    let text = cif(path, "masks split sequence tracked -o masks").succeeds().stdout;
+    assert!(text.contains("4 masks of 2 instances"), "{text}");
+    // Ids are dense now: 3 and 7 became 1 and 2.
+    let mask = |file: &str| image::open(path.join(file)).unwrap().into_luma16().into_raw();
+    let before = mask("table/masks/000001.png");
+    let after = mask("masks/000001.png");
+    let dense = |id: &u16| [0, 1, 2][[0, 3 * 257, 7 * 257].iter().position(|known| known == id).unwrap()];
+    assert_eq!(
+        after,
+        before.iter().map(dense).collect::<Vec<u16>>().iter().map(|id| id * 257).collect::<Vec<_>>()
+    );
+    let facts = cif(path, "info table --masks ../masks").succeeds();
+    assert!(facts.stdout.contains("instance_1"), "{}", facts.stdout);
+    cif(path, "masks zigzag table -o sequence").fails(1, &["sequence"]);
+    cif(path, "masks split tracked tracked -o other").fails(1, &["cif masks zigzag"]);
 }

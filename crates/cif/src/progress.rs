@@ -58,9 +58,12 @@ impl Progress {
                     bar.set_position(u64::from(*iteration));
                     bar.set_message("");
                 }
-                self.plain(&format!(
-                    "{stage}: {iterations} steps from step {iteration}, {gaussians} Gaussians"
-                ));
+                // Identity estimation has no steps and tells its result itself.
+                if *iterations > 0 {
+                    self.plain(&format!(
+                        "{stage}: {iterations} steps from step {iteration}, {gaussians} Gaussians"
+                    ));
+                }
             }
             TrainEvent::Step {
                 stage,

@@ -4,12 +4,11 @@ use std::path::{Path, PathBuf};
 
 use cif_dataset::Split;
 use cif_field::Field;
-use cif_render::cpu::SimdLevel;
 use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, Scores, evaluate};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 
-use super::{CaptureOptions, print_warnings, scene};
+use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::error::Error;
 use crate::pictures::{
     Picture, depth_picture, error_picture, instance_picture, rgb_picture, save_rgb, side_by_side,
@@ -27,8 +26,8 @@ n/a (JSON null) means that there is nothing to measure.
   cif eval table.cif captures/table
   cif eval table.cif captures/table --masks masks --json scores.json --images pictures
 
-Pictures show, side by side: truth, render, instance map, error (brightest from a quarter of full
-range on), depth (near is bright).")]
+Pictures show, side by side: truth, render, instance map (faint where instances hardly cover), error
+(brightest from a quarter of full range on), depth (near is bright).")]
 pub(super) struct Eval {
     /// Trained scene
     #[arg(value_name = "SCENE.cif")]
@@ -49,6 +48,9 @@ pub(super) struct Eval {
     force: bool,
     #[command(flatten)]
     capture_options: CaptureOptions,
+    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are
+    #[arg(long, value_name = "LEVEL", default_value = "auto")]
+    simd: Simd,
 }
 
 /// Splits by name.
@@ -67,7 +69,7 @@ impl From<SplitName> for Split {
     }
 }
 
-pub(super) fn run(command: &Eval, simd: SimdLevel) -> Result<(), Error> {
+pub(super) fn run(command: &Eval) -> Result<(), Error> {
     let to_stdout = command.json.as_deref() == Some(Path::new("-"));
     if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
         output::check_file(path, command.force)?;
@@ -83,7 +85,7 @@ pub(super) fn run(command: &Eval, simd: SimdLevel) -> Result<(), Error> {
     let options = EvaluationOptions {
         split: command.split.into(),
         settings: scene::render_settings(&field),
-        simd,
+        simd: command.simd.into(),
         depth: command.images.is_some(),
     };
     interrupt::watch();
@@ -120,7 +122,9 @@ impl From<EvaluationError> for Error {
 fn panel(view: &FrameView<'_>) -> Picture {
     let truth = &view.truth.image;
     let mut pictures = vec![truth.clone(), rgb_picture(&view.rendered.color)];
-    pictures.extend(view.predicted.map(instance_picture));
+    if let (Some(ids), Some(layers)) = (view.predicted, &view.rendered.instances) {
+        pictures.push(instance_picture(ids, &layers.coverage));
+    }
     pictures.push(error_picture(&view.rendered.color, truth));
     pictures.extend(view.rendered.depth.as_ref().map(depth_picture));
     side_by_side(&pictures)

@@ -132,7 +132,11 @@ fn range(values: &[f64]) -> [f64; 2] {
 }
 
 fn corners(bounds: &Bounds) -> Value {
-    if bounds.is_empty() { Value::Null } else { json!([bounds.low.to_array(), bounds.high.to_array()]) }
+    if bounds.is_empty() {
+        Value::Null
+    } else {
+        json!({ "from": bounds.low.to_array(), "to": bounds.high.to_array() })
+    }
 }
 
 fn print(facts: &Facts) {
@@ -143,7 +147,7 @@ fn print(facts: &Facts) {
             Value::Array(items) if items.iter().all(Value::is_object) => {
                 println!("{name:>28}  {}", items.len());
                 for item in items {
-                    println!("{:>28}  {}", "", one_line(item));
+                    println!("{:>28}  {}", "", named(item));
                 }
             }
             Value::Array(items) if name == "warnings" => {
@@ -158,6 +162,21 @@ fn print(facts: &Facts) {
             value => println!("{name:>28}  {}", one_line(value)),
         }
     }
+}
+
+/// An instance in one line.
+fn named(instance: &Value) -> String {
+    let text = |key: &str| instance.get(key).map(one_line);
+    let mut line = format!(
+        "id {:>3}  {}  ({})",
+        text("id").unwrap_or_default(),
+        text("label").unwrap_or_default(),
+        text("category").unwrap_or_default()
+    );
+    if let Some(gaussians) = text("gaussians") {
+        line += &format!("  {gaussians} Gaussians");
+    }
+    line
 }
 
 fn one_line(value: &Value) -> String {

@@ -3,6 +3,7 @@
 mod eval;
 mod export;
 mod info;
+mod masks;
 mod query;
 mod render;
 mod scene;
@@ -39,8 +40,9 @@ A short tour:
   cif export table.cif --usd table.usda                  one moving prim per object
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
 
-A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with instance
-masks (PNG, value = instance id, 0 = unlabelled) in its folder masks/.
+A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
+instance masks (PNG, value = instance id, 0 = unlabelled) in its folder masks/. `cif masks` helps to
+make them with a video tracker.
 Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 `cif COMMAND --help` explains one command.";
 
@@ -52,6 +54,7 @@ enum Command {
     Export(export::Export),
     Query(query::Query),
     Info(info::Info),
+    Masks(masks::Masks),
 }
 
 /// How the machine is used; results never depend on the number of threads.
@@ -61,11 +64,9 @@ struct Machine {
     /// Threads to use; all processors by default. Results do not depend on it
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1024))]
     threads: Option<u32>,
-    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are
-    #[arg(long, global = true, value_name = "LEVEL", default_value = "auto")]
-    simd: Simd,
 }
 
+/// Vector instructions of the renderer.
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum Simd {
     Auto,
@@ -86,14 +87,14 @@ impl From<Simd> for SimdLevel {
 /// # Errors
 /// Whatever keeps the command from doing what was asked.
 pub fn run(arguments: Arguments) -> Result<(), Error> {
-    let simd = arguments.machine.simd.into();
     let run = || match arguments.command {
-        Command::Train(command) => train::run(&command, simd),
-        Command::Eval(command) => eval::run(&command, simd),
-        Command::Render(command) => render::run(&command, simd),
+        Command::Train(command) => train::run(&command),
+        Command::Eval(command) => eval::run(&command),
+        Command::Render(command) => render::run(&command),
         Command::Export(command) => export::run(&command),
         Command::Query(command) => query::run(&command),
         Command::Info(command) => info::run(&command),
+        Command::Masks(command) => masks::run(&command),
     };
     match arguments.machine.threads {
         None => run(),

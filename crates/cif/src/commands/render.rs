@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 
 use cif_field::Field;
 use cif_geometry::PixelGrid;
-use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::cpu::Renderer;
 use cif_render::{Channels, RenderedImage};
 use cif_train::metrics::mask_ids;
 use clap::{ArgGroup, Args, ValueEnum};
 
 use super::eval::SplitName;
-use super::{CaptureOptions, print_warnings, scene};
+use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
 use crate::pictures::{depth_picture, instance_picture, rgb_picture, save_grey, save_rgb};
@@ -50,6 +50,9 @@ pub(super) struct Render {
     force: bool,
     #[command(flatten)]
     capture_options: CaptureOptions,
+    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are
+    #[arg(long, value_name = "LEVEL", default_value = "auto")]
+    simd: Simd,
 }
 
 /// Layers that can be written.
@@ -59,7 +62,7 @@ enum What {
     Rgb,
     /// Mask id of the most probable instance, 16-bit grey, 0 = none
     Instance,
-    /// The same in colours, 8-bit RGB
+    /// The same in colours, faint where instances hardly cover, 8-bit RGB
     InstanceColor,
     /// Expected depth along the viewing axis, 16-bit grey, millimetres for scenes in metres, 0 = none
     Depth,
@@ -92,7 +95,7 @@ fn after_help() -> String {
     )
 }
 
-pub(super) fn run(command: &Render, simd: SimdLevel) -> Result<(), Error> {
+pub(super) fn run(command: &Render) -> Result<(), Error> {
     scene::check_time(command.time)?;
     let field = scene::load(&command.scene)?;
     let what: BTreeSet<What> = command.what.iter().copied().collect();
@@ -107,7 +110,7 @@ pub(super) fn run(command: &Render, simd: SimdLevel) -> Result<(), Error> {
     output::check_folder(&command.output, command.force)?;
     let depth = what.contains(&What::Depth) || what.contains(&What::DepthColor);
     let settings = scene::render_settings(&field);
-    let mut renderer = Renderer::new(simd);
+    let mut renderer = Renderer::new(command.simd.into());
     interrupt::watch();
     for view in &views {
         if interrupt::requested() {
@@ -162,7 +165,7 @@ fn write(what: What, field: &Field, image: &RenderedImage, folder: &Path, name: 
         (What::DepthColor, Some(depth), _) => save_rgb(&path, &depth_picture(depth)),
         (What::Instance, _, Some(layers)) => save_grey(&path, &mask_ids(field, &layers.label)),
         (What::InstanceColor, _, Some(layers)) => {
-            save_rgb(&path, &instance_picture(&mask_ids(field, &layers.label)))
+            save_rgb(&path, &instance_picture(&mask_ids(field, &layers.label), &layers.coverage))
         }
         (What::Coverage, _, Some(layers)) => save_grey(&path, &unit(&layers.coverage)),
         (What::Probability, _, Some(layers)) => save_grey(&path, &unit(&layers.probability)),

@@ -4,7 +4,6 @@ use std::path::{Path, PathBuf};
 
 use cif_dataset::Layout;
 use cif_field::Checkpoint;
-use cif_render::cpu::SimdLevel;
 use cif_train::{Control, Outcome, Preset, TrainConfig, TrainEvent, Trainer};
 use clap::{Args, ValueEnum};
 
@@ -118,7 +117,7 @@ enum AblationName {
     NoResampling,
 }
 
-pub(super) fn run(command: &Train, simd: SimdLevel) -> Result<(), Error> {
+pub(super) fn run(command: &Train) -> Result<(), Error> {
     // Everything that can be refused is refused before the first image is read.
     output::check_file(&command.output, command.force || command.resume)?;
     let settings_path = command.output.with_extension("train.toml");
@@ -157,7 +156,6 @@ pub(super) fn run(command: &Train, simd: SimdLevel) -> Result<(), Error> {
         }
     }
     .map_err(Error::plain)?;
-    let _ = simd;
 
     let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
     interrupt::watch();

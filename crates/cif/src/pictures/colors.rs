@@ -29,10 +29,22 @@ pub fn instance_color(id: u16) -> [u8; 3] {
     })
 }
 
-/// Mask ids in their colours.
+/// Mask ids in their colours, fading to nearly black where little of any instance covers the pixel: every
+/// pixel has a most probable instance, however improbable.
+///
+/// # Panics
+/// When the sizes differ.
 #[must_use]
-pub fn instance_picture(ids: &PixelGrid<u16>) -> Picture {
-    ids.map(|id| instance_color(*id))
+pub fn instance_picture(ids: &PixelGrid<u16>, coverage: &PixelGrid<f32>) -> Picture {
+    assert_eq!((ids.width, ids.height), (coverage.width, coverage.height), "pictures of another size");
+    let pixels = ids.pixels.iter().zip(&coverage.pixels).map(|(id, share)| {
+        let (color, share) = (instance_color(*id), share.clamp(0.0, 1.0));
+        std::array::from_fn(|channel| {
+            let (full, none) = (f32::from(color[channel]), f32::from(UNLABELLED[channel]));
+            (none + (full - none) * share).round() as u8
+        })
+    });
+    PixelGrid::from_pixels(ids.width, ids.height, pixels.collect())
 }
 
 /// Rendered colour, clamped to what 8 bits hold.
@@ -99,6 +111,13 @@ mod tests {
             let distance: i32 = (0..3).map(|c| (i32::from(a[c]) - i32::from(b[c])).abs()).sum();
             assert!(distance > 90, "{id}: {a:?} {b:?}");
         }
+    }
+
+    #[test]
+    fn instances_fade_with_their_coverage() {
+        let ids = PixelGrid::from_pixels(3, 1, vec![4, 4, 0]);
+        let picture = instance_picture(&ids, &PixelGrid::from_pixels(3, 1, vec![1.0, 0.0, 1.0]));
+        assert_eq!(picture.pixels, [instance_color(4), UNLABELLED, UNLABELLED]);
     }
 
     #[test]

@@ -1,0 +1,112 @@
+//! `cif masks`: sequences for video trackers, and their answers brought back.
+
+use std::path::{Path, PathBuf};
+
+use cif_dataset::masks::{INDEX_FILE, ViewOrder, ZigzagIndex, split_tracker_masks, write_zigzag};
+use clap::{Args, Subcommand, ValueEnum};
+
+use super::{CaptureOptions, print_warnings};
+use crate::error::Error;
+
+/// Prepare masks with a video tracker
+#[derive(Debug, Args)]
+#[command(after_help = "\
+A tracker follows objects through one video. A capture with many cameras becomes one video by running
+through the first camera forwards, through the next backwards, and so on: neighbouring images then
+differ a little in time or in place, never in both.
+
+  cif masks zigzag captures/kitchen -o sequence
+  ... run the tracker on sequence/: one PNG of ids per image ...
+  cif masks split sequence tracked -o captures/kitchen/masks
+  cif train captures/kitchen -o kitchen.cif
+
+Scores on such masks measure agreement with a consistent tracker, not with human truth.")]
+pub(super) struct Masks {
+    #[command(subcommand)]
+    step: Step,
+}
+
+#[derive(Debug, Subcommand)]
+enum Step {
+    /// Write the images of all cameras as one sequence
+    Zigzag {
+        /// Folder of the capture
+        capture: PathBuf,
+        /// New folder for the sequence
+        #[arg(short, long, value_name = "DIR")]
+        output: PathBuf,
+        /// Order of the cameras
+        #[arg(long, default_value = "name", value_name = "ORDER")]
+        order: Order,
+        #[command(flatten)]
+        capture_options: CaptureOptions,
+    },
+    /// Bring the ids of a tracker back to the cameras, and drop objects that some camera never sees
+    Split {
+        /// Folder that `cif masks zigzag` wrote
+        sequence: PathBuf,
+        /// Folder of the tracker's id images
+        tracked: PathBuf,
+        /// New folder for the masks
+        #[arg(short, long, value_name = "DIR")]
+        output: PathBuf,
+        /// Pixels that an object needs in one frame of every camera
+        #[arg(long, default_value_t = 1, value_name = "PIXELS")]
+        min_px: u64,
+    },
+}
+
+/// Orders of the cameras.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Order {
+    /// By name
+    Name,
+    /// From one end of the rig, always on to the nearest camera left
+    Greedy,
+}
+
+pub(super) fn run(command: &Masks) -> Result<(), Error> {
+    match &command.step {
+        Step::Zigzag { capture, output, order, capture_options } => {
+            zigzag(capture, output, *order, capture_options)
+        }
+        Step::Split { sequence, tracked, output, min_px } => split(sequence, tracked, output, *min_px),
+    }
+}
+
+fn zigzag(capture: &Path, output: &Path, order: Order, options: &CaptureOptions) -> Result<(), Error> {
+    let mut options = options.clone();
+    options.no_masks = options.masks.is_none();
+    let dataset = options.open(capture)?;
+    print_warnings(&dataset);
+    let order = match order {
+        Order::Name => ViewOrder::Name,
+        Order::Greedy => ViewOrder::Greedy,
+    };
+    let index = write_zigzag(&dataset, output, order).map_err(Error::plain)?;
+    println!("{} images and {INDEX_FILE} in {}", index.images.len(), output.display());
+    if index.is_multi_view() {
+        println!("cameras in order: {}; way between them {:.3} m", index.views.join(", "), index.view_path_m);
+    } else {
+        println!("one view, in the order of the capture");
+    }
+    Ok(())
+}
+
+fn split(sequence: &Path, tracked: &Path, output: &Path, min_px: u64) -> Result<(), Error> {
+    let index = ZigzagIndex::load(sequence).map_err(Error::plain)?;
+    let report = split_tracker_masks(&index, tracked, output, min_px).map_err(Error::plain)?;
+    println!("{} masks of {} instances in {}", report.masks, report.instances.len(), output.display());
+    for removed in &report.removed {
+        println!(
+            "removed id {} ({} pixels): not seen by {}",
+            removed.tracker_id,
+            removed.pixels,
+            removed.missing_in.join(", ")
+        );
+    }
+    if !report.without_mask.is_empty() {
+        eprintln!("warning: the tracker wrote no mask for {}", report.without_mask.join(", "));
+    }
+    Ok(())
+}

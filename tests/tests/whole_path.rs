@@ -1,0 +1,187 @@
+//! A capture goes in; a scene that shows it and knows its objects comes out.
+
+use std::fs;
+use std::path::Path;
+
+use cif_field::Checkpoint;
+use cif_test::capture;
+use cif_test::command::{Run, run};
+use serde_json::Value;
+
+const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
+
+/// Settings of a run of a few seconds.
+const SHORT: &str = "--iterations-coarse 150 --iterations-fine 350 --iterations-instance 100 \
+                     --set model.spatial_resolution=[16,16,16] --set densify.until=300 --max-gaussians 2000";
+
+/// Settings of a run that learns nothing, for tests of what lies around it.
+const TINY: &str = "--iterations-coarse 6 --iterations-fine 6 --iterations-instance 6 \
+                    --set model.spatial_resolution=[8,8,8] --set report.step_every=1";
+
+fn cif(folder: &Path, line: &str) -> Run {
+    run(CIF, folder, line.split_whitespace())
+}
+
+fn with_capture(frames: usize) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    capture::write(&folder.path().join("table"), frames);
+    folder
+}
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error} in {text}"))
+}
+
+#[test]
+fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
+    let folder = with_capture(24);
+    let path = folder.path();
+    let trained = cif(path, &format!("train table -o scene.cif --seed 1 --log run.jsonl {SHORT}")).succeeds();
+    assert!(trained.stderr.contains("saved scene.cif"), "{}", trained.stderr);
+    assert!(trained.stdout.is_empty(), "progress belongs on stderr: {}", trained.stdout);
+
+    // The log is JSON lines that end with the result; the settings are those that were typed.
+    let log = fs::read_to_string(path.join("run.jsonl")).unwrap();
+    let events: Vec<Value> = log.lines().map(json).collect();
+    assert_eq!(events[0]["event"], "stage_started");
+    assert_eq!(events.last().unwrap()["event"], "finished");
+    let settings = fs::read_to_string(path.join("scene.train.toml")).unwrap();
+    assert!(settings.contains("fine = 350") && settings.contains("seed = 1"), "{settings}");
+
+    // The scene shows the capture and knows its objects.
+    let scores = json(&cif(path, "eval scene.cif table --json - --images pictures").succeeds().stdout);
+    let number = |key: &str| scores[key].as_f64().unwrap_or_else(|| panic!("{key} in {scores:#}"));
+    assert!(number("psnr") > 18.0, "{scores:#}");
+    assert!(number("ssim") > 0.5, "{scores:#}");
+    assert!(number("miou") > 60.0, "{scores:#}");
+    assert!(number("macc_pix") > 75.0 && number("macc_inst") > 75.0, "{scores:#}");
+    assert_eq!(scores["frames"], 6);
+    assert_eq!(scores["train"]["iterations"], 600);
+    assert_eq!(scores["train"]["preset"], "standard");
+    assert_eq!(scores["train"]["seed"], 1);
+    assert!(number("gaussians") > 0.0 && number("render_ms_per_frame") > 0.0);
+    let instances = scores["instances"].as_array().unwrap();
+    assert_eq!(instances.len(), 2);
+    assert_eq!((&instances[0]["id"], &instances[0]["label"]), (&3.into(), &"red ball".into()));
+    assert!(instances.iter().all(|one| one["iou"].is_number() && one["accuracy"].is_number()));
+    // Five pictures of 40 pixels and four gaps of 2.
+    let picture = image::open(path.join("pictures/000002.png")).unwrap();
+    assert_eq!((picture.width(), picture.height()), (208, 30));
+
+    // Layers are written as documented: ids as they are in the masks, depth in millimetres.
+    let what = "rgb,instance,depth,alpha,coverage,probability,entropy,instance-color,depth-color";
+    cif(path, &format!("render scene.cif --capture table --split val -o views --what {what}")).succeeds();
+    let ids = image::open(path.join("views/instance/000002.png")).unwrap();
+    assert_eq!(ids.color(), image::ColorType::L16);
+    let ids = ids.into_luma16().into_raw();
+    assert!(ids.iter().all(|id| [0, capture::ROLLING, capture::STANDING].contains(id)));
+    let depth = image::open(path.join("views/depth/000002.png")).unwrap().into_luma16();
+    let middle = depth.get_pixel(capture::WIDTH / 2, capture::HEIGHT / 2).0[0];
+    assert!((900..3000).contains(&middle), "the scene is about two metres away, not {middle} mm");
+
+    // Views of one's own, at a time of one's own.
+    fs::write(
+        path.join("views.json"),
+        r#"[{"name": "above", "width": 20, "height": 10, "vertical_fov_deg": 50,
+             "position": [0, -1, 1.5], "look_at": [0, 0, 0]}]"#,
+    )
+    .unwrap();
+    cif(path, "render scene.cif --camera views.json --time 0.5 -o own").succeeds();
+    assert_eq!(image::open(path.join("own/rgb/above.png")).unwrap().width(), 20);
+
+    // Places and labels.
+    let place = capture::centre(capture::STANDING, 0.5) + glam::DVec3::Z * 0.2;
+    let at = format!("query scene.cif --at={},{},{} --time 0.5 --json", place.x, place.y, place.z);
+    let answer = json(&cif(path, &at).succeeds().stdout);
+    let best = answer["instances"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .max_by(|a, b| a["probability"].as_f64().unwrap().total_cmp(&b["probability"].as_f64().unwrap()));
+    assert_eq!(best.unwrap()["label"], "blue ball", "{answer:#}");
+    let found = json(&cif(path, "query scene.cif --label BLUE* --json").succeeds().stdout);
+    assert_eq!(found.as_array().unwrap().len(), 1);
+    assert_eq!((&found[0]["label"], &found[0]["class"]), (&"blue ball".into(), &"ball".into()));
+    cif(path, "query scene.cif --label teapot").fails(1, &["teapot", "blue ball", "red ball"]);
+
+    // The motion table needs no USD; a build without it says so before any work.
+    let table = cif(path, "export scene.cif --report").succeeds().stdout;
+    assert!(table.contains("blue ball") && table.contains("background"), "{table}");
+    cif(path, "export scene.cif --usd out.usda").fails(1, &["USD"]);
+    assert!(!path.join("out.usda").exists());
+
+    // Nothing is overwritten unasked.
+    cif(path, "eval scene.cif table --images pictures").fails(1, &["pictures", "--force"]);
+    cif(path, "train table -o scene.cif").fails(1, &["scene.cif exists"]);
+    cif(path, "train table -o scene.cif --resume").fails(1, &["finished"]);
+
+    // A scene that was cut short is refused.
+    let bytes = fs::read(path.join("scene.cif")).unwrap();
+    fs::write(path.join("short.cif"), &bytes[..bytes.len() / 2]).unwrap();
+    cif(path, "info short.cif").fails(1, &["short.cif", "cut short"]);
+}
+
+#[test]
+fn an_interrupted_run_resumes_to_the_same_scene() {
+    let folder = with_capture(6);
+    let path = folder.path();
+    cif(path, &format!("train table -o whole.cif {TINY}")).succeeds();
+    // Stops inside each of the three stages.
+    let mut line = format!("train table -o parts.cif {TINY} --stop-after");
+    for limit in [3, 5, 5] {
+        let stopped = cif(path, &format!("{line} {limit}")).succeeds();
+        assert!(stopped.stderr.contains("--resume"), "{}", stopped.stderr);
+        line = "train table -o parts.cif --resume --stop-after".to_owned();
+    }
+    assert!(Checkpoint::load(path.join("parts.cif")).unwrap().training.is_some());
+    cif(path, "train table -o parts.cif --resume").succeeds();
+
+    let whole = Checkpoint::load(path.join("whole.cif")).unwrap();
+    let mut parts = Checkpoint::load(path.join("parts.cif")).unwrap();
+    assert!(parts.training.is_none());
+    // Times and memory differ; everything else may not.
+    parts.field.provenance = whole.field.provenance.clone();
+    assert!(parts == whole, "the resumed scene differs from the uninterrupted one");
+}
+
+#[test]
+fn threads_do_not_change_the_scene() {
+    let folder = with_capture(4);
+    for threads in [1, 3] {
+        cif(folder.path(), &format!("train table -o {threads}.cif --threads {threads} {TINY}")).succeeds();
+    }
+    let load = |name: &str| {
+        let mut field = Checkpoint::load(folder.path().join(name)).unwrap().field;
+        field.provenance = Value::Null;
+        field
+    };
+    assert!(load("1.cif") == load("3.cif"));
+}
+
+#[test]
+fn without_masks_colour_is_trained_and_nothing_is_invented() {
+    let folder = with_capture(4);
+    let path = folder.path();
+    fs::remove_dir_all(path.join("table/masks")).unwrap();
+    let trained = cif(path, &format!("train table -o scene.cif {TINY}")).succeeds();
+    assert!(trained.stderr.contains("no masks"), "{}", trained.stderr);
+    let scores = json(&cif(path, "eval scene.cif table --json -").succeeds().stdout);
+    assert!(scores["psnr"].is_number());
+    for key in ["macc_pix", "macc_inst", "miou"] {
+        assert!(scores[key].is_null(), "{key} must be undefined: {scores:#}");
+    }
+    assert!(cif(path, "eval scene.cif table").succeeds().stdout.contains("n/a"));
+    cif(path, "render scene.cif --capture table -o out --what instance").fails(1, &["without masks"]);
+}
+
+/// A limit on file sizes stands in for a full disk: writing fails half way.
+#[cfg(unix)]
+#[test]
+fn a_full_disk_leaves_the_old_scene() {
+    let folder = with_capture(4);
+    let path = folder.path();
+    fs::write(path.join("scene.cif"), "an older scene").unwrap();
+    let line = format!("trap '' XFSZ; ulimit -f 40; exec {CIF} train table -o scene.cif --force {TINY}");
+    run("bash", path, ["-c", line.as_str()]).fails(1, &["scene.cif", "space"]);
+    assert_eq!(fs::read_to_string(path.join("scene.cif")).unwrap(), "an older scene");
+}
