@@ -154,6 +154,18 @@ fn neu3d_holds_out_cam00_and_counts_frames() {
 }
 
 #[test]
+fn frame_numbers_may_outgrow_their_zeros() {
+    let folder = neu3d(1, 2);
+    let images = folder.path().join("cam00/images");
+    std::fs::rename(images.join("0000.png"), images.join("9999.png")).unwrap();
+    std::fs::rename(images.join("0001.png"), images.join("10000.png")).unwrap();
+    let dataset = open(&folder);
+    let order: Vec<(&str, f64)> =
+        dataset.frames.iter().map(|frame| (frame.name.as_str(), frame.time)).collect();
+    assert_eq!(order, [("cam00/9999", 0.0), ("cam00/10000", 0.5)]);
+}
+
+#[test]
 fn neu3d_masks_may_lie_beside_the_cameras_and_a_step_may_be_missing() {
     let folder = neu3d(2, 4);
     std::fs::remove_file(folder.path().join("cam01/images/0001.png")).unwrap();

@@ -11,7 +11,7 @@ use crate::Error;
 /// Folder inside a capture that holds extracted frames.
 const CACHE: &str = ".cif_frames";
 
-/// The frames of a video as PNG files in order, extracted unless an earlier call did so.
+/// The frames of a video as PNG files in order (`0000.png`, ...), extracted unless an earlier call did so.
 ///
 /// They lie in `.cif_frames/<stem>` inside `root`, or in the system's temporary folder where `root` cannot be
 /// written. `images` is where a person would put extracted frames (for the message).
@@ -30,7 +30,7 @@ fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Resu
     for cache in &caches {
         let folder = cache.join(&name);
         if folder.is_dir() && changed(&folder) >= changed(video) {
-            let found = listing::images(&folder)?;
+            let found = numbered(&folder)?;
             if !found.is_empty() {
                 return Ok(found);
             }
@@ -44,7 +44,7 @@ fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Resu
         .args(["-nostdin", "-v", "error", "-i"])
         .arg(video)
         .args(["-start_number", "0"])
-        .arg(partial.path().join("%06d.png"))
+        .arg(partial.path().join("%04d.png"))
         .output();
     let output = match output {
         Ok(output) => output,
@@ -67,7 +67,14 @@ fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Resu
         std::fs::remove_dir_all(&folder).map_err(Error::write(&folder))?;
     }
     std::fs::rename(partial.keep(), &folder).map_err(Error::write(&folder))?;
-    listing::images(&folder)
+    numbered(&folder)
+}
+
+/// Extracted frames in order: numbers beyond 9999 have more digits, and so come last.
+fn numbered(folder: &Path) -> Result<Vec<PathBuf>, Error> {
+    let mut found = listing::images(folder)?;
+    found.sort_by_key(|path| path.as_os_str().len());
+    Ok(found)
 }
 
 /// A folder beside the final one, removed again unless kept.
@@ -118,15 +125,15 @@ mod tests {
         let program = root.path().join("stand-in");
         std::fs::write(
             &program,
-            "#!/bin/sh\nfor last; do :; done\nfolder=$(dirname \"$last\")\necho a > \"$folder/000000.png\"\n\
-             echo b > \"$folder/000001.png\"\n",
+            "#!/bin/sh\nfor last; do :; done\nfolder=$(dirname \"$last\")\necho a > \"$folder/0000.png\"\n\
+             echo b > \"$folder/0001.png\"\n",
         )
         .unwrap();
         std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
         let images = root.path().join("cam00/images");
         let first = frames_with(program.as_os_str(), root.path(), &video, &images).unwrap();
         assert_eq!(first.len(), 2);
-        assert!(first[0].ends_with(".cif_frames/cam00/000000.png"));
+        assert!(first[0].ends_with(".cif_frames/cam00/0000.png"));
         // The second call needs no program.
         let second = frames_with(OsStr::new("no-such-program"), root.path(), &video, &images).unwrap();
         assert_eq!(first, second);

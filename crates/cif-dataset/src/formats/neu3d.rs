@@ -47,7 +47,9 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     // Frames of different cameras belong together by name; a step that some camera lacks still counts.
     let steps: BTreeSet<String> =
         views.iter().flat_map(|view| view.images.iter().map(|image| listing::stem(image))).collect();
-    let steps: Vec<String> = steps.into_iter().collect();
+    let mut steps: Vec<String> = steps.into_iter().collect();
+    // Frame numbers that outgrow their leading zeros come last.
+    steps.sort_by_key(String::len);
     let mut warnings = Vec::new();
     let mut frames = Vec::new();
     let held_out =
@@ -67,7 +69,9 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         let camera = camera(&poses_path, &poses.values[row * poses.columns..][..15]);
         for image in &view.images {
             let stem = listing::stem(image);
-            let step = steps.binary_search(&stem).expect("every stem was collected");
+            let step = steps
+                .binary_search_by(|step| step.len().cmp(&stem.len()).then_with(|| step.cmp(&stem)))
+                .expect("every stem was collected");
             frames.push(DraftFrame {
                 name: format!("{}/{stem}", view.name),
                 camera_name: view.name.clone(),
