@@ -1,8 +1,9 @@
 //! What a stage is made of.
 
+use std::collections::BTreeMap;
+
 use cif_geometry::Bounds;
 use cif_scene::{DenseSample, Motion, Node, NodeKind, PointProxy, PoseSample, SceneGraph, extent};
-use glam::DVec3;
 use pyo3::prelude::*;
 
 use crate::pxr::{Pxr, set, set_default};
@@ -190,14 +191,45 @@ fn splats(
         (tokens::PRIMVAR_IDENTITY, &splats.identity_probabilities),
     ] {
         let primvar = primvars.call_method1("CreatePrimvar", (name, &float_array, tokens::VERTEX))?;
-        set(&primvar.call_method0("GetAttr")?, pxr.float_array(values)?, None)?;
+        let (unique, indices) = without_repetitions(values.as_chunks::<1>().0);
+        set(&primvar.call_method0("GetAttr")?, pxr.float_array(unique.as_flattened())?, None)?;
+        set_indices(pxr, &primvar, indices)?;
     }
     Ok(())
 }
 
 fn display_color(pxr: &Pxr<'_>, gprim: &Bound<'_, PyAny>, colors: &[[f32; 3]]) -> PyResult<()> {
     let primvar = gprim.call_method1("CreateDisplayColorPrimvar", (tokens::VERTEX,))?;
-    set(&primvar.call_method0("GetAttr")?, pxr.vec3f_array(colors)?, None)
+    let (unique, indices) = without_repetitions(colors);
+    set(&primvar.call_method0("GetAttr")?, pxr.vec3f_array(&unique)?, None)?;
+    set_indices(pxr, &primvar, indices)
+}
+
+/// Values without repetitions in the order of first appearance, and an index per value; no indices where
+/// nothing repeats. Validators ask for indices as soon as one value repeats (requirement VG.009).
+fn without_repetitions<const C: usize>(values: &[[f32; C]]) -> (Vec<[f32; C]>, Option<Vec<i32>>) {
+    let mut places: BTreeMap<[u32; C], i32> = BTreeMap::new();
+    let mut unique: Vec<[f32; C]> = Vec::new();
+    let mut indices = Vec::with_capacity(values.len());
+    for value in values {
+        // Adding 0 makes one zero of both.
+        let value = value.map(|component| component + 0.0);
+        let next = unique.len() as i32;
+        let index = *places.entry(value.map(f32::to_bits)).or_insert(next);
+        if index == next {
+            unique.push(value);
+        }
+        indices.push(index);
+    }
+    let repeats = unique.len() < values.len();
+    (unique, repeats.then_some(indices))
+}
+
+fn set_indices(pxr: &Pxr<'_>, primvar: &Bound<'_, PyAny>, indices: Option<Vec<i32>>) -> PyResult<()> {
+    if let Some(indices) = indices {
+        primvar.call_method1("SetIndices", (pxr.int_array(&indices)?,))?;
+    }
+    Ok(())
 }
 
 fn author_proxy(
@@ -214,22 +246,27 @@ fn author_proxy(
         proxy.indices.iter().map(|&index| means[index as usize]).collect()
     };
     let points = pick(&node.splats.means);
-    let extents = set_default(&prim, "CreateExtentAttr", box_array(pxr, &points_box(&points, proxy))?)?;
+    let extents = set_default(&prim, "CreateExtentAttr", pxr.vec3f_array(&points_box(&points, proxy))?)?;
     let attribute = set_default(&prim, "CreatePointsAttr", pxr.vec3f_array(&points)?)?;
     for sample in dense_samples(node) {
         let points = pick(&sample.means);
         set(&attribute, pxr.vec3f_array(&points)?, Some(sample.time_code))?;
-        set(&extents, box_array(pxr, &points_box(&points, proxy))?, Some(sample.time_code))?;
+        set(&extents, pxr.vec3f_array(&points_box(&points, proxy))?, Some(sample.time_code))?;
     }
     set_default(&prim, "CreateWidthsAttr", pxr.float_array(&proxy.widths)?)?;
     prim.call_method1("SetWidthsInterpolation", (tokens::VERTEX,))?;
     display_color(pxr, &prim, &proxy.colors)
 }
 
-fn points_box(points: &[[f32; 3]], proxy: &PointProxy) -> Bounds {
-    points.iter().zip(&proxy.widths).fold(Bounds::EMPTY, |bounds, (point, width)| {
-        let centre = DVec3::from_array(point.map(f64::from));
-        let half = f64::from(*width) / 2.0;
-        bounds.including(centre - half).including(centre + half)
-    })
+/// Box of points with widths, in the single-precision arithmetic of usd-core itself: validators compare exactly.
+fn points_box(points: &[[f32; 3]], proxy: &PointProxy) -> [[f32; 3]; 2] {
+    let mut corners = [[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]];
+    for (point, width) in points.iter().zip(&proxy.widths) {
+        let half = width / 2.0;
+        for axis in 0..3 {
+            corners[0][axis] = corners[0][axis].min(point[axis] - half);
+            corners[1][axis] = corners[1][axis].max(point[axis] + half);
+        }
+    }
+    corners
 }

@@ -96,6 +96,12 @@ impl<'py> Pxr<'py> {
         self.array("FloatArray", values, 1)
     }
 
+    /// `VtIntArray`.
+    pub(crate) fn int_array(&self, values: &[i32]) -> PyResult<Bound<'py, PyAny>> {
+        let array = PyArray1::from_slice(self.py, values);
+        self.vt.getattr("IntArray")?.call_method1("FromNumpy", (array,))
+    }
+
     /// `VtQuatfArray` of (w, x, y, z) quaternions.
     pub(crate) fn quatf_array(&self, values: &[[f32; 4]]) -> PyResult<Bound<'py, PyAny>> {
         self.array("QuatfArray", conventions::quaternion_memory_order(values).as_flattened(), 4)

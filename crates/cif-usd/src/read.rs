@@ -13,17 +13,7 @@ use crate::{UsdError, conventions, tokens};
 pub(crate) fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdError> {
     let matcher = query.matcher()?;
     pxr::with(|pxr| {
-        if !path.is_file() {
-            return Err(UsdError::NotFound { path: path.to_owned() });
-        }
-        let stage = pxr
-            .usd
-            .getattr("Stage")
-            .and_then(|class| class.call_method1("Open", (path.as_os_str(),)))
-            .map_err(|error| UsdError::Unreadable {
-                path: path.to_owned(),
-                reason: reason(pxr.py, &error),
-            })?;
+        let stage = open(pxr, path)?;
         let (found, known) = search(pxr, &stage, query, &matcher)
             .map_err(|error| UsdError::Python { reason: reason(pxr.py, &error) })?;
         if found.is_empty() {
