@@ -66,8 +66,7 @@ def make_field() -> cif.Field:
         instances=LABELS,
         times=TIMES,
         frames_per_second=12.0,
-        cameras=[("hand held", k, camera_at(0.1 * k)) for k in range(FRAMES)]
-        + [("tripod", 0, camera_at(2.0))],
+        cameras=[("hand held", k, camera_at(0.1 * k)) for k in range(FRAMES)] + [("tripod", 0, camera_at(2.0))],
     )
 
 

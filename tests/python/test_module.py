@@ -16,7 +16,15 @@ def test_fields_survive_files(field: cif.Field, tmp_path: Path) -> None:
     path = tmp_path / "scene.cif"
     field.save(path)
     again = cif.Field.load(path)
-    for name in ["means", "scales", "quaternions", "opacities", "occupancies", "sh_coefficients", "identities"]:
+    for name in [
+        "means",
+        "scales",
+        "quaternions",
+        "opacities",
+        "occupancies",
+        "sh_coefficients",
+        "identities",
+    ]:
         assert np.array_equal(getattr(again, name), getattr(field, name)), name
     assert again.instances == field.instances and again.times == TIMES
     assert again.cameras[2][:2] == ("hand held", 2)
@@ -49,7 +57,12 @@ def test_queries(field: cif.Field) -> None:
 def test_motion_table(field: cif.Field, motion, tmp_path: Path) -> None:
     report = field.export(tmp_path / "a.usdc", motion=motion)
     models = {row["label"]: row["model"] for row in report["motion"]}
-    assert models == {"red mug": "static", "toy car": "rigid", "green napkin": "dense", "background": "static"}
+    assert models == {
+        "red mug": "static",
+        "toy car": "rigid",
+        "green napkin": "dense",
+        "background": "static",
+    }
     car = next(row for row in report["motion"] if row["label"] == "toy car")
     assert car["residual"]["max"] < 1e-5 < car["static_residual"]["rms"]
     limited = field.export(tmp_path / "b.usdc", motion=motion, most_expensive_motion="rigid")

@@ -82,7 +82,10 @@ def test_motion_model_is_the_cheapest(stage: Usd.Stage) -> None:
         ("background", 0, 0),
     ]:
         xform = UsdGeom.Xformable(stage.GetPrimAtPath(f"/World/{name}"))
-        assert [op.GetOpName() for op in xform.GetOrderedXformOps()] == ["xformOp:translate", "xformOp:orient"]
+        assert [op.GetOpName() for op in xform.GetOrderedXformOps()] == [
+            "xformOp:translate",
+            "xformOp:orient",
+        ]
         for op in xform.GetOrderedXformOps():
             assert op.GetNumTimeSamples() == sampled, name
         for attribute in ["positions", "orientations", "extent"]:

@@ -8,6 +8,9 @@ use crate::conventions::{UsdCamera, usd_camera};
 use crate::pxr::{Pxr, set, set_default};
 use crate::tokens;
 
+/// A scalar of a camera.
+type LensValue = fn(&UsdCamera) -> f64;
+
 pub(crate) fn author(
     pxr: &Pxr<'_>,
     stage: &Bound<'_, PyAny>,
@@ -35,7 +38,7 @@ pub(crate) fn author(
         .iter()
         .any(|pose| pose.translation != poses[0].translation || pose.rotation != poses[0].rotation);
     transform_ops(pxr, &camera, &poses[0], if moves { &poses } else { &[] })?;
-    let lens: [(&str, fn(&UsdCamera) -> f64); 5] = [
+    let lens: [(&str, LensValue); 5] = [
         ("CreateFocalLengthAttr", |view| view.focal_length),
         ("CreateHorizontalApertureAttr", |view| view.aperture.x),
         ("CreateVerticalApertureAttr", |view| view.aperture.y),

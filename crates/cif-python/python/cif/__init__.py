@@ -1,6 +1,6 @@
 """Consistent Instance Field: captures in, segmented dynamic Gaussian scenes out.
 
-The command line of the package runs in this process: ``cif.run(["train", "captures/table", "-o", "table.cif"])``.
+The command line runs in this process: ``cif.run(["train", "captures/table", "-o", "table.cif"])``.
 Captures, trained scenes and stages are also here as objects with numpy arrays::
 
     import cif

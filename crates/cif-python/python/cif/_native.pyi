@@ -28,7 +28,7 @@ class Camera:
         principal: tuple[float, float] | None = None,
         camera_from_world: NDArray[np.float64] | None = None,
     ) -> None:
-        """Make a camera; pixels, [4, 4] world to camera. Principal point in the centre and identity by default."""
+        """Make a camera from pixels and a [4, 4] pose; by default central principal point, identity."""
     @property
     def width(self) -> int: ...
     @property
@@ -155,7 +155,7 @@ class Field:
     def query(self, points: NDArray[np.float64], time: float = 0.0) -> dict[str, NDArray[Any]]:
         """Tell what is at points [P, 3]: existence [P], instance [P] (-1 for none), probabilities [P, K]."""
     def find(self, label: str, time_code: float | None = None) -> list[dict[str, Any]]:
-        """Return objects by label, class or name (globs, any case): path, transform, low and high of the box."""
+        """Return objects by label, class or name (globs, any case): path, transform, low, high."""
     def export(
         self,
         path: str | os.PathLike[str],
@@ -190,7 +190,7 @@ def open_dataset(
 def query_stage(
     path: str | os.PathLike[str], label: str, time_code: float | None = None
 ) -> list[dict[str, Any]]:
-    """Return the prims of a stage that carry a label (globs, any case); an unknown label lists the known ones."""
+    """Return the prims that carry a label (globs, any case); an unknown label lists the known ones."""
 
 def usd_version() -> str:
     """Return the version of the usd-core in use, e.g. 26.11."""
