@@ -27,24 +27,9 @@ pub enum Error {
         help: Option<String>,
     },
     /// A place in a text file.
-    #[error("{}:{line}: {message}", path.display())]
-    InText {
-        /// The file.
-        path: PathBuf,
-        /// Line, from 1.
-        line: usize,
-        /// What is wrong there.
-        message: String,
-        /// How to fix it.
-        #[help]
-        help: Option<String>,
-        /// The text.
-        #[source_code]
-        source_code: NamedSource<String>,
-        /// The place.
-        #[label("here")]
-        span: SourceSpan,
-    },
+    #[error(transparent)]
+    #[diagnostic(transparent)]
+    InText(Box<TextError>),
     /// The file system refused.
     #[error("cannot {action} {}: {source}", path.display())]
     Io {
@@ -64,6 +49,21 @@ pub enum Error {
         #[help]
         help: Option<String>,
     },
+}
+
+/// What is wrong at a place in a text file.
+#[derive(Debug, thiserror::Error, Diagnostic)]
+#[error("{}:{line}: {message}", path.display())]
+pub struct TextError {
+    path: PathBuf,
+    line: usize,
+    message: String,
+    #[help]
+    help: Option<String>,
+    #[source_code]
+    source_code: NamedSource<String>,
+    #[label("here")]
+    span: SourceSpan,
 }
 
 impl Error {
@@ -97,14 +97,14 @@ impl Error {
         help: Option<String>,
     ) -> Self {
         let start = span.start.min(text.len());
-        Self::InText {
+        Self::InText(Box::new(TextError {
             path: path.to_owned(),
             line: text.as_bytes()[..start].iter().filter(|byte| **byte == b'\n').count() + 1,
             message: message.into(),
             help,
             source_code: NamedSource::new(path.display().to_string(), text.to_owned()),
             span: (start, span.end.clamp(start, text.len()) - start).into(),
-        }
+        }))
     }
 
     /// Exit code of the process.

@@ -36,7 +36,8 @@ pub(super) struct Train {
     /// Go on where SCENE.cif was interrupted; settings come from it
     #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings")]
     resume: bool,
-    /// Stop at the first report at or after N steps, saving so that --resume goes on
+    /// Stop after N steps of this command (at the next report, see report.step_every), saving so that
+    /// --resume goes on
     #[arg(long, value_name = "N")]
     stop_after: Option<u64>,
     /// Write every event as a line of JSON
@@ -170,11 +171,14 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     match outcome {
         Outcome::Finished => eprintln!("saved {saved}"),
         Outcome::Interrupted => {
-            let help = Some(format!("go on with: {}", resume_command(command)));
+            let help = format!("go on with: {}", resume_command(command));
             if interrupt::requested() {
-                return Err(Error::Interrupted { message: format!("interrupted; saved {saved}"), help });
+                return Err(Error::Interrupted {
+                    message: format!("interrupted; saved {saved}"),
+                    help: Some(help),
+                });
             }
-            eprintln!("stopped; saved {saved}; {}", help.unwrap_or_default());
+            eprintln!("stopped; saved {saved}; {help}");
         }
     }
     logged
@@ -190,11 +194,11 @@ fn train(
     let mut steps_done = StepCount::default();
     let outcome = trainer.run(&mut |event, view| {
         progress.event(event);
-        if matches!(event, TrainEvent::CheckpointDue { .. }) {
-            if let Err(error) = save(&view.checkpoint(true), &command.output) {
-                failure = Some(error);
-                return Control::Stop;
-            }
+        if matches!(event, TrainEvent::CheckpointDue { .. })
+            && let Err(error) = save(&view.checkpoint(true), &command.output)
+        {
+            failure = Some(error);
+            return Control::Stop;
         }
         let enough = command.stop_after.is_some_and(|limit| steps_done.after(event) >= limit);
         if interrupt::requested() || enough { Control::Stop } else { Control::Continue }
@@ -202,24 +206,25 @@ fn train(
     (outcome, failure)
 }
 
-/// Optimiser steps over all stages of this process and, after a resume, of the present stage before it.
+/// Optimiser steps done by this command, over all stages.
 #[derive(Default)]
 struct StepCount {
     earlier_stages: u64,
-    stage: u64,
+    /// Steps that the present stage had when this command entered it, and has now.
+    stage: (u64, u64),
 }
 
 impl StepCount {
     fn after(&mut self, event: &TrainEvent) -> u64 {
         match event {
             TrainEvent::StageStarted { iteration, .. } => {
-                self.earlier_stages += self.stage;
-                self.stage = u64::from(*iteration);
+                self.earlier_stages += self.stage.1 - self.stage.0;
+                self.stage = (u64::from(*iteration), u64::from(*iteration));
             }
-            TrainEvent::Step { iteration, .. } => self.stage = u64::from(*iteration),
+            TrainEvent::Step { iteration, .. } => self.stage.1 = u64::from(*iteration),
             _ => {}
         }
-        self.earlier_stages + self.stage
+        self.earlier_stages + self.stage.1 - self.stage.0
     }
 }
 
