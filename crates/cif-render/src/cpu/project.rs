@@ -117,9 +117,11 @@ struct Footprint {
     ratio_clamped: [bool; 2],
     /// Clamped x and y of the Jacobian.
     clamped_xy: [f32; 2],
-    covariance_in_camera: Matrix,
+    /// T = J R_v R diag(exp s).
+    image_spread: [Vector; 2],
     /// Before the low pass: C0 00, 01, 11.
     sharp: [f32; 3],
+    sharp_determinant: f32,
     /// After it.
     blurred: [f32; 3],
     conic: [f32; 3],
@@ -128,10 +130,13 @@ struct Footprint {
     compensation_floored: bool,
 }
 
-fn determinant([a, b, c]: [f32; 3]) -> f32 {
-    // Difference of products with the rounding error of the second product compensated in double: needles
-    // make both products nearly equal.
-    (f64::from(a) * f64::from(c) - f64::from(b) * f64::from(b)) as f32
+fn dot(a: Vector, b: Vector) -> f32 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn squared_area(a: Vector, b: Vector) -> f32 {
+    let cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+    dot(cross, cross)
 }
 
 fn transform(m: &Matrix, v: Vector) -> Vector {
@@ -171,12 +176,6 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
         }
     }
     let m = multiply(&view.rotation, &spread);
-    let mut covariance_in_camera = [[0.0; 3]; 3];
-    for r in 0..3 {
-        for c in 0..3 {
-            covariance_in_camera[r][c] = m[r][0] * m[c][0] + m[r][1] * m[c][1] + m[r][2] * m[c][2];
-        }
-    }
     let mut ratio_clamped = [false; 2];
     let clamped_xy = [0, 1].map(|axis| {
         let ratio = in_camera[axis] / z;
@@ -187,25 +186,29 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
     let r = 1.0 / z;
     let [fx, fy] = view.focal;
     let jacobian = [[fx * r, 0.0, -fx * clamped_xy[0] * r * r], [0.0, fy * r, -fy * clamped_xy[1] * r * r]];
-    // J has two non-zero entries a row.
-    let v = &covariance_in_camera;
+    // Rows of T = J R_v B, so that C0 = T T^T and det C0 = |t0 x t1|^2: a sum of squares has nothing to
+    // cancel, however thin the Gaussian. J has two non-zero entries a row.
     let [j0, j1] = &jacobian;
-    let jv0 = [0, 1, 2].map(|c| j0[0] * v[0][c] + j0[2] * v[2][c]);
-    let jv1 = [0, 1, 2].map(|c| j1[1] * v[1][c] + j1[2] * v[2][c]);
-    let mut sharp =
-        [jv0[0] * j0[0] + jv0[2] * j0[2], jv0[1] * j1[1] + jv0[2] * j1[2], jv1[1] * j1[1] + jv1[2] * j1[2]];
-    let largest = sharp[0].max(sharp[2]);
+    let mut image_spread = [
+        [0, 1, 2].map(|c| j0[0] * m[0][c] + j0[2] * m[2][c]),
+        [0, 1, 2].map(|c| j1[1] * m[1][c] + j1[2] * m[2][c]),
+    ];
+    let largest = dot(image_spread[0], image_spread[0]).max(dot(image_spread[1], image_spread[1]));
     if largest > MAX_COVARIANCE {
-        sharp = sharp.map(|entry| entry * (MAX_COVARIANCE / largest));
+        let factor = (MAX_COVARIANCE / largest).sqrt();
+        image_spread = image_spread.map(|row| row.map(|entry| entry * factor));
     }
+    let [t0, t1] = image_spread;
+    let sharp = [dot(t0, t0), dot(t0, t1), dot(t1, t1)];
     let blurred = [sharp[0] + LOW_PASS, sharp[1], sharp[2] + LOW_PASS];
-    let det = determinant(blurred);
-    if !(det > 0.0) || !det.is_finite() {
+    let sharp_determinant = squared_area(t0, t1);
+    let det = sharp_determinant + LOW_PASS * (sharp[0] + sharp[2]) + LOW_PASS * LOW_PASS;
+    if !det.is_finite() {
         return None;
     }
     let conic = [blurred[2] / det, -blurred[1] / det, blurred[0] / det];
     let (compensation, compensation_floored) = if view.antialiased {
-        let squared = determinant(sharp).max(0.0) / det;
+        let squared = sharp_determinant / det;
         let floor = MIN_ANTIALIASING * MIN_ANTIALIASING;
         (squared.max(floor).sqrt(), squared <= floor)
     } else {
@@ -220,8 +223,9 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
         jacobian,
         ratio_clamped,
         clamped_xy,
-        covariance_in_camera,
+        image_spread,
         sharp,
+        sharp_determinant,
         blurred,
         conic,
         compensation,
@@ -257,6 +261,9 @@ pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) ->
         None => (0.0, opacity),
         Some(OccupancySource::Own) => {
             let occupancy = sigmoid(posed.occupancy_logit);
+            if occupancy.is_nan() {
+                return None;
+            }
             (occupancy, opacity.max(occupancy))
         }
         Some(OccupancySource::Opacity) => (opacity, opacity),
@@ -280,10 +287,11 @@ pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) ->
     let half_trace = 0.5 * (c00 + c11);
     let spread = (0.25 * (c00 - c11) * (c00 - c11) + c01 * c01).sqrt();
     let (direction, distance) = view_direction(view, posed.mean);
-    let color = color_unclamped(view, direction, posed.sh).map(|c| c.max(0.0));
+    let color = color_unclamped(view, direction, posed.sh);
     if !color.iter().all(|c| c.is_finite()) {
         return None;
     }
+    let color = color.map(|c| c.max(0.0));
     Some(Splat {
         mean,
         conic: footprint.conic,
@@ -344,29 +352,29 @@ pub(super) fn project_backward(
     let a10 = x01 * v00 + x11 * v01;
     let a11 = x01 * v01 + x11 * v11;
     let mut g = [-(a00 * x00 + a01 * x01), -(a00 * x01 + a01 * x11), -(a10 * x01 + a11 * x11)];
-    let v_opacity = v.opacity * f.compensation;
+    // With opacity as occupancy, -q / o is the instance loss by the blended opacity (dl / d log pi = -q).
+    let v_blended = match view.occupancy {
+        Some(OccupancySource::Opacity) => v.opacity - v.responsibility / splat.opacity,
+        _ => v.opacity,
+    };
+    let v_opacity = v_blended * f.compensation;
     if !f.compensation_floored {
-        let det = determinant(f.sharp);
-        let v_compensation = v.opacity * base_opacity;
+        let det = f.sharp_determinant;
+        let v_compensation = v_blended * base_opacity;
         let factor = 0.5 * v_compensation * f.compensation;
         g[0] += factor * (f.sharp[2] / det - x00);
         g[1] += factor * (-f.sharp[1] / det - x01);
         g[2] += factor * (f.sharp[0] / det - x11);
     }
 
-    // Step 3: v_J = 2 G J V, v_V = J^T G J.
-    let j = &f.jacobian;
-    let gj = [
-        [0, 1, 2].map(|c| g[0] * j[0][c] + g[1] * j[1][c]),
-        [0, 1, 2].map(|c| g[1] * j[0][c] + g[2] * j[1][c]),
+    // Step 3: with C0 = T T^T, v_T / 2 = G T; T = J M gives v_J = v_T M^T and v_M = J^T v_T.
+    let [t0, t1] = f.image_spread;
+    let v_image_spread = [
+        [0, 1, 2].map(|c| 2.0 * (g[0] * t0[c] + g[1] * t1[c])),
+        [0, 1, 2].map(|c| 2.0 * (g[1] * t0[c] + g[2] * t1[c])),
     ];
-    let v_j = gj.map(|row| {
-        [0, 1, 2].map(|c| {
-            2.0 * (row[0] * f.covariance_in_camera[0][c]
-                + row[1] * f.covariance_in_camera[1][c]
-                + row[2] * f.covariance_in_camera[2][c])
-        })
-    });
+    let j = &f.jacobian;
+    let v_j = v_image_spread.map(|row| [0, 1, 2].map(|c| dot(row, f.spread_in_camera[c])));
 
     // Step 4: camera-space point.
     let [x, y, z] = f.in_camera;
@@ -390,20 +398,13 @@ pub(super) fn project_backward(
         v_point = v_point.map(|value| value * (MAX_POSITION_GRADIENT / norm));
     }
 
-    // Step 5: to the world. V = M M^T with M = R_v B, so v_M = 2 v_V M = 2 J^T (G J) M.
+    // Step 5: to the world, M = R_v B.
     let rv = &view.rotation;
     let mut v_mean = [0, 1, 2].map(|c| rv[0][c] * v_point[0] + rv[1][c] * v_point[1] + rv[2][c] * v_point[2]);
-    let gjm = gj.map(|row| {
-        [0, 1, 2].map(|c| {
-            row[0] * f.spread_in_camera[0][c]
-                + row[1] * f.spread_in_camera[1][c]
-                + row[2] * f.spread_in_camera[2][c]
-        })
-    });
     let mut v_spread_in_camera = [[0.0; 3]; 3];
     for row in 0..3 {
         for c in 0..3 {
-            v_spread_in_camera[row][c] = 2.0 * (j[0][row] * gjm[0][c] + j[1][row] * gjm[1][c]);
+            v_spread_in_camera[row][c] = j[0][row] * v_image_spread[0][c] + j[1][row] * v_image_spread[1][c];
         }
     }
     let mut v_spread = [[0.0; 3]; 3];
@@ -470,13 +471,10 @@ pub(super) fn project_backward(
     }
 
     // Step 8.
-    let mut opacity_logit = base_opacity * (1.0 - base_opacity) * v_opacity;
-    let mut occupancy_logit = 0.0;
-    match view.occupancy {
-        None => {}
-        Some(OccupancySource::Own) => occupancy_logit = -(1.0 - splat.occupancy) * v.responsibility,
-        // b = rho o P: db/da = b (1 - o), and db / drho = b / rho is part of the geometry the ablation ignores.
-        Some(OccupancySource::Opacity) => opacity_logit += -(1.0 - base_opacity) * v.responsibility,
-    }
+    let opacity_logit = base_opacity * (1.0 - base_opacity) * v_opacity;
+    let occupancy_logit = match view.occupancy {
+        Some(OccupancySource::Own) => -(1.0 - splat.occupancy) * v.responsibility,
+        Some(OccupancySource::Opacity) | None => 0.0,
+    };
     PosedGradient { mean: v_mean, log_scale, quaternion, opacity_logit, occupancy_logit }
 }
