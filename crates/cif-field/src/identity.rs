@@ -11,7 +11,7 @@ pub struct Identities {
     pub row_offsets: Vec<u32>,
     /// Dense instance index per entry.
     pub labels: Vec<u16>,
-    /// Fixed identity estimate log phat per entry.
+    /// Fixed identity estimate per entry: log ptilde, whose row sum is [`Self::labelled_shares`].
     pub log_estimates: Vec<f32>,
     /// Learnable log-calibration mu per entry.
     pub log_calibrations: Vec<f32>,
@@ -84,6 +84,17 @@ impl Identities {
                 let found = self.labels[range.clone()].binary_search(&label);
                 found.map_or(0.0, |at| probabilities[range.start + at])
             })
+            .collect()
+    }
+
+    /// Share of each Gaussian's image that fell on labelled pixels when its identity was estimated, `[N]`,
+    /// in [0, 1]: the sum of a row's estimates. Rows are estimated over all pixels, labelled or not
+    /// (ptilde = n / d of methods reference 5.1); the softmax does not see the difference, but what belongs
+    /// to no instance shows here.
+    #[must_use]
+    pub fn labelled_shares(&self) -> Vec<f32> {
+        (0..self.len())
+            .map(|row| self.log_estimates[self.range(row)].iter().map(|log| log.exp()).sum::<f32>().min(1.0))
             .collect()
     }
 

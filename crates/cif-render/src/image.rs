@@ -37,6 +37,27 @@ pub struct InstanceImage {
     pub probability: PixelGrid<f32>,
     /// Instance coverage A = sum of M over all instances.
     pub coverage: PixelGrid<f32>,
+    /// Probability that the pixel belongs to any instance rather than to the unlabelled rest: the labelled
+    /// shares of its Gaussians ([`cif_field::Identities::labelled_shares`]), blended like M.
+    pub foreground: PixelGrid<f32>,
     /// Entropy of M / A, nats; 0 without coverage.
     pub entropy: PixelGrid<f32>,
+}
+
+/// Foreground from which a pixel is taken to belong to its most probable instance.
+const FOREGROUND: f32 = 0.5;
+
+impl InstanceImage {
+    /// The most probable instance where the pixel belongs to any, else [`UNLABELLED`]: what a compositor
+    /// wants, while the metrics force every pixel to an instance (methods reference 9).
+    #[must_use]
+    pub fn foreground_label(&self) -> PixelGrid<u16> {
+        let mut label = self.label.clone();
+        for (label, foreground) in label.pixels.iter_mut().zip(&self.foreground.pixels) {
+            if *foreground < FOREGROUND {
+                *label = UNLABELLED;
+            }
+        }
+        label
+    }
 }

@@ -446,6 +446,7 @@ fn images() {
                         2e-5,
                     );
                     compare("coverage", e.coverage.pixels[position], a.coverage.pixels[position], 2e-5);
+                    compare("foreground", e.foreground.pixels[position], a.foreground.pixels[position], 1e-4);
                     compare("entropy", e.entropy.pixels[position], a.entropy.pixels[position], 1e-4);
                     let mut row = maps.values[position * instances..(position + 1) * instances].to_vec();
                     row.sort_by(|a, b| b.total_cmp(a));

@@ -38,6 +38,7 @@ fn identities(values: [f64; 3]) -> IdentityProbabilities<f64> {
         row_offsets: vec![0, 2, 4, 6],
         labels: vec![0, 1, 0, 1, 0, 1],
         values: values.iter().flat_map(|p| [*p, 1.0 - *p]).collect(),
+        labelled_shares: vec![1.0; 3],
     }
 }
 

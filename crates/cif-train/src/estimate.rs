@@ -89,7 +89,13 @@ pub fn estimate(
     let min_mass = f64::from(config.min_mass);
     let truncation = f64::from(config.truncation);
 
-    // phat = n / sum n: the total mass cancels, it only tells seen from unseen.
+    // Share of a Gaussian's mass that lies on labelled pixels, sum n / d. It leaves the softmax untouched and
+    // tells the background from the instances later on.
+    let share = |row: usize| -> Option<f64> {
+        let total = counts.total_mass[row];
+        let labelled: f64 = counts.label_mass[row * k..(row + 1) * k].iter().sum();
+        (total >= min_mass).then(|| (labelled / total).clamp(MIN_LABELLED_SHARE, 1.0))
+    };
     let counted: Vec<Option<(Row, f64)>> = counts
         .label_mass
         .par_chunks(k)
@@ -104,11 +110,11 @@ pub fn estimate(
     let positions: Vec<[f32; 3]> = seen.iter().map(|row| gaussians.means[*row as usize]).collect();
     let index = NearestNeighbours::new(&positions);
     let reach = f64::from(config.neighbour_distance) * extent;
-    let rows: Vec<(Row, RowSource)> = (0..n)
+    let rows: Vec<(Row, f64, RowSource)> = (0..n)
         .into_par_iter()
         .map(|row| {
             if let Some((entries, _)) = &counted[row] {
-                return (entries.clone(), RowSource::Counted);
+                return (entries.clone(), share(row).unwrap_or(1.0), RowSource::Counted);
             }
             let position = gaussians.means[row].map(f64::from);
             let near: Vec<(usize, f64)> = index
@@ -119,18 +125,22 @@ pub fn estimate(
                 .collect();
             if near.is_empty() {
                 let uniform = (0..k as u16).map(|label| (label, 1.0 / k as f64)).collect();
-                return (uniform, RowSource::Uniform);
+                return (uniform, share(row).unwrap_or(MIN_LABELLED_SHARE), RowSource::Uniform);
             }
             let mut mixed = vec![0.0; k];
+            let (mut shares, mut weights) = (0.0, 0.0);
             for (neighbour, distance) in near {
                 let weight = 1.0 / distance.max(1e-6 * extent.max(f64::MIN_POSITIVE));
+                shares += weight * share(neighbour).unwrap_or(1.0);
+                weights += weight;
                 if let Some((entries, _)) = &counted[neighbour] {
                     for (label, probability) in entries {
                         mixed[usize::from(*label)] += weight * probability;
                     }
                 }
             }
-            (strongest(&mixed, MAX_FILLED_SUPPORT), RowSource::Neighbours)
+            let own = share(row).unwrap_or(shares / weights);
+            (strongest(&mixed, MAX_FILLED_SUPPORT), own, RowSource::Neighbours)
         })
         .collect();
 
@@ -140,10 +150,10 @@ pub fn estimate(
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
     };
-    for (entries, _) in &rows {
+    for (entries, share, _) in &rows {
         for (label, probability) in entries {
             identities.labels.push(*label);
-            identities.log_estimates.push(probability.ln() as f32);
+            identities.log_estimates.push((probability * share).ln() as f32);
         }
         identities.row_offsets.push(identities.labels.len() as u32);
     }
@@ -152,7 +162,7 @@ pub fn estimate(
     let label_mass = (0..k).map(|k_| counts.label_mass.iter().skip(k_).step_by(k).sum()).collect();
     IdentityEstimate {
         identities,
-        sources: rows.into_iter().map(|(_, source)| source).collect(),
+        sources: rows.into_iter().map(|(_, _, source)| source).collect(),
         dropped_mass: dropped / (seen.len().max(1)) as f64,
         label_mass,
     }
@@ -160,6 +170,9 @@ pub fn estimate(
 
 /// Labels and probabilities of a row, ascending labels.
 type Row = Vec<(u16, f64)>;
+
+/// Smallest labelled share that is kept, so that its logarithm stays finite.
+const MIN_LABELLED_SHARE: f64 = 1e-6;
 
 /// Support of a row that was filled from neighbours.
 const MAX_FILLED_SUPPORT: usize = 8;

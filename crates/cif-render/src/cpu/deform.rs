@@ -5,7 +5,7 @@
 //! lines. Rows go through the network in blocks. The backward pass visits only rows with a gradient and
 //! recomputes their activations, which is cheaper than keeping everyone's.
 
-use cif_field::deformation::{HeadKind, MlpLayout, PLANES, PlaneLayout, is_time_plane};
+use cif_field::deformation::{HeadKind, LinearLayout, MlpLayout, PLANES, PlaneLayout, is_time_plane};
 use cif_field::gaussians::SH_FLOATS;
 use cif_field::{Deformation, Gaussians};
 use fearless_simd::prelude::*;
@@ -14,7 +14,7 @@ use fearless_simd_macros::simd;
 use rayon::prelude::*;
 
 use super::channels::{add_scaled, blend, running_product, slope};
-use super::matrix::{Operand, multiply_into};
+use super::matrix::{Left, Shape, Start, multiply, padded, transpose};
 
 /// Rows that go through the network together; sized so that activations stay in the second-level cache.
 const BLOCK: usize = 256;
@@ -32,9 +32,37 @@ pub(super) struct DeformationAtTime<'a> {
     axes: Vec<[AxisScale; 3]>,
     /// `[levels][3]` lines of the xt, yt and zt planes, each `[columns, channels]`.
     lines: Vec<[Vec<f32>; 3]>,
+    /// Weights in the form that the forward pass multiplies by.
+    trunk: ForwardLayer,
+    /// Per head: hidden and output layer.
+    heads: Vec<[ForwardLayer; 2]>,
     /// Stored row below the time, and the fraction above it.
     time_row: usize,
     time_fraction: f32,
+}
+
+/// Transposed weights `[inputs, outputs]` and biases `[outputs]`, outputs padded with zeros.
+struct ForwardLayer {
+    inputs: usize,
+    outputs: usize,
+    weights: Vec<f32>,
+    biases: Vec<f32>,
+}
+
+impl ForwardLayer {
+    fn new(layout: &LinearLayout, parameters: &[f32]) -> Self {
+        let outputs = padded(layout.outputs);
+        let weights = transpose(&parameters[layout.weights.clone()], layout.outputs, layout.inputs, outputs);
+        let mut biases = parameters[layout.biases.clone()].to_vec();
+        biases.resize(outputs, 0.0);
+        Self { inputs: layout.inputs, outputs, weights, biases }
+    }
+
+    fn apply(&self, level: Level, input: &[f32], rows: usize, rectify: bool, output: &mut Vec<f32>) {
+        output.resize(rows * self.outputs, 0.0);
+        let shape = Shape { rows, inner: self.inputs, columns: self.outputs };
+        multiply(level, shape, Left::Rows(input), &self.weights, Start::Bias(&self.biases), rectify, output);
+    }
 }
 
 /// `coordinate = (position - low) * slope`, in [0, last].
@@ -68,7 +96,7 @@ struct Activations {
     trunk: Vec<f32>,
     /// ReLU of each head's hidden layer, `[heads][rows, width]`.
     hidden: Vec<Vec<f32>>,
-    /// `[heads][rows, outputs]`.
+    /// `[heads][rows, padded outputs]`.
     outputs: Vec<Vec<f32>>,
     // Backward only.
     v_output: Vec<f32>,
@@ -132,7 +160,14 @@ impl<'a> DeformationAtTime<'a> {
                 })
             })
             .collect();
-        Self { deformation, axes, mlp: config.mlp_layout(), levels, channels, lines, time_row, time_fraction }
+        let mlp = config.mlp_layout();
+        let trunk = ForwardLayer::new(&mlp.trunk, &deformation.mlp);
+        let heads = mlp
+            .heads
+            .iter()
+            .map(|head| [&head.hidden, &head.output].map(|layer| ForwardLayer::new(layer, &deformation.mlp)))
+            .collect();
+        Self { deformation, axes, mlp, trunk, heads, levels, channels, lines, time_row, time_fraction }
     }
 
     #[inline(always)]
@@ -180,15 +215,12 @@ impl<'a> DeformationAtTime<'a> {
     fn forward_block(&self, level: Level, positions: &[[f32; 3]], block: &mut Activations) {
         self.look_up(level, positions, block);
         let rows = positions.len();
-        let parameters = &self.deformation.mlp;
-        linear(&self.mlp.trunk, parameters, &block.features, rows, &mut block.trunk);
-        rectify(&mut block.trunk);
-        block.hidden.resize_with(self.mlp.heads.len(), Vec::new);
-        block.outputs.resize_with(self.mlp.heads.len(), Vec::new);
-        for (index, head) in self.mlp.heads.iter().enumerate() {
-            linear(&head.hidden, parameters, &block.trunk, rows, &mut block.hidden[index]);
-            rectify(&mut block.hidden[index]);
-            linear(&head.output, parameters, &block.hidden[index], rows, &mut block.outputs[index]);
+        self.trunk.apply(level, &block.features, rows, true, &mut block.trunk);
+        block.hidden.resize_with(self.heads.len(), Vec::new);
+        block.outputs.resize_with(self.heads.len(), Vec::new);
+        for (index, [hidden, output]) in self.heads.iter().enumerate() {
+            hidden.apply(level, &block.trunk, rows, true, &mut block.hidden[index]);
+            output.apply(level, &block.hidden[index], rows, false, &mut block.outputs[index]);
         }
     }
 
@@ -230,8 +262,13 @@ impl<'a> DeformationAtTime<'a> {
                             HeadKind::Opacity => &mut *opacities,
                             HeadKind::Sh => sh.as_flattened_mut(),
                         };
-                        for (value, delta) in target.iter_mut().zip(output) {
-                            *value += delta;
+                        let outputs = head.kind.outputs();
+                        for (target, output) in
+                            target.chunks_exact_mut(outputs).zip(output.chunks_exact(padded(outputs)))
+                        {
+                            for (value, delta) in target.iter_mut().zip(output) {
+                                *value += delta;
+                            }
                         }
                     }
                 },
@@ -270,7 +307,7 @@ impl<'a> DeformationAtTime<'a> {
                     let positions: Vec<[f32; 3]> =
                         rows.iter().map(|row| gaussians.means[*row as usize]).collect();
                     self.forward_block(level, &positions, block);
-                    self.backward_block(rows, v, block, &mut v_mlp);
+                    self.backward_block(level, rows, v, block, &mut v_mlp);
                     dispatch!(level, simd => look_up_rows_backward(
                         simd, self, &positions, &block.values, &block.v_features, v_values, v_positions));
                 }
@@ -293,18 +330,18 @@ impl<'a> DeformationAtTime<'a> {
     /// Network gradients of a block; leaves `v_features` in the block.
     fn backward_block(
         &self,
+        level: Level,
         rows: &[u32],
         v: &PosedArrayGradients,
         block: &mut Activations,
         v_mlp: &mut [f32],
     ) {
-        let parameters = &self.deformation.mlp;
         let count = rows.len();
         let width = self.mlp.trunk.outputs;
         block.v_trunk.clear();
         block.v_trunk.resize(count * width, 0.0);
+        block.v_hidden.resize(count * width, 0.0);
         for (index, head) in self.mlp.heads.iter().enumerate() {
-            let outputs = head.kind.outputs();
             block.v_output.clear();
             for &row in rows {
                 let row = row as usize;
@@ -316,35 +353,70 @@ impl<'a> DeformationAtTime<'a> {
                     HeadKind::Sh => block.v_output.extend_from_slice(&v.sh_coefficients[row]),
                 }
             }
-            let v_output = Operand::new(&block.v_output, count, outputs);
-            let hidden = Operand::new(&block.hidden[index], count, width);
-            multiply_into(v_output.t(), hidden, 1.0, &mut v_mlp[head.output.weights.clone()]);
-            add_columns(&block.v_output, &mut v_mlp[head.output.biases.clone()]);
-            block.v_hidden.resize(count * width, 0.0);
-            let weights = Operand::new(&parameters[head.output.weights.clone()], outputs, width);
-            multiply_into(v_output, weights, 0.0, &mut block.v_hidden);
-            gate(&mut block.v_hidden, &block.hidden[index]);
-
-            let v_hidden = Operand::new(&block.v_hidden, count, width);
-            let trunk = Operand::new(&block.trunk, count, width);
-            multiply_into(v_hidden.t(), trunk, 1.0, &mut v_mlp[head.hidden.weights.clone()]);
-            add_columns(&block.v_hidden, &mut v_mlp[head.hidden.biases.clone()]);
-            let weights = Operand::new(&parameters[head.hidden.weights.clone()], width, width);
-            multiply_into(v_hidden, weights, 1.0, &mut block.v_trunk);
+            let hidden = &block.hidden[index];
+            self.layer_backward(
+                level,
+                &head.output,
+                hidden,
+                &block.v_output,
+                false,
+                &mut block.v_hidden,
+                v_mlp,
+            );
+            gate(&mut block.v_hidden, hidden);
+            self.layer_backward(
+                level,
+                &head.hidden,
+                &block.trunk,
+                &block.v_hidden,
+                true,
+                &mut block.v_trunk,
+                v_mlp,
+            );
         }
         gate(&mut block.v_trunk, &block.trunk);
-        let features = self.mlp.trunk.inputs;
-        let v_trunk = Operand::new(&block.v_trunk, count, width);
-        multiply_into(
-            v_trunk.t(),
-            Operand::new(&block.features, count, features),
-            1.0,
-            &mut v_mlp[self.mlp.trunk.weights.clone()],
+        block.v_features.resize(count * self.mlp.trunk.inputs, 0.0);
+        self.layer_backward(
+            level,
+            &self.mlp.trunk,
+            &block.features,
+            &block.v_trunk,
+            false,
+            &mut block.v_features,
+            v_mlp,
         );
-        add_columns(&block.v_trunk, &mut v_mlp[self.mlp.trunk.biases.clone()]);
-        block.v_features.resize(count * features, 0.0);
-        let weights = Operand::new(&parameters[self.mlp.trunk.weights.clone()], width, features);
-        multiply_into(v_trunk, weights, 0.0, &mut block.v_features);
+    }
+
+    /// Gradients of one linear layer: adds those of weights and biases, and sets (or adds, when
+    /// `accumulates`) those of its input.
+    fn layer_backward(
+        &self,
+        level: Level,
+        layout: &LinearLayout,
+        input: &[f32],
+        v_output: &[f32],
+        accumulates: bool,
+        v_input: &mut [f32],
+        v_mlp: &mut [f32],
+    ) {
+        let rows = v_output.len() / layout.outputs;
+        let weights = &self.deformation.mlp[layout.weights.clone()];
+        let shape = Shape { rows: layout.outputs, inner: rows, columns: layout.inputs };
+        multiply(
+            level,
+            shape,
+            Left::Columns(v_output),
+            input,
+            Start::Out,
+            false,
+            &mut v_mlp[layout.weights.clone()],
+        );
+        add_columns(v_output, &mut v_mlp[layout.biases.clone()]);
+        if !accumulates {
+            v_input.fill(0.0);
+        }
+        let shape = Shape { rows, inner: layout.outputs, columns: layout.inputs };
+        multiply(level, shape, Left::Rows(v_output), weights, Start::Out, false, v_input);
     }
 
     /// Adds `[active, levels, 6, channels]` gradients of plane values to the planes. One task per plane
@@ -370,27 +442,6 @@ impl<'a> DeformationAtTime<'a> {
             dispatch!(level, simd => scatter_plane(
                 simd, self, (index, plane), &gaussians.means, active, v_values, v_plane));
         });
-    }
-}
-
-fn linear(
-    layout: &cif_field::deformation::LinearLayout,
-    parameters: &[f32],
-    input: &[f32],
-    rows: usize,
-    output: &mut Vec<f32>,
-) {
-    output.clear();
-    for _ in 0..rows {
-        output.extend_from_slice(&parameters[layout.biases.clone()]);
-    }
-    let weights = Operand::new(&parameters[layout.weights.clone()], layout.outputs, layout.inputs);
-    multiply_into(Operand::new(input, rows, layout.inputs), weights.t(), 1.0, output);
-}
-
-fn rectify(values: &mut [f32]) {
-    for value in values {
-        *value = value.max(0.0);
     }
 }
 

@@ -16,13 +16,20 @@ pub(super) struct InstanceTile {
     pub(super) label: [[u16; LANES]; GROUPS],
     pub(super) probability: TilePixels,
     pub(super) coverage: TilePixels,
+    pub(super) foreground: TilePixels,
     pub(super) entropy: TilePixels,
 }
 
 impl Default for InstanceTile {
     fn default() -> Self {
         let zero = [[0.0; LANES]; GROUPS];
-        Self { label: [[0; LANES]; GROUPS], probability: zero, coverage: zero, entropy: zero }
+        Self {
+            label: [[0; LANES]; GROUPS],
+            probability: zero,
+            coverage: zero,
+            foreground: zero,
+            entropy: zero,
+        }
     }
 }
 
@@ -34,6 +41,7 @@ pub(super) fn instance_tile<S: Simd>(
     ranks: &[u32],
     place: &TilePlace,
     rows: IdentityRows<'_>,
+    labelled_shares: &[f32],
     tile: &mut InstanceTile,
 ) {
     // The dictionary of labels that any splat of the tile supports keeps memory independent of K.
@@ -50,6 +58,7 @@ pub(super) fn instance_tile<S: Simd>(
     }
     labels.sort_unstable();
     labels.dedup();
+    tile.foreground = [[0.0; LANES]; GROUPS];
     let mut masses: Vec<TilePixels> = vec![[[0.0; LANES]; GROUPS]; labels.len()];
 
     let zero = splat(simd, 0.0);
@@ -79,6 +88,7 @@ pub(super) fn instance_tile<S: Simd>(
             slots.push((slot, rows.probabilities[entry]));
         }
         let occupancy = splat(simd, s.occupancy);
+        let share = splat(simd, labelled_shares[s.gaussian as usize]);
         while groups != 0 {
             let group = groups.trailing_zeros() as usize;
             groups &= groups - 1;
@@ -94,6 +104,8 @@ pub(super) fn instance_tile<S: Simd>(
             let stops = draws & next.simd_lt(min_transmittance);
             let blends = draws & !stops;
             let weight = blends.select(t * b, zero);
+            let foreground = &mut tile.foreground[group];
+            weight.mul_add(share, load(simd, foreground)).store_array(foreground);
             for (slot, probability) in &slots {
                 let mass = &mut masses[*slot][group];
                 weight.mul_add(splat(simd, *probability), load(simd, mass)).store_array(mass);
@@ -128,6 +140,7 @@ pub(super) fn instance_tile<S: Simd>(
             tile.label[group][lane] = best;
             tile.probability[group][lane] = most;
             tile.coverage[group][lane] = total;
+            tile.foreground[group][lane] = tile.foreground[group][lane].min(1.0);
             tile.entropy[group][lane] = entropy.max(0.0);
         }
     }

@@ -1,83 +1,255 @@
-//! Row-major matrix products through `matrixmultiply`, with their lengths checked.
+//! Products of the small matrices of the deformation network: many rows by a few dozen columns, the right
+//! side small enough for the first-level cache, so that nothing needs packing.
+//!
+//! All matrices are row-major. Vectors run over the columns of a product; columns beyond a multiple of
+//! [`COLUMNS`] go one by one, so callers pad what is small.
 
-#![allow(
-    unsafe_code,
-    reason = "the one door to matrixmultiply's pointer interface; lengths are checked here"
-)]
+use fearless_simd::prelude::*;
+use fearless_simd::{Level, dispatch, f32x8, f32x16};
+use fearless_simd_macros::simd;
 
-/// A row-major matrix, possibly read transposed.
+/// Columns are padded to a multiple of this.
+pub(super) const COLUMNS: usize = 8;
+
+/// Rows that one tile of the product keeps in registers.
+const TILE_ROWS: usize = 6;
+
+/// Columns of a wide tile.
+const WIDE: usize = 16;
+
+/// The left side of a product.
 #[derive(Clone, Copy)]
-pub(super) struct Operand<'a> {
-    values: &'a [f32],
-    rows: usize,
-    columns: usize,
-    transposed: bool,
+pub(super) enum Left<'a> {
+    /// `[rows, inner]`.
+    Rows(&'a [f32]),
+    /// The transpose of `[inner, rows]`.
+    Columns(&'a [f32]),
 }
 
-impl<'a> Operand<'a> {
-    /// `[rows, columns]`.
-    pub(super) fn new(values: &'a [f32], rows: usize, columns: usize) -> Self {
-        assert_eq!(values.len(), rows * columns, "matrix length");
-        Self { values, rows, columns, transposed: false }
-    }
+/// What a product is added to.
+#[derive(Clone, Copy)]
+pub(super) enum Start<'a> {
+    /// The same row of numbers everywhere.
+    Bias(&'a [f32]),
+    /// What `out` holds.
+    Out,
+}
 
-    /// The transpose.
-    pub(super) fn t(self) -> Self {
-        Self { transposed: !self.transposed, ..self }
-    }
+/// Sizes of a product: `[rows, inner] [inner, columns]`.
+#[derive(Clone, Copy)]
+pub(super) struct Shape {
+    pub(super) rows: usize,
+    pub(super) inner: usize,
+    pub(super) columns: usize,
+}
 
-    /// Rows, columns, row stride, column stride as read.
-    fn shape(&self) -> (usize, usize, isize, isize) {
-        if self.transposed {
-            (self.columns, self.rows, 1, self.columns as isize)
-        } else {
-            (self.rows, self.columns, self.columns as isize, 1)
+/// `out = start + left right`, rectified (`max(0, .)`) on request.
+///
+/// # Panics
+/// When a length differs from the shape.
+pub(super) fn multiply(
+    level: Level,
+    shape: Shape,
+    left: Left<'_>,
+    right: &[f32],
+    start: Start<'_>,
+    rectify: bool,
+    out: &mut [f32],
+) {
+    let Shape { rows, inner, columns } = shape;
+    let (Left::Rows(values) | Left::Columns(values)) = left;
+    assert_eq!(values.len(), rows * inner, "left side length");
+    assert_eq!(right.len(), inner * columns, "right side length");
+    assert_eq!(out.len(), rows * columns, "output length");
+    if let Start::Bias(bias) = start {
+        assert_eq!(bias.len(), columns, "bias length");
+    }
+    dispatch!(level, simd => multiply_tiles(simd, shape, left, right, start, rectify, out));
+}
+
+#[simd]
+fn multiply_tiles<S: Simd>(
+    simd: S,
+    shape: Shape,
+    left: Left<'_>,
+    right: &[f32],
+    start: Start<'_>,
+    rectify: bool,
+    out: &mut [f32],
+) {
+    let Shape { rows, columns, .. } = shape;
+    let whole_rows = rows / TILE_ROWS * TILE_ROWS;
+    let wide = columns / WIDE * WIDE;
+    for column in (0..wide).step_by(WIDE) {
+        for row in (0..whole_rows).step_by(TILE_ROWS) {
+            wide_tile::<S, TILE_ROWS>(simd, shape, left, right, start, rectify, out, (row, column));
+        }
+        for row in whole_rows..rows {
+            wide_tile::<S, 1>(simd, shape, left, right, start, rectify, out, (row, column));
+        }
+    }
+    let narrow = columns / COLUMNS * COLUMNS;
+    if wide < narrow {
+        for row in (0..whole_rows).step_by(TILE_ROWS) {
+            narrow_tile::<S, TILE_ROWS>(simd, shape, left, right, start, rectify, out, (row, wide));
+        }
+        for row in whole_rows..rows {
+            narrow_tile::<S, 1>(simd, shape, left, right, start, rectify, out, (row, wide));
+        }
+    }
+    for column in narrow..columns {
+        for row in 0..rows {
+            single(shape, left, right, start, rectify, out, (row, column));
         }
     }
 }
 
-/// `out = a b + beta out`, out row-major.
-pub(super) fn multiply_into(a: Operand<'_>, b: Operand<'_>, beta: f32, out: &mut [f32]) {
-    let (m, k, row_a, column_a) = a.shape();
-    let (k_b, n, row_b, column_b) = b.shape();
-    assert_eq!(k, k_b, "inner dimensions");
-    assert_eq!(out.len(), m * n, "output length");
-    // SAFETY: the constructors and the asserts above make every strided access of the three operands fall
-    // inside its slice; `out` is borrowed mutably, so it overlaps neither input.
-    unsafe {
-        matrixmultiply::sgemm(
-            m,
-            k,
-            n,
-            1.0,
-            a.values.as_ptr(),
-            row_a,
-            column_a,
-            b.values.as_ptr(),
-            row_b,
-            column_b,
-            beta,
-            out.as_mut_ptr(),
-            n as isize,
-            1,
-        );
+/// One entry of a product.
+fn single(
+    shape: Shape,
+    left: Left<'_>,
+    right: &[f32],
+    start: Start<'_>,
+    rectify: bool,
+    out: &mut [f32],
+    (row, column): (usize, usize),
+) {
+    let Shape { rows, inner, columns } = shape;
+    let at = row * columns + column;
+    let mut sum = match start {
+        Start::Bias(bias) => bias[column],
+        Start::Out => out[at],
+    };
+    for k in 0..inner {
+        let value = match left {
+            Left::Rows(values) => values[row * inner + k],
+            Left::Columns(values) => values[k * rows + row],
+        };
+        sum += value * right[k * columns + column];
     }
+    out[at] = if rectify { sum.max(0.0) } else { sum };
+}
+
+/// One tile of `R` rows by one vector of columns; the two widths differ in the vector type alone.
+macro_rules! tile {
+    ($name:ident, $vector:ident, $width:expr) => {
+        #[inline(always)]
+        fn $name<S: Simd, const R: usize>(
+            simd: S,
+            shape: Shape,
+            left: Left<'_>,
+            right: &[f32],
+            start: Start<'_>,
+            rectify: bool,
+            out: &mut [f32],
+            (row, column): (usize, usize),
+        ) {
+            let Shape { rows, inner, columns } = shape;
+            let mut sums: [$vector<S>; R] = match start {
+                Start::Bias(bias) => [$vector::from_slice(simd, &bias[column..column + $width]); R],
+                Start::Out => std::array::from_fn(|r| {
+                    let at = (row + r) * columns + column;
+                    $vector::from_slice(simd, &out[at..at + $width])
+                }),
+            };
+            let right =
+                right.chunks_exact(columns).map(|b| $vector::from_slice(simd, &b[column..column + $width]));
+            match left {
+                Left::Rows(values) => {
+                    let values: [&[f32]; R] =
+                        std::array::from_fn(|r| &values[(row + r) * inner..(row + r + 1) * inner]);
+                    for (k, b) in right.take(inner).enumerate() {
+                        for r in 0..R {
+                            sums[r] = b.mul_add($vector::splat(simd, values[r][k]), sums[r]);
+                        }
+                    }
+                }
+                Left::Columns(values) => {
+                    for (values, b) in values.chunks_exact(rows).zip(right) {
+                        let values: &[f32; R] = values[row..row + R].try_into().expect("a slice of R values");
+                        for r in 0..R {
+                            sums[r] = b.mul_add($vector::splat(simd, values[r]), sums[r]);
+                        }
+                    }
+                }
+            }
+            let zero = $vector::splat(simd, 0.0);
+            for (r, sum) in sums.into_iter().enumerate() {
+                let at = (row + r) * columns + column;
+                let sum = if rectify { sum.max(zero) } else { sum };
+                sum.store_slice(&mut out[at..at + $width]);
+            }
+        }
+    };
+}
+
+tile!(wide_tile, f32x16, WIDE);
+tile!(narrow_tile, f32x8, COLUMNS);
+
+/// The transpose of `[rows, columns]`, each of its rows padded with zeros to `padded` entries.
+pub(super) fn transpose(values: &[f32], rows: usize, columns: usize, padded: usize) -> Vec<f32> {
+    let mut transposed = vec![0.0; columns * padded];
+    for row in 0..rows {
+        for column in 0..columns {
+            transposed[column * padded + row] = values[row * columns + column];
+        }
+    }
+    transposed
+}
+
+/// The next multiple of [`COLUMNS`].
+pub(super) fn padded(columns: usize) -> usize {
+    columns.next_multiple_of(COLUMNS)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn numbers(count: usize, seed: u32) -> Vec<f32> {
+        (0..count as u32)
+            .map(|k| ((k * 2_654_435_761_u32.wrapping_add(seed)) >> 16) as f32 / 32_768.0 - 1.0)
+            .collect()
+    }
+
     #[test]
-    fn products_of_transposes() {
-        let a = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0];
-        let b = [1.0, -1.0, 0.5, 2.0, 0.0, 3.0];
-        let mut out = [1.0; 4];
-        multiply_into(Operand::new(&a, 2, 3), Operand::new(&b, 2, 3).t(), 0.0, &mut out);
-        assert_eq!(out, [0.5, 11.0, 2.0, 26.0]);
-        let mut out = [1.0; 9];
-        multiply_into(Operand::new(&a, 2, 3).t(), Operand::new(&b, 2, 3), 1.0, &mut out);
-        assert_eq!(out[0], 1.0 + 1.0 + 8.0);
-        assert_eq!(out[8], 1.0 + 1.5 + 18.0);
+    fn products_equal_plain_sums_on_every_level() {
+        for level in [Level::new(), Level::baseline()] {
+            for (rows, inner, columns) in
+                [(1, 1, 8), (7, 5, 24), (13, 64, 64), (6, 3, 16), (64, 19, 8), (9, 4, 29)]
+            {
+                let (a, b, bias) =
+                    (numbers(rows * inner, 1), numbers(inner * columns, 2), numbers(columns, 3));
+                let shape = Shape { rows, inner, columns };
+                let mut from_rows = vec![0.0; rows * columns];
+                multiply(level, shape, Left::Rows(&a), &b, Start::Bias(&bias), false, &mut from_rows);
+                let transposed = transpose(&a, rows, inner, rows);
+                let mut from_columns = bias.repeat(rows);
+                multiply(level, shape, Left::Columns(&transposed), &b, Start::Out, true, &mut from_columns);
+                for row in 0..rows {
+                    for column in 0..columns {
+                        let expected: f64 = f64::from(bias[column])
+                            + (0..inner)
+                                .map(|k| f64::from(a[row * inner + k]) * f64::from(b[k * columns + column]))
+                                .sum::<f64>();
+                        let at = row * columns + column;
+                        assert!(
+                            (f64::from(from_rows[at]) - expected).abs() < 1e-5,
+                            "{level:?} {row} {column}"
+                        );
+                        assert!((f64::from(from_columns[at]) - expected.max(0.0)).abs() < 1e-5);
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn transposes_are_padded_with_zeros() {
+        assert_eq!(
+            transpose(&[1.0, 2.0, 3.0, 4.0, 5.0, 6.0], 2, 3, 3),
+            [1.0, 4.0, 0.0, 2.0, 5.0, 0.0, 3.0, 6.0, 0.0]
+        );
+        assert_eq!((padded(3), padded(8), padded(48)), (8, 8, 48));
     }
 }

@@ -156,9 +156,8 @@ fn multiply(a: &Matrix, b: &Matrix) -> Matrix {
 fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
     let rotated = transform(&view.rotation, posed.mean);
     let in_camera = [0, 1, 2].map(|k| rotated[k] + view.translation[k]);
-    let [x, y, z] = in_camera;
-    // Written so that NaN is culled too.
-    if !(z >= view.near) || !x.is_finite() || !y.is_finite() || !z.is_finite() {
+    let z = in_camera[2];
+    if !in_camera.iter().all(|v| v.is_finite()) || z < view.near {
         return None;
     }
     let unit = quaternion::try_normalize(posed.quaternion)?;
@@ -268,7 +267,7 @@ pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) ->
         }
         Some(OccupancySource::Opacity) => (opacity, opacity),
     };
-    if !(strongest >= MIN_ALPHA) {
+    if strongest.is_nan() || strongest < MIN_ALPHA {
         return None;
     }
     let reach = [opacity, occupancy].map(|weight| (weight / MIN_ALPHA).ln());

@@ -176,7 +176,7 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
                     let hidden = remainder + load(simd, &cotangents.coverage_ratio[group]);
                     let q = r - weight * b * hidden / rest;
                     let q = (blends & unclamped.simd_le(max_alpha)).select(q, zero);
-                    v_responsibility = v_responsibility + q;
+                    v_responsibility += q;
                     v_sigma = q.mul_add(full_geometry, v_sigma);
                     v_sigma_mean = q.mul_add(mean_geometry, v_sigma_mean);
                     match instances.labels.uniform[group] {

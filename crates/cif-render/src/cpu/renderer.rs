@@ -436,6 +436,7 @@ impl Renderer {
     fn render_instances(&self, identities: &Identities, width: u32, height: u32) -> InstanceImage {
         let probabilities = identities.probabilities();
         let rows = identity_rows(identities, &probabilities);
+        let labelled_shares = identities.labelled_shares();
         let lists = &self.tape.lists;
         let level = self.level;
         let tiles: Vec<InstanceTile> = (0..lists.tiles())
@@ -444,7 +445,7 @@ impl Renderer {
                 let mut image = InstanceTile::default();
                 let place = self.place(tile);
                 dispatch!(level, simd => instance_tile(
-                    simd, &self.tape.splats, lists.tile(tile), &place, rows, &mut image));
+                    simd, &self.tape.splats, lists.tile(tile), &place, rows, &labelled_shares, &mut image));
                 image
             })
             .collect();
@@ -455,6 +456,9 @@ impl Renderer {
             }),
             coverage: gather_tiles(lists, width, height, |tile, group, lane| {
                 tiles[tile].coverage[group][lane]
+            }),
+            foreground: gather_tiles(lists, width, height, |tile, group, lane| {
+                tiles[tile].foreground[group][lane]
             }),
             entropy: gather_tiles(lists, width, height, |tile, group, lane| tiles[tile].entropy[group][lane]),
         }

@@ -26,6 +26,10 @@ pub(super) fn sum<S: Simd>(vector: f32x8<S>) -> f32 {
     ((l[0] + l[4]) + (l[2] + l[6])) + ((l[1] + l[5]) + (l[3] + l[7]))
 }
 
+/// `ln(2)^k / k!` for k = 6 down to 0.
+const EXP2_COEFFICIENTS: [f32; 7] =
+    [1.540_353e-4, 1.333_355_8e-3, 9.618_129e-3, 5.550_411e-2, 2.402_265e-1, std::f32::consts::LN_2, 1.0];
+
 /// `2^x` for x in [-126, 0]; relative error below 2e-7. Source: Taylor polynomial of degree 6 on
 /// [-1/2, 1/2], scaled by the exponent bits.
 #[inline(always)]
@@ -33,9 +37,9 @@ pub(super) fn exp2<S: Simd>(simd: S, x: f32x8<S>) -> f32x8<S> {
     let x = x.max(splat(simd, -126.0));
     let whole = x.round_ties_even();
     let f = x - whole;
-    let mut p = splat(simd, 1.540_353e-4);
-    for coefficient in [1.333_355_8e-3_f32, 9.618_129e-3, 5.550_410_9e-2, 2.402_265e-1, 6.931_471_8e-1, 1.0] {
-        p = p.mul_add(f, splat(simd, coefficient));
+    let mut p = splat(simd, EXP2_COEFFICIENTS[0]);
+    for coefficient in &EXP2_COEFFICIENTS[1..] {
+        p = p.mul_add(f, splat(simd, *coefficient));
     }
     let exponent: fearless_simd::i32x8<S> = whole.to_int();
     let scale: f32x8<S> = ((exponent + 127) << 23).bitcast();

@@ -22,6 +22,8 @@ pub struct DenseMaps<R> {
     pub instances: usize,
     /// M, `[height * width, K]`.
     pub values: Vec<R>,
+    /// Blended labelled shares of the Gaussians, `[height * width]`.
+    pub labelled: Vec<R>,
     /// Instance transmittance S behind the last contributor, `[height * width]`.
     pub transmittances: Vec<R>,
     /// Position in the order after the last contributor, `[height * width]`.
@@ -44,6 +46,7 @@ pub fn rasterize_dense<R: Real>(
         height,
         instances,
         values: vec![R::zero(); pixels * instances],
+        labelled: vec![R::zero(); pixels],
         transmittances: vec![R::one(); pixels],
         ends: vec![0; pixels],
     };
@@ -63,6 +66,7 @@ pub fn rasterize_dense<R: Real>(
                 maps.values[pixel * instances + instance] +=
                     transmittance * b.value * identities.values[entry];
             }
+            maps.labelled[pixel] += transmittance * b.value * identities.labelled_shares[index as usize];
             transmittance = next;
             maps.ends[pixel] = rank + 1;
         }
@@ -183,13 +187,14 @@ pub fn rasterize_dense_backward<R: Real>(
     gradients
 }
 
-/// Most probable instance, its probability, coverage and entropy per pixel.
+/// Most probable instance, its probability, coverage, foreground and entropy per pixel.
 #[must_use]
 pub fn instance_image<R: Real>(maps: &DenseMaps<R>) -> InstanceImage {
     let mut image = InstanceImage {
         label: PixelGrid::filled(maps.width, maps.height, UNLABELLED),
         probability: PixelGrid::filled(maps.width, maps.height, 0.0),
         coverage: PixelGrid::filled(maps.width, maps.height, 0.0),
+        foreground: PixelGrid::filled(maps.width, maps.height, 0.0),
         entropy: PixelGrid::filled(maps.width, maps.height, 0.0),
     };
     for pixel in 0..maps.transmittances.len() {
@@ -213,6 +218,7 @@ pub fn instance_image<R: Real>(maps: &DenseMaps<R>) -> InstanceImage {
         image.label.pixels[pixel] = best as u16 + 1;
         image.probability.pixels[pixel] = values[best].to_double() as f32;
         image.coverage.pixels[pixel] = coverage.to_double() as f32;
+        image.foreground.pixels[pixel] = maps.labelled[pixel].min(R::one()).to_double() as f32;
         image.entropy.pixels[pixel] = entropy.to_double() as f32;
     }
     image

@@ -29,6 +29,8 @@ pub struct IdentityProbabilities<R> {
     pub labels: Vec<u16>,
     /// p per entry; rows sum to 1.
     pub values: Vec<R>,
+    /// Labelled share of each row, `[N]`: the sum of its estimates.
+    pub labelled_shares: Vec<R>,
 }
 
 impl<R: Real> IdentityRows<R> {
@@ -48,7 +50,20 @@ impl<R: Real> IdentityRows<R> {
                 *value /= sum;
             }
         }
-        IdentityProbabilities { row_offsets: self.row_offsets.clone(), labels: self.labels.clone(), values }
+        let labelled_shares = self
+            .row_offsets
+            .windows(2)
+            .map(|bounds| {
+                let row = &self.log_estimates[bounds[0] as usize..bounds[1] as usize];
+                row.iter().map(|log| log.exp()).sum::<R>().min(R::one())
+            })
+            .collect();
+        IdentityProbabilities {
+            row_offsets: self.row_offsets.clone(),
+            labels: self.labels.clone(),
+            values,
+            labelled_shares,
+        }
     }
 }
 

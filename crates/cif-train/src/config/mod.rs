@@ -65,14 +65,14 @@ pub struct TrainConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StagesConfig {
-    /// Coarse steps: one static set for all times, default 800. A capture with one time has no coarse stage:
+    /// Coarse steps: one static set for all times, default 300. A capture with one time has no coarse stage:
     /// its steps are added to the fine stage, which then has no deformation.
     pub coarse: u32,
-    /// Fine steps: deformation and regularisers on, default 4500.
+    /// Fine steps: deformation and regularisers on, default 7000.
     pub fine: u32,
     /// Whether the coarse steps count towards `fine`, default no (A1).
     pub fine_includes_coarse: bool,
-    /// Instance steps, default 1200; skipped without masks.
+    /// Instance steps, default 1500; skipped without masks.
     pub instance: u32,
     /// Views per step, default 1 (A27: all stages alike).
     pub batch: u32,
@@ -86,7 +86,7 @@ pub struct ModelConfig {
     pub max_initial_points: u32,
     /// Opacity of initial Gaussians, (0, 1), default 0.1.
     pub initial_opacity: f32,
-    /// Nodes of the spatial planes along x, y, z at multiplier 1, default 32 each.
+    /// Nodes of the spatial planes along x, y, z at multiplier 1, default 64 each.
     pub spatial_resolution: [u32; 3],
     /// Nodes of the time planes over [-1, 1], of which times in [0, 1] use the upper half. Default 0: as many
     /// as the capture has distinct times, within 8 and 150.
@@ -131,10 +131,13 @@ pub struct RatesConfig {
     pub sh_base: f32,
     /// Spherical harmonics of degrees 1 to 3, default 1.25e-4.
     pub sh_rest: f32,
-    /// Hexplane features, x extent, default [1.6e-3, 1.6e-4].
+    /// Hexplane features, default [1e-2, 5e-4]; [1.6e-3, 1.6e-4] x extent in `paper`.
     pub planes: [f32; 2],
-    /// Network weights, x extent, default [1.6e-4, 1.6e-5].
+    /// Network weights, default [2e-3, 1e-4]; [1.6e-4, 1.6e-5] x extent in `paper`.
     pub mlp: [f32; 2],
+    /// Multiplies the rates of planes and network by the extent, as the base code does. Default off: a short
+    /// run needs higher rates than a long one to learn motion, and the same ones in scenes of any size.
+    pub network_follows_extent: bool,
     /// Occupancy logits, default 1e-2.
     pub occupancy: f32,
     /// Log-calibrations, default 1e-2.
@@ -160,11 +163,11 @@ pub struct LossConfig {
     pub lambda_dssim: f32,
     /// Weight of the instance loss, default 0.01; 0.005 in the `paper` preset on Neu3D captures.
     pub lambda_instance: f32,
-    /// Weight of the second difference of the spatial planes, default 1e-4.
+    /// Weight of the second difference of the spatial planes, default 2e-5.
     pub plane_smoothness: f32,
-    /// Weight of the second difference of the time planes, default 1e-3.
+    /// Weight of the second difference of the time planes, default 1e-4.
     pub time_smoothness: f32,
-    /// Weight of the distance of the time planes from 1, default 1e-4.
+    /// Weight of the distance of the time planes from 1, default 1e-5.
     pub time_sparsity: f32,
 }
 
@@ -174,7 +177,7 @@ pub struct LossConfig {
 pub struct DensifyConfig {
     /// First step after which Gaussians are added, default 300.
     pub from: u32,
-    /// Statistics are kept and Gaussians added before this step, default 3000; 0 never.
+    /// Statistics are kept and Gaussians added before this step, default 4000; 0 never.
     pub until: u32,
     /// Steps between additions, default 100.
     pub every: u32,
@@ -250,7 +253,7 @@ pub struct InstanceConfig {
 pub struct ResampleConfig {
     /// First event, default 100.
     pub from: u32,
-    /// Last event, default 1000 (A7: none in the last sixth of the stage).
+    /// Last event, default 1250 (A7: none in the last sixth of the stage).
     pub until: u32,
     /// Steps between events, default 100.
     pub every: u32,

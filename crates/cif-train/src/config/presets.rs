@@ -22,12 +22,12 @@ impl TrainConfig {
 
 fn draft() -> TrainConfig {
     let mut config = TrainConfig { preset: Preset::Draft, ..TrainConfig::default() };
-    config.stages = StagesConfig { coarse: 250, fine: 1100, instance: 300, ..config.stages };
-    config.model.max_initial_points = 8_000;
+    config.stages = StagesConfig { coarse: 150, fine: 2_000, instance: 500, ..config.stages };
+    config.model.max_initial_points = 5_000;
     config.model.sh_interval = 150;
     config.densify =
-        DensifyConfig { from: 150, until: 800, every: 75, max_gaussians: 8_000, ..config.densify };
-    config.resample = ResampleConfig { from: 50, until: 250, every: 50, ..config.resample };
+        DensifyConfig { from: 150, until: 1_200, every: 75, max_gaussians: 6_000, ..config.densify };
+    config.resample = ResampleConfig { from: 50, until: 400, every: 50, ..config.resample };
     config
 }
 
@@ -45,7 +45,13 @@ fn paper(layout: Layout) -> TrainConfig {
         sh_interval: 1_000,
         ..config.model
     };
-    config.rates.schedule_steps = 20_000;
+    config.rates = RatesConfig {
+        schedule_steps: 20_000,
+        planes: [1.6e-3, 1.6e-4],
+        mlp: [1.6e-4, 1.6e-5],
+        network_follows_extent: true,
+        ..config.rates
+    };
     config.loss =
         LossConfig { plane_smoothness: 1e-4, time_smoothness: 1e-2, time_sparsity: 1e-4, ..config.loss };
     config.densify = DensifyConfig {
@@ -125,7 +131,7 @@ impl Default for TrainConfig {
 
 impl Default for StagesConfig {
     fn default() -> Self {
-        Self { coarse: 800, fine: 4_500, fine_includes_coarse: false, instance: 1_200, batch: 1 }
+        Self { coarse: 300, fine: 7_000, fine_includes_coarse: false, instance: 1_500, batch: 1 }
     }
 }
 
@@ -134,7 +140,7 @@ impl Default for ModelConfig {
         Self {
             max_initial_points: 20_000,
             initial_opacity: 0.1,
-            spatial_resolution: [32; 3],
+            spatial_resolution: [64; 3],
             time_resolution: 0,
             multipliers: vec![1, 2],
             channels: 16,
@@ -159,8 +165,9 @@ impl Default for RatesConfig {
             opacity: 5e-2,
             sh_base: 2.5e-3,
             sh_rest: 1.25e-4,
-            planes: [1.6e-3, 1.6e-4],
-            mlp: [1.6e-4, 1.6e-5],
+            planes: [1e-2, 5e-4],
+            mlp: [2e-3, 1e-4],
+            network_follows_extent: false,
             occupancy: 1e-2,
             calibration: 1e-2,
         }
@@ -172,9 +179,9 @@ impl Default for LossConfig {
         Self {
             lambda_dssim: 0.0,
             lambda_instance: 0.01,
-            plane_smoothness: 1e-4,
-            time_smoothness: 1e-3,
-            time_sparsity: 1e-4,
+            plane_smoothness: 2e-5,
+            time_smoothness: 1e-4,
+            time_sparsity: 1e-5,
         }
     }
 }
@@ -183,7 +190,7 @@ impl Default for DensifyConfig {
     fn default() -> Self {
         Self {
             from: 300,
-            until: 3_000,
+            until: 4_000,
             every: 100,
             gradient_threshold: 2e-4,
             split_scale: 0.01,
@@ -232,7 +239,7 @@ impl Default for ResampleConfig {
     fn default() -> Self {
         Self {
             from: 100,
-            until: 1_000,
+            until: 1_250,
             every: 100,
             rate: 0.01,
             gamma_floor: 1e-3,

@@ -1,10 +1,13 @@
 //! The parameter groups of a field and their steps. Source: methods reference 1.1.
 
+use std::time::Instant;
+
 use cif_field::Field;
 use cif_field::gaussians::SH_FLOATS;
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_render::Gradients;
 
+use super::times::{StepTimes, lap};
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
 use crate::config::{Ablation, TrainConfig};
 use crate::events::Stage;
@@ -36,6 +39,13 @@ impl StepRates {
             iteration
         };
         let scheduled = |pair| log_linear(pair, step, schedule_steps(config)) * extent;
+        let network = |pair| {
+            if rates.network_follows_extent {
+                scheduled(pair)
+            } else {
+                log_linear(pair, step, schedule_steps(config))
+            }
+        };
         let only_if = |condition: bool, rate: f32| if condition { rate } else { 0.0 };
         let own_occupancy =
             !config.ablates(Ablation::ConstantOccupancy) && !config.ablates(Ablation::OpacityOccupancy);
@@ -51,8 +61,8 @@ impl StepRates {
                 in_instance_stage && !config.ablates(Ablation::NoCalibration),
                 rates.calibration,
             ),
-            planes: scheduled(rates.planes),
-            mlp: scheduled(rates.mlp),
+            planes: network(rates.planes),
+            mlp: network(rates.mlp),
         }
     }
 }
@@ -134,7 +144,7 @@ impl Optimiser {
         ]
     }
 
-    /// Moves every parameter; gradients become zero. Groups with rate 0 keep still.
+    /// Moves every parameter; gradients become zero. Groups with rate 0 keep still. Adds to `times`.
     ///
     /// # Errors
     /// The name of a group whose gradient is not finite.
@@ -145,7 +155,9 @@ impl Optimiser {
         rates: &StepRates,
         weights: &PlaneWeights,
         visible_rows_only: bool,
+        times: &mut StepTimes,
     ) -> Result<(), &'static str> {
+        let mut since = Instant::now();
         let visible = visible_rows_only.then_some(&gradients.radii[..]);
         let (p, g) = (&mut field.gaussians, &mut gradients.gaussians);
         let uniform = RowRates::Uniform;
@@ -222,6 +234,7 @@ impl Optimiser {
                 g.fill(0.0);
             }
         }
+        lap(&mut times.optimiser_gaussians, &mut since);
         if let Some(deformation) = &mut field.deformation {
             if moved(rates.planes) {
                 step_planes(
@@ -237,6 +250,7 @@ impl Optimiser {
             } else {
                 gradients.planes.fill(0.0);
             }
+            lap(&mut times.optimiser_planes, &mut since);
             if moved(rates.mlp) {
                 self.mlp
                     .step(&mut deformation.mlp, &mut gradients.mlp, uniform(rates.mlp), None)
@@ -244,6 +258,7 @@ impl Optimiser {
             } else {
                 gradients.mlp.fill(0.0);
             }
+            lap(&mut times.optimiser_mlp, &mut since);
         }
         Ok(())
     }

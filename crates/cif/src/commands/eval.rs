@@ -123,7 +123,7 @@ fn panel(view: &FrameView<'_>) -> Picture {
     let truth = &view.truth.image;
     let mut pictures = vec![truth.clone(), rgb_picture(&view.rendered.color)];
     if let (Some(ids), Some(layers)) = (view.predicted, &view.rendered.instances) {
-        pictures.push(instance_picture(ids, &layers.coverage));
+        pictures.push(instance_picture(ids, &layers.foreground));
     }
     pictures.push(error_picture(&view.rendered.color, truth));
     pictures.extend(view.rendered.depth.as_ref().map(depth_picture));

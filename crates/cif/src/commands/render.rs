@@ -60,9 +60,9 @@ pub(super) struct Render {
 enum What {
     /// Colour, 8-bit RGB
     Rgb,
-    /// Mask id of the most probable instance, 16-bit grey, 0 = none
+    /// Mask id of the most probable instance, 16-bit grey, 0 = belongs to none
     Instance,
-    /// The same in colours, faint where instances hardly cover, 8-bit RGB
+    /// The same in colours, dark where no instance is, 8-bit RGB
     InstanceColor,
     /// Expected depth along the viewing axis, 16-bit grey, millimetres for scenes in metres, 0 = none
     Depth,
@@ -70,6 +70,8 @@ enum What {
     DepthColor,
     /// Colour coverage, 16-bit grey, 65535 = 1
     Alpha,
+    /// Probability that the pixel belongs to any instance, 16-bit grey, 65535 = 1
+    Foreground,
     /// Instance coverage, 16-bit grey, 65535 = 1
     Coverage,
     /// Probability of the most probable instance, 16-bit grey, 65535 = 1
@@ -82,7 +84,12 @@ impl What {
     fn of_instances(self) -> bool {
         matches!(
             self,
-            Self::Instance | Self::InstanceColor | Self::Coverage | Self::Probability | Self::Entropy
+            Self::Instance
+                | Self::InstanceColor
+                | Self::Foreground
+                | Self::Coverage
+                | Self::Probability
+                | Self::Entropy
         )
     }
 }
@@ -103,7 +110,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     if instances && field.identities.is_none() {
         return Err(Error::failed(
             format!("{} was trained without masks, so it has no instances to show", command.scene.display()),
-            "leave instance, coverage, probability and entropy out of --what, or train with masks",
+            "leave instance, foreground, coverage, probability and entropy out of --what, or train with masks",
         ));
     }
     let views = views(command, &field)?;
@@ -163,10 +170,11 @@ fn write(what: What, field: &Field, image: &RenderedImage, folder: &Path, name: 
         (What::Alpha, ..) => save_grey(&path, &unit(&image.alpha)),
         (What::Depth, Some(depth), _) => save_grey(&path, &scaled(depth, 1000.0)),
         (What::DepthColor, Some(depth), _) => save_rgb(&path, &depth_picture(depth)),
-        (What::Instance, _, Some(layers)) => save_grey(&path, &mask_ids(field, &layers.label)),
+        (What::Instance, _, Some(layers)) => save_grey(&path, &mask_ids(field, &layers.foreground_label())),
         (What::InstanceColor, _, Some(layers)) => {
-            save_rgb(&path, &instance_picture(&mask_ids(field, &layers.label), &layers.coverage))
+            save_rgb(&path, &instance_picture(&mask_ids(field, &layers.label), &layers.foreground))
         }
+        (What::Foreground, _, Some(layers)) => save_grey(&path, &unit(&layers.foreground)),
         (What::Coverage, _, Some(layers)) => save_grey(&path, &unit(&layers.coverage)),
         (What::Probability, _, Some(layers)) => save_grey(&path, &unit(&layers.probability)),
         (What::Entropy, _, Some(layers)) => save_grey(&path, &scaled(&layers.entropy, 1000.0)),

@@ -29,15 +29,15 @@ pub fn instance_color(id: u16) -> [u8; 3] {
     })
 }
 
-/// Mask ids in their colours, fading to nearly black where little of any instance covers the pixel: every
-/// pixel has a most probable instance, however improbable.
+/// Mask ids in their colours, fading to nearly black by `foreground` where the pixel belongs to no instance:
+/// every pixel has a most probable one, however improbable.
 ///
 /// # Panics
 /// When the sizes differ.
 #[must_use]
-pub fn instance_picture(ids: &PixelGrid<u16>, coverage: &PixelGrid<f32>) -> Picture {
-    assert_eq!((ids.width, ids.height), (coverage.width, coverage.height), "pictures of another size");
-    let pixels = ids.pixels.iter().zip(&coverage.pixels).map(|(id, share)| {
+pub fn instance_picture(ids: &PixelGrid<u16>, foreground: &PixelGrid<f32>) -> Picture {
+    assert_eq!((ids.width, ids.height), (foreground.width, foreground.height), "pictures of another size");
+    let pixels = ids.pixels.iter().zip(&foreground.pixels).map(|(id, share)| {
         let (color, share) = (instance_color(*id), share.clamp(0.0, 1.0));
         std::array::from_fn(|channel| {
             let (full, none) = (f32::from(color[channel]), f32::from(UNLABELLED[channel]));
@@ -114,7 +114,7 @@ mod tests {
     }
 
     #[test]
-    fn instances_fade_with_their_coverage() {
+    fn instances_fade_into_the_background() {
         let ids = PixelGrid::from_pixels(3, 1, vec![4, 4, 0]);
         let picture = instance_picture(&ids, &PixelGrid::from_pixels(3, 1, vec![1.0, 0.0, 1.0]));
         assert_eq!(picture.pixels, [instance_color(4), UNLABELLED, UNLABELLED]);
