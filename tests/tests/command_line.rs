@@ -45,10 +45,13 @@ fn listing(folder: &Path) -> Vec<String> {
 fn help_teaches_the_tool() {
     let folder = folder();
     let help = cif(folder.path(), "--help").succeeds().stdout;
-    for word in ["train", "eval", "render", "export", "query", "info", "masks", "A short tour", "Exit code"] {
+    for word in
+        ["train", "eval", "render", "export", "query", "info", "masks", "bench", "A short tour", "Exit code"]
+    {
         assert!(help.contains(word), "{word} in {help}");
     }
-    for command in ["train", "eval", "render", "export", "query", "info", "masks zigzag", "masks split"] {
+    let commands = ["train", "eval", "render", "export", "query", "info", "masks zigzag", "masks split"];
+    for command in commands.into_iter().chain(["bench step"]) {
         let help = cif(folder.path(), &format!("{command} --help")).succeeds().stdout;
         assert!(help.contains("Usage: cif"), "{help}");
     }
@@ -67,6 +70,7 @@ fn what_is_not_understood_ends_with_2() {
     cif(folder.path(), "train table -o a.cif --set seed").fails(2, &["KEY=VALUE"]);
     cif(folder.path(), "render a.cif -o out").fails(2, &["--capture"]);
     cif(folder.path(), "render a.cif --capture table -o out --time 3").fails(2, &["from 0"]);
+    cif(folder.path(), "train table -o a.cif --simd widest").fails(2, &["portable"]);
     cif(folder.path(), "query a.cif").fails(2, &["--label"]);
     cif(folder.path(), "query a.cif --at 1,2").fails(2, &["three"]);
     cif(folder.path(), "query a.usda --at 1,2,3").fails(2, &["--label"]);

@@ -59,6 +59,28 @@ pub enum TrainError {
         /// Step, from 1.
         iteration: u32,
     },
+    /// No labels for the instance stage.
+    #[error("{}: no training mask has a labelled pixel, so there is no instance stage", root.display())]
+    NoLabels {
+        /// Folder of the capture.
+        root: PathBuf,
+    },
+    /// The counts of identity estimation do not fit.
+    #[error(
+        "identity estimation would need {gaussians} Gaussians x {instances} instances x 8 bytes = {bytes} \
+         bytes, more than 1 GiB; train at most {most_gaussians} Gaussians (`densify.max_gaussians`), or give \
+         masks with fewer instances"
+    )]
+    IdentityMemory {
+        /// Gaussians N.
+        gaussians: usize,
+        /// Instances K.
+        instances: usize,
+        /// Bytes of the counts, 8 N K.
+        bytes: u64,
+        /// Gaussians that would fit.
+        most_gaussians: u64,
+    },
     /// The checkpoint was written without training state.
     #[error("the checkpoint holds a finished scene without training state, so the run cannot be resumed")]
     NoState,

@@ -43,4 +43,4 @@ pub mod trainer;
 pub use config::{Ablation, Preset, TrainConfig};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
-pub use trainer::Trainer;
+pub use trainer::{InstancePass, StepTimes, Trainer};

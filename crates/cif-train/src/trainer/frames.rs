@@ -92,6 +92,19 @@ impl FrameStore {
         })
     }
 
+    /// Renames dense labels, in frames kept and in those decoded later.
+    pub(super) fn relabel(&mut self, new_label: impl Fn(u16) -> u16) {
+        let rename = |label: &u16| if *label == UNLABELLED { UNLABELLED } else { new_label(label - 1) + 1 };
+        self.label_of_id.iter_mut().for_each(|label| *label = rename(label));
+        for frame in self.frames.iter_mut().filter_map(|(_, frame)| frame.as_mut()) {
+            *frame = Arc::new(TrainFrame {
+                image: frame.image.clone(),
+                labels: frame.labels.as_ref().map(|labels| labels.map(rename)),
+                labelled: frame.labelled,
+            });
+        }
+    }
+
     fn load(&self, dataset: &Dataset, k: usize) -> Result<TrainFrame, TrainError> {
         let data = dataset.load_frame(self.frames[k].0, self.background)?;
         let labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));

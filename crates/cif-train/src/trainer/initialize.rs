@@ -27,11 +27,6 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
     let mut gaussians = Gaussians::from_points(&positions, &colors)?;
     gaussians.opacity_logits.fill(logit(config.model.initial_opacity));
     gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
-    let instance = |label: &cif_dataset::InstanceLabel| Instance {
-        id: label.id,
-        label: label.label.clone(),
-        category: label.category.clone(),
-    };
     let camera = |frame: &cif_dataset::Frame| RecordedCamera {
         name: frame.camera_name.clone(),
         time_index: frame.time_index,
@@ -42,7 +37,7 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
         gaussians,
         deformation: None,
         identities: None,
-        instances: dataset.instances.iter().map(instance).collect(),
+        instances: instances(dataset),
         timeline: Timeline {
             times: dataset.times.clone(),
             frames_per_second: dataset.frames_per_second.unwrap_or(DEFAULT_FRAMES_PER_SECOND),
@@ -54,6 +49,16 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
         extent: dataset.extent() as f32,
         provenance: serde_json::json!({}),
     })
+}
+
+/// The table of instances of a capture.
+pub(super) fn instances(dataset: &Dataset) -> Vec<Instance> {
+    let instance = |label: &cif_dataset::InstanceLabel| Instance {
+        id: label.id,
+        label: label.label.clone(),
+        category: label.category.clone(),
+    };
+    dataset.instances.iter().map(instance).collect()
 }
 
 /// A fresh deformation in the box of the initial points.

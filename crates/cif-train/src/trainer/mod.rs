@@ -8,6 +8,7 @@
 //! | `optimiser` | which parameter groups there are, and how fast they move |
 //! | `identity` | how identity rows come about |
 //! | `state` | what is saved, and how a run resumes |
+//! | `times`, `measure` | where the time of a step goes |
 //!
 //! Random choices depend on the seed and the step alone (see `random`), and all sums have a fixed order: a
 //! run that was interrupted and resumed ends bit for bit where an uninterrupted one ends, on any number of
@@ -17,11 +18,13 @@ mod evaluate;
 mod frames;
 mod identity;
 mod initialize;
+mod measure;
 mod optimiser;
 mod progress;
 mod provenance;
 mod state;
 mod step;
+mod times;
 
 use std::time::Instant;
 
@@ -31,9 +34,11 @@ use cif_render::Gradients;
 use cif_render::cpu::{Renderer, SimdLevel};
 
 use self::frames::FrameStore;
+pub use self::measure::InstancePass;
 use self::optimiser::Optimiser;
 use self::progress::{Plan, Progress};
 use self::step::{Scratch, StepLoss};
+pub use self::times::StepTimes;
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
@@ -63,6 +68,10 @@ pub struct Trainer {
     renderer: Renderer,
     gradients: Gradients,
     scratch: Scratch,
+    /// Where the time of steps went.
+    times: StepTimes,
+    /// Off only while the cost of the pass is measured.
+    instance_pass: InstancePass,
     /// Warnings not sent yet.
     warnings: Vec<String>,
 }
@@ -122,6 +131,8 @@ impl Trainer {
             renderer: Renderer::new(SimdLevel::Auto),
             gradients: Gradients::zeros(&field),
             scratch: Scratch::new(),
+            times: StepTimes::default(),
+            instance_pass: InstancePass::On,
             warnings: Vec::new(),
             dataset,
             config,
@@ -153,6 +164,12 @@ impl Trainer {
                 self.frames.len(),
                 self.config.frame_memory_mib
             ));
+        }
+        let most = self.field.gaussians.len().max(self.config.densify.max_gaussians as usize);
+        if self.plan.has_instances
+            && let Err(error) = identity::check_memory(most, self.field.instances.len())
+        {
+            self.warnings.push(format!("if the Gaussians become as many as they may: {error}"));
         }
     }
 
@@ -197,6 +214,29 @@ impl Trainer {
     #[must_use]
     pub fn steps_left(&self) -> u64 {
         self.plan.steps_left(&self.config, self.progress.stage, self.progress.iteration)
+    }
+
+    /// Chooses the vector instructions of the renderer, the widest there are by default. Results of two levels
+    /// differ by rounding.
+    pub fn set_simd(&mut self, simd: SimdLevel) {
+        self.renderer = Renderer::new(simd);
+    }
+
+    /// Name of the vector instructions in use.
+    #[must_use]
+    pub fn simd_name(&self) -> String {
+        self.renderer.simd_name()
+    }
+
+    /// Where the time of the steps since [`Self::reset_times`] went, and what they did.
+    #[must_use]
+    pub fn times(&self) -> StepTimes {
+        self.times
+    }
+
+    /// Sets times and counts to zero.
+    pub fn reset_times(&mut self) {
+        self.times = StepTimes::default();
     }
 
     /// Runs all stages that are left; `observer` sees every event and may stop the run.
@@ -338,10 +378,6 @@ impl Trainer {
 
     /// Begins a stage: the fine stage gets its deformation and a new optimiser (methods reference 1.3).
     fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
-        self.progress.stage = stage;
-        self.progress.iteration = 0;
-        self.progress.sh_start = self.field.sh_degree;
-        self.progress.opacities_were_reset = false;
         if stage == Stage::Fine {
             if self.plan.is_dynamic {
                 self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
@@ -349,7 +385,16 @@ impl Trainer {
             self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
             self.gradients = Gradients::zeros(&self.field);
         }
-        self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
+        self.begin(stage);
         Ok(())
+    }
+
+    /// Stands at the start of a stage, with the field and the optimiser as they are.
+    fn begin(&mut self, stage: Stage) {
+        self.progress.stage = stage;
+        self.progress.iteration = 0;
+        self.progress.sh_start = self.field.sh_degree;
+        self.progress.opacities_were_reset = false;
+        self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
     }
 }

@@ -33,6 +33,7 @@ impl Trainer {
                 "wall_s": self.progress.total_wall_s(),
                 "wall_s_by_stage": self.progress.wall_s,
                 "peak_rss_mb": peak_rss_mb(),
+                "simd": self.simd_name(),
                 "gaussians": self.field.gaussians.len(),
                 "psnr_training_views": self.progress.psnr,
             },

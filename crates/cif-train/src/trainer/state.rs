@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_dataset::{Dataset, Split};
+use cif_field::Field;
 use cif_field::checkpoint::{Checkpoint, StateTensor, TrainingState};
 use serde::{Deserialize, Serialize};
 
@@ -71,6 +72,21 @@ impl Capture {
         differs("the image size", show(self.image_size), show(found.image_size))?;
         differs("the list of instance ids", ids(&self.instance_ids), ids(&found.instance_ids))
     }
+}
+
+/// Refuses a scene that was trained with other instances than the capture has.
+pub(super) fn check_instances(field: &Field, dataset: &Dataset) -> Result<(), TrainError> {
+    let expected: Vec<u16> = field.instances.iter().map(|instance| instance.id).collect();
+    let found: Vec<u16> = dataset.instances.iter().map(|instance| instance.id).collect();
+    if expected == found {
+        return Ok(());
+    }
+    Err(TrainError::OtherCapture {
+        what: "the list of instance ids",
+        expected: format!("{expected:?}"),
+        found: format!("{found:?}"),
+        root: dataset.root.clone(),
+    })
 }
 
 fn unusable(reason: impl Into<String>) -> TrainError {

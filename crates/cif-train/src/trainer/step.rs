@@ -1,12 +1,15 @@
 //! One optimiser step.
 
+use std::time::Instant;
+
 use cif_geometry::scalar::logit;
 use cif_geometry::{PixelGrid, quaternion};
 use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
 use rand::seq::SliceRandom;
 
-use super::Trainer;
 use super::optimiser::StepRates;
+use super::times::lap;
+use super::{InstancePass, Trainer};
 use crate::adam::PlaneWeights;
 use crate::config::Ablation;
 use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, reset_opacities};
@@ -86,6 +89,7 @@ impl Trainer {
 
     /// Renders the step's views forward and backward, then moves the parameters.
     pub(super) fn step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
+        let start = Instant::now();
         let stage = self.progress.stage;
         let iteration = self.progress.iteration + 1;
         let batch = self.config.stages.batch;
@@ -98,9 +102,12 @@ impl Trainer {
             views.push((self.frames.index(view), self.frames.get(&self.dataset, view)?));
         }
         let settings = RenderSettings {
-            instances: (stage == Stage::Instance).then(|| self.instance_settings()),
+            instances: (stage == Stage::Instance && self.instance_pass == InstancePass::On)
+                .then(|| self.instance_settings()),
             ..self.color_settings()
         };
+        // Rendering between steps, for scores and identities, is no part of them.
+        self.renderer.reset_times();
         let labelled: usize = views.iter().map(|(_, frame)| frame.labelled).sum();
         let weight = 1.0 / batch as f32;
         let mut loss = StepLoss::default();
@@ -113,6 +120,7 @@ impl Trainer {
                 RenderSettings { instances: settings.instances.filter(|_| with_instances), ..settings };
             let labels = labels.filter(|_| with_instances);
             let pass = self.renderer.forward(&self.field, &frame.camera, frame.time, &settings, labels);
+            let mut since = Instant::now();
             let color = color_loss(
                 &pass.color,
                 &data.image,
@@ -121,6 +129,7 @@ impl Trainer {
                 &mut self.scratch.v_color,
                 &mut self.scratch.ssim,
             );
+            lap(&mut self.times.losses, &mut since);
             loss.color += color.loss * f64::from(weight);
             self.progress.add_psnr(color.psnr());
             if stage == Stage::Instance && !self.config.instance.color_loss {
@@ -134,7 +143,9 @@ impl Trainer {
             self.check_finite(pass.instance_loss, "the instance loss")?;
             let instance_weight = (share * f64::from(self.config.loss.lambda_instance)) as f32;
             self.renderer.backward(&self.field, &self.scratch.v_color, instance_weight, &mut self.gradients);
+            self.times.add_view(self.field.gaussians.len(), &self.renderer.statistics());
         }
+        self.times.add_render(&self.renderer.times());
         loss.total = loss.color;
         if stage == Stage::Instance && labelled > 0 {
             loss.instance = Some(instance_loss);
@@ -151,7 +162,14 @@ impl Trainer {
             time_sparsity: self.config.loss.time_sparsity,
         };
         self.optimiser
-            .step(&mut self.field, &mut self.gradients, &rates, &weights, self.config.adam.visible_rows_only)
+            .step(
+                &mut self.field,
+                &mut self.gradients,
+                &rates,
+                &weights,
+                self.config.adam.visible_rows_only,
+                &mut self.times,
+            )
             .map_err(|tensor| self.not_finite(tensor))?;
         self.gradients.screen.fill([0.0; 2]);
         self.gradients.radii.fill(0.0);
@@ -160,10 +178,14 @@ impl Trainer {
         self.progress.total_steps += 1;
         *self.progress.steps.entry(stage.name().to_owned()).or_default() += 1;
         self.keep_in_range(stage);
+        let mut since = Instant::now();
         match stage {
             Stage::Instance => self.instance_events(iteration, events)?,
             _ => self.densify(stage, iteration, events)?,
         }
+        lap(&mut self.times.rearrange, &mut since);
+        self.times.total += start.elapsed();
+        self.times.steps += 1;
         Ok(loss)
     }
 

@@ -1,5 +1,6 @@
 //! The subcommands, one file each.
 
+mod bench;
 mod eval;
 mod export;
 mod info;
@@ -55,6 +56,7 @@ enum Command {
     Query(query::Query),
     Info(info::Info),
     Masks(masks::Masks),
+    Bench(bench::Bench),
 }
 
 /// How the machine is used; results never depend on the number of threads.
@@ -95,6 +97,7 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
         Command::Query(command) => query::run(&command),
         Command::Info(command) => info::run(&command),
         Command::Masks(command) => masks::run(&command),
+        Command::Bench(command) => bench::run(&command),
     };
     match arguments.machine.threads {
         None => run(),

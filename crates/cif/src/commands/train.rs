@@ -7,7 +7,7 @@ use cif_field::Checkpoint;
 use cif_train::{Control, Outcome, Preset, TrainConfig, TrainEvent, Trainer};
 use clap::{Args, ValueEnum};
 
-use super::{CaptureOptions, print_warnings, scene};
+use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::error::Error;
 use crate::progress::Progress;
 use crate::settings::Layers;
@@ -57,6 +57,10 @@ pub(super) struct Train {
     set: Vec<String>,
     #[command(flatten)]
     capture_options: CaptureOptions,
+    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are; results differ by
+    /// rounding
+    #[arg(long, value_name = "LEVEL", default_value = "auto")]
+    simd: Simd,
     #[command(flatten)]
     settings: Settings,
 }
@@ -157,6 +161,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         }
     }
     .map_err(Error::plain)?;
+    trainer.set_simd(command.simd.into());
 
     let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
     interrupt::watch();
@@ -259,6 +264,9 @@ fn resume_command(command: &Train) -> String {
     if let Some(layout) = capture.layout.and_then(|layout| layout.to_possible_value()) {
         line += &format!(" --layout {}", layout.get_name());
     }
+    if let Simd::Portable = command.simd {
+        line += " --simd portable";
+    }
     line + " --resume"
 }
 
@@ -339,7 +347,7 @@ fn resolve(command: &Train, layout: Layout) -> Result<TrainConfig, Error> {
     Ok(config)
 }
 
-fn preset(name: &str, place: &str) -> Result<Preset, Error> {
+pub(super) fn preset(name: &str, place: &str) -> Result<Preset, Error> {
     serde_json::from_value(serde_json::Value::String(name.to_owned())).map_err(|_| {
         Error::failed(format!("{place}: there is no preset `{name}`"), "presets: draft, standard, paper")
     })

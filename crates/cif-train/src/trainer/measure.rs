@@ -1,0 +1,206 @@
+//! Steps for measuring: one at a time, from any stage, with the instance pass on or off.
+
+use std::sync::Arc;
+
+use cif_dataset::Dataset;
+use cif_field::{Field, Identities, Instance};
+use cif_render::UNLABELLED;
+
+use super::state::check_instances;
+use super::{StepTimes, Trainer, initialize};
+use crate::config::TrainConfig;
+use crate::error::TrainError;
+use crate::events::Stage;
+
+/// Whether the steps of the instance stage blend identities.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum InstancePass {
+    /// As in training.
+    #[default]
+    On,
+    /// Colour only, on the same view.
+    Off,
+}
+
+impl Trainer {
+    /// A run inside `stage`, for measuring its steps; the optimiser starts there. Without `scene` it begins
+    /// with the points of the capture: its fine stage with a fresh deformation, its instance stage after
+    /// `warm_up` fine steps and an estimation of identities. A scene keeps what it has and `stage` uses, and
+    /// gets what is missing.
+    ///
+    /// # Errors
+    /// As [`Trainer::new`]; when the scene has other instances than the capture; when the instance stage is
+    /// asked of a capture without labels.
+    ///
+    /// # Panics
+    /// When `stage` is none that has steps.
+    pub fn for_measuring(
+        dataset: Dataset,
+        config: TrainConfig,
+        scene: Option<Field>,
+        stage: Stage,
+        warm_up: u32,
+    ) -> Result<Self, TrainError> {
+        assert!(!matches!(stage, Stage::Identity | Stage::Done), "the {stage} stage has no steps");
+        config.validate()?;
+        let is_trained = scene.is_some();
+        let mut field = match scene {
+            Some(field) => field,
+            None => initialize::initial_field(&dataset, &config)?,
+        };
+        if field.identities.is_some() && stage == Stage::Instance {
+            check_instances(&field, &dataset)?;
+        } else {
+            field.identities = None;
+            field.instances = initialize::instances(&dataset);
+        }
+        if stage == Stage::Coarse {
+            field.deformation = None;
+        } else if field.deformation.is_none() && dataset.times.len() > 1 {
+            field.deformation = Some(initialize::initial_deformation(&dataset, &config)?);
+        }
+        let mut trainer = Self::assemble(dataset, config, field, None)?;
+        if stage == Stage::Instance {
+            if !trainer.plan.has_instances {
+                return Err(TrainError::NoLabels { root: trainer.dataset.root.clone() });
+            }
+            if trainer.field.identities.is_none() {
+                trainer.begin(Stage::Fine);
+                for _ in 0..if is_trained { 0 } else { warm_up } {
+                    trainer.measure_step(InstancePass::Off)?;
+                }
+                trainer.estimate_identities(true)?;
+            } else {
+                trainer.unseen = vec![false; trainer.field.gaussians.len()];
+                trainer.label_pixels = trainer.count_label_pixels()?;
+            }
+        }
+        trainer.begin(stage);
+        Ok(trainer)
+    }
+
+    /// One step of the present stage, also past its end; tells where its time went.
+    ///
+    /// # Errors
+    /// As [`Trainer::run`].
+    pub fn measure_step(&mut self, pass: InstancePass) -> Result<StepTimes, TrainError> {
+        self.instance_pass = pass;
+        self.reset_times();
+        let result = self.step(&mut Vec::new());
+        self.instance_pass = InstancePass::On;
+        result.map(|_| self.times())
+    }
+
+    /// Makes the next step take the views of the last one again.
+    pub fn repeat_views(&mut self) {
+        self.progress.iteration = self.progress.iteration.saturating_sub(1);
+    }
+
+    /// Pads the table of instances to `count` and spreads the labels over it by a fixed permutation; the
+    /// labels added occur in no mask and no row, so that the scene stays the same.
+    ///
+    /// # Panics
+    /// When the table is longer than `count`, or `count` leaves the labels of masks.
+    pub fn spread_instances(&mut self, count: usize) {
+        let present = self.field.instances.len();
+        assert!((present..=usize::from(u16::MAX) - 1).contains(&count), "{count} labels for {present}");
+        let mut taken: Vec<u16> = self.field.instances.iter().map(|instance| instance.id).collect();
+        taken.sort_unstable();
+        let free = (1..=u16::MAX).filter(|id| taken.binary_search(id).is_err());
+        let new_label = |label: u16| spread(usize::from(label), count);
+        let padding = free.take(count - present).map(|id| {
+            let label = format!("padding_{id}");
+            Instance { id, category: label.clone(), label }
+        });
+        let old: Vec<Instance> = self.field.instances.drain(..).chain(padding).collect();
+        let mut table: Vec<(u16, Instance)> =
+            old.into_iter().enumerate().map(|(label, one)| (new_label(label as u16), one)).collect();
+        table.sort_by_key(|(label, _)| *label);
+        self.field.instances = table.into_iter().map(|(_, instance)| instance).collect();
+        if let Some(rows) = &mut self.field.identities {
+            let origins = relabel(rows, new_label);
+            self.optimiser.calibration.gather(&origins);
+        }
+        if !self.label_pixels.is_empty() {
+            let mut pixels = vec![0.0; count];
+            for (label, number) in self.label_pixels.iter().enumerate() {
+                pixels[usize::from(new_label(label as u16))] = *number;
+            }
+            self.label_pixels = pixels;
+        }
+        self.frames.relabel(new_label);
+    }
+
+    /// Labelled pixels per instance, over all training frames.
+    fn count_label_pixels(&self) -> Result<Vec<f64>, TrainError> {
+        let mut pixels = vec![0.0; self.field.instances.len()];
+        for view in 0..self.frames.len() {
+            let frame = Arc::clone(&self.frames.get(&self.dataset, view)?);
+            let Some(labels) = &frame.labels else { continue };
+            for label in labels.pixels.iter().filter(|label| **label != UNLABELLED) {
+                pixels[usize::from(*label) - 1] += 1.0;
+            }
+        }
+        Ok(pixels)
+    }
+}
+
+/// A permutation of `0..count`: steps of about the golden section, which leave no two small labels close.
+fn spread(label: usize, count: usize) -> u16 {
+    let coprime = |step: &usize| {
+        let (mut a, mut b) = (*step, count);
+        while b != 0 {
+            (a, b) = (b, a % b);
+        }
+        a == 1
+    };
+    let first = ((count as f64 * 0.618) as usize).max(1);
+    let step = (first..=count).find(coprime).unwrap_or(1);
+    ((label * step + count / 3) % count) as u16
+}
+
+/// Renames labels, keeping rows ascending; returns where each entry was before.
+fn relabel(rows: &mut Identities, new_label: impl Fn(u16) -> u16) -> Vec<Option<u32>> {
+    let mut order: Vec<u32> = Vec::with_capacity(rows.labels.len());
+    for row in 0..rows.len() {
+        let start = order.len();
+        order.extend(rows.range(row).map(|entry| entry as u32));
+        order[start..].sort_by_key(|entry| new_label(rows.labels[*entry as usize]));
+    }
+    let at = |entry: &u32| *entry as usize;
+    rows.labels = order.iter().map(|entry| new_label(rows.labels[at(entry)])).collect();
+    rows.log_estimates = order.iter().map(|entry| rows.log_estimates[at(entry)]).collect();
+    rows.log_calibrations = order.iter().map(|entry| rows.log_calibrations[at(entry)]).collect();
+    order.into_iter().map(Some).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spreading_is_a_permutation_of_any_size() {
+        for count in [1, 2, 3, 8, 12, 255, 256, 1000] {
+            let mut seen = vec![false; count];
+            (0..count).for_each(|label| seen[usize::from(spread(label, count))] = true);
+            assert!(seen.iter().all(|seen| *seen), "{count}");
+        }
+        let far = usize::from(spread(0, 256)).abs_diff(usize::from(spread(1, 256)));
+        assert!(far > 16, "{far}");
+    }
+
+    #[test]
+    fn relabelled_rows_stay_ascending_and_keep_their_values() {
+        let mut rows = Identities {
+            row_offsets: vec![0, 3, 4],
+            labels: vec![0, 1, 2, 1],
+            log_estimates: vec![0.1, 0.2, 0.3, 0.4],
+            log_calibrations: vec![1.0, 2.0, 3.0, 4.0],
+        };
+        let origins = relabel(&mut rows, |label| [7, 2, 5][usize::from(label)]);
+        assert_eq!(rows.labels, [2, 5, 7, 2]);
+        assert_eq!(rows.log_estimates, [0.2, 0.3, 0.1, 0.4]);
+        assert_eq!(rows.log_calibrations, [2.0, 3.0, 1.0, 4.0]);
+        assert_eq!(origins, [Some(1), Some(2), Some(0), Some(3)]);
+    }
+}

@@ -1,0 +1,109 @@
+//! Where the time of a step goes, and what it is spent on.
+
+use std::time::{Duration, Instant};
+
+use cif_render::cpu::{StageTimes, ViewStatistics};
+
+/// Wall time of training steps by part, and counts of their work, summed over steps and views since
+/// [`Trainer::reset_times`](super::Trainer::reset_times).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StepTimes {
+    /// Steps summed.
+    pub steps: u64,
+    /// Views rendered.
+    pub views: u64,
+    /// The renderer's stages, forward and backward.
+    pub render: StageTimes,
+    /// Colour loss and its gradient; the instance loss is part of the raster passes.
+    pub losses: Duration,
+    /// Optimiser: everything that has a row per Gaussian, with occupancy and calibration.
+    pub optimiser_gaussians: Duration,
+    /// Optimiser: hexplanes, with their regularisers.
+    pub optimiser_planes: Duration,
+    /// Optimiser: network of the deformation.
+    pub optimiser_mlp: Duration,
+    /// Densification, resampling and refreshed identities.
+    pub rearrange: Duration,
+    /// Whole steps.
+    pub total: Duration,
+    /// Gaussians, visible or not, per view.
+    pub gaussians: u64,
+    /// Gaussians with a footprint in the view.
+    pub visible: u64,
+    /// (tile, Gaussian) pairs.
+    pub tile_pairs: u64,
+    /// (pixel, Gaussian) pairs evaluated in the forward pass.
+    pub evaluated_pairs: u64,
+    /// Gaussians whose deformation was differentiated.
+    pub deformed_backward: u64,
+}
+
+impl StepTimes {
+    /// Part names and times in the order of a step; they sum to [`Self::total`].
+    #[must_use]
+    pub fn rows(&self) -> Vec<(&'static str, Duration)> {
+        let (forward, backward) = (self.render.rows(), self.render.rows());
+        let mut rows: Vec<_> = forward.into_iter().take(4).collect();
+        rows.push(("losses", self.losses));
+        rows.extend(backward.into_iter().skip(4));
+        rows.extend([
+            ("optimiser: Gaussians", self.optimiser_gaussians),
+            ("optimiser: planes", self.optimiser_planes),
+            ("optimiser: network", self.optimiser_mlp),
+            ("densify, resample", self.rearrange),
+        ]);
+        let known: Duration = rows.iter().map(|(_, time)| *time).sum();
+        rows.push(("other", self.total.saturating_sub(known)));
+        rows
+    }
+
+    /// Adds the renderer's times of a step.
+    pub(super) fn add_render(&mut self, times: &StageTimes) {
+        let render = &mut self.render;
+        render.deform += times.deform;
+        render.project += times.project;
+        render.bin += times.bin;
+        render.rasterize += times.rasterize;
+        render.rasterize_backward += times.rasterize_backward;
+        render.project_backward += times.project_backward;
+        render.deform_backward += times.deform_backward;
+    }
+
+    /// Adds the counts of a view that was rendered forward and backward.
+    pub(super) fn add_view(&mut self, gaussians: usize, view: &ViewStatistics) {
+        self.views += 1;
+        self.gaussians += gaussians as u64;
+        self.visible += view.visible as u64;
+        self.tile_pairs += view.tile_pairs as u64;
+        self.evaluated_pairs += view.evaluated_pairs;
+        self.deformed_backward += view.deformed_backward as u64;
+    }
+}
+
+/// Adds the time since `since` to `total`, and starts anew.
+pub(super) fn lap(total: &mut Duration, since: &mut Instant) {
+    let now = Instant::now();
+    *total += now - *since;
+    *since = now;
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_are_in_the_order_of_a_step_and_sum_to_the_total() {
+        let ms = Duration::from_millis;
+        let mut times =
+            StepTimes { losses: ms(2), optimiser_planes: ms(5), total: ms(20), ..StepTimes::default() };
+        // The renderer's times add up over steps.
+        times.add_render(&StageTimes { deform: ms(1), rasterize_backward: ms(7), ..StageTimes::default() });
+        times.add_render(&StageTimes { deform: ms(2), ..StageTimes::default() });
+        let rows = times.rows();
+        assert_eq!(rows.iter().map(|(_, time)| *time).sum::<Duration>(), times.total);
+        assert_eq!(rows.last(), Some(&("other", ms(3))));
+        let at = |name| rows.iter().position(|(row, _)| *row == name).unwrap();
+        assert!(at("rasterize") < at("losses") && at("losses") < at("rasterize backward"));
+        assert!(at("deform backward") < at("optimiser: Gaussians"));
+    }
+}

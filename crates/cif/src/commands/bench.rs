@@ -1,0 +1,466 @@
+//! `cif bench`: what a training step costs, and where.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use cif_dataset::{Dataset, Layout};
+use cif_field::Field;
+use cif_train::metrics::training_config;
+use cif_train::{InstancePass, Stage, StepTimes, TrainConfig, Trainer};
+use clap::{Args, Subcommand, ValueEnum};
+use serde_json::{Map, Value, json};
+
+use super::{CaptureOptions, Simd, print_warnings, scene, train};
+use crate::error::Error;
+use crate::output;
+use crate::settings::Layers;
+
+/// Measure what a training step costs
+#[derive(Debug, Args)]
+#[command(subcommand_required = true, arg_required_else_help = true)]
+pub(super) struct Bench {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    Step(Step),
+}
+
+/// Tell where the time of a training step goes
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Times are milliseconds per step, mean and median over the measured steps; shares are of the mean.
+Without --scene the Gaussians are the capture's points, with few of the properties of a trained
+scene: give a scene to measure what training costs in the end.
+
+  cif bench step captures/table --preset draft
+  cif bench step captures/table --scene table.cif --threads 1 --json cost.json
+  cif bench step captures/table --scene table.cif --instances 8,256
+
+In the instance stage every view is measured twice, with the instance pass and without, which tells
+what the pass adds to colour. --instances repeats that with a longer table of instances, the labels
+spread over it. Nothing is saved of the training done.")]
+struct Step {
+    /// Folder of the capture
+    capture: PathBuf,
+    /// Trained scene to measure; settings come from it unless --preset is given
+    #[arg(long, value_name = "SCENE.cif")]
+    scene: Option<PathBuf>,
+    /// Stage whose steps are measured [default: instance with a scene that has identities, else fine]
+    #[arg(long)]
+    stage: Option<StageName>,
+    /// Steps to measure
+    #[arg(long, value_name = "N", default_value_t = 50, value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    steps: u32,
+    /// Steps before, not measured
+    #[arg(long, value_name = "N", default_value_t = 20, value_parser = clap::value_parser!(u32).range(0..=1_000_000))]
+    warm_up: u32,
+    /// Repeat the instance stage with so many instances
+    #[arg(long, value_name = "K,...", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(1..=60_000))]
+    instances: Vec<u16>,
+    /// Write the costs as JSON; - for stdout
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Replace existing output
+    #[arg(long)]
+    force: bool,
+    /// Named settings: draft, standard or paper [default: standard]
+    #[arg(long, value_name = "NAME")]
+    preset: Option<String>,
+    /// Any setting by its key in SCENE.train.toml, e.g. --set stages.batch=2
+    #[arg(long, value_name = "TABLE.KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are
+    #[arg(long, value_name = "LEVEL", default_value = "auto")]
+    simd: Simd,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum StageName {
+    Coarse,
+    Fine,
+    Instance,
+}
+
+impl From<StageName> for Stage {
+    fn from(name: StageName) -> Self {
+        match name {
+            StageName::Coarse => Self::Coarse,
+            StageName::Fine => Self::Fine,
+            StageName::Instance => Self::Instance,
+        }
+    }
+}
+
+pub(super) fn run(command: &Bench) -> Result<(), Error> {
+    match &command.what {
+        What::Step(command) => step(command),
+    }
+}
+
+fn step(command: &Step) -> Result<(), Error> {
+    let to_stdout = command.json.as_deref() == Some(Path::new("-"));
+    if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
+        output::check_file(path, command.force)?;
+    }
+    if !command.instances.is_empty() && command.stage.is_some_and(|stage| stage != StageName::Instance) {
+        return Err(no_instances());
+    }
+    resolve(command, None, Layout::HyperNerf)?;
+    let field = command.scene.as_deref().map(scene::load).transpose()?;
+    let stage: Stage = match command.stage {
+        Some(stage) => stage.into(),
+        None if field.as_ref().is_some_and(|field| field.identities.is_some()) => Stage::Instance,
+        None => Stage::Fine,
+    };
+    if !command.instances.is_empty() && stage != Stage::Instance {
+        return Err(no_instances());
+    }
+    let mut capture = command.capture_options.clone();
+    capture.downscale = capture.downscale.or(field.as_ref().and_then(scene::trained_downscale)).or(resolve(
+        command,
+        field.as_ref(),
+        Layout::HyperNerf,
+    )?
+    .downscale);
+    let dataset = capture.open(&command.capture)?;
+    print_warnings(&dataset);
+    let config = resolve(command, field.as_ref(), dataset.layout)?;
+    let report = measure(command, dataset, config, field, stage)?;
+    if to_stdout {
+        println!("{:#}", report.json());
+    } else {
+        report.print();
+        if let Some(path) = &command.json {
+            output::write_file(path, format!("{:#}\n", report.json()).as_bytes())?;
+        }
+    }
+    Ok(())
+}
+
+fn no_instances() -> Error {
+    Error::usage(
+        "--instances measures the instance stage",
+        "give --stage instance, or a --scene that was trained with masks",
+    )
+}
+
+/// Settings of the scene or the preset, then what was typed.
+fn resolve(command: &Step, field: Option<&Field>, layout: Layout) -> Result<TrainConfig, Error> {
+    let base = match (&command.preset, field.and_then(training_config)) {
+        (Some(name), _) => TrainConfig::preset(train::preset(name, "--preset")?, layout),
+        (None, Some(trained)) => trained,
+        (None, None) => TrainConfig::preset(Default::default(), layout),
+    };
+    let mut layers = Layers::new(base);
+    for assignment in &command.set {
+        layers.assignment(assignment)?;
+    }
+    let config = layers.finish();
+    config.validate().map_err(Error::plain)?;
+    Ok(config)
+}
+
+fn measure(
+    command: &Step,
+    dataset: Dataset,
+    config: TrainConfig,
+    field: Option<Field>,
+    stage: Stage,
+) -> Result<Report, Error> {
+    // Refused before any step is done.
+    let present = match (&field, stage) {
+        (Some(field), Stage::Instance) if field.identities.is_some() => field.instances.len(),
+        _ => dataset.instances.len(),
+    };
+    let mut tables = command.instances.clone();
+    tables.sort_unstable();
+    tables.dedup();
+    if let Some(short) = tables.iter().find(|count| usize::from(**count) < present) {
+        return Err(Error::failed(
+            format!("--instances {short}: the masks have {present} instances already"),
+            format!("give {present} or more"),
+        ));
+    }
+    let mut trainer =
+        Trainer::for_measuring(dataset, config, field, stage, command.warm_up).map_err(Error::plain)?;
+    trainer.set_simd(command.simd.into());
+    let mut series = vec![Series::measure(&mut trainer, command)?];
+    for count in tables {
+        trainer.spread_instances(usize::from(count));
+        series.push(Series::measure(&mut trainer, command)?);
+    }
+    Ok(Report { stage, warm_up: command.warm_up, simd: trainer.simd_name(), series })
+}
+
+/// Measured steps with one table of instances.
+struct Series {
+    instances: usize,
+    steps: Vec<StepTimes>,
+    /// The same views without the instance pass; empty in other stages.
+    without: Vec<StepTimes>,
+}
+
+impl Series {
+    fn measure(trainer: &mut Trainer, command: &Step) -> Result<Self, Error> {
+        let compares = trainer.stage() == Stage::Instance;
+        let instances = trainer.field().instances.len();
+        let mut series = Self { instances, steps: Vec::new(), without: Vec::new() };
+        for step in 0..command.warm_up + command.steps {
+            let with = trainer.measure_step(InstancePass::On).map_err(Error::plain)?;
+            let without = match compares {
+                true => {
+                    // In turns, so that whatever else the machine does falls on both.
+                    trainer.repeat_views();
+                    Some(trainer.measure_step(InstancePass::Off).map_err(Error::plain)?)
+                }
+                false => None,
+            };
+            if step >= command.warm_up {
+                series.steps.push(with);
+                series.without.extend(without);
+            }
+        }
+        Ok(series)
+    }
+
+    /// What the instance pass adds to colour, `None` in other stages.
+    fn overhead(&self) -> Option<Overhead> {
+        if self.without.is_empty() {
+            return None;
+        }
+        let raster = |times: &StepTimes| times.render.rasterize + times.render.rasterize_backward;
+        let pair = |of: &dyn Fn(&StepTimes) -> Duration| {
+            [cost(&self.without, of).median, cost(&self.steps, of).median]
+        };
+        Some(Overhead { raster: pair(&raster), total: pair(&|times| times.total) })
+    }
+}
+
+/// Median milliseconds per step, without and with the instance pass.
+struct Overhead {
+    raster: [f64; 2],
+    total: [f64; 2],
+}
+
+fn percent([without, with]: [f64; 2]) -> Option<f64> {
+    (without > 0.0).then(|| 100.0 * (with - without) / without)
+}
+
+/// Milliseconds per step.
+struct Cost {
+    mean: f64,
+    median: f64,
+}
+
+fn cost(steps: &[StepTimes], of: impl Fn(&StepTimes) -> Duration) -> Cost {
+    let mut ms: Vec<f64> = steps.iter().map(|step| 1e3 * of(step).as_secs_f64()).collect();
+    ms.sort_by(f64::total_cmp);
+    let (count, middle) = (ms.len(), ms.len() / 2);
+    let median = match count {
+        0 => 0.0,
+        _ if count % 2 == 1 => ms[middle],
+        _ => (ms[middle - 1] + ms[middle]) / 2.0,
+    };
+    Cost { mean: ms.iter().sum::<f64>() / count.max(1) as f64, median }
+}
+
+struct Report {
+    stage: Stage,
+    warm_up: u32,
+    simd: String,
+    /// The capture's own table of instances first.
+    series: Vec<Series>,
+}
+
+/// A count per step, and the time that one of them takes.
+struct Unit {
+    name: &'static str,
+    per_step: f64,
+    /// Wall time of the stage over the count, nanoseconds.
+    stage: &'static str,
+    ns_each: Option<f64>,
+}
+
+impl Report {
+    fn steps(&self) -> &[StepTimes] {
+        &self.series[0].steps
+    }
+
+    /// Parts of a step in their order, and the whole.
+    fn costs(&self) -> Vec<(&'static str, Cost)> {
+        let steps = self.steps();
+        let names: Vec<&'static str> = steps[0].rows().into_iter().map(|(name, _)| name).collect();
+        let part = |index: usize| move |step: &StepTimes| step.rows()[index].1;
+        let parts = names.into_iter().enumerate().map(|(index, name)| (name, cost(steps, part(index))));
+        parts.chain([("total", cost(steps, |step| step.total))]).collect()
+    }
+
+    fn units(&self) -> Vec<Unit> {
+        let steps = self.steps();
+        let unit = |name, count: fn(&StepTimes) -> u64, stage, time: fn(&StepTimes) -> Duration| {
+            let total: u64 = steps.iter().map(count).sum();
+            let ns: f64 = steps.iter().map(|step| 1e9 * time(step).as_secs_f64()).sum();
+            let per_step = total as f64 / steps.len() as f64;
+            Unit { name, per_step, stage, ns_each: (total > 0).then(|| ns / total as f64) }
+        };
+        vec![
+            unit("Gaussians", |step| step.gaussians, "deform", |step| step.render.deform),
+            unit(
+                "visible Gaussians",
+                |step| step.visible,
+                "project backward",
+                |step| step.render.project_backward,
+            ),
+            unit("tile pairs", |step| step.tile_pairs, "bin and sort", |step| step.render.bin),
+            unit("evaluated pairs", |step| step.evaluated_pairs, "rasterize", |step| step.render.rasterize),
+            unit(
+                "Gaussians deformed backward",
+                |step| step.deformed_backward,
+                "deform backward",
+                |step| step.render.deform_backward,
+            ),
+        ]
+    }
+
+    /// Evaluated pairs per second and thread in the forward raster pass.
+    fn pair_rate(&self) -> Option<f64> {
+        let seconds: f64 = self.steps().iter().map(|step| step.render.rasterize.as_secs_f64()).sum();
+        let pairs: u64 = self.steps().iter().map(|step| step.evaluated_pairs).sum();
+        (seconds > 0.0).then(|| pairs as f64 / seconds / rayon::current_num_threads() as f64)
+    }
+
+    fn json(&self) -> Value {
+        let costs = self.costs();
+        let whole = costs.last().map_or(0.0, |(_, cost)| cost.mean);
+        let stages: Map<String, Value> = costs
+            .iter()
+            .map(|(name, cost)| {
+                let share = if whole > 0.0 { Some(cost.mean / whole) } else { None };
+                let value = json!({ "mean_ms": cost.mean, "median_ms": cost.median, "share": share });
+                ((*name).to_owned(), value)
+            })
+            .collect();
+        let units: Map<String, Value> = self
+            .units()
+            .into_iter()
+            .map(|unit| {
+                let value = json!({ "per_step": unit.per_step, "of": unit.stage, "ns_each": unit.ns_each });
+                (unit.name.to_owned(), value)
+            })
+            .collect();
+        let passes: Vec<Value> = self
+            .series
+            .iter()
+            .filter_map(|series| {
+                let Overhead { raster, total } = series.overhead()?;
+                Some(json!({
+                    "instances": series.instances,
+                    "raster_ms_without": raster[0],
+                    "raster_ms": raster[1],
+                    "raster_overhead_percent": percent(raster),
+                    "total_ms_without": total[0],
+                    "total_ms": total[1],
+                    "total_overhead_percent": percent(total),
+                }))
+            })
+            .collect();
+        json!({
+            "stage": self.stage,
+            "steps": self.steps().len(),
+            "warm_up": self.warm_up,
+            "threads": rayon::current_num_threads(),
+            "simd": self.simd,
+            "instances": self.series[0].instances,
+            "stages": stages,
+            "units": units,
+            "evaluated_pairs_per_second_and_thread": self.pair_rate(),
+            "instance_pass": passes,
+        })
+    }
+
+    fn print(&self) {
+        println!(
+            "{} stage, {} steps after {}, {} threads, {}\n",
+            self.stage,
+            self.steps().len(),
+            self.warm_up,
+            rayon::current_num_threads(),
+            self.simd
+        );
+        let costs = self.costs();
+        let whole = costs.last().map_or(0.0, |(_, cost)| cost.mean);
+        let mut table = super::table(["part of a step", "ms", "median ms", "share"]);
+        for (name, cost) in &costs {
+            let share = if whole > 0.0 { 100.0 * cost.mean / whole } else { 0.0 };
+            table.add_row([
+                (*name).to_owned(),
+                format!("{:.3}", cost.mean),
+                format!("{:.3}", cost.median),
+                format!("{share:.1} %"),
+            ]);
+        }
+        println!("{table}\n");
+        let mut table = super::table(["work", "per step", "ns each", "of"]);
+        for unit in self.units() {
+            table.add_row([
+                unit.name.to_owned(),
+                format!("{:.0}", unit.per_step),
+                number(unit.ns_each, 2),
+                unit.stage.to_owned(),
+            ]);
+        }
+        println!("{table}\n");
+        let rate = number(self.pair_rate().map(|rate| rate / 1e6), 1);
+        println!("{rate} million evaluated pairs per second and thread (rasterize)");
+        if self.series.iter().all(|series| series.without.is_empty()) {
+            return;
+        }
+        let mut table = super::table([
+            "instances",
+            "raster ms without",
+            "with instance pass",
+            "overhead",
+            "total ms without",
+            "with",
+            "overhead",
+        ]);
+        for series in &self.series {
+            let Some(Overhead { raster, total }) = series.overhead() else { continue };
+            table.add_row([
+                series.instances.to_string(),
+                format!("{:.3}", raster[0]),
+                format!("{:.3}", raster[1]),
+                format!("{} %", number(percent(raster), 1)),
+                format!("{:.3}", total[0]),
+                format!("{:.3}", total[1]),
+                format!("{} %", number(percent(total), 1)),
+            ]);
+        }
+        println!("\nInstance pass on top of colour, medians; raster is forward and backward:\n{table}");
+    }
+}
+
+fn number(value: Option<f64>, digits: usize) -> String {
+    value.map_or("n/a".to_owned(), |value| format!("{value:.digits$}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn costs_are_mean_and_median() {
+        let steps =
+            [1, 2, 3, 10].map(|ms| StepTimes { total: Duration::from_millis(ms), ..Default::default() });
+        let all = cost(&steps, |step| step.total);
+        assert!((all.mean - 4.0).abs() < 1e-9 && (all.median - 2.5).abs() < 1e-9);
+        assert!((cost(&steps[..3], |step| step.total).median - 2.0).abs() < 1e-9);
+        assert_eq!(percent([2.0, 3.0]), Some(50.0));
+        assert_eq!(percent([0.0, 3.0]), None);
+    }
+}
