@@ -40,8 +40,8 @@ scene: give a scene to measure what training costs in the end.
   cif bench step captures/table --scene table.cif --instances 8,256
 
 In the instance stage every view is measured twice, with the instance pass and without, which tells
-what the pass adds to colour. --instances repeats that with a longer table of instances, the labels
-spread over it. Nothing is saved of the training done.")]
+what the pass adds to colour. --instances repeats that from the same start with a longer table of
+instances, the labels spread over it. Nothing is saved of the training done.")]
 struct Step {
     /// Folder of the capture
     capture: PathBuf,
@@ -130,7 +130,7 @@ fn step(command: &Step) -> Result<(), Error> {
     let dataset = capture.open(&command.capture)?;
     print_warnings(&dataset);
     let config = resolve(command, field.as_ref(), dataset.layout)?;
-    let report = measure(command, dataset, config, field, stage)?;
+    let report = measure(command, &dataset, &config, field, stage)?;
     if to_stdout {
         println!("{:#}", report.json());
     } else {
@@ -167,8 +167,8 @@ fn resolve(command: &Step, field: Option<&Field>, layout: Layout) -> Result<Trai
 
 fn measure(
     command: &Step,
-    dataset: Dataset,
-    config: TrainConfig,
+    dataset: &Dataset,
+    config: &TrainConfig,
     field: Option<Field>,
     stage: Stage,
 ) -> Result<Report, Error> {
@@ -186,15 +186,21 @@ fn measure(
             format!("give {present} or more"),
         ));
     }
-    let mut trainer =
-        Trainer::for_measuring(dataset, config, field, stage, command.warm_up).map_err(Error::plain)?;
-    trainer.set_simd(command.simd.into());
-    let mut series = vec![Series::measure(&mut trainer, command)?];
-    for count in tables {
-        trainer.spread_instances(usize::from(count));
+    // Every series starts from the same state, because training changes what a step costs.
+    let mut series = Vec::new();
+    let mut simd = String::new();
+    for table in std::iter::once(None).chain(tables.into_iter().map(Some)) {
+        let (dataset, config, field) = (dataset.clone(), config.clone(), field.clone());
+        let mut trainer =
+            Trainer::for_measuring(dataset, config, field, stage, command.warm_up).map_err(Error::plain)?;
+        trainer.set_simd(command.simd.into());
+        if let Some(count) = table {
+            trainer.spread_instances(usize::from(count));
+        }
+        simd = trainer.simd_name();
         series.push(Series::measure(&mut trainer, command)?);
     }
-    Ok(Report { stage, warm_up: command.warm_up, simd: trainer.simd_name(), series })
+    Ok(Report { stage, warm_up: command.warm_up, simd, series })
 }
 
 /// Measured steps with one table of instances.
@@ -234,21 +240,52 @@ impl Series {
             return None;
         }
         let raster = |times: &StepTimes| times.render.rasterize + times.render.rasterize_backward;
-        let pair = |of: &dyn Fn(&StepTimes) -> Duration| {
-            [cost(&self.without, of).median, cost(&self.steps, of).median]
+        let added = |of: &dyn Fn(&StepTimes) -> Duration| {
+            let pairs = self.without.iter().zip(&self.steps);
+            Added {
+                without: cost(&self.without, of).median,
+                with: cost(&self.steps, of).median,
+                percent: added_percent(pairs.map(|(without, with)| (of(without), of(with)))),
+            }
         };
-        Some(Overhead { raster: pair(&raster), total: pair(&|times| times.total) })
+        Some(Overhead { raster: added(&raster), total: added(&|times| times.total) })
     }
 }
 
-/// Median milliseconds per step, without and with the instance pass.
+/// What the instance pass adds.
 struct Overhead {
-    raster: [f64; 2],
-    total: [f64; 2],
+    /// Raster forward and backward.
+    raster: Added,
+    /// Whole step.
+    total: Added,
 }
 
-fn percent([without, with]: [f64; 2]) -> Option<f64> {
-    (without > 0.0).then(|| 100.0 * (with - without) / without)
+/// Median milliseconds per step without and with the pass, and the median of what it adds to a view, percent.
+struct Added {
+    without: f64,
+    with: f64,
+    percent: Option<f64>,
+}
+
+/// Median of the growth of pairs of times, percent; `None` where no first time is measurable.
+fn added_percent(pairs: impl Iterator<Item = (Duration, Duration)>) -> Option<f64> {
+    let growth = |(without, with): (Duration, Duration)| {
+        let without = without.as_secs_f64();
+        (without > 0.0).then(|| 100.0 * (with.as_secs_f64() / without - 1.0))
+    };
+    let mut grown: Vec<f64> = pairs.filter_map(growth).collect();
+    grown.sort_by(f64::total_cmp);
+    median(&grown)
+}
+
+/// Median of ascending values.
+fn median(sorted: &[f64]) -> Option<f64> {
+    let middle = sorted.len() / 2;
+    match sorted.len() {
+        0 => None,
+        count if count % 2 == 1 => Some(sorted[middle]),
+        _ => Some((sorted[middle - 1] + sorted[middle]) / 2.0),
+    }
 }
 
 /// Milliseconds per step.
@@ -260,13 +297,7 @@ struct Cost {
 fn cost(steps: &[StepTimes], of: impl Fn(&StepTimes) -> Duration) -> Cost {
     let mut ms: Vec<f64> = steps.iter().map(|step| 1e3 * of(step).as_secs_f64()).collect();
     ms.sort_by(f64::total_cmp);
-    let (count, middle) = (ms.len(), ms.len() / 2);
-    let median = match count {
-        0 => 0.0,
-        _ if count % 2 == 1 => ms[middle],
-        _ => (ms[middle - 1] + ms[middle]) / 2.0,
-    };
-    Cost { mean: ms.iter().sum::<f64>() / count.max(1) as f64, median }
+    Cost { mean: ms.iter().sum::<f64>() / ms.len().max(1) as f64, median: median(&ms).unwrap_or(0.0) }
 }
 
 struct Report {
@@ -360,12 +391,12 @@ impl Report {
                 let Overhead { raster, total } = series.overhead()?;
                 Some(json!({
                     "instances": series.instances,
-                    "raster_ms_without": raster[0],
-                    "raster_ms": raster[1],
-                    "raster_overhead_percent": percent(raster),
-                    "total_ms_without": total[0],
-                    "total_ms": total[1],
-                    "total_overhead_percent": percent(total),
+                    "raster_ms_without": raster.without,
+                    "raster_ms": raster.with,
+                    "raster_overhead_percent": raster.percent,
+                    "total_ms_without": total.without,
+                    "total_ms": total.with,
+                    "total_overhead_percent": total.percent,
                 }))
             })
             .collect();
@@ -433,15 +464,17 @@ impl Report {
             let Some(Overhead { raster, total }) = series.overhead() else { continue };
             table.add_row([
                 series.instances.to_string(),
-                format!("{:.3}", raster[0]),
-                format!("{:.3}", raster[1]),
-                format!("{} %", number(percent(raster), 1)),
-                format!("{:.3}", total[0]),
-                format!("{:.3}", total[1]),
-                format!("{} %", number(percent(total), 1)),
+                format!("{:.3}", raster.without),
+                format!("{:.3}", raster.with),
+                format!("{} %", number(raster.percent, 1)),
+                format!("{:.3}", total.without),
+                format!("{:.3}", total.with),
+                format!("{} %", number(total.percent, 1)),
             ]);
         }
-        println!("\nInstance pass on top of colour, medians; raster is forward and backward:\n{table}");
+        println!(
+            "\nInstance pass on top of colour, medians over views measured in turns; raster is forward and backward:\n{table}"
+        );
     }
 }
 
@@ -460,7 +493,9 @@ mod tests {
         let all = cost(&steps, |step| step.total);
         assert!((all.mean - 4.0).abs() < 1e-9 && (all.median - 2.5).abs() < 1e-9);
         assert!((cost(&steps[..3], |step| step.total).median - 2.0).abs() < 1e-9);
-        assert_eq!(percent([2.0, 3.0]), Some(50.0));
-        assert_eq!(percent([0.0, 3.0]), None);
+        let pairs = [(2, 3), (100, 110), (0, 5), (10, 12)];
+        let pairs = pairs.map(|(without, with)| (Duration::from_secs(without), Duration::from_secs(with)));
+        assert!((added_percent(pairs.into_iter()).unwrap() - 20.0).abs() < 1e-9);
+        assert_eq!(added_percent(pairs[2..3].iter().copied()), None);
     }
 }
