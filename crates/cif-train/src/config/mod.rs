@@ -163,11 +163,11 @@ pub struct LossConfig {
     pub lambda_dssim: f32,
     /// Weight of the instance loss, default 0.01; 0.005 in the `paper` preset on Neu3D captures.
     pub lambda_instance: f32,
-    /// Weight of the second difference of the spatial planes, default 2e-5.
+    /// Weight of the second difference of the spatial planes, default 1e-4.
     pub plane_smoothness: f32,
-    /// Weight of the second difference of the time planes, default 1e-4.
+    /// Weight of the second difference of the time planes, default 1e-3.
     pub time_smoothness: f32,
-    /// Weight of the distance of the time planes from 1, default 1e-5.
+    /// Weight of the distance of the time planes from 1, default 1e-4.
     pub time_sparsity: f32,
 }
 

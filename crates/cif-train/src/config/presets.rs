@@ -179,9 +179,9 @@ impl Default for LossConfig {
         Self {
             lambda_dssim: 0.0,
             lambda_instance: 0.01,
-            plane_smoothness: 2e-5,
-            time_smoothness: 1e-4,
-            time_sparsity: 1e-5,
+            plane_smoothness: 1e-4,
+            time_smoothness: 1e-3,
+            time_sparsity: 1e-4,
         }
     }
 }
