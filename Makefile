@@ -57,7 +57,7 @@ demo: build
 test: test-rust test-python
 
 test-rust:
-	cargo test --locked
+	cargo test --locked --no-fail-fast
 
 test-python: build
 	$(BIN)/python -m pytest

@@ -41,7 +41,7 @@ pub(super) struct DeformationAtTime<'a> {
     time_fraction: f32,
 }
 
-/// Transposed weights `[inputs, outputs]` and biases `[outputs]`, outputs padded with zeros.
+/// Transposed weights `[inputs, outputs]` and biases `[outputs]`; outputs may be padded with zeros.
 struct ForwardLayer {
     inputs: usize,
     outputs: usize,
@@ -50,8 +50,8 @@ struct ForwardLayer {
 }
 
 impl ForwardLayer {
-    fn new(layout: &LinearLayout, parameters: &[f32]) -> Self {
-        let outputs = padded(layout.outputs);
+    /// `outputs`: at least those of the layout.
+    fn new(layout: &LinearLayout, parameters: &[f32], outputs: usize) -> Self {
         let weights = transpose(&parameters[layout.weights.clone()], layout.outputs, layout.inputs, outputs);
         let mut biases = parameters[layout.biases.clone()].to_vec();
         biases.resize(outputs, 0.0);
@@ -161,11 +161,16 @@ impl<'a> DeformationAtTime<'a> {
             })
             .collect();
         let mlp = config.mlp_layout();
-        let trunk = ForwardLayer::new(&mlp.trunk, &deformation.mlp);
+        let width = mlp.trunk.outputs;
+        let trunk = ForwardLayer::new(&mlp.trunk, &deformation.mlp, width);
         let heads = mlp
             .heads
             .iter()
-            .map(|head| [&head.hidden, &head.output].map(|layer| ForwardLayer::new(layer, &deformation.mlp)))
+            .map(|head| {
+                // Only what leaves the network is padded: the next layer reads a hidden one as it is.
+                [(&head.hidden, width), (&head.output, padded(head.output.outputs))]
+                    .map(|(layer, outputs)| ForwardLayer::new(layer, &deformation.mlp, outputs))
+            })
             .collect();
         Self { deformation, axes, mlp, trunk, heads, levels, channels, lines, time_row, time_fraction }
     }

@@ -208,7 +208,7 @@ mod tests {
 
     fn numbers(count: usize, seed: u32) -> Vec<f32> {
         (0..count as u32)
-            .map(|k| ((k * 2_654_435_761_u32.wrapping_add(seed)) >> 16) as f32 / 32_768.0 - 1.0)
+            .map(|k| (k.wrapping_mul(2_654_435_761).wrapping_add(seed) >> 16) as f32 / 32_768.0 - 1.0)
             .collect()
     }
 

@@ -15,14 +15,16 @@ fn gaussians(positions: &[[f32; 3]]) -> Gaussians {
 fn rows_are_normalised_mass_with_small_entries_dropped() {
     let mut counts = empty_counts(2, 3);
     counts.label_mass = vec![3.0, 0.0, 1.0, 1e-5, 9.99999, 0.0];
-    // Unlabelled pixels add to the total and cancel in the rows.
+    // Unlabelled pixels add to the total: they cancel in the rows and show in the labelled share.
     counts.total_mass = vec![40.0, 10.0];
     let result = estimate(&counts, &gaussians(&[[0.0; 3], [1.0, 0.0, 0.0]]), 1.0, &IdentityConfig::default());
     let rows = &result.identities;
     assert_eq!((rows.row_offsets.as_slice(), rows.labels.as_slice()), (&[0, 2, 3][..], &[0, 2, 1][..]));
-    assert!((rows.log_estimates[0] - 0.75_f32.ln()).abs() < 1e-6);
-    assert!((rows.log_estimates[1] - 0.25_f32.ln()).abs() < 1e-6);
-    assert_eq!(rows.log_estimates[2], 0.0, "a single label is certain");
+    let p = rows.probabilities();
+    assert!((p[0] - 0.75).abs() < 1e-6 && (p[1] - 0.25).abs() < 1e-6, "{p:?}");
+    assert_eq!(p[2], 1.0, "a single label is certain");
+    let shares = rows.labelled_shares();
+    assert!((shares[0] - 0.1).abs() < 1e-6 && (shares[1] - 1.0).abs() < 1e-5, "{shares:?}");
     assert!((result.dropped_mass - 0.5e-6).abs() < 1e-9, "{}", result.dropped_mass);
     assert_eq!(result.empty_instances(), [2]);
 }
@@ -52,6 +54,12 @@ fn hidden_gaussians_take_their_neighbours_rows_and_nothing_is_nan() {
     assert!(row(3)[0] > 0.999);
     assert_eq!(row(4), [0.5, 0.5]);
     assert!(row(5)[1] > 0.98);
+    let shares = result.identities.labelled_shares();
+    assert!(shares[0] > 0.999 && shares[3] > 0.999, "{shares:?}");
+    assert!(
+        shares[4] < 1e-5 && shares[5] < 1e-5,
+        "what no label was seen on belongs to no instance: {shares:?}"
+    );
 }
 
 #[test]
