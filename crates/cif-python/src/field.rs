@@ -291,6 +291,7 @@ impl Field {
             out.set_item("label", arrays::image(py, &instances.label)?)?;
             out.set_item("probability", arrays::image(py, &instances.probability)?)?;
             out.set_item("coverage", arrays::image(py, &instances.coverage)?)?;
+            out.set_item("foreground", arrays::image(py, &instances.foreground)?)?;
             out.set_item("entropy", arrays::image(py, &instances.entropy)?)?;
         }
         Ok(out)

@@ -150,7 +150,7 @@ class Field:
         """Render a view.
 
         color [H, W, 3] and alpha; depth in metres; label (index into instances plus 1, 0 for none),
-        probability, coverage and entropy where the field has identities.
+        probability, coverage, foreground and entropy where the field has identities.
         """
     def query(self, points: NDArray[np.float64], time: float = 0.0) -> dict[str, NDArray[Any]]:
         """Tell what is at points [P, 3]: existence [P], instance [P] (-1 for none), probabilities [P, K]."""
