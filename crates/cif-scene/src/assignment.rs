@@ -3,8 +3,8 @@
 //! 1. A Gaussian's instance is its most probable one (ties to the lowest index).
 //! 2. It is *background* when its instance mass gamma = pi p_max is below
 //!    [`SceneOptions::background_threshold`], or when it was seen on labelled pixels for less than half of its
-//!    image (where the estimates kept that share; see [`labelled_share`]). Pixels without a label give no loss,
-//!    so Gaussians outside all masks keep the occupancy at which training started, although they have identity
+//!    image (see [`labelled_share`]; a tiny instance may have less). Pixels without a label give no loss, so
+//!    Gaussians outside all masks keep the occupancy at which training started, although they have identity
 //!    rows (methods reference 4.4, 5.4 and A2).
 //! 3. Gaussians inside an object are hardly ever seen, so that they too keep their first occupancy. One that
 //!    lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of that
@@ -31,6 +31,11 @@ const ROUNDS: usize = 4;
 const SAME_OCCUPANCY: f32 = 1e-4;
 /// Share of its image on labelled pixels below which a Gaussian is background.
 const LABELLED_SHARE: f32 = 0.5;
+/// Where no Gaussian of an instance reaches that share (an object of a few pixels, narrower than the Gaussians
+/// that draw it), those within this factor of its best one are the instance.
+const RELATIVE_SHARE: f32 = 0.75;
+/// Smallest share that may make an instance at all.
+const MIN_SHARE: f32 = 0.2;
 
 /// Most probable instance of a Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -86,12 +91,24 @@ pub fn assign(
 ) -> Vec<Option<usize>> {
     let occupancy = occupancies(field, visible);
     let candidate = |position: usize| identities[visible[position] as usize];
-    let mut owners: Vec<Option<usize>> = (0..visible.len())
+    // Candidates with enough instance mass, and the largest labelled share among those of each instance.
+    let candidates: Vec<Option<Identity>> = (0..visible.len())
         .map(|position| {
-            let identity = candidate(position)?;
-            let mass = occupancy[position] * identity.probability;
-            (mass >= options.background_threshold && identity.labelled_share >= LABELLED_SHARE)
-                .then_some(identity.index)
+            candidate(position)
+                .filter(|identity| occupancy[position] * identity.probability >= options.background_threshold)
+        })
+        .collect();
+    let mut best_shares = vec![0.0_f32; field.instances.len()];
+    for identity in candidates.iter().flatten() {
+        let best = &mut best_shares[identity.index];
+        *best = best.max(identity.labelled_share);
+    }
+    let mut owners: Vec<Option<usize>> = candidates
+        .iter()
+        .map(|identity| {
+            let identity = (*identity)?;
+            let needed = LABELLED_SHARE.min((RELATIVE_SHARE * best_shares[identity.index]).max(MIN_SHARE));
+            (identity.labelled_share >= needed).then_some(identity.index)
         })
         .collect();
     enclose(field, visible, &candidate, &mut owners);

@@ -223,6 +223,25 @@ fn a_gaussian_mostly_seen_outside_masks_is_background() {
 }
 
 #[test]
+fn an_object_narrower_than_its_gaussians_keeps_the_best_of_them() {
+    let mut field = field(1);
+    let rows = field.identities.as_mut().unwrap();
+    let entries = rows.log_estimates.len();
+    rows.log_estimates.fill(0.25_f32.ln());
+    rows.log_estimates[0] = 0.4_f32.ln();
+    rows.log_estimates[1] = 0.35_f32.ln();
+    assert!(entries > 2);
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    let owned = &graph.nodes[0].splats.rows;
+    assert!(owned.contains(&0) && owned.contains(&1), "{owned:?}");
+    // Where even the best was hardly seen in a mask, nothing is.
+    field.identities.as_mut().unwrap().log_estimates.fill(0.01_f32.ln());
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    assert_eq!(graph.nodes.len(), 1);
+    assert_eq!(graph.nodes[0].kind, NodeKind::Background);
+}
+
+#[test]
 fn untrained_occupancy_falls_back_to_opacity() {
     let mut field = field(1);
     field.gaussians.occupancy_logits.fill(logit(0.02));
