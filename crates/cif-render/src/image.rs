@@ -37,8 +37,8 @@ pub struct InstanceImage {
     pub probability: PixelGrid<f32>,
     /// Instance coverage A = sum of M over all instances.
     pub coverage: PixelGrid<f32>,
-    /// Probability that the pixel belongs to any instance rather than to the unlabelled rest: the labelled
-    /// shares of its Gaussians ([`cif_field::Identities::labelled_shares`]), blended like M.
+    /// Probability that what is seen at the pixel belongs to any instance rather than to the unlabelled rest:
+    /// the labelled shares of its Gaussians ([`cif_field::Identities::labelled_shares`]), blended like colour.
     pub foreground: PixelGrid<f32>,
     /// Entropy of M / A, nats; 0 without coverage.
     pub entropy: PixelGrid<f32>,

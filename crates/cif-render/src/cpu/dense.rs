@@ -2,11 +2,12 @@
 //! that occur in a tile. Source: methods reference 4.2 (evaluation).
 
 use fearless_simd::prelude::*;
+use fearless_simd::{f32x8, mask32x8};
 use fearless_simd_macros::simd;
 
 use super::project::Splat;
 use super::rasterize::{GROUPS, IdentityRows, TilePixels, TilePlace, prepare};
-use super::vector::{LANES, load, splat};
+use super::vector::{LANES, Lanes, load, splat};
 use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE};
 
 /// Instance outputs of a tile.
@@ -66,19 +67,32 @@ pub(super) fn instance_tile<S: Simd>(
     let max_alpha = splat(simd, MAX_ALPHA);
     let min_alpha = splat(simd, MIN_ALPHA);
     let min_transmittance = splat(simd, MIN_TRANSMITTANCE);
-    let mut transmittance = place.initial_transmittance();
+    let mut instance_transmittance = place.initial_transmittance();
+    let mut color_transmittance = instance_transmittance;
     let mut slots: Vec<(usize, f32)> = Vec::new();
-    let mut live = u32::MAX;
+    let (mut live_instances, mut live_color) = (u32::MAX, u32::MAX);
+    // One step of either pass: the blended weight of each pixel, and whether the group is finished.
+    let blend = |weight: f32x8<S>, valid: mask32x8<S>, transmittance: &mut Lanes| {
+        let alpha = weight.min(max_alpha);
+        let t = load(simd, transmittance);
+        let draws = valid & alpha.simd_ge(min_alpha) & t.simd_gt(zero);
+        let next = t * (one - alpha);
+        let stops = draws & next.simd_lt(min_transmittance);
+        let blends = draws & !stops;
+        let blended = blends.select(t * alpha, zero);
+        let t = stops.select(-t, blends.select(next, t));
+        t.store_array(transmittance);
+        (blended, t.simd_gt(zero).to_bitmask() == 0)
+    };
     for &rank in ranks {
-        if live == 0 {
+        if live_instances | live_color == 0 {
             break;
         }
         let s = &splats[rank as usize];
-        if s.occupancy < MIN_ALPHA {
-            continue;
-        }
         let prepared = prepare::<S, true>(simd, s, place);
-        let mut groups = prepared.groups[1] & live;
+        let color_groups = prepared.groups[0] & live_color;
+        let instance_groups = prepared.groups[1] & live_instances;
+        let mut groups = color_groups | instance_groups;
         if groups == 0 {
             continue;
         }
@@ -87,33 +101,26 @@ pub(super) fn instance_tile<S: Simd>(
             let slot = labels.binary_search(&rows.labels[entry]).expect("the dictionary holds every label");
             slots.push((slot, rows.probabilities[entry]));
         }
-        let occupancy = splat(simd, s.occupancy);
+        let (opacity, occupancy) = (splat(simd, s.opacity), splat(simd, s.occupancy));
         let share = splat(simd, labelled_shares[s.gaussian as usize]);
         while groups != 0 {
             let group = groups.trailing_zeros() as usize;
             groups &= groups - 1;
             let (dx, dy) = prepared.offset(group);
             let (p, valid) = prepared.footprint(simd, dx, dy);
-            let b = (occupancy * p).min(max_alpha);
-            let t = load(simd, &transmittance[group]);
-            let draws = valid & b.simd_ge(min_alpha) & t.simd_gt(zero);
-            if draws.to_bitmask() == 0 {
-                continue;
+            if color_groups >> group & 1 == 1 {
+                let (weight, finished) = blend(opacity * p, valid, &mut color_transmittance[group]);
+                let foreground = &mut tile.foreground[group];
+                weight.mul_add(share, load(simd, foreground)).store_array(foreground);
+                live_color &= !(u32::from(finished) << group);
             }
-            let next = t * (one - b);
-            let stops = draws & next.simd_lt(min_transmittance);
-            let blends = draws & !stops;
-            let weight = blends.select(t * b, zero);
-            let foreground = &mut tile.foreground[group];
-            weight.mul_add(share, load(simd, foreground)).store_array(foreground);
-            for (slot, probability) in &slots {
-                let mass = &mut masses[*slot][group];
-                weight.mul_add(splat(simd, *probability), load(simd, mass)).store_array(mass);
-            }
-            let t = stops.select(-t, blends.select(next, t));
-            t.store_array(&mut transmittance[group]);
-            if t.simd_gt(zero).to_bitmask() == 0 {
-                live &= !(1 << group);
+            if instance_groups >> group & 1 == 1 {
+                let (weight, finished) = blend(occupancy * p, valid, &mut instance_transmittance[group]);
+                for (slot, probability) in &slots {
+                    let mass = &mut masses[*slot][group];
+                    weight.mul_add(splat(simd, *probability), load(simd, mass)).store_array(mass);
+                }
+                live_instances &= !(u32::from(finished) << group);
             }
         }
     }

@@ -22,7 +22,7 @@ pub struct DenseMaps<R> {
     pub instances: usize,
     /// M, `[height * width, K]`.
     pub values: Vec<R>,
-    /// Blended labelled shares of the Gaussians, `[height * width]`.
+    /// Labelled shares of the Gaussians, blended like colour, `[height * width]`.
     pub labelled: Vec<R>,
     /// Instance transmittance S behind the last contributor, `[height * width]`.
     pub transmittances: Vec<R>,
@@ -66,11 +66,22 @@ pub fn rasterize_dense<R: Real>(
                 maps.values[pixel * instances + instance] +=
                     transmittance * b.value * identities.values[entry];
             }
-            maps.labelled[pixel] += transmittance * b.value * identities.labelled_shares[index as usize];
             transmittance = next;
             maps.ends[pixel] = rank + 1;
         }
         maps.transmittances[pixel] = transmittance;
+        let mut transmittance = R::one();
+        for &index in order {
+            let Some(splat) = &splats[index as usize] else { continue };
+            let Some(footprint) = footprint(splat, position) else { continue };
+            let Some(alpha) = weight(splat.opacity, footprint.peak) else { continue };
+            let next = transmittance * (R::one() - alpha.value);
+            if next < constant(MIN_TRANSMITTANCE) {
+                break;
+            }
+            maps.labelled[pixel] += transmittance * alpha.value * identities.labelled_shares[index as usize];
+            transmittance = next;
+        }
     }
     maps
 }
@@ -200,6 +211,7 @@ pub fn instance_image<R: Real>(maps: &DenseMaps<R>) -> InstanceImage {
     for pixel in 0..maps.transmittances.len() {
         let values = &maps.values[pixel * maps.instances..(pixel + 1) * maps.instances];
         let coverage: R = values.iter().copied().sum();
+        image.foreground.pixels[pixel] = maps.labelled[pixel].min(R::one()).to_double() as f32;
         if coverage <= R::zero() {
             continue;
         }
@@ -218,7 +230,6 @@ pub fn instance_image<R: Real>(maps: &DenseMaps<R>) -> InstanceImage {
         image.label.pixels[pixel] = best as u16 + 1;
         image.probability.pixels[pixel] = values[best].to_double() as f32;
         image.coverage.pixels[pixel] = coverage.to_double() as f32;
-        image.foreground.pixels[pixel] = maps.labelled[pixel].min(R::one()).to_double() as f32;
         image.entropy.pixels[pixel] = entropy.to_double() as f32;
     }
     image
