@@ -96,6 +96,7 @@ pub fn read(path: &Path) -> Result<GroundTruth, Error> {
 /// `meters_per_unit` of the scene turns world units into millimetres.
 #[must_use]
 pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
+    let step_of = steps(graph, truth);
     graph
         .nodes
         .iter()
@@ -111,9 +112,9 @@ pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
                 .time_codes
                 .samples
                 .iter()
-                .zip(&graph.time_codes.times)
+                .zip(&step_of)
                 .filter(|(code, _)| (first as f64..=last as f64).contains(*code))
-                .filter_map(|(code, time)| Some((node.world_transform(*code), step_at(truth, *time)?)))
+                .filter_map(|(code, step)| Some((node.world_transform(*code), (*step)?)))
                 .collect();
             let mut error = MotionError {
                 id,
@@ -164,6 +165,22 @@ impl KnownMotion {
     fn centre(&self, step: usize) -> DVec3 {
         (DVec3::from(self.aabb_min[step]) + DVec3::from(self.aabb_max[step])) / 2.0
     }
+}
+
+/// Known time step of every exported sample. Times count where they are the same on both sides; layouts that
+/// normalise time otherwise (Neu3D divides by the number of frames) are matched frame by frame instead.
+fn steps(graph: &SceneGraph, truth: &GroundTruth) -> Vec<Option<usize>> {
+    let by_time: Vec<Option<usize>> =
+        graph.time_codes.times.iter().map(|time| step_at(truth, *time)).collect();
+    if by_time.iter().all(Option::is_some) {
+        return by_time;
+    }
+    let mut ascending: Vec<usize> = (0..truth.frames.len()).collect();
+    ascending.sort_by(|a, b| truth.frames[*a].time.total_cmp(&truth.frames[*b].time).then(a.cmp(b)));
+    let frame = |code: f64| ascending.get(code as usize).copied();
+    let codes = &graph.time_codes.samples;
+    let frames_fit = codes.iter().all(|code| code.fract() == 0.0 && frame(*code).is_some());
+    if frames_fit { codes.iter().map(|code| frame(*code)).collect() } else { by_time }
 }
 
 fn step_at(truth: &GroundTruth, time: f64) -> Option<usize> {
@@ -302,6 +319,15 @@ mod tests {
         let turned = &compare(&exported(DVec3::ZERO, 2.0_f64.to_radians()), &truth("rigid"))[0];
         assert!((turned.rotation_max_deg - 2.0).abs() < 1e-6, "{turned:?}");
         assert!(turned.translation_max_mm < 1e-9, "{turned:?}");
+    }
+
+    #[test]
+    fn times_normalised_otherwise_are_matched_frame_by_frame() {
+        let mut graph = exported(DVec3::new(0.0, 0.0, 0.003), 0.0);
+        graph.time_codes.times = vec![0.0, 1.0 / 3.0, 2.0 / 3.0];
+        let error = &compare(&graph, &truth("rigid"))[0];
+        assert_eq!(error.samples, 3);
+        assert!((error.translation_max_mm - 3.0).abs() < 1e-9, "{error:?}");
     }
 
     #[test]

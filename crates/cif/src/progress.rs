@@ -92,7 +92,7 @@ impl Progress {
                 }
             }
             TrainEvent::IdentityEstimated { frames, instances, unseen, empty_instances, .. } => {
-                self.line(&format!("identities of {instances} instances from {frames} frames; {unseen} Gaussians were never seen"));
+                self.line(&format!("identities of {instances} instances from {frames} frames; {unseen} Gaussians were never seen on a labelled pixel"));
                 if !empty_instances.is_empty() {
                     let ids: Vec<String> = empty_instances.iter().map(u16::to_string).collect();
                     self.line(&format!("warning: no Gaussian belongs to mask id {}", ids.join(", ")));
