@@ -621,8 +621,6 @@ fn threads_do_not_change_a_bit() {
     }
 }
 
-// Known differences, kept as expected failures: when one of them starts to pass, drop its `should_panic`.
-
 /// The antialiasing factor is part of the instance gradient when occupancy is the opacity.
 #[test]
 fn antialiased_opacity_as_occupancy() {
@@ -656,8 +654,7 @@ fn gradients_of(scene: &SyntheticScene) -> Gradients {
     gradients
 }
 
-/// The fast path takes the determinant from the rounded covariance, which cancels for needles hundreds of pixels
-/// long; the single-precision reference stays below 1e-4 here (`hard_cases.rs`, row 13).
+/// Needles hundreds of pixels long: a determinant from the rounded covariance would cancel (`hard_cases.rs`, row 13).
 #[test]
 fn long_needles() {
     let mut scene = generate(&SyntheticConfig { gaussians: 50, ..config() });
