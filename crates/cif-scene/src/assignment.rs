@@ -3,9 +3,9 @@
 //! 1. A Gaussian's instance is its most probable one (ties to the lowest index).
 //! 2. It is *background* when its instance mass gamma = pi p_max is below
 //!    [`SceneOptions::background_threshold`], or when it was seen on labelled pixels for less than half of its
-//!    image (see [`labelled_share`]; a tiny instance may have less). Pixels without a label give no loss, so
-//!    Gaussians outside all masks keep the occupancy at which training started, although they have identity
-//!    rows (methods reference 4.4, 5.4 and A2).
+//!    image (see [`cif_field::Identities::labelled_shares`]; a tiny instance may have less). Pixels without a
+//!    label give no loss, so Gaussians outside all masks keep the occupancy at which training started,
+//!    although they have identity rows (methods reference 4.4, 5.4 and A2).
 //! 3. Gaussians inside an object are hardly ever seen, so that they too keep their first occupancy. One that
 //!    lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of that
 //!    instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
@@ -44,7 +44,7 @@ pub struct Identity {
     pub index: usize,
     /// Its probability p_max.
     pub probability: f32,
-    /// See [`labelled_share`].
+    /// See [`cif_field::Identities::labelled_shares`].
     pub labelled_share: f32,
 }
 
@@ -55,6 +55,7 @@ pub fn most_probable(field: &Field) -> Vec<Option<Identity>> {
         return vec![None; field.gaussians.len()];
     };
     let probabilities = identities.probabilities();
+    let labelled_shares = identities.labelled_shares();
     (0..identities.len())
         .map(|row| {
             let mut best: Option<Identity> = None;
@@ -66,19 +67,9 @@ pub fn most_probable(field: &Field) -> Vec<Option<Identity>> {
                     best = Some(Identity { index, probability, labelled_share: 1.0 });
                 }
             }
-            best.map(|best| Identity {
-                labelled_share: labelled_share(&identities.log_estimates[identities.range(row)]),
-                ..best
-            })
+            best.map(|best| Identity { labelled_share: labelled_shares[row], ..best })
         })
         .collect()
-}
-
-/// Share of a Gaussian's image that fell on labelled pixels: the sum of its identity estimates. It is 1 where
-/// the estimates were normalised; estimates over all pixels (methods reference 5.1, n_i^k / d_i) keep it.
-#[must_use]
-pub fn labelled_share(log_estimates: &[f32]) -> f32 {
-    log_estimates.iter().map(|log| log.exp()).sum::<f32>().min(1.0)
 }
 
 /// Owner of every row of `visible`: a dense instance index, or `None` for the background.

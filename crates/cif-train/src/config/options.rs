@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Preset {
-    /// A quick look: about a quarter of the iterations of `standard`.
+    /// A quick look: under a third of the iterations of `standard`, and half its Gaussians.
     Draft,
     /// Tuned for two processor cores and small images.
     #[default]
