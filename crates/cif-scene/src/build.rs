@@ -6,7 +6,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::assignment::{self, Identity};
-use crate::graph::{DenseMotion, DenseSample, Motion, Node, NodeKind, SceneGraph, Splats, TimeCodes};
+use crate::graph::{DenseMotion, DenseSample, Motion, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes};
 use crate::motion::{MeanShape, MovingGroup, dot, vector};
 use crate::procrustes::weighted_quantile;
 use crate::report::MotionReport;
@@ -99,6 +99,7 @@ pub fn build_from(
         sort_metric: field.sort_metric,
         omitted,
         warnings,
+        origin: Origin { field_fingerprint: None, options: Some(options.clone()) },
     })
 }
 
@@ -447,7 +448,7 @@ fn node(
             shape(&mut splats, &group.rigid_shape);
             Motion::Rigid(group.track(time_codes))
         }
-        MotionModel::Dense => {
+        MotionModel::Parts | MotionModel::Dense => {
             // The first sample stands in wherever only the default time is read.
             shape(&mut splats, &group.static_shape);
             if let Some(first) = samples.first() {
@@ -482,6 +483,8 @@ fn node(
         motion,
         splats,
         proxy,
+        colliders: Vec::new(),
+        visibility: Vec::new(),
         extent,
         source_frames: (0, 0),
         mean_occupancy,
@@ -519,6 +522,11 @@ fn motion_report(
     let (residual, samples, motion_bytes) = match motion {
         Motion::Static => (static_residual, 0, 0),
         Motion::Rigid(track) => (rigid_residual.unwrap_or_default(), track.len(), track.len() * pose_bytes),
+        Motion::Parts(motion) => {
+            let samples =
+                motion.track.len() + motion.parts.iter().map(|part| part.track.len()).sum::<usize>();
+            (rigid_residual.unwrap_or_default(), samples, samples * pose_bytes)
+        }
         Motion::Dense(dense) => {
             let per_splat = |sample: &DenseSample| 28 + if sample.scales.is_some() { 12 } else { 0 };
             let bytes: usize =

@@ -5,7 +5,7 @@ use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::report::MotionReport;
-use crate::{UpAxis, extent};
+use crate::{SceneOptions, UpAxis, extent};
 
 /// A scene, ready to be written in any format.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,6 +28,20 @@ pub struct SceneGraph {
     pub omitted: Vec<String>,
     /// What the user should know, one sentence each.
     pub warnings: Vec<String>,
+    /// Where the graph came from: what an edited file is compared with when it comes home.
+    pub origin: Origin,
+}
+
+/// Where a graph came from.
+///
+/// A file that cif wrote keeps both, so that [`Splats::rows`] read from it can be traced to the field and the
+/// graph that was exported can be built again.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Origin {
+    /// Fingerprint of the field whose rows [`Splats::rows`] are; `None` for files that others wrote.
+    pub field_fingerprint: Option<String>,
+    /// Options that the graph was built with; `None` for files that others wrote.
+    pub options: Option<SceneOptions>,
 }
 
 /// Captured frame numbers: frame `f` of the field's timeline is time code `f`.
@@ -89,6 +103,10 @@ pub struct Node {
     pub splats: Splats,
     /// Light stand-in for the splats; `None` when proxies were not asked for.
     pub proxy: Option<PointProxy>,
+    /// Convex hulls of the opaque splats, for simulators; empty when not asked for and for the background.
+    pub colliders: Vec<ConvexHull>,
+    /// Changes of visibility, ascending time codes; empty where the node is always visible.
+    pub visibility: Vec<VisibilitySample>,
     /// Box of the 3-sigma ellipsoids of `splats`, local frame.
     pub extent: Bounds,
     /// Captured frames over which the node exists, first and last.
@@ -99,7 +117,7 @@ pub struct Node {
     pub report: MotionReport,
 }
 
-/// Motion models, cheapest first. Rigid parts are the next model to come between rigid and dense.
+/// Motion models, cheapest first.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum MotionModel {
@@ -107,6 +125,8 @@ pub enum MotionModel {
     Static,
     /// Turns and moves as one body.
     Rigid,
+    /// A few rigid bodies.
+    Parts,
     /// Every Gaussian has its own path.
     Dense,
 }
@@ -116,6 +136,7 @@ impl std::fmt::Display for MotionModel {
         f.pad(match self {
             Self::Static => "static",
             Self::Rigid => "rigid",
+            Self::Parts => "parts",
             Self::Dense => "dense",
         })
     }
@@ -128,6 +149,8 @@ pub enum Motion {
     Static,
     /// The local frame moves; the splats are constant in it.
     Rigid(Vec<PoseSample>),
+    /// The local frame moves, and a few rigid parts move in it.
+    Parts(PartsMotion),
     /// The local frame moves and the splats deform in it.
     Dense(DenseMotion),
 }
@@ -149,6 +172,50 @@ impl PoseSample {
     pub fn transform(&self) -> RigidTransform {
         RigidTransform { rotation: DMat3::from_quat(self.rotation), translation: self.translation }
     }
+}
+
+/// A few rigid parts under one node.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PartsMotion {
+    /// Path of the node's local frame, which carries the bulk of the motion; empty where it stays at the pivot.
+    pub track: Vec<PoseSample>,
+    /// The parts, at least two. Their [`Part::splats`] partition [`Node::splats`] in order.
+    pub parts: Vec<Part>,
+}
+
+/// One rigid part of a node.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Part {
+    /// Unique within the node, `[A-Za-z0-9_]`, e.g. `part_00`.
+    pub name: String,
+    /// Range of [`Node::splats`]; these splats are in the part's own frame.
+    pub splats: std::ops::Range<usize>,
+    /// Origin of the part's frame at the reference time, in the node's local frame.
+    pub pivot: DVec3,
+    /// Poses `node_from_part`, ascending time codes; empty where the part stays at its pivot.
+    pub track: Vec<PoseSample>,
+    /// Box of the 3-sigma ellipsoids, part frame.
+    pub extent: Bounds,
+}
+
+/// A closed convex mesh.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ConvexHull {
+    /// Corners, at most 64; in the node's local frame, or in the part's where there is one.
+    pub points: Vec<[f32; 3]>,
+    /// Triangles, counter-clockwise from outside.
+    pub triangles: Vec<[u32; 3]>,
+    /// Part that the hull moves with.
+    pub part: Option<usize>,
+}
+
+/// A change of visibility; it holds until the next.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VisibilitySample {
+    /// Time code.
+    pub time_code: f64,
+    /// Whether the node can be seen from here on.
+    pub visible: bool,
 }
 
 /// Per-sample splats.
@@ -254,13 +321,37 @@ pub struct CameraSample {
     pub camera: PinholeCamera,
 }
 
+/// Pose on a track at a time code: linear in translation, spherical in rotation between samples, held outside
+/// them; without samples unturned at `rest`.
+#[must_use]
+pub fn pose_at(track: &[PoseSample], rest: DVec3, time_code: f64) -> PoseSample {
+    let Some((first, last)) = track.first().zip(track.last()) else {
+        return PoseSample { time_code, translation: rest, rotation: DQuat::IDENTITY };
+    };
+    let after = track.partition_point(|sample| sample.time_code <= time_code);
+    if after == 0 {
+        return PoseSample { time_code, ..*first };
+    }
+    if after == track.len() {
+        return PoseSample { time_code, ..*last };
+    }
+    let (a, b) = (&track[after - 1], &track[after]);
+    let fraction = (time_code - a.time_code) / (b.time_code - a.time_code);
+    PoseSample {
+        time_code,
+        translation: a.translation.lerp(b.translation, fraction),
+        rotation: a.rotation.slerp(b.rotation, fraction),
+    }
+}
+
 impl Node {
-    /// Path of the local frame: one sample per time code, or none where it stays at the pivot.
+    /// Path of the local frame: samples by ascending time code, or none where it stays at the pivot.
     #[must_use]
     pub fn track(&self) -> &[PoseSample] {
         match &self.motion {
             Motion::Static => &[],
             Motion::Rigid(track) => track,
+            Motion::Parts(parts) => &parts.track,
             Motion::Dense(dense) => &dense.track,
         }
     }
@@ -271,6 +362,7 @@ impl Node {
         match self.motion {
             Motion::Static => MotionModel::Static,
             Motion::Rigid(_) => MotionModel::Rigid,
+            Motion::Parts(_) => MotionModel::Parts,
             Motion::Dense(_) => MotionModel::Dense,
         }
     }
@@ -279,31 +371,34 @@ impl Node {
     /// outside them.
     #[must_use]
     pub fn world_transform(&self, time_code: f64) -> RigidTransform {
-        let track = self.track();
-        let Some((first, last)) = track.first().zip(track.last()) else {
-            return RigidTransform { rotation: DMat3::IDENTITY, translation: self.pivot };
-        };
-        let after = track.partition_point(|sample| sample.time_code <= time_code);
-        if after == 0 {
-            return first.transform();
-        }
-        if after == track.len() {
-            return last.transform();
-        }
-        let (a, b) = (&track[after - 1], &track[after]);
-        let fraction = (time_code - a.time_code) / (b.time_code - a.time_code);
-        PoseSample {
-            time_code,
-            translation: a.translation.lerp(b.translation, fraction),
-            rotation: a.rotation.slerp(b.rotation, fraction),
-        }
-        .transform()
+        pose_at(self.track(), self.pivot, time_code).transform()
+    }
+
+    /// Whether the node can be seen at a time code.
+    #[must_use]
+    pub fn is_visible(&self, time_code: f64) -> bool {
+        let after = self.visibility.partition_point(|sample| sample.time_code <= time_code);
+        self.visibility.get(after.max(1) - 1).is_none_or(|sample| sample.visible)
     }
 
     /// World box of the 3-sigma ellipsoids at a time code. Between dense samples the nearest one counts.
     #[must_use]
     pub fn bounds(&self, time_code: f64) -> Bounds {
         let world_from_local = self.world_transform(time_code);
+        if let Motion::Parts(motion) = &self.motion {
+            let boxes = motion.parts.iter().map(|part| {
+                let world_from_part =
+                    world_from_local.compose(&pose_at(&part.track, part.pivot, time_code).transform());
+                let (splats, range) = (&self.splats, part.splats.clone());
+                extent::ellipsoid_bounds(
+                    &world_from_part,
+                    &splats.means[range.clone()],
+                    &splats.orientations[range.clone()],
+                    &splats.scales[range],
+                )
+            });
+            return boxes.fold(Bounds::EMPTY, |all, bounds| all.union(bounds));
+        }
         let (means, orientations, scales) = match &self.motion {
             Motion::Dense(dense) => {
                 let nearest = dense.samples.iter().min_by(|a, b| {

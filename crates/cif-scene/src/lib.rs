@@ -39,8 +39,8 @@ mod tests;
 pub use build::{build, build_from};
 pub use error::SceneError;
 pub use graph::{
-    CameraSample, CameraTrack, DenseMotion, DenseSample, Motion, MotionModel, Node, NodeKind, PointProxy,
-    PoseSample, SceneGraph, Splats, TimeCodes,
+    CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, Node, NodeKind,
+    Origin, Part, PartsMotion, PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
 pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
 pub use query::{LabelMatch, LabelQuery, QueryError, query};

@@ -139,7 +139,7 @@ fn box_array<'py>(pxr: &Pxr<'py>, bounds: &Bounds) -> PyResult<Bound<'py, PyAny>
 fn dense_samples(node: &Node) -> &[DenseSample] {
     match &node.motion {
         Motion::Dense(dense) => &dense.samples,
-        Motion::Static | Motion::Rigid(_) => &[],
+        Motion::Static | Motion::Rigid(_) | Motion::Parts(_) => &[],
     }
 }
 

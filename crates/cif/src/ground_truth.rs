@@ -225,6 +225,8 @@ mod tests {
             motion: Motion::Rigid(track),
             splats: Splats::default(),
             proxy: None,
+            colliders: Vec::new(),
+            visibility: Vec::new(),
             extent: Bounds::EMPTY,
             source_frames: (0, count - 1),
             mean_occupancy: 1.0,
@@ -244,6 +246,7 @@ mod tests {
             sort_metric: cif_field::SortMetric::Z,
             omitted: Vec::new(),
             warnings: Vec::new(),
+            origin: cif_scene::Origin::default(),
         }
     }
 
