@@ -5,7 +5,7 @@
 //! | [`scalar`] | which number type a formula runs in (`f32` or `f64`) |
 //! | [`transform`] | rigid transforms `a_from_b` |
 //! | [`quaternion`] | rotation of a (w, x, y, z) quaternion, with derivative |
-//! | [`spherical_harmonics`] | view-dependent colour basis, degrees 0 to 3, with derivative |
+//! | [`spherical_harmonics`] | view-dependent colour basis, degrees 0 to 3, with derivative and rotation |
 //! | [`camera`] | ideal pinhole cameras |
 //! | [`lens`] | lens distortion and its removal |
 //! | [`grid`] | row-major pixel grids |

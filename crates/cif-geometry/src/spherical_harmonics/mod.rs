@@ -1,6 +1,10 @@
 //! Real spherical harmonics with the Condon-Shortley sign, degrees 0 to 3, as 3D Gaussian splatting uses
 //! them: `colour = max(0, sum_m basis_m(direction) * coefficient_m + 0.5)`. Source: methods reference 3.1.
 
+mod rotation;
+
+pub use rotation::HarmonicsRotation;
+
 use crate::Real;
 
 /// Coefficients per colour channel at degree 3.
