@@ -66,6 +66,7 @@ fn what_is_not_understood_ends_with_2() {
     cif(folder.path(), "").fails(2, &["Usage"]);
     cif(folder.path(), "train table").fails(2, &["--output"]);
     cif(folder.path(), "train table -o a.cif --resume --seed 3").fails(2, &["--resume"]);
+    cif(folder.path(), "train table -o a.cif --from b.cif --no-masks").fails(2, &["--from", "--no-masks"]);
     cif(folder.path(), "train table -o a.cif --ablate everything").fails(2, &["no-resampling"]);
     cif(folder.path(), "train table -o a.cif --set seed").fails(2, &["KEY=VALUE"]);
     cif(folder.path(), "render a.cif -o out").fails(2, &["--capture"]);
@@ -117,7 +118,9 @@ fn outputs_are_checked_before_training() {
     cif(path, "train table -o no/where/a.cif").fails(1, &["no/where", "mkdir -p"]);
     cif(path, "train table -o table").fails(1, &["is a folder"]);
     cif(path, "train table -o a.cif --resume").fails(1, &["a.cif", "nothing to resume"]);
+    cif(path, "train table -o a.cif --from b.cif").fails(1, &["b.cif", "no such scene"]);
     fs::write(path.join("kept.cif"), "precious").unwrap();
+    cif(path, "train table -o a.cif --from kept.cif").fails(1, &["kept.cif"]);
     cif(path, "train table -o kept.cif").fails(1, &["kept.cif exists", "--force"]);
     cif(path, "train table -o a.cif --log kept.cif").fails(1, &["kept.cif exists"]);
     fs::write(path.join("b.train.toml"), "# mine").unwrap();

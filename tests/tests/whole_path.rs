@@ -145,6 +145,21 @@ fn an_interrupted_run_resumes_to_the_same_scene() {
 }
 
 #[test]
+fn instances_are_trained_on_the_reconstruction_of_another_scene() {
+    let folder = with_capture(6);
+    let path = folder.path();
+    cif(path, &format!("train table -o bare.cif --no-masks {TINY} --set near=0.19")).succeeds();
+    cif(path, "train table -o named.cif --from bare.cif --ablate no-resampling").succeeds();
+    let named = Checkpoint::load(path.join("named.cif")).unwrap().field;
+    assert!(named.identities.is_some());
+    let record = &named.provenance;
+    assert_eq!(record["train"]["from"]["scene"], "bare.cif");
+    assert!((record["config"]["near"].as_f64().unwrap() - 0.19).abs() < 1e-6, "settings of the scene");
+    assert_eq!(record["config"]["instance"]["ablate"][0], "no-resampling");
+    cif(path, "train table -o none.cif --from scene.cif --iterations-fine 3").fails(2, &["--from"]);
+}
+
+#[test]
 fn threads_do_not_change_the_scene() {
     let folder = with_capture(4);
     for threads in [1, 3] {

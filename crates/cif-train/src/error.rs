@@ -90,6 +90,27 @@ pub enum TrainError {
         /// What is wrong.
         reason: String,
     },
+    /// A scene to begin with has no motion, and the capture has.
+    #[error(
+        "{scene} has no deformation, but {} has {times} times; begin with a scene that was trained on them",
+        root.display()
+    )]
+    NoMotion {
+        /// Name of the scene.
+        scene: String,
+        /// Times of the capture.
+        times: usize,
+        /// Folder of the capture.
+        root: PathBuf,
+    },
+    /// A scene to begin with was interrupted before its reconstruction was whole.
+    #[error("{scene} was interrupted in its {stage} stage; finish it first, with --resume")]
+    Unfinished {
+        /// Name of the scene.
+        scene: String,
+        /// Stage it stands in.
+        stage: Stage,
+    },
     /// The checkpoint belongs to another capture.
     #[error("the checkpoint was trained on another capture: {what} was {expected}, and is {found} in {}", root.display())]
     OtherCapture {

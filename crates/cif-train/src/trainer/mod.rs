@@ -7,6 +7,7 @@
 //! | `step` | what one step does |
 //! | `optimiser` | which parameter groups there are, and how fast they move |
 //! | `identity` | how identity rows come about |
+//! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `state` | what is saved, and how a run resumes |
 //! | `times`, `measure` | where the time of a step goes |
 //!
@@ -16,6 +17,7 @@
 
 mod evaluate;
 mod frames;
+mod from_scene;
 mod identity;
 mod initialize;
 mod measure;
@@ -208,6 +210,12 @@ impl Trainer {
     #[must_use]
     pub fn iteration(&self) -> u32 {
         self.progress.iteration
+    }
+
+    /// Steps done in all stages.
+    #[must_use]
+    pub fn steps_done(&self) -> u64 {
+        self.progress.total_steps
     }
 
     /// Steps left in all stages.

@@ -29,6 +29,21 @@ pub(super) struct Progress {
     pub psnr: Option<f64>,
     /// Whether the user was told about unsupported pixels.
     pub warned_of_unsupported: bool,
+    /// The scene whose Gaussians and deformation the run began with, where it began with one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub source: Option<Source>,
+}
+
+/// A scene that a run began with, as recorded.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Source {
+    /// What it was called, without its folder.
+    pub scene: String,
+    /// Its Gaussians.
+    pub gaussians: usize,
+    /// What it recorded of its own training; null where it recorded nothing.
+    pub train: serde_json::Value,
 }
 
 /// Weight of the newest view in the running PSNR.
@@ -49,6 +64,7 @@ impl Progress {
             opacities_were_reset: false,
             psnr: None,
             warned_of_unsupported: false,
+            source: None,
         }
     }
 

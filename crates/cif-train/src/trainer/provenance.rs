@@ -13,7 +13,7 @@ impl Trainer {
             let folder = mask.strip_prefix(&dataset.root).ok().unwrap_or(mask).components().next()?;
             folder.as_os_str().to_str().map(str::to_owned)
         });
-        json!({
+        let mut record = json!({
             "generator": { "name": "cif", "version": env!("CARGO_PKG_VERSION") },
             "dataset": {
                 "name": dataset.root.file_name().and_then(|name| name.to_str()),
@@ -38,7 +38,11 @@ impl Trainer {
                 "psnr_training_views": self.progress.psnr,
             },
             "config": self.config,
-        })
+        });
+        if let Some(source) = &self.progress.source {
+            record["train"]["from"] = json!(source);
+        }
+        record
     }
 }
 

@@ -8,6 +8,7 @@ use cif_field::checkpoint::{Checkpoint, StateTensor, TrainingState};
 use serde::{Deserialize, Serialize};
 
 use super::Trainer;
+use super::optimiser::Optimiser;
 use super::progress::Progress;
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
@@ -19,13 +20,13 @@ const VERSION: u32 = 1;
 /// The JSON part of the state.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-struct State {
+pub(super) struct State {
     version: u32,
-    config: TrainConfig,
-    progress: Progress,
+    pub(super) config: TrainConfig,
+    pub(super) progress: Progress,
     capture: Capture,
     /// Steps per parameter group.
-    adam_steps: BTreeMap<String, u32>,
+    pub(super) adam_steps: BTreeMap<String, u32>,
 }
 
 /// What must be equal for a run to go on.
@@ -37,6 +38,15 @@ pub(super) struct Capture {
     times: usize,
     image_size: [u32; 2],
     instance_ids: Vec<u16>,
+}
+
+impl State {
+    pub(super) fn parse(json: serde_json::Value) -> Result<Self, TrainError> {
+        if json.get("version").and_then(serde_json::Value::as_u64) != Some(u64::from(VERSION)) {
+            return Err(unusable("it was written by another version of the trainer"));
+        }
+        serde_json::from_value(json).map_err(|error| unusable(error.to_string()))
+    }
 }
 
 impl Capture {
@@ -136,25 +146,13 @@ impl Trainer {
     /// cannot be read.
     pub fn resume(dataset: Dataset, checkpoint: Checkpoint) -> Result<Self, TrainError> {
         let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
-        if json.get("version").and_then(serde_json::Value::as_u64) != Some(u64::from(VERSION)) {
-            return Err(unusable("it was written by another version of the trainer"));
-        }
-        let state: State = serde_json::from_value(json).map_err(|error| unusable(error.to_string()))?;
+        let state = State::parse(json)?;
         state.config.validate()?;
         state.capture.check(&Capture::of(&dataset), &dataset)?;
         let mut trainer = Self::assemble(dataset, state.config, checkpoint.field, Some(state.progress))?;
 
         let n = trainer.field.gaussians.len();
-        for (name, moments) in trainer.optimiser.groups_mut() {
-            let len = moments.first.len();
-            moments.first = floats(&mut tensors, &format!("adam.{name}.first"), len)?;
-            moments.second = floats(&mut tensors, &format!("adam.{name}.second"), len)?;
-            moments.births = counters(&mut tensors, &format!("adam.{name}.births"), moments.births.len())?;
-            moments.steps = *state
-                .adam_steps
-                .get(name)
-                .ok_or_else(|| unusable(format!("the step count of {name} is missing")))?;
-        }
+        restore(&mut trainer.optimiser, &mut tensors, &state.adam_steps)?;
         trainer.statistics = DensifyStatistics {
             gradient: floats(&mut tensors, "densify.gradient", n)?,
             count: counters(&mut tensors, "densify.count", n)?,
@@ -170,6 +168,23 @@ impl Trainer {
         };
         Ok(trainer)
     }
+}
+
+/// Moments and step counts of all parameter groups.
+pub(super) fn restore(
+    optimiser: &mut Optimiser,
+    tensors: &mut BTreeMap<String, StateTensor>,
+    steps: &BTreeMap<String, u32>,
+) -> Result<(), TrainError> {
+    for (name, moments) in optimiser.groups_mut() {
+        let len = moments.first.len();
+        moments.first = floats(tensors, &format!("adam.{name}.first"), len)?;
+        moments.second = floats(tensors, &format!("adam.{name}.second"), len)?;
+        moments.births = counters(tensors, &format!("adam.{name}.births"), moments.births.len())?;
+        moments.steps =
+            *steps.get(name).ok_or_else(|| unusable(format!("the step count of {name} is missing")))?;
+    }
+    Ok(())
 }
 
 fn floats(

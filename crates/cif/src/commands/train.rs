@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use cif_dataset::Layout;
 use cif_field::Checkpoint;
-use cif_train::{Control, Outcome, Preset, TrainConfig, TrainEvent, Trainer};
+use cif_train::{Control, Outcome, Preset, TrainConfig, TrainError, TrainEvent, Trainer};
 use clap::{Args, ValueEnum};
 
 use super::{CaptureOptions, Simd, print_warnings, scene};
@@ -23,6 +23,13 @@ written beside the scene as SCENE.train.toml, which --config accepts again.
   cif train captures/table -o table.cif --masks masks_tracker --iterations-fine 8000 --seed 3
   cif train captures/table -o table.cif --config mine.toml --set densify.max_gaussians=30000
 
+Other masks or variants on one reconstruction, without training it again (settings that are not typed
+are those of the scene it comes from):
+
+  cif train captures/table -o table.cif --no-masks
+  cif train captures/table -o exact.cif --from table.cif
+  cif train captures/table -o fixed.cif --from table.cif --ablate no-resampling
+
 Ctrl-C saves and stops; the same command with --resume goes on as if nothing had happened.")]
 pub(super) struct Train {
     /// Folder of the capture
@@ -36,6 +43,11 @@ pub(super) struct Train {
     /// Go on where SCENE.cif was interrupted; settings come from it
     #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings")]
     resume: bool,
+    /// Begin with the Gaussians and the motion of a trained scene of this capture: only identities and
+    /// instances are trained
+    #[arg(long, value_name = "SCENE.cif", conflicts_with_all = ["resume", "no_masks", "iterations_coarse",
+        "iterations_fine"])]
+    from: Option<PathBuf>,
     /// Stop after N steps of this command (at the next report, see report.step_every), saving so that
     /// --resume goes on
     #[arg(long, value_name = "N")]
@@ -130,16 +142,18 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         output::check_file(log, command.force || command.resume)?;
     }
     let checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
+    let source = command.from.as_deref().map(load_source).transpose()?;
+    let base = source.as_ref().and_then(|source| cif_train::metrics::training_config(&source.field));
     if checkpoint.is_none() {
         output::check_file(&settings_path, command.force)?;
         // Typing errors show before a long look at the capture; the layout only shifts preset values.
-        resolve(command, Layout::HyperNerf)?;
+        resolve(command, base.as_ref(), Layout::HyperNerf)?;
     }
 
     let mut capture = command.capture_options.clone();
     let wanted = match &checkpoint {
         Some(checkpoint) => scene::trained_downscale(&checkpoint.field),
-        None => resolve(command, Layout::HyperNerf)?.downscale,
+        None => resolve(command, base.as_ref(), Layout::HyperNerf)?.downscale,
     };
     capture.downscale = capture.downscale.or(wanted);
     let dataset = capture.open(&command.capture)?;
@@ -151,9 +165,15 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     let mut trainer = match checkpoint {
         Some(checkpoint) => Trainer::resume(dataset, checkpoint),
         None => {
-            let config = resolve(command, dataset.layout)?;
+            let config = resolve(command, base.as_ref(), dataset.layout)?;
             let text = toml::to_string_pretty(&config).expect("settings serialise to TOML");
-            let trainer = Trainer::new(dataset, config);
+            let trainer = match (source, &command.from) {
+                (Some(source), Some(path)) => {
+                    let name = path.file_name().unwrap_or_default().to_string_lossy();
+                    Trainer::from_scene(dataset, config, source, &name)
+                }
+                _ => Trainer::new(dataset, config),
+            };
             if trainer.is_ok() {
                 output::write_file(&settings_path, text.as_bytes())?;
             }
@@ -170,7 +190,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     if let Some(failure) = failure {
         return Err(failure);
     }
-    let outcome = outcome.map_err(Error::plain)?;
+    let outcome = outcome.map_err(|error| stopped_by(&error, &trainer, &command.output))?;
     save(&trainer.checkpoint(outcome == Outcome::Interrupted), &command.output)?;
     let saved = command.output.display();
     match outcome {
@@ -194,7 +214,7 @@ fn train(
     trainer: &mut Trainer,
     command: &Train,
     progress: &mut Progress,
-) -> (Result<Outcome, cif_train::TrainError>, Option<Error>) {
+) -> (Result<Outcome, TrainError>, Option<Error>) {
     let mut failure = None;
     let mut steps_done = StepCount::default();
     let outcome = trainer.run(&mut |event, view| {
@@ -248,6 +268,26 @@ fn save(checkpoint: &Checkpoint, path: &Path) -> Result<(), Error> {
     })
 }
 
+/// What stopped the run. Its state is saved: everything up to the failed step is good, and hours may be in it.
+fn stopped_by(error: &TrainError, trainer: &Trainer, path: &Path) -> Error {
+    if trainer.steps_done() == 0 {
+        return Error::plain(error);
+    }
+    let name = path.display();
+    match save(&trainer.checkpoint(true), path) {
+        Ok(()) if matches!(error, TrainError::IdentityMemory { .. }) => Error::failed(
+            error.to_string(),
+            format!(
+                "{name} holds the reconstruction; train its instances on other masks with: cif train {} \
+                 -o OTHER.cif --masks MASKS --from {name}",
+                trainer.dataset().root.display()
+            ),
+        ),
+        Ok(()) => Error::failed(error.to_string(), format!("{name} holds the state before that step")),
+        Err(unsaved) => Error::failed(error.to_string(), format!("its state could not be saved: {unsaved}")),
+    }
+}
+
 /// The command line that goes on with this run.
 fn resume_command(command: &Train) -> String {
     let capture = &command.capture_options;
@@ -287,12 +327,26 @@ fn load_state(path: &Path) -> Result<Checkpoint, Error> {
     Ok(checkpoint)
 }
 
-/// Preset, file, flags.
-fn resolve(command: &Train, layout: Layout) -> Result<TrainConfig, Error> {
+/// A scene to begin with, with its training state where it has one.
+fn load_source(path: &Path) -> Result<Checkpoint, Error> {
+    if path.is_dir() || !path.exists() {
+        return Err(Error::failed(
+            format!("--from {}: no such scene", path.display()),
+            "give a trained scene (.cif); without --from the reconstruction is trained too",
+        ));
+    }
+    Checkpoint::load(path).map_err(Error::plain)
+}
+
+/// Preset or the settings of the scene to begin with, file, flags.
+fn resolve(command: &Train, source: Option<&TrainConfig>, layout: Layout) -> Result<TrainConfig, Error> {
     let typed = command.preset.as_deref().map(|name| preset(name, "--preset")).transpose()?;
     let from_file = command.config.as_deref().map(preset_in_file).transpose()?.flatten();
-    let base = typed.or(from_file).unwrap_or_default();
-    let mut layers = Layers::new(TrainConfig::preset(base, layout));
+    let base = match (typed.or(from_file), source) {
+        (None, Some(source)) => source.clone(),
+        (named, _) => TrainConfig::preset(named.unwrap_or_default(), layout),
+    };
+    let mut layers = Layers::new(base);
     if let Some(path) = &command.config {
         layers.file(path)?;
     }

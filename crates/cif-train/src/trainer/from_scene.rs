@@ -1,0 +1,131 @@
+//! Runs that begin with the Gaussians and the deformation of a trained scene: other masks, or another variant
+//! of the instance stage, on one and the same reconstruction.
+
+use cif_dataset::{Dataset, Split};
+use cif_field::{Checkpoint, Field};
+use cif_geometry::PinholeCamera;
+use cif_geometry::scalar::logit;
+
+use super::progress::{Progress, Source};
+use super::state::{State, restore};
+use super::{Trainer, identity, initialize};
+use crate::config::TrainConfig;
+use crate::error::TrainError;
+use crate::events::Stage;
+
+/// Times that differ by less are the same.
+const SAME_TIME: f64 = 1e-9;
+
+/// Poses whose numbers differ by less, relative to the extent where they are lengths, are the same.
+const SAME_POSE: f64 = 1e-5;
+
+impl Trainer {
+    /// A run at its identity stage, with Gaussians and deformation of `scene`, which `name` calls; identities,
+    /// occupancy, calibration and the table of instances start anew. Coarse and fine steps of `config` only
+    /// place the learning rates.
+    ///
+    /// A scene saved with its state where the reconstruction ended keeps the moments of the optimiser too: the
+    /// run then ends bit for bit where one run through all stages ends.
+    ///
+    /// # Errors
+    /// When a setting cannot work; when the scene is of other times, frames or cameras than the capture, does
+    /// not move, or is not reconstructed yet; when no training mask has a labelled pixel; when the counts of
+    /// identity estimation would not fit; or when a frame cannot be read.
+    pub fn from_scene(
+        dataset: Dataset,
+        config: TrainConfig,
+        scene: Checkpoint,
+        name: &str,
+    ) -> Result<Self, TrainError> {
+        config.validate()?;
+        let Checkpoint { mut field, training } = scene;
+        check_capture(&field, &dataset)?;
+        let mut progress = Progress::at(Stage::Identity);
+        let mut state = None;
+        if let Some(training) = training {
+            let parsed = State::parse(training.json)?;
+            match parsed.progress.stage {
+                stage @ (Stage::Coarse | Stage::Fine) => {
+                    return Err(TrainError::Unfinished { scene: name.to_owned(), stage });
+                }
+                // Moments are kept in a shape that this variant of the optimiser decides.
+                Stage::Identity
+                    if parsed.config.adam.fresh_row_bias_correction
+                        == config.adam.fresh_row_bias_correction =>
+                {
+                    progress = parsed.progress;
+                    state = Some((training.tensors, parsed.adam_steps));
+                }
+                _ => {}
+            }
+        }
+        if dataset.times.len() > 1 && field.deformation.is_none() {
+            return Err(TrainError::NoMotion {
+                scene: name.to_owned(),
+                times: dataset.times.len(),
+                root: dataset.root,
+            });
+        }
+        identity::check_memory(field.gaussians.len(), dataset.instances.len())?;
+        progress.source = Some(Source {
+            scene: name.to_owned(),
+            gaussians: field.gaussians.len(),
+            train: field.provenance.get("train").cloned().unwrap_or_default(),
+        });
+        field.identities = None;
+        field.instances = initialize::instances(&dataset);
+        field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
+        (field.background, field.sort_metric) = (config.background, config.sort_metric);
+        let mut trainer = Self::assemble(dataset, config, field, Some(progress))?;
+        if !trainer.plan.has_instances {
+            return Err(TrainError::NoLabels { root: trainer.dataset.root });
+        }
+        if let Some((mut tensors, steps)) = state {
+            restore(&mut trainer.optimiser, &mut tensors, &steps)?;
+        }
+        trainer.warn_of_capture();
+        trainer.begin(Stage::Identity);
+        Ok(trainer)
+    }
+}
+
+/// Refuses a capture that the scene was not trained on: masks, labels and image size may differ, what was
+/// seen from where and when may not.
+fn check_capture(field: &Field, dataset: &Dataset) -> Result<(), TrainError> {
+    let other = |what, expected: String, found: String| {
+        Err(TrainError::OtherCapture { what, expected, found, root: dataset.root.clone() })
+    };
+    let (times, found) = (&field.timeline.times, &dataset.times);
+    if times.len() != found.len() {
+        return other("the number of times", times.len().to_string(), found.len().to_string());
+    }
+    if let Some((a, b)) = times.iter().zip(found).find(|(a, b)| (*a - *b).abs() > SAME_TIME) {
+        return other("a time", a.to_string(), b.to_string());
+    }
+    let (cameras, frames) = (&field.cameras, &dataset.frames);
+    if cameras.len() != frames.len() {
+        return other("the number of frames", cameras.len().to_string(), frames.len().to_string());
+    }
+    for (camera, frame) in cameras.iter().zip(frames) {
+        let role = |trained| if trained { "trained on" } else { "held out" };
+        let expected = format!("{} at time {}, {}", camera.name, camera.time_index, role(camera.trained));
+        let trained = frame.split == Split::Train;
+        let found = format!("{} at time {}, {}", frame.camera_name, frame.time_index, role(trained));
+        if expected != found {
+            return other("a frame", expected, found);
+        }
+        if !same_pose(&camera.camera, &frame.camera, f64::from(field.extent)) {
+            let at = |camera: &PinholeCamera| {
+                format!("{expected} from {:.4}", camera.camera_from_world.inverse().translation)
+            };
+            return other("the pose of a camera", at(&camera.camera), at(&frame.camera));
+        }
+    }
+    Ok(())
+}
+
+fn same_pose(a: &PinholeCamera, b: &PinholeCamera, extent: f64) -> bool {
+    let (a, b) = (&a.camera_from_world, &b.camera_from_world);
+    a.rotation.abs_diff_eq(b.rotation, SAME_POSE)
+        && a.translation.abs_diff_eq(b.translation, SAME_POSE * extent.max(1.0))
+}
