@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Deformation, Gaussians, Identities, Instance, RecordedCamera, Timeline};
+use crate::tracks::GaussiansMut;
+use crate::{Deformation, Gaussians, Identities, Instance, RecordedCamera, Timeline, Tracks};
 
 /// Order in which a view sorts its Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -20,8 +21,10 @@ pub enum SortMetric {
 pub struct Field {
     /// Canonical Gaussians.
     pub gaussians: Gaussians,
-    /// Motion; `None` for a static scene.
+    /// Learned motion; `None` where nothing was learned to move.
     pub deformation: Option<Deformation>,
+    /// Recorded motion, put on after the learned one; `None` without.
+    pub tracks: Option<Tracks>,
     /// Identity rows, one per Gaussian; `None` before identity estimation or without masks.
     pub identities: Option<Identities>,
     /// Instance table; identity labels index it.
@@ -55,12 +58,42 @@ impl Field {
         self.gaussians.is_empty()
     }
 
-    /// The Gaussians at a normalised time in [0, 1], in raw form with the deformation's deltas added.
+    /// The Gaussians at a normalised time in [0, 1], in raw form: the deformation's deltas added, then moved
+    /// by their tracks. What is hidden at this time has an opacity and an occupancy of 0.
     #[must_use]
     pub fn deformed(&self, time: f64) -> Gaussians {
-        match &self.deformation {
+        let mut posed = match &self.deformation {
             Some(deformation) => deformation.apply(&self.gaussians, time),
             None => self.gaussians.clone(),
+        };
+        if let Some(tracks) = &self.tracks {
+            tracks.at(time).apply(&self.gaussians, GaussiansMut::of(&mut posed));
+        }
+        posed
+    }
+
+    /// Whether Gaussians move or deform over time, by learning or by record.
+    #[must_use]
+    pub fn moves(&self) -> bool {
+        self.deformation.is_some() || self.tracks.as_ref().is_some_and(Tracks::moves)
+    }
+
+    /// The field with the Gaussians `sources[0], sources[1], ...` instead of its own; they may repeat.
+    ///
+    /// # Panics
+    /// When a source is out of range.
+    #[must_use]
+    pub fn gather(&self, sources: &[u32]) -> Self {
+        Self {
+            gaussians: self.gaussians.gather(sources),
+            deformation: self.deformation.clone(),
+            tracks: self.tracks.as_ref().and_then(|tracks| tracks.gather(sources).compact()),
+            identities: self.identities.as_ref().map(|identities| identities.gather(sources)),
+            instances: self.instances.clone(),
+            timeline: self.timeline.clone(),
+            cameras: self.cameras.clone(),
+            provenance: self.provenance.clone(),
+            ..*self
         }
     }
 

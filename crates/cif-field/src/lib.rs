@@ -5,10 +5,12 @@
 //! | [`gaussians`] | what is stored per Gaussian, and how fresh ones begin |
 //! | [`neighbours`] | which points are nearest, coincident ones included |
 //! | [`deformation`] | how Gaussians move: hexplane and MLP parameters, and their evaluation |
+//! | [`tracks`] | what moves by recorded poses rather than by learned deformation |
 //! | [`identity`] | whose a Gaussian is |
 //! | [`instance`] | what the instances are called |
 //! | [`timeline`] | which times were captured, and from which cameras |
 //! | [`field`] | all of it together |
+//! | [`fingerprint`] | whether two fields are the same |
 //! | [`validate`] | which rules every field keeps |
 //! | [`query`] | what exists at a place and time, and whose it is |
 //! | [`checkpoint`] | how `.cif` files are laid out, read and written |
@@ -22,6 +24,7 @@
 //! let field = Field {
 //!     gaussians: Gaussians::from_points(&[[0.0, 0.0, 1.0]], &[[0.9, 0.1, 0.1]])?,
 //!     deformation: None,
+//!     tracks: None,
 //!     identities: Some(Identities {
 //!         row_offsets: vec![0, 1],
 //!         labels: vec![0],
@@ -50,6 +53,7 @@
 pub mod checkpoint;
 pub mod deformation;
 pub mod field;
+pub mod fingerprint;
 pub mod gaussians;
 pub mod identity;
 pub mod instance;
@@ -58,6 +62,7 @@ pub mod query;
 #[cfg(test)]
 mod testing;
 pub mod timeline;
+pub mod tracks;
 pub mod validate;
 
 pub use checkpoint::{Checkpoint, CheckpointError, StateTensor, TrainingState};
@@ -68,4 +73,5 @@ pub use identity::Identities;
 pub use instance::Instance;
 pub use query::{FieldAtTime, QueryResult};
 pub use timeline::{RecordedCamera, Timeline};
+pub use tracks::{TrackGroup, Tracks};
 pub use validate::FieldError;

@@ -1,10 +1,11 @@
 //! Random fields for the unit tests.
 
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
-use glam::{DMat3, DVec2, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
+use crate::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use crate::{
     Deformation, DeformationConfig, Field, Gaussians, Heads, Identities, Instance, RecordedCamera,
     SortMetric, TimeEncoding, Timeline,
@@ -75,6 +76,7 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
     Field {
         gaussians,
         deformation: Some(deformation),
+        tracks: None,
         identities: Some(identities),
         instances,
         timeline: Timeline { times: vec![0.0, 1.0 / 3.0, 0.1 + 0.6, 1.0], frames_per_second: 29.97 },
@@ -85,4 +87,40 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
         extent: 2.345_678_9,
         provenance: serde_json::json!({ "seed": u64::MAX, "loss": 0.1 + 0.2, "tiny": 5e-324, "z": [null, -0.0] }),
     }
+}
+
+/// [`field`] with recorded motion: group 0 turns and travels, group 1 appears late and is dense, group 2 is
+/// exempt from the deformation; a quarter of the Gaussians have no group.
+pub(crate) fn tracked_field(n: usize, seed: u64) -> Field {
+    let mut field = field(n, seed);
+    let group_of: Vec<u32> = (0..n as u32).map(|row| if row % 4 == 3 { NO_GROUP } else { row % 4 }).collect();
+    let members = group_of.iter().filter(|group| **group == 1).count();
+    let mut rng = Pcg64::seed_from_u64(seed ^ 77);
+    let mut row = || std::array::from_fn(|_| rng.random_range(-1.0_f32..1.0));
+    let pose = |time: f64, angle: f64| TrackPose {
+        time,
+        translation: DVec3::new(0.3 + time, -0.2, 0.1 * angle),
+        rotation: DQuat::from_axis_angle(DVec3::new(1.0, 2.0, 2.0) / 3.0, angle),
+    };
+    let dense = DenseTrack {
+        times: vec![0.1, 0.5, 0.9],
+        means: (0..3 * members).map(|_| row()).collect(),
+        quaternions: (0..3 * members).map(|k| [1.0, 0.1, 0.01 * k as f32, -0.2]).collect(),
+        log_scales: Some(vec![[-2.0, -3.0, -2.5]; 3 * members]),
+    };
+    let still = |name: &str| TrackGroup::still(name, DVec3::new(0.25, 0.5, -0.125));
+    let groups = vec![
+        TrackGroup { poses: vec![pose(0.0, 0.0), pose(0.25, 0.9), pose(0.75, -0.6)], ..still("turning") },
+        TrackGroup {
+            visibility: vec![
+                VisibilityStep { time: 0.0, visible: false },
+                VisibilityStep { time: 0.5, visible: true },
+            ],
+            dense: Some(dense),
+            ..still("late")
+        },
+        TrackGroup { deformed: false, poses: vec![pose(0.5, 2.5)], ..still("added") },
+    ];
+    field.tracks = Some(Tracks { group_of, groups });
+    field
 }

@@ -3,6 +3,7 @@
 use cif_geometry::Bounds;
 
 use crate::deformation::ConfigError;
+use crate::tracks::{NO_GROUP, TrackGroup, Tracks};
 use crate::{Deformation, Field, Gaussians, Identities, Instance, RecordedCamera, Timeline};
 
 /// Largest deviation of a camera rotation from orthonormality.
@@ -71,6 +72,16 @@ pub enum FieldError {
         /// What is wrong.
         problem: String,
     },
+    /// A group of recorded motion is inconsistent.
+    #[error("track group {index} ({name:?}) {problem}")]
+    Track {
+        /// Position in [`Tracks::groups`].
+        index: usize,
+        /// Its name.
+        name: String,
+        /// What is wrong.
+        problem: String,
+    },
     /// A captured time or rate is out of range.
     #[error("the timeline is broken: {problem}")]
     Timeline {
@@ -108,6 +119,9 @@ impl Field {
         self.gaussians.validate()?;
         if let Some(deformation) = &self.deformation {
             deformation.validate()?;
+        }
+        if let Some(tracks) = &self.tracks {
+            tracks.validate(self.gaussians.len())?;
         }
         validate_instances(&self.instances)?;
         if let Some(identities) = &self.identities {
@@ -226,6 +240,87 @@ impl Identities {
         finite("identities.log_estimates", &self.log_estimates, 1)?;
         finite("identities.log_calibrations", &self.log_calibrations, 1)
     }
+}
+
+/// Largest deviation of a track's quaternion from unit norm.
+const MAX_NORM_ERROR: f64 = 1e-6;
+
+impl Tracks {
+    /// Checks the groups against `gaussians` rows: every group is there, samples ascend in time, poses are
+    /// finite and unit, dense samples hold all members.
+    ///
+    /// # Errors
+    /// The first broken rule.
+    pub fn validate(&self, gaussians: usize) -> Result<(), FieldError> {
+        same_length("tracks.group_of", self.group_of.len(), gaussians)?;
+        let mut members = vec![0_usize; self.groups.len()];
+        for (row, &group) in self.group_of.iter().enumerate().filter(|(_, group)| **group != NO_GROUP) {
+            let Some(count) = members.get_mut(group as usize) else {
+                return Err(FieldError::Value {
+                    name: "tracks.group_of",
+                    value: format!("{group} at row {row}"),
+                    expected: "the index of a group",
+                });
+            };
+            *count += 1;
+        }
+        for (index, (group, &members)) in self.groups.iter().zip(&members).enumerate() {
+            validate_group(group, members).map_err(|problem| FieldError::Track {
+                index,
+                name: group.name.clone(),
+                problem,
+            })?;
+        }
+        Ok(())
+    }
+}
+
+fn validate_group(group: &TrackGroup, members: usize) -> Result<(), String> {
+    fn ascending(what: &str, times: impl Iterator<Item = f64> + Clone) -> Result<(), String> {
+        if let Some(time) = times.clone().find(|time| !time.is_finite()) {
+            return Err(format!("has a {what} at the time {time}"));
+        }
+        match times.clone().zip(times.skip(1)).find(|(before, after)| before >= after) {
+            Some((before, after)) => {
+                Err(format!("has a {what} at {after} after one at {before}, but times must ascend"))
+            }
+            None => Ok(()),
+        }
+    }
+    if !group.pivot.is_finite() {
+        return Err("has a pivot that is not finite".to_owned());
+    }
+    ascending("pose", group.poses.iter().map(|pose| pose.time))?;
+    ascending("change of visibility", group.visibility.iter().map(|step| step.time))?;
+    if group.poses.iter().any(|pose| !pose.translation.is_finite()) {
+        return Err("has a pose whose translation is not finite".to_owned());
+    }
+    // Written so that a NaN fails too.
+    if !group.poses.iter().all(|pose| (pose.rotation.length() - 1.0).abs() <= MAX_NORM_ERROR) {
+        return Err("has a pose whose quaternion is not unit".to_owned());
+    }
+    let Some(dense) = &group.dense else { return Ok(()) };
+    ascending("dense sample", dense.times.iter().copied())?;
+    if dense.times.is_empty() {
+        return Err("has a dense track without samples".to_owned());
+    }
+    let expected = dense.times.len().checked_mul(members);
+    let lengths = [
+        ("centres", dense.means.len()),
+        ("quaternions", dense.quaternions.len()),
+        ("log-scales", dense.log_scales.as_ref().map_or(dense.means.len(), Vec::len)),
+    ];
+    for (what, found) in lengths {
+        if Some(found) != expected {
+            let samples = dense.times.len();
+            return Err(format!("has {found} {what} for {samples} samples of {members} Gaussians"));
+        }
+    }
+    let not_finite = |error: FieldError| error.to_string();
+    finite("its centres", dense.means.as_flattened(), 3).map_err(not_finite)?;
+    finite("its quaternions", dense.quaternions.as_flattened(), 4).map_err(not_finite)?;
+    finite("its log-scales", dense.log_scales.as_deref().unwrap_or_default().as_flattened(), 3)
+        .map_err(not_finite)
 }
 
 impl Timeline {

@@ -58,7 +58,7 @@ pub struct RenderSettings {
     pub antialiased: bool,
     /// Depth order.
     pub sort_metric: SortMetric,
-    /// Evaluate the deformation; off in the coarse stage.
+    /// Evaluate the learned deformation; off in the coarse stage. Recorded motion always counts.
     pub deform: bool,
     /// Instance pass; `None` skips it.
     pub instances: Option<InstanceSettings>,

@@ -73,6 +73,7 @@ pub fn generate(config: &SyntheticConfig) -> SyntheticScene {
     let field = Field {
         gaussians,
         deformation,
+        tracks: None,
         identities,
         instances: (0..config.instances)
             .map(|k| Instance {

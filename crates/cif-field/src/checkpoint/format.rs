@@ -3,10 +3,24 @@
 use cif_geometry::Bounds;
 use serde::{Deserialize, Serialize};
 
+use glam::{DQuat, DVec3};
+
+use crate::tracks::{DenseTrack, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Timeline};
 
-/// Version of the layout that this crate writes, and the newest that it reads.
-pub const FORMAT: u32 = 1;
+/// Newest version of the layout, which this crate writes where it is needed; it reads all up to it.
+///
+/// 1 is the first; 2 adds recorded motion ([`crate::Tracks`]). A field without tracks is written as 1, so that
+/// older software reads it.
+pub const FORMAT: u32 = 2;
+
+/// The layout before there were tracks.
+const FORMAT_WITHOUT_TRACKS: u32 = 1;
+
+/// Oldest layout that holds a field.
+pub(super) fn format_of(field: &Field) -> u32 {
+    if field.tracks.is_some() { FORMAT } else { FORMAT_WITHOUT_TRACKS }
+}
 
 /// Longest header, bytes; the limit of the safetensors format.
 pub(super) const MAX_HEADER: u64 = 100_000_000;
@@ -24,6 +38,11 @@ pub(super) const OCCUPANCY_LOGITS: &str = "gaussians.occupancy_logits";
 pub(super) const SH_COEFFICIENTS: &str = "gaussians.sh_coefficients";
 pub(super) const PLANES: &str = "deformation.planes";
 pub(super) const MLP: &str = "deformation.mlp";
+pub(super) const TRACK_GROUPS: &str = "tracks.group_of";
+pub(super) const TRACK_POSES: &str = "tracks.poses";
+pub(super) const TRACK_MEANS: &str = "tracks.means";
+pub(super) const TRACK_QUATERNIONS: &str = "tracks.quaternions";
+pub(super) const TRACK_LOG_SCALES: &str = "tracks.log_scales";
 pub(super) const ROW_OFFSETS: &str = "identities.row_offsets";
 pub(super) const LABELS: &str = "identities.labels";
 pub(super) const LOG_ESTIMATES: &str = "identities.log_estimates";
@@ -35,6 +54,8 @@ pub(super) const TRAINING_PREFIX: &str = "training.";
 #[serde(deny_unknown_fields)]
 pub(super) struct FieldJson {
     pub(super) deformation: Option<DeformationJson>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) tracks: Option<Vec<TrackGroupJson>>,
     pub(super) has_identities: bool,
     pub(super) instances: Vec<Instance>,
     pub(super) timeline: Timeline,
@@ -54,6 +75,105 @@ pub(super) struct DeformationJson {
     pub(super) bounds: Bounds,
 }
 
+/// The part of a [`TrackGroup`] that is not a tensor.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct TrackGroupJson {
+    name: String,
+    deformed: bool,
+    pivot: [f64; 3],
+    /// Rows of the poses' tensor; those of the groups follow one another.
+    pub(super) poses: usize,
+    /// Pairs of time and whether visible.
+    visibility: Vec<(f64, bool)>,
+    pub(super) dense: Option<DenseJson>,
+}
+
+/// The part of a [`DenseTrack`] that is not a tensor.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct DenseJson {
+    times: Vec<f64>,
+    /// Rows of the dense tensors.
+    pub(super) rows: usize,
+    /// Whether log-scales are sampled too.
+    pub(super) log_scales: bool,
+}
+
+/// Time, translation x y z, quaternion w x y z.
+pub(super) const POSE_FLOATS: usize = 8;
+
+/// What a group takes from the tensors.
+#[derive(Default)]
+pub(super) struct TrackArrays {
+    pub(super) poses: Vec<[f64; POSE_FLOATS]>,
+    pub(super) means: Vec<[f32; 3]>,
+    pub(super) quaternions: Vec<[f32; 4]>,
+    pub(super) log_scales: Vec<[f32; 3]>,
+}
+
+impl TrackGroupJson {
+    fn of(group: &TrackGroup) -> Self {
+        Self {
+            name: group.name.clone(),
+            deformed: group.deformed,
+            pivot: group.pivot.to_array(),
+            poses: group.poses.len(),
+            visibility: group.visibility.iter().map(|step| (step.time, step.visible)).collect(),
+            dense: group.dense.as_ref().map(|dense| DenseJson {
+                times: dense.times.clone(),
+                rows: dense.means.len(),
+                log_scales: dense.log_scales.is_some(),
+            }),
+        }
+    }
+
+    /// The group again; `arrays` hold its own rows only.
+    pub(super) fn group(self, arrays: TrackArrays) -> TrackGroup {
+        let pose = |[time, x, y, z, qw, qx, qy, qz]: [f64; POSE_FLOATS]| TrackPose {
+            time,
+            translation: DVec3::new(x, y, z),
+            rotation: DQuat::from_xyzw(qx, qy, qz, qw),
+        };
+        TrackGroup {
+            name: self.name,
+            deformed: self.deformed,
+            pivot: DVec3::from_array(self.pivot),
+            poses: arrays.poses.into_iter().map(pose).collect(),
+            visibility: self
+                .visibility
+                .into_iter()
+                .map(|(time, visible)| VisibilityStep { time, visible })
+                .collect(),
+            dense: self.dense.map(|dense| DenseTrack {
+                times: dense.times,
+                means: arrays.means,
+                quaternions: arrays.quaternions,
+                log_scales: dense.log_scales.then_some(arrays.log_scales),
+            }),
+        }
+    }
+}
+
+impl TrackArrays {
+    /// The tensors of all groups.
+    pub(super) fn of(tracks: &Tracks) -> Self {
+        let mut arrays = Self::default();
+        for group in &tracks.groups {
+            arrays.poses.extend(group.poses.iter().map(|pose| {
+                let (t, q) = (pose.translation, pose.rotation);
+                [pose.time, t.x, t.y, t.z, q.w, q.x, q.y, q.z]
+            }));
+            if let Some(dense) = &group.dense {
+                arrays.means.extend_from_slice(&dense.means);
+                arrays.quaternions.extend_from_slice(&dense.quaternions);
+                arrays.log_scales.extend_from_slice(dense.log_scales.as_deref().unwrap_or_default());
+            }
+        }
+        arrays
+    }
+}
+
 impl FieldJson {
     pub(super) fn of(field: &Field) -> Self {
         Self {
@@ -61,6 +181,10 @@ impl FieldJson {
                 config: deformation.config.clone(),
                 bounds: deformation.bounds,
             }),
+            tracks: field
+                .tracks
+                .as_ref()
+                .map(|tracks| tracks.groups.iter().map(TrackGroupJson::of).collect()),
             has_identities: field.identities.is_some(),
             instances: field.instances.clone(),
             timeline: field.timeline.clone(),

@@ -4,7 +4,7 @@
 //!
 //! | key | holds |
 //! |---|---|
-//! | `cif.format` | [`FORMAT`], a decimal number |
+//! | `cif.format` | up to [`FORMAT`], a decimal number: the oldest layout that holds the field |
 //! | `cif.version` | version of the cif that wrote the file |
 //! | `cif.field` | JSON of everything in a [`Field`] that is not a tensor |
 //! | `cif.training` | JSON of the [`TrainingState`]; absent in a scene without one |
@@ -18,6 +18,10 @@
 //! | `gaussians.opacity_logits`, `gaussians.occupancy_logits` | F32 | `[N]` |
 //! | `gaussians.sh_coefficients` | F32 | `[N, 16, 3]` |
 //! | `deformation.planes`, `deformation.mlp` | F32 | `[floats]`; absent in a static scene |
+//! | `tracks.group_of` | U32 | `[N]`, 2^32 - 1 without a group; absent without recorded motion, as the next four |
+//! | `tracks.poses` | F64 | `[poses, 8]`: time, translation x y z, quaternion w x y z; group after group |
+//! | `tracks.means`, `tracks.log_scales` | F32 | `[rows, 3]`, dense samples, group after group |
+//! | `tracks.quaternions` | F32 | `[rows, 4]`, w x y z |
 //! | `identities.row_offsets` | U32 | `[N + 1]`; absent without identities, as the next two |
 //! | `identities.labels` | U16 | `[E]` |
 //! | `identities.log_estimates`, `identities.log_calibrations` | F32 | `[E]` |

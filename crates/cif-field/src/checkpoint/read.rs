@@ -11,12 +11,13 @@ use safetensors::tensor::{Metadata, TensorInfo};
 
 use super::format::{
     FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES,
-    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, QUATERNIONS, ROW_OFFSETS,
-    SH_COEFFICIENTS, TRAINING_KEY, TRAINING_PREFIX, VERSION_KEY,
+    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS,
+    SH_COEFFICIENTS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY,
+    TRAINING_PREFIX, TrackArrays, TrackGroupJson, VERSION_KEY,
 };
 use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 use crate::gaussians::SH_FLOATS;
-use crate::{Deformation, Field, Gaussians, Identities};
+use crate::{Deformation, Field, Gaussians, Identities, Tracks};
 
 pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
     let failed = |source: io::Error| CheckpointError::Read { path: path.to_owned(), source };
@@ -90,6 +91,7 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
             })
         }
     };
+    let tracks = json.tracks.map(|groups| read_tracks(reader, groups, n)).transpose()?;
     let identities = if json.has_identities {
         let entries = match reader.info(LABELS, Dtype::U16)?.shape[..] {
             [entries] => entries,
@@ -108,6 +110,7 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
     Ok(Field {
         gaussians,
         deformation,
+        tracks,
         identities,
         instances: json.instances,
         timeline: json.timeline,
@@ -118,6 +121,45 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
         extent: json.extent,
         provenance: json.provenance,
     })
+}
+
+fn read_tracks<S: Read + Seek>(
+    reader: &mut Reader<'_, S>,
+    groups: Vec<TrackGroupJson>,
+    n: usize,
+) -> Result<Tracks, CheckpointError> {
+    let group_of = reader.values(TRACK_GROUPS, Dtype::U32, n, &[])?;
+    let rows_of = |group: &TrackGroupJson| group.dense.as_ref().map_or(0, |dense| dense.rows);
+    let scale_rows_of = |group: &TrackGroupJson| {
+        group.dense.as_ref().filter(|dense| dense.log_scales).map_or(0, |dense| dense.rows)
+    };
+    // The tensors must have exactly as many rows as the groups say, so that no sum can overflow afterwards.
+    let total = |count: &dyn Fn(&TrackGroupJson) -> usize| {
+        groups.iter().try_fold(0_usize, |sum, group| sum.checked_add(count(group))).unwrap_or(usize::MAX)
+    };
+    let rows = total(&rows_of);
+    let all = TrackArrays {
+        poses: reader.values(TRACK_POSES, Dtype::F64, total(&|group| group.poses), &[POSE_FLOATS])?,
+        means: reader.values(TRACK_MEANS, Dtype::F32, rows, &[3])?,
+        quaternions: reader.values(TRACK_QUATERNIONS, Dtype::F32, rows, &[4])?,
+        log_scales: reader.values(TRACK_LOG_SCALES, Dtype::F32, total(&scale_rows_of), &[3])?,
+    };
+    let (mut poses, mut means) = (all.poses.into_iter(), all.means.into_iter());
+    let (mut quaternions, mut log_scales) = (all.quaternions.into_iter(), all.log_scales.into_iter());
+    let groups = groups
+        .into_iter()
+        .map(|group| {
+            let (rows, scale_rows) = (rows_of(&group), scale_rows_of(&group));
+            let own = TrackArrays {
+                poses: poses.by_ref().take(group.poses).collect(),
+                means: means.by_ref().take(rows).collect(),
+                quaternions: quaternions.by_ref().take(rows).collect(),
+                log_scales: log_scales.by_ref().take(scale_rows).collect(),
+            };
+            group.group(own)
+        })
+        .collect();
+    Ok(Tracks { group_of, groups })
 }
 
 fn read_training<S: Read + Seek>(

@@ -272,6 +272,45 @@ fn a_later_format_names_the_cif_that_reads_it() {
 }
 
 #[test]
+fn recorded_motion_survives_and_raises_the_format() {
+    let format = |bytes: &[u8]| {
+        let (_, header) = safetensors::SafeTensors::read_metadata(bytes).unwrap();
+        header.metadata().clone().unwrap()["cif.format"].clone()
+    };
+    let plain = example(20);
+    assert_eq!(format(&bytes_of(&plain)), "1", "older software reads fields without tracks");
+    let tracked = Checkpoint { field: testing::tracked_field(20, 4), training: None };
+    let bytes = bytes_of(&tracked);
+    assert_eq!(format(&bytes), "2");
+    let loaded = read_bytes(&bytes).unwrap();
+    assert_eq!(loaded, tracked);
+    assert_eq!(bytes_of(&loaded), bytes);
+    let empty = Checkpoint {
+        field: Field { tracks: Some(Default::default()), ..testing::field(0, 1) },
+        training: None,
+    };
+    assert_eq!(read_bytes(&bytes_of(&empty)).unwrap(), empty);
+}
+
+#[test]
+fn tracks_that_do_not_fit_their_tensors_are_refused() {
+    let bytes = bytes_of(&Checkpoint { field: testing::tracked_field(20, 4), training: None });
+    let change = |change: &dyn Fn(&mut serde_json::Value)| {
+        message(read_bytes(&with_field(&bytes, |field| change(&mut field["tracks"]))))
+    };
+    let poses = change(&|tracks| tracks[0]["poses"] = json!(5));
+    assert!(poses.contains("`tracks.poses` has the shape [4, 8], expected [6, 8]"), "{poses}");
+    let overflow = change(&|tracks| tracks[0]["poses"] = json!(u64::MAX));
+    assert!(overflow.contains("`tracks.poses`"), "{overflow}");
+    let dense = change(&|tracks| tracks[1]["dense"]["rows"] = json!(14));
+    assert!(dense.contains("`tracks.means` has the shape [15, 3]"), "{dense}");
+    let times = change(&|tracks| tracks[1]["dense"]["times"] = json!([0.1, 0.5]));
+    assert!(times.contains("has 15 centres for 2 samples of 5 Gaussians"), "{times}");
+    let none = change(&|tracks| *tracks = serde_json::Value::Null);
+    assert!(none.contains("is not part of a scene"), "{none}");
+}
+
+#[test]
 fn tensors_that_do_not_fit_are_named() {
     let bytes = bytes_of(&example(4));
     let reshape = |name: &str, shape: serde_json::Value| {

@@ -10,9 +10,10 @@ use safetensors::tensor::TensorInfo;
 use serde::Serialize;
 
 use super::format::{
-    FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES,
-    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, QUATERNIONS, ROW_OFFSETS,
-    SH_COEFFICIENTS, TRAINING_KEY, TRAINING_PREFIX, VERSION_KEY,
+    FIELD_KEY, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES, MAX_HEADER, MEANS,
+    MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS, SH_COEFFICIENTS,
+    TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY,
+    TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of,
 };
 use super::{CheckpointError, StateTensor, TrainingState};
 use crate::Field;
@@ -116,11 +117,12 @@ pub(super) fn write(
     }
 
     let mut metadata = BTreeMap::from([
-        (FORMAT_KEY, FORMAT.to_string()),
+        (FORMAT_KEY, format_of(field).to_string()),
         (VERSION_KEY, env!("CARGO_PKG_VERSION").to_owned()),
         (FIELD_KEY, json(serde_json::to_string(&FieldJson::of(field)))?),
     ]);
-    let mut tensors = field_tensors(field);
+    let track_arrays = field.tracks.as_ref().map(TrackArrays::of);
+    let mut tensors = field_tensors(field, track_arrays.as_ref());
     if let Some(training) = training {
         metadata.insert(TRAINING_KEY, json(serde_json::to_string(&training.json))?);
         tensors.extend(training.tensors.iter().map(|(name, tensor)| state_tensor(name, tensor)));
@@ -159,7 +161,7 @@ fn deeper_than(value: &serde_json::Value, levels: usize) -> bool {
     }
 }
 
-fn field_tensors(field: &Field) -> Vec<Tensor<'_>> {
+fn field_tensors<'a>(field: &'a Field, track_arrays: Option<&'a TrackArrays>) -> Vec<Tensor<'a>> {
     fn tensor<'a, T: bytemuck::NoUninit>(
         name: &str,
         dtype: Dtype,
@@ -187,6 +189,13 @@ fn field_tensors(field: &Field) -> Vec<Tensor<'_>> {
     if let Some(deformation) = &field.deformation {
         tensors.push(tensor(PLANES, Dtype::F32, &deformation.planes, &[]));
         tensors.push(tensor(MLP, Dtype::F32, &deformation.mlp, &[]));
+    }
+    if let Some((tracks, arrays)) = field.tracks.as_ref().zip(track_arrays) {
+        tensors.push(tensor(TRACK_GROUPS, Dtype::U32, &tracks.group_of, &[]));
+        tensors.push(tensor(TRACK_POSES, Dtype::F64, &arrays.poses, &[POSE_FLOATS]));
+        tensors.push(tensor(TRACK_MEANS, Dtype::F32, &arrays.means, &[3]));
+        tensors.push(tensor(TRACK_QUATERNIONS, Dtype::F32, &arrays.quaternions, &[4]));
+        tensors.push(tensor(TRACK_LOG_SCALES, Dtype::F32, &arrays.log_scales, &[3]));
     }
     if let Some(identities) = &field.identities {
         tensors.push(tensor(ROW_OFFSETS, Dtype::U32, &identities.row_offsets, &[]));

@@ -112,6 +112,8 @@ pub(super) struct PosedArrays {
     pub(super) log_scales: Vec<[f32; 3]>,
     pub(super) quaternions: Vec<[f32; 4]>,
     pub(super) opacity_logits: Vec<f32>,
+    /// Only tracks hide things.
+    pub(super) occupancy_logits: Vec<f32>,
     pub(super) sh_coefficients: Vec<[f32; SH_FLOATS]>,
 }
 

@@ -1,6 +1,7 @@
 //! Strings the stages together.
 
-use cif_field::{Field, Gaussians, Identities};
+use cif_field::tracks::{GaussiansMut, TracksAtTime};
+use cif_field::{Deformation, Field, Gaussians, Identities};
 use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
@@ -223,7 +224,8 @@ impl Renderer {
     /// multiplies the view's mean instance loss.
     ///
     /// # Panics
-    /// Without a forward pass before, or when sizes differ from it.
+    /// Without a forward pass before, when sizes differ from it, or when the field has recorded motion, which is
+    /// not differentiated.
     pub fn backward(
         &mut self,
         field: &Field,
@@ -232,6 +234,7 @@ impl Renderer {
         gradients: &mut Gradients,
     ) {
         let (view, settings, time) = self.tape.view.expect("backward follows a forward pass");
+        assert!(field.tracks.is_none(), "recorded motion has no gradients: trainers refuse such fields");
         assert_eq!((v_color.width, v_color.height), (view.width, view.height), "cotangent size");
         let mut times = self.times;
         let (pairs, label_mass, label_offsets) = timed(&mut times.rasterize_backward, || {
@@ -313,21 +316,33 @@ impl Renderer {
         }
     }
 
-    /// The canonical Gaussians moved to a time: every array in raw form, deltas added (methods reference 2.3).
+    /// The canonical Gaussians moved to a time: every array in raw form, deltas added (methods reference 2.3),
+    /// then moved by their tracks.
     pub fn deform(&mut self, field: &Field, time: f64) -> Gaussians {
-        let mut moved = field.gaussians.clone();
-        if let Some(deformation) = &field.deformation {
-            let mut posed = PosedArrays::default();
-            DeformationAtTime::new(deformation, time).forward(self.level, &field.gaussians, &mut posed);
-            moved.means = posed.means;
-            moved.log_scales = posed.log_scales;
-            moved.quaternions = posed.quaternions;
-            moved.opacity_logits = posed.opacity_logits;
-            if !posed.sh_coefficients.is_empty() {
-                moved.sh_coefficients = posed.sh_coefficients;
-            }
+        self.posed_gaussians(field, field.tracks.as_ref().map(|tracks| tracks.at(time)), time)
+    }
+
+    /// As [`Self::deform`], with what is hidden at the time as if it were not.
+    pub fn deform_unhidden(&mut self, field: &Field, time: f64) -> Gaussians {
+        let tracks = field.tracks.as_ref().map(|tracks| tracks.at(time).unhidden());
+        self.posed_gaussians(field, tracks, time)
+    }
+
+    fn posed_gaussians(&mut self, field: &Field, tracks: Option<TracksAtTime<'_>>, time: f64) -> Gaussians {
+        let mut posed = PosedArrays::default();
+        pose(self.level, field, field.deformation.as_ref(), tracks, time, &mut posed);
+        let canonical = &field.gaussians;
+        fn or<T: Clone>(moved: Vec<T>, canonical: &[T]) -> Vec<T> {
+            if moved.is_empty() { canonical.to_vec() } else { moved }
         }
-        moved
+        Gaussians {
+            means: or(posed.means, &canonical.means),
+            log_scales: or(posed.log_scales, &canonical.log_scales),
+            quaternions: or(posed.quaternions, &canonical.quaternions),
+            opacity_logits: or(posed.opacity_logits, &canonical.opacity_logits),
+            occupancy_logits: or(posed.occupancy_logits, &canonical.occupancy_logits),
+            sh_coefficients: or(posed.sh_coefficients, &canonical.sh_coefficients),
+        }
     }
 
     /// Deformation, projection, sorting and tile lists of a view.
@@ -337,11 +352,10 @@ impl Renderer {
         let tape = &mut self.tape;
         let view = ViewConstants::new(camera, settings);
         tape.view = Some((view, *settings, time));
-        timed(&mut times.deform, || match field.deformation.as_ref().filter(|_| settings.deform) {
-            Some(deformation) => {
-                DeformationAtTime::new(deformation, time).forward(level, &field.gaussians, &mut tape.posed);
-            }
-            None => tape.posed = PosedArrays::default(),
+        timed(&mut times.deform, || {
+            let deformation = field.deformation.as_ref().filter(|_| settings.deform);
+            let tracks = field.tracks.as_ref().map(|tracks| tracks.at(time));
+            pose(level, field, deformation, tracks, time, &mut tape.posed);
         });
         timed(&mut times.project, || {
             let posed = PosedView::new(&field.gaussians, &tape.posed);
@@ -727,6 +741,44 @@ impl SplatGradient {
     }
 }
 
+/// The one place where Gaussians are moved to a time: learned deltas, then tracks. Arrays that nothing moves
+/// are left empty.
+fn pose(
+    level: Level,
+    field: &Field,
+    deformation: Option<&Deformation>,
+    tracks: Option<TracksAtTime<'_>>,
+    time: f64,
+    posed: &mut PosedArrays,
+) {
+    let canonical = &field.gaussians;
+    match deformation {
+        Some(deformation) => DeformationAtTime::new(deformation, time).forward(level, canonical, posed),
+        None => *posed = PosedArrays::default(),
+    }
+    posed.occupancy_logits.clear();
+    let Some(tracks) = tracks.filter(TracksAtTime::changes_anything) else { return };
+    if deformation.is_none() {
+        posed.means.clone_from(&canonical.means);
+        posed.log_scales.clone_from(&canonical.log_scales);
+        posed.quaternions.clone_from(&canonical.quaternions);
+        posed.opacity_logits.clone_from(&canonical.opacity_logits);
+    }
+    posed.occupancy_logits.clone_from(&canonical.occupancy_logits);
+    if posed.sh_coefficients.is_empty() && tracks.changes_sh() {
+        posed.sh_coefficients.clone_from(&canonical.sh_coefficients);
+    }
+    let moved = GaussiansMut {
+        means: &mut posed.means,
+        log_scales: &mut posed.log_scales,
+        quaternions: &mut posed.quaternions,
+        opacity_logits: &mut posed.opacity_logits,
+        occupancy_logits: &mut posed.occupancy_logits,
+        sh_coefficients: &mut posed.sh_coefficients,
+    };
+    tracks.apply(canonical, moved);
+}
+
 /// Posed parameters by row, falling back to the canonical ones where nothing moves.
 struct PosedView<'a> {
     canonical: &'a Gaussians,
@@ -741,7 +793,7 @@ impl<'a> PosedView<'a> {
     #[inline(always)]
     fn at(&self, row: usize) -> Posed<'a> {
         let (canonical, moved) = (self.canonical, self.moved);
-        let occupancy_logit = canonical.occupancy_logits[row];
+        let occupancy_logit = *moved.occupancy_logits.get(row).unwrap_or(&canonical.occupancy_logits[row]);
         let sh = moved.sh_coefficients.get(row).unwrap_or(&canonical.sh_coefficients[row]);
         if moved.means.is_empty() {
             Posed {

@@ -15,6 +15,7 @@ use super::rasterize::{
 };
 use super::scene::{Parameters, Scene};
 use super::sort::sort;
+use super::tracks::follow;
 use crate::constants::MIN_COVERAGE;
 use crate::cpu::IdentityCounts;
 use crate::image::{Channels, RenderedImage};
@@ -91,8 +92,15 @@ pub fn forward<R: Real>(
         assert_eq!((labels.width, labels.height), (camera.width, camera.height), "size of the label map");
     }
     let view = View::from_camera(camera);
-    let deformed: Vec<Deformed<R>> =
+    let mut deformed: Vec<Deformed<R>> =
         (0..scene.parameters.gaussians.len()).map(|i| deform(scene, i, time, settings.deform)).collect();
+    if let Some(tracks) = scene.tracks.as_ref().map(|tracks| tracks.at(time)) {
+        for (row, deformed) in deformed.iter_mut().enumerate() {
+            if let Some((group, member)) = tracks.group(row) {
+                follow(group, member, &scene.parameters.gaussians[row], &mut deformed.gaussian);
+            }
+        }
+    }
     let splats: Vec<Option<Splat2d<R>>> =
         deformed.iter().map(|deformed| project(&deformed.gaussian, &view, settings)).collect();
     let order = sort(&splats);
@@ -131,6 +139,9 @@ pub fn forward<R: Real>(
 
 /// Gradients of `v_color . colour + v_depth . D + v_alpha . alpha + instance_weight * instance loss` by every
 /// parameter; `forward` is the forward pass of the same scene.
+///
+/// # Panics
+/// When the scene has recorded motion, which is not differentiated.
 #[must_use]
 pub fn backward<R: Real>(
     scene: &Scene<R>,
@@ -140,6 +151,7 @@ pub fn backward<R: Real>(
     v_alpha: Option<&PixelGrid<R>>,
     instance_weight: R,
 ) -> SceneGradients<R> {
+    assert!(scene.tracks.is_none(), "recorded motion has no gradients");
     let settings = &forward.settings;
     let instances =
         forward.target().filter(|_| forward.loss.labelled_pixels > 0).map(|target| InstanceCotangent {

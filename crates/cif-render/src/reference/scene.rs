@@ -1,7 +1,7 @@
 //! The parameters of a field in the scalar of the evaluation, and gradients of the same shape.
 
 use cif_field::gaussians::SH_FLOATS;
-use cif_field::{Deformation, Field};
+use cif_field::{Deformation, Field, Tracks};
 use cif_geometry::Real;
 
 use super::identity::IdentityRows;
@@ -179,6 +179,8 @@ pub struct Scene<R> {
     /// Configuration and bounds of the deformation; its own parameter vectors are empty, see
     /// [`Parameters::planes`] and [`Parameters::mlp`].
     pub deformation: Option<Deformation>,
+    /// Recorded motion.
+    pub tracks: Option<Tracks>,
     /// Number of instances K.
     pub instances: usize,
 }
@@ -224,6 +226,7 @@ impl<R: Real> Scene<R> {
                 planes: Vec::new(),
                 mlp: Vec::new(),
             }),
+            tracks: field.tracks.clone(),
             instances: field.instances.len(),
         }
     }

@@ -1,0 +1,290 @@
+//! Tracks at one time, put onto posed Gaussians.
+
+use cif_geometry::quaternion;
+use cif_geometry::spherical_harmonics::HarmonicsRotation;
+use glam::{DMat3, DQuat, DVec3};
+use rayon::prelude::*;
+
+use super::{DenseTrack, NO_GROUP, Tracks};
+use crate::Gaussians;
+use crate::gaussians::SH_FLOATS;
+
+/// Opacity and occupancy logit of a hidden Gaussian: nothing in single precision is nearer to 0 and not 0.
+pub const HIDDEN_LOGIT: f32 = -104.0;
+
+/// Gaussians handled by one task.
+const CHUNK: usize = 512;
+
+/// A turn whose matrix is nearer to the identity than this changes no pixel.
+const NO_TURN: f64 = 1e-12;
+
+/// A group at a time.
+#[derive(Clone, Debug)]
+pub struct GroupAtTime<'a> {
+    /// See [`super::TrackGroup::deformed`].
+    pub deformed: bool,
+    /// Whether it is drawn.
+    pub visible: bool,
+    /// Whether the pose does anything.
+    pub moved: bool,
+    /// Whether the pose turns.
+    pub turned: bool,
+    /// Turn around the pivot.
+    pub rotation: DQuat,
+    /// Point that the pose carries.
+    pub pivot: DVec3,
+    /// Where the pivot is.
+    pub translation: DVec3,
+    /// Dense samples around the time.
+    pub dense: Option<DenseAtTime<'a>>,
+}
+
+impl GroupAtTime<'_> {
+    /// Whether nothing happens to the group.
+    fn is_still(&self) -> bool {
+        self.deformed && self.visible && !self.moved && self.dense.is_none()
+    }
+}
+
+/// The dense samples before and after a time.
+#[derive(Clone, Copy, Debug)]
+pub struct DenseAtTime<'a> {
+    track: &'a DenseTrack,
+    /// First entry of the sample before.
+    before: usize,
+    /// First entry of the sample after.
+    after: usize,
+    /// Share of the sample after.
+    pub fraction: f64,
+}
+
+impl<'a> DenseAtTime<'a> {
+    fn new(track: &'a DenseTrack, time: f64) -> Self {
+        let stride = track.members();
+        let after = track.times.partition_point(|sample| *sample <= time);
+        let last = track.times.len() - 1;
+        if after == 0 || after > last {
+            let at = if after == 0 { 0 } else { last };
+            return Self { track, before: at * stride, after: at * stride, fraction: 0.0 };
+        }
+        let (low, high) = (track.times[after - 1], track.times[after]);
+        let fraction = (time - low) / (high - low);
+        Self { track, before: (after - 1) * stride, after: after * stride, fraction }
+    }
+
+    /// Centres of a member before and after.
+    #[must_use]
+    pub fn means(&self, member: usize) -> [[f32; 3]; 2] {
+        [self.track.means[self.before + member], self.track.means[self.after + member]]
+    }
+
+    /// Quaternions of a member before and after, in one hemisphere.
+    #[must_use]
+    pub fn quaternions(&self, member: usize) -> [[f32; 4]; 2] {
+        [self.track.quaternions[self.before + member], self.track.quaternions[self.after + member]]
+    }
+
+    /// Log-scales of a member before and after; `None` where they do not change.
+    #[must_use]
+    pub fn log_scales(&self, member: usize) -> Option<[[f32; 3]; 2]> {
+        let values = self.track.log_scales.as_ref()?;
+        Some([values[self.before + member], values[self.after + member]])
+    }
+}
+
+/// All groups of a [`Tracks`] at a time.
+#[derive(Clone, Debug)]
+pub struct TracksAtTime<'a> {
+    group_of: &'a [u32],
+    /// The groups, in the order of [`Tracks::groups`].
+    pub groups: Vec<GroupAtTime<'a>>,
+    /// [`Tracks::members`]; empty where no group is dense.
+    members: Vec<u32>,
+}
+
+/// Posed parameters, `[N]` each, that tracks are put onto; in raw form as in [`Gaussians`].
+#[derive(Debug)]
+pub struct GaussiansMut<'a> {
+    /// Centres.
+    pub means: &'a mut [[f32; 3]],
+    /// Log-scales.
+    pub log_scales: &'a mut [[f32; 3]],
+    /// Quaternions.
+    pub quaternions: &'a mut [[f32; 4]],
+    /// Opacity logits.
+    pub opacity_logits: &'a mut [f32],
+    /// Occupancy logits.
+    pub occupancy_logits: &'a mut [f32],
+    /// Spherical harmonics; may be empty when [`TracksAtTime::changes_sh`] says so.
+    pub sh_coefficients: &'a mut [[f32; SH_FLOATS]],
+}
+
+impl<'a> GaussiansMut<'a> {
+    /// Every array of a set.
+    #[must_use]
+    pub fn of(gaussians: &'a mut Gaussians) -> Self {
+        Self {
+            means: &mut gaussians.means,
+            log_scales: &mut gaussians.log_scales,
+            quaternions: &mut gaussians.quaternions,
+            opacity_logits: &mut gaussians.opacity_logits,
+            occupancy_logits: &mut gaussians.occupancy_logits,
+            sh_coefficients: &mut gaussians.sh_coefficients,
+        }
+    }
+}
+
+impl<'a> TracksAtTime<'a> {
+    pub(super) fn new(tracks: &'a Tracks, time: f64) -> Self {
+        let groups: Vec<GroupAtTime<'a>> = tracks
+            .groups
+            .iter()
+            .map(|group| {
+                let (rotation, translation) = group.pose(time);
+                let turned = rotation.xyz().length_squared() > NO_TURN * NO_TURN;
+                GroupAtTime {
+                    deformed: group.deformed,
+                    visible: group.is_visible(time),
+                    moved: turned || translation != group.pivot,
+                    turned,
+                    rotation,
+                    pivot: group.pivot,
+                    translation,
+                    dense: group.dense.as_ref().map(|dense| DenseAtTime::new(dense, time)),
+                }
+            })
+            .collect();
+        let is_dense = groups.iter().any(|group| group.dense.is_some());
+        let members = if is_dense { tracks.members() } else { Vec::new() };
+        Self { group_of: &tracks.group_of, groups, members }
+    }
+
+    /// The same with every group visible: what a hidden object would look like.
+    #[must_use]
+    pub fn unhidden(mut self) -> Self {
+        self.groups.iter_mut().for_each(|group| group.visible = true);
+        self
+    }
+
+    /// Group of a row, with the row's place among the members of a dense group.
+    #[must_use]
+    pub fn group(&self, row: usize) -> Option<(&GroupAtTime<'a>, usize)> {
+        let group = *self.group_of.get(row)?;
+        let member = self.members.get(row).map_or(0, |member| *member as usize);
+        (group != NO_GROUP).then(|| (&self.groups[group as usize], member))
+    }
+
+    /// Whether any Gaussian is other than posed without tracks.
+    #[must_use]
+    pub fn changes_anything(&self) -> bool {
+        self.groups.iter().any(|group| !group.is_still())
+    }
+
+    /// Whether colours turn, or learned colour changes are undone.
+    #[must_use]
+    pub fn changes_sh(&self) -> bool {
+        self.groups.iter().any(|group| group.turned || !group.deformed)
+    }
+
+    /// Puts the tracks onto `posed`, the canonical Gaussians with the learned deformation at this time.
+    ///
+    /// # Panics
+    /// When the arrays have other lengths than the tracks; the spherical harmonics may be empty.
+    pub fn apply(&self, canonical: &Gaussians, posed: GaussiansMut<'_>) {
+        if !self.changes_anything() {
+            return;
+        }
+        let n = self.group_of.len();
+        assert!(canonical.len() == n && posed.means.len() == n, "one group per Gaussian");
+        (
+            posed.means.par_iter_mut(),
+            posed.log_scales.par_iter_mut(),
+            posed.quaternions.par_iter_mut(),
+            posed.opacity_logits.par_iter_mut(),
+            posed.occupancy_logits.par_iter_mut(),
+        )
+            .into_par_iter()
+            .with_min_len(CHUNK)
+            .enumerate()
+            .for_each(|(row, (mean, log_scale, quaternion, opacity_logit, occupancy_logit))| {
+                let Some((group, member)) = self.group(row) else { return };
+                if !group.deformed {
+                    *mean = canonical.means[row];
+                    *log_scale = canonical.log_scales[row];
+                    *quaternion = canonical.quaternions[row];
+                    *opacity_logit = canonical.opacity_logits[row];
+                }
+                if let Some(dense) = &group.dense {
+                    dense.place(member, mean, log_scale, quaternion);
+                }
+                if group.moved {
+                    let offset = DVec3::from_array(mean.map(f64::from)) - group.pivot;
+                    let moved = group.rotation * offset + group.translation;
+                    *mean = moved.to_array().map(|value| value as f32);
+                }
+                if group.turned {
+                    let DQuat { x, y, z, w } = group.rotation;
+                    let turned = quaternion::multiply([w, x, y, z], quaternion.map(f64::from));
+                    *quaternion = turned.map(|value| value as f32);
+                }
+                if !group.visible {
+                    *opacity_logit = HIDDEN_LOGIT;
+                    *occupancy_logit = HIDDEN_LOGIT;
+                }
+            });
+        if !posed.sh_coefficients.is_empty() && self.changes_sh() {
+            self.turn_colors(canonical, posed.sh_coefficients);
+        }
+    }
+
+    fn turn_colors(&self, canonical: &Gaussians, sh_coefficients: &mut [[f32; SH_FLOATS]]) {
+        let turns: Vec<Option<HarmonicsRotation<f32>>> = self
+            .groups
+            .iter()
+            .map(|group| group.turned.then(|| harmonics_rotation(group.rotation)))
+            .collect();
+        sh_coefficients.par_iter_mut().with_min_len(CHUNK).enumerate().for_each(|(row, sh)| {
+            let group = self.group_of[row];
+            if group == NO_GROUP {
+                return;
+            }
+            if !self.groups[group as usize].deformed {
+                *sh = canonical.sh_coefficients[row];
+            }
+            if let Some(turn) = &turns[group as usize] {
+                turn.rotate(sh);
+            }
+        });
+    }
+}
+
+/// How view-dependent colours follow a turn.
+fn harmonics_rotation(rotation: DQuat) -> HarmonicsRotation<f32> {
+    let rows = DMat3::from_quat(rotation).transpose().to_cols_array_2d();
+    HarmonicsRotation::new(rows.map(|row| row.map(|value| value as f32)))
+}
+
+impl DenseAtTime<'_> {
+    /// Replaces a shape by the samples around the time.
+    fn place(
+        &self,
+        member: usize,
+        mean: &mut [f32; 3],
+        log_scale: &mut [f32; 3],
+        quaternion: &mut [f32; 4],
+    ) {
+        let fraction = self.fraction as f32;
+        *mean = mix(self.means(member), fraction);
+        *quaternion = mix(self.quaternions(member), fraction);
+        if let Some(log_scales) = self.log_scales(member) {
+            *log_scale = mix(log_scales, fraction);
+        }
+    }
+}
+
+fn mix<const LENGTH: usize>([before, after]: [[f32; LENGTH]; 2], fraction: f32) -> [f32; LENGTH] {
+    if fraction == 0.0 {
+        return before;
+    }
+    std::array::from_fn(|k| (1.0 - fraction) * before[k] + fraction * after[k])
+}

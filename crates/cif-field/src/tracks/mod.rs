@@ -1,0 +1,243 @@
+//! Recorded motion: groups of Gaussians that follow a sampled path.
+//!
+//! Training learns motion as a [`crate::Deformation`]; motion that comes from elsewhere (an animated file, an
+//! object moved by hand) is recorded here. At a time t a Gaussian of a group is
+//!
+//! 1. its canonical parameters, with the learned deltas added unless the group is exempt
+//!    ([`TrackGroup::deformed`]),
+//! 2. replaced by the dense samples of the group, where it has some ([`DenseTrack`]),
+//! 3. carried by the rigid pose of the group, `x' = R(t) (x - pivot) + translation(t)`: the orientation turns
+//!    with it, and so does the view-dependent colour,
+//! 4. not drawn while the group is hidden.
+//!
+//! Between samples, translations and dense samples are linear and rotations spherical; outside the samples the
+//! nearest one holds. Times are normalised as in [`crate::Timeline`].
+
+mod apply;
+
+use glam::{DQuat, DVec3};
+
+pub use apply::{DenseAtTime, GaussiansMut, GroupAtTime, HIDDEN_LOGIT, TracksAtTime};
+
+/// Entry of [`Tracks::group_of`] for a Gaussian without a group.
+pub const NO_GROUP: u32 = u32::MAX;
+
+/// Recorded motion of a field.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Tracks {
+    /// Group of every Gaussian, `[N]`: an index into `groups`, or [`NO_GROUP`].
+    pub group_of: Vec<u32>,
+    /// The groups. One without Gaussians is allowed and does nothing.
+    pub groups: Vec<TrackGroup>,
+}
+
+/// Gaussians that move together.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TrackGroup {
+    /// What the group is, for people: the object's name.
+    pub name: String,
+    /// Whether the learned deformation moves the group before its track does; off for what was added to a
+    /// trained scene.
+    pub deformed: bool,
+    /// Point that the poses carry, world, metres.
+    pub pivot: DVec3,
+    /// Poses by strictly ascending time; empty where the group stays.
+    pub poses: Vec<TrackPose>,
+    /// Changes of visibility by strictly ascending time; the first holds before its time too. Empty where the
+    /// group is always visible.
+    pub visibility: Vec<VisibilityStep>,
+    /// A path for every Gaussian of the group, before the pose; `None` where the pose says it all.
+    pub dense: Option<DenseTrack>,
+}
+
+/// A pose at a time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TrackPose {
+    /// Normalised time.
+    pub time: f64,
+    /// Where the pivot is, world, metres.
+    pub translation: DVec3,
+    /// Unit turn around the pivot; successive poses lie in one hemisphere.
+    pub rotation: DQuat,
+}
+
+/// A change of visibility; it holds until the next.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VisibilityStep {
+    /// Normalised time.
+    pub time: f64,
+    /// Whether the group can be seen from here on.
+    pub visible: bool,
+}
+
+/// Sampled shapes of a group of M Gaussians, which are its rows of [`Tracks::group_of`] in ascending order.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DenseTrack {
+    /// T normalised times, strictly ascending, at least one.
+    pub times: Vec<f64>,
+    /// Centres `[T, M]`, world before the pose, metres.
+    pub means: Vec<[f32; 3]>,
+    /// Quaternions `[T, M]` (w, x, y, z); every one in the hemisphere of its predecessor.
+    pub quaternions: Vec<[f32; 4]>,
+    /// Log-scales `[T, M]`; `None` where they stay as in the canonical Gaussians.
+    pub log_scales: Option<Vec<[f32; 3]>>,
+}
+
+impl DenseTrack {
+    /// Gaussians per sample, M.
+    #[must_use]
+    pub fn members(&self) -> usize {
+        self.means.len() / self.times.len().max(1)
+    }
+
+    /// The samples of members `members[0], members[1], ...`, which may repeat.
+    fn gather(&self, members: &[usize]) -> Self {
+        let stride = self.members();
+        let pick = |sample: usize| members.iter().map(move |member| sample * stride + member);
+        let samples = 0..self.times.len();
+        Self {
+            times: self.times.clone(),
+            means: samples.clone().flat_map(pick).map(|at| self.means[at]).collect(),
+            quaternions: samples.clone().flat_map(pick).map(|at| self.quaternions[at]).collect(),
+            log_scales: self
+                .log_scales
+                .as_ref()
+                .map(|values| samples.clone().flat_map(pick).map(|at| values[at]).collect()),
+        }
+    }
+}
+
+impl TrackGroup {
+    /// A group that does nothing yet, around a pivot.
+    #[must_use]
+    pub fn still(name: impl Into<String>, pivot: DVec3) -> Self {
+        Self {
+            name: name.into(),
+            deformed: true,
+            pivot,
+            poses: Vec::new(),
+            visibility: Vec::new(),
+            dense: None,
+        }
+    }
+
+    /// Turn and place of the pivot at a time.
+    #[must_use]
+    pub fn pose(&self, time: f64) -> (DQuat, DVec3) {
+        let (Some(first), Some(last)) = (self.poses.first(), self.poses.last()) else {
+            return (DQuat::IDENTITY, self.pivot);
+        };
+        let after = self.poses.partition_point(|pose| pose.time <= time);
+        if after == 0 {
+            return (first.rotation, first.translation);
+        }
+        if after == self.poses.len() {
+            return (last.rotation, last.translation);
+        }
+        let (a, b) = (&self.poses[after - 1], &self.poses[after]);
+        let fraction = (time - a.time) / (b.time - a.time);
+        (a.rotation.slerp(b.rotation, fraction), a.translation.lerp(b.translation, fraction))
+    }
+
+    /// Whether the group can be seen at a time.
+    #[must_use]
+    pub fn is_visible(&self, time: f64) -> bool {
+        let after = self.visibility.partition_point(|step| step.time <= time);
+        self.visibility.get(after.max(1) - 1).is_none_or(|step| step.visible)
+    }
+
+    /// Whether anything of the group changes over time, apart from its visibility.
+    #[must_use]
+    pub fn moves(&self) -> bool {
+        self.poses.len() > 1 || self.dense.as_ref().is_some_and(|dense| dense.times.len() > 1)
+    }
+}
+
+impl Tracks {
+    /// The groups at a normalised time.
+    #[must_use]
+    pub fn at(&self, time: f64) -> TracksAtTime<'_> {
+        TracksAtTime::new(self, time)
+    }
+
+    /// Whether anything moves, apart from visibility.
+    #[must_use]
+    pub fn moves(&self) -> bool {
+        self.groups.iter().any(TrackGroup::moves)
+    }
+
+    /// Group of a row.
+    #[must_use]
+    pub fn group(&self, row: usize) -> Option<usize> {
+        self.group_of.get(row).filter(|group| **group != NO_GROUP).map(|group| *group as usize)
+    }
+
+    /// Place of every row among the rows of its group, `[N]`; 0 without a group.
+    #[must_use]
+    pub fn members(&self) -> Vec<u32> {
+        let mut sizes = vec![0; self.groups.len()];
+        self.group_of
+            .iter()
+            .map(|&group| {
+                if group == NO_GROUP {
+                    return 0;
+                }
+                let size = &mut sizes[group as usize];
+                *size += 1;
+                *size - 1
+            })
+            .collect()
+    }
+
+    /// Rows `sources[0], sources[1], ...` as a new set; rows may repeat. All groups stay.
+    ///
+    /// # Panics
+    /// When a source is out of range.
+    #[must_use]
+    pub fn gather(&self, sources: &[u32]) -> Self {
+        let members = self.members();
+        let mut kept: Vec<Vec<usize>> = vec![Vec::new(); self.groups.len()];
+        let group_of: Vec<u32> = sources.iter().map(|&row| self.group_of[row as usize]).collect();
+        for (&row, &group) in sources.iter().zip(&group_of) {
+            if group != NO_GROUP {
+                kept[group as usize].push(members[row as usize] as usize);
+            }
+        }
+        let groups = self
+            .groups
+            .iter()
+            .zip(&kept)
+            .map(|(group, kept)| TrackGroup {
+                dense: group.dense.as_ref().map(|dense| dense.gather(kept)),
+                ..group.clone()
+            })
+            .collect();
+        Self { group_of, groups }
+    }
+
+    /// The same motion without groups that have no Gaussians; `None` when none is left.
+    #[must_use]
+    pub fn compact(mut self) -> Option<Self> {
+        let mut used = vec![false; self.groups.len()];
+        for &group in self.group_of.iter().filter(|group| **group != NO_GROUP) {
+            used[group as usize] = true;
+        }
+        let mut next = 0;
+        let renumbered: Vec<u32> = used
+            .iter()
+            .map(|used| {
+                next += u32::from(*used);
+                if *used { next - 1 } else { NO_GROUP }
+            })
+            .collect();
+        for group in self.group_of.iter_mut().filter(|group| **group != NO_GROUP) {
+            *group = renumbered[*group as usize];
+        }
+        let mut flags = used.iter();
+        self.groups.retain(|_| *flags.next().expect("one flag per group"));
+        (!self.groups.is_empty()).then_some(self)
+    }
+}
+
+#[cfg(test)]
+mod tests;
