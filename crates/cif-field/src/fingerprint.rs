@@ -143,6 +143,6 @@ mod tests {
             timeline: crate::Timeline { times: vec![0.0, 0.5], frames_per_second: 24.0 },
             ..testing::field(0, 1)
         };
-        assert_eq!(field.fingerprint(), "e4");
+        assert_eq!(field.fingerprint(), "4756fe2eb119afcc59405d96414e8efd");
     }
 }

@@ -1,6 +1,14 @@
 //! Sparse identity distributions: `p_i^k = softmax_k(log phat_i^k + mu_i^k)` over the support of row i.
 //! Source: methods reference 5.2 and 5.3.
 
+/// Estimate of a row whose owner is told, not estimated: `ln 2`. Estimates are shares of an image, so a measured
+/// one is never above 0.
+pub const TOLD: f32 = std::f32::consts::LN_2;
+
+/// Estimate of a row that is told to belong to no instance: its labelled share is 0. Measured estimates are
+/// shares above 1e-8.
+pub const TOLD_BACKGROUND: f32 = -104.0;
+
 /// Identity rows of N Gaussians in compressed sparse row form.
 ///
 /// Labels are dense indices into [`crate::Field::instances`] (not mask ids), ascending in a row. A row is
@@ -98,15 +106,42 @@ impl Identities {
             .collect()
     }
 
-    /// Rows `sources[0], sources[1], ...` as a new set; rows may repeat.
+    /// No rows yet.
     #[must_use]
-    pub fn gather(&self, sources: &[u32]) -> Self {
-        let mut gathered = Self {
+    pub fn empty() -> Self {
+        Self {
             row_offsets: vec![0],
             labels: Vec::new(),
             log_estimates: Vec::new(),
             log_calibrations: Vec::new(),
-        };
+        }
+    }
+
+    /// Adds a row at the end whose owner is told: an instance, or none of them.
+    pub fn push_told(&mut self, owner: Option<u16>) {
+        self.labels.push(owner.unwrap_or(0));
+        self.log_estimates.push(if owner.is_some() { TOLD } else { TOLD_BACKGROUND });
+        self.log_calibrations.push(0.0);
+        self.row_offsets.push(self.labels.len() as u32);
+    }
+
+    /// Owner of a row that was told ([`Self::push_told`]): `Some(None)` for none of the instances, `None` for a
+    /// row that was estimated.
+    #[must_use]
+    pub fn told_owner(&self, row: usize) -> Option<Option<u16>> {
+        let range = self.range(row);
+        let [estimate] = self.log_estimates[range.clone()] else { return None };
+        if estimate == TOLD {
+            Some(Some(self.labels[range.start]))
+        } else {
+            (estimate <= TOLD_BACKGROUND).then_some(None)
+        }
+    }
+
+    /// Rows `sources[0], sources[1], ...` as a new set; rows may repeat.
+    #[must_use]
+    pub fn gather(&self, sources: &[u32]) -> Self {
+        let mut gathered = Self::empty();
         for &source in sources {
             let range = self.range(source as usize);
             gathered.labels.extend_from_slice(&self.labels[range.clone()]);
@@ -161,6 +196,19 @@ mod tests {
         let probabilities = identities().probability_of(2);
         assert!(probabilities[0] < 1e-8 && probabilities[0] > 0.0);
         assert_eq!(probabilities[1..], [0.0, 0.5]);
+    }
+
+    #[test]
+    fn told_rows_are_told_apart_from_estimated_ones() {
+        let mut rows = identities();
+        assert_eq!([0, 1, 2].map(|row| rows.told_owner(row)), [None; 3]);
+        rows.push_told(Some(5));
+        rows.push_told(None);
+        rows.validate(5, 6).unwrap();
+        assert_eq!([3, 4].map(|row| rows.told_owner(row)), [Some(Some(5)), Some(None)]);
+        assert_eq!(rows.argmax()[3], 5);
+        assert_eq!(rows.labelled_shares()[3..], [1.0, 0.0]);
+        assert_eq!(rows.gather(&[4]).told_owner(0), Some(None));
     }
 
     #[test]

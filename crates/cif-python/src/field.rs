@@ -153,6 +153,7 @@ impl Field {
                 sh_coefficients,
             },
             deformation: None,
+            tracks: None,
             identities,
             instances,
             timeline: Timeline { times, frames_per_second },

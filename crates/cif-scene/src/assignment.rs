@@ -10,6 +10,9 @@
 //!    lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of that
 //!    instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
 //!
+//! Rows whose owner was told ([`cif_field::Identities::told_owner`]: what came from a file that names its objects)
+//! belong to it, whatever their occupancy.
+//!
 //! Where occupancy is the same for all Gaussians (never trained, or an ablation), opacity takes its place.
 //! Without identities everything is background.
 
@@ -102,7 +105,14 @@ pub fn assign(
             (identity.labelled_share >= needed).then_some(identity.index)
         })
         .collect();
-    enclose(field, visible, &candidate, &mut owners);
+    let told = |position: usize| field.identities.as_ref()?.told_owner(visible[position] as usize);
+    for (position, owner) in owners.iter_mut().enumerate() {
+        if let Some(told) = told(position) {
+            *owner = told.map(usize::from);
+        }
+    }
+    let open = |position: usize| candidate(position).filter(|_| told(position).is_none());
+    enclose(field, visible, &open, &mut owners);
     owners
 }
 

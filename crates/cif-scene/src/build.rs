@@ -11,7 +11,9 @@ use crate::motion::{MeanShape, MovingGroup, dot, vector};
 use crate::procrustes::weighted_quantile;
 use crate::report::MotionReport;
 use crate::source::FieldMotion;
-use crate::{MotionModel, MotionSource, SceneError, SceneOptions, camera_tracks, extent, naming, proxy};
+use crate::{
+    MotionModel, MotionSource, SceneError, SceneOptions, camera_tracks, extent, naming, proxy, visibility,
+};
 
 /// Share of an instance's weight that may be outliers when a motion model is chosen.
 const INSTANCE_TRIM: f64 = 0.05;
@@ -78,6 +80,7 @@ pub fn build_from(
         let input = NodeInput { field, reference: &reference, identities: &identities, options };
         let mut node = node(&input, naming, *owner, group, *model, samples, &time_codes.samples);
         node.source_frames = (frames[0], frames[frames.len() - 1]);
+        node.visibility = visibility::of_rows(field, &node.splats.rows);
         nodes.push(node);
     }
     let omitted: Vec<String> = (0..field.instances.len())
@@ -99,7 +102,7 @@ pub fn build_from(
         sort_metric: field.sort_metric,
         omitted,
         warnings,
-        origin: Origin { field_fingerprint: None, options: Some(options.clone()) },
+        origin: Origin { field_fingerprint: Some(field.fingerprint()), options: Some(options.clone()) },
     })
 }
 

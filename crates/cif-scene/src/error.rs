@@ -34,6 +34,14 @@ pub enum SceneError {
         /// Last frame of the field.
         newest: usize,
     },
+    /// An object of a file that cannot become Gaussians.
+    #[error("{object} cannot be imported: {what}; mend it where the file was made")]
+    Import {
+        /// Name of the node, or the file.
+        object: String,
+        /// What does not fit.
+        what: String,
+    },
     /// An option outside its range.
     #[error("{option} is {value}, but must be {expected}")]
     Option {

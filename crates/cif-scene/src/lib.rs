@@ -14,6 +14,7 @@
 //! | [`naming`] | names that every format accepts |
 //! | [`report`] | what the chosen motion models cost and miss |
 //! | [`query`] | nodes by label |
+//! | [`field_from_graph`] | the way back: Gaussians, recorded motion and instances of a graph |
 //!
 //! Frames: world as captured (right-handed, metres). A node's splats live in its local frame, whose axes are the
 //! world's and whose origin is the node's pivot at the reference time, so that no rotation is baked into splats
@@ -24,6 +25,7 @@ pub mod build;
 pub mod camera_tracks;
 pub mod error;
 pub mod extent;
+pub mod field_from_graph;
 pub mod graph;
 pub mod motion;
 pub mod naming;
@@ -34,10 +36,15 @@ pub mod query;
 pub mod report;
 pub mod source;
 #[cfg(test)]
+mod testing;
+#[cfg(test)]
 mod tests;
+mod time_map;
+mod visibility;
 
 pub use build::{build, build_from};
 pub use error::SceneError;
+pub use field_from_graph::field_from_graph;
 pub use graph::{
     CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, Node, NodeKind,
     Origin, Part, PartsMotion, PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,

@@ -5,7 +5,8 @@ use cif_render::cpu::{Renderer, SimdLevel};
 
 /// Gives the Gaussians of a field at a time. Rows keep their order and number.
 pub trait MotionSource {
-    /// All Gaussians at a normalised time in [0, 1], raw form, deformation added.
+    /// All Gaussians at a normalised time in [0, 1], raw form, deformation added. What is hidden at the time is
+    /// given as if it were not: visibility is told apart from motion.
     fn gaussians_at(&mut self, time: f64) -> Gaussians;
 
     /// Whether anything can move at all.
@@ -20,17 +21,18 @@ impl<F: FnMut(f64) -> Gaussians> MotionSource for F {
     }
 }
 
-/// The trained deformation of a field.
+/// The learned and the recorded motion of a field.
 pub struct FieldMotion<'a> {
     field: &'a Field,
     renderer: Option<Renderer>,
 }
 
 impl<'a> FieldMotion<'a> {
-    /// Motion of a field; a field without deformation stands still.
+    /// Motion of a field; a field without either stands still.
     #[must_use]
     pub fn new(field: &'a Field) -> Self {
-        let renderer = field.deformation.as_ref().map(|_| Renderer::new(SimdLevel::Auto));
+        let posed = field.deformation.is_some() || field.tracks.is_some();
+        let renderer = posed.then(|| Renderer::new(SimdLevel::Auto));
         Self { field, renderer }
     }
 }
@@ -38,12 +40,12 @@ impl<'a> FieldMotion<'a> {
 impl MotionSource for FieldMotion<'_> {
     fn gaussians_at(&mut self, time: f64) -> Gaussians {
         match &mut self.renderer {
-            Some(renderer) => renderer.deform(self.field, time),
+            Some(renderer) => renderer.deform_unhidden(self.field, time),
             None => self.field.gaussians.clone(),
         }
     }
 
     fn moves(&self) -> bool {
-        self.renderer.is_some()
+        self.field.moves()
     }
 }

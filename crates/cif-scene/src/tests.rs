@@ -45,6 +45,7 @@ fn field(objects: usize) -> Field {
     Field {
         gaussians,
         deformation: None,
+        tracks: None,
         identities: Some(identities),
         instances: (0..objects)
             .map(|k| Instance { id: k as u16 + 1, label: "red mug".into(), category: "mug".into() })

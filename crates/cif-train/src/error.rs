@@ -81,6 +81,15 @@ pub enum TrainError {
         /// Gaussians that would fit.
         most_gaussians: u64,
     },
+    /// The scene moves by record, which training cannot change.
+    #[error(
+        "the scene holds recorded motion of {groups} groups (from an animated file, or from edits), which has no \
+         gradients; train the scene as it was before, and import the edits again"
+    )]
+    RecordedMotion {
+        /// Groups of [`cif_field::Tracks`].
+        groups: usize,
+    },
     /// The checkpoint was written without training state.
     #[error("the checkpoint holds a finished scene without training state, so the run cannot be resumed")]
     NoState,

@@ -175,6 +175,7 @@ fn one_in_view(others: usize) -> (Field, PinholeCamera) {
     let field = Field {
         gaussians,
         deformation: None,
+        tracks: None,
         identities: Some(Identities {
             row_offsets: (0..=n as u32).collect(),
             labels: vec![0; n],

@@ -254,3 +254,16 @@ fn numbers_that_are_not_finite_stop_the_run_by_name() {
         }
     }
 }
+
+#[test]
+fn a_scene_with_recorded_motion_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene::default());
+    let mut checkpoint = Trainer::new(dataset.clone(), small_config()).unwrap().checkpoint(true);
+    assert!(Trainer::resume(dataset.clone(), checkpoint.clone()).is_ok());
+    let group = cif_field::TrackGroup::still("mug", glam::DVec3::ZERO);
+    let group_of = vec![0; checkpoint.field.len()];
+    checkpoint.field.tracks = Some(cif_field::Tracks { group_of, groups: vec![group] });
+    let error = Trainer::resume(dataset, checkpoint).err().unwrap();
+    assert!(matches!(error, TrainError::RecordedMotion { groups: 1 }), "{error}");
+}

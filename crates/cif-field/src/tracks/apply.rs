@@ -266,13 +266,7 @@ fn harmonics_rotation(rotation: DQuat) -> HarmonicsRotation<f32> {
 
 impl DenseAtTime<'_> {
     /// Replaces a shape by the samples around the time.
-    fn place(
-        &self,
-        member: usize,
-        mean: &mut [f32; 3],
-        log_scale: &mut [f32; 3],
-        quaternion: &mut [f32; 4],
-    ) {
+    fn place(&self, member: usize, mean: &mut [f32; 3], log_scale: &mut [f32; 3], quaternion: &mut [f32; 4]) {
         let fraction = self.fraction as f32;
         *mean = mix(self.means(member), fraction);
         *quaternion = mix(self.quaternions(member), fraction);

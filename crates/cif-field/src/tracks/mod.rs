@@ -215,6 +215,48 @@ impl Tracks {
         Self { group_of, groups }
     }
 
+    /// Gives rows a motion of their own: `change` makes the new group from the old one (a still one called
+    /// `name` around `pivot` where there was none), once per old group. Dense samples go with their rows.
+    ///
+    /// # Panics
+    /// When a row is out of range or given twice.
+    pub fn regroup(
+        &mut self,
+        rows: &[u32],
+        name: &str,
+        pivot: DVec3,
+        mut change: impl FnMut(TrackGroup) -> TrackGroup,
+    ) {
+        let members = self.members();
+        let mut by_group: std::collections::BTreeMap<u32, Vec<u32>> = Default::default();
+        for &row in rows {
+            by_group.entry(self.group_of[row as usize]).or_default().push(row);
+        }
+        for (old, mut rows) in by_group {
+            rows.sort_unstable();
+            assert!(rows.windows(2).all(|pair| pair[0] < pair[1]), "every row once");
+            let group = if old == NO_GROUP {
+                TrackGroup::still(name, pivot)
+            } else {
+                let group = &mut self.groups[old as usize];
+                let dense = group.dense.take().map(|dense| {
+                    let taken: Vec<usize> = rows.iter().map(|&row| members[row as usize] as usize).collect();
+                    let mut is_taken = vec![false; dense.members()];
+                    taken.iter().for_each(|&member| is_taken[member] = true);
+                    let rest: Vec<usize> = (0..is_taken.len()).filter(|&member| !is_taken[member]).collect();
+                    (dense.gather(&taken), dense.gather(&rest))
+                });
+                let moving = group.clone();
+                let (taken, rest) = dense.unzip();
+                group.dense = rest;
+                TrackGroup { dense: taken, ..moving }
+            };
+            let new = self.groups.len() as u32;
+            self.groups.push(change(group));
+            rows.iter().for_each(|&row| self.group_of[row as usize] = new);
+        }
+    }
+
     /// The same motion without groups that have no Gaussians; `None` when none is left.
     #[must_use]
     pub fn compact(mut self) -> Option<Self> {

@@ -108,6 +108,28 @@ fn gathered_rows_keep_their_motion() {
 }
 
 #[test]
+fn regrouped_rows_move_on_their_own_and_the_others_as_before() {
+    let field = testing::tracked_field(40, 12);
+    let rows = [9, 1, 0, 3, 8, 2];
+    let mut changed = field.clone();
+    let mut asked = Vec::new();
+    changed.tracks.as_mut().unwrap().regroup(&rows, "edited", DVec3::X, |group| {
+        asked.push(group.name.clone());
+        TrackGroup { visibility: vec![VisibilityStep { time: 0.0, visible: false }], ..group }
+    });
+    changed.validate().unwrap();
+    assert_eq!(asked, ["turning", "late", "added", "edited"]);
+    for time in [0.2, 0.7] {
+        let (before, after) = (field.deformed(time), changed.deformed(time));
+        for row in 0..40 {
+            assert_eq!(before.means[row], after.means[row], "row {row}");
+            assert_eq!(before.quaternions[row], after.quaternions[row]);
+            assert_eq!(after.opacity(row) == 0.0, rows.contains(&(row as u32)) || before.opacity(row) == 0.0);
+        }
+    }
+}
+
+#[test]
 fn a_group_that_does_nothing_changes_no_bit() {
     let plain = testing::field(30, 2);
     let tracks = Tracks { group_of: vec![0; 30], groups: vec![TrackGroup::still("all", DVec3::ONE)] };
@@ -120,7 +142,9 @@ fn a_group_that_does_nothing_changes_no_bit() {
 fn broken_tracks_are_refused() {
     type Break = fn(&mut Tracks);
     let breaks: [(&str, Break); 10] = [
-        ("`tracks.group_of` has 19 entries", |tracks| drop(tracks.group_of.pop())),
+        ("`tracks.group_of` has 19 entries", |tracks| {
+            tracks.group_of.pop();
+        }),
         ("`tracks.group_of` is 3 at row 0", |tracks| tracks.group_of[0] = 3),
         ("track group 0 (\"turning\") has a pose at 0.25 after one at 0.25", |tracks| {
             tracks.groups[0].poses[0].time = 0.25;
@@ -130,7 +154,7 @@ fn broken_tracks_are_refused() {
         ("translation is not finite", |tracks| tracks.groups[0].poses[1].translation.x = f64::INFINITY),
         ("pivot", |tracks| tracks.groups[2].pivot.y = f64::NAN),
         ("has 14 centres for 3 samples of 5 Gaussians", |tracks| {
-            drop(tracks.groups[1].dense.as_mut().unwrap().means.pop());
+            tracks.groups[1].dense.as_mut().unwrap().means.pop();
         }),
         ("without samples", |tracks| tracks.groups[1].dense.as_mut().unwrap().times.clear()),
         ("`its log-scales` holds NaN at row 2, column 1", |tracks| {

@@ -7,6 +7,7 @@
 //! |---|---|
 //! | [`scene`] | parameters and gradients as plain scalars, addressed by group and index |
 //! | [`deform`] | where a Gaussian is at a time |
+//! | [`tracks`] | where recorded motion carries it |
 //! | [`project`] | what it looks like in a view: [`Splat2d`] |
 //! | [`sort`] | in which order splats are blended |
 //! | [`rasterize`] | colour, depth and the label's rendered identity per pixel |
@@ -27,6 +28,7 @@ pub mod rasterize;
 pub mod render;
 pub mod scene;
 pub mod sort;
+pub mod tracks;
 
 pub use deform::Deformed;
 pub use identity::IdentityProbabilities;

@@ -28,9 +28,8 @@ pub fn follow<R: Real>(
     let rotation = quaternion::to_rotation(turn);
     let (pivot, translation) = (group.pivot.to_array().map(R::of), group.translation.to_array().map(R::of));
     let offset: [R; 3] = std::array::from_fn(|k| posed.mean[k] - pivot[k]);
-    posed.mean = std::array::from_fn(|r| {
-        (0..3).map(|c| rotation[r][c] * offset[c]).sum::<R>() + translation[r]
-    });
+    posed.mean =
+        std::array::from_fn(|r| (0..3).map(|c| rotation[r][c] * offset[c]).sum::<R>() + translation[r]);
     posed.quaternion = quaternion::multiply(turn, posed.quaternion);
     HarmonicsRotation::new(rotation).rotate(&mut posed.sh);
     if !group.visible {

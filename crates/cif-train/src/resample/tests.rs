@@ -18,6 +18,7 @@ fn field() -> Field {
             sh_coefficients: (0..n).map(|k| [k as f32; 48]).collect(),
         },
         deformation: None,
+        tracks: None,
         identities: Some(Identities {
             row_offsets: (0..=n as u32).map(|k| 2 * k).collect(),
             labels: (0..2 * n).map(|k| (k % 2) as u16).collect(),

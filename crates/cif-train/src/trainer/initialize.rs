@@ -36,6 +36,7 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
     Ok(Field {
         gaussians,
         deformation: None,
+        tracks: None,
         identities: None,
         instances: instances(dataset),
         timeline: Timeline {

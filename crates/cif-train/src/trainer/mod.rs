@@ -119,6 +119,9 @@ impl Trainer {
         field: Field,
         progress: Option<Progress>,
     ) -> Result<Self, TrainError> {
+        if let Some(tracks) = &field.tracks {
+            return Err(TrainError::RecordedMotion { groups: tracks.groups.len() });
+        }
         let budget = u64::from(config.frame_memory_mib) << 20;
         let frames = FrameStore::open(&dataset, config.background, budget)?;
         let has_instances = !dataset.instances.is_empty() && frames.has_labels(&dataset);

@@ -1,0 +1,190 @@
+//! Recorded motion: the fast path against the reference, and images that must not change.
+
+mod common;
+
+use cif_field::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use cif_field::{Field, Heads};
+use cif_geometry::RigidTransform;
+use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::reference::{self, Scene};
+use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
+use cif_render::{Channels, InstanceSettings, RenderSettings, RenderedImage};
+use common::{pixel_discontinuity, render};
+use glam::{DMat3, DQuat, DVec3};
+
+const EVERYTHING: Channels = Channels { depth: true, instances: true };
+
+fn settings() -> RenderSettings {
+    RenderSettings { instances: Some(InstanceSettings::default()), ..RenderSettings::default() }
+}
+
+fn config(heads: Option<Heads>) -> SyntheticConfig {
+    SyntheticConfig {
+        seed: 5,
+        gaussians: 120,
+        instances: 4,
+        width: 61,
+        height: 43,
+        heads,
+        screen_size: (0.02, 0.1),
+    }
+}
+
+fn turn() -> DQuat {
+    DQuat::from_axis_angle(DVec3::new(2.0, -1.0, 2.0) / 3.0, 0.7)
+}
+
+/// Groups that turn, hide, follow dense samples and are exempt from the deformation; the rest stands still.
+fn with_tracks(field: &Field) -> Field {
+    let n = field.len() as u32;
+    let group_of: Vec<u32> = (0..n).map(|row| if row % 5 == 4 { NO_GROUP } else { row % 5 }).collect();
+    let pivot = DVec3::from_array(field.gaussians.means[0].map(f64::from));
+    let pose = |time: f64, angle: f64| TrackPose {
+        time,
+        translation: pivot + DVec3::new(0.2, 0.1, -0.15) * time,
+        rotation: DQuat::from_axis_angle(DVec3::Y, angle),
+    };
+    let members: Vec<usize> = (0..n as usize).filter(|row| row % 5 == 2).collect();
+    let sampled = |shift: f32| {
+        members.iter().map(move |&row| {
+            let [x, y, z] = field.gaussians.means[row];
+            [x + shift, y - 0.5 * shift, z]
+        })
+    };
+    let quaternions = members.iter().map(|&row| field.gaussians.quaternions[row]);
+    let dense = DenseTrack {
+        times: vec![0.0, 1.0],
+        means: sampled(0.0).chain(sampled(0.3)).collect(),
+        quaternions: quaternions.clone().chain(quaternions.map(|q| q.map(|c| c * 1.5))).collect(),
+        log_scales: None,
+    };
+    let still = |name| TrackGroup::still(name, pivot);
+    let groups = vec![
+        TrackGroup { poses: vec![pose(0.0, 0.2), pose(0.5, 1.4)], ..still("turning") },
+        TrackGroup { visibility: vec![VisibilityStep { time: 0.0, visible: false }], ..still("hidden") },
+        TrackGroup { dense: Some(dense), poses: vec![pose(0.0, -0.3)], ..still("dense") },
+        TrackGroup { deformed: false, ..still("exempt") },
+    ];
+    Field { tracks: Some(Tracks { group_of, groups }), ..field.clone() }
+}
+
+fn tracked_scene(heads: Option<Heads>) -> SyntheticScene {
+    let mut scene = generate(&config(heads));
+    scene.field = with_tracks(&scene.field);
+    scene.field.validate().unwrap();
+    scene
+}
+
+#[test]
+fn the_fast_path_follows_tracks_as_the_reference_does() {
+    for heads in [None, Some(Heads { sh: false, ..ALL_HEADS }), Some(ALL_HEADS)] {
+        let scene = tracked_scene(heads);
+        let double = Scene::<f64>::from_field(&scene.field);
+        let forward = render(&double, &scene, &settings());
+        for simd in [SimdLevel::Auto, SimdLevel::Portable] {
+            let mut renderer = Renderer::new(simd);
+            let image = renderer.render(&scene.field, &scene.camera, scene.time, &settings(), EVERYTHING);
+            let mut compared = 0;
+            for (position, (found, expected)) in
+                image.color.pixels.iter().zip(&forward.color.pixels).enumerate()
+            {
+                if pixel_discontinuity(&forward, position, 1e-3).is_some() {
+                    continue;
+                }
+                compared += 1;
+                for channel in 0..3 {
+                    let error = (f64::from(found[channel]) - expected[channel]).abs();
+                    assert!(error < 3e-5, "pixel {position}: {found:?} {expected:?}");
+                }
+            }
+            assert!(compared > 1000, "{compared} pixels are clear of thresholds");
+            let reference =
+                reference::render::<f64>(&scene.field, &scene.camera, scene.time, &settings(), EVERYTHING);
+            let labels = |image: &RenderedImage| image.instances.as_ref().unwrap().label.pixels.clone();
+            let same = labels(&image).iter().zip(labels(&reference)).filter(|(a, b)| **a == *b).count();
+            assert!(same * 1000 > 995 * image.color.pixels.len(), "{same} labels agree");
+        }
+        // The comparison can fail: the tracks do show.
+        let still = Field { tracks: None, ..scene.field.clone() };
+        let plain = reference::render::<f64>(&still, &scene.camera, scene.time, &settings(), EVERYTHING);
+        let changed = plain
+            .color
+            .pixels
+            .iter()
+            .zip(&forward.color.pixels)
+            .filter(|(a, b)| (f64::from(a[0]) - b[0]).abs() > 0.02)
+            .count();
+        assert!(changed > 300, "{changed} pixels show the tracks");
+    }
+}
+
+#[test]
+fn posed_gaussians_are_the_same_everywhere() {
+    for heads in [None, Some(Heads { sh: false, ..ALL_HEADS }), Some(ALL_HEADS)] {
+        let scene = tracked_scene(heads);
+        for time in [0.0, 0.37, 1.0] {
+            let fast = Renderer::new(SimdLevel::Auto).deform(&scene.field, time);
+            let plain = scene.field.deformed(time);
+            let pairs = [
+                (fast.means.as_flattened(), plain.means.as_flattened()),
+                (fast.log_scales.as_flattened(), plain.log_scales.as_flattened()),
+                (fast.quaternions.as_flattened(), plain.quaternions.as_flattened()),
+                (fast.sh_coefficients.as_flattened(), plain.sh_coefficients.as_flattened()),
+                (&fast.opacity_logits, &plain.opacity_logits),
+                (&fast.occupancy_logits, &plain.occupancy_logits),
+            ];
+            for (fast, plain) in pairs {
+                assert!(fast.iter().zip(plain).all(|(a, b)| (a - b).abs() < 1e-4));
+            }
+            let unhidden = Renderer::new(SimdLevel::Auto).deform_unhidden(&scene.field, time);
+            assert!(plain.opacity(1) == 0.0 && unhidden.opacity(1) > 0.01);
+            assert_eq!(unhidden.means, fast.means);
+        }
+    }
+}
+
+#[test]
+fn a_scene_and_a_camera_that_move_together_give_the_same_image() {
+    // Everything is in one group: places, orientations and view-dependent colours must all turn.
+    for heads in [None, Some(ALL_HEADS)] {
+        let scene = generate(&config(heads));
+        let pivot = DVec3::new(0.4, -0.2, 1.0);
+        let (rotation, translation) = (turn(), DVec3::new(-0.6, 0.3, 2.0));
+        let group = TrackGroup {
+            poses: vec![TrackPose { time: 0.0, translation, rotation }],
+            ..TrackGroup::still("world", pivot)
+        };
+        let tracks = Tracks { group_of: vec![0; scene.field.len()], groups: vec![group] };
+        let moved = Field { tracks: Some(tracks), ..scene.field.clone() };
+        let rotation = DMat3::from_quat(rotation);
+        let moved_from_still = RigidTransform { rotation, translation: translation - rotation * pivot };
+        let mut camera = scene.camera;
+        camera.camera_from_world = scene.camera.camera_from_world.compose(&moved_from_still.inverse());
+
+        let reference = |field: &Field, camera| {
+            reference::render::<f64>(field, camera, scene.time, &settings(), EVERYTHING).color
+        };
+        let (before, after) = (reference(&scene.field, &scene.camera), reference(&moved, &camera));
+        for (a, b) in before.pixels.iter().flatten().zip(after.pixels.iter().flatten()) {
+            assert!((a - b).abs() < 1e-6, "{a} {b}");
+        }
+        let fast =
+            Renderer::new(SimdLevel::Auto).render(&moved, &camera, scene.time, &settings(), EVERYTHING).color;
+        let off = fast.pixels.iter().flatten().zip(before.pixels.iter().flatten());
+        let off = off.filter(|(a, b)| (**a - **b).abs() > 1e-4).count();
+        assert!(off < 30, "{off} values differ");
+        // The comparison can fail: without the turn of the camera it is another image.
+        let other = reference(&moved, &scene.camera);
+        assert!(other.pixels != before.pixels);
+    }
+}
+
+#[test]
+#[should_panic(expected = "recorded motion has no gradients")]
+fn tracks_are_not_differentiated() {
+    let scene = tracked_scene(None);
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    let forward = renderer.forward(&scene.field, &scene.camera, 0.0, &settings(), Some(&scene.labels));
+    let mut gradients = cif_render::Gradients::zeros(&scene.field);
+    renderer.backward(&scene.field, &forward.color, 0.0, &mut gradients);
+}

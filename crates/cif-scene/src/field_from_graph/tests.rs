@@ -1,0 +1,225 @@
+use cif_geometry::RigidTransform;
+
+use super::*;
+use crate::testing::{MEMBERS, TIMES, recorded_field};
+use crate::{MotionModel, SceneOptions, Tolerance, build};
+
+fn options() -> SceneOptions {
+    SceneOptions { tolerance: Tolerance::Absolute(1e-4), ..SceneOptions::default() }
+}
+
+/// Largest difference of two lists of numbers.
+fn off<'a>(a: impl IntoIterator<Item = &'a f32>, b: impl IntoIterator<Item = &'a f32>) -> f32 {
+    let (mut a, mut b) = (a.into_iter(), b.into_iter());
+    let mut worst = 0.0_f32;
+    loop {
+        match (a.next(), b.next()) {
+            (Some(a), Some(b)) => worst = worst.max((a - b).abs()),
+            (None, None) => return worst,
+            _ => return f32::INFINITY,
+        }
+    }
+}
+
+fn turned_off(a: &[[f32; 4]], b: &[[f32; 4]]) -> f32 {
+    let dots = a.iter().zip(b).map(|(a, b)| a.iter().zip(b).map(|(a, b)| a * b).sum::<f32>().abs());
+    dots.fold(if a.len() == b.len() { 0.0 } else { f32::INFINITY }, |worst, dot| worst.max(1.0 - dot))
+}
+
+#[track_caller]
+fn assert_same(a: &SceneGraph, b: &SceneGraph) {
+    assert_eq!(a.nodes.len(), b.nodes.len());
+    assert_eq!(a.time_codes, b.time_codes);
+    assert_eq!(a.cameras, b.cameras);
+    assert_eq!((a.background_color, a.sort_metric), (b.background_color, b.sort_metric));
+    for (a, b) in a.nodes.iter().zip(&b.nodes) {
+        let name = &a.name;
+        assert_eq!((&a.kind, name, &a.label, &a.category), (&b.kind, &b.name, &b.label, &b.category));
+        assert_eq!((a.model(), &a.visibility), (b.model(), &b.visibility), "{name}");
+        assert_eq!(a.splats.len(), b.splats.len(), "{name}");
+        let (s, t) = (&a.splats, &b.splats);
+        assert!(off(s.means.as_flattened(), t.means.as_flattened()) < 2e-6, "{name}");
+        assert!(turned_off(&s.orientations, &t.orientations) < 1e-6, "{name}");
+        assert!(off(s.scales.as_flattened(), t.scales.as_flattened()) < 1e-6, "{name}");
+        assert!(off(&s.opacities, &t.opacities) < 1e-6, "{name}");
+        assert!(off(&s.occupancies, &t.occupancies) < 1e-6, "{name}");
+        assert!(off(&s.sh_coefficients, &t.sh_coefficients) < 3e-6, "{name}");
+        for code in [0.0, 1.0, 2.5, 4.0, 5.0] {
+            let (p, q) = (a.world_transform(code), b.world_transform(code));
+            assert!((p.translation - q.translation).length() < 2e-6, "{name} at {code}");
+            let turn = p.rotation - q.rotation;
+            assert!(turn.to_cols_array().iter().all(|v| v.abs() < 1e-5), "{name} at {code}");
+        }
+        if let (Motion::Dense(a), Motion::Dense(b)) = (&a.motion, &b.motion) {
+            assert_eq!(a.samples.len(), b.samples.len());
+            for (a, b) in a.samples.iter().zip(&b.samples) {
+                assert_eq!(a.time_code, b.time_code);
+                assert!(off(a.means.as_flattened(), b.means.as_flattened()) < 2e-6, "{name}");
+                assert!(turned_off(&a.orientations, &b.orientations) < 1e-6, "{name}");
+                let (s, t) = (a.scales.as_ref().unwrap(), b.scales.as_ref().unwrap());
+                assert!(off(s.as_flattened(), t.as_flattened()) < 1e-6, "{name}");
+            }
+        }
+    }
+}
+
+#[test]
+fn a_graph_comes_back_as_the_graph_it_was() {
+    for seed in 0..6 {
+        let field = recorded_field(1 + seed as usize, seed);
+        field.validate().unwrap();
+        let graph = build(&field, &options()).unwrap();
+        let back = field_from_graph(&graph, "scene.usda").unwrap();
+        assert_eq!(back.len(), field.len());
+        assert_eq!(back.instances, field.instances);
+        assert_eq!(back.timeline, field.timeline);
+        assert_eq!(back.provenance["imported"]["exported_from"], field.fingerprint());
+        let again = build(&back, &options()).unwrap();
+        assert_same(&graph, &again);
+        // What is posed is the same at every frame, hidden or not.
+        for time in TIMES {
+            let (a, b) = (field.deformed(time), back.deformed(time));
+            let rows: Vec<usize> =
+                graph.nodes.iter().flat_map(|node| &node.splats.rows).map(|row| *row as usize).collect();
+            for (new, old) in rows.into_iter().enumerate() {
+                assert!(off(&a.means[old], &b.means[new]) < 5e-5, "row {old} at {time}");
+                assert!(off(&a.sh_coefficients[old], &b.sh_coefficients[new]) < 1e-4, "row {old} at {time}");
+                assert_eq!(a.opacity(old) == 0.0, b.opacity(new) == 0.0);
+            }
+        }
+    }
+}
+
+#[test]
+fn every_kind_of_motion_is_there_and_the_comparison_can_fail() {
+    let graph = build(&recorded_field(4, 3), &options()).unwrap();
+    let models: Vec<_> = graph.nodes.iter().map(Node::model).collect();
+    use MotionModel::{Dense, Rigid, Static};
+    assert_eq!(models, [Static, Rigid, Dense, Static, Static]);
+    assert_eq!(graph.nodes[3].visibility.len(), 2);
+    assert!(!graph.nodes[3].is_visible(1.0) && graph.nodes[3].is_visible(2.0));
+    let mut moved = graph.clone();
+    moved.nodes[0].pivot.x += 1e-4;
+    assert!(std::panic::catch_unwind(|| assert_same(&graph, &moved)).is_err());
+}
+
+/// The rigid node of a scene of two objects, as two parts of which the second opens like a lid.
+fn with_parts(graph: &mut SceneGraph) {
+    let Motion::Rigid(track) = graph.nodes[1].motion.clone() else { panic!("the second object is rigid") };
+    let node = &mut graph.nodes[1];
+    let half = node.splats.len() / 2;
+    let lid = |code: f64| PoseSample {
+        time_code: code,
+        translation: DVec3::new(0.02, 0.0, 0.05),
+        rotation: DQuat::from_rotation_x(0.3 * code),
+    };
+    let part = |name: &str, splats, pivot, track| crate::Part {
+        name: name.to_owned(),
+        splats,
+        pivot,
+        track,
+        extent: Bounds::EMPTY,
+    };
+    let parts = vec![
+        part("part_00", 0..half, DVec3::new(0.0, 0.1, 0.0), Vec::new()),
+        part("part_01", half..node.splats.len(), DVec3::ZERO, vec![lid(1.0), lid(5.0)]),
+    ];
+    node.motion = Motion::Parts(crate::PartsMotion { track, parts });
+}
+
+#[test]
+fn parts_move_as_node_and_part_say() {
+    let mut graph = build(&recorded_field(2, 8), &options()).unwrap();
+    with_parts(&mut graph);
+    let field = field_from_graph(&graph, "parts.glb").unwrap();
+    let node = &graph.nodes[1];
+    let Motion::Parts(parts) = &node.motion else { unreachable!() };
+    let first = graph.nodes[0].splats.len();
+    for (frame, time) in TIMES.iter().enumerate() {
+        let posed = field.deformed(*time);
+        for part in &parts.parts {
+            let in_node = pose_at(&part.track, part.pivot, frame as f64).transform();
+            let world: RigidTransform = node.world_transform(frame as f64).compose(&in_node);
+            for splat in part.splats.clone() {
+                let expected = world.apply(DVec3::from_array(node.splats.means[splat].map(f64::from)));
+                let found = DVec3::from_array(posed.means[first + splat].map(f64::from));
+                assert!((expected - found).length() < 1e-6, "{} at {frame}", part.name);
+            }
+        }
+    }
+}
+
+#[test]
+fn a_turned_still_object_is_turned_once_with_its_colours() {
+    let mut graph = build(&recorded_field(1, 2), &options()).unwrap();
+    let turn = DQuat::from_rotation_y(0.8);
+    let node = &mut graph.nodes[0];
+    node.motion = Motion::Rigid(vec![PoseSample { time_code: 0.0, translation: DVec3::X, rotation: turn }]);
+    let field = field_from_graph(&graph, "turned.glb").unwrap();
+    assert_eq!(field.tracks, None, "nothing moves");
+    let mut sh = graph.nodes[0].splats.sh_coefficients[..48].to_vec();
+    HarmonicsRotation::new(rows_of(turn)).rotate(&mut sh);
+    assert!(off(&sh, &field.gaussians.sh_coefficients[0]) < 1e-6);
+    let expected = turn * DVec3::from_array(graph.nodes[0].splats.means[0].map(f64::from)) + DVec3::X;
+    assert!(off(&expected.as_vec3().to_array(), &field.gaussians.means[0]) < 1e-6);
+}
+
+#[test]
+fn opacities_of_0_and_1_and_odd_ids_survive() {
+    let mut graph = build(&recorded_field(3, 4), &options()).unwrap();
+    graph.nodes[0].splats.opacities[..3].copy_from_slice(&[0.0, 1.0, f32::MIN_POSITIVE]);
+    graph.nodes[0].splats.occupancies.clear();
+    for (node, id) in [(0, 0), (1, 7), (2, 7)] {
+        graph.nodes[node].kind = NodeKind::Instance { id, index: 0 };
+    }
+    let field = field_from_graph(&graph, "odd.ply").unwrap();
+    assert_eq!([0, 1].map(|row| field.gaussians.opacity(row)), [0.0, 1.0]);
+    assert_eq!(field.gaussians.occupancy(1), 1.0, "no occupancies: opacities");
+    let ids: Vec<u16> = field.instances.iter().map(|instance| instance.id).collect();
+    assert_eq!(ids, [1, 7, 2]);
+}
+
+#[test]
+fn files_of_others_have_an_unseen_background() {
+    let mut graph = build(&recorded_field(1, 4), &options()).unwrap();
+    graph.origin = crate::Origin::default();
+    let field = field_from_graph(&graph, "theirs.glb").unwrap();
+    assert!((field.gaussians.occupancy(MEMBERS) - 0.02).abs() < 1e-6);
+    // Without instances there are no identities, and what is there is there.
+    graph.nodes.remove(0);
+    let field = field_from_graph(&graph, "theirs.glb").unwrap();
+    assert_eq!((field.identities.is_none(), field.instances.len()), (true, 0));
+    assert!((field.gaussians.occupancy(0) - graph.nodes[0].splats.occupancies[0]).abs() < 1e-6);
+}
+
+#[test]
+fn broken_graphs_are_refused_by_name() {
+    type Break = fn(&mut SceneGraph);
+    let breaks: [(&str, Break); 9] = [
+        ("thing_0_002", |graph| drop(graph.nodes[0].splats.scales.split_off(3))),
+        ("scale is not above 0", |graph| graph.nodes[0].splats.scales[2][1] = 0.0),
+        ("opacity", |graph| graph.nodes[0].splats.opacities[2] = f32::NAN),
+        ("degree 4", |graph| graph.nodes[0].splats.sh_degree = 4),
+        ("means", |graph| graph.nodes[0].splats.means[0][0] = f32::INFINITY),
+        ("has no samples", |graph| {
+            graph.nodes[1].motion = Motion::Dense(DenseMotion { track: Vec::new(), samples: Vec::new() });
+        }),
+        ("does not ascend", |graph| {
+            let Motion::Rigid(track) = &mut graph.nodes[1].motion else { unreachable!() };
+            track.swap(0, 1);
+        }),
+        ("its parts hold 20 of 40", |graph| {
+            with_parts(graph);
+            let Motion::Parts(parts) = &mut graph.nodes[1].motion else { unreachable!() };
+            parts.parts.pop();
+        }),
+        ("time codes do not ascend", |graph| graph.time_codes.times[1] = 0.0),
+    ];
+    let graph = build(&recorded_field(2, 4), &options()).unwrap();
+    for (words, break_it) in breaks {
+        let mut graph = graph.clone();
+        break_it(&mut graph);
+        let message = field_from_graph(&graph, "broken.usda").unwrap_err().to_string();
+        assert!(message.contains(words), "{message}");
+    }
+}

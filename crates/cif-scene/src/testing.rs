@@ -1,0 +1,147 @@
+//! Scenes with recorded motion, for the tests of the way back.
+
+use cif_field::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use cif_field::{Field, Gaussians, Identities, Instance, RecordedCamera, SortMetric, Timeline};
+use cif_geometry::{PinholeCamera, RigidTransform};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+
+/// Gaussians per object, and of the background.
+pub(crate) const MEMBERS: usize = 40;
+
+/// Times of the scenes.
+pub(crate) const TIMES: [f64; 6] = [0.0, 0.15, 0.4, 0.55, 0.8, 1.0];
+
+/// Numbers in [-1, 1) that depend on the seed alone.
+pub(crate) struct Numbers(u64);
+
+impl Numbers {
+    pub(crate) fn new(seed: u64) -> Self {
+        Self(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1)
+    }
+
+    pub(crate) fn next(&mut self) -> f64 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 11) as f64 / (1_u64 << 52) as f64 - 1.0
+    }
+
+    pub(crate) fn vector(&mut self) -> DVec3 {
+        DVec3::new(self.next(), self.next(), self.next())
+    }
+}
+
+/// `objects` instances one metre apart and a background. By turns an object stands still, turns and travels,
+/// deforms, or appears at frame 2. Object k has id 3 k + 2. Occupancies are anything: owners are told.
+pub(crate) fn recorded_field(objects: usize, seed: u64) -> Field {
+    let mut numbers = Numbers::new(seed);
+    let mut gaussians = Gaussians::default();
+    let mut identities = Identities::empty();
+    let mut tracks = Tracks::default();
+    for object in 0..=objects {
+        let owner = (object < objects).then_some(object as u16);
+        let centre = DVec3::new(object as f64, 0.3 * numbers.next(), 0.5);
+        let first = gaussians.len();
+        for _ in 0..MEMBERS {
+            gaussians.means.push((centre + 0.2 * numbers.vector()).as_vec3().to_array());
+            gaussians.log_scales.push((0.7 * numbers.vector() - 4.0).as_vec3().to_array());
+            let turn = numbers.vector();
+            let turn = DQuat::from_xyzw(turn.x, turn.y, turn.z, 1.2).normalize();
+            gaussians.quaternions.push([turn.w, turn.x, turn.y, turn.z].map(|v| v as f32));
+            gaussians.opacity_logits.push(1.5 + numbers.next() as f32);
+            gaussians.occupancy_logits.push(4.0 * numbers.next() as f32);
+            gaussians
+                .sh_coefficients
+                .push(std::array::from_fn(|k| numbers.next() as f32 * if k < 3 { 1.0 } else { 0.2 }));
+            identities.push_told(owner);
+        }
+        if owner.is_none() {
+            tracks.group_of.extend([NO_GROUP; MEMBERS]);
+            continue;
+        }
+        tracks.group_of.extend([tracks.groups.len() as u32; MEMBERS]);
+        tracks.groups.push(group(object, centre, &gaussians, first, &mut numbers));
+    }
+    Field {
+        gaussians,
+        deformation: None,
+        tracks: tracks.compact(),
+        identities: Some(identities),
+        instances: (0..objects as u16)
+            .map(|k| Instance { id: 3 * k + 2, label: format!("thing {k}"), category: "thing".into() })
+            .collect(),
+        timeline: Timeline { times: TIMES.to_vec(), frames_per_second: 30.0 },
+        cameras: cameras(),
+        sh_degree: 3,
+        background: [0.25, 0.5, 1.0],
+        sort_metric: SortMetric::Distance,
+        extent: 1.0,
+        provenance: serde_json::Value::Null,
+    }
+}
+
+fn group(
+    object: usize,
+    centre: DVec3,
+    gaussians: &Gaussians,
+    first: usize,
+    numbers: &mut Numbers,
+) -> TrackGroup {
+    let mut group = TrackGroup::still(format!("object {object}"), centre);
+    match object % 4 {
+        1 => {
+            let axis = (numbers.vector() + DVec3::Z * 1.5).normalize();
+            let pose = |time: f64| TrackPose {
+                time,
+                translation: centre + DVec3::new(0.3 * time, -0.2 * time, time * time),
+                rotation: DQuat::from_axis_angle(axis, 1.7 * time),
+            };
+            group.poses = TIMES.map(pose).to_vec();
+        }
+        2 => {
+            let rows = first..first + MEMBERS;
+            let mut dense = DenseTrack {
+                times: TIMES.to_vec(),
+                means: Vec::new(),
+                quaternions: Vec::new(),
+                log_scales: Some(Vec::new()),
+            };
+            for time in TIMES {
+                for row in rows.clone() {
+                    let sway = (0.3 * time * numbers.vector()).as_vec3().to_array();
+                    let mean = gaussians.means[row];
+                    dense.means.push(std::array::from_fn(|k| mean[k] + sway[k]));
+                    dense.quaternions.push(gaussians.quaternions[row]);
+                    let grown = gaussians.log_scales[row].map(|scale| scale + 0.3 * time as f32);
+                    dense.log_scales.as_mut().unwrap().push(grown);
+                }
+            }
+            group.dense = Some(dense);
+        }
+        3 => {
+            group.visibility = vec![
+                VisibilityStep { time: TIMES[0], visible: false },
+                VisibilityStep { time: TIMES[2], visible: true },
+            ];
+        }
+        _ => {}
+    }
+    group
+}
+
+fn cameras() -> Vec<RecordedCamera> {
+    let record = |(name, time_index): (&str, usize)| RecordedCamera {
+        name: name.to_owned(),
+        time_index,
+        trained: true,
+        camera: PinholeCamera {
+            width: 40,
+            height: 30,
+            focal_px: DVec2::new(30.0, 31.0),
+            principal_px: DVec2::new(20.5, 14.0),
+            camera_from_world: RigidTransform {
+                rotation: DMat3::from_rotation_x(0.1 * time_index as f64),
+                translation: DVec3::new(-1.0, 0.0, 4.0 + 0.1 * time_index as f64),
+            },
+        },
+    };
+    [("left", 0), ("left", 3), ("right", 5)].map(record).to_vec()
+}
