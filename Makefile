@@ -13,11 +13,12 @@ MATURIN := maturin==1.16.0
 PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
 
-.PHONY: help build demo test test-rust test-python lint format clean
+.PHONY: help build demo plugin test test-rust test-python lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
 	@echo "make demo    train, evaluate, export, query and render the small capture into $(OUT)"
+	@echo "make plugin  the Blender extension, into out/"
 	@echo "make test    all tests, Rust and Python"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make format  put the formatting right"
@@ -53,6 +54,9 @@ demo: build
 	@echo "$(OUT)/metrics.json how good it is"
 	@echo "$(OUT)/comparison/  truth, render, instance map, error and depth side by side"
 	@echo "$(OUT)/views/       the views that were held out"
+
+plugin:
+	$(PYTHON) plugin/blender/build.py out
 
 test: test-rust test-python
 

@@ -1,0 +1,67 @@
+"""The object of one splat prim: vertices with attributes and the modifier that draws them."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+
+from ..io.color import BAND_0, linear_from_display
+from ..io.scene import Splats
+from . import animation, nodes
+
+MODIFIER = "Splats"
+
+
+def splat_mesh(name: str, splats: Splats, harmonics: bool) -> bpy.types.Mesh:
+    """A mesh without faces: centres as vertices, everything else as attributes."""
+    mesh = bpy.data.meshes.new(name)
+    mesh.vertices.add(splats.count)
+    mesh.attributes["position"].data.foreach_set("vector", _flat(splats.positions))
+    store(mesh, "rot", "QUATERNION", splats.rotations)
+    store(mesh, "scale", "FLOAT_VECTOR", splats.scales)
+    store(mesh, "opacity", "FLOAT", splats.opacities)
+    display = np.clip(0.5 + BAND_0 * splats.harmonics[:, 0], 0.0, None)
+    store(mesh, "colour", "FLOAT_COLOR", np.c_[linear_from_display(display), np.ones(splats.count)])
+    if splats.occupancies is not None:
+        store(mesh, "occupancy", "FLOAT", splats.occupancies)
+    if harmonics:
+        for number in range(splats.harmonics.shape[1]):
+            store(mesh, f"sh_{number}", "FLOAT_VECTOR", splats.harmonics[:, number])
+    if (samples := splats.samples) is not None:
+        for number in range(len(samples.codes)):
+            store(mesh, f"position_{number}", "FLOAT_VECTOR", samples.positions[number])
+            store(mesh, f"rot_{number}", "QUATERNION", samples.rotations[number])
+            if samples.scales is not None:
+                store(mesh, f"scale_{number}", "FLOAT_VECTOR", samples.scales[number])
+    mesh.color_attributes.active_color_name = "colour"
+    mesh.update()
+    return mesh
+
+
+def add_modifier(
+    obj: bpy.types.Object, splats: Splats, pixel_angle: float, near: float, display_blending: bool
+) -> None:
+    """Draw the vertices as ellipsoids, and play the samples of splats that deform."""
+    modifier = obj.modifiers.new(MODIFIER, "NODES")
+    modifier.node_group = nodes.splat_nodes()
+    nodes.set_input(modifier, nodes.BLUR, pixel_angle)
+    nodes.set_input(modifier, nodes.NEAR, near)
+    nodes.set_input(modifier, nodes.DISPLAY, display_blending)
+    if (samples := splats.samples) is not None:
+        path = nodes.set_input(modifier, nodes.SAMPLE, 0.0)
+        numbers = np.arange(len(samples.codes), dtype=np.float64)
+        steps = np.diff(samples.codes)
+        if np.allclose(steps, steps[0]):
+            numbers = numbers[[0, -1]]
+        animation.curve(obj, path, 0, samples.codes[numbers.astype(int)], numbers)
+
+
+def store(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:
+    """Add an attribute of the vertices."""
+    attribute = mesh.attributes.new(name, kind, "POINT")
+    key = {"FLOAT": "value", "FLOAT_COLOR": "color", "QUATERNION": "value"}.get(kind, "vector")
+    attribute.data.foreach_set(key, _flat(values))
+
+
+def _flat(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, dtype=np.float32).ravel()

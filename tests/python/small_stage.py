@@ -1,0 +1,186 @@
+"""A stage of every kind of motion, written as text, so that any USD can read it without our package."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+FRAMES = 9
+"""Time codes 0 to 8."""
+COUNT = 20
+"""Splats of every prim."""
+RED_BAND_0 = (1.2, -1.0, -1.2)
+"""First coefficient of every splat: red."""
+
+
+def turned(angle: float) -> tuple[float, float, float, float]:
+    """Quaternion (w, x, y, z) of a turn about z."""
+    return (float(np.cos(angle / 2)), 0.0, 0.0, float(np.sin(angle / 2)))
+
+
+def positions(seed: int, frame: int = 0, bend: float = 0.0) -> np.ndarray:
+    """Centres of a prim's splats, local frame; those that bend rise with x squared."""
+    centres = np.random.default_rng(seed).uniform(-0.1, 0.1, (COUNT, 3))
+    centres[:, 2] += bend * frame * centres[:, 0] ** 2
+    return centres
+
+
+def scales(seed: int) -> np.ndarray:
+    """Standard deviations of a prim's splats."""
+    return np.random.default_rng(seed + 100).uniform(0.005, 0.03, (COUNT, 3))
+
+
+def orientations(seed: int) -> np.ndarray:
+    """Unit quaternions (w, x, y, z) of a prim's splats."""
+    values = np.random.default_rng(seed + 200).normal(size=(COUNT, 4))
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+def write_stage(path: Path, up_axis: str = "Z", meters_per_unit: float = 1.0) -> Path:
+    """A mug that stands, a car that drives and turns, a box of two parts, a napkin that bends, a background.
+
+    The car turns by 0.4 rad and drives by 0.1 a frame; the lid turns by 0.1 rad a frame on a box that slides;
+    the ball is hidden until frame 3; the camera looks down from 2 units above and rises by 0.1 a frame.
+    """
+    codes = range(FRAMES)
+    body = [
+        _object("red_mug_001", ["mug", "red mug"], 1, _pose((0.5, 0.0, 0.1), turned(0.3)), _splats(1)),
+        _object(
+            "toy_car_002",
+            ["car", "toy car"],
+            2,
+            _poses((f, (0.1 * f, -0.4, 0.0), turned(0.4 * f)) for f in codes),
+            _splats(2),
+        ),
+        _object(
+            "box_003",
+            ["box"],
+            3,
+            _poses([(0, (-0.5, 0.0, 0.0), turned(0)), (8, (-0.5, 0.8, 0.0), turned(0))]),
+            _part("part_00", _pose((0, 0, 0), turned(0)), _splats(3))
+            + _part("part_01", _poses((f, (0, 0, 0.2), turned(0.1 * f)) for f in codes), _splats(4)),
+        ),
+        _object(
+            "green_napkin_007",
+            ["napkin", "green napkin"],
+            7,
+            _poses((f, (0.0, 0.05 * f, 0.3), turned(0)) for f in codes),
+            _splats(5, bend=2.0),
+        ),
+        _object(
+            "ball_008",
+            ["ball"],
+            8,
+            _pose((0.0, 0.6, 0.0), turned(0))
+            + 'token visibility = "invisible"\n'
+            + 'token visibility.timeSamples = { 0: "invisible", 3: "inherited" }\n',
+            _splats(6),
+        ),
+        _object("background", ["background"], None, _pose((0, 0, -0.5), turned(0)), _splats(9)),
+        _camera(),
+    ]
+    path.write_text(
+        f"""#usda 1.0
+(
+    customLayerData = {{ dictionary cif = {{ float3 backgroundColor = (0.5, 0.25, 1) }} }}
+    defaultPrim = "World"
+    upAxis = "{up_axis}"
+    metersPerUnit = {meters_per_unit}
+    timeCodesPerSecond = 12
+    framesPerSecond = 12
+    startTimeCode = 0
+    endTimeCode = {FRAMES - 1}
+)
+def Xform "World" (kind = "assembly")
+{{
+{"".join(body)}
+}}
+"""
+    )
+    return path
+
+
+def _tuple(values: Iterable[float]) -> str:
+    return "(" + ", ".join(f"{float(value):.9g}" for value in values) + ")"
+
+
+def _array(rows: Iterable) -> str:
+    return "[" + ", ".join(_tuple(row) if np.ndim(row) else f"{float(row):.9g}" for row in rows) + "]"
+
+
+def _pose(translation: Iterable[float], rotation: Iterable[float]) -> str:
+    return f"""double3 xformOp:translate = {_tuple(translation)}
+quatf xformOp:orient = {_tuple(rotation)}
+uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]
+"""
+
+
+def _poses(samples: Iterable[tuple[float, Iterable[float], Iterable[float]]]) -> str:
+    samples = list(samples)
+    translations = ", ".join(f"{code}: {_tuple(t)}" for code, t, _ in samples)
+    rotations = ", ".join(f"{code}: {_tuple(q)}" for code, _, q in samples)
+    return (
+        _pose(samples[0][1], samples[0][2])
+        + f"""double3 xformOp:translate.timeSamples = {{ {translations} }}
+quatf xformOp:orient.timeSamples = {{ {rotations} }}
+"""
+    )
+
+
+def _object(name: str, labels: list[str], number: int | None, pose: str, children: str) -> str:
+    words = ", ".join(f'"{label}"' for label in labels)
+    data = f"customData = {{ dictionary cif = {{ int id = {number} }} }}" if number else ""
+    return f"""def Xform "{name}" (
+    kind = "component"
+    displayName = "{labels[-1]}"
+    prepend apiSchemas = ["SemanticsLabelsAPI:class", "SemanticsLabelsAPI:instance"]
+    {data}
+) {{
+token[] semantics:labels:class = [{words}]
+token[] semantics:labels:instance = ["{name}"]
+custom string userProperties:label = "{labels[-1]}"
+{pose}
+{children}
+}}
+"""
+
+
+def _part(name: str, pose: str, children: str) -> str:
+    return f'def Xform "{name}" {{\n{pose}\n{children}\n}}\n'
+
+
+def _splats(seed: int, bend: float = 0.0) -> str:
+    samples = ""
+    if bend:
+        sampled = ", ".join(f"{f}: {_array(positions(seed, f, bend))}" for f in range(FRAMES))
+        samples = f"point3f[] positions.timeSamples = {{ {sampled} }}\n"
+    harmonics = np.zeros((COUNT, 4, 3))
+    harmonics[:, 0] = RED_BAND_0
+    return f"""def ParticleField3DGaussianSplat "Splats" {{
+point3f[] positions = {_array(positions(seed))}
+{samples}quatf[] orientations = {_array(orientations(seed))}
+float3[] scales = {_array(scales(seed))}
+float[] opacities = {_array(np.full(COUNT, 0.8))}
+uniform int radiance:sphericalHarmonicsDegree = 1
+float3[] radiance:sphericalHarmonicsCoefficients = {_array(harmonics.reshape(-1, 3))} (
+    elementSize = 4
+    interpolation = "vertex"
+)
+}}
+"""
+
+
+def _camera() -> str:
+    return f"""def Camera "camera_0" {{
+float focalLength = 18
+float horizontalAperture = 36
+float verticalAperture = 27
+float horizontalApertureOffset = 1.8
+float2 clippingRange = (0.01, 1000)
+int userProperties:imageWidth = 64
+int userProperties:imageHeight = 48
+{_poses((f, (0, 0, 2 + 0.1 * f), turned(0)) for f in range(FRAMES))}
+}}
+"""
