@@ -42,6 +42,28 @@ pub enum SceneError {
         /// What does not fit.
         what: String,
     },
+    /// A file that does not tell which field it came from.
+    #[error(
+        "{file} does not say that cif exported it, so its edits cannot be told; import it without a base to get a \
+         scene of its own"
+    )]
+    NotExported {
+        /// The file.
+        file: String,
+    },
+    /// Edits of another field.
+    #[error(
+        "{file} was exported from another scene than this base (fingerprint {exported}, the base has {base}); give \
+         the scene it was exported from, or force it if this one has the same Gaussians in the same order"
+    )]
+    OtherBase {
+        /// The file.
+        file: String,
+        /// Fingerprint in the file.
+        exported: String,
+        /// Fingerprint of the base.
+        base: String,
+    },
     /// An option outside its range.
     #[error("{option} is {value}, but must be {expected}")]
     Option {

@@ -198,6 +198,24 @@ impl NodeRows {
         group
     }
 
+    /// Keeps the learned deformation of a field away from the rows.
+    pub(crate) fn exempt(&mut self, name: &str) {
+        let mut next = 0;
+        let mut gaps = Vec::new();
+        for (range, group) in &mut self.groups {
+            group.deformed = false;
+            if next < range.start {
+                gaps.push(next..range.start);
+            }
+            next = range.end;
+        }
+        if next < self.gaussians.len() {
+            gaps.push(next..self.gaussians.len());
+        }
+        let still = TrackGroup { deformed: false, ..TrackGroup::still(name, DVec3::ZERO) };
+        self.groups.extend(gaps.into_iter().map(|gap| (gap, still.clone())));
+    }
+
     /// Adds the rows at the end of a set with tracks.
     pub(crate) fn append_to(self, gaussians: &mut Gaussians, tracks: &mut Tracks) {
         let first = gaussians.len();

@@ -261,11 +261,14 @@ pub struct Splats {
     pub occupancies: Vec<f32>,
     /// Probability of the most probable instance; 0 without identities.
     pub identity_probabilities: Vec<f32>,
-    /// Row of every splat in the field.
+    /// Row of every splat in the field; [`Splats::NO_ROW`] for a splat that comes from elsewhere.
     pub rows: Vec<u32>,
 }
 
 impl Splats {
+    /// Entry of [`Splats::rows`] for a splat that is no row of a field.
+    pub const NO_ROW: u32 = u32::MAX;
+
     /// Number of splats.
     #[must_use]
     pub fn len(&self) -> usize {

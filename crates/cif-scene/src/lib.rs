@@ -14,6 +14,8 @@
 //! | [`naming`] | names that every format accepts |
 //! | [`report`] | what the chosen motion models cost and miss |
 //! | [`query`] | nodes by label |
+//! | [`diff`] | what differs between two graphs, object by object |
+//! | [`edits`] | what was changed in an exported file, applied to the field it came from |
 //! | [`field_from_graph`] | the way back: Gaussians, recorded motion and instances of a graph |
 //!
 //! Frames: world as captured (right-handed, metres). A node's splats live in its local frame, whose axes are the
@@ -23,6 +25,8 @@
 pub mod assignment;
 pub mod build;
 pub mod camera_tracks;
+pub mod diff;
+pub mod edits;
 pub mod error;
 pub mod extent;
 pub mod field_from_graph;
@@ -43,6 +47,8 @@ mod time_map;
 mod visibility;
 
 pub use build::{build, build_from};
+pub use diff::{ChangeKind, ObjectChange, SceneDiff};
+pub use edits::import_edits;
 pub use error::SceneError;
 pub use field_from_graph::field_from_graph;
 pub use graph::{

@@ -30,6 +30,15 @@ pub fn identifier(text: &str, fallback: &str) -> String {
     if name.starts_with(|first: char| first.is_ascii_digit()) { format!("_{name}") } else { name.to_owned() }
 }
 
+/// Label for a name that a person gave: without the id at its end, underscores as blanks. `blue_mug_001` and 1
+/// give `blue mug`.
+#[must_use]
+pub fn label_of_name(name: &str, id: u16) -> String {
+    let bare = name.strip_suffix(&format!("_{id:03}")).unwrap_or(name);
+    let label = bare.replace('_', " ").trim().to_owned();
+    if label.is_empty() { name.to_owned() } else { label }
+}
+
 /// `name`, or `name_2`, `name_3`, ... where it is taken.
 #[must_use]
 pub fn unique(name: String, taken: impl Fn(&str) -> bool) -> String {
@@ -58,6 +67,15 @@ mod tests {
         ];
         for (label, id, name) in cases {
             assert_eq!(instance_name(label, id), name, "{label}");
+        }
+    }
+
+    #[test]
+    fn names_become_labels() {
+        for (name, label) in
+            [("blue_mug_007", "blue mug"), ("blue_mug", "blue mug"), ("_007", "_007"), ("a_008", "a 008")]
+        {
+            assert_eq!(label_of_name(name, 7), label);
         }
     }
 

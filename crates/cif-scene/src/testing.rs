@@ -145,3 +145,39 @@ fn cameras() -> Vec<RecordedCamera> {
     };
     [("left", 0), ("left", 3), ("right", 5)].map(record).to_vec()
 }
+
+/// The objects of [`recorded_field`] without recorded motion, with a deformation as training makes them, and
+/// identities as they are estimated: some rows name two instances, and every tenth Gaussian is too faint to see.
+pub(crate) fn learned_field(objects: usize, seed: u64) -> Field {
+    let mut field = Field { tracks: None, ..recorded_field(objects, seed) };
+    let heads = cif_field::Heads { position: true, scale: true, rotation: true, opacity: false, sh: false };
+    let config = cif_render::synthetic::SyntheticConfig { heads: Some(heads), seed, ..Default::default() };
+    let mut deformation = cif_render::synthetic::generate(&config).field.deformation.unwrap();
+    deformation.bounds =
+        cif_geometry::Bounds { low: DVec3::splat(-1.0), high: DVec3::new(objects as f64 + 1.0, 1.0, 1.5) };
+    field.deformation = Some(deformation);
+    let mut identities = Identities::empty();
+    for row in 0..field.len() {
+        let object = (row / MEMBERS) as u16;
+        let is_background = usize::from(object) == objects;
+        field.gaussians.occupancy_logits[row] = if is_background { -4.0 } else { 2.0 };
+        if row % 10 == 3 {
+            field.gaussians.opacity_logits[row] = -7.0;
+        }
+        let label = if is_background { 0 } else { object };
+        let other = (label + 1) % objects as u16;
+        let mut entries = vec![(label, 0.8_f32)];
+        if row % 3 == 0 && other != label {
+            entries.push((other, 0.15));
+        }
+        entries.sort_by_key(|(label, _)| *label);
+        for (label, share) in entries {
+            identities.labels.push(label);
+            identities.log_estimates.push(share.ln());
+            identities.log_calibrations.push(0.1);
+        }
+        identities.row_offsets.push(identities.labels.len() as u32);
+    }
+    field.identities = Some(identities);
+    field
+}

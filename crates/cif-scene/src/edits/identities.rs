@@ -1,0 +1,113 @@
+//! Instance table and identity rows of an edited field.
+
+use std::collections::BTreeMap;
+
+use cif_field::{Field, Identities, Instance};
+
+use super::{Plan, instance_of};
+use crate::{SceneGraph, assignment};
+
+/// Instance of the base table (or one added after it), or none.
+pub(super) type Owner = Option<u16>;
+
+/// Where the identity of a row comes from.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum RowIdentity {
+    /// The row of this number of the gathered base.
+    Kept(u32),
+    /// Its owner is told.
+    Told(Owner),
+}
+
+/// Rows of each instance that are in no node of the graph: too faint to be seen, they still belong to it.
+pub(super) fn unseen_members(base: &Field, exported: &SceneGraph) -> BTreeMap<usize, Vec<u32>> {
+    let mut members: BTreeMap<usize, Vec<u32>> = BTreeMap::new();
+    if base.identities.is_none() {
+        return members;
+    }
+    let mut is_seen = vec![false; base.len()];
+    for row in exported.nodes.iter().flat_map(|node| &node.splats.rows) {
+        is_seen[*row as usize] = true;
+    }
+    // As if they could be seen.
+    let all: Vec<u32> = (0..base.len() as u32).collect();
+    let options = exported.origin.options.clone().unwrap_or_default();
+    let owners = assignment::assign(base, &assignment::most_probable(base), &all, &options);
+    for (row, owner) in owners.into_iter().enumerate().filter(|(row, _)| !is_seen[*row]) {
+        if let Some(owner) = owner {
+            members.entry(owner).or_default().push(row as u32);
+        }
+    }
+    members
+}
+
+/// The table without what was removed, and rows that name only what is left. `instances` is the base's table
+/// with new entries at its end.
+pub(super) fn rebuild(
+    plan: &Plan<'_>,
+    instances: Vec<Instance>,
+    gathered: Option<&Identities>,
+    rows: &[RowIdentity],
+) -> (Vec<Instance>, Option<Identities>) {
+    let mut next = 0;
+    let renumbered: Vec<Owner> = (0..instances.len())
+        .map(|index| {
+            let stays = !plan.removed.contains(&index);
+            next += u16::from(stays);
+            stays.then(|| next - 1)
+        })
+        .collect();
+    let instances: Vec<Instance> = instances
+        .into_iter()
+        .zip(&renumbered)
+        .filter_map(|(instance, index)| index.map(|_| instance))
+        .collect();
+    if instances.is_empty() {
+        return (instances, None);
+    }
+    let mut is_owned = vec![false; plan.base.len()];
+    for node in plan.exported.nodes.iter().filter(|node| instance_of(node).is_some()) {
+        node.splats.rows.iter().for_each(|row| is_owned[*row as usize] = true);
+    }
+    let mut identities = Identities::empty();
+    for row in rows {
+        match (*row, gathered) {
+            (RowIdentity::Told(owner), _) => {
+                identities.push_told(owner.and_then(|owner| renumbered[usize::from(owner)]));
+            }
+            (RowIdentity::Kept(_), None) => identities.push_told(None),
+            (RowIdentity::Kept(row), Some(gathered)) => {
+                let owned = is_owned[plan.sources[row as usize] as usize];
+                keep(&mut identities, gathered, row as usize, &renumbered, owned);
+            }
+        }
+    }
+    (instances, Some(identities))
+}
+
+/// A row without the entries of removed instances. A row that belongs to one that stays keeps its labelled
+/// share, so that it goes on belonging to it.
+fn keep(to: &mut Identities, from: &Identities, row: usize, renumbered: &[Owner], owned: bool) {
+    let range = from.range(row);
+    let share = |entries: &[f32]| entries.iter().map(|log| f64::from(*log).exp()).sum::<f64>();
+    let first = to.labels.len();
+    for entry in range.clone() {
+        if let Some(label) = renumbered[usize::from(from.labels[entry])] {
+            to.labels.push(label);
+            to.log_estimates.push(from.log_estimates[entry]);
+            to.log_calibrations.push(from.log_calibrations[entry]);
+        }
+    }
+    if to.labels.len() == first {
+        to.push_told(None);
+        return;
+    }
+    if owned && to.labels.len() - first < range.len() {
+        let (before, after) = (share(&from.log_estimates[range]), share(&to.log_estimates[first..]));
+        let factor = (before / after).ln() as f32;
+        if factor.is_finite() {
+            to.log_estimates[first..].iter_mut().for_each(|log| *log += factor);
+        }
+    }
+    to.row_offsets.push(to.labels.len() as u32);
+}

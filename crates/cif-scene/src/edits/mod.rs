@@ -1,0 +1,460 @@
+//! Edits come home: what was changed in an exported file is applied to the field it was exported from.
+//!
+//! The graph that was exported is built again from the field, and compared with the edited one ([`crate::diff`]).
+//! What did not change keeps everything the field knows of it, its learned motion included:
+//!
+//! | edit | in the field |
+//! |---|---|
+//! | object moved, also over time | recorded motion after the learned one |
+//! | relabelled, renamed, another category | instance table |
+//! | hidden, also over time | visibility of recorded motion |
+//! | recoloured, faded or resized splats | their canonical parameters, by the difference |
+//! | deleted splats or objects | gone, with what nobody saw of an object |
+//! | splats moved within an object | taken from the file, with the motion that the file gives them |
+//! | duplicated object | a copy of its Gaussians, as a new instance |
+//! | added object | its Gaussians and motion, exempt from the learned one |
+
+mod identities;
+mod parts;
+
+use std::collections::BTreeSet;
+
+use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use cif_field::{Field, Instance};
+use cif_geometry::spherical_harmonics::HarmonicsRotation;
+use glam::DVec3;
+
+use crate::diff::splats::{SplatPairs, coefficients, is_faded, is_recoloured, is_resized, pair};
+use crate::diff::units::{Unit, delta, key_codes, matching, step};
+use crate::diff::{Pair, SceneDiff, diff, pairs, same_rows, visibility_differs};
+use crate::field_from_graph::{InstanceTable, NodeRows, log_scale, logit, rows_of};
+use crate::time_map::TimeMap;
+use crate::{Node, NodeKind, SceneError, SceneGraph, build, naming};
+use identities::{Owner, RowIdentity, unseen_members};
+use parts::subset;
+
+/// Applies the edits of a file to the field that the file was exported from, and lists them. `source` names the
+/// file, in errors and in the field's provenance. With `force` another field than the exported one is taken as
+/// its base all the same: rows are then compared as they are numbered.
+///
+/// # Errors
+/// When the file was not exported by cif, when it was exported from another field (without `force`), or when an
+/// edited object cannot become Gaussians.
+pub fn import_edits(
+    base: &Field,
+    edited: &SceneGraph,
+    source: &str,
+    force: bool,
+) -> Result<(Field, SceneDiff), SceneError> {
+    let (Some(fingerprint), Some(options)) = (&edited.origin.field_fingerprint, &edited.origin.options)
+    else {
+        return Err(SceneError::NotExported { file: source.to_owned() });
+    };
+    let found = base.fingerprint();
+    if *fingerprint != found && !force {
+        return Err(SceneError::OtherBase {
+            file: source.to_owned(),
+            exported: fingerprint.clone(),
+            base: found,
+        });
+    }
+    let exported = build(base, options)?;
+    if *fingerprint == found {
+        return apply(base, &exported, edited, source);
+    }
+    let mut edited = edited.clone();
+    edited.origin.field_fingerprint = Some(found);
+    apply(base, &exported, &edited, source)
+}
+
+/// Applies what differs between `exported`, a graph of `base`, and `edited`.
+///
+/// # Errors
+/// When an edited object cannot become Gaussians; it is named.
+pub fn apply(
+    base: &Field,
+    exported: &SceneGraph,
+    edited: &SceneGraph,
+    source: &str,
+) -> Result<(Field, SceneDiff), SceneError> {
+    let changes = diff(exported, edited);
+    if changes.is_empty() {
+        return Ok((base.clone(), changes));
+    }
+    let plan = Plan::new(base, exported, edited)?;
+    let mut work = plan.start();
+    for (index, step) in plan.steps.iter().enumerate() {
+        work.adjust(&plan, index, step);
+    }
+    for step in &plan.steps {
+        work.append(&plan, step)?;
+    }
+    let field = work.finish(&plan, source, &changes)?;
+    Ok((field, changes))
+}
+
+/// One pair of nodes and what becomes of their splats.
+struct Step {
+    pair: Pair,
+    splats: SplatPairs,
+    /// First row of a duplicate in the edited field.
+    first_copy: u32,
+    /// Base rows that nobody sees, but that belong to the object.
+    unseen: Vec<u32>,
+}
+
+struct Plan<'a> {
+    base: &'a Field,
+    exported: &'a SceneGraph,
+    edited: &'a SceneGraph,
+    times: TimeMap,
+    reference: f64,
+    steps: Vec<Step>,
+    /// Base row of every row that is kept or copied.
+    sources: Vec<u32>,
+    /// Row in the edited field of every base row that is kept.
+    new_of_base: Vec<Option<u32>>,
+    /// Base instances that go.
+    removed: BTreeSet<usize>,
+}
+
+impl<'a> Plan<'a> {
+    fn new(base: &'a Field, exported: &'a SceneGraph, edited: &'a SceneGraph) -> Result<Self, SceneError> {
+        let rows_match = same_rows(exported, edited);
+        let mut unseen = unseen_members(base, exported);
+        let mut deleted = vec![false; base.len()];
+        let mut removed = BTreeSet::new();
+        let mut steps = Vec::new();
+        for pair_of_nodes in pairs(exported, edited) {
+            let first = pair_of_nodes.before.map(|index| &exported.nodes[index]);
+            let second = pair_of_nodes.after.map(|index| &edited.nodes[index]);
+            if let Some(second) = second {
+                crate::field_from_graph::check(second)?;
+            }
+            let mut step = Step {
+                pair: pair_of_nodes,
+                splats: SplatPairs::default(),
+                first_copy: 0,
+                unseen: Vec::new(),
+            };
+            let mut delete = |row: u32| deleted[row as usize] = true;
+            match (first, second) {
+                (Some(first), Some(second)) => {
+                    step.splats = pair(first, second, rows_match);
+                    if !pair_of_nodes.duplicate {
+                        let reshaped = step.splats.reshaped.iter().map(|(i, _)| i);
+                        step.splats
+                            .removed
+                            .iter()
+                            .chain(reshaped)
+                            .for_each(|i| delete(first.splats.rows[*i]));
+                        step.unseen = instance_of(first).and_then(|k| unseen.remove(&k)).unwrap_or_default();
+                    }
+                }
+                (Some(first), None) => {
+                    first.splats.rows.iter().copied().for_each(&mut delete);
+                    if let Some(index) = instance_of(first) {
+                        unseen.remove(&index).unwrap_or_default().into_iter().for_each(&mut delete);
+                        removed.insert(index);
+                    }
+                }
+                (None, Some(second)) => step.splats.added = (0..second.splats.len()).collect(),
+                (None, None) => {}
+            }
+            steps.push(step);
+        }
+        let mut sources: Vec<u32> = (0..base.len() as u32).filter(|row| !deleted[*row as usize]).collect();
+        let mut new_of_base = vec![None; base.len()];
+        for (new, old) in sources.iter().enumerate() {
+            new_of_base[*old as usize] = Some(new as u32);
+        }
+        for step in steps.iter_mut().filter(|step| step.pair.duplicate) {
+            step.first_copy = sources.len() as u32;
+            if let Some(first) = step.pair.before.map(|index| &exported.nodes[index]) {
+                sources.extend(step.splats.kept.iter().map(|(i, _)| first.splats.rows[*i]));
+            }
+        }
+        Ok(Self {
+            times: TimeMap::of_field(&base.timeline),
+            reference: exported.time_codes.start(),
+            base,
+            exported,
+            edited,
+            steps,
+            sources,
+            new_of_base,
+            removed,
+        })
+    }
+
+    /// The base without what is deleted, with copies of what is duplicated.
+    fn start(&self) -> Work {
+        let mut field = self.base.gather(&self.sources);
+        let tracks = field
+            .tracks
+            .take()
+            .unwrap_or_else(|| Tracks { group_of: vec![NO_GROUP; field.len()], groups: Vec::new() });
+        let rows = (0..self.sources.len() as u32).map(RowIdentity::Kept).collect();
+        let instances = InstanceTable { entries: std::mem::take(&mut field.instances) };
+        Work { field, tracks, rows, instances, owners: vec![None; self.steps.len()] }
+    }
+
+    fn nodes(&self, step: &Step) -> (Option<&'a Node>, Option<&'a Node>) {
+        let before = step.pair.before.map(|index| &self.exported.nodes[index]);
+        (before, step.pair.after.map(|index| &self.edited.nodes[index]))
+    }
+
+    /// Rows in the edited field of the kept splats of a step, with their positions in both nodes.
+    fn kept_rows(&self, step: &Step, first: &Node) -> Vec<(u32, usize, usize)> {
+        let pairs = step.splats.kept.iter().enumerate();
+        pairs
+            .filter_map(|(place, (i, j))| {
+                let row = if step.pair.duplicate {
+                    Some(step.first_copy + place as u32)
+                } else {
+                    self.new_of_base[first.splats.rows[*i] as usize]
+                };
+                row.map(|row| (row, *i, *j))
+            })
+            .collect()
+    }
+}
+
+fn instance_of(node: &Node) -> Option<usize> {
+    match node.kind {
+        NodeKind::Instance { index, .. } => Some(index),
+        NodeKind::Background => None,
+    }
+}
+
+/// The field on its way.
+struct Work {
+    field: Field,
+    tracks: Tracks,
+    rows: Vec<RowIdentity>,
+    instances: InstanceTable,
+    /// Owner of new splats of every step.
+    owners: Vec<Owner>,
+}
+
+impl Work {
+    /// Everything about a pair but its new splats.
+    fn adjust(&mut self, plan: &Plan<'_>, index: usize, step: &Step) {
+        let (Some(first), Some(second)) = plan.nodes(step) else { return };
+        let kept = plan.kept_rows(step, first);
+        self.appearance(plan, first, second, &kept);
+        self.motion(plan, step, first, second, &kept);
+        if step.pair.duplicate {
+            return;
+        }
+        self.owners[index] = instance_of(first).map(|index| index as u16);
+        if let NodeKind::Instance { id, index } = first.kind {
+            rename(&mut self.instances.entries[index], id, first, second);
+        }
+    }
+
+    /// Colours, opacities and sizes, by their differences.
+    fn appearance(&mut self, plan: &Plan<'_>, first: &Node, second: &Node, kept: &[(u32, usize, usize)]) {
+        let (a, b) = (&first.splats, &second.splats);
+        let time = plan.times.time(plan.reference);
+        for unit in crate::diff::units::units(first) {
+            let rest = unit.pose(plan.reference).rotation;
+            for &(row, i, j) in kept.iter().filter(|(_, i, _)| unit.splats.contains(i)) {
+                let row = row as usize;
+                let gaussians = &mut self.field.gaussians;
+                if is_recoloured(a, i, b, j) {
+                    let (x, y) = (coefficients(a, i), coefficients(b, j));
+                    let mut change = [0.0; cif_field::gaussians::SH_FLOATS];
+                    for (k, change) in change.iter_mut().enumerate() {
+                        *change = y.get(k).unwrap_or(&0.0) - x.get(k).unwrap_or(&0.0);
+                    }
+                    // The file shows colours in the object's frame; the field keeps them before its tracks.
+                    let posed = self.tracks.group(row).map(|group| self.tracks.groups[group].pose(time).0);
+                    let back = posed.unwrap_or_default().conjugate() * rest;
+                    if back.xyz().length() > 1e-9 {
+                        HarmonicsRotation::new(rows_of(back)).rotate(&mut change);
+                    }
+                    let sh = &mut gaussians.sh_coefficients[row];
+                    sh.iter_mut().zip(change).for_each(|(value, change)| *value += change);
+                }
+                if is_faded(a, i, b, j) {
+                    gaussians.opacity_logits[row] += logit(b.opacities[j]) - logit(a.opacities[i]);
+                    if let Some((x, y)) = a.occupancies.get(i).zip(b.occupancies.get(j)) {
+                        gaussians.occupancy_logits[row] += logit(*y) - logit(*x);
+                    }
+                }
+                if is_resized(a, i, b, j) {
+                    for axis in 0..3 {
+                        gaussians.log_scales[row][axis] +=
+                            log_scale(b.scales[j][axis]) - log_scale(a.scales[i][axis]);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Moves and visibility, as recorded motion after what moves the rows already.
+    fn motion(
+        &mut self,
+        plan: &Plan<'_>,
+        step: &Step,
+        first: &Node,
+        second: &Node,
+        kept: &[(u32, usize, usize)],
+    ) {
+        let codes = key_codes(&[plan.exported, plan.edited], &[first, second]);
+        let hides = visibility_differs(first, second, &codes);
+        let Some(pairs) = matching(first, second) else { return };
+        let is_whole = pairs.len() == 1;
+        for (before, after) in &pairs {
+            let moved = delta(before, after, &codes);
+            if moved.is_none() && !hides {
+                continue;
+            }
+            let mut rows: Vec<u32> =
+                kept.iter().filter(|(_, i, _)| before.splats.contains(i)).map(|(row, ..)| *row).collect();
+            if is_whole {
+                rows.extend(step.unseen.iter().filter_map(|row| plan.new_of_base[*row as usize]));
+            }
+            if rows.is_empty() {
+                continue;
+            }
+            let pivot = before.pose(plan.reference).translation;
+            self.tracks.regroup(&rows, &second.name, pivot, |mut group| {
+                if let Some(moved) = &moved {
+                    carry(&mut group, before, after, moved.constant, &codes, &plan.times);
+                }
+                if hides {
+                    group.visibility = visibility(second, &plan.times);
+                }
+                group
+            });
+        }
+    }
+
+    /// New splats of a pair, as the file has them.
+    fn append(&mut self, plan: &Plan<'_>, step: &Step) -> Result<(), SceneError> {
+        let (first, second) = plan.nodes(step);
+        let Some(second) = second else { return Ok(()) };
+        let is_new = step.pair.duplicate || first.is_none();
+        let owner = match (is_new, second.kind, first.and_then(instance_of)) {
+            (true, NodeKind::Instance { id, .. }, _) => {
+                // A copy has the id of its original; everything else keeps its own where it is free.
+                Some(self.instances.add(second, if step.pair.duplicate { 0 } else { id })?)
+            }
+            (true, NodeKind::Background, _) => None,
+            (false, _, index) => index.map(|index| index as u16),
+        };
+        if step.pair.duplicate {
+            let copies = step.first_copy as usize..step.first_copy as usize + step.splats.kept.len();
+            self.rows[copies].fill(RowIdentity::Told(owner));
+        }
+        let reshaped = step.splats.reshaped.iter().map(|(_, j)| *j);
+        let mut positions: Vec<usize> = step.splats.added.iter().copied().chain(reshaped).collect();
+        if positions.is_empty() {
+            return Ok(());
+        }
+        positions.sort_unstable();
+        let node = subset(second, &positions);
+        let samples = &plan.edited.time_codes.samples;
+        let mut rows = NodeRows::of(&node, &plan.times, samples, plan.reference)?;
+        if plan.base.deformation.is_some() {
+            rows.exempt(&node.name);
+        }
+        let degree = node.splats.sh_degree;
+        if degree > self.field.sh_degree {
+            let active = 3 * cif_geometry::spherical_harmonics::coefficient_count(self.field.sh_degree);
+            for sh in &mut self.field.gaussians.sh_coefficients {
+                sh[active..].fill(0.0);
+            }
+            self.field.sh_degree = degree;
+        }
+        self.rows.extend(std::iter::repeat_n(RowIdentity::Told(owner), rows.gaussians.len()));
+        rows.append_to(&mut self.field.gaussians, &mut self.tracks);
+        Ok(())
+    }
+
+    fn finish(self, plan: &Plan<'_>, source: &str, changes: &SceneDiff) -> Result<Field, SceneError> {
+        let Self { mut field, tracks, rows, instances, .. } = self;
+        field.tracks = tracks.compact();
+        (field.instances, field.identities) =
+            identities::rebuild(plan, instances.entries, field.identities.as_ref(), &rows);
+        let entry = serde_json::json!({ "file": source, "objects": changes.objects });
+        match &mut field.provenance {
+            serde_json::Value::Object(record) => {
+                let edits = record.entry("edits").or_insert_with(|| serde_json::json!([]));
+                match edits {
+                    serde_json::Value::Array(edits) => edits.push(entry),
+                    other => *other = serde_json::json!([entry]),
+                }
+            }
+            other => *other = serde_json::json!({ "edits": [entry] }),
+        }
+        field
+            .validate()
+            .map_err(|error| SceneError::Import { object: source.to_owned(), what: error.to_string() })?;
+        Ok(field)
+    }
+}
+
+/// Label and category of the edited node; a new name becomes the label where the label was left alone.
+fn rename(instance: &mut Instance, id: u16, first: &Node, second: &Node) {
+    if second.label != first.label {
+        instance.label.clone_from(&second.label);
+    } else if second.name != first.name {
+        instance.label = naming::label_of_name(&second.name, id);
+    }
+    if second.category != first.category {
+        instance.category.clone_from(&second.category);
+    }
+}
+
+fn visibility(node: &Node, times: &TimeMap) -> Vec<VisibilityStep> {
+    let steps = node.visibility.iter();
+    let steps: Vec<VisibilityStep> = steps
+        .map(|step| VisibilityStep { time: times.time(step.time_code), visible: step.visible })
+        .collect();
+    if steps.iter().all(|step| step.visible) { Vec::new() } else { steps }
+}
+
+/// Puts the move from one unit to another after the poses of a group.
+fn carry(
+    group: &mut TrackGroup,
+    before: &Unit<'_>,
+    after: &Unit<'_>,
+    constant: bool,
+    codes: &[f64],
+    times: &TimeMap,
+) {
+    if constant {
+        let (turn, shift) = step(before, after, codes[0]);
+        if group.poses.is_empty() {
+            let rest = TrackPose { time: 0.0, translation: group.pivot, rotation: glam::DQuat::IDENTITY };
+            group.poses.push(rest);
+        }
+        for pose in &mut group.poses {
+            pose.translation = turn * pose.translation + shift;
+            pose.rotation = (turn * pose.rotation).normalize();
+        }
+        return;
+    }
+    let mut codes: Vec<f64> =
+        codes.iter().copied().chain(group.poses.iter().map(|pose| times.code(pose.time))).collect();
+    codes.sort_by(f64::total_cmp);
+    codes.dedup_by(|a, b| (*a - *b).abs() < 1e-9);
+    let mut poses: Vec<TrackPose> = Vec::with_capacity(codes.len());
+    for code in codes {
+        let time = times.time(code);
+        let (rotation, translation): (_, DVec3) = group.pose(time);
+        let (turn, shift) = step(before, after, code);
+        let mut rotation = (turn * rotation).normalize();
+        if poses.last().is_some_and(|last| last.rotation.dot(rotation) < 0.0) {
+            rotation = -rotation;
+        }
+        poses.push(TrackPose { time, translation: turn * translation + shift, rotation });
+    }
+    group.poses = poses;
+}
+
+#[cfg(test)]
+mod tests;
