@@ -1,4 +1,5 @@
 //! Recorded motion: the fast path against the reference, and images that must not change.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod common;
 
