@@ -1,0 +1,115 @@
+//! What can go wrong between a scene and a glTF file.
+
+use std::path::PathBuf;
+
+/// Why a glTF file cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum GltfError {
+    /// Not a file name of glTF.
+    #[error("{path}: the ending decides the kind of file; use .glb (one file) or .gltf (text beside a .bin)")]
+    Extension {
+        /// Given path.
+        path: PathBuf,
+    },
+    /// The folder of the output is missing.
+    #[error("{folder}: no such folder; create it first (for {path})")]
+    NoFolder {
+        /// Missing folder.
+        folder: PathBuf,
+        /// Output in it.
+        path: PathBuf,
+    },
+    /// A folder is in the way.
+    #[error("{path} is a folder; give a file name")]
+    IsFolder {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A file that cif did not write is in the way.
+    #[error("{path} exists and was not written by cif; choose another name, or replace it with --force")]
+    Foreign {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Motion that glTF cannot hold.
+    #[error(
+        "{node} moves splat by splat, which glTF cannot hold; build the scene with parts or rigid as the most expensive motion"
+    )]
+    Dense {
+        /// Name of the node.
+        node: String,
+    },
+    /// A graph that no file can hold.
+    #[error("{node} cannot be written: {what}")]
+    Inconsistent {
+        /// Name of the node or camera.
+        node: String,
+        /// What is wrong with it.
+        what: String,
+    },
+    /// More than a `.glb` can hold.
+    #[error("{path} would have {bytes} bytes, but a .glb ends at 4 GiB; write a .gltf instead")]
+    TooLarge {
+        /// Output.
+        path: PathBuf,
+        /// Its size.
+        bytes: u64,
+    },
+    /// Writing failed.
+    #[error("{path} could not be written: {source}")]
+    Write {
+        /// Output.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// Reading failed.
+    #[error("{path} cannot be read: {source}")]
+    Read {
+        /// Given path.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The file is no glTF, or damaged.
+    #[error("{path} is not readable as glTF: {reason}")]
+    Unreadable {
+        /// Given path.
+        path: PathBuf,
+        /// What is wrong with it and what to do.
+        reason: String,
+    },
+    /// An object of the file is wrong.
+    #[error("{path}: {object}: {what}")]
+    Invalid {
+        /// Given path.
+        path: PathBuf,
+        /// Node, mesh or accessor, with its index.
+        object: String,
+        /// What is wrong with it and what to do.
+        what: String,
+    },
+    /// An extension that must be understood and is not.
+    #[error("{path} cannot be read without the extension {extension}{note}; {fix}")]
+    UnknownExtension {
+        /// Given path.
+        path: PathBuf,
+        /// Its name.
+        extension: String,
+        /// What it does.
+        note: String,
+        /// What to do.
+        fix: String,
+    },
+    /// Nothing to read.
+    #[error(
+        "{path} holds no Gaussian splats ({found}); a mesh primitive with KHR_gaussian_splatting is expected"
+    )]
+    NoSplats {
+        /// Given path.
+        path: PathBuf,
+        /// What is there instead.
+        found: String,
+    },
+}

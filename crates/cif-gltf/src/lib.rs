@@ -1,0 +1,111 @@
+//! Scene graph to glTF 2.0 and back: Gaussian splats through `KHR_gaussian_splatting`.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`conventions`] | how axes, quaternions, times and cameras differ from ours |
+//! | `extras` | what stands in `extras.cif`, because glTF has no place for it |
+//! | `document` | the objects of glTF that are written |
+//! | `author` | which nodes, meshes, cameras and tracks a scene becomes |
+//! | `arrays` | what the buffer holds |
+//! | `write` | file kinds, atomic replacement, what may be replaced |
+//! | `read` | files, ours and others', to scene graphs |
+//!
+//! Layout of a file: the node `World` brings our axes and units to those of glTF; below it stand one node per
+//! instance, one for the background, and `Cameras`. A rigid instance is a mesh of one point primitive with
+//! splats; one that moves in parts has a child node per part. One animation holds all motion. Splats carry the
+//! attributes [`ROW`], [`OCCUPANCY`] and [`IDENTITY`] besides those of the extension, so that an edited file can
+//! be traced home.
+//!
+//! Proxies and colliders of the graph are not written: the points of the splats stand in where the extension is
+//! not known.
+
+pub mod conventions;
+pub mod error;
+
+mod arrays;
+mod author;
+mod document;
+mod extras;
+mod read;
+#[cfg(test)]
+mod testing;
+#[cfg(test)]
+mod tests;
+mod write;
+
+use std::path::{Path, PathBuf};
+
+use cif_scene::SceneGraph;
+
+pub use error::GltfError;
+pub use read::UNKNOWN_ROW;
+
+/// The extension that holds the splats.
+pub const EXTENSION: &str = "KHR_gaussian_splatting";
+/// Attribute with the row of every splat in the field: two unsigned shorts, the low one first.
+pub const ROW: &str = "_CIF_ROW";
+/// Attribute with the occupancy of every splat.
+pub const OCCUPANCY: &str = "_CIF_OCCUPANCY";
+/// Attribute with the probability of the most probable instance of every splat.
+pub const IDENTITY: &str = "_CIF_IDENTITY";
+
+const GENERATOR: &str = concat!("cif ", env!("CARGO_PKG_VERSION"));
+const GENERATOR_PREFIX: &str = "cif ";
+
+/// How a file is written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ExportOptions {
+    /// Replace an existing file even when it was not written by cif.
+    pub force: bool,
+}
+
+/// What was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ExportSummary {
+    /// The `.glb` or `.gltf`.
+    pub path: PathBuf,
+    /// All files: `path`, and the `.bin` beside a `.gltf`.
+    pub files: Vec<PathBuf>,
+    /// Their size together.
+    pub bytes: u64,
+    /// Instances and background.
+    pub nodes: usize,
+    /// Splats over all nodes.
+    pub splats: usize,
+    /// Time samples of the timeline.
+    pub samples: usize,
+}
+
+/// Writes a scene to a `.glb`, or to a `.gltf` with a `.bin` beside it: to temporary files in the same folder,
+/// then renamed.
+///
+/// # Errors
+/// Unknown ending, missing folder, a file there that is not ours (without [`ExportOptions::force`]), a node with
+/// dense motion, values that are not finite, disk full. Nothing existing is touched then.
+pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result<ExportSummary, GltfError> {
+    write::export(graph, path, options)
+}
+
+/// Checks everything about an output that can be checked before the work starts.
+///
+/// # Errors
+/// As [`export`].
+pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), GltfError> {
+    write::check_target(path, options)
+}
+
+/// Reads a `.glb` or `.gltf` with `KHR_gaussian_splatting` as a scene.
+///
+/// Our own files come back as the graph that was written, with the edits that were made to them: float exact,
+/// without proxies and colliders. Of other files every node with splats becomes an instance that is labelled by
+/// the node's name, occupied and certain of its identity; a node that is turned but does not move gets a rigid
+/// track of one sample; scales that are not 1 are worked into the splats. The world then has glTF's axes and
+/// units (+y up, metres), 24 time codes per second, and [`cif_scene::Origin`] is empty. Whatever could not be
+/// taken over is said in [`SceneGraph::warnings`].
+///
+/// # Errors
+/// Missing, truncated or inconsistent files, buffers outside the file's folder, extensions that must be known,
+/// values that are not finite; each names the object of the file.
+pub fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
+    read::read_scene(path)
+}

@@ -1,0 +1,282 @@
+//! Files, ours and others', to scene graphs.
+//!
+//! | module | answers |
+//! |---|---|
+//! | `source` | what lies in the file and beside it, and whether it may be read |
+//! | `accessor` | the numbers of an accessor |
+//! | `hierarchy` | nodes and their transforms |
+//! | `animation` | curves over time |
+//! | `motion` | poses of chains of nodes |
+//! | `bake` | scales and mirrors worked into splats |
+//! | `splats` | splats of meshes |
+//! | `objects` | which nodes are objects, and who they are |
+//! | `cameras` | cameras over time |
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use cif_field::SortMetric;
+use cif_scene::{Motion, NodeKind, Origin, SceneGraph, TimeCodes, UpAxis};
+use glam::{DAffine3, DQuat, DVec3};
+
+use self::animation::Curves;
+use self::hierarchy::{Hierarchy, Placed};
+use self::motion::{Clock, Stage};
+use self::objects::Builder;
+use self::source::Source;
+use crate::extras::{self, Cif, World};
+use crate::{GltfError, conventions};
+
+mod accessor;
+mod animation;
+mod bake;
+mod cameras;
+mod hierarchy;
+mod motion;
+mod objects;
+mod source;
+mod splats;
+
+pub use splats::UNKNOWN_ROW;
+
+/// Time codes per second of files that have none.
+const FRAMES_PER_SECOND: f64 = 24.0;
+
+pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
+    let source = Source::open(path)?;
+    let mut warnings = Vec::new();
+    let hierarchy = Hierarchy::read(&source, &mut warnings)?;
+    let curves = Curves::read(&source, &hierarchy.locals, &mut warnings)?;
+    check_amount(&source, &hierarchy)?;
+    let world = hierarchy.placed.iter().find_map(|placed| match &placed.cif {
+        Some(Cif::World(world)) => Some((placed, (**world).clone())),
+        _ => None,
+    });
+    if let Some((placed, world)) = &world {
+        check_world(world).map_err(|what| source.invalid(source.node_name(placed.index), what))?;
+        if world.layout > extras::LAYOUT {
+            warnings.push(format!("{} wrote this file; a newer cif may read more of it", world.generator));
+        }
+    }
+    let stage = stage(&source, &hierarchy, &curves, world.as_ref().map(|(_, world)| world));
+    let found = objects::find(&stage, &hierarchy.placed);
+    check_keys(&stage, &found)?;
+    let moved = world.as_ref().and_then(|(placed, world)| moved_world(&stage, placed, world, &mut warnings));
+    let mut builder = Builder {
+        stage: &stage,
+        world: world.as_ref().map(|(placed, _)| (placed.index, moved)),
+        warnings: &mut warnings,
+        nodes: Vec::new(),
+        used_ids: BTreeSet::new(),
+        next_index: next_index(&hierarchy),
+        next_row: (!is_traced(&source)).then_some(0),
+        reserved_ids: reserved_ids(&hierarchy),
+    };
+    for object in &found {
+        builder.add(object)?;
+    }
+    let cameras = cameras::read(&mut builder, &hierarchy.placed);
+    let mut nodes = builder.nodes;
+    nodes.sort_by_key(|node| node.kind == NodeKind::Background);
+    if nodes.is_empty() {
+        return Err(GltfError::NoSplats { path: path.to_owned(), found: what_else(&source) });
+    }
+    warn_of_meshes(&source, &hierarchy, &mut warnings);
+    let time_codes = match &world {
+        Some((_, world)) => TimeCodes {
+            samples: world.time_codes.clone(),
+            times: world.times.clone(),
+            frames_per_second: world.frames_per_second,
+        },
+        None => foreign_time_codes(&nodes, &cameras),
+    };
+    let world = world.map(|(_, world)| world);
+    for node in nodes.iter_mut().filter(|node| node.source_frames == objects::ALL_FRAMES) {
+        let frame = |code: f64| code.max(0.0).round() as usize;
+        node.source_frames = match &world {
+            Some(_) => (frame(time_codes.start()), frame(time_codes.end())),
+            None => (0, time_codes.samples.len() - 1),
+        };
+    }
+    Ok(SceneGraph {
+        up_axis: world.as_ref().map_or(UpAxis::Y, |world| world.up_axis),
+        meters_per_unit: world.as_ref().map_or(1.0, |world| world.meters_per_unit),
+        time_codes,
+        nodes,
+        cameras,
+        background_color: world.as_ref().map_or([0.0; 3], |world| world.background_color),
+        sort_metric: world.as_ref().map_or(SortMetric::Distance, |world| world.sort_metric),
+        omitted: world.as_ref().map_or_else(Vec::new, |world| world.omitted.clone()),
+        warnings: world.iter().flat_map(|world| world.warnings.clone()).chain(warnings).collect(),
+        origin: Origin {
+            field_fingerprint: world.as_ref().and_then(|world| world.field_fingerprint.clone()),
+            options: world.and_then(|world| world.options),
+        },
+    })
+}
+
+/// What our exporter wrote may have been changed since.
+fn check_world(world: &World) -> Result<(), String> {
+    let codes = &world.time_codes;
+    let ascending = |values: &[f64]| values.windows(2).all(|pair| pair[0] < pair[1]);
+    let finite = codes.iter().chain(&world.times).all(|value| value.is_finite());
+    if codes.is_empty() || codes.len() != world.times.len() || !finite || !ascending(codes) {
+        return Err(
+            "time_codes and times of its extras.cif do not pair up; export the scene again".to_owned()
+        );
+    }
+    let positive = |value: f64| value.is_finite() && value > 0.0;
+    if !positive(world.frames_per_second)
+        || !positive(world.meters_per_unit)
+        || !world.first_time_code.is_finite()
+    {
+        return Err("frame rate or unit of its extras.cif is not above 0; export the scene again".to_owned());
+    }
+    Ok(())
+}
+
+fn stage<'a>(
+    source: &'a Source,
+    hierarchy: &'a Hierarchy,
+    curves: &'a Curves,
+    world: Option<&World>,
+) -> Stage<'a> {
+    let of_cameras = hierarchy.placed.iter().filter_map(|placed| match &placed.cif {
+        Some(Cif::Camera(camera)) => Some(camera.time_codes.iter().copied()),
+        _ => None,
+    });
+    let clock = match world {
+        Some(world) => Clock::new(
+            world.first_time_code,
+            world.frames_per_second,
+            world.time_codes.iter().copied().chain(of_cameras.flatten()),
+        ),
+        None => Clock::new(0.0, FRAMES_PER_SECOND, std::iter::empty()),
+    };
+    let start = world.map_or(0.0, |world| world.time_codes[0]);
+    Stage { source, locals: &hierarchy.locals, curves, clock, start }
+}
+
+/// Where our root was moved: what brings the world of the file into that of the scene.
+fn moved_world(
+    stage: &Stage<'_>,
+    placed: &Placed,
+    world: &World,
+    warnings: &mut Vec<String>,
+) -> Option<DAffine3> {
+    let scale = DVec3::splat(f64::from(world.meters_per_unit as f32));
+    let rotation = DQuat::from_array(conventions::world_rotation(world.up_axis).map(f64::from)).normalize();
+    let written = DAffine3::from_scale_rotation_translation(scale, rotation, DVec3::ZERO);
+    let chain = placed.chain.iter();
+    let now = chain.clone().fold(DAffine3::IDENTITY, |all, &node| all * stage.locals[node].affine());
+    let animated = chain.clone().any(|&node| stage.curves.of(node).is_some());
+    let difference = (now.matrix3 - written.matrix3).to_cols_array();
+    let turned = difference.iter().any(|value| value.abs() > 1e-6 * scale.x);
+    if !animated && !turned && now.translation.length() < 1e-9 {
+        return None;
+    }
+    warnings.push(format!("{} was moved: all objects move with it", stage.source.node_name(placed.index)));
+    Some(written.inverse())
+}
+
+fn is_traced(source: &Source) -> bool {
+    let row = gltf::json::validation::Checked::Valid(gltf::json::mesh::Semantic::Extras(
+        crate::ROW[1..].to_owned(),
+    ));
+    source.root.meshes.iter().flat_map(|mesh| &mesh.primitives).any(|p| p.attributes.contains_key(&row))
+}
+
+/// Mask values that objects of ours carry.
+fn reserved_ids(hierarchy: &Hierarchy) -> BTreeSet<u16> {
+    let ids = hierarchy.placed.iter().filter_map(|placed| match &placed.cif {
+        Some(Cif::Instance(instance)) => Some(instance.id),
+        _ => None,
+    });
+    ids.collect()
+}
+
+/// First place behind those of our instance table.
+fn next_index(hierarchy: &Hierarchy) -> usize {
+    let indices = hierarchy.placed.iter().filter_map(|placed| match &placed.cif {
+        Some(Cif::Instance(instance)) => Some(instance.index.saturating_add(1)),
+        _ => None,
+    });
+    indices.max().unwrap_or(0)
+}
+
+/// Meshes may be placed often; what they become must stay in proportion to the file.
+fn check_amount(source: &Source, hierarchy: &Hierarchy) -> Result<(), GltfError> {
+    let mut total = 0_u64;
+    for placed in &hierarchy.placed {
+        let Some(mesh) = source.root.nodes[placed.index].mesh else { continue };
+        if mesh.value() >= source.root.meshes.len() {
+            let what = format!("its mesh {} is not in the file", mesh.value());
+            return Err(source.invalid(source.node_name(placed.index), what));
+        }
+        total = total.saturating_add(source.splat_count(mesh.value()).unwrap_or(0));
+        if total > source.bytes {
+            let what = format!(
+                "up to here the file places {total} splats, more than its {} bytes can describe; place meshes less often",
+                source.bytes
+            );
+            return Err(source.invalid(source.node_name(placed.index), what));
+        }
+    }
+    Ok(())
+}
+
+/// As [`check_amount`], for the keys of nodes above many objects.
+fn check_keys(stage: &Stage<'_>, found: &[objects::Found<'_>]) -> Result<(), GltfError> {
+    let allowed = stage.source.bytes.max(1 << 20);
+    let mut total = 0_u64;
+    for placed in found.iter().flat_map(objects::Found::all) {
+        let keys: usize =
+            placed.chain.iter().filter_map(|&node| stage.curves.of(node)).map(|c| c.keys()).sum();
+        total += (keys * placed.chain.len()) as u64;
+        if total > allowed {
+            let what = format!(
+                "up to here {total} keys are to be followed; animate nodes that are nearer to the splats"
+            );
+            return Err(stage.source.invalid(stage.source.node_name(placed.index), what));
+        }
+    }
+    Ok(())
+}
+
+/// The keys of everything, as time codes; normalised times run from the first to the last.
+fn foreign_time_codes(nodes: &[cif_scene::Node], cameras: &[cif_scene::CameraTrack]) -> TimeCodes {
+    let mut samples: Vec<f64> = vec![0.0];
+    for node in nodes {
+        if let Motion::Rigid(track) = &node.motion {
+            samples.extend(track.iter().map(|pose| pose.time_code));
+        }
+        samples.extend(node.visibility.iter().map(|sample| sample.time_code));
+    }
+    samples.extend(cameras.iter().flat_map(|track| &track.samples).map(|sample| sample.time_code));
+    samples.sort_by(f64::total_cmp);
+    samples.dedup();
+    let (first, last) = (samples[0], samples[samples.len() - 1]);
+    let length = if last > first { last - first } else { 1.0 };
+    let times = samples.iter().map(|code| (code - first) / length).collect();
+    TimeCodes { samples, times, frames_per_second: FRAMES_PER_SECOND }
+}
+
+fn what_else(source: &Source) -> String {
+    let root = &source.root;
+    let points = root.meshes.iter().flat_map(|mesh| &mesh.primitives).count();
+    match (root.meshes.len(), points) {
+        (0, _) => format!("{} nodes without meshes", root.nodes.len()),
+        (meshes, primitives) => format!("{meshes} meshes with {primitives} primitives of other kinds"),
+    }
+}
+
+fn warn_of_meshes(source: &Source, hierarchy: &Hierarchy, warnings: &mut Vec<String>) {
+    let others = hierarchy.placed.iter().filter(|placed| {
+        let mesh = source.root.nodes[placed.index].mesh;
+        mesh.is_some_and(|mesh| source.splat_count(mesh.value()).is_none())
+    });
+    let count = others.count();
+    if count > 0 {
+        warnings.push(format!("{count} nodes hold meshes without splats; they were left out"));
+    }
+}

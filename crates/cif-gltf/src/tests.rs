@@ -1,0 +1,224 @@
+//! Round trips and what comes of edited files.
+
+use std::path::Path;
+
+use cif_scene::{Motion, NodeKind, PoseSample, SceneGraph, UpAxis};
+use glam::{DMat3, DVec3};
+use proptest::prelude::*;
+use serde_json::{Value, json};
+
+use super::*;
+use crate::testing::{Recipe, recipes, scene};
+
+fn recipe() -> Recipe {
+    Recipe {
+        seed: 7,
+        nodes: 4,
+        splats: 5,
+        sh_degree: 3,
+        frames: 6,
+        first_frame: 10,
+        up_axis: UpAxis::Z,
+        meters_per_unit: 1.0,
+    }
+}
+
+fn round_trip(graph: &SceneGraph, name: &str) -> SceneGraph {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    let summary = export(graph, &path, ExportOptions::default()).unwrap();
+    let bytes: u64 = summary.files.iter().map(|file| file.metadata().unwrap().len()).sum();
+    assert_eq!(summary.bytes, bytes);
+    read_scene(&path).unwrap()
+}
+
+/// What single precision leaves of a graph: glTF holds no more of poses.
+fn rounded(mut graph: SceneGraph) -> SceneGraph {
+    let round = |v: DVec3| v.as_vec3().as_dvec3();
+    let pose = |pose: &mut PoseSample| {
+        pose.translation = round(pose.translation);
+        pose.rotation = pose.rotation.as_quat().as_dquat();
+    };
+    for node in &mut graph.nodes {
+        match &mut node.motion {
+            Motion::Static => {}
+            Motion::Rigid(track) => track.iter_mut().for_each(pose),
+            Motion::Parts(motion) => {
+                motion.track.iter_mut().for_each(pose);
+                motion.parts.iter_mut().flat_map(|part| &mut part.track).for_each(pose);
+            }
+            Motion::Dense(_) => unreachable!(),
+        }
+    }
+    graph
+}
+
+/// Cameras to single precision and everything else exactly; the box of parts is derived.
+fn assert_same(written: &SceneGraph, read: &SceneGraph) {
+    let mut expected = rounded(written.clone());
+    let mut found = read.clone();
+    for (a, b) in expected.cameras.iter_mut().zip(&mut found.cameras) {
+        assert_eq!((&a.name, &a.label, a.samples.len()), (&b.name, &b.label, b.samples.len()));
+        for (a, b) in a.samples.iter_mut().zip(&b.samples) {
+            let (from, to) = (a.camera.camera_from_world, b.camera.camera_from_world);
+            assert!((from.translation - to.translation).length() < 2e-6, "{from:?} {to:?}");
+            let turn: DMat3 = from.rotation - to.rotation;
+            assert!(turn.to_cols_array().iter().all(|v| v.abs() < 1e-6), "{from:?} {to:?}");
+            a.camera.camera_from_world = to;
+        }
+    }
+    for (a, b) in expected.nodes.iter_mut().zip(&mut found.nodes) {
+        if let Motion::Parts(_) = a.motion {
+            a.extent = b.extent;
+        }
+        assert_eq!(a, b);
+    }
+    assert_eq!(expected, found);
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]
+
+    #[test]
+    fn scenes_come_back_as_they_were_written(recipe in recipes(), text: bool) {
+        let graph = scene(recipe);
+        let read = round_trip(&graph, if text { "a b%.gltf" } else { "scene.glb" });
+        assert_same(&graph, &read);
+        // A second time nothing is rounded any more.
+        let again = round_trip(&read, "scene.glb");
+        prop_assert_eq!(&again.nodes, &read.nodes);
+    }
+}
+
+/// Writes a scene as `.gltf`, changes its JSON, and reads it.
+fn edited(graph: &SceneGraph, edit: impl FnOnce(&mut Value)) -> Result<SceneGraph, GltfError> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.gltf");
+    export(graph, &path, ExportOptions::default()).unwrap();
+    edit_file(&path, edit);
+    read_scene(&path)
+}
+
+fn edit_file(path: &Path, edit: impl FnOnce(&mut Value)) {
+    let mut json: Value = serde_json::from_slice(&std::fs::read(path).unwrap()).unwrap();
+    edit(&mut json);
+    std::fs::write(path, json.to_string()).unwrap();
+}
+
+fn node_index(json: &Value, name: &str) -> usize {
+    json["nodes"].as_array().unwrap().iter().position(|node| node["name"] == name).unwrap()
+}
+
+#[test]
+fn moved_renamed_deleted_and_copied_objects_come_home() {
+    let graph = scene(recipe());
+    let read = edited(&graph, |json| {
+        // thing_001 stands still: moved and renamed.
+        let moved = node_index(json, "thing_001");
+        json["nodes"][moved]["translation"] = json!([5.0, 6.0, 7.0]);
+        json["nodes"][moved]["name"] = json!("blue mug");
+        // thing_003 is deleted, thing_000 copied.
+        let (deleted, copied) = (node_index(json, "thing_003"), node_index(json, "thing_000"));
+        let world = node_index(json, "World");
+        let mut copy = json["nodes"][copied].clone();
+        copy["name"] = json!("thing_000.001");
+        let nodes = json["nodes"].as_array_mut().unwrap();
+        nodes.push(copy);
+        let added = nodes.len() - 1;
+        let children = json["nodes"][world]["children"].as_array_mut().unwrap();
+        children.retain(|child| *child != json!(deleted));
+        children.push(json!(added));
+    })
+    .unwrap();
+    let names: Vec<&str> = read.nodes.iter().map(|node| node.label.as_str()).collect();
+    assert_eq!(names, ["thing_000 杯", "blue mug", "thing_002 杯", "thing_000 杯", "background 杯"]);
+    assert_eq!(read.nodes[1].name, "thing_001", "still known by its first name");
+    assert_eq!(read.nodes[1].pivot, DVec3::new(5.0, 6.0, 7.0));
+    assert_eq!(read.nodes[1].motion, Motion::Static);
+    assert_eq!(read.nodes[3].splats, read.nodes[0].splats, "rows tell what was copied");
+    let ids: Vec<NodeKind> = read.nodes.iter().map(|node| node.kind).collect();
+    assert_eq!(ids[3], NodeKind::Instance { id: 2, index: 3 }, "an id of its own: {ids:?}");
+    let said = |text: &str| read.warnings.iter().any(|warning| warning.contains(text));
+    assert!(said("becomes 'blue mug'") && said("repeats thing_000"), "{:?}", read.warnings);
+}
+
+#[test]
+fn turned_and_scaled_objects_come_home() {
+    let graph = scene(recipe());
+    let half = std::f32::consts::FRAC_1_SQRT_2;
+    let read = edited(&graph, |json| {
+        let node = node_index(json, "thing_001");
+        json["nodes"][node]["rotation"] = json!([0.0, 0.0, half, half]);
+        json["nodes"][node]["scale"] = json!([2.0, 2.0, 2.0]);
+    })
+    .unwrap();
+    let (before, after) = (&graph.nodes[1], &read.nodes[1]);
+    let Motion::Rigid(track) = &after.motion else { panic!("{:?}", after.motion) };
+    assert_eq!(track.len(), 1);
+    assert!((track[0].rotation * DVec3::X - DVec3::Y).length() < 1e-6);
+    assert_eq!(after.splats.scales[0], before.splats.scales[0].map(|scale| 2.0 * scale));
+    assert_eq!(after.splats.sh_coefficients, before.splats.sh_coefficients);
+}
+
+#[test]
+fn a_moved_world_moves_everything() {
+    let graph = scene(recipe());
+    let read = edited(&graph, |json| {
+        let world = node_index(json, "World");
+        // +y of glTF is +z of the scene.
+        json["nodes"][world]["translation"] = json!([0.0, 1.0, 0.0]);
+    })
+    .unwrap();
+    for (before, after) in graph.nodes.iter().zip(&read.nodes) {
+        for code in [10.0, 14.0, 20.0] {
+            let (a, b) = (before.world_transform(code), after.world_transform(code));
+            assert!((a.translation + DVec3::Z - b.translation).length() < 1e-5, "{a:?} {b:?}");
+            assert!((a.rotation - b.rotation).to_cols_array().iter().all(|v| v.abs() < 1e-5));
+        }
+        assert_eq!(before.splats.scales.len(), after.splats.scales.len());
+    }
+    assert!(read.warnings.iter().any(|warning| warning.contains("was moved")));
+}
+
+#[test]
+fn dense_motion_is_refused() {
+    let mut graph = scene(recipe());
+    graph.nodes[0].motion = Motion::Dense(cif_scene::DenseMotion { track: Vec::new(), samples: Vec::new() });
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.glb");
+    let error = export(&graph, &path, ExportOptions::default()).unwrap_err();
+    assert!(error.to_string().starts_with("thing_000 moves splat by splat"), "{error}");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn foreign_files_are_not_replaced() {
+    let graph = scene(recipe());
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.glb");
+    export(&graph, &path, ExportOptions::default()).unwrap();
+    export(&graph, &path, ExportOptions::default()).expect("ours may be replaced");
+    std::fs::write(&path, b"glTF and something else").unwrap();
+    let error = export(&graph, &path, ExportOptions::default()).unwrap_err();
+    assert!(error.to_string().contains("was not written by cif"), "{error}");
+    assert_eq!(std::fs::read(&path).unwrap(), b"glTF and something else");
+    export(&graph, &path, ExportOptions { force: true }).unwrap();
+    let text = folder.path().join("other.gltf");
+    std::fs::write(text.with_extension("bin"), b"precious").unwrap();
+    let error = export(&graph, &text, ExportOptions::default()).unwrap_err();
+    assert!(error.to_string().contains("other.bin exists"), "{error}");
+    for (name, says) in [("scene.usd", "the ending decides"), ("no/scene.glb", "no such folder")] {
+        let error = check_target(&folder.path().join(name), ExportOptions::default()).unwrap_err();
+        assert!(error.to_string().contains(says), "{error}");
+    }
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 2, "no temporary file is left");
+}
+
+#[test]
+fn values_that_cannot_be_drawn_are_refused() {
+    let mut graph = scene(recipe());
+    graph.nodes[1].splats.means[0][1] = f32::NAN;
+    let folder = tempfile::tempdir().unwrap();
+    let error = export(&graph, &folder.path().join("a.glb"), ExportOptions::default()).unwrap_err();
+    assert!(error.to_string().contains("thing_001 cannot be written"), "{error}");
+}

@@ -1,0 +1,212 @@
+//! The layout of the 3D Gaussian splatting reference implementation, binary little endian.
+//!
+//! Per splat 17 + 3 K floats, K = (degree + 1)^2 - 1: x y z, nx ny nz (0), `f_dc_0..2`, `f_rest_*` channel by
+//! channel (all of red first), opacity as logit, logarithms of the scales, `rot_0..3` as (w, x, y, z).
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter, Read, Write};
+use std::path::{Path, PathBuf};
+
+use cif_geometry::spherical_harmonics::coefficient_count;
+use cif_scene::{Node, SceneGraph, Splats};
+use tempfile::NamedTempFile;
+
+use crate::pose::world_splats;
+use crate::{ExportOptions, ExportSummary, PlyError};
+
+/// First comment of our files; tells what may be replaced.
+const MARK: &str = concat!("comment cif ", env!("CARGO_PKG_VERSION"));
+const MARK_PREFIX: &[u8] = b"ply\nformat binary_little_endian 1.0\ncomment cif ";
+
+/// Folder of an output; `.` for a bare name.
+fn folder_of(path: &Path) -> PathBuf {
+    match path.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
+        _ => PathBuf::from("."),
+    }
+}
+
+fn is_ply(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"))
+}
+
+pub(crate) fn check_target(path: &Path, options: &ExportOptions) -> Result<(), PlyError> {
+    let several = options.split || options.sequence;
+    if !several {
+        return if is_ply(path) { check_file(path, options.force) } else { Err(extension(path)) };
+    }
+    if is_ply(path) {
+        return Err(extension(path));
+    }
+    if path.exists() && !path.is_dir() {
+        return Err(PlyError::InTheWay { path: path.to_owned(), found: "a file", wanted: "a folder" });
+    }
+    let folder = folder_of(path);
+    if !folder.is_dir() {
+        return Err(PlyError::NoFolder { folder, path: path.to_owned() });
+    }
+    Ok(())
+}
+
+fn extension(path: &Path) -> PlyError {
+    PlyError::Extension { path: path.to_owned() }
+}
+
+fn check_file(path: &Path, force: bool) -> Result<(), PlyError> {
+    if path.is_dir() {
+        return Err(PlyError::InTheWay { path: path.to_owned(), found: "a folder", wanted: "a file" });
+    }
+    let folder = folder_of(path);
+    if !folder.is_dir() {
+        return Err(PlyError::NoFolder { folder, path: path.to_owned() });
+    }
+    if path.exists() && !force && !is_ours(path) {
+        return Err(PlyError::Foreign { path: path.to_owned() });
+    }
+    Ok(())
+}
+
+fn is_ours(path: &Path) -> bool {
+    let mut head = Vec::new();
+    let read = File::open(path).and_then(|file| file.take(MARK_PREFIX.len() as u64).read_to_end(&mut head));
+    read.is_ok() && head == MARK_PREFIX
+}
+
+/// A file to write.
+struct Job<'a> {
+    path: PathBuf,
+    time_code: f64,
+    nodes: Vec<&'a Node>,
+}
+
+pub(crate) fn export(
+    graph: &SceneGraph,
+    path: &Path,
+    options: &ExportOptions,
+) -> Result<ExportSummary, PlyError> {
+    check_target(path, options)?;
+    let jobs = jobs(graph, path, options);
+    for job in &jobs {
+        // Folders that do not exist yet hold nothing.
+        if folder_of(&job.path).is_dir() {
+            check_file(&job.path, options.force)?;
+        }
+    }
+    let mut summary = ExportSummary { files: Vec::new(), bytes: 0, splats: 0 };
+    for job in jobs {
+        if job.nodes.is_empty() {
+            if options.split || options.sequence {
+                continue;
+            }
+            return Err(PlyError::NothingVisible { path: job.path, time_code: job.time_code });
+        }
+        let failed = |source| PlyError::Write { path: job.path.clone(), source };
+        fs::create_dir_all(folder_of(&job.path)).map_err(failed)?;
+        summary.bytes += write(&job).map_err(failed)?;
+        summary.splats += job.nodes.iter().map(|node| node.splats.len()).sum::<usize>();
+        summary.files.push(job.path);
+    }
+    if summary.files.is_empty() {
+        let time_code = options.time_code.unwrap_or_else(|| graph.time_codes.start());
+        return Err(PlyError::NothingVisible { path: path.to_owned(), time_code });
+    }
+    Ok(summary)
+}
+
+fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> Vec<Job<'a>> {
+    let at = options.time_code.unwrap_or_else(|| graph.time_codes.start());
+    let codes = if options.sequence { graph.time_codes.samples.clone() } else { vec![at] };
+    let visible = |code: f64| move |node: &&Node| node.is_visible(code) && !node.splats.is_empty();
+    let mut jobs = Vec::new();
+    for code in codes {
+        let number = format!("{:04}.ply", code.round());
+        if options.split {
+            for node in graph.nodes.iter().filter(visible(code)) {
+                let path = if options.sequence {
+                    path.join(&node.name).join(&number)
+                } else {
+                    path.join(format!("{}.ply", node.name))
+                };
+                jobs.push(Job { path, time_code: code, nodes: vec![node] });
+            }
+        } else {
+            let path = if options.sequence { path.join(&number) } else { path.to_owned() };
+            let nodes = graph.nodes.iter().filter(visible(code)).collect();
+            jobs.push(Job { path, time_code: code, nodes });
+        }
+    }
+    jobs
+}
+
+/// Writes a file through a temporary one in the same folder; its size.
+fn write(job: &Job<'_>) -> io::Result<u64> {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".cif-export-");
+    // Temporary files are private by default; the result should have the usual permissions.
+    #[cfg(unix)]
+    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+    let mut file: NamedTempFile = builder.tempfile_in(folder_of(&job.path))?;
+    let mut out = BufWriter::with_capacity(1 << 16, &mut file);
+    let degree = job.nodes.iter().map(|node| node.splats.sh_degree).max().unwrap_or(0);
+    let count = job.nodes.iter().map(|node| node.splats.len()).sum();
+    out.write_all(header(count, degree, job.time_code).as_bytes())?;
+    for node in &job.nodes {
+        rows(&mut out, &world_splats(node, job.time_code), degree)?;
+    }
+    out.flush()?;
+    drop(out);
+    file.as_file().sync_all()?;
+    let bytes = file.as_file().metadata()?.len();
+    file.persist(&job.path).map_err(|error| error.error)?;
+    Ok(bytes)
+}
+
+fn header(count: usize, degree: u8, time_code: f64) -> String {
+    let mut header = format!(
+        "ply\nformat binary_little_endian 1.0\n{MARK}\ncomment time code {time_code}\nelement vertex {count}\n"
+    );
+    let rest = 3 * (coefficient_count(degree) - 1);
+    let names = ["x", "y", "z", "nx", "ny", "nz"].map(str::to_owned).into_iter();
+    let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));
+    let names = names
+        .chain(numbered("f_dc", 3))
+        .chain(numbered("f_rest", rest))
+        .chain(["opacity".to_owned()])
+        .chain(numbered("scale", 3))
+        .chain(numbered("rot", 4));
+    for name in names {
+        header.push_str("property float ");
+        header.push_str(&name);
+        header.push('\n');
+    }
+    header + "end_header\n"
+}
+
+fn rows(out: &mut impl Write, splats: &Splats, degree: u8) -> io::Result<()> {
+    let held = coefficient_count(splats.sh_degree);
+    let written = coefficient_count(degree);
+    let mut row: Vec<u8> = Vec::with_capacity(4 * (17 + 3 * (written - 1)));
+    for (k, coefficients) in splats.sh_coefficients.chunks_exact(3 * held).enumerate() {
+        row.clear();
+        let mut put = |value: f32| row.extend_from_slice(&value.to_le_bytes());
+        splats.means[k].into_iter().for_each(&mut put);
+        [0.0; 3].into_iter().for_each(&mut put);
+        coefficients[..3].iter().copied().for_each(&mut put);
+        for channel in 0..3 {
+            for index in 1..written {
+                put(if index < held { coefficients[3 * index + channel] } else { 0.0 });
+            }
+        }
+        put(logit(splats.opacities[k]));
+        splats.scales[k].into_iter().map(|scale| scale.max(f32::MIN_POSITIVE).ln()).for_each(&mut put);
+        splats.orientations[k].into_iter().for_each(&mut put);
+        out.write_all(&row)?;
+    }
+    Ok(())
+}
+
+/// Finite also for 0 and 1.
+fn logit(opacity: f32) -> f32 {
+    let opacity = f64::from(opacity).clamp(1e-7, 1.0 - 1e-7);
+    (opacity / (1.0 - opacity)).ln() as f32
+}
