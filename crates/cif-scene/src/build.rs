@@ -6,13 +6,16 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::assignment::{self, Identity};
+use crate::frames::{Frame, Frames};
 use crate::graph::{DenseMotion, DenseSample, Motion, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes};
 use crate::motion::{MeanShape, MovingGroup, dot, vector};
+use crate::opacities::{self, Opacities};
 use crate::procrustes::weighted_quantile;
 use crate::report::MotionReport;
 use crate::source::FieldMotion;
 use crate::{
-    MotionModel, MotionSource, SceneError, SceneOptions, camera_tracks, extent, naming, proxy, visibility,
+    MotionModel, MotionSource, SceneError, SceneOptions, camera_tracks, colliders, extent, naming, proxy,
+    visibility,
 };
 
 /// Share of an instance's weight that may be outliers when a motion model is chosen.
@@ -56,31 +59,45 @@ pub fn build_from(
         });
     }
     let mut warnings = Vec::new();
-    let visible = visible_rows(&reference, options, &mut warnings)?;
+    let mut frames_of = Frames::new(motion, &time_codes.times, Frame::of(reference.clone()));
+    let opacities = Opacities::of(&mut frames_of);
+    let visible = visible_rows(&reference, &opacities.peak, options, &mut warnings)?;
     let identities = assignment::most_probable(field);
     let owners = assignment::assign(field, &identities, &visible, options);
-    let mut groups = moving_groups(field, &visible, &owners, &reference, options);
-    let models = if time_codes.times.len() > 1 && motion.moves() {
-        follow(&mut groups, motion, &time_codes, &reference);
+    let mut groups = moving_groups(field, &visible, &owners, &reference, &opacities.peak, options);
+    let models = if frames_of.moves() {
+        follow(&mut groups, &mut frames_of);
         groups.iter().map(|(_, group)| choose(group, options)).collect()
     } else {
+        let frame = frames_of.at(0);
         for (_, group) in &mut groups {
-            group.gather_shape(&reference);
-            group.finish_shape(&reference);
+            group.gather_shape(&frame);
+            group.finish_shape(&frame);
         }
         vec![MotionModel::Static; groups.len()]
     };
-    let mut dense = gather_dense(&groups, &models, motion, &time_codes);
+    let mut dense = gather_dense(&groups, &models, &mut frames_of, &time_codes);
     warn_of_unsampled_heads(field, &mut warnings);
 
     let mut nodes: Vec<Node> = Vec::with_capacity(groups.len());
     for (position, ((owner, group), model)) in groups.iter().zip(&models).enumerate() {
         let samples = std::mem::take(&mut dense[position]);
         let naming = Naming::of(field, *owner, &nodes);
-        let input = NodeInput { field, reference: &reference, identities: &identities, options };
+        let input = NodeInput { field, reference: &reference, identities: &identities };
         let mut node = node(&input, naming, *owner, group, *model, samples, &time_codes.samples);
         node.source_frames = (frames[0], frames[frames.len() - 1]);
         node.visibility = visibility::of_rows(field, &node.splats.rows);
+        if opacities.change {
+            let rows = &node.splats.rows;
+            let (shown, mean) =
+                opacities::over_time(&mut frames_of, rows, options.min_opacity, &time_codes.samples);
+            node.visibility = opacities::both(&node.visibility, &shown);
+            node.splats.opacities = mean;
+        }
+        if options.proxy_points > 0 {
+            node.proxy = Some(proxy::point_proxy(&node.splats, options.proxy_points));
+        }
+        add_colliders(&mut node, options, &mut warnings);
         nodes.push(node);
     }
     let omitted: Vec<String> = (0..field.instances.len())
@@ -104,6 +121,18 @@ pub fn build_from(
         warnings,
         origin: Origin { field_fingerprint: Some(field.fingerprint()), options: Some(options.clone()) },
     })
+}
+
+/// Hulls for simulators; told where there is no body to make one of.
+fn add_colliders(node: &mut Node, options: &SceneOptions, warnings: &mut Vec<String>) {
+    let hulls = match node.kind {
+        NodeKind::Instance { .. } => options.hulls_per_instance,
+        NodeKind::Background => options.background_hulls,
+    };
+    node.colliders = colliders::colliders(node, hulls);
+    if hulls > 0 && node.colliders.is_empty() {
+        warnings.push(format!("{} has no collider: its splats have no extent", node.name));
+    }
 }
 
 /// What a node is called.
@@ -143,7 +172,6 @@ struct NodeInput<'a> {
     field: &'a Field,
     reference: &'a Gaussians,
     identities: &'a [Option<Identity>],
-    options: &'a SceneOptions,
 }
 
 fn check_consistency(field: &Field) -> Result<(), SceneError> {
@@ -195,13 +223,14 @@ fn sampled_frames(field: &Field, options: &SceneOptions) -> Result<Vec<usize>, S
     Ok(frames)
 }
 
-fn sigmoid(logit: f32) -> f32 {
+pub(crate) fn sigmoid(logit: f32) -> f32 {
     1.0 / (1.0 + (-logit).exp())
 }
 
-/// Rows that can be drawn, ascending.
+/// Rows that can be drawn at any time, ascending.
 fn visible_rows(
     gaussians: &Gaussians,
+    opacities: &[f32],
     options: &SceneOptions,
     warnings: &mut Vec<String>,
 ) -> Result<Vec<u32>, SceneError> {
@@ -214,7 +243,7 @@ fn visible_rows(
                 && gaussians.sh_coefficients[row].iter().all(|value| value.is_finite())
                 && quaternion::try_normalize(gaussians.quaternions[row]).is_some()
                 && !gaussians.opacity_logits[row].is_nan();
-            let drawn = sigmoid(gaussians.opacity_logits[row]) >= options.min_opacity
+            let drawn = opacities[row] >= options.min_opacity
                 && sigmoid(gaussians.occupancy_logits[row]) >= options.min_occupancy;
             invalid += usize::from(!usable);
             invisible += usize::from(usable && !drawn);
@@ -238,6 +267,7 @@ fn moving_groups(
     visible: &[u32],
     owners: &[Option<usize>],
     reference: &Gaussians,
+    opacities: &[f32],
     options: &SceneOptions,
 ) -> Vec<(Option<usize>, MovingGroup)> {
     let mut rows: Vec<Vec<u32>> = vec![Vec::new(); field.instances.len() + 1];
@@ -253,7 +283,7 @@ fn moving_groups(
             .map(|&row| {
                 let row = row as usize;
                 let size = (vector(reference.log_scales[row]).element_sum() / 3.0).exp();
-                f64::from(sigmoid(reference.opacity_logits[row])) * size
+                f64::from(opacities[row]) * size
             })
             .collect();
         let (low, high) = trimmed_box(&rows, &weights, reference);
@@ -270,7 +300,8 @@ fn moving_groups(
         let pivot = if owner.is_some() { (low + high) / 2.0 } else { DVec3::ZERO };
         let trim = if owner.is_some() { INSTANCE_TRIM } else { BACKGROUND_TRIM };
         let tolerance = options.tolerance.in_world_units(yardstick);
-        let group = MovingGroup::new(rows, weights, pivot, owner.is_some(), trim, tolerance, reference);
+        let group =
+            MovingGroup::new(rows, weights, pivot, owner.is_some(), trim, tolerance, &reference.means);
         groups.push((owner, group));
     }
     groups
@@ -290,19 +321,15 @@ fn trimmed_box(rows: &[u32], weights: &[f64], gaussians: &Gaussians) -> (DVec3, 
 }
 
 /// Both passes of [`crate::motion`].
-fn follow(
-    groups: &mut [(Option<usize>, MovingGroup)],
-    motion: &mut dyn MotionSource,
-    time_codes: &TimeCodes,
-    reference: &Gaussians,
-) {
-    for &time in &time_codes.times {
-        let gaussians = motion.gaussians_at(time);
+fn follow(groups: &mut [(Option<usize>, MovingGroup)], frames: &mut Frames<'_>) {
+    for step in 0..frames.len() {
+        let gaussians = frames.at(step);
         groups.par_iter_mut().for_each(|(_, group)| group.gather_shape(&gaussians));
     }
-    groups.par_iter_mut().for_each(|(_, group)| group.finish_shape(reference));
-    for &time in &time_codes.times {
-        let gaussians = motion.gaussians_at(time);
+    let reference = frames.at(0);
+    groups.par_iter_mut().for_each(|(_, group)| group.finish_shape(&reference));
+    for step in 0..frames.len() {
+        let gaussians = frames.at(step);
         groups.par_iter_mut().for_each(|(_, group)| group.gather_residuals(&gaussians));
     }
 }
@@ -328,15 +355,15 @@ fn choose(group: &MovingGroup, options: &SceneOptions) -> MotionModel {
 fn gather_dense(
     groups: &[(Option<usize>, MovingGroup)],
     models: &[MotionModel],
-    motion: &mut dyn MotionSource,
+    frames: &mut Frames<'_>,
     time_codes: &TimeCodes,
 ) -> Vec<Vec<DenseSample>> {
     let mut samples: Vec<Vec<DenseSample>> = vec![Vec::new(); groups.len()];
     if !models.contains(&MotionModel::Dense) {
         return samples;
     }
-    for (step, (&time, &time_code)) in time_codes.times.iter().zip(&time_codes.samples).enumerate() {
-        let gaussians = motion.gaussians_at(time);
+    for (step, &time_code) in time_codes.samples.iter().enumerate() {
+        let gaussians = frames.at(step);
         samples.par_iter_mut().zip(groups).zip(models).for_each(|((samples, (_, group)), model)| {
             if *model == MotionModel::Dense {
                 let pose = group.poses.get(step).copied().unwrap_or_else(|| group.rest_pose());
@@ -353,7 +380,7 @@ fn gather_dense(
 
 fn dense_sample(
     group: &MovingGroup,
-    gaussians: &Gaussians,
+    gaussians: &Frame,
     pose: &RigidTransform,
     time_code: f64,
     previous: Option<&DenseSample>,
@@ -417,10 +444,11 @@ fn drop_constant_scales(samples: &mut [DenseSample]) {
 fn warn_of_unsampled_heads(field: &Field, warnings: &mut Vec<String>) {
     if let Some(deformation) = &field.deformation {
         let heads = deformation.config.heads;
-        for (on, what) in [(heads.opacity, "opacities"), (heads.sh, "colours")] {
+        for (on, what, when) in
+            [(heads.opacity, "opacities", "as their mean"), (heads.sh, "colours", "as at the first frame")]
+        {
             if on {
-                warnings
-                    .push(format!("{what} change over time in this field, but leave as at the first frame"));
+                warnings.push(format!("{what} change over time in this field, but leave {when}"));
             }
         }
     }
@@ -475,8 +503,6 @@ fn node(
         if total > 0.0 { (sum / total) as f32 } else { 0.0 }
     };
     let report = motion_report(group, &motion, model, input);
-    let proxy =
-        (input.options.proxy_points > 0).then(|| proxy::point_proxy(&splats, input.options.proxy_points));
     Node {
         kind: naming.kind,
         name: naming.name,
@@ -485,7 +511,7 @@ fn node(
         pivot: group.pivot,
         motion,
         splats,
-        proxy,
+        proxy: None,
         colliders: Vec::new(),
         visibility: Vec::new(),
         extent,
@@ -545,7 +571,10 @@ fn motion_report(
         residual,
         static_residual,
         rigid_residual,
+        parts_residual: None,
+        parts: 0,
         samples,
         motion_bytes,
+        seconds: 0.0,
     }
 }

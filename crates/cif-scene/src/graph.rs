@@ -103,7 +103,8 @@ pub struct Node {
     pub splats: Splats,
     /// Light stand-in for the splats; `None` when proxies were not asked for.
     pub proxy: Option<PointProxy>,
-    /// Convex hulls of the opaque splats, for simulators; empty when not asked for and for the background.
+    /// Convex hulls of the opaque splats, for simulators; empty when not asked for, which for the background
+    /// is the default.
     pub colliders: Vec<ConvexHull>,
     /// Changes of visibility, ascending time codes; empty where the node is always visible.
     pub visibility: Vec<VisibilitySample>,
@@ -324,6 +325,13 @@ pub struct CameraSample {
     pub camera: PinholeCamera,
 }
 
+/// Whether changes of visibility leave something visible at a time code; before the first one it counts.
+#[must_use]
+pub fn is_visible_at(changes: &[VisibilitySample], time_code: f64) -> bool {
+    let after = changes.partition_point(|sample| sample.time_code <= time_code);
+    changes.get(after.max(1) - 1).is_none_or(|sample| sample.visible)
+}
+
 /// Pose on a track at a time code: linear in translation, spherical in rotation between samples, held outside
 /// them; without samples unturned at `rest`.
 #[must_use]
@@ -380,8 +388,7 @@ impl Node {
     /// Whether the node can be seen at a time code.
     #[must_use]
     pub fn is_visible(&self, time_code: f64) -> bool {
-        let after = self.visibility.partition_point(|sample| sample.time_code <= time_code);
-        self.visibility.get(after.max(1) - 1).is_none_or(|sample| sample.visible)
+        is_visible_at(&self.visibility, time_code)
     }
 
     /// World box of the 3-sigma ellipsoids at a time code. Between dense samples the nearest one counts.

@@ -6,9 +6,15 @@
 //! | [`graph`] | what a scene is made of: nodes, motion, splats, cameras, timeline |
 //! | [`assignment`] | which node a Gaussian belongs to |
 //! | [`source`] | where the moved Gaussians come from |
+//! | [`frames`] | the moved Gaussians of every sampled time |
 //! | [`procrustes`] | robust rigid alignment of two point sets |
 //! | [`motion`] | static, rigid or dense: the cheapest model inside the tolerance |
 //! | [`extent`] | boxes that hold the 3-sigma ellipsoids |
+//! | [`convex_hull`] | convex hulls with few corners |
+//! | [`colliders`] | one or several hulls around a node's opaque splats |
+//! | [`level_of_detail`] | the most important splats of a node |
+//! | [`velocity`] | how fast a node moves |
+//! | [`opacities`] | opacities that change over time, and when a node is hidden by them |
 //! | [`proxy`] | a light point cloud standing in for the splats |
 //! | [`camera_tracks`] | recorded cameras as tracks over time |
 //! | [`naming`] | names that every format accepts |
@@ -25,14 +31,19 @@
 pub mod assignment;
 pub mod build;
 pub mod camera_tracks;
+pub mod colliders;
+pub mod convex_hull;
 pub mod diff;
 pub mod edits;
 pub mod error;
 pub mod extent;
 pub mod field_from_graph;
+pub mod frames;
 pub mod graph;
+pub mod level_of_detail;
 pub mod motion;
 pub mod naming;
+pub mod opacities;
 pub mod options;
 pub mod procrustes;
 pub mod proxy;
@@ -44,6 +55,7 @@ mod testing;
 #[cfg(test)]
 mod tests;
 mod time_map;
+pub mod velocity;
 mod visibility;
 
 pub use build::{build, build_from};
@@ -55,7 +67,9 @@ pub use graph::{
     CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, Node, NodeKind,
     Origin, Part, PartsMotion, PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
+pub use level_of_detail::level_of_detail;
 pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
 pub use query::{LabelMatch, LabelQuery, QueryError, query};
 pub use report::{MotionReport, ResidualStatistics};
 pub use source::MotionSource;
+pub use velocity::Velocity;

@@ -7,11 +7,11 @@
 //!
 //! Nodes that need it then get their splats of every time in a third pass (see [`crate::build`]).
 
-use cif_field::Gaussians;
 use cif_geometry::{RigidTransform, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::PoseSample;
+use crate::frames::Frame;
 use crate::procrustes::{residuals, robust_procrustes, weighted_quantile};
 use crate::proxy::systematic;
 use crate::report::ResidualStatistics;
@@ -72,7 +72,7 @@ pub struct ResidualSum {
 
 impl MeanShape {
     /// Adds one time, seen from a local frame.
-    fn add(&mut self, local_from_world: &RigidTransform, rows: &[u32], gaussians: &Gaussians) {
+    fn add(&mut self, local_from_world: &RigidTransform, rows: &[u32], gaussians: &Frame) {
         let n = rows.len();
         if self.means.is_empty() {
             *self = Self {
@@ -166,7 +166,7 @@ impl ResidualSum {
 }
 
 impl MovingGroup {
-    /// A group of rows, with its shape at the reference time.
+    /// A group of rows, with its shape at the reference time; `means` are those of all rows then.
     #[must_use]
     pub fn new(
         rows: Vec<u32>,
@@ -175,9 +175,9 @@ impl MovingGroup {
         is_body: bool,
         trim: f64,
         tolerance: f64,
-        gaussians: &Gaussians,
+        means: &[[f32; 3]],
     ) -> Self {
-        let reference = rows.iter().map(|&row| vector(gaussians.means[row as usize]) - pivot).collect();
+        let reference = rows.iter().map(|&row| vector(means[row as usize]) - pivot).collect();
         let order: Vec<u32> = (0..rows.len() as u32).collect();
         let fit_points =
             if rows.len() <= FIT_POINTS { order } else { systematic(&order, &weights, FIT_POINTS) };
@@ -204,7 +204,7 @@ impl MovingGroup {
         RigidTransform { translation: self.pivot, ..RigidTransform::IDENTITY }
     }
 
-    fn fit(&self, shape: &[DVec3], gaussians: &Gaussians, initial: RigidTransform) -> RigidTransform {
+    fn fit(&self, shape: &[DVec3], gaussians: &Frame, initial: RigidTransform) -> RigidTransform {
         let pick = |points: &[DVec3]| -> Vec<DVec3> {
             self.fit_points.iter().map(|&k| points[k as usize]).collect()
         };
@@ -218,7 +218,7 @@ impl MovingGroup {
     }
 
     /// First pass: one time.
-    pub fn gather_shape(&mut self, gaussians: &Gaussians) {
+    pub fn gather_shape(&mut self, gaussians: &Frame) {
         let rest = self.rest_pose();
         self.static_shape.add(&rest.inverse(), &self.rows, gaussians);
         if self.is_body {
@@ -231,7 +231,7 @@ impl MovingGroup {
 
     /// Between the passes: finishes the mean shapes and puts the rigid one where it fits the reference time,
     /// so that the pose there is the rest pose.
-    pub fn finish_shape(&mut self, reference: &Gaussians) {
+    pub fn finish_shape(&mut self, reference: &Frame) {
         self.static_shape.finish();
         if self.is_body {
             self.rigid_shape.finish();
@@ -243,7 +243,7 @@ impl MovingGroup {
     }
 
     /// Second pass: one time.
-    pub fn gather_residuals(&mut self, gaussians: &Gaussians) {
+    pub fn gather_residuals(&mut self, gaussians: &Frame) {
         let target: Vec<DVec3> = self.rows.iter().map(|&row| vector(gaussians.means[row as usize])).collect();
         let rest = self.rest_pose();
         let distances = residuals(&rest, &self.static_shape.means, &target);
@@ -285,7 +285,7 @@ fn add_turns(
     orientations: &[[f64; 4]],
     rows: &[u32],
     weights: &[f64],
-    gaussians: &Gaussians,
+    gaussians: &Frame,
 ) {
     let turn = quaternion_of(&pose.rotation);
     for ((&row, orientation), weight) in rows.iter().zip(orientations).zip(weights) {

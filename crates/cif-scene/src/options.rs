@@ -116,8 +116,8 @@ impl FromStr for FrameRange {
 pub struct SceneOptions {
     /// Largest residual of a simplified motion. Default 1 % of the instance size.
     pub tolerance: Tolerance,
-    /// The most expensive motion model that may be chosen. `rigid` keeps every instance a rigid body and only
-    /// reports what is lost. Default dense.
+    /// The most expensive motion model that may be chosen; what is lost is only reported then. `rigid` keeps
+    /// every instance a rigid body; `parts` is for formats that hold no dense motion. Default dense.
     pub most_expensive_motion: MotionModel,
     /// Gaussians below this opacity are left out. Default 1/255: the blending rule never draws fainter ones.
     pub min_opacity: f32,
@@ -128,6 +128,15 @@ pub struct SceneOptions {
     /// two and a half times the occupancy at which training starts: what the masks never spoke for stays near
     /// its start.
     pub background_threshold: f32,
+    /// Most rigid parts of an instance, 2 to 64; what needs more becomes dense. Default 8.
+    pub max_parts: usize,
+    /// Leave out samples that interpolation reproduces inside the tolerance. Default true.
+    pub reduce_keys: bool,
+    /// Most convex hulls of an instance, 0 for no colliders. More than one pay for concave instances. Default 1.
+    pub hulls_per_instance: usize,
+    /// Most convex hulls of the background. Default 0: viewers need none, and one hull of a whole room would
+    /// hold every object in it. Simulators in which objects fall need about 16 to 64.
+    pub background_hulls: usize,
     /// Frames to export; `None` takes all.
     pub frames: Option<FrameRange>,
     /// Every how many frames motion and cameras are sampled; the last frame is always kept. Default 1.
@@ -148,6 +157,10 @@ impl Default for SceneOptions {
             min_opacity: 1.0 / 255.0,
             min_occupancy: 0.0,
             background_threshold: 0.05,
+            max_parts: 8,
+            reduce_keys: true,
+            hulls_per_instance: 1,
+            background_hulls: 0,
             frames: None,
             frame_step: 1,
             up_axis: UpAxis::default(),
@@ -176,6 +189,13 @@ impl SceneOptions {
                 option: "tolerance",
                 value: tolerance.to_string(),
                 expected: "0 or more",
+            });
+        }
+        if !(2..=64).contains(&self.max_parts) {
+            return Err(SceneError::Option {
+                option: "max_parts",
+                value: self.max_parts.to_string(),
+                expected: "2 to 64",
             });
         }
         if self.frame_step == 0 {
@@ -221,6 +241,7 @@ mod tests {
     #[test]
     fn options_outside_their_range_are_refused() {
         let bad = [
+            SceneOptions { max_parts: 1, ..SceneOptions::default() },
             SceneOptions { frame_step: 0, ..SceneOptions::default() },
             SceneOptions { min_opacity: f32::NAN, ..SceneOptions::default() },
             SceneOptions { meters_per_unit: 0.0, ..SceneOptions::default() },

@@ -4,19 +4,11 @@ use crate::{PointProxy, Splats, extent::SIGMAS};
 
 /// Picks at most `count` splats, spread over the node and denser where the splats are more important.
 ///
-/// Importance is opacity times the area of the two larger axes. Splats are walked along a Morton curve and
+/// Importance is [`Splats::importance`]. Splats are walked along a Morton curve and
 /// picked at equal steps of summed importance, so the choice needs no chance and covers the node evenly.
 #[must_use]
 pub fn point_proxy(splats: &Splats, count: usize) -> PointProxy {
-    let importance: Vec<f64> = splats
-        .opacities
-        .iter()
-        .zip(&splats.scales)
-        .map(|(opacity, scale)| {
-            let [x, y, z] = scale.map(f64::from);
-            f64::from(*opacity) * (x * y).max(y * z).max(x * z)
-        })
-        .collect();
+    let importance = splats.importance();
     let mut indices: Vec<u32> = if splats.len() <= count {
         (0..splats.len() as u32).collect()
     } else {

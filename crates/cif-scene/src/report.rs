@@ -26,8 +26,19 @@ pub struct ResidualStatistics {
     pub orientation_rms_degrees: f64,
 }
 
+/// Residual at one sampled time.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TimeResidual {
+    /// As [`ResidualStatistics::decisive`], at this time.
+    pub decisive: f64,
+    /// Share of the weight that `decisive` is taken over.
+    pub inlier_share: f64,
+}
+
 /// Motion of one node, as chosen.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+///
+/// Two reports are equal whatever the seconds.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct MotionReport {
     /// Chosen model.
     pub model: MotionModel,
@@ -38,16 +49,46 @@ pub struct MotionReport {
     pub size: f64,
     /// Largest `decisive` residual allowed, world units.
     pub tolerance: f64,
-    /// Residual of the chosen model; zero for dense.
+    /// Residual of what is exported: of the chosen model, with the samples that were left out interpolated.
     pub residual: ResidualStatistics,
     /// What standing still would miss.
     pub static_residual: ResidualStatistics,
     /// What one rigid body would miss; `None` for the background, which is never one body.
     pub rigid_residual: Option<ResidualStatistics>,
-    /// Time samples written.
+    /// What the best rigid parts would miss; `None` where they were not tried.
+    pub parts_residual: Option<ResidualStatistics>,
+    /// Rigid parts; 0 for the other models.
+    pub parts: usize,
+    /// Time samples written: poses of the node and its parts, or dense samples.
     pub samples: usize,
     /// Bytes of the sampled values.
     pub motion_bytes: usize,
+    /// Seconds spent fitting and choosing.
+    pub seconds: f64,
+}
+
+impl PartialEq for MotionReport {
+    fn eq(&self, other: &Self) -> bool {
+        let known = |report: &Self| {
+            let Self {
+                model,
+                gaussians,
+                size,
+                tolerance,
+                residual,
+                static_residual,
+                rigid_residual,
+                parts_residual,
+                parts,
+                samples,
+                motion_bytes,
+                seconds: _,
+            } = report.clone();
+            let residuals = (residual, static_residual, rigid_residual, parts_residual);
+            (model, gaussians, size, tolerance, residuals, parts, samples, motion_bytes)
+        };
+        known(self) == known(other)
+    }
 }
 
 /// One line of the table that a command prints.

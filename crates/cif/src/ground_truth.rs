@@ -213,8 +213,11 @@ mod tests {
             residual: ResidualStatistics::default(),
             static_residual: ResidualStatistics::default(),
             rigid_residual: None,
+            parts_residual: None,
+            parts: 0,
             samples: count,
             motion_bytes: 0,
+            seconds: 0.0,
         };
         let node = Node {
             kind: NodeKind::Instance { id: 4, index: 0 },

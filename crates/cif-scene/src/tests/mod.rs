@@ -362,3 +362,5 @@ fn results_do_not_depend_on_the_number_of_threads() {
     };
     assert_eq!(run(1), run(4));
 }
+
+mod nodes;

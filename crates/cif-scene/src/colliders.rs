@@ -1,0 +1,215 @@
+//! Convex colliders of nodes.
+//!
+//! A collider is the hull of the opaque splats: of their centres and the points one standard deviation along
+//! their axes, without what sticks out of the bulk. A concave node can have several hulls: its splats are cut
+//! by planes, each time where that takes most off the summed volume.
+
+use cif_geometry::quaternion;
+use glam::DVec3;
+use nalgebra::Matrix3;
+
+use crate::convex_hull::{self, HullMesh};
+use crate::procrustes::weighted_quantile;
+use crate::{ConvexHull, Motion, Node, Splats};
+
+/// Splats of less opacity carry no collider, unless the node has little else.
+const OPAQUE: f32 = 0.5;
+/// Standard deviations that a hull reaches around a centre.
+const SIGMAS: f64 = 1.0;
+/// Weight that may stick out of the bulk in every direction.
+const TRIM: f64 = 0.01;
+/// What sticks out further than this share of the bulk's width is trimmed.
+const TRIM_MARGIN: f64 = 0.1;
+/// Share of the kept centres that the hull holds.
+const HELD: f64 = 0.995;
+/// Splats at most that cuts are judged by.
+const JUDGED: usize = 400;
+/// A cut that takes less than this share off a piece's volume is not made: cutting a cloud in two always
+/// loses a little.
+const MIN_GAIN: f64 = 0.15;
+/// Places where a cut is tried: quantiles of the weight along each principal axis.
+const CUTS: [f64; 7] = [0.1, 0.25, 0.4, 0.5, 0.6, 0.75, 0.9];
+
+/// An opaque splat: its centre, the ends of its axes, and its importance.
+#[derive(Clone, Debug)]
+struct Blob {
+    centre: DVec3,
+    ends: [DVec3; 6],
+    weight: f64,
+}
+
+/// Hulls of a node, `hulls` at most (every part has one at least), in its local frame or its parts' frames.
+#[must_use]
+pub fn colliders(node: &Node, hulls: usize) -> Vec<ConvexHull> {
+    if hulls == 0 {
+        return Vec::new();
+    }
+    let ranges: Vec<(Option<usize>, std::ops::Range<usize>)> = match &node.motion {
+        Motion::Parts(motion) => {
+            motion.parts.iter().enumerate().map(|(part, p)| (Some(part), p.splats.clone())).collect()
+        }
+        _ => vec![(None, 0..node.splats.len())],
+    };
+    let each = (hulls / ranges.len()).max(1);
+    let importance = node.splats.importance();
+    ranges
+        .into_iter()
+        .flat_map(|(part, range)| {
+            let blobs = trimmed(opaque(&node.splats, &importance, range));
+            decompose(blobs, each).into_iter().filter_map(move |blobs| {
+                let mesh = hull(&blobs)?;
+                Some(ConvexHull {
+                    points: mesh.points.iter().map(|p| p.to_array().map(|v| v as f32)).collect(),
+                    triangles: mesh.triangles,
+                    part,
+                })
+            })
+        })
+        .collect()
+}
+
+/// The opaque splats of a range.
+fn opaque(splats: &Splats, importance: &[f64], range: std::ops::Range<usize>) -> Vec<Blob> {
+    let opacities: Vec<f64> = splats.opacities[range.clone()].iter().map(|o| f64::from(*o)).collect();
+    // A glass has no opaque splats: then those of the better half are its body.
+    let half = weighted_quantile(&opacities, &importance[range.clone()], 0.5) as f32;
+    let opaque = OPAQUE.min(half);
+    range
+        .filter(|&index| splats.opacities[index] >= opaque)
+        .map(|index| {
+            let centre = DVec3::from_array(splats.means[index].map(f64::from));
+            let rotation = quaternion::to_rotation(splats.orientations[index].map(f64::from));
+            let ends = std::array::from_fn(|end| {
+                let axis = end / 2;
+                let length = SIGMAS * f64::from(splats.scales[index][axis]);
+                let direction = DVec3::new(rotation[0][axis], rotation[1][axis], rotation[2][axis]);
+                centre + if end % 2 == 0 { length } else { -length } * direction
+            });
+            Blob { centre, ends, weight: importance[index] }
+        })
+        .collect()
+}
+
+/// Drops splats whose centres stick out of the bulk, and pulls in ends that do.
+fn trimmed(mut blobs: Vec<Blob>) -> Vec<Blob> {
+    let weights: Vec<f64> = blobs.iter().map(|blob| blob.weight).collect();
+    // The bulk between two planes along each of 13 axes: faces, edges and corners of a cube.
+    let mut slabs = Vec::with_capacity(13);
+    for code in 14..27 {
+        let axis = DVec3::new(f64::from(code % 3 - 1), f64::from(code / 3 % 3 - 1), f64::from(code / 9 - 1));
+        let axis = axis.normalize();
+        let along: Vec<f64> = blobs.iter().map(|blob| axis.dot(blob.centre)).collect();
+        let low = weighted_quantile(&along, &weights, TRIM);
+        let high = weighted_quantile(&along, &weights, 1.0 - TRIM);
+        let sigma: Vec<f64> = blobs
+            .iter()
+            .map(|blob| blob.ends.iter().map(|end| axis.dot(*end - blob.centre)).fold(0.0, f64::max))
+            .collect();
+        let reach = weighted_quantile(&sigma, &weights, 0.5);
+        let margin = TRIM_MARGIN * (high - low) + reach;
+        slabs.push((axis, low - margin, high + margin));
+    }
+    let inside =
+        |point: DVec3| slabs.iter().all(|(axis, low, high)| (*low..=*high).contains(&axis.dot(point)));
+    blobs.retain(|blob| inside(blob.centre));
+    for blob in &mut blobs {
+        for end in &mut blob.ends {
+            let mut shorter = 1.0;
+            while shorter > 0.1 && !inside(blob.centre + shorter * (*end - blob.centre)) {
+                shorter *= 0.7;
+            }
+            *end = if shorter > 0.1 { blob.centre + shorter * (*end - blob.centre) } else { blob.centre };
+        }
+    }
+    blobs
+}
+
+fn hull(blobs: &[Blob]) -> Option<HullMesh> {
+    let points: Vec<DVec3> =
+        blobs.iter().flat_map(|blob| blob.ends.iter().copied().chain([blob.centre])).collect();
+    let mut mesh = convex_hull::convex_hull(&points)?;
+    let centres: Vec<DVec3> = blobs.iter().map(|blob| blob.centre).collect();
+    mesh.grow_to_hold(&centres, HELD);
+    Some(mesh)
+}
+
+/// A piece, and the best cut of it.
+struct Piece {
+    blobs: Vec<Blob>,
+    cut: Option<Cut>,
+}
+
+struct Cut {
+    axis: DVec3,
+    offset: f64,
+    /// Volume that it saves.
+    gain: f64,
+}
+
+/// Cuts splats into at most `count` groups with convex hulls of little summed volume.
+fn decompose(blobs: Vec<Blob>, count: usize) -> Vec<Vec<Blob>> {
+    if count == 1 || blobs.len() < 2 {
+        return vec![blobs];
+    }
+    let mut pieces = vec![piece(blobs)];
+    while pieces.len() < count {
+        let best = (0..pieces.len())
+            .filter_map(|index| Some((index, pieces[index].cut.as_ref()?.gain)))
+            .max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
+        let Some((index, _)) = best else { break };
+        let Piece { blobs, cut, .. } = pieces.swap_remove(index);
+        let Some(Cut { axis, offset, .. }) = cut else { break };
+        let (low, high): (Vec<Blob>, Vec<Blob>) =
+            blobs.into_iter().partition(|blob| axis.dot(blob.centre) <= offset);
+        pieces.push(piece(low));
+        pieces.push(piece(high));
+    }
+    pieces.into_iter().map(|piece| piece.blobs).collect()
+}
+
+fn piece(blobs: Vec<Blob>) -> Piece {
+    let judged: Vec<&Blob> = {
+        let step = blobs.len().div_ceil(JUDGED).max(1);
+        blobs.iter().step_by(step).collect()
+    };
+    let volume_of = |blobs: &mut dyn Iterator<Item = &&Blob>| {
+        let points: Vec<DVec3> =
+            blobs.flat_map(|blob| blob.ends.iter().copied().chain([blob.centre])).collect();
+        convex_hull::convex_hull(&points).map_or(0.0, |mesh| mesh.volume())
+    };
+    let volume = volume_of(&mut judged.iter());
+    let weights: Vec<f64> = judged.iter().map(|blob| blob.weight).collect();
+    let mut cut: Option<Cut> = None;
+    for axis in principal_axes(&judged) {
+        let along: Vec<f64> = judged.iter().map(|blob| axis.dot(blob.centre)).collect();
+        for quantile in CUTS {
+            let offset = weighted_quantile(&along, &weights, quantile);
+            let below = along.iter().filter(|value| **value <= offset).count();
+            if below == 0 || below == judged.len() {
+                continue;
+            }
+            let low = volume_of(&mut judged.iter().filter(|blob| axis.dot(blob.centre) <= offset));
+            let high = volume_of(&mut judged.iter().filter(|blob| axis.dot(blob.centre) > offset));
+            let gain = volume - low - high;
+            if gain > cut.as_ref().map_or(MIN_GAIN * volume, |cut| cut.gain) {
+                cut = Some(Cut { axis, offset, gain });
+            }
+        }
+    }
+    Piece { blobs, cut }
+}
+
+fn principal_axes(blobs: &[&Blob]) -> [DVec3; 3] {
+    let total: f64 = blobs.iter().map(|blob| blob.weight).sum();
+    let mean = blobs.iter().map(|blob| blob.weight * blob.centre).sum::<DVec3>() / total;
+    let mut covariance = Matrix3::zeros();
+    for blob in blobs {
+        let d = nalgebra::Vector3::from((blob.centre - mean).to_array());
+        covariance += d * d.transpose() * (blob.weight / total);
+    }
+    if !covariance.iter().all(|value| value.is_finite()) {
+        return [DVec3::X, DVec3::Y, DVec3::Z];
+    }
+    let axes = covariance.symmetric_eigen().eigenvectors;
+    std::array::from_fn(|k| DVec3::new(axes[(0, k)], axes[(1, k)], axes[(2, k)]))
+}
