@@ -100,7 +100,7 @@ mod tests {
             [sample(0.0, false), sample(2.0, true), sample(6.0, false)],
             [sample(3.0, true), sample(5.0, false)],
         );
-        assert_eq!(both(&a, &b), [sample(0.0, false), sample(3.0, true), sample(5.0, false)]);
+        assert_eq!(both(&a, &b), [sample(0.0, false), sample(2.0, true), sample(5.0, false)]);
         assert_eq!(both(&a, &[]), a);
         assert!(both(&[], &[]).is_empty());
     }
