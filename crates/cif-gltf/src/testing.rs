@@ -216,6 +216,9 @@ fn node(
             rigid_residual: None,
             samples: codes.len(),
             motion_bytes: 123,
+            parts_residual: None,
+            parts: 0,
+            seconds: 0.0,
         },
         splats,
     }

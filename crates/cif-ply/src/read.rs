@@ -316,6 +316,9 @@ fn scene(path: &Path, splats: Splats, left_out: usize) -> SceneGraph {
         rigid_residual: None,
         samples: 0,
         motion_bytes: 0,
+        parts_residual: None,
+        parts: 0,
+        seconds: 0.0,
     };
     let node = Node {
         kind: NodeKind::Instance { id: 1, index: 0 },

@@ -56,14 +56,17 @@ pub struct MotionReport {
     /// What one rigid body would miss; `None` for the background, which is never one body.
     pub rigid_residual: Option<ResidualStatistics>,
     /// What the best rigid parts would miss; `None` where they were not tried.
+    #[serde(default)]
     pub parts_residual: Option<ResidualStatistics>,
     /// Rigid parts; 0 for the other models.
+    #[serde(default)]
     pub parts: usize,
     /// Time samples written: poses of the node and its parts, or dense samples.
     pub samples: usize,
     /// Bytes of the sampled values.
     pub motion_bytes: usize,
-    /// Seconds spent fitting and choosing.
+    /// Seconds spent fitting and choosing; not serialised, so that files of one scene are equal.
+    #[serde(skip)]
     pub seconds: f64,
 }
 
@@ -101,6 +104,8 @@ pub struct ReportRow {
     /// Motion.
     #[serde(flatten)]
     pub motion: MotionReport,
+    /// Seconds spent fitting and choosing.
+    pub seconds: f64,
 }
 
 impl SceneGraph {
@@ -111,6 +116,7 @@ impl SceneGraph {
             name: node.name.clone(),
             label: node.label.clone(),
             motion: node.report.clone(),
+            seconds: node.report.seconds,
         };
         self.nodes.iter().map(row).collect()
     }

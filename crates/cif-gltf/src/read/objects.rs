@@ -470,5 +470,8 @@ fn foreign_report(splats: &Splats, samples: usize) -> MotionReport {
         rigid_residual: None,
         samples,
         motion_bytes: samples * 28,
+        parts_residual: None,
+        parts: 0,
+        seconds: 0.0,
     }
 }
