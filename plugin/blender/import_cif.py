@@ -53,12 +53,20 @@ def main() -> int:
     parser.add_argument("--render", type=Path, help="render one frame into this picture")
     parser.add_argument("--frame", type=int, help="frame to render (default: the first)")
     parser.add_argument("--camera", help="camera to render from (default: the first)")
-    parser.add_argument("--samples", type=int, default=16, help="samples per pixel (default: 16)")
+    parser.add_argument(
+        "--samples", type=int, default=1, help="samples per pixel (default: 1, at its centre, as in training)"
+    )
     parser.add_argument("--one-colour", action="store_true", help="leave out colours that depend on the view")
-    parser.add_argument("--display-blending", action="store_true", help="blend as training does; see Options")
+    parser.add_argument("--display-blending", action="store_true", help="blend as training does, see README")
+    parser.add_argument("--ellipsoids", action="store_true", help="render ellipsoids instead of discs")
     options = parser.parse_args(argv)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    import_stage(options.stage, harmonics=not options.one_colour, display_blending=options.display_blending)
+    import_stage(
+        options.stage,
+        harmonics=not options.one_colour,
+        display_blending=options.display_blending,
+        discs=not options.ellipsoids,
+    )
     scene = bpy.context.scene
     if options.camera:
         scene.camera = bpy.data.objects[options.camera]
@@ -68,6 +76,8 @@ def main() -> int:
         bpy.ops.wm.save_as_mainfile(filepath=str(options.save.resolve()))
     if options.render:
         scene.cycles.device, scene.cycles.samples = "CPU", options.samples
+        if options.samples == 1:
+            scene.cycles.pixel_filter_type, scene.cycles.filter_width = "BOX", 0.01
         scene.render.filepath = str(options.render.resolve())
         bpy.ops.render.render(write_still=True)
     return 0

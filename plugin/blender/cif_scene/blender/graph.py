@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import bpy
 
@@ -48,6 +48,21 @@ class Graph:
         return self.add("ShaderNodeVectorMath", {0: vector, "Scale": factor}, operation="SCALE").outputs[
             "Vector"
         ]
+
+    def total(self, terms: Sequence[Value]) -> bpy.types.NodeSocket:
+        """Sum of scalars."""
+        result = terms[0]
+        for term in terms[1:]:
+            result = self.math("ADD", result, term)
+        return result
+
+    def clamped(self, value: Value, bound: Value) -> bpy.types.NodeSocket:
+        """A scalar held between -bound and bound."""
+        return self.math("MAXIMUM", self.math("MINIMUM", value, bound), self.math("MULTIPLY", bound, -1.0))
+
+    def compare(self, operation: str, a: Value, b: Value) -> bpy.types.NodeSocket:
+        """A comparison of scalars."""
+        return self.add("FunctionNodeCompare", {0: a, 1: b}, operation=operation).outputs[0]
 
     def attribute(self, name: Value, kind: str) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
         """A named attribute and whether it exists."""

@@ -12,7 +12,7 @@ import numpy as np
 from ..io.color import linear_from_display
 from ..io.scene import Camera, Instance, Piece, Scene
 from ..io.tracks import Track
-from . import animation
+from . import animation, nodes
 from .splats import add_modifier, splat_mesh
 
 FILM_MM = 36.0
@@ -24,6 +24,10 @@ STAGE, PRIMS, PRIM, PART, IMPORTED = "cif_stage", "cif_prims", "prim_path", "cif
 imported; on an object its prim, the splat prim of a part, and the name that it was given."""
 
 
+Look = dict[str, float | bool | tuple[float, ...]]
+"""Inputs of the nodes by name."""
+
+
 @dataclass(frozen=True)
 class Options:
     """What to import, and how it shall look."""
@@ -32,6 +36,9 @@ class Options:
     """Colours that depend on the view, as seen from the scene's camera; otherwise one colour per splat."""
     training_blur: bool = True
     """Widen splats by the blur that training adds on the image, and draw nothing close to the camera."""
+    discs: bool = True
+    """Render what the camera sees of the Gaussians, as discs that face it; otherwise ellipsoids, as in the
+    viewport."""
     display_blending: bool = False
     """Blend display-referred colours, as training does, and show them without a view transform. Closer to the
     renders of cif, but other objects in the scene then look wrong."""
@@ -77,13 +84,12 @@ def build(scene: Scene, options: Options) -> Imported:
     collection.objects.link(root)
     imported = Imported(root, collection, warnings=scene.warnings)
     by_label: dict[str, bpy.types.Collection] = {}
-    blur = _pixel_angle(scene) if options.training_blur else 0.0
-    near = NEAR_METERS / scene.meters_per_unit
+    look = _look(scene, options)
     for instance in scene.instances:
         if instance.label not in by_label:
             by_label[instance.label] = bpy.data.collections.new(instance.label)
             collection.children.link(by_label[instance.label])
-        for obj in _instance(instance, root, options, blur, near):
+        for obj in _instance(instance, root, options, look):
             by_label[instance.label].objects.link(obj)
             imported.objects.append(obj)
     if scene.cameras:
@@ -99,19 +105,19 @@ def build(scene: Scene, options: Options) -> Imported:
 
 
 def _instance(
-    instance: Instance, root: bpy.types.Object, options: Options, blur: float, near: float
+    instance: Instance, root: bpy.types.Object, options: Options, look: Look
 ) -> list[bpy.types.Object]:
     """The object of an instance, and one per part where it has several."""
     single = len(instance.pieces) == 1 and instance.pieces[0].track.is_identity
     if single:
-        obj = _splats(instance.name, instance.pieces[0], options, blur, near)
+        obj = _splats(instance.name, instance.pieces[0], options, look)
         objects = [obj]
     else:
         obj = bpy.data.objects.new(instance.name, None)
         obj.empty_display_size = 0.05
         objects = [obj]
         for piece in instance.pieces:
-            part = _splats(f"{instance.name}.{piece.name}", piece, options, blur, near)
+            part = _splats(f"{instance.name}.{piece.name}", piece, options, look)
             part.parent = obj
             place(part, piece.track)
             part[PART] = piece.path
@@ -130,10 +136,10 @@ def _instance(
     return objects
 
 
-def _splats(name: str, piece: Piece, options: Options, blur: float, near: float) -> bpy.types.Object:
+def _splats(name: str, piece: Piece, options: Options, look: Look) -> bpy.types.Object:
     mesh = splat_mesh(name, piece.splats, options.harmonics)
     obj = bpy.data.objects.new(name, mesh)
-    add_modifier(obj, piece.splats, blur, near, options.display_blending)
+    add_modifier(obj, piece.splats, look)
     return obj
 
 
@@ -191,12 +197,20 @@ def _camera(camera: Camera, root: bpy.types.Object, meters_per_unit: float) -> b
     return obj
 
 
-def _pixel_angle(scene: Scene) -> float:
-    """Angle of one pixel of the recorded images, radians; 0 where the stage does not tell."""
-    for camera in scene.cameras:
-        if camera.size:
-            return float(1.0 / (camera.focal[0] * camera.size[0]))
-    return 0.0
+def _look(scene: Scene, options: Options) -> Look:
+    """Inputs of the nodes that all splats of a scene share."""
+    look: Look = {
+        nodes.DISPLAY: options.display_blending,
+        nodes.FACING: options.discs,
+        nodes.NEAR: NEAR_METERS / scene.meters_per_unit,
+    }
+    recorded = next((camera for camera in scene.cameras if camera.size), None)
+    if recorded is not None and recorded.size is not None:
+        half = 0.5 / float(recorded.focal[0])
+        look[nodes.VIEW] = (half, half * recorded.aspect, 0.0)
+        if options.training_blur:
+            look[nodes.BLUR] = 2 * half / recorded.size[0]
+    return look
 
 
 def _set_scene(scene: Scene, imported: Imported, options: Options) -> None:

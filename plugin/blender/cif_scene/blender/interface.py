@@ -52,6 +52,11 @@ class ImportCifScene(bpy.types.Operator, ImportHelper):
     training_blur: BoolProperty(
         name="Training Blur", description="Widen splats as training does on the recorded images", default=True
     )
+    discs: BoolProperty(
+        name="Discs in Renders",
+        description="Render what the camera sees of the splats, sorted as in training; otherwise ellipsoids",
+        default=True,
+    )
     display_blending: BoolProperty(
         name="Display Blending",
         description="Blend as training does and show without a view transform; other objects look wrong",
@@ -70,6 +75,7 @@ class ImportCifScene(bpy.types.Operator, ImportHelper):
                 self.filepath,
                 harmonics=self.harmonics,
                 training_blur=self.training_blur,
+                discs=self.discs,
                 display_blending=self.display_blending,
                 set_scene=self.set_scene,
             )

@@ -1,8 +1,11 @@
-"""Geometry Nodes that put an ellipsoid on every vertex.
+"""Geometry Nodes that draw every vertex as a Gaussian.
 
 Attributes of the mesh: `rot` (quaternion), `scale` (standard deviations), `opacity`, `colour` (linear); `sh_0`
 to `sh_15` where the colour depends on the view; `position_K`, `rot_K`, `scale_K` where the splats deform, K
 counting the samples.
+
+In the viewport each vertex carries an ellipsoid. Renders from the scene's camera draw what it sees of them:
+discs that are sorted by the depth of their centres, as in training, and crossed once by a ray instead of twice.
 """
 
 from __future__ import annotations
@@ -11,37 +14,27 @@ import math
 
 import bpy
 
-from . import material
+from . import color_nodes, material, shape_nodes
 from .graph import Graph, Value
 
 NAME = "CIF splats"
 SAMPLE = "Sample"
 """Input that picks the sample of splats that deform; fractions blend two of them."""
 BLUR = "Pixel Angle"
-"""Input with the angle of one recorded pixel, radians: training blurs splats by `LOW_PASS` pixels^2."""
+"""Input with the angle of one recorded pixel, radians: training blurs splats by some pixels."""
+VIEW = "Half View"
+"""Input with half the size of the recorded image over its focal length, (x, y, 0)."""
 NEAR = "Near"
 """Input with the depth below which a splat is not drawn, object units."""
 DISPLAY = "Display Blending"
 """Input that leaves colours display-referred, to be shown without a view transform."""
-LOW_PASS = 0.3
-"""Variance of the blur on the image that training adds to every splat, pixels^2."""
+FACING = "Discs in Renders"
+"""Input that draws discs that face the camera in renders; ellipsoids otherwise."""
+TRANSFORM = "splat_transform"
 SUBDIVISIONS = 2
 INRADIUS = 0.9341723589627157
-"""Radius of the sphere inside an icosphere of that many subdivisions, see `_inradius` in the tests."""
-
-BAND_0 = 0.28209479177387814
-BAND_1 = 0.4886025119029199
-BAND_2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
-BAND_3 = (
-    -0.5900435899266435,
-    2.890611442640554,
-    -0.4570457994644658,
-    0.3731763325901154,
-    -0.4570457994644658,
-    1.445305721320277,
-    -0.5900435899266435,
-)
-"""Factors of real spherical harmonics with the Condon-Shortley sign, as 3D Gaussian splatting uses them."""
+"""Radius of the sphere inside an icosphere of that many subdivisions (Blender counts the icosahedron as 1)."""
+CORNERS = 12
 
 
 def splat_nodes() -> bpy.types.GeometryNodeTree:
@@ -55,8 +48,10 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
         ("Geometry", "NodeSocketGeometry", None),
         (SAMPLE, "NodeSocketFloat", 0.0),
         (BLUR, "NodeSocketFloat", 0.0),
+        (VIEW, "NodeSocketVector", (1.0, 1.0, 0.0)),
         (NEAR, "NodeSocketFloat", 0.0),
         (DISPLAY, "NodeSocketBool", False),
+        (FACING, "NodeSocketBool", True),
     ):
         socket = tree.interface.new_socket(name, in_out="INPUT", socket_type=kind)
         if value is not None:
@@ -65,37 +60,51 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
     graph = Graph(tree)
     given = graph.add("NodeGroupInput").outputs
 
-    moved = _deformed(graph, given["Geometry"], given[SAMPLE])
-    camera = _Camera(graph)
-    scale = _size(graph, camera, given[BLUR], given[NEAR])
-    points = _store(graph, moved, material.COLOR, "FLOAT_VECTOR", _color(graph, camera, given[DISPLAY]))
+    points = _deformed(graph, given["Geometry"], given[SAMPLE])
+    camera = shape_nodes.Camera(graph)
+    lens = shape_nodes.Lens(given[BLUR], given[VIEW], given[NEAR])
+    shape = shape_nodes.Shape(graph, camera, lens)
+    viewport = graph.add("GeometryNodeIsViewport").outputs[0]
+    facing = graph.add("FunctionNodeBooleanMath", {0: given[FACING], 1: viewport}, operation="NIMPLY").outputs[
+        0
+    ]
+    transform = graph.switch(facing, shape.ellipsoid(), shape.disc(), "MATRIX")
+    points = _store(graph, points, TRANSFORM, "FLOAT4X4", transform)
+    points = _store(
+        graph, points, material.COLOR, "FLOAT_VECTOR", color_nodes.color(graph, camera, given[DISPLAY])
+    )
     points = _store(graph, points, material.OPACITY, "FLOAT", graph.attribute("opacity", "FLOAT")[0])
-    rotation = graph.attribute("rot", "QUATERNION")[0]
-    ball = graph.add("GeometryNodeMeshIcoSphere", {"Radius": 1.0 / INRADIUS, "Subdivisions": SUBDIVISIONS})
-    ball = graph.add("GeometryNodeSetMaterial", {0: ball.outputs["Mesh"], 2: material.splat_material()})
-    instances = graph.add(
-        "GeometryNodeInstanceOnPoints",
-        {"Points": points, "Instance": ball.outputs[0], "Rotation": rotation, "Scale": scale},
-    ).outputs[0]
     # The shader looks up two attributes of an instance; thousands of copies of the others would be waste.
-    for name in ("rot", "scale", "opacity", "colour", "sh_*"):
-        instances = _remove(graph, instances, name)
-    graph.add("NodeGroupOutput", {0: instances})
+    for name in ("rot", "scale", "opacity", "colour", "occupancy", "sh_*"):
+        points = _remove(graph, points, name)
+    instances = graph.add(
+        "GeometryNodeInstanceOnPoints", {"Points": points, "Instance": _body(graph, facing)}
+    ).outputs[0]
+    instances = graph.add(
+        "GeometryNodeSetInstanceTransform",
+        {"Instances": instances, "Transform": graph.attribute(TRANSFORM, "FLOAT4X4")[0]},
+    ).outputs[0]
+    graph.add("NodeGroupOutput", {0: _remove(graph, instances, TRANSFORM)})
     graph.arrange()
     return tree
 
 
-def set_input(modifier: bpy.types.NodesModifier, name: str, value: float | bool) -> str:
+def set_input(modifier: bpy.types.NodesModifier, name: str, value: float | bool | tuple[float, ...]) -> str:
     """Set an input of the modifier by name; its data path in the object, to be animated."""
-    identifier = input_identifier(modifier, name)
+    items = modifier.node_group.interface.items_tree
+    identifier = next(item.identifier for item in items if item.name == name and item.in_out == "INPUT")
     modifier[identifier] = value
     return f'modifiers["{modifier.name}"]["{identifier}"]'
 
 
-def input_identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
-    """Key of an input in the modifier."""
-    items = modifier.node_group.interface.items_tree
-    return next(item.identifier for item in items if item.name == name and item.in_out == "INPUT")
+def _body(graph: Graph, facing: Value) -> bpy.types.NodeSocket:
+    """Ball or disc that holds the unit sphere or circle."""
+    ball = graph.add("GeometryNodeMeshIcoSphere", {"Radius": 1.0 / INRADIUS, "Subdivisions": SUBDIVISIONS})
+    disc = graph.add("GeometryNodeMeshCircle", fill_type="TRIANGLE_FAN")
+    graph.give(disc.inputs["Vertices"], CORNERS)
+    graph.give(disc.inputs["Radius"], 1.0 / math.cos(math.pi / CORNERS))
+    body = graph.switch(facing, ball.outputs["Mesh"], disc.outputs["Mesh"], "GEOMETRY")
+    return graph.add("GeometryNodeSetMaterial", {0: body, 2: material.splat_material()}).outputs[0]
 
 
 def _store(graph: Graph, geometry: Value, name: str, kind: str, value: Value) -> bpy.types.NodeSocket:
@@ -153,114 +162,3 @@ def _deformed(graph: Graph, geometry: Value, sample: Value) -> bpy.types.NodeSoc
     for name in ("position", "rot", "scale"):
         moved = _remove(graph, moved, f"{name}_*")
     return moved
-
-
-class _Camera:
-    """The scene's camera in the frame of the object."""
-
-    def __init__(self, graph: Graph) -> None:
-        active = graph.add("GeometryNodeInputActiveCamera").outputs[0]
-        info = graph.add("GeometryNodeObjectInfo", {"Object": active}, transform_space="RELATIVE")
-        position = graph.add("GeometryNodeInputPosition").outputs[0]
-        inverse = graph.add("FunctionNodeInvertMatrix", {0: info.outputs["Transform"]}).outputs[0]
-        seen = graph.add("FunctionNodeTransformPoint", {"Vector": position, "Transform": inverse}).outputs[0]
-        depth = graph.add("ShaderNodeSeparateXYZ", {0: seen}).outputs["Z"]
-        self.depth = graph.math("MULTIPLY", depth, -1.0)
-        """Distance in front of the camera along its axis, negative behind it."""
-        offset = graph.vector("SUBTRACT", position, info.outputs["Location"])
-        self.direction = graph.vector("NORMALIZE", offset)
-        """Unit vector from the camera to the splat."""
-
-
-def _size(graph: Graph, camera: _Camera, blur: Value, near: Value) -> bpy.types.NodeSocket:
-    """Half axes of the ellipsoid, 0 where nothing is seen."""
-    opacity = graph.attribute("opacity", "FLOAT")[0]
-    # ln(255 opacity) * 2, which is negative where the splat is fainter than one step.
-    steps = graph.math("MAXIMUM", graph.math("MULTIPLY", opacity, material.STEPS), 1e-9)
-    squared = graph.math("MULTIPLY", graph.math("LOGARITHM", steps, math.e), 2.0)
-    # Without a camera, or with the blur turned off, the near limit does not count either.
-    trained = graph.add("FunctionNodeCompare", {0: blur, 1: 0.0}, operation="GREATER_THAN").outputs[0]
-    close = graph.add("FunctionNodeCompare", {0: camera.depth, 1: near}, operation="LESS_THAN").outputs[0]
-    hidden = graph.add("FunctionNodeBooleanMath", {0: trained, 1: close}, operation="AND").outputs[0]
-    squared = graph.switch(hidden, squared, 0.0, "FLOAT")
-    pixel = graph.math("MULTIPLY", graph.math("MAXIMUM", camera.depth, 0.0), blur)
-    variance = graph.math("MULTIPLY", graph.math("MULTIPLY", pixel, pixel), LOW_PASS)
-    scale = graph.attribute("scale", "FLOAT_VECTOR")[0]
-    widened = graph.vector("ADD", graph.vector("MULTIPLY", scale, scale), variance)
-    radius = graph.math("SQRT", graph.math("MAXIMUM", squared, 0.0))
-    axes = graph.add("ShaderNodeSeparateXYZ", {0: widened}).outputs
-    half = [graph.math("MULTIPLY", graph.math("SQRT", axes[axis]), radius) for axis in range(3)]
-    return graph.add("ShaderNodeCombineXYZ", dict(enumerate(half))).outputs[0]
-
-
-def _color(graph: Graph, camera: _Camera, display: Value) -> bpy.types.NodeSocket:
-    """Colour seen from the camera: linear, or display-referred where that is wanted."""
-    plain = graph.attribute("colour", "FLOAT_VECTOR")[0]
-    first, exists = graph.attribute("sh_0", "FLOAT_VECTOR")
-    total = graph.vector("ADD", graph.scaled(first, BAND_0), (0.5, 0.5, 0.5))
-    for number, weight in enumerate(_basis(graph, camera.direction), start=1):
-        total = graph.vector(
-            "ADD", total, graph.scaled(graph.attribute(f"sh_{number}", "FLOAT_VECTOR")[0], weight)
-        )
-    total = graph.vector("MAXIMUM", total, (0.0, 0.0, 0.0))
-    linear = graph.switch(exists, plain, _transfer(graph, total, decode=True), "VECTOR")
-    shown = graph.switch(exists, _transfer(graph, plain, decode=False), total, "VECTOR")
-    return graph.switch(display, linear, shown, "VECTOR")
-
-
-def _transfer(graph: Graph, color: Value, decode: bool) -> bpy.types.NodeSocket:
-    """The sRGB curve per channel, to linear or back; unclamped. Source: IEC 61966-2-1."""
-
-    def channel(value: Value) -> bpy.types.NodeSocket:
-        if decode:
-            curved = graph.math("POWER", graph.math("DIVIDE", graph.math("ADD", value, 0.055), 1.055), 2.4)
-            straight, low = graph.math("DIVIDE", value, 12.92), 0.04045
-        else:
-            curved = graph.math(
-                "SUBTRACT", graph.math("MULTIPLY", graph.math("POWER", value, 1 / 2.4), 1.055), 0.055
-            )
-            straight, low = graph.math("MULTIPLY", value, 12.92), 0.0031308
-        small = graph.add("FunctionNodeCompare", {0: value, 1: low}, operation="LESS_EQUAL").outputs[0]
-        return graph.switch(small, curved, straight, "FLOAT")
-
-    channels = graph.add("ShaderNodeSeparateXYZ", {0: color}).outputs
-    return graph.add("ShaderNodeCombineXYZ", {i: channel(channels[i]) for i in range(3)}).outputs[0]
-
-
-def _basis(graph: Graph, direction: Value) -> list[bpy.types.NodeSocket]:
-    """Spherical harmonics of degrees 1 to 3 at a unit direction, in the order of 3D Gaussian splatting."""
-    x, y, z = graph.add("ShaderNodeSeparateXYZ", {0: direction}).outputs[:3]
-
-    def times(*factors: Value) -> bpy.types.NodeSocket:
-        product = factors[0]
-        for factor in factors[1:]:
-            product = graph.math("MULTIPLY", product, factor)
-        return product
-
-    def plus(a: Value, b: Value) -> bpy.types.NodeSocket:
-        return graph.math("ADD", a, b)
-
-    def minus(a: Value, b: Value) -> bpy.types.NodeSocket:
-        return graph.math("SUBTRACT", a, b)
-
-    xx, yy, zz = times(x, x), times(y, y), times(z, z)
-    five = minus(times(zz, 4.0), plus(xx, yy))  # 4 zz - xx - yy
-    flat = minus(xx, yy)
-    b2, b3 = BAND_2, BAND_3
-    return [
-        times(y, -BAND_1),
-        times(z, BAND_1),
-        times(x, -BAND_1),
-        times(x, y, b2[0]),
-        times(y, z, b2[1]),
-        times(minus(times(zz, 2.0), plus(xx, yy)), b2[2]),
-        times(x, z, b2[3]),
-        times(flat, b2[4]),
-        times(y, minus(times(xx, 3.0), yy), b3[0]),
-        times(x, times(y, z), b3[1]),
-        times(y, five, b3[2]),
-        times(z, minus(times(zz, 2.0), times(plus(xx, yy), 3.0)), b3[3]),
-        times(x, five, b3[4]),
-        times(z, flat, b3[5]),
-        times(x, minus(xx, times(yy, 3.0)), b3[6]),
-    ]

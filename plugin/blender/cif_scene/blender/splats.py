@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import bpy
 import numpy as np
 
@@ -39,14 +41,13 @@ def splat_mesh(name: str, splats: Splats, harmonics: bool) -> bpy.types.Mesh:
 
 
 def add_modifier(
-    obj: bpy.types.Object, splats: Splats, pixel_angle: float, near: float, display_blending: bool
+    obj: bpy.types.Object, splats: Splats, look: Mapping[str, float | bool | tuple[float, ...]]
 ) -> None:
-    """Draw the vertices as ellipsoids, and play the samples of splats that deform."""
+    """Draw the vertices as Gaussians with inputs of the nodes, and play the samples of splats that deform."""
     modifier = obj.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = nodes.splat_nodes()
-    nodes.set_input(modifier, nodes.BLUR, pixel_angle)
-    nodes.set_input(modifier, nodes.NEAR, near)
-    nodes.set_input(modifier, nodes.DISPLAY, display_blending)
+    for name, value in look.items():
+        nodes.set_input(modifier, name, value)
     if (samples := splats.samples) is not None:
         path = nodes.set_input(modifier, nodes.SAMPLE, 0.0)
         numbers = np.arange(len(samples.codes), dtype=np.float64)
