@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -132,6 +133,10 @@ quatf xformOp:orient.timeSamples = {{ {rotations} }}
 def _object(name: str, labels: list[str], number: int | None, pose: str, children: str) -> str:
     words = ", ".join(f'"{label}"' for label in labels)
     data = f"customData = {{ dictionary cif = {{ int id = {number} }} }}" if number else ""
+    if selected := re.search(r"# selected: (\w+)", children):
+        data += f"""
+    variants = {{ string physics = "{selected[1]}" }}
+    prepend variantSets = "physics\""""
     return f"""def Xform "{name}" (
     kind = "component"
     displayName = "{labels[-1]}"
@@ -168,6 +173,105 @@ float3[] radiance:sphericalHarmonicsCoefficients = {_array(harmonics.reshape(-1,
     elementSize = 4
     interpolation = "vertex"
 )
+}}
+"""
+
+
+def write_simulation(path: Path) -> Path:
+    """A cube that hovers, a pusher on a track, a step that stands, a table without a collider at height -0.5.
+
+    Instances have the variants `physics` that an export has. The pusher moves along x by 0.05 a frame.
+    """
+    track = [(f, (-0.6 + 0.05 * f, 0.8, 0.0), turned(0)) for f in range(FRAMES)]
+    rest = [(0, (0.0, 0.0, 0.0), turned(0.3))]
+    table = np.random.default_rng(4).uniform([-2, -2, -0.002], [2, 2, 0.002], (COUNT * 20, 3))
+    step = [(0, (0.9, 0.0, -0.45), turned(0))]
+    hull = _collider(0.12)
+    body = [
+        _object("cube_001", ["cube"], 1, "", _physics(rest, "none") + _splats(1) + hull),
+        _object("pusher_002", ["tool", "pusher"], 2, "", _physics(track, "kinematic") + _splats(2) + hull),
+        _object("step_003", ["step"], 3, "", _physics(step, "none") + _splats(3) + hull),
+        _object("background", ["background"], None, _pose((0, 0, -0.5), turned(0)), _flat(table)),
+    ]
+    path.write_text(
+        f"""#usda 1.0
+(
+    defaultPrim = "World"
+    upAxis = "Z"
+    metersPerUnit = 1
+    kilogramsPerUnit = 1
+    timeCodesPerSecond = 12
+    framesPerSecond = 12
+    startTimeCode = 0
+    endTimeCode = {FRAMES - 1}
+)
+def Xform "World" (kind = "assembly")
+{{
+def PhysicsScene "PhysicsScene" {{
+vector3f physics:gravityDirection = (0, 0, -1)
+float physics:gravityMagnitude = 9.81
+}}
+{"".join(body)}
+}}
+"""
+    )
+    return path
+
+
+def _flat(places: np.ndarray) -> str:
+    """A prim of round splats at the given places."""
+    count = len(places)
+    return f"""def ParticleField3DGaussianSplat "Splats" {{
+point3f[] positions = {_array(places)}
+quatf[] orientations = {_array([(1, 0, 0, 0)] * count)}
+float3[] scales = {_array([(0.05, 0.05, 0.001)] * count)}
+float[] opacities = {_array([0.9] * count)}
+uniform int radiance:sphericalHarmonicsDegree = 0
+float3[] radiance:sphericalHarmonicsCoefficients = {_array([(0, 0, 0)] * count)} (
+    elementSize = 1
+    interpolation = "vertex"
+)
+}}
+"""
+
+
+def _physics(samples: list, selected: str) -> str:
+    """The variant set `physics` and the variant that is chosen; bodies and tracks live inside the variants."""
+    still = _pose(samples[0][1], samples[0][2])
+    moving = _poses(samples) if len(samples) > 1 else still
+    body = """prepend apiSchemas = ["PhysicsRigidBodyAPI", "PhysicsMassAPI"]"""
+    return f"""variantSet "physics" = {{
+"none" {{
+{moving}
+}}
+"kinematic" ({body}) {{
+{moving}
+bool physics:kinematicEnabled = 1
+float physics:density = 1000
+}}
+"dynamic" ({body}) {{
+{still}
+bool physics:kinematicEnabled = 0
+float physics:density = 1000
+}}
+}}
+# selected: {selected}
+"""
+
+
+def _collider(half: float) -> str:
+    """A cube around the origin."""
+    corners = [(x, y, z) for x in (-half, half) for y in (-half, half) for z in (-half, half)]
+    sides = ("0132", "4675", "0451", "2376", "0264", "1573")
+    triangles = ", ".join(f"{a}, {b}, {c}, {a}, {c}, {d}" for a, b, c, d in sides)
+    return f"""def Mesh "Collider" (prepend apiSchemas = ["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"]) {{
+uniform token purpose = "guide"
+uniform token physics:approximation = "convexHull"
+uniform token subdivisionScheme = "none"
+point3f[] points = {_array(corners)}
+float3[] extent = {_array([(-half,) * 3, (half,) * 3])}
+int[] faceVertexCounts = [{", ".join(["3"] * 12)}]
+int[] faceVertexIndices = [{triangles}]
 }}
 """
 
