@@ -48,7 +48,8 @@ def splats(stage: Usd.Stage, time: float) -> cif.Field:
     """All splats of the stage at a time code, tinted by object."""
     columns: dict[str, list[np.ndarray]] = {}
     prims = [prim for prim in stage.Traverse() if prim.GetTypeName() == SPLATS]
-    objects = [prim for prim in prims if prim.GetParent().GetCustomDataByKey("cif:id") is not None]
+    owners = {prim.GetPath(): instance_of(prim) for prim in prims}
+    objects = sorted({owner.GetPath() for owner in owners.values() if owner})
     for prim in prims:
 
         def read(name: str, prim: Usd.Prim = prim) -> np.ndarray:
@@ -59,8 +60,8 @@ def splats(stage: Usd.Stage, time: float) -> cif.Field:
         degree = prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get()
         first_band = read("radiance:sphericalHarmonicsCoefficients").reshape(-1, (degree + 1) ** 2, 3)[:, 0]
         colors = np.clip(0.5 + BAND_0 * first_band, 0, 1)
-        if prim in objects:
-            hue = objects.index(prim) * 0.618 % 1
+        if owner := owners[prim.GetPath()]:
+            hue = objects.index(owner.GetPath()) * 0.618 % 1
             colors = (1 - TINT) * colors + TINT * np.array(colorsys.hsv_to_rgb(hue, 0.8, 1.0))
         xyzw = read("orientations")
         rows = {
@@ -75,6 +76,15 @@ def splats(stage: Usd.Stage, time: float) -> cif.Field:
     if not columns:
         sys.exit("the stage holds no splats")
     return cif.Field.from_arrays(**{name: np.concatenate(parts) for name, parts in columns.items()})
+
+
+def instance_of(prim: Usd.Prim) -> Usd.Prim | None:
+    """The instance that a splat prim or the part around it belongs to; none for the background."""
+    while not prim.IsPseudoRoot():
+        if prim.GetAttribute("cif:id").HasAuthoredValue():
+            return prim
+        prim = prim.GetParent()
+    return None
 
 
 def product(turn: Gf.Quatd, xyzw: np.ndarray) -> np.ndarray:
