@@ -32,6 +32,20 @@ impl Frame {
         Self { means, log_scales, quaternions, opacity_logits }
     }
 
+    /// Some rows, in their order.
+    #[must_use]
+    pub fn rows(&self, rows: &[u32]) -> Self {
+        fn pick<T: Copy>(values: &[T], rows: &[u32]) -> Vec<T> {
+            rows.iter().map(|&row| values[row as usize]).collect()
+        }
+        Self {
+            means: pick(&self.means, rows),
+            log_scales: pick(&self.log_scales, rows),
+            quaternions: pick(&self.quaternions, rows),
+            opacity_logits: pick(&self.opacity_logits, rows),
+        }
+    }
+
     /// A Gaussian that the network throws out of the world at one time stays as at the reference time.
     fn keep_finite(&mut self, reference: &Self) {
         fn keep<const N: usize>(values: &mut [[f32; N]], reference: &[[f32; N]]) {

@@ -5,7 +5,7 @@ use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::report::MotionReport;
-use crate::{SceneOptions, UpAxis, extent};
+use crate::{SceneOptions, UpAxis, extent, placement};
 
 /// A scene, ready to be written in any format.
 #[derive(Clone, Debug, PartialEq)]
@@ -168,6 +168,13 @@ pub struct PoseSample {
 }
 
 impl PoseSample {
+    /// A transform at a time code.
+    #[must_use]
+    pub fn new(time_code: f64, transform: &RigidTransform) -> Self {
+        let rotation = DQuat::from_mat3(&transform.rotation).normalize();
+        Self { time_code, translation: transform.translation, rotation }
+    }
+
     /// The pose as `world_from_local`.
     #[must_use]
     pub fn transform(&self) -> RigidTransform {
@@ -224,11 +231,12 @@ pub struct VisibilitySample {
 pub struct DenseMotion {
     /// Best rigid fit, which carries the bulk of the motion; empty for the background, which stays put.
     pub track: Vec<PoseSample>,
-    /// Splats at every sampled time code, in the local frame of that time.
+    /// Splats in the local frame of their time, ascending time codes; where samples were left out, interpolation
+    /// is inside the tolerance. First and last are those of the graph.
     pub samples: Vec<DenseSample>,
 }
 
-/// Splats of a node at one time code; arrays parallel to [`Node::splats`].
+/// Splats of a node at one time code; between samples centres and scales are interpolated linearly; arrays parallel to [`Node::splats`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct DenseSample {
     /// Time code.
@@ -356,7 +364,8 @@ pub fn pose_at(track: &[PoseSample], rest: DVec3, time_code: f64) -> PoseSample 
 }
 
 impl Node {
-    /// Path of the local frame: samples by ascending time code, or none where it stays at the pivot.
+    /// Path of the local frame: samples by ascending time code, or none where it stays at the pivot. Not every
+    /// sampled time code needs one; see [`pose_at`].
     #[must_use]
     pub fn track(&self) -> &[PoseSample] {
         match &self.motion {
@@ -391,7 +400,7 @@ impl Node {
         is_visible_at(&self.visibility, time_code)
     }
 
-    /// World box of the 3-sigma ellipsoids at a time code. Between dense samples the nearest one counts.
+    /// World box of the 3-sigma ellipsoids at a time code.
     #[must_use]
     pub fn bounds(&self, time_code: f64) -> Bounds {
         let world_from_local = self.world_transform(time_code);
@@ -409,22 +418,14 @@ impl Node {
             });
             return boxes.fold(Bounds::EMPTY, |all, bounds| all.union(bounds));
         }
-        let (means, orientations, scales) = match &self.motion {
-            Motion::Dense(dense) => {
-                let nearest = dense.samples.iter().min_by(|a, b| {
-                    (a.time_code - time_code).abs().total_cmp(&(b.time_code - time_code).abs())
-                });
-                match nearest {
-                    Some(sample) => (
-                        &sample.means,
-                        &sample.orientations,
-                        sample.scales.as_ref().unwrap_or(&self.splats.scales),
-                    ),
-                    None => (&self.splats.means, &self.splats.orientations, &self.splats.scales),
-                }
-            }
-            _ => (&self.splats.means, &self.splats.orientations, &self.splats.scales),
-        };
+        if let Motion::Dense(dense) = &self.motion {
+            let placed = placement::local_splats_at(dense, &self.splats.scales, time_code);
+            let means: Vec<[f32; 3]> = placed.means.iter().map(|mean| mean.as_vec3().to_array()).collect();
+            let orientations: Vec<[f32; 4]> =
+                placed.orientations.iter().map(|q| q.map(|component| component as f32)).collect();
+            return extent::ellipsoid_bounds(&world_from_local, &means, &orientations, &placed.scales);
+        }
+        let Splats { means, orientations, scales, .. } = &self.splats;
         extent::ellipsoid_bounds(&world_from_local, means, orientations, scales)
     }
 }

@@ -8,7 +8,10 @@
 //! | [`source`] | where the moved Gaussians come from |
 //! | [`frames`] | the moved Gaussians of every sampled time |
 //! | [`procrustes`] | robust rigid alignment of two point sets |
-//! | [`motion`] | static, rigid or dense: the cheapest model inside the tolerance |
+//! | [`motion`] | how well standing still and one rigid body fit a group of Gaussians |
+//! | [`parts`] | a few rigid parts, found by clustering the paths of Gaussians |
+//! | [`keys`] | fewer samples of a track inside an error bound |
+//! | [`placement`] | where a node's splats are at any time |
 //! | [`extent`] | boxes that hold the 3-sigma ellipsoids |
 //! | [`convex_hull`] | convex hulls with few corners |
 //! | [`colliders`] | one or several hulls around a node's opaque splats |
@@ -31,8 +34,10 @@
 pub mod assignment;
 pub mod build;
 pub mod camera_tracks;
+mod choose;
 pub mod colliders;
 pub mod convex_hull;
+mod dense;
 pub mod diff;
 pub mod edits;
 pub mod error;
@@ -40,11 +45,15 @@ pub mod extent;
 pub mod field_from_graph;
 pub mod frames;
 pub mod graph;
+pub mod keys;
 pub mod level_of_detail;
 pub mod motion;
 pub mod naming;
+mod node;
 pub mod opacities;
 pub mod options;
+pub mod parts;
+pub mod placement;
 pub mod procrustes;
 pub mod proxy;
 pub mod query;
@@ -69,6 +78,7 @@ pub use graph::{
 };
 pub use level_of_detail::level_of_detail;
 pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
+pub use placement::PlacedSplats;
 pub use query::{LabelMatch, LabelQuery, QueryError, query};
 pub use report::{MotionReport, ResidualStatistics};
 pub use source::MotionSource;

@@ -1,23 +1,26 @@
-//! The cheapest motion model inside the tolerance.
+//! How well standing still and one rigid body fit a group of Gaussians.
 //!
 //! Two passes over the sampled times, so that no more than one time's Gaussians are in memory:
 //! 1. poses against the shape at the reference time, which give the mean shape (in the world for static, in
 //!    the moving frame for rigid): the noise of one time must not become the shape;
 //! 2. poses against the mean shape, and the residuals of both models.
 //!
-//! Nodes that need it then get their splats of every time in a third pass (see [`crate::build`]).
+//! Parts of a body are groups of their own, with the same two passes.
 
 use cif_geometry::{RigidTransform, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::PoseSample;
 use crate::frames::Frame;
+use crate::keys::one_hemisphere;
 use crate::procrustes::{residuals, robust_procrustes, weighted_quantile};
 use crate::proxy::systematic;
-use crate::report::ResidualStatistics;
+use crate::report::{ResidualStatistics, TimeResidual};
 
 /// Most points that a pose is fitted to; residuals are taken over all.
 const FIT_POINTS: usize = 4096;
+/// Weight left out on each side when the size of a group is taken.
+const SIZE_TRIM: f64 = 0.02;
 
 /// Gaussians of one node, and what is learnt about their motion.
 #[derive(Clone, Debug)]
@@ -44,6 +47,10 @@ pub struct MovingGroup {
     pub static_residual: ResidualSum,
     /// Residuals of the rigid body.
     pub rigid_residual: ResidualSum,
+    /// Residuals of rigid parts, where they were tried.
+    pub parts_residual: Option<ResidualStatistics>,
+    /// Seconds spent on the group.
+    pub seconds: f64,
     reference: Vec<DVec3>,
     fit_points: Vec<u32>,
 }
@@ -63,6 +70,8 @@ pub struct MeanShape {
 /// Residuals, gathered time by time.
 #[derive(Clone, Debug, Default)]
 pub struct ResidualSum {
+    /// Residual at every time, in the order in which they were added.
+    pub times: Vec<TimeResidual>,
     statistics: ResidualStatistics,
     squares: f64,
     turn_squares: f64,
@@ -120,22 +129,46 @@ impl MeanShape {
     }
 }
 
+/// Weighted RMS without the outlying share of the weight that has the largest values, and the share of the
+/// weight that it is taken over; zero without weight.
+pub(crate) fn trimmed_rms(distances: &[f64], weights: &[f64], trim: f64) -> (f64, f64) {
+    let total: f64 = weights.iter().sum();
+    let cut = if trim > 0.0 { weighted_quantile(distances, weights, 1.0 - trim) } else { f64::INFINITY };
+    let (mut squares, mut inliers) = (0.0, 0.0);
+    for (distance, weight) in distances.iter().zip(weights) {
+        if *distance <= cut {
+            squares += weight * distance * distance;
+            inliers += weight;
+        }
+    }
+    if inliers > 0.0 { ((squares / inliers).sqrt(), inliers / total) } else { (0.0, 0.0) }
+}
+
+/// Box of the centres of rows without the outermost weight on each side.
+pub(crate) fn trimmed_box(rows: &[u32], weights: &[f64], means: &[[f32; 3]]) -> (DVec3, DVec3) {
+    let mut low = DVec3::ZERO;
+    let mut high = DVec3::ZERO;
+    for axis in 0..3 {
+        let values: Vec<f64> = rows.iter().map(|&row| f64::from(means[row as usize][axis])).collect();
+        low[axis] = weighted_quantile(&values, weights, SIZE_TRIM);
+        high[axis] = weighted_quantile(&values, weights, 1.0 - SIZE_TRIM).max(low[axis]);
+    }
+    (low, high)
+}
+
 impl ResidualSum {
     /// Adds the residuals of one time.
-    fn add(&mut self, distances: &[f64], weights: &[f64], trim: f64, tolerance: f64) {
+    pub fn add(&mut self, distances: &[f64], weights: &[f64], trim: f64, tolerance: f64) {
         let total: f64 = weights.iter().sum();
         if total <= 0.0 {
+            self.times.push(TimeResidual::default());
             return;
         }
-        let cut = weighted_quantile(distances, weights, 1.0 - trim);
-        let (mut inliers, mut inlier_weight, mut outliers) = (0.0, 0.0, 0.0);
+        let (decisive, inlier_share) = trimmed_rms(distances, weights, trim);
+        self.times.push(TimeResidual { decisive, inlier_share });
+        let mut outliers = 0.0;
         for (distance, weight) in distances.iter().zip(weights) {
-            let square = weight * distance * distance;
-            self.squares += square;
-            if *distance <= cut {
-                inliers += square;
-                inlier_weight += weight;
-            }
+            self.squares += weight * distance * distance;
             if *distance > tolerance {
                 outliers += weight;
             }
@@ -143,7 +176,7 @@ impl ResidualSum {
         }
         self.weight += total;
         let worst = &mut self.statistics;
-        worst.decisive = worst.decisive.max((inliers / inlier_weight).sqrt());
+        worst.decisive = worst.decisive.max(decisive);
         worst.percentile_95 = worst.percentile_95.max(weighted_quantile(distances, weights, 0.95));
         worst.outlier_share = worst.outlier_share.max(outliers / total);
     }
@@ -193,6 +226,8 @@ impl MovingGroup {
             poses: Vec::new(),
             static_residual: ResidualSum::default(),
             rigid_residual: ResidualSum::default(),
+            parts_residual: None,
+            seconds: 0.0,
             reference,
             fit_points,
         }
@@ -242,8 +277,15 @@ impl MovingGroup {
         self.poses.clear();
     }
 
-    /// Second pass: one time.
-    pub fn gather_residuals(&mut self, gaussians: &Frame) {
+    /// Does something with the group, and adds the seconds that it took.
+    pub(crate) fn timed(&mut self, action: impl FnOnce(&mut Self)) {
+        let start = std::time::Instant::now();
+        action(self);
+        self.seconds += start.elapsed().as_secs_f64();
+    }
+
+    /// Second pass: one time. Gives the distances from the rigid body; none where there is no body.
+    pub fn gather_residuals(&mut self, gaussians: &Frame) -> Vec<f64> {
         let target: Vec<DVec3> = self.rows.iter().map(|&row| vector(gaussians.means[row as usize])).collect();
         let rest = self.rest_pose();
         let distances = residuals(&rest, &self.static_shape.means, &target);
@@ -258,27 +300,27 @@ impl MovingGroup {
             let shape = &self.rigid_shape.orientations;
             add_turns(&mut self.rigid_residual, &pose, shape, &self.rows, &self.weights, gaussians);
             self.poses.push(pose);
+            return distances;
         }
+        Vec::new()
     }
 
     /// The poses as a track, quaternions in one hemisphere.
     #[must_use]
     pub fn track(&self, time_codes: &[f64]) -> Vec<PoseSample> {
-        let mut previous = DQuat::IDENTITY;
-        self.poses
-            .iter()
-            .zip(time_codes)
-            .map(|(pose, &time_code)| {
-                let rotation = DQuat::from_mat3(&pose.rotation).normalize();
-                let rotation = if rotation.dot(previous) < 0.0 { -rotation } else { rotation };
-                previous = rotation;
-                PoseSample { time_code, translation: pose.translation, rotation }
-            })
-            .collect()
+        let poses = self.poses.iter().zip(time_codes);
+        let mut track: Vec<PoseSample> =
+            poses.map(|(pose, &time_code)| PoseSample::new(time_code, pose)).collect();
+        // The first one in the hemisphere of the identity.
+        if let Some(first) = track.first_mut().filter(|first| first.rotation.w < 0.0) {
+            first.rotation = -first.rotation;
+        }
+        one_hemisphere(&mut track);
+        track
     }
 }
 
-/// Adds the turns between predicted and trained orientations; a Gaussian counts by how far from round it is.
+/// Adds the turns between the orientations of a shape under a pose and the trained ones.
 fn add_turns(
     sum: &mut ResidualSum,
     pose: &RigidTransform,
@@ -288,10 +330,23 @@ fn add_turns(
     gaussians: &Frame,
 ) {
     let turn = quaternion_of(&pose.rotation);
-    for ((&row, orientation), weight) in rows.iter().zip(orientations).zip(weights) {
+    let turned: Vec<[f64; 4]> =
+        orientations.iter().map(|orientation| quaternion::multiply(turn, *orientation)).collect();
+    add_turns_between(sum, &turned, rows, weights, gaussians);
+}
+
+/// Adds the turns between predicted and trained orientations; a Gaussian counts by how far from round it is.
+pub(crate) fn add_turns_between(
+    sum: &mut ResidualSum,
+    predicted: &[[f64; 4]],
+    rows: &[u32],
+    weights: &[f64],
+    gaussians: &Frame,
+) {
+    for ((&row, predicted), weight) in rows.iter().zip(predicted).zip(weights) {
         let trained = gaussians.quaternions[row as usize].map(f64::from);
         let Some(trained) = quaternion::try_normalize(trained) else { continue };
-        let cosine = dot(quaternion::multiply(turn, *orientation), trained).abs().min(1.0);
+        let cosine = dot(*predicted, trained).abs().min(1.0);
         let scales = vector(gaussians.log_scales[row as usize]);
         let flatness = 1.0 - (scales.min_element() - scales.max_element()).exp();
         sum.add_turn(2.0 * cosine.acos().to_degrees(), weight * flatness);

@@ -90,7 +90,8 @@ fn pseudo_noise(row: usize, time: f64, axis: usize) -> f32 {
 fn a_rigid_instance_gets_its_track() {
     let field = field(2);
     let mut source = |time: f64| moved(&field, 60..120, &pose(time));
-    let graph = build_from(&field, &mut source, &SceneOptions::default()).unwrap();
+    let all_samples = SceneOptions { reduce_keys: false, ..SceneOptions::default() };
+    let graph = build_from(&field, &mut source, &all_samples).unwrap();
     let models: Vec<_> = graph.nodes.iter().map(|node| (node.name.as_str(), node.model())).collect();
     assert_eq!(
         models,
@@ -168,7 +169,8 @@ fn bending_is_dense_and_reproduces_the_trained_splats() {
         }
         gaussians
     };
-    let graph = build_from(&field, &mut { bend }, &SceneOptions::default()).unwrap();
+    let options = SceneOptions { reduce_keys: false, max_parts: 2, ..SceneOptions::default() };
+    let graph = build_from(&field, &mut { bend }, &options).unwrap();
     let node = &graph.nodes[0];
     let Motion::Dense(dense) = &node.motion else { panic!("{:?}", node.report) };
     assert_eq!((dense.samples.len(), dense.track.len()), (FRAMES, FRAMES));
@@ -363,4 +365,5 @@ fn results_do_not_depend_on_the_number_of_threads() {
     assert_eq!(run(1), run(4));
 }
 
+mod motion_models;
 mod nodes;

@@ -1,0 +1,278 @@
+//! Nodes from groups of Gaussians and their chosen motion.
+
+use cif_field::{Field, Gaussians};
+use cif_geometry::RigidTransform;
+use glam::DVec3;
+
+use crate::assignment::Identity;
+use crate::build::sigmoid;
+use crate::choose::{Chosen, DENSE_BYTES, POSE_BYTES};
+use crate::dense::positive_scales;
+use crate::frames::Frames;
+use crate::graph::{DenseMotion, DenseSample, Motion, Node, NodeKind, Part, PartsMotion, Splats};
+use crate::motion::{MeanShape, MovingGroup, ResidualSum, add_turns_between, trimmed_box, vector};
+use crate::report::{MotionReport, ResidualStatistics};
+use crate::{MotionModel, extent, naming};
+
+/// What a node is called.
+pub(crate) struct Naming {
+    kind: NodeKind,
+    name: String,
+    label: String,
+    category: String,
+}
+
+impl Naming {
+    pub(crate) fn of(field: &Field, owner: Option<usize>, nodes: &[Node]) -> Self {
+        match owner {
+            Some(index) => {
+                let instance = &field.instances[index];
+                let name = naming::instance_name(&instance.label, instance.id);
+                let name = naming::unique(name, |name| nodes.iter().any(|node| node.name == name));
+                Self {
+                    kind: NodeKind::Instance { id: instance.id, index },
+                    name,
+                    label: instance.label.clone(),
+                    category: instance.category.clone(),
+                }
+            }
+            None => Self {
+                kind: NodeKind::Background,
+                name: naming::BACKGROUND.to_owned(),
+                label: naming::BACKGROUND.to_owned(),
+                category: naming::BACKGROUND.to_owned(),
+            },
+        }
+    }
+}
+
+/// What all nodes are made from.
+pub(crate) struct NodeInput<'a> {
+    pub(crate) field: &'a Field,
+    pub(crate) reference: &'a Gaussians,
+    pub(crate) identities: &'a [Option<Identity>],
+}
+
+/// One node: the splats of the chosen model in the local frame, and the report, whose residual is that of
+/// the model before [`measure`].
+pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, chosen: Chosen) -> Node {
+    let order: Option<&[u32]> = match &chosen {
+        Chosen::Parts { parts, .. } => Some(&parts.order),
+        _ => None,
+    };
+    let rows: Vec<u32> = match order {
+        Some(order) => order.iter().map(|&position| group.rows[position as usize]).collect(),
+        None => group.rows.clone(),
+    };
+    let is_instance = matches!(naming.kind, NodeKind::Instance { .. });
+    let mut splats = appearance(input, is_instance, rows);
+    let (motion, residual) = match chosen {
+        Chosen::Static => {
+            take_shape(&mut splats, &group.static_shape);
+            (Motion::Static, group.static_residual.statistics())
+        }
+        Chosen::Rigid(track) => {
+            take_shape(&mut splats, &group.rigid_shape);
+            (Motion::Rigid(track), group.rigid_residual.statistics())
+        }
+        Chosen::Parts { track, parts, tracks } => {
+            let residual = parts.residual.statistics();
+            let mut out = Vec::with_capacity(parts.parts.len());
+            for (number, ((range, part), track)) in parts.parts.into_iter().zip(tracks).enumerate() {
+                take_shape(&mut splats, &part.rigid_shape);
+                out.push(Part {
+                    name: format!("part_{number:02}"),
+                    extent: extent::ellipsoid_bounds(
+                        &RigidTransform::IDENTITY,
+                        &splats.means[range.clone()],
+                        &splats.orientations[range.clone()],
+                        &splats.scales[range.clone()],
+                    ),
+                    splats: range,
+                    pivot: part.pivot - group.pivot,
+                    track,
+                });
+            }
+            (Motion::Parts(PartsMotion { track, parts: out }), residual)
+        }
+        Chosen::Dense { track, samples } => {
+            // The first sample stands in wherever only the default time is read.
+            take_shape(&mut splats, &group.static_shape);
+            if let Some(first) = samples.first() {
+                splats.means.clone_from(&first.means);
+                splats.orientations.clone_from(&first.orientations);
+                if let Some(scales) = &first.scales {
+                    splats.scales.clone_from(scales);
+                }
+            }
+            (Motion::Dense(DenseMotion { track, samples }), ResidualStatistics::default())
+        }
+    };
+    let report = motion_report(group, &motion, residual, input);
+    let mut node = Node {
+        kind: naming.kind,
+        name: naming.name,
+        label: naming.label,
+        category: naming.category,
+        pivot: group.pivot,
+        motion,
+        mean_occupancy: mean_occupancy(&splats),
+        splats,
+        proxy: None,
+        colliders: Vec::new(),
+        visibility: Vec::new(),
+        extent: cif_geometry::Bounds::EMPTY,
+        source_frames: (0, 0),
+        report,
+    };
+    node.extent = resting_extent(&node);
+    node
+}
+
+/// Adds the splats of a shape.
+fn take_shape(splats: &mut Splats, shape: &MeanShape) {
+    splats.means.extend(shape.means.iter().map(|mean| mean.to_array().map(|v| v as f32)));
+    splats.orientations.extend(shape.orientations.iter().map(|q| q.map(|v| v as f32)));
+    splats.scales.extend(shape.log_scales.iter().map(|log| positive_scales(log.to_array())));
+}
+
+/// Box of the splats in the local frame; parts as they are at their pivots.
+fn resting_extent(node: &Node) -> cif_geometry::Bounds {
+    let splats = &node.splats;
+    match &node.motion {
+        Motion::Parts(motion) => motion.parts.iter().fold(cif_geometry::Bounds::EMPTY, |all, part| {
+            let range = part.splats.clone();
+            let rest = RigidTransform { translation: part.pivot, ..RigidTransform::IDENTITY };
+            all.union(extent::ellipsoid_bounds(
+                &rest,
+                &splats.means[range.clone()],
+                &splats.orientations[range.clone()],
+                &splats.scales[range],
+            ))
+        }),
+        _ => extent::ellipsoid_bounds(
+            &RigidTransform::IDENTITY,
+            &splats.means,
+            &splats.orientations,
+            &splats.scales,
+        ),
+    }
+}
+
+fn mean_occupancy(splats: &Splats) -> f32 {
+    let (sum, total) = splats
+        .occupancies
+        .iter()
+        .zip(&splats.opacities)
+        .fold((0.0, 0.0), |(sum, total), (pi, o)| (sum + f64::from(pi * o), total + f64::from(*o)));
+    if total > 0.0 { (sum / total) as f32 } else { 0.0 }
+}
+
+/// Everything about the splats that no motion model changes.
+fn appearance(input: &NodeInput<'_>, is_instance: bool, rows: Vec<u32>) -> Splats {
+    let gaussians = input.reference;
+    let degree = input.field.sh_degree;
+    let floats = 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
+    let mut splats = Splats { sh_degree: degree, ..Splats::default() };
+    for &row in &rows {
+        let row = row as usize;
+        splats.opacities.push(sigmoid(gaussians.opacity_logits[row]));
+        splats.sh_coefficients.extend_from_slice(&gaussians.sh_coefficients[row][..floats]);
+        splats.occupancies.push(sigmoid(gaussians.occupancy_logits[row]));
+        let probability = input.identities[row].map_or(0.0, |identity| identity.probability);
+        splats.identity_probabilities.push(if is_instance { probability } else { 0.0 });
+    }
+    splats.rows = rows;
+    splats
+}
+
+/// Takes the residuals of nodes that move against the trained Gaussians at all sampled times, as the nodes are
+/// now: with the samples that were left out interpolated.
+pub(crate) fn measure(
+    nodes: &mut [Node],
+    groups: &[MovingGroup],
+    frames: &mut Frames<'_>,
+    time_codes: &[f64],
+) {
+    use rayon::prelude::*;
+
+    let mut sums = vec![ResidualSum::default(); nodes.len()];
+    // Weights of the group, in the order of the node.
+    let weights: Vec<Vec<f64>> = nodes
+        .iter()
+        .zip(groups)
+        .map(|(node, group)| {
+            let position = |row: &u32| group.rows.binary_search(row).ok();
+            node.splats
+                .rows
+                .iter()
+                .map(|row| position(row).map_or(0.0, |position| group.weights[position]))
+                .collect()
+        })
+        .collect();
+    let moving = |node: &Node| !matches!(node.motion, Motion::Static);
+    if !nodes.iter().any(moving) {
+        return;
+    }
+    for (step, &time_code) in time_codes.iter().enumerate() {
+        let frame = frames.at(step);
+        sums.par_iter_mut().zip(nodes.par_iter()).zip(groups).zip(&weights).for_each(
+            |(((sum, node), group), weights)| {
+                if moving(node) {
+                    let placed = node.splats_at(time_code);
+                    let distances: Vec<f64> = placed
+                        .means
+                        .iter()
+                        .zip(&node.splats.rows)
+                        .map(|(mean, &row)| mean.distance(vector(frame.means[row as usize])))
+                        .collect();
+                    sum.add(&distances, weights, group.trim, group.tolerance);
+                    add_turns_between(sum, &placed.orientations, &node.splats.rows, weights, &frame);
+                }
+            },
+        );
+    }
+    for (node, sum) in nodes.iter_mut().zip(&sums) {
+        if moving(node) {
+            node.report.residual = sum.statistics();
+        }
+    }
+}
+
+fn motion_report(
+    group: &MovingGroup,
+    motion: &Motion,
+    residual: ResidualStatistics,
+    input: &NodeInput<'_>,
+) -> MotionReport {
+    let (low, high) = trimmed_box(&group.rows, &group.weights, &input.reference.means);
+    let (model, samples, motion_bytes) = match motion {
+        Motion::Static => (MotionModel::Static, 0, 0),
+        Motion::Rigid(track) => (MotionModel::Rigid, track.len(), track.len() * POSE_BYTES),
+        Motion::Parts(motion) => {
+            let samples =
+                motion.track.len() + motion.parts.iter().map(|part| part.track.len()).sum::<usize>();
+            (MotionModel::Parts, samples, samples * POSE_BYTES)
+        }
+        Motion::Dense(dense) => {
+            let per_splat = |sample: &DenseSample| DENSE_BYTES + if sample.scales.is_some() { 12 } else { 0 };
+            let bytes: usize =
+                dense.samples.iter().map(|sample| sample.means.len() * per_splat(sample)).sum();
+            (MotionModel::Dense, dense.samples.len(), bytes + dense.track.len() * POSE_BYTES)
+        }
+    };
+    MotionReport {
+        model,
+        gaussians: group.rows.len(),
+        size: DVec3::length(high - low),
+        tolerance: group.tolerance,
+        residual,
+        static_residual: group.static_residual.statistics(),
+        rigid_residual: group.is_body.then(|| group.rigid_residual.statistics()),
+        parts_residual: group.parts_residual,
+        parts: if let Motion::Parts(motion) = motion { motion.parts.len() } else { 0 },
+        samples,
+        motion_bytes,
+        seconds: group.seconds,
+    }
+}
