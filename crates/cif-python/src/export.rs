@@ -54,8 +54,11 @@ pub(crate) fn motion_model(name: &str) -> PyResult<MotionModel> {
     match name {
         "static" => Ok(MotionModel::Static),
         "rigid" => Ok(MotionModel::Rigid),
+        "parts" => Ok(MotionModel::Parts),
         "dense" => Ok(MotionModel::Dense),
-        _ => Err(PyValueError::new_err(format!("motion model '{name}': choose static, rigid or dense"))),
+        _ => {
+            Err(PyValueError::new_err(format!("motion model '{name}': choose static, rigid, parts or dense")))
+        }
     }
 }
 

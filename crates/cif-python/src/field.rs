@@ -336,7 +336,8 @@ impl Field {
     }
 
     #[pyo3(signature = (path, *, tolerance="1%", motion=None, most_expensive_motion="dense", frames=None,
-                        frame_step=1, up_axis="z", background_threshold=None, proxy_points=None, force=false))]
+                        frame_step=1, up_axis="z", background_threshold=None, proxy_points=None, max_parts=8,
+                        reduce_keys=true, hulls=1, background_hulls=0, force=false))]
     #[expect(clippy::too_many_arguments, reason = "keyword arguments of a method")]
     fn export<'py>(
         &self,
@@ -350,6 +351,10 @@ impl Field {
         up_axis: &str,
         background_threshold: Option<f32>,
         proxy_points: Option<usize>,
+        max_parts: usize,
+        reduce_keys: bool,
+        hulls: usize,
+        background_hulls: usize,
         force: bool,
     ) -> PyResult<Bound<'py, PyDict>> {
         let defaults = cif_scene::SceneOptions::default();
@@ -361,6 +366,10 @@ impl Field {
             up_axis: up_axis.parse().map_err(cif_error)?,
             background_threshold: background_threshold.unwrap_or(defaults.background_threshold),
             proxy_points: proxy_points.unwrap_or(defaults.proxy_points),
+            max_parts,
+            reduce_keys,
+            hulls_per_instance: hulls,
+            background_hulls,
             ..defaults
         };
         export::export(py, self, &path, &options, motion, force)

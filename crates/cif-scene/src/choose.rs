@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::time::Instant;
 
 use cif_geometry::RigidTransform;
+use glam::DVec3;
 use rayon::prelude::*;
 
 use crate::dense;
@@ -235,7 +236,7 @@ fn with_tracks(
             Chosen::Rigid(if options.reduce_keys { keys::reduce(&full, &allowed, deviation) } else { full })
         }
         (MotionModel::Parts, Some(parts)) => {
-            let track = bulk_track(group, full.clone(), options);
+            let track = leading_track(group, &parts, time_codes, options);
             let tracks = parts
                 .parts
                 .iter()
@@ -250,19 +251,54 @@ fn with_tracks(
     }
 }
 
-/// The track that carries the bulk of the motion of parts and dense samples. Those are taken relative to it as
-/// it is interpolated, so that leaving out its samples costs nothing but larger relative motion.
+/// The track of a node with parts: that of its largest part, which then needs none of its own. The other parts
+/// are taken relative to it as it is interpolated.
+fn leading_track(
+    group: &MovingGroup,
+    parts: &FittedParts,
+    time_codes: &[f64],
+    options: &SceneOptions,
+) -> Vec<PoseSample> {
+    let Some((_, leader)) = parts.parts.first() else { return Vec::new() };
+    let offset = group.pivot - leader.pivot;
+    let part_from_node = RigidTransform { translation: offset, ..RigidTransform::IDENTITY };
+    let mut full: Vec<PoseSample> = leader
+        .track(time_codes)
+        .iter()
+        .map(|sample| PoseSample::new(sample.time_code, &sample.transform().compose(&part_from_node)))
+        .collect();
+    keys::one_hemisphere(&mut full);
+    if !options.reduce_keys {
+        return full;
+    }
+    let shape: Vec<DVec3> = leader.rigid_shape.means.iter().map(|mean| *mean - offset).collect();
+    let moments = Moments::of(&shape, &leader.weights);
+    let allowed = keys::allowances(&parts.residual.times, group.tolerance);
+    reduced_or_resting(&full, &allowed, &moments, &group.rest_pose())
+}
+
+/// A reduced track, or none where resting is inside the allowances too.
+fn reduced_or_resting(
+    full: &[PoseSample],
+    allowed: &[f64],
+    moments: &Moments,
+    rest: &RigidTransform,
+) -> Vec<PoseSample> {
+    let deviation = |sample: usize, pose: &RigidTransform| moments.deviation(&full[sample].transform(), pose);
+    if (0..full.len()).all(|sample| deviation(sample, rest) <= allowed[sample]) {
+        return Vec::new();
+    }
+    keys::reduce(full, allowed, deviation)
+}
+
+/// The track that carries the bulk of the motion of dense samples. Those are taken relative to it as it is
+/// interpolated, so that leaving out its samples costs nothing but larger relative motion.
 fn bulk_track(group: &MovingGroup, full: Vec<PoseSample>, options: &SceneOptions) -> Vec<PoseSample> {
     if !options.reduce_keys {
         return full;
     }
     let moments = Moments::of(&group.rigid_shape.means, &group.weights);
-    let rest = group.rest_pose();
-    if full.iter().all(|sample| moments.deviation(&sample.transform(), &rest) <= group.tolerance) {
-        return Vec::new();
-    }
-    let allowed = vec![group.tolerance; full.len()];
-    keys::reduce(&full, &allowed, |sample, pose| moments.deviation(&full[sample].transform(), pose))
+    reduced_or_resting(&full, &vec![group.tolerance; full.len()], &moments, &group.rest_pose())
 }
 
 /// Poses `node_from_part`, reduced; empty where the part stays at its pivot inside the bound.
@@ -288,12 +324,8 @@ fn part_track(
     }
     let moments = Moments::of(&part.rigid_shape.means, &part.weights);
     let allowed = keys::allowances(&residual.times, group.tolerance);
-    let deviation = |sample: usize, pose: &RigidTransform| moments.deviation(&full[sample].transform(), pose);
     let rest = RigidTransform { translation: part.pivot - group.pivot, ..RigidTransform::IDENTITY };
-    if (0..full.len()).all(|sample| deviation(sample, &rest) <= allowed[sample]) {
-        return Vec::new();
-    }
-    keys::reduce(&full, &allowed, deviation)
+    reduced_or_resting(&full, &allowed, &moments, &rest)
 }
 
 /// The splats of dense groups at every time, relative to their tracks.

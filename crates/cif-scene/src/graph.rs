@@ -185,7 +185,7 @@ impl PoseSample {
 /// A few rigid parts under one node.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PartsMotion {
-    /// Path of the node's local frame, which carries the bulk of the motion; empty where it stays at the pivot.
+    /// Path of the node's local frame, which follows its largest part; empty where it stays at the pivot.
     pub track: Vec<PoseSample>,
     /// The parts, at least two. Their [`Part::splats`] partition [`Node::splats`] in order.
     pub parts: Vec<Part>,

@@ -168,12 +168,17 @@ class Field:
         up_axis: str = "z",
         background_threshold: float | None = None,
         proxy_points: int | None = None,
+        max_parts: int = 8,
+        reduce_keys: bool = True,
+        hulls: int = 1,
+        background_hulls: int = 0,
         force: bool = False,
     ) -> dict[str, Any]:
         """Write a .usda, .usdc or .usdz stage with one prim per object.
 
         motion replaces the trained deformation by a function of time that returns means [N, 3] and quaternions
-        [N, 4]. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
+        [N, 4]. most_expensive_motion is static, rigid, parts or dense. hulls and background_hulls are the most
+        convex colliders of an object and of the background. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
         replaced with force.
         """
 

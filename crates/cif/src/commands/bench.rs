@@ -1,4 +1,4 @@
-//! `cif bench`: what a training step costs, and where.
+//! `cif bench`: what a training step costs, and where; what accuracy of exported motion costs.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -15,7 +15,7 @@ use crate::error::Error;
 use crate::output;
 use crate::settings::Layers;
 
-/// Measure what a training step costs
+/// Measure what a training step or an export costs
 #[derive(Debug, Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub(super) struct Bench {
@@ -26,6 +26,7 @@ pub(super) struct Bench {
 #[derive(Debug, Subcommand)]
 enum What {
     Step(Step),
+    Export(super::bench_export::BenchExport),
 }
 
 /// Tell where the time of a training step goes
@@ -99,6 +100,7 @@ impl From<StageName> for Stage {
 pub(super) fn run(command: &Bench) -> Result<(), Error> {
     match &command.what {
         What::Step(command) => step(command),
+        What::Export(command) => super::bench_export::run(command),
     }
 }
 

@@ -2,10 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::{FrameRange, MotionModel, SceneGraph, SceneOptions, Tolerance, UpAxis};
-use clap::{ArgGroup, Args, ValueEnum};
+use cif_scene::{FrameRange, SceneGraph, SceneOptions, Tolerance, UpAxis};
+use clap::{ArgGroup, Args};
 use serde_json::json;
 
+use super::model_options::ModelOptions;
 use super::scene;
 use crate::error::Error;
 use crate::ground_truth::{self, MotionError};
@@ -14,10 +15,11 @@ use crate::output;
 /// Export a scene as USD, one prim per object
 #[derive(Debug, Args)]
 #[command(
-    group = ArgGroup::new("result").required(true).multiple(true).args(["usd", "report"]),
+    group = ArgGroup::new("result").required(true).multiple(true).args(["usd", "report", "report_json"]),
     after_help = "\
-Every object gets the cheapest motion that stays inside the tolerance: static, rigid, or dense (a
-path for every splat). The table tells which one, and what it misses.
+Every object gets the cheapest motion that stays inside the tolerance: static, rigid, parts (a few
+rigid bodies), or dense (a path for every splat). Samples that interpolation reproduces inside the
+tolerance are left out. The table tells which motion was chosen, and what it misses.
 
   cif export table.cif --usd table.usda
   cif export table.cif --usd table.usdz --tolerance 0.5%
@@ -33,9 +35,6 @@ pub(super) struct Export {
     /// Largest error of a simplified motion: 1% of the object's size, or 0.002 in world units
     #[arg(long, default_value = "1%", value_name = "TOLERANCE")]
     tolerance: Tolerance,
-    /// Most expensive motion that may be chosen
-    #[arg(long, default_value = "dense", value_name = "MODEL")]
-    motion: Motion,
     /// Frames to export, e.g. 0:71 [default: all]
     #[arg(long, value_name = "FIRST:LAST")]
     frames: Option<FrameRange>,
@@ -60,22 +59,20 @@ pub(super) struct Export {
     /// Print the motion table even when nothing is written
     #[arg(long)]
     report: bool,
+    /// Write the motion table and the comparison with known motion as JSON; - for stdout
+    #[arg(long, value_name = "FILE")]
+    report_json: Option<PathBuf>,
     /// Print tables as JSON
     #[arg(long)]
     json: bool,
     /// Compare with known motion
     #[arg(long, value_name = "motion.json")]
     ground_truth: Option<PathBuf>,
-    /// Replace an existing stage
+    /// Replace existing output
     #[arg(long)]
     force: bool,
-}
-
-#[derive(Clone, Copy, Debug, ValueEnum)]
-enum Motion {
-    Static,
-    Rigid,
-    Dense,
+    #[command(flatten)]
+    models: ModelOptions,
 }
 
 pub(super) fn run(command: &Export) -> Result<(), Error> {
@@ -83,6 +80,10 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         check_stage_name(path)?;
         output::check_file(path, command.force)?;
         cif_usd::check_target(path, writing(command)).map_err(Error::plain)?;
+    }
+    let report_to_stdout = command.report_json.as_deref() == Some(Path::new("-"));
+    if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
+        output::check_file(path, command.force)?;
     }
     let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
     let field = scene::load(&command.scene)?;
@@ -98,8 +99,12 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         None => None,
     };
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
-    if command.json {
-        println!("{:#}", json!({ "motion": graph.motion_table(), "ground_truth": errors }));
+    let tables = json!({ "motion": graph.motion_table(), "ground_truth": errors });
+    if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
+        output::write_file(path, format!("{tables:#}\n").as_bytes())?;
+    }
+    if command.json || report_to_stdout {
+        println!("{tables:#}");
     } else {
         print_motion(&graph);
         if let Some(errors) = &errors {
@@ -126,13 +131,8 @@ fn writing(command: &Export) -> cif_usd::ExportOptions {
 
 fn options(command: &Export) -> SceneOptions {
     let defaults = SceneOptions::default();
-    SceneOptions {
+    command.models.apply(SceneOptions {
         tolerance: command.tolerance,
-        most_expensive_motion: match command.motion {
-            Motion::Static => MotionModel::Static,
-            Motion::Rigid => MotionModel::Rigid,
-            Motion::Dense => MotionModel::Dense,
-        },
         frames: command.frames,
         frame_step: command.frame_step,
         up_axis: command.up_axis,
@@ -141,7 +141,7 @@ fn options(command: &Export) -> SceneOptions {
         background_threshold: command.background_threshold.unwrap_or(defaults.background_threshold),
         proxy_points: command.proxy_points.unwrap_or(defaults.proxy_points),
         ..defaults
-    }
+    })
 }
 
 fn check_stage_name(path: &Path) -> Result<(), Error> {
@@ -161,6 +161,7 @@ fn print_motion(graph: &SceneGraph) {
         "label",
         "splats",
         "motion",
+        "parts",
         "size",
         "tolerance",
         "error RMS",
@@ -168,6 +169,7 @@ fn print_motion(graph: &SceneGraph) {
         "max",
         "samples",
         "KB",
+        "seconds",
     ]);
     for row in graph.motion_table() {
         let motion = &row.motion;
@@ -176,6 +178,7 @@ fn print_motion(graph: &SceneGraph) {
             row.label.clone(),
             motion.gaussians.to_string(),
             motion.model.to_string(),
+            if motion.parts > 0 { motion.parts.to_string() } else { String::new() },
             format!("{:.4}", motion.size),
             format!("{:.5}", motion.tolerance),
             format!("{:.5}", motion.residual.rms),
@@ -183,6 +186,7 @@ fn print_motion(graph: &SceneGraph) {
             format!("{:.5}", motion.residual.max),
             motion.samples.to_string(),
             format!("{:.1}", motion.motion_bytes as f64 / 1e3),
+            format!("{:.3}", row.seconds),
         ]);
     }
     println!("{table}");

@@ -1,10 +1,12 @@
 //! The subcommands, one file each.
 
 mod bench;
+mod bench_export;
 mod eval;
 mod export;
 mod info;
 mod masks;
+mod model_options;
 mod query;
 mod render;
 mod scene;

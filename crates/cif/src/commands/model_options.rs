@@ -1,0 +1,52 @@
+//! Options of motion models and colliders that `cif export` and `cif bench export` share.
+
+use cif_scene::{MotionModel, SceneOptions};
+use clap::{Args, ValueEnum};
+
+/// How motion is simplified and what simulators get.
+#[derive(Clone, Debug, Args)]
+#[command(next_help_heading = "Motion and colliders")]
+pub(super) struct ModelOptions {
+    /// Most expensive motion that may be chosen; what it loses is told
+    #[arg(long, default_value = "dense", value_name = "MODEL")]
+    motion: Motion,
+    /// Most rigid parts of an object, 2 to 64
+    #[arg(long, default_value_t = 8, value_name = "N", value_parser = clap::value_parser!(u8).range(2..=64))]
+    max_parts: u8,
+    /// Write a sample at every frame, also where interpolation would do
+    #[arg(long)]
+    no_reduce_keys: bool,
+    /// Most convex hulls of an object, 0 for no colliders; more than one pay for concave objects
+    #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
+    hulls: u16,
+    /// Most convex hulls of the background, for simulators in which objects fall on it; 16 to 64 do
+    #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
+    background_hulls: u16,
+}
+
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Motion {
+    Static,
+    Rigid,
+    Parts,
+    Dense,
+}
+
+impl ModelOptions {
+    /// Options of the scene graph with these.
+    pub(super) fn apply(&self, options: SceneOptions) -> SceneOptions {
+        SceneOptions {
+            most_expensive_motion: match self.motion {
+                Motion::Static => MotionModel::Static,
+                Motion::Rigid => MotionModel::Rigid,
+                Motion::Parts => MotionModel::Parts,
+                Motion::Dense => MotionModel::Dense,
+            },
+            max_parts: usize::from(self.max_parts),
+            reduce_keys: !self.no_reduce_keys,
+            hulls_per_instance: usize::from(self.hulls),
+            background_hulls: usize::from(self.background_hulls),
+            ..options
+        }
+    }
+}
