@@ -83,8 +83,9 @@ struct Format {
 const FORMATS: [Format; 1] = [Format { name: "USD", ending: "usdc", write: write_usd }];
 
 fn write_usd(graph: &SceneGraph, path: &Path) -> Result<u64, String> {
-    let options = cif_usd::ExportOptions { force: true, ..Default::default() };
-    cif_usd::export(graph, path, options).map(|written| written.bytes).map_err(|error| error.to_string())
+    cif_usd::export(graph, path, cif_usd::ExportOptions::default())
+        .map(|written| written.bytes)
+        .map_err(|error| error.to_string())
 }
 
 pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
