@@ -71,7 +71,7 @@ fn what_is_not_understood_ends_with_2() {
     cif(folder.path(), "train table -o a.cif --set seed").fails(2, &["KEY=VALUE"]);
     cif(folder.path(), "render a.cif -o out").fails(2, &["--capture"]);
     cif(folder.path(), "render a.cif --capture table -o out --time 3").fails(2, &["from 0"]);
-    cif(folder.path(), "train table -o a.cif --simd widest").fails(2, &["portable"]);
+    cif(folder.path(), "train table -o a.cif --simd widest").fails(2, &["avx2", "portable"]);
     cif(folder.path(), "query a.cif").fails(2, &["--label"]);
     cif(folder.path(), "query a.cif --at 1,2").fails(2, &["three"]);
     cif(folder.path(), "query a.usda --at 1,2,3").fails(2, &["--label"]);

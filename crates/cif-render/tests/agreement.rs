@@ -25,7 +25,10 @@ const BAND: f64 = 1e-3;
 /// What one decision at a threshold can change of a pixel: 1/255 of the largest colour here (about 3).
 const ONE_DECISION: f64 = 0.013;
 
-const LEVELS: [SimdLevel; 2] = [SimdLevel::Auto, SimdLevel::Portable];
+/// Every level of vector instructions that this processor has.
+fn levels() -> Vec<SimdLevel> {
+    SimdLevel::available()
+}
 
 fn settings() -> RenderSettings {
     RenderSettings {
@@ -128,7 +131,7 @@ fn check_within(
     let expected = render(&double, &synthetic, settings);
     let expected_gradients = cotangents.backward(&double, &expected);
 
-    for simd in LEVELS {
+    for simd in levels() {
         let name = format!("{name}, {simd:?}");
         let mut gradients = Gradients::zeros(&synthetic.field);
         let actual = forward_and_backward(simd, &synthetic, settings, &cotangents, &mut gradients);
@@ -338,7 +341,7 @@ fn clamped_log_scales_have_no_gradient() {
     scene.field.gaussians.log_scales[0] = [12.0, -25.0, -2.0];
     scene.field.gaussians.log_scales[1] = [60.0, f32::MAX, -3.0];
     let cotangents = Cotangents::random(3, scene.camera.width, scene.camera.height);
-    for simd in LEVELS {
+    for simd in levels() {
         let mut gradients = Gradients::zeros(&scene.field);
         forward_and_backward(simd, &scene, &settings(), &cotangents, &mut gradients);
         let v = &gradients.gaussians.log_scales;
@@ -412,7 +415,7 @@ fn images() {
             let identities = forward.identities.as_ref().unwrap();
             let (width, height) = (camera.width, camera.height);
             let maps = rasterize_dense(&forward.splats, &forward.order, width, height, identities, instances);
-            for simd in LEVELS {
+            for simd in levels() {
                 let actual = Renderer::new(simd).render(&synthetic.field, camera, time, &settings, CHANNELS);
                 let mut mismatches = Mismatches::default();
                 let instance_images =
@@ -484,7 +487,7 @@ fn label_mass() {
         let settings = RenderSettings { instances: None, ..settings() };
         let mut expected = IdentityCounts::zeros(config.gaussians, config.instances);
         reference::count_identities(&scene, camera, time, &settings, labels, &mut expected);
-        for simd in LEVELS {
+        for simd in levels() {
             let mut actual = IdentityCounts::zeros(config.gaussians, config.instances);
             let mut renderer = Renderer::new(simd);
             // Twice: masses add.
@@ -494,13 +497,43 @@ fn label_mass() {
             let mut mismatches = Mismatches::default();
             // A few decisions at 1/255 of a pixel each may differ in this many pixels.
             let tolerance = 6.0 / 255.0;
-            for (index, (e, a)) in expected.label_mass.iter().zip(&actual.label_mass).enumerate() {
-                mismatches.compare("label mass", index, *e, *a / 2.0, 1e-3, tolerance);
-            }
-            for (index, (e, a)) in expected.total_mass.iter().zip(&actual.total_mass).enumerate() {
-                mismatches.compare("total mass", index, *e, *a / 2.0, 1e-3, tolerance);
+            for index in 0..config.gaussians {
+                for label in 0..config.instances as u16 {
+                    let (e, a) = (expected.label_mass(index, label), actual.label_mass(index, label));
+                    mismatches.compare("label mass", index, e, a / 2.0, 1e-3, tolerance);
+                }
+                let (e, a) = (expected.total_mass(index), actual.total_mass(index));
+                mismatches.compare("total mass", index, e, a / 2.0, 1e-3, tolerance);
             }
             mismatches.finish("label mass");
+        }
+    }
+}
+
+/// As many instances as masks can name: nothing grows with N x K, which would be 8 GB here.
+#[test]
+fn label_mass_of_the_longest_table() {
+    const INSTANCES: usize = 65_535;
+    let config = SyntheticConfig { gaussians: 16_000, screen_size: (0.005, 0.02), ..config() };
+    let mut synthetic = generate(&config);
+    // Labels from the whole range: the last one, and 37 others.
+    for (position, label) in synthetic.labels.pixels.iter_mut().enumerate() {
+        *label = 65_535 - (position % 38 * 1700) as u16;
+    }
+    let (camera, labels) = (&synthetic.camera, &synthetic.labels);
+    let settings = RenderSettings { instances: None, ..settings() };
+    for simd in levels() {
+        let mut renderer = Renderer::new(simd);
+        let mut counts = IdentityCounts::zeros(config.gaussians, INSTANCES);
+        renderer.count_identities(&synthetic.field, camera, 0.0, &settings, labels, &mut counts);
+        let met: usize = (0..config.gaussians).map(|row| counts.row(row).len()).sum();
+        assert!(met > 1000 && met < 38 * config.gaussians, "{met} entries, {simd:?}");
+        assert!((0..config.gaussians).any(|row| counts.label_mass(row, 65_534) > 0.0));
+        for row in 0..config.gaussians {
+            // Every pixel is labelled, so that all mass is label mass.
+            let labelled: f64 = counts.row(row).iter().map(|(_, mass)| mass).sum();
+            assert!((labelled - counts.total_mass(row)).abs() <= 1e-5 * labelled + 1e-9, "row {row}");
+            assert!(counts.row(row).windows(2).all(|pair| pair[0].0 < pair[1].0), "ascending labels");
         }
     }
 }
@@ -509,7 +542,7 @@ fn label_mass() {
 fn deformed_parameters() {
     let synthetic = generate(&SyntheticConfig { heads: Some(ALL_HEADS), ..config() });
     let scene = Scene::<f64>::from_field(&synthetic.field);
-    for simd in LEVELS {
+    for simd in levels() {
         for time in [0.0, 0.37, 1.0] {
             let moved = Renderer::new(simd).deform(&synthetic.field, time);
             let mut mismatches = Mismatches::default();
@@ -610,7 +643,7 @@ fn run_on(threads: usize, simd: SimdLevel, scene: &SyntheticScene) -> Outputs {
 fn threads_do_not_change_a_bit() {
     let config = SyntheticConfig { gaussians: 3000, heads: Some(ALL_HEADS), ..config() };
     let synthetic = generate(&config);
-    for simd in LEVELS {
+    for simd in levels() {
         let one = run_on(1, simd, &synthetic);
         for threads in [2, 3, 8] {
             assert!(run_on(threads, simd, &synthetic) == one, "{threads} threads differ from one, {simd:?}");

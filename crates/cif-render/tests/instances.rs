@@ -319,8 +319,7 @@ fn label_mass_of_a_view() {
     let settings = RenderSettings::default();
     let count = |labels: &PixelGrid<u16>, scene: &Scene<f64>| {
         let n = scene.parameters.gaussians.len();
-        let mut counts =
-            IdentityCounts { instances: 3, label_mass: vec![0.0; n * 3], total_mass: vec![0.0; n] };
+        let mut counts = IdentityCounts::zeros(n, 3);
         count_identities(scene, &synthetic.camera, 0.0, &settings, labels, &mut counts);
         counts
     };
@@ -328,7 +327,10 @@ fn label_mass_of_a_view() {
     // Weights are shares of a pixel: each covered pixel hands out exactly 1.
     let forward = reference::forward(&scene, &synthetic.camera, 0.0, &settings, None);
     let covered = forward.alpha.pixels.iter().filter(|alpha| **alpha >= 1e-3).count() as f64;
-    assert!((counts.total_mass.iter().sum::<f64>() - covered).abs() < 1e-9 * covered);
+    let total_mass = |counts: &IdentityCounts| (0..10).map(|i| counts.total_mass(i)).sum::<f64>();
+    let label_mass =
+        |counts: &IdentityCounts| (0..10).flat_map(|i| counts.row(i)).map(|(_, mass)| mass).sum::<f64>();
+    assert!((total_mass(&counts) - covered).abs() < 1e-9 * covered);
     let labelled = forward
         .alpha
         .pixels
@@ -336,14 +338,14 @@ fn label_mass_of_a_view() {
         .zip(&synthetic.labels.pixels)
         .filter(|(alpha, label)| **alpha >= 1e-3 && **label != 0)
         .count() as f64;
-    assert!((counts.label_mass.iter().sum::<f64>() - labelled).abs() < 1e-9 * labelled);
+    assert!((label_mass(&counts) - labelled).abs() < 1e-9 * labelled);
     // With one label everywhere, n_i = d_i.
     let counts = count(&PixelGrid::filled(config.width, config.height, 2), &scene);
     for i in 0..10 {
-        assert_eq!(counts.label_mass[i * 3 + 1], counts.total_mass[i]);
-        assert_eq!((counts.label_mass[i * 3], counts.label_mass[i * 3 + 2]), (0.0, 0.0));
+        assert_eq!(counts.label_mass(i, 1), counts.total_mass(i));
+        assert!(counts.row(i).iter().all(|(label, _)| *label == 1));
     }
     // Labels that the table does not know are not counted anywhere, and do not panic.
     let counts = count(&PixelGrid::filled(config.width, config.height, 9), &scene);
-    assert!(counts.label_mass.iter().all(|mass| *mass == 0.0) && counts.total_mass.iter().any(|m| *m > 0.0));
+    assert!(label_mass(&counts) == 0.0 && total_mass(&counts) > 0.0);
 }

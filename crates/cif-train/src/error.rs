@@ -65,22 +65,6 @@ pub enum TrainError {
         /// Folder of the capture.
         root: PathBuf,
     },
-    /// The counts of identity estimation do not fit.
-    #[error(
-        "identity estimation would need {gaussians} Gaussians x {instances} instances x 8 bytes = {bytes} \
-         bytes, more than 1 GiB; train at most {most_gaussians} Gaussians (`densify.max_gaussians`), or give \
-         masks with fewer instances"
-    )]
-    IdentityMemory {
-        /// Gaussians N.
-        gaussians: usize,
-        /// Instances K.
-        instances: usize,
-        /// Bytes of the counts, 8 N K.
-        bytes: u64,
-        /// Gaussians that would fit.
-        most_gaussians: u64,
-    },
     /// The scene moves by record, which training cannot change.
     #[error(
         "the scene holds recorded motion of {groups} groups (from an animated file, or from edits), which has no \

@@ -1,6 +1,8 @@
 //! Identity estimation: whose is each Gaussian, from the label mass that colour rendering gave it.
 //! Source: methods reference 5.
 
+use std::collections::BTreeMap;
+
 use cif_field::neighbours::NearestNeighbours;
 use cif_field::{Gaussians, Identities};
 use cif_render::cpu::IdentityCounts;
@@ -65,14 +67,9 @@ pub fn most_probable(identities: &Identities, row: usize) -> u16 {
     best.1
 }
 
-/// Zero counts of `n` Gaussians and `k` instances.
-#[must_use]
-pub fn empty_counts(n: usize, k: usize) -> IdentityCounts {
-    IdentityCounts { instances: k, label_mass: vec![0.0; n * k], total_mass: vec![0.0; n] }
-}
-
 /// Normalises counts to sparse rows; Gaussians without mass take the inverse-distance weighted mean of their
-/// nearest counted neighbours, or all instances alike where none is near. `extent` in metres.
+/// nearest counted neighbours, or all instances alike where none is near: of a long table the
+/// [`UNIFORM_SUPPORT`] instances with the most mass, so that memory does not grow with it. `extent` in metres.
 ///
 /// # Panics
 /// When there are no instances, or the counts are not of these Gaussians.
@@ -83,28 +80,32 @@ pub fn estimate(
     extent: f64,
     config: &IdentityConfig,
 ) -> IdentityEstimate {
-    let (n, k) = (gaussians.len(), counts.instances);
+    let (n, k) = (gaussians.len(), counts.instances());
     assert!(k > 0, "identities need instances");
-    assert_eq!(counts.label_mass.len(), n * k, "counts belong to other Gaussians");
+    assert_eq!(counts.gaussians(), n, "counts belong to other Gaussians");
     let min_mass = f64::from(config.min_mass);
     let truncation = f64::from(config.truncation);
 
     // Share of a Gaussian's mass that lies on labelled pixels, sum n / d. It leaves the softmax untouched and
     // tells the background from the instances later on.
     let share = |row: usize| -> Option<f64> {
-        let total = counts.total_mass[row];
-        let labelled: f64 = counts.label_mass[row * k..(row + 1) * k].iter().sum();
+        let (total, labelled) = (counts.total_mass(row), mass_of(counts.row(row)));
         (total >= min_mass).then(|| (labelled / total).clamp(MIN_LABELLED_SHARE, 1.0))
     };
-    let counted: Vec<Option<(Row, f64)>> = counts
-        .label_mass
-        .par_chunks(k)
-        .zip(&counts.total_mass)
-        .map(|(mass, total)| {
-            let sum: f64 = mass.iter().sum();
-            (*total >= min_mass && sum >= min_mass).then(|| truncated(mass, sum, truncation))
+    let counted: Vec<Option<(Row, f64)>> = (0..n)
+        .into_par_iter()
+        .map(|row| {
+            let masses = counts.row(row);
+            let sum = mass_of(masses);
+            let enough = counts.total_mass(row) >= min_mass && sum >= min_mass;
+            enough.then(|| truncated(masses, sum, truncation))
         })
         .collect();
+    let mut label_mass = vec![0.0; k];
+    for (label, mass) in (0..n).flat_map(|row| counts.row(row)) {
+        label_mass[usize::from(*label)] += mass;
+    }
+    let uniform = uniform(&label_mass);
 
     let seen: Vec<u32> = (0..n as u32).filter(|row| counted[*row as usize].is_some()).collect();
     let positions: Vec<[f32; 3]> = seen.iter().map(|row| gaussians.means[*row as usize]).collect();
@@ -124,10 +125,9 @@ pub fn estimate(
                 .filter(|(_, distance)| *distance <= reach)
                 .collect();
             if near.is_empty() {
-                let uniform = (0..k as u16).map(|label| (label, 1.0 / k as f64)).collect();
-                return (uniform, share(row).unwrap_or(MIN_LABELLED_SHARE), RowSource::Uniform);
+                return (uniform.clone(), share(row).unwrap_or(MIN_LABELLED_SHARE), RowSource::Uniform);
             }
-            let mut mixed = vec![0.0; k];
+            let mut mixed = BTreeMap::new();
             let (mut shares, mut weights) = (0.0, 0.0);
             for (neighbour, distance) in near {
                 let weight = 1.0 / distance.max(1e-6 * extent.max(f64::MIN_POSITIVE));
@@ -135,12 +135,12 @@ pub fn estimate(
                 weights += weight;
                 if let Some((entries, _)) = &counted[neighbour] {
                     for (label, probability) in entries {
-                        mixed[usize::from(*label)] += weight * probability;
+                        *mixed.entry(*label).or_insert(0.0) += weight * probability;
                     }
                 }
             }
             let own = share(row).unwrap_or(shares / weights);
-            (strongest(&mixed, MAX_FILLED_SUPPORT), own, RowSource::Neighbours)
+            (strongest(mixed, MAX_FILLED_SUPPORT), own, RowSource::Neighbours)
         })
         .collect();
 
@@ -159,7 +159,6 @@ pub fn estimate(
     }
     identities.log_calibrations = vec![0.0; identities.labels.len()];
     let dropped: f64 = counted.iter().flatten().map(|(_, dropped)| dropped).sum();
-    let label_mass = (0..k).map(|k_| counts.label_mass.iter().skip(k_).step_by(k).sum()).collect();
     IdentityEstimate {
         identities,
         sources: rows.into_iter().map(|(_, _, source)| source).collect(),
@@ -177,28 +176,43 @@ const MIN_LABELLED_SHARE: f64 = 1e-6;
 /// Support of a row that was filled from neighbours.
 const MAX_FILLED_SUPPORT: usize = 8;
 
+/// Most instances that a row without any evidence names.
+pub const UNIFORM_SUPPORT: usize = 64;
+
+fn mass_of(masses: &[(u16, f64)]) -> f64 {
+    masses.iter().map(|(_, mass)| mass).sum()
+}
+
 /// Entries of at least `truncation`, renormalised, and the probability dropped. The largest always stays.
-fn truncated(mass: &[f64], sum: f64, truncation: f64) -> (Row, f64) {
-    let largest = mass.iter().copied().fold(0.0, f64::max);
-    let stays = |m: f64| m > 0.0 && (m >= truncation * sum || m == largest);
-    let kept: f64 = mass.iter().copied().filter(|m| stays(*m)).sum();
-    let entries = mass
-        .iter()
-        .enumerate()
-        .filter(|(_, m)| stays(**m))
-        .map(|(label, m)| (label as u16, m / kept))
-        .collect();
-    (entries, 1.0 - kept / sum)
+fn truncated(masses: &[(u16, f64)], sum: f64, truncation: f64) -> (Row, f64) {
+    let largest = masses.iter().map(|(_, mass)| *mass).fold(0.0, f64::max);
+    let stays = |mass: f64| mass > 0.0 && (mass >= truncation * sum || mass == largest);
+    let kept: Row = masses.iter().copied().filter(|(_, mass)| stays(*mass)).collect();
+    let total = mass_of(&kept);
+    (kept.into_iter().map(|(label, mass)| (label, mass / total)).collect(), 1.0 - total / sum)
+}
+
+/// All instances alike, or those with the most mass of a long table.
+fn uniform(label_mass: &[f64]) -> Row {
+    let mut labels: Vec<u16> = (0..label_mass.len()).map(|label| label as u16).collect();
+    if labels.len() > UNIFORM_SUPPORT {
+        let mass = |label: &u16| label_mass[usize::from(*label)];
+        labels.sort_by(|a, b| mass(b).total_cmp(&mass(a)).then(a.cmp(b)));
+        labels.truncate(UNIFORM_SUPPORT);
+        labels.sort_unstable();
+    }
+    let probability = 1.0 / labels.len() as f64;
+    labels.into_iter().map(|label| (label, probability)).collect()
 }
 
 /// The `most` largest entries, normalised; lower labels first among equals.
-fn strongest(mass: &[f64], most: usize) -> Row {
-    let mut order: Vec<usize> = (0..mass.len()).filter(|k| mass[*k] > 0.0).collect();
-    order.sort_by(|a, b| mass[*b].total_cmp(&mass[*a]).then(a.cmp(b)));
-    order.truncate(most);
-    order.sort_unstable();
-    let sum: f64 = order.iter().map(|k| mass[*k]).sum();
-    order.into_iter().map(|k| (k as u16, mass[k] / sum)).collect()
+fn strongest(mass: BTreeMap<u16, f64>, most: usize) -> Row {
+    let mut row: Row = mass.into_iter().filter(|(_, mass)| *mass > 0.0).collect();
+    row.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+    row.truncate(most);
+    row.sort_unstable_by_key(|(label, _)| *label);
+    let sum = mass_of(&row);
+    row.into_iter().map(|(label, mass)| (label, mass / sum)).collect()
 }
 
 #[cfg(test)]

@@ -3,8 +3,11 @@
 mod color;
 mod random;
 
-use std::collections::BTreeMap;
+use std::collections::HashMap;
 use std::path::Path;
+
+use cif_geometry::Bounds;
+use glam::DVec3;
 
 pub(crate) use color::sample_colors;
 pub(crate) use random::draw;
@@ -12,11 +15,14 @@ pub(crate) use random::draw;
 use crate::files::npy;
 use crate::{Error, PointCloud};
 
-/// First voxel edge of the thinning, metres (methods reference 1.1).
-const VOXEL: f64 = 0.02;
+/// First voxel edges of the thinning between points that lie evenly on a surface.
+const VOXELS_PER_POINT: f64 = 8.0;
 
-/// Growth of the voxel edge per round, metres (methods reference 1.1).
-const VOXEL_STEP: f64 = 0.01;
+/// Growth of the voxel edge per round of the thinning.
+const VOXEL_GROWTH: f64 = 1.2;
+
+/// Voxel edge of a cloud without any size, in its unit.
+const SMALLEST_VOXEL: f64 = 1e-9;
 
 /// Colour of points whose source has none and that no image shows.
 pub(crate) const GREY: [u8; 3] = [128; 3];
@@ -63,38 +69,44 @@ impl RawPoints {
 }
 
 impl PointCloud {
-    /// The cloud with at most `limit` points: while there are more, points inside one voxel become their mean,
-    /// with an edge of 0.02 m, growing by 0.01 m a round (methods reference 1.1). After fifty rounds the edge
-    /// grows by a quarter a round instead, so that clouds in other units end too.
+    /// The cloud with at most `limit` points, at least one: where there are more, the points inside one voxel
+    /// become their mean, in the order of their first points. Voxels start small for the cloud's box and grow by a
+    /// fifth until few enough are occupied, so that the unit of length does not matter.
     #[must_use]
     pub fn thinned(&self, limit: usize) -> Self {
-        let mut cloud = self.clone();
-        let mut voxel = VOXEL;
-        let mut round = 0;
-        while cloud.positions.len() > limit.max(1) {
-            cloud = cloud.averaged_in_voxels(voxel);
-            round += 1;
-            voxel = if round < 50 { voxel + VOXEL_STEP } else { voxel * 1.25 };
+        let limit = limit.max(1);
+        if self.positions.len() <= limit {
+            return self.clone();
         }
-        cloud
+        let bounds = Bounds::around(self.positions.iter().map(|p| DVec3::from_array(p.map(f64::from))));
+        // Of N points on a surface, a voxel of 1 / sqrt(N) of the box holds about one; start well below.
+        let mut voxel =
+            (bounds.size().max_element() / (limit as f64).sqrt() / VOXELS_PER_POINT).max(SMALLEST_VOXEL);
+        loop {
+            let cloud = self.averaged_in_voxels(voxel);
+            if cloud.positions.len() <= limit {
+                return cloud;
+            }
+            voxel *= VOXEL_GROWTH;
+        }
     }
 
-    /// One mean point per occupied voxel, ordered by voxel. The grid starts half a voxel below the lowest
-    /// corner of the cloud.
+    /// One mean point per occupied voxel, in the order of their first points.
     fn averaged_in_voxels(&self, voxel: f64) -> Self {
         struct Sum {
             position: [f64; 3],
             color: [u64; 3],
             count: u64,
         }
-        let low: [f64; 3] = std::array::from_fn(|axis| {
-            self.positions.iter().map(|p| f64::from(p[axis])).fold(f64::INFINITY, f64::min) - voxel / 2.0
-        });
-        let mut sums: BTreeMap<[i64; 3], Sum> = BTreeMap::new();
+        let mut slots = HashMap::<[i64; 3], usize>::new();
+        let mut sums: Vec<Sum> = Vec::new();
         for (position, color) in self.positions.iter().zip(&self.colors) {
-            let key =
-                std::array::from_fn(|axis| ((f64::from(position[axis]) - low[axis]) / voxel).floor() as i64);
-            let sum = sums.entry(key).or_insert(Sum { position: [0.0; 3], color: [0; 3], count: 0 });
+            let key = position.map(|v| (f64::from(v) / voxel).floor() as i64);
+            let slot = *slots.entry(key).or_insert(sums.len());
+            if slot == sums.len() {
+                sums.push(Sum { position: [0.0; 3], color: [0; 3], count: 0 });
+            }
+            let sum = &mut sums[slot];
             for axis in 0..3 {
                 sum.position[axis] += f64::from(position[axis]);
                 sum.color[axis] += u64::from(color[axis]);
@@ -102,8 +114,8 @@ impl PointCloud {
             sum.count += 1;
         }
         Self {
-            positions: sums.values().map(|s| s.position.map(|v| (v / s.count as f64) as f32)).collect(),
-            colors: sums.values().map(|s| s.color.map(|v| ((v + s.count / 2) / s.count) as u8)).collect(),
+            positions: sums.iter().map(|s| s.position.map(|v| (v / s.count as f64) as f32)).collect(),
+            colors: sums.iter().map(|s| s.color.map(|v| ((v + s.count / 2) / s.count) as u8)).collect(),
             source: self.source.clone(),
         }
     }
@@ -130,18 +142,39 @@ mod tests {
 
     #[test]
     fn thinning_averages_inside_voxels() {
-        // Points 1 mm apart: the first voxel starts 1 cm below the first point and holds ten of them.
-        let thinned = line(100, 1e-3).thinned(99);
+        // Points a unit apart: the first voxel small enough has an edge of 16.76 and holds 0 to 16.
+        let thinned = line(100, 1.0).thinned(7);
+        assert_eq!(thinned.positions[0], [8.0, 0.0, 0.0]);
+        assert_eq!(thinned.colors[0], [8, 10, 20]);
         assert_eq!(thinned.positions.len(), 6);
-        assert!((thinned.positions[0][0] - 0.0045).abs() < 1e-6, "{:?}", thinned.positions[0]);
-        assert_eq!(thinned.colors[0], [5, 10, 20]);
-        assert!(line(100, 1e-3).thinned(3).positions.len() <= 3);
     }
 
     #[test]
-    fn clouds_in_other_units_end() {
-        let thinned = line(1000, 1e6).thinned(7);
-        assert!((1..=7).contains(&thinned.positions.len()));
+    fn thinning_keeps_the_shape_and_most_of_the_limit() {
+        let grid = PointCloud {
+            positions: (0..40_000).map(|k| [(k % 200) as f32 * 0.01, (k / 200) as f32 * 0.01, 1.0]).collect(),
+            colors: (0..40_000).map(|k| [(k % 200) as u8, (k / 200) as u8, 128]).collect(),
+            source: PointSource::Random,
+        };
+        let thinned = grid.thinned(5_000);
+        assert!((2_001..=5_000).contains(&thinned.positions.len()), "{}", thinned.positions.len());
+        for (position, color) in thinned.positions.iter().zip(&thinned.colors) {
+            for axis in 0..2 {
+                assert!(
+                    (position[axis] * 100.0 - f32::from(color[axis])).abs() < 0.51,
+                    "{position:?} {color:?}"
+                );
+            }
+            assert!((position[2] - 1.0).abs() < 1e-6 && color[2] == 128);
+        }
+    }
+
+    #[test]
+    fn the_unit_of_length_does_not_matter() {
+        for step in [1e-6, 1e-3, 1e6] {
+            let thinned = line(1000, step).thinned(40);
+            assert!((20..=40).contains(&thinned.positions.len()), "{step}: {}", thinned.positions.len());
+        }
     }
 
     #[test]

@@ -3,7 +3,42 @@
 use rayon::prelude::*;
 
 use super::project::Splat;
+use super::tile::{Groups, Pass};
 use crate::constants::TILE;
+
+/// A splat of a tile: its rank (index into the depth-sorted splats) and which passes draw it there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct TileEntry(u32);
+
+impl TileEntry {
+    /// Bits of a rank.
+    const RANK_BITS: u32 = 30;
+
+    fn new(rank: u32, passes: u8) -> Self {
+        Self(u32::from(passes) << Self::RANK_BITS | rank)
+    }
+
+    /// Index into the depth-sorted splats.
+    #[inline(always)]
+    pub(super) fn rank(self) -> usize {
+        (self.0 & ((1 << Self::RANK_BITS) - 1)) as usize
+    }
+
+    #[inline(always)]
+    fn draws(self, pass: Pass) -> bool {
+        self.0 >> Self::RANK_BITS >> pass as u32 & 1 == 1
+    }
+
+    /// The groups that each pass wants of the splat, of those that are live in it.
+    #[inline(always)]
+    pub(super) fn wanted<const INSTANCES: bool>(self, color: Groups, instances: Groups) -> [Groups; 2] {
+        let none = Groups::default();
+        [
+            if self.draws(Pass::Color) { color } else { none },
+            if INSTANCES && self.draws(Pass::Instances) { instances } else { none },
+        ]
+    }
+}
 
 /// Which splats each tile draws, front to back.
 ///
@@ -15,11 +50,11 @@ pub(super) struct TileLists {
     pub(super) rows: u32,
     /// `[tiles + 1]` first pair of each tile.
     pub(super) tile_offsets: Vec<u32>,
-    /// `[pairs]` rank of the splat (index into the depth-sorted splats).
-    pub(super) ranks: Vec<u32>,
+    /// `[pairs]` the splats of the tiles.
+    pub(super) entries: Vec<TileEntry>,
     /// `[splats + 1]` first entry of each splat in `splat_pairs`.
     pub(super) splat_offsets: Vec<u32>,
-    /// `[pairs]` position in `ranks` of each of a splat's pairs.
+    /// `[pairs]` position in `entries` of each of a splat's pairs.
     pub(super) splat_pairs: Vec<u32>,
 }
 
@@ -56,8 +91,8 @@ fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
     smallest
 }
 
-/// Calls `visit` with every tile the splat reaches, in row order.
-fn visit_tiles(splat: &Splat, columns: u32, rows: u32, mut visit: impl FnMut(u32)) {
+/// Calls `visit` with every tile the splat reaches, in row order, and the passes that reach it, a bit each.
+fn visit_tiles(splat: &Splat, columns: u32, rows: u32, mut visit: impl FnMut(u32, u8)) {
     let tile = TILE as f32;
     // Pixel centres lie half a pixel inside the tile.
     let range = |axis: usize, count: u32| {
@@ -68,13 +103,15 @@ fn visit_tiles(splat: &Splat, columns: u32, rows: u32, mut visit: impl FnMut(u32
     let (first_column, last_column) = range(0, columns);
     let (first_row, last_row) = range(1, rows);
     // A hair more than the gate, so that rounding never drops a tile that holds a drawn pixel.
-    let reach = splat.reach[0].max(splat.reach[1]) * 1.000_01 + 1e-5;
+    let reaches = splat.reach.map(|reach| reach * 1.000_01 + 1e-5);
     for row in i64::from(first_row)..=last_row {
         for column in i64::from(first_column)..=last_column {
             let low = [column as f32 * tile + 0.5, row as f32 * tile + 0.5];
             let high = [low[0] + tile - 1.0, low[1] + tile - 1.0];
-            if smallest_sigma(splat, low, high) <= reach {
-                visit((row as u32) * columns + column as u32);
+            let sigma = smallest_sigma(splat, low, high);
+            let passes = u8::from(sigma <= reaches[0]) | u8::from(sigma <= reaches[1]) << 1;
+            if passes != 0 {
+                visit((row as u32) * columns + column as u32, passes);
             }
         }
     }
@@ -88,16 +125,18 @@ impl TileLists {
         let (columns, rows) = (self.columns, self.rows);
         let tiles = (columns * rows) as usize;
 
+        assert!(splats.len() < 1 << TileEntry::RANK_BITS, "more than 2^30 Gaussians are visible in one view");
+
         // Tiles of every splat, in chunks so that threads share the tests.
         const CHUNK: usize = 1024;
-        let chunks: Vec<(Vec<u32>, Vec<u32>)> = splats
+        let chunks: Vec<(Vec<u32>, Vec<(u32, u8)>)> = splats
             .par_chunks(CHUNK)
             .map(|chunk| {
                 let (mut counts, mut reached) =
                     (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
                 for splat in chunk {
                     let before = reached.len();
-                    visit_tiles(splat, columns, rows, |tile| reached.push(tile));
+                    visit_tiles(splat, columns, rows, |tile, passes| reached.push((tile, passes)));
                     counts.push((reached.len() - before) as u32);
                 }
                 (counts, reached)
@@ -114,7 +153,7 @@ impl TileLists {
                 total = total.checked_add(*count).expect("more than 2^32 tile pairs: the image is too large");
                 self.splat_offsets.push(total);
             }
-            for tile in reached {
+            for (tile, _) in reached {
                 self.tile_offsets[*tile as usize + 1] += 1;
             }
         }
@@ -122,18 +161,18 @@ impl TileLists {
             self.tile_offsets[tile + 1] += self.tile_offsets[tile];
         }
         let mut next: Vec<u32> = self.tile_offsets[..tiles].to_vec();
-        self.ranks.clear();
-        self.ranks.resize(total as usize, 0);
+        self.entries.clear();
+        self.entries.resize(total as usize, TileEntry::default());
         self.splat_pairs.clear();
         self.splat_pairs.reserve(total as usize);
         let mut rank = 0;
         for (counts, reached) in &chunks {
             let mut reached = reached.iter();
             for count in counts {
-                for tile in reached.by_ref().take(*count as usize) {
+                for (tile, passes) in reached.by_ref().take(*count as usize) {
                     let position = next[*tile as usize];
                     next[*tile as usize] += 1;
-                    self.ranks[position as usize] = rank;
+                    self.entries[position as usize] = TileEntry::new(rank, *passes);
                     self.splat_pairs.push(position);
                 }
                 rank += 1;
@@ -146,9 +185,18 @@ impl TileLists {
         (self.columns * self.rows) as usize
     }
 
-    /// Ranks of a tile's splats, front to back.
-    pub(super) fn tile(&self, tile: usize) -> &[u32] {
-        &self.ranks[self.tile_offsets[tile] as usize..self.tile_offsets[tile + 1] as usize]
+    /// A tile's splats, front to back.
+    pub(super) fn tile(&self, tile: usize) -> &[TileEntry] {
+        &self.entries[self.tile_offsets[tile] as usize..self.tile_offsets[tile + 1] as usize]
+    }
+
+    /// The tile of every pair.
+    pub(super) fn tile_of_pair(&self) -> Vec<u32> {
+        let mut tiles = vec![0_u32; self.entries.len()];
+        for tile in 0..self.tiles() {
+            tiles[self.tile_offsets[tile] as usize..self.tile_offsets[tile + 1] as usize].fill(tile as u32);
+        }
+        tiles
     }
 
     /// Positions in the tile-sorted pairs of one splat's pairs.

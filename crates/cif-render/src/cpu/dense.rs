@@ -2,13 +2,13 @@
 //! that occur in a tile. Source: methods reference 4.2 (evaluation).
 
 use fearless_simd::prelude::*;
-use fearless_simd::{f32x8, mask32x8};
 use fearless_simd_macros::simd;
 
+use super::bin::TileEntry;
+use super::labels::IdentityRows;
+use super::pixels::{LANES, load, splat};
 use super::project::Splat;
-use super::rasterize::{GROUPS, IdentityRows, TilePixels, TilePlace, prepare};
-use super::vector::{LANES, Lanes, load, splat};
-use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE};
+use super::tile::{Blending, GROUPS, SplatInTile, TilePixels, TilePlace, live, prepare};
 
 /// Instance outputs of a tile.
 #[derive(Clone, Debug)]
@@ -39,7 +39,7 @@ impl Default for InstanceTile {
 pub(super) fn instance_tile<S: Simd>(
     simd: S,
     splats: &[Splat],
-    ranks: &[u32],
+    entries: &[TileEntry],
     place: &TilePlace,
     rows: IdentityRows<'_>,
     labelled_shares: &[f32],
@@ -47,14 +47,13 @@ pub(super) fn instance_tile<S: Simd>(
 ) {
     // The dictionary of labels that any splat of the tile supports keeps memory independent of K.
     let mut labels: Vec<u16> = Vec::new();
-    let entries = |gaussian: u32| {
-        rows.row_offsets[gaussian as usize] as usize..rows.row_offsets[gaussian as usize + 1] as usize
-    };
-    for &rank in ranks {
-        labels.extend_from_slice(&rows.labels[entries(splats[rank as usize].gaussian)]);
-        if labels.len() > 4096 {
+    let mut enough = 4096;
+    for entry in entries {
+        labels.extend_from_slice(&rows.labels[rows.entries(splats[entry.rank()].gaussian)]);
+        if labels.len() > enough {
             labels.sort_unstable();
             labels.dedup();
+            enough = 4096.max(2 * labels.len());
         }
     }
     labels.sort_unstable();
@@ -62,66 +61,50 @@ pub(super) fn instance_tile<S: Simd>(
     tile.foreground = [[0.0; LANES]; GROUPS];
     let mut masses: Vec<TilePixels> = vec![[[0.0; LANES]; GROUPS]; labels.len()];
 
-    let zero = splat(simd, 0.0);
-    let one = splat(simd, 1.0);
-    let max_alpha = splat(simd, MAX_ALPHA);
-    let min_alpha = splat(simd, MIN_ALPHA);
-    let min_transmittance = splat(simd, MIN_TRANSMITTANCE);
-    let mut instance_transmittance = place.initial_transmittance();
-    let mut color_transmittance = instance_transmittance;
+    let blending = Blending::new(simd);
+    let mut color_transmittance = place.initial_transmittance();
+    let mut instance_transmittance = color_transmittance;
     let mut slots: Vec<(usize, f32)> = Vec::new();
-    let (mut live_instances, mut live_color) = (u32::MAX, u32::MAX);
-    // One step of either pass: the blended weight of each pixel, and whether the group is finished.
-    let blend = |weight: f32x8<S>, valid: mask32x8<S>, transmittance: &mut Lanes| {
-        let alpha = weight.min(max_alpha);
-        let t = load(simd, transmittance);
-        let draws = valid & alpha.simd_ge(min_alpha) & t.simd_gt(zero);
-        let next = t * (one - alpha);
-        let stops = draws & next.simd_lt(min_transmittance);
-        let blends = draws & !stops;
-        let blended = blends.select(t * alpha, zero);
-        let t = stops.select(-t, blends.select(next, t));
-        t.store_array(transmittance);
-        (blended, t.simd_gt(zero).to_bitmask() == 0)
-    };
-    for &rank in ranks {
-        if live_instances | live_color == 0 {
+    let mut live_color = live(&color_transmittance);
+    let mut live_instances = live_color;
+    for entry in entries {
+        if live_color.union(live_instances).is_empty() {
             break;
         }
-        let s = &splats[rank as usize];
-        let prepared = prepare::<S, true>(simd, s, place);
-        let color_groups = prepared.groups[0] & live_color;
-        let instance_groups = prepared.groups[1] & live_instances;
-        let mut groups = color_groups | instance_groups;
-        if groups == 0 {
+        let wanted = entry.wanted::<true>(live_color, live_instances);
+        if wanted[0].union(wanted[1]).is_empty() {
+            continue;
+        }
+        let s = &splats[entry.rank()];
+        let Some(prepared) = prepare(simd, s, place, wanted) else { continue };
+        let prepared: SplatInTile<S> = prepared;
+        let [in_color, in_instances] = prepared.groups;
+        let (opacity, occupancy) = (splat(simd, s.opacity), splat(simd, s.occupancy));
+        let share = splat(simd, labelled_shares[s.gaussian as usize]);
+        for group in in_color {
+            let at = prepared.footprint(simd, group);
+            let blended = blending.step(simd, opacity * at.peak, at.valid, &mut color_transmittance[group]);
+            let foreground = &mut tile.foreground[group];
+            blended.weight.mul_add(share, load(simd, foreground)).store_array(foreground);
+            live_color.finish(group, blended.finished);
+        }
+        if in_instances.is_empty() {
             continue;
         }
         slots.clear();
-        for entry in entries(s.gaussian) {
+        for entry in rows.entries(s.gaussian) {
             let slot = labels.binary_search(&rows.labels[entry]).expect("the dictionary holds every label");
             slots.push((slot, rows.probabilities[entry]));
         }
-        let (opacity, occupancy) = (splat(simd, s.opacity), splat(simd, s.occupancy));
-        let share = splat(simd, labelled_shares[s.gaussian as usize]);
-        while groups != 0 {
-            let group = groups.trailing_zeros() as usize;
-            groups &= groups - 1;
-            let (dx, dy) = prepared.offset(group);
-            let (p, valid) = prepared.footprint(simd, dx, dy);
-            if color_groups >> group & 1 == 1 {
-                let (weight, finished) = blend(opacity * p, valid, &mut color_transmittance[group]);
-                let foreground = &mut tile.foreground[group];
-                weight.mul_add(share, load(simd, foreground)).store_array(foreground);
-                live_color &= !(u32::from(finished) << group);
+        for group in in_instances {
+            let at = prepared.footprint(simd, group);
+            let transmittance = &mut instance_transmittance[group];
+            let blended = blending.step(simd, occupancy * at.peak, at.valid, transmittance);
+            for (slot, probability) in &slots {
+                let mass = &mut masses[*slot][group];
+                blended.weight.mul_add(splat(simd, *probability), load(simd, mass)).store_array(mass);
             }
-            if instance_groups >> group & 1 == 1 {
-                let (weight, finished) = blend(occupancy * p, valid, &mut instance_transmittance[group]);
-                for (slot, probability) in &slots {
-                    let mass = &mut masses[*slot][group];
-                    weight.mul_add(splat(simd, *probability), load(simd, mass)).store_array(mass);
-                }
-                live_instances &= !(u32::from(finished) << group);
-            }
+            live_instances.finish(group, blended.finished);
         }
     }
 

@@ -5,25 +5,34 @@
 //! | `deform` | canonical Gaussians to the time of the view, and back |
 //! | `project` | Gaussians to splats, and back |
 //! | `bin` | depth order and tile lists |
+//! | `tile` | how a splat falls on a tile's pixels and blends: the steps that all of these share: |
 //! | `rasterize`, `rasterize_backward` | pixels, and back |
 //! | `dense` | instance images |
-//! | `identity` | label mass for identity estimation |
+//! | `identity`, `counts` | label mass for identity estimation |
+//! | `renderer` | the stages in order, in both directions |
 //!
 //! Results do not depend on the number of threads: every sum over pixels, tiles or Gaussians runs in an
 //! order fixed by the data.
 
 mod bin;
 mod channels;
+mod counts;
 mod deform;
 mod dense;
 mod identity;
+mod labels;
+mod level;
 mod matrix;
+mod pixels;
 mod project;
 mod rasterize;
 mod rasterize_backward;
 mod renderer;
+mod tile;
 mod timing;
 mod vector;
 
-pub use renderer::{ForwardPass, IdentityCounts, Renderer, SimdLevel, ViewStatistics};
+pub use counts::IdentityCounts;
+pub use level::SimdLevel;
+pub use renderer::{ForwardPass, Renderer, ViewStatistics};
 pub use timing::StageTimes;

@@ -104,6 +104,16 @@ pub(super) struct Splat {
     pub(super) gaussian: u32,
 }
 
+impl Splat {
+    /// a, b, c of the footprint's exponent of two, `a dx^2 + b dx dy + c dy^2`.
+    #[inline(always)]
+    pub(super) fn exponent(&self) -> [f32; 3] {
+        let [x00, x01, x11] = self.conic;
+        let scale = -std::f32::consts::LOG2_E;
+        [0.5 * scale * x00, scale * x01, 0.5 * scale * x11]
+    }
+}
+
 /// Intermediate values shared by both directions.
 struct Footprint {
     in_camera: Vector,

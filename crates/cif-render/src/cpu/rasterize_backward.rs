@@ -5,17 +5,22 @@
 //! `v_alpha_i = T_i e_i - (Q - E_i) / (1 - alpha_i)`, where `e_i = v_C . c_i` and `E_i` is the running sum of
 //! `T alpha e` through i; `Q - E_i` is kept as one running remainder.
 //!
-//! Instances: `r_i = W_i p_i / M`, remainder `1 - c_i`, `q_i = r_i - b_i (1 - c_i) / (1 - b_i)`.
+//! Instances: `r_i = W_i p_i / M`, remainder `1 - c_i`, `q_i = r_i - b_i (1 - c_i) / (1 - b_i)`. Behind the last
+//! Gaussian that supports a pixel's label both are 0: there the instance pass of a group ends.
 
-use fearless_simd::f32x8;
+use fearless_simd::f32x16;
 use fearless_simd::prelude::*;
 use fearless_simd_macros::simd;
 
+use super::bin::TileEntry;
+use super::labels::{IdentityRows, TileLabels};
+use super::pixels::{LANES, Lanes, load, splat, splat_each, sum, sum_each};
 use super::project::{Splat, SplatGradient};
-use super::rasterize::{GROUPS, IdentityRows, TileLabels, TilePixels, TilePlace, prepare, slot_values};
-use super::vector::{LANES, load, splat, sum};
+use super::tile::{Blending, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare};
 use crate::GeometryPath;
-use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE};
+
+/// Remainder 1 - c_i that is rounding: the sum of a few hundred responsibilities in single precision.
+const SETTLED: f32 = 1e-6;
 
 /// What a tile's pixels ask of the splats.
 pub(super) struct TileCotangents {
@@ -23,12 +28,6 @@ pub(super) struct TileCotangents {
     pub(super) color: [TilePixels; 3],
     /// `v_C . C_out`, background included.
     pub(super) remainder: TilePixels,
-    /// Loss weight of each pixel over its M_y: `weight / M_y`, 0 where nothing flows.
-    pub(super) weight_over_probability: TilePixels,
-    /// Loss weight of each pixel, 0 where nothing flows.
-    pub(super) weight: TilePixels,
-    /// Added to the remainder 1 - c_i: `S_end / A` under coverage normalisation, else 0.
-    pub(super) coverage_ratio: TilePixels,
 }
 
 /// Instance inputs of a tile.
@@ -36,190 +35,269 @@ pub(super) struct TileInstances<'a> {
     pub(super) labels: &'a TileLabels,
     pub(super) rows: IdentityRows<'a>,
     pub(super) geometry: GeometryPath,
+    /// Loss weight of a pixel.
+    pub(super) weight: f32,
+    /// 1 / M_y of each pixel, 0 where nothing flows.
+    pub(super) inverse_probability: TilePixels,
+    /// Added to the remainder 1 - c_i under coverage normalisation: `S_end / A`.
+    pub(super) coverage_ratio: Option<Box<TilePixels>>,
 }
 
-/// Writes one gradient per entry of `ranks`; `label_mass` gets `[ranks, labels]` weighted responsibilities.
+/// Running state of the instance pass.
+struct Replay<'a> {
+    transmittance: TilePixels,
+    /// 1 - c_i.
+    remainder: TilePixels,
+    /// Of the splat, at the tile's labels.
+    probabilities: Vec<f32>,
+    /// Responsibility of the splat for each of the tile's labels.
+    mass: Vec<Lanes>,
+    instances: &'a TileInstances<'a>,
+}
+
+impl<'a> Replay<'a> {
+    fn new(instances: &'a TileInstances<'a>) -> Self {
+        let starts = |flows: &f32| if *flows != 0.0 { 1.0 } else { -1.0 };
+        Self {
+            transmittance: instances.inverse_probability.each_ref().map(|lanes| lanes.each_ref().map(starts)),
+            remainder: [[1.0; LANES]; GROUPS],
+            probabilities: vec![0.0; instances.labels.labels.len()],
+            mass: vec![[0.0; LANES]; instances.labels.labels.len()],
+            instances,
+        }
+    }
+}
+
+/// A splat as the cotangents of a tile see it.
+struct Seen<S: Simd> {
+    blending: Blending<S>,
+    one: f32x16<S>,
+    zero: f32x16<S>,
+    opacity: f32x16<S>,
+    occupancy: f32x16<S>,
+    color: [f32x16<S>; 3],
+    /// Loss weight of a pixel, for all geometry and for means.
+    weight: f32x16<S>,
+    full_geometry: f32x16<S>,
+    mean_geometry: f32x16<S>,
+}
+
+/// Gradient of a splat, per lane.
+struct Sums<S: Simd> {
+    color: [f32x16<S>; 3],
+    opacity: f32x16<S>,
+    responsibility: f32x16<S>,
+    /// Moments of v_sigma: first for the mean, second for the conic.
+    x: f32x16<S>,
+    y: f32x16<S>,
+    xx: f32x16<S>,
+    xy: f32x16<S>,
+    yy: f32x16<S>,
+}
+
+impl<S: Simd> Sums<S> {
+    #[inline(always)]
+    fn zero(zero: f32x16<S>) -> Self {
+        Self {
+            color: [zero; 3],
+            opacity: zero,
+            responsibility: zero,
+            x: zero,
+            y: zero,
+            xx: zero,
+            xy: zero,
+            yy: zero,
+        }
+    }
+
+    /// Adds the moments of a group: `v_sigma` for the conic, `v_sigma_mean` for the mean.
+    #[inline(always)]
+    fn add_moments(&mut self, at: &Footprint<S>, v_sigma: f32x16<S>, v_sigma_mean: f32x16<S>) {
+        let (first_x, first_y) = (v_sigma * at.dx, v_sigma * at.dy);
+        self.x = v_sigma_mean.mul_add(at.dx, self.x);
+        self.y = v_sigma_mean.mul_add(at.dy, self.y);
+        self.xx = first_x.mul_add(at.dx, self.xx);
+        self.xy = first_x.mul_add(at.dy, self.xy);
+        self.yy = first_y.mul_add(at.dy, self.yy);
+    }
+
+    #[inline(always)]
+    fn finish(self, simd: S, [x00, x01, x11]: [f32; 3]) -> SplatGradient {
+        let [x, y, xx, xy] = sum_each(simd, [self.x, self.y, self.xx, self.xy]);
+        let [red, green, blue, opacity] =
+            sum_each(simd, [self.color[0], self.color[1], self.color[2], self.opacity]);
+        SplatGradient {
+            mean: [x00 * x + x01 * y, x01 * x + x11 * y],
+            conic: [0.5 * xx, xy, 0.5 * sum(simd, self.yy)],
+            color: [red, green, blue],
+            opacity,
+            responsibility: sum(simd, self.responsibility),
+        }
+    }
+}
+
+impl<S: Simd> Seen<S> {
+    /// Adds the colour gradients of a group; returns v_sigma and whether the group is finished.
+    #[inline(always)]
+    fn color_backward(
+        &self,
+        simd: S,
+        at: &Footprint<S>,
+        group: usize,
+        transmittance: &mut TilePixels,
+        cotangents: &mut TileCotangents,
+        sums: &mut Sums<S>,
+    ) -> (f32x16<S>, bool) {
+        let unclamped = self.opacity * at.peak;
+        let blended = self.blending.step(simd, unclamped, at.valid, &mut transmittance[group]);
+        let [red, green, blue] = &cotangents.color;
+        let v_c = [load(simd, &red[group]), load(simd, &green[group]), load(simd, &blue[group])];
+        let e = v_c[0].mul_add(self.color[0], v_c[1].mul_add(self.color[1], v_c[2] * self.color[2]));
+        for channel in 0..3 {
+            sums.color[channel] = blended.weight.mul_add(v_c[channel], sums.color[channel]);
+        }
+        let remainder = load(simd, &cotangents.remainder[group]) - blended.weight * e;
+        remainder.store_array(&mut cotangents.remainder[group]);
+        let v_alpha = blended.transmittance.mul_add(e, -(remainder / (self.one - blended.alpha)));
+        let flows = blended.drawn & self.blending.unclamped(unclamped);
+        let v_alpha = flows.select(v_alpha, self.zero);
+        sums.opacity = at.peak.mul_add(v_alpha, sums.opacity);
+        (-(blended.alpha * v_alpha), blended.finished)
+    }
+
+    /// Adds the responsibilities of a group; returns the weighted q and whether the group is finished.
+    #[inline(always)]
+    fn instances_backward(
+        &self,
+        simd: S,
+        at: &Footprint<S>,
+        group: usize,
+        replay: &mut Replay<'_>,
+        sums: &mut Sums<S>,
+    ) -> (f32x16<S>, bool) {
+        let instances = replay.instances;
+        let labels = instances.labels;
+        let unclamped = self.occupancy * at.peak;
+        let blended = self.blending.step(simd, unclamped, at.valid, &mut replay.transmittance[group]);
+        let identity = labels.gather(simd, group, &replay.probabilities);
+        let r = blended.weight * (identity * load(simd, &instances.inverse_probability[group]));
+        // 1 - c_i, clamped against rounding at the tail.
+        let remainder = (load(simd, &replay.remainder[group]) - r).max(self.zero);
+        remainder.store_array(&mut replay.remainder[group]);
+        let (hidden, settled) = match &instances.coverage_ratio {
+            Some(ratio) => (remainder + load(simd, &ratio[group]), blended.finished),
+            None => {
+                let open = load(simd, &replay.transmittance[group]).simd_gt(self.zero)
+                    & remainder.simd_gt(splat(simd, SETTLED));
+                (remainder, open.to_bitmask() == 0)
+            }
+        };
+        let q = r - blended.alpha * hidden / (self.one - blended.alpha);
+        let flows = blended.drawn & self.blending.unclamped(unclamped);
+        let q = flows.select(q, self.zero) * self.weight;
+        sums.responsibility += q;
+        match labels.uniform[group] {
+            Some(slot) => {
+                let mass = &mut replay.mass[slot as usize];
+                (load(simd, mass) + r).store_array(mass);
+            }
+            None => {
+                for (lane, r) in r.to_array().into_iter().enumerate() {
+                    replay.mass[labels.slots[group][lane] as usize][lane] += r;
+                }
+            }
+        }
+        (q, settled)
+    }
+}
+
+/// Writes one gradient per entry; `label_mass` gets `[entries, labels]` weighted responsibilities.
 #[simd]
 pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     simd: S,
     splats: &[Splat],
-    ranks: &[u32],
+    entries: &[TileEntry],
     place: &TilePlace,
     cotangents: &mut TileCotangents,
     instances: Option<&TileInstances<'_>>,
     gradients: &mut [SplatGradient],
     label_mass: &mut [f32],
 ) {
-    let zero = splat(simd, 0.0);
-    let one = splat(simd, 1.0);
-    let min_alpha = splat(simd, MIN_ALPHA);
-    let max_alpha = splat(simd, MAX_ALPHA);
-    let min_transmittance = splat(simd, MIN_TRANSMITTANCE);
+    let (zero, one) = (splat(simd, 0.0), splat(simd, 1.0));
+    let blending = Blending::new(simd);
     let mut transmittance = place.initial_transmittance();
-    let (mut live_color, mut live_instances) = (0_u32, 0_u32);
-    for group in 0..GROUPS {
-        live_color |= u32::from(transmittance[group].iter().any(|t| *t > 0.0)) << group;
-    }
-    let mut instance_transmittance = [[-1.0_f32; LANES]; GROUPS];
-    let mut instance_remainder = [[1.0_f32; LANES]; GROUPS];
-    let mut slot_probabilities = Vec::new();
-    let mut slot_mass: Vec<[f32; LANES]> = Vec::new();
-    if INSTANCES && let Some(instances) = instances {
-        for group in 0..GROUPS {
-            for lane in 0..LANES {
-                if instances.labels.labelled[group] >> lane & 1 == 1 && cotangents.weight[group][lane] != 0.0
-                {
-                    instance_transmittance[group][lane] = 1.0;
-                    live_instances |= 1 << group;
-                }
-            }
-        }
-        slot_probabilities.resize(instances.labels.labels.len(), 0.0);
-        slot_mass.resize(instances.labels.labels.len(), [0.0; LANES]);
+    let mut live_color = live(&transmittance);
+    let mut live_instances = Groups::default();
+    let mut replay = instances.filter(|_| INSTANCES).map(Replay::new);
+    if let Some(replay) = &replay {
+        live_instances = live(&replay.transmittance);
     }
     let (full_geometry, mean_geometry) = match instances.map(|instances| instances.geometry) {
         Some(GeometryPath::Full) => (one, one),
         Some(GeometryPath::MeansOnly) => (zero, one),
         Some(GeometryPath::Off) | None => (zero, zero),
     };
+    let weight = instances.map_or(0.0, |instances| instances.weight);
 
-    for (pair, &rank) in ranks.iter().enumerate() {
-        if live_color | live_instances == 0 {
+    for (pair, entry) in entries.iter().enumerate() {
+        if live_color.union(live_instances).is_empty() {
             break;
         }
-        let s = &splats[rank as usize];
-        let prepared = prepare::<S, INSTANCES>(simd, s, place);
-        let instance_groups = prepared.groups[1] & live_instances;
-        let mut groups = prepared.groups[0] & live_color | instance_groups;
-        if groups == 0 {
+        let wanted = entry.wanted::<INSTANCES>(live_color, live_instances);
+        if wanted[0].union(wanted[1]).is_empty() {
             continue;
         }
-        let touches_instances = INSTANCES && instance_groups != 0;
-        if touches_instances && let Some(instances) = instances {
-            instances.rows.at_labels(s.gaussian, &instances.labels.labels, &mut slot_probabilities);
-            slot_mass.fill([0.0; LANES]);
-        }
-        let opacity = splat(simd, s.opacity);
-        let occupancy = splat(simd, s.occupancy);
-        let color = s.color.map(|c| splat(simd, c));
-        let mut v_color = [zero; 3];
-        let (mut v_opacity, mut v_responsibility) = (zero, zero);
-        // Moments of v_sigma: first for the mean, second for the conic.
-        let (mut v_x, mut v_y, mut v_xx, mut v_xy, mut v_yy) = (zero, zero, zero, zero, zero);
-        while groups != 0 {
-            let group = groups.trailing_zeros() as usize;
-            groups &= groups - 1;
-            let (dx, dy) = prepared.offset(group);
-            let (p, valid) = prepared.footprint(simd, dx, dy);
-            let mut v_sigma = zero;
-            let mut v_sigma_mean = zero;
-
-            let unclamped = opacity * p;
-            let alpha = unclamped.min(max_alpha);
-            let t = load(simd, &transmittance[group]);
-            let draws = valid & alpha.simd_ge(min_alpha) & t.simd_gt(zero);
-            if draws.to_bitmask() != 0 {
-                let rest = one - alpha;
-                let next = t * rest;
-                let stops = draws & next.simd_lt(min_transmittance);
-                let blends = draws & !stops;
-                let weight = blends.select(t * alpha, zero);
-                let v_c = [
-                    load(simd, &cotangents.color[0][group]),
-                    load(simd, &cotangents.color[1][group]),
-                    load(simd, &cotangents.color[2][group]),
-                ];
-                let e = v_c[0].mul_add(color[0], v_c[1].mul_add(color[1], v_c[2] * color[2]));
-                for channel in 0..3 {
-                    v_color[channel] = weight.mul_add(v_c[channel], v_color[channel]);
-                }
-                let remainder = load(simd, &cotangents.remainder[group]) - weight * e;
-                remainder.store_array(&mut cotangents.remainder[group]);
-                let v_alpha = t.mul_add(e, -(remainder / rest));
-                let flows = blends & unclamped.simd_le(max_alpha);
-                let v_alpha = flows.select(v_alpha, zero);
-                v_opacity = p.mul_add(v_alpha, v_opacity);
-                v_sigma = -(alpha * v_alpha);
-                v_sigma_mean = v_sigma;
-                let t = stops.select(-t, blends.select(next, t));
-                t.store_array(&mut transmittance[group]);
-                if stops.to_bitmask() != 0 && t.simd_gt(zero).to_bitmask() == 0 {
-                    live_color &= !(1 << group);
-                }
-            }
-
-            if INSTANCES
-                && instance_groups >> group & 1 == 1
-                && let Some(instances) = instances
-            {
-                let unclamped = occupancy * p;
-                let b = unclamped.min(max_alpha);
-                let t = load(simd, &instance_transmittance[group]);
-                let draws = valid & b.simd_ge(min_alpha) & t.simd_gt(zero);
-                if draws.to_bitmask() != 0 {
-                    let rest = one - b;
-                    let next = t * rest;
-                    let stops = draws & next.simd_lt(min_transmittance);
-                    let blends = draws & !stops;
-                    let identity = slot_values(simd, instances.labels, group, &slot_probabilities);
-                    let weight = load(simd, &cotangents.weight[group]);
-                    // The pixel's loss weight times r_i.
-                    let r = blends.select(
-                        t * b * identity * load(simd, &cotangents.weight_over_probability[group]),
-                        zero,
-                    );
-                    let remainder = load(simd, &instance_remainder[group]);
-                    // 1 - c_i, in units of the loss weight on use; clamped against rounding at the tail.
-                    let share = weight.simd_gt(zero).select(r / weight, zero);
-                    let remainder = (remainder - share).max(zero);
-                    remainder.store_array(&mut instance_remainder[group]);
-                    let hidden = remainder + load(simd, &cotangents.coverage_ratio[group]);
-                    let q = r - weight * b * hidden / rest;
-                    let q = (blends & unclamped.simd_le(max_alpha)).select(q, zero);
-                    v_responsibility += q;
-                    v_sigma = q.mul_add(full_geometry, v_sigma);
-                    v_sigma_mean = q.mul_add(mean_geometry, v_sigma_mean);
-                    match instances.labels.uniform[group] {
-                        Some(slot) => {
-                            let mass = &mut slot_mass[slot as usize];
-                            (load(simd, mass) + r).store_array(mass);
-                        }
-                        None => {
-                            for (lane, r) in r.to_array().into_iter().enumerate() {
-                                slot_mass[instances.labels.slots[group][lane] as usize][lane] += r;
-                            }
-                        }
-                    }
-                    let t = stops.select(-t, blends.select(next, t));
-                    t.store_array(&mut instance_transmittance[group]);
-                    if stops.to_bitmask() != 0 && t.simd_gt(zero).to_bitmask() == 0 {
-                        live_instances &= !(1 << group);
-                    }
-                }
-            }
-
-            let dy = splat(simd, dy);
-            let first = v_sigma * dx;
-            v_x = v_sigma_mean.mul_add(dx, v_x);
-            v_y = v_sigma_mean.mul_add(dy, v_y);
-            v_xx = first.mul_add(dx, v_xx);
-            v_xy = first.mul_add(dy, v_xy);
-            v_yy = (v_sigma * dy).mul_add(dy, v_yy);
-        }
-        let [x00, x01, x11] = s.conic;
-        let (sum_x, sum_y) = (sum(v_x), sum(v_y));
-        gradients[pair] = SplatGradient {
-            mean: [x00 * sum_x + x01 * sum_y, x01 * sum_x + x11 * sum_y],
-            conic: [0.5 * sum(v_xx), sum(v_xy), 0.5 * sum(v_yy)],
-            color: v_color.map(|v: f32x8<S>| sum(v)),
-            opacity: sum(v_opacity),
-            responsibility: sum(v_responsibility),
+        let s = &splats[entry.rank()];
+        let Some(prepared) = prepare(simd, s, place, wanted) else { continue };
+        let prepared: SplatInTile<S> = prepared;
+        let [in_color, in_instances] = prepared.groups;
+        let seen = Seen {
+            blending,
+            one,
+            zero,
+            opacity: splat(simd, s.opacity),
+            occupancy: splat(simd, s.occupancy),
+            color: splat_each(simd, s.color),
+            weight: splat(simd, weight),
+            full_geometry,
+            mean_geometry,
         };
-        if touches_instances {
-            let slots = slot_mass.len();
-            for (out, mass) in label_mass[pair * slots..(pair + 1) * slots].iter_mut().zip(&slot_mass) {
-                *out = sum(load(simd, mass));
+        let mut sums = Sums::zero(zero);
+        for group in in_color.without(in_instances) {
+            let at = prepared.footprint(simd, group);
+            let (v_sigma, finished) =
+                seen.color_backward(simd, &at, group, &mut transmittance, cotangents, &mut sums);
+            live_color.finish(group, finished);
+            sums.add_moments(&at, v_sigma, v_sigma);
+        }
+        if INSTANCES
+            && !in_instances.is_empty()
+            && let Some(replay) = &mut replay
+        {
+            let labels = &replay.instances.labels.labels;
+            replay.instances.rows.at_labels(s.gaussian, labels, &mut replay.probabilities);
+            replay.mass.fill([0.0; LANES]);
+            for group in in_color.both(in_instances) {
+                let at = prepared.footprint(simd, group);
+                let (v_sigma, finished) =
+                    seen.color_backward(simd, &at, group, &mut transmittance, cotangents, &mut sums);
+                live_color.finish(group, finished);
+                let (q, finished) = seen.instances_backward(simd, &at, group, replay, &mut sums);
+                live_instances.finish(group, finished);
+                let v_sigma_mean = q.mul_add(seen.mean_geometry, v_sigma);
+                sums.add_moments(&at, q.mul_add(seen.full_geometry, v_sigma), v_sigma_mean);
+            }
+            for group in in_instances.without(in_color) {
+                let at = prepared.footprint(simd, group);
+                let (q, finished) = seen.instances_backward(simd, &at, group, replay, &mut sums);
+                live_instances.finish(group, finished);
+                sums.add_moments(&at, q * seen.full_geometry, q * seen.mean_geometry);
+            }
+            let slots = replay.mass.len();
+            for (out, mass) in label_mass[pair * slots..(pair + 1) * slots].iter_mut().zip(&replay.mass) {
+                *out = weight * sum(simd, load(simd, mass));
             }
         }
+        gradients[pair] = sums.finish(simd, s.conic);
     }
 }

@@ -138,10 +138,9 @@ pub fn count_label_mass<R: Real>(
                 break;
             }
             let mass = (transmittance * alpha.value / coverage).to_double();
-            counts.total_mass[index as usize] += mass;
-            let instance = usize::from(*label).wrapping_sub(1);
-            if instance < counts.instances {
-                counts.label_mass[index as usize * counts.instances + instance] += mass;
+            counts.add_total_mass(index as usize, mass);
+            if let Some(instance) = label.checked_sub(1) {
+                counts.add_label_mass(index as usize, instance, mass);
             }
             transmittance = next;
         }

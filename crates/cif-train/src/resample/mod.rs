@@ -115,7 +115,7 @@ pub fn plan(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) ->
 
     let mut is_weak = vec![false; n];
     let mut weak: Vec<Vec<u32>> = vec![Vec::new(); k];
-    for label in 0..k {
+    for label in (0..k).filter(|label| shares[*label] > 0) {
         let candidates: Vec<u32> = match context.config.weak_set {
             WeakSet::Members => members[label].clone(),
             WeakSet::Literal => (0..n as u32).collect(),

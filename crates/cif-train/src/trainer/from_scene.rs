@@ -8,7 +8,7 @@ use cif_geometry::scalar::logit;
 
 use super::progress::{Progress, Source};
 use super::state::{State, restore};
-use super::{Trainer, identity, initialize};
+use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::events::Stage;
@@ -29,8 +29,8 @@ impl Trainer {
     ///
     /// # Errors
     /// When a setting cannot work; when the scene is of other times, frames or cameras than the capture, does
-    /// not move, or is not reconstructed yet; when no training mask has a labelled pixel; when the counts of
-    /// identity estimation would not fit; or when a frame cannot be read.
+    /// not move, or is not reconstructed yet; when no training mask has a labelled pixel; or when a frame cannot
+    /// be read.
     pub fn from_scene(
         dataset: Dataset,
         config: TrainConfig,
@@ -66,7 +66,6 @@ impl Trainer {
                 root: dataset.root,
             });
         }
-        identity::check_memory(field.gaussians.len(), dataset.instances.len())?;
         progress.source = Some(Source {
             scene: name.to_owned(),
             gaussians: field.gaussians.len(),

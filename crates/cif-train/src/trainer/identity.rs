@@ -1,34 +1,21 @@
 //! The identity stage: counts label mass over the training frames and makes identity rows of it.
 
 use cif_geometry::scalar::{logit, sigmoid};
+use cif_render::cpu::IdentityCounts;
 use cif_render::{Gradients, UNLABELLED};
 
 use super::Trainer;
 use crate::config::{Ablation, OccupancyStart};
 use crate::error::TrainError;
-use crate::estimate::{RowSource, empty_counts, estimate};
+use crate::estimate::{RowSource, estimate};
 use crate::events::TrainEvent;
-
-/// Most memory for the counts of label mass, bytes.
-const MAX_COUNT_BYTES: u64 = 1 << 30;
-
-/// Refuses counts, one number of 8 bytes per Gaussian and instance, that memory is not meant for.
-pub(super) fn check_memory(gaussians: usize, instances: usize) -> Result<(), TrainError> {
-    let bytes = 8 * gaussians as u64 * instances as u64;
-    if bytes <= MAX_COUNT_BYTES {
-        return Ok(());
-    }
-    let most_gaussians = MAX_COUNT_BYTES / (8 * instances as u64);
-    Err(TrainError::IdentityMemory { gaussians, instances, bytes, most_gaussians })
-}
 
 impl Trainer {
     /// Estimates the rows of all Gaussians; `starts` also sets occupancy to where the instance stage begins.
     pub(super) fn estimate_identities(&mut self, starts: bool) -> Result<TrainEvent, TrainError> {
         let settings = self.color_settings();
         let k = self.field.instances.len();
-        check_memory(self.field.gaussians.len(), k)?;
-        let mut counts = empty_counts(self.field.gaussians.len(), k);
+        let mut counts = IdentityCounts::zeros(self.field.gaussians.len(), k);
         let mut frames = 0;
         self.label_pixels = vec![0.0; k];
         for view in (0..self.frames.len()).step_by(self.config.identity.stride as usize) {
@@ -92,21 +79,5 @@ impl Trainer {
         self.optimiser.occupancy.reset_all();
         self.optimiser.occupancy.steps = 0;
         self.optimiser.occupancy.births.fill(0);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn counts_beyond_a_gibibyte_are_refused_with_the_arithmetic() {
-        check_memory(1 << 20, 128).unwrap();
-        check_memory(0, 0).unwrap();
-        let error = check_memory((1 << 20) + 1, 128).unwrap_err().to_string();
-        for part in ["1048577 Gaussians x 128 instances x 8 bytes", "1073742848", "1048576", "max_gaussians"]
-        {
-            assert!(error.contains(part), "{part} in {error}");
-        }
     }
 }

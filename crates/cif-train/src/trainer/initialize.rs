@@ -1,7 +1,5 @@
 //! The field that a run starts from. Source: methods reference 1.1.
 
-use std::collections::HashMap;
-
 use cif_dataset::{Dataset, Split};
 use cif_field::{Deformation, DeformationConfig, Field, Gaussians, Instance, RecordedCamera, Timeline};
 use cif_geometry::Bounds;
@@ -89,66 +87,7 @@ pub(super) fn initial_deformation(
 
 /// Points of the capture with colours in [0, 1], thinned to the wanted number.
 fn initial_points(dataset: &Dataset, config: &TrainConfig) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
-    let colors: Vec<[f32; 3]> =
-        dataset.points.colors.iter().map(|color| color.map(|c| f32::from(c) / 255.0)).collect();
-    thin(&dataset.points.positions, &colors, config.model.max_initial_points as usize)
-}
-
-/// Means of the points in each voxel; voxels grow until at most `most` are left.
-fn thin(positions: &[[f32; 3]], colors: &[[f32; 3]], most: usize) -> (Vec<[f32; 3]>, Vec<[f32; 3]>) {
-    if positions.len() <= most {
-        return (positions.to_vec(), colors.to_vec());
-    }
-    let bounds = Bounds::around(positions.iter().map(|p| DVec3::from_array(p.map(f64::from))));
-    // Of N points on a surface, a voxel of 1 / sqrt(N) of the box holds about one; start well below.
-    let mut voxel = (bounds.size().max_element() / (most as f64).sqrt() / 8.0).max(1e-9);
-    loop {
-        let mut slots = HashMap::<[i64; 3], usize>::new();
-        let mut sums: Vec<([f64; 6], f64)> = Vec::new();
-        for (position, color) in positions.iter().zip(colors) {
-            let cell = position.map(|v| (f64::from(v) / voxel).floor() as i64);
-            let slot = *slots.entry(cell).or_insert(sums.len());
-            if slot == sums.len() {
-                sums.push(([0.0; 6], 0.0));
-            }
-            for k in 0..3 {
-                sums[slot].0[k] += f64::from(position[k]);
-                sums[slot].0[3 + k] += f64::from(color[k]);
-            }
-            sums[slot].1 += 1.0;
-        }
-        if sums.len() <= most {
-            let mean = |first: usize| {
-                sums.iter()
-                    .map(|(sum, count)| std::array::from_fn(|k| (sum[first + k] / count) as f32))
-                    .collect()
-            };
-            return (mean(0), mean(3));
-        }
-        voxel *= 1.2;
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn thinning_keeps_the_shape_and_the_limit() {
-        let positions: Vec<[f32; 3]> =
-            (0..40_000).map(|k| [(k % 200) as f32 * 0.01, (k / 200) as f32 * 0.01, 1.0]).collect();
-        let colors: Vec<[f32; 3]> = positions.iter().map(|p| [p[0] / 2.0, p[1] / 2.0, 0.5]).collect();
-        let (thinned, thinned_colors) = thin(&positions, &colors, 5_000);
-        assert!(thinned.len() <= 5_000 && thinned.len() > 2_000, "{}", thinned.len());
-        for (position, color) in thinned.iter().zip(&thinned_colors) {
-            assert!((position[0] / 2.0 - color[0]).abs() < 1e-4 && (position[2] - 1.0).abs() < 1e-5);
-        }
-    }
-
-    #[test]
-    fn few_points_are_kept_as_they_are() {
-        let positions = vec![[1.0, 2.0, 3.0]; 7];
-        assert_eq!(thin(&positions, &[[0.5; 3]; 7], 7).0, positions);
-        assert_eq!(thin(&positions, &[[0.5; 3]; 7], 6).0, [[1.0, 2.0, 3.0]]);
-    }
+    let points = dataset.points.thinned(config.model.max_initial_points as usize);
+    let colors = points.colors.iter().map(|color| color.map(|c| f32::from(c) / 255.0)).collect();
+    (points.positions, colors)
 }

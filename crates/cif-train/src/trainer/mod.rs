@@ -170,12 +170,6 @@ impl Trainer {
                 self.config.frame_memory_mib
             ));
         }
-        let most = self.field.gaussians.len().max(self.config.densify.max_gaussians as usize);
-        if self.plan.has_instances
-            && let Err(error) = identity::check_memory(most, self.field.instances.len())
-        {
-            self.warnings.push(format!("if the Gaussians become as many as they may: {error}"));
-        }
     }
 
     /// The field as it is now; its provenance is up to date once a run has returned.

@@ -75,8 +75,8 @@ struct Step {
     set: Vec<String>,
     #[command(flatten)]
     capture_options: CaptureOptions,
-    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are
-    #[arg(long, value_name = "LEVEL", default_value = "auto")]
+    /// Vector instructions: `auto` takes the widest that the processor has
+    #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
 }
 

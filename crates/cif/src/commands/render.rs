@@ -50,8 +50,8 @@ pub(super) struct Render {
     force: bool,
     #[command(flatten)]
     capture_options: CaptureOptions,
-    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are
-    #[arg(long, value_name = "LEVEL", default_value = "auto")]
+    /// Vector instructions: `auto` takes the widest that the processor has
+    #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
 }
 

@@ -69,9 +69,9 @@ pub(super) struct Train {
     set: Vec<String>,
     #[command(flatten)]
     capture_options: CaptureOptions,
-    /// Vector instructions: `portable` works everywhere, `auto` takes the widest there are; results differ by
+    /// Vector instructions: `auto` takes the widest that the processor has; results differ by
     /// rounding
-    #[arg(long, value_name = "LEVEL", default_value = "auto")]
+    #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
     #[command(flatten)]
     settings: Settings,
@@ -275,14 +275,6 @@ fn stopped_by(error: &TrainError, trainer: &Trainer, path: &Path) -> Error {
     }
     let name = path.display();
     match save(&trainer.checkpoint(true), path) {
-        Ok(()) if matches!(error, TrainError::IdentityMemory { .. }) => Error::failed(
-            error.to_string(),
-            format!(
-                "{name} holds the reconstruction; train its instances on other masks with: cif train {} \
-                 -o OTHER.cif --masks MASKS --from {name}",
-                trainer.dataset().root.display()
-            ),
-        ),
         Ok(()) => Error::failed(error.to_string(), format!("{name} holds the state before that step")),
         Err(unsaved) => Error::failed(error.to_string(), format!("its state could not be saved: {unsaved}")),
     }
@@ -304,8 +296,8 @@ fn resume_command(command: &Train) -> String {
     if let Some(layout) = capture.layout.and_then(|layout| layout.to_possible_value()) {
         line += &format!(" --layout {}", layout.get_name());
     }
-    if let Simd::Portable = command.simd {
-        line += " --simd portable";
+    if command.simd != Simd::Auto {
+        line += &format!(" --simd {}", command.simd.name());
     }
     line + " --resume"
 }

@@ -1,0 +1,351 @@
+//! Gradients of the last forward pass.
+
+use cif_field::Field;
+use cif_geometry::PixelGrid;
+use fearless_simd::dispatch;
+use rayon::prelude::*;
+
+use super::super::deform::{DeformationAtTime, PosedArrayGradients};
+use super::super::labels::{IdentityRows, TileLabels};
+use super::super::pixels::LANES;
+use super::super::project::{PosedGradient, SplatGradient, ViewConstants, project_backward};
+use super::super::rasterize::TileImage;
+use super::super::rasterize_backward::{TileCotangents, TileInstances, rasterize_tile_backward};
+use super::super::tile::{GROUPS, TilePixels, TilePlace};
+use super::super::timing::timed;
+use super::pose::PosedView;
+use super::{CHUNK, NOT_VISIBLE, Renderer};
+use crate::constants::MIN_LABEL_PROBABILITY;
+use crate::{Gradients, InstanceNormalisation, RenderSettings};
+
+/// Weighted label responsibilities of (tile, splat) pairs.
+struct LabelMass {
+    /// `[tiles + 1]` first value of each tile.
+    offsets: Vec<usize>,
+    /// `[pairs of the tile, labels of the tile]` for each tile.
+    values: Vec<f32>,
+}
+
+impl Renderer {
+    /// Adds the gradients of the last forward pass: `v_color` is dL/dcolour per pixel, `instance_weight`
+    /// multiplies the view's mean instance loss.
+    ///
+    /// # Panics
+    /// Without a forward pass before, when sizes differ from it, or when the field has recorded motion, which is
+    /// not differentiated.
+    pub fn backward(
+        &mut self,
+        field: &Field,
+        v_color: &PixelGrid<[f32; 3]>,
+        instance_weight: f32,
+        gradients: &mut Gradients,
+    ) {
+        let (view, settings, time) = self.tape.view.expect("backward follows a forward pass");
+        assert!(field.tracks.is_none(), "recorded motion has no gradients: trainers refuse such fields");
+        assert_eq!((v_color.width, v_color.height), (view.width, view.height), "cotangent size");
+        let mut times = self.times;
+        let (pairs, label_mass) = timed(&mut times.rasterize_backward, || {
+            self.rasterize_backward(field, v_color, instance_weight, &settings)
+        });
+
+        let n = field.gaussians.len();
+        let deformation =
+            field.deformation.as_ref().filter(|_| settings.deform).map(|d| DeformationAtTime::new(d, time));
+        let mut v_posed = PosedArrayGradients::default();
+        timed(&mut times.project_backward, || {
+            self.project_backward(field, &view, &pairs, gradients, &mut v_posed);
+            self.calibration_backward(field, &label_mass, gradients);
+        });
+        if let Some(deformation) = deformation {
+            timed(&mut times.deform_backward, || {
+                let active: Vec<u32> = (0..n as u32)
+                    .filter(|&row| {
+                        let row = row as usize;
+                        v_posed.means[row] != [0.0; 3]
+                            || v_posed.log_scales[row] != [0.0; 3]
+                            || v_posed.quaternions[row] != [0.0; 4]
+                            || v_posed.opacity_logits[row] != 0.0
+                            || v_posed.sh_coefficients.get(row).is_some_and(|sh| sh.iter().any(|v| *v != 0.0))
+                    })
+                    .collect();
+                self.statistics.deformed_backward = active.len();
+                deformation.backward(
+                    self.level,
+                    &field.gaussians,
+                    &active,
+                    &v_posed,
+                    &mut gradients.planes,
+                    &mut gradients.mlp,
+                    &mut gradients.gaussians.means,
+                );
+            });
+        }
+        self.times = times;
+    }
+
+    /// Per (tile, splat) gradients and label masses.
+    fn rasterize_backward(
+        &self,
+        field: &Field,
+        v_color: &PixelGrid<[f32; 3]>,
+        instance_weight: f32,
+        settings: &RenderSettings,
+    ) -> (Vec<SplatGradient>, LabelMass) {
+        let tape = &self.tape;
+        let lists = &tape.lists;
+        let trains_instances = instance_weight != 0.0 && tape.labelled_pixels > 0;
+        let rows = field.identities.as_ref().map(|rows| IdentityRows::new(rows, &tape.probabilities));
+        let instances = |tile: usize| {
+            let labels = tape.labels[tile].as_ref().filter(|_| trains_instances)?;
+            Some((labels, rows?))
+        };
+        let mut offsets = vec![0_usize];
+        for tile in 0..lists.tiles() {
+            let slots = instances(tile).map_or(0, |(labels, _)| labels.labels.len());
+            offsets.push(offsets[tile] + slots * lists.tile(tile).len());
+        }
+        let mut pairs = vec![SplatGradient::default(); lists.entries.len()];
+        let mut values = vec![0.0_f32; offsets[lists.tiles()]];
+        let mut tasks = Vec::with_capacity(lists.tiles());
+        let (mut pair_rest, mut mass_rest) = (&mut pairs[..], &mut values[..]);
+        for tile in 0..lists.tiles() {
+            let (pairs, rest) = pair_rest.split_at_mut(lists.tile(tile).len());
+            pair_rest = rest;
+            let (mass, rest) = mass_rest.split_at_mut(offsets[tile + 1] - offsets[tile]);
+            mass_rest = rest;
+            tasks.push((tile, pairs, mass));
+        }
+        let pixel_weight = instance_weight / tape.labelled_pixels.max(1) as f32;
+        let level = self.level;
+        tasks.into_par_iter().for_each(|(tile, pairs, mass)| {
+            if pairs.is_empty() {
+                return;
+            }
+            let place = self.place(tile);
+            let entries = lists.tile(tile);
+            let mut cotangents = tile_cotangents(&place, &v_color.pixels, &tape.color);
+            let instances = instances(tile).map(|(labels, rows)| {
+                let (inverse_probability, coverage_ratio) =
+                    instance_cotangents(labels, &tape.tiles[tile], settings);
+                TileInstances {
+                    labels,
+                    rows,
+                    geometry: settings.instances.unwrap_or_default().geometry,
+                    weight: pixel_weight,
+                    inverse_probability,
+                    coverage_ratio,
+                }
+            });
+            dispatch!(level, simd => if instances.is_some() {
+                rasterize_tile_backward::<_, true>(
+                    simd, &tape.splats, entries, &place, &mut cotangents, instances.as_ref(), pairs, mass);
+            } else {
+                rasterize_tile_backward::<_, false>(
+                    simd, &tape.splats, entries, &place, &mut cotangents, None, pairs, mass);
+            });
+        });
+        (pairs, LabelMass { offsets, values })
+    }
+
+    /// Sums each splat's pairs and carries them to the raw parameters.
+    fn project_backward(
+        &self,
+        field: &Field,
+        view: &ViewConstants,
+        pairs: &[SplatGradient],
+        gradients: &mut Gradients,
+        v_posed: &mut PosedArrayGradients,
+    ) {
+        let tape = &self.tape;
+        let n = field.gaussians.len();
+        let rank_of = self.ranks(n);
+        let posed = PosedView::new(&field.gaussians, &tape.posed);
+        let moves_sh = !tape.posed.sh_coefficients.is_empty();
+        v_posed.means = vec![[0.0; 3]; n];
+        v_posed.log_scales = vec![[0.0; 3]; n];
+        v_posed.quaternions = vec![[0.0; 4]; n];
+        v_posed.opacity_logits = vec![0.0; n];
+        let mut v_sh = Vec::new();
+        if moves_sh {
+            v_sh = vec![[0.0; cif_field::gaussians::SH_FLOATS]; n];
+        }
+        let half = [view.width as f32 / 2.0, view.height as f32 / 2.0];
+        let out = &mut gradients.gaussians;
+        let sh = if moves_sh { &mut v_sh } else { &mut out.sh_coefficients };
+        let level = self.level;
+        out.means
+            .par_chunks_mut(CHUNK)
+            .zip(out.log_scales.par_chunks_mut(CHUNK))
+            .zip(out.quaternions.par_chunks_mut(CHUNK))
+            .zip(out.opacity_logits.par_chunks_mut(CHUNK))
+            .zip(out.occupancy_logits.par_chunks_mut(CHUNK))
+            .zip(sh.par_chunks_mut(CHUNK))
+            .zip(gradients.screen.par_chunks_mut(CHUNK))
+            .zip(gradients.radii.par_chunks_mut(CHUNK))
+            .zip(v_posed.means.par_chunks_mut(CHUNK))
+            .zip(v_posed.log_scales.par_chunks_mut(CHUNK))
+            .zip(v_posed.quaternions.par_chunks_mut(CHUNK))
+            .zip(v_posed.opacity_logits.par_chunks_mut(CHUNK))
+            .enumerate()
+            .for_each(|(chunk, rows)| {
+                let (rows, v_opacities) = rows;
+                let (rows, v_quaternions) = rows;
+                let (rows, v_log_scales) = rows;
+                let (rows, v_means) = rows;
+                let (rows, radii) = rows;
+                let (rows, screen) = rows;
+                let (rows, sh) = rows;
+                let (rows, occupancies) = rows;
+                let (rows, opacities) = rows;
+                let (rows, quaternions) = rows;
+                let (means, log_scales) = rows;
+                dispatch!(level, _simd => for row in 0..means.len() {
+                    let gaussian = chunk * CHUNK + row;
+                    let rank = rank_of[gaussian];
+                    if rank == NOT_VISIBLE {
+                        continue;
+                    }
+                    let splat = &tape.splats[rank as usize];
+                    radii[row] = splat.radius.max(radii[row]);
+                    let mut v = SplatGradient::default();
+                    for &pair in tape.lists.pairs_of(rank as usize) {
+                        v.add(&pairs[pair as usize]);
+                    }
+                    if v == SplatGradient::default() {
+                        continue;
+                    }
+                    let PosedGradient { mean, log_scale, quaternion, opacity_logit, occupancy_logit } =
+                        project_backward(view, &posed.at(gaussian), splat, &v, &mut sh[row]);
+                    for axis in 0..2 {
+                        screen[row][axis] += half[axis] * v.mean[axis];
+                    }
+                    for axis in 0..3 {
+                        means[row][axis] += mean[axis];
+                        log_scales[row][axis] += log_scale[axis];
+                    }
+                    for axis in 0..4 {
+                        quaternions[row][axis] += quaternion[axis];
+                    }
+                    opacities[row] += opacity_logit;
+                    occupancies[row] += occupancy_logit;
+                    v_means[row] = mean;
+                    v_log_scales[row] = log_scale;
+                    v_quaternions[row] = quaternion;
+                    v_opacities[row] = opacity_logit;
+                });
+            });
+        if moves_sh {
+            for (total, v) in out.sh_coefficients.as_flattened_mut().iter_mut().zip(v_sh.as_flattened()) {
+                *total += v;
+            }
+            v_posed.sh_coefficients = v_sh;
+        }
+    }
+
+    /// `v_mu_i^k = -(rho_i^k - p_i^k R_i)` (methods reference 4.2).
+    fn calibration_backward(&self, field: &Field, label_mass: &LabelMass, gradients: &mut Gradients) {
+        let LabelMass { offsets, values } = label_mass;
+        let Some(identities) = field.identities.as_ref().filter(|_| !values.is_empty()) else { return };
+        let tape = &self.tape;
+        let tile_of_pair = tape.lists.tile_of_pair();
+        // Chunks of splats find their gradients side by side; rows belong to one splat each.
+        let chunks: Vec<Vec<(usize, f32)>> = tape
+            .splats
+            .par_chunks(CHUNK)
+            .enumerate()
+            .map(|(chunk, splats)| {
+                let mut found = Vec::new();
+                let mut mass = Vec::new();
+                for (k, splat) in splats.iter().enumerate() {
+                    let entries = identities.range(splat.gaussian as usize);
+                    mass.clear();
+                    mass.resize(entries.len(), 0.0_f32);
+                    for &pair in tape.lists.pairs_of(chunk * CHUNK + k) {
+                        let tile = tile_of_pair[pair as usize] as usize;
+                        if offsets[tile + 1] == offsets[tile] {
+                            continue;
+                        }
+                        let Some(labels) = &tape.labels[tile] else { continue };
+                        let local = pair as usize - tape.lists.tile_offsets[tile] as usize;
+                        let start = offsets[tile] + local * labels.labels.len();
+                        for (label, value) in labels.labels.iter().zip(&values[start..]) {
+                            if *value != 0.0
+                                && let Ok(entry) = identities.labels[entries.clone()].binary_search(label)
+                            {
+                                mass[entry] += value;
+                            }
+                        }
+                    }
+                    let total: f32 = mass.iter().sum();
+                    if total != 0.0 {
+                        let calibrated = entries.zip(&mass);
+                        found.extend(
+                            calibrated.map(|(entry, mass)| (entry, mass - tape.probabilities[entry] * total)),
+                        );
+                    }
+                }
+                found
+            })
+            .collect();
+        for (entry, value) in chunks.into_iter().flatten() {
+            gradients.log_calibrations[entry] -= value;
+        }
+    }
+}
+
+/// What the colour loss asks of a tile's pixels.
+fn tile_cotangents(place: &TilePlace, v_color: &[[f32; 3]], color: &[[f32; 3]]) -> TileCotangents {
+    let zero = [[0.0; LANES]; GROUPS];
+    let mut cotangents = TileCotangents { color: [zero; 3], remainder: zero };
+    for group in 0..GROUPS {
+        for lane in 0..LANES {
+            if let Some(pixel) = place.pixel(group, lane) {
+                let (v, c) = (v_color[pixel], color[pixel]);
+                for channel in 0..3 {
+                    cotangents.color[channel][group][lane] = v[channel];
+                }
+                cotangents.remainder[group][lane] = v[0] * c[0] + v[1] * c[1] + v[2] * c[2];
+            }
+        }
+    }
+    cotangents
+}
+
+/// 1 / M_y where it carries a gradient, and `S_end / A` under coverage normalisation.
+fn instance_cotangents(
+    labels: &TileLabels,
+    image: &TileImage,
+    settings: &RenderSettings,
+) -> (TilePixels, Option<Box<TilePixels>>) {
+    let normalised = settings.instances.is_some_and(|i| i.normalisation == InstanceNormalisation::Coverage);
+    let mut inverse_probability = [[0.0; LANES]; GROUPS];
+    let mut coverage_ratio = normalised.then(|| Box::new([[0.0; LANES]; GROUPS]));
+    for group in 0..GROUPS {
+        for lane in labels.labelled_lanes(group) {
+            let probability = image.label_probability[group][lane];
+            if probability < MIN_LABEL_PROBABILITY {
+                continue;
+            }
+            inverse_probability[group][lane] = 1.0 / probability;
+            if let Some(ratio) = &mut coverage_ratio {
+                let rest = image.instance_transmittance[group][lane];
+                ratio[group][lane] = rest / (1.0 - rest).max(MIN_LABEL_PROBABILITY);
+            }
+        }
+    }
+    (inverse_probability, coverage_ratio)
+}
+
+impl SplatGradient {
+    fn add(&mut self, other: &Self) {
+        for axis in 0..2 {
+            self.mean[axis] += other.mean[axis];
+        }
+        for k in 0..3 {
+            self.conic[k] += other.conic[k];
+            self.color[k] += other.color[k];
+        }
+        self.opacity += other.opacity;
+        self.responsibility += other.responsibility;
+    }
+}

@@ -1,0 +1,116 @@
+//! Gaussians at the time of the view.
+
+use cif_field::tracks::{GaussiansMut, TracksAtTime};
+use cif_field::{Deformation, Field, Gaussians};
+use fearless_simd::Level;
+
+use super::super::deform::{DeformationAtTime, PosedArrays};
+use super::super::project::Posed;
+use super::Renderer;
+
+impl Renderer {
+    /// The canonical Gaussians moved to a time: every array in raw form, deltas added (methods reference 2.3),
+    /// then moved by their tracks.
+    pub fn deform(&mut self, field: &Field, time: f64) -> Gaussians {
+        self.posed_gaussians(field, field.tracks.as_ref().map(|tracks| tracks.at(time)), time)
+    }
+
+    /// As [`Self::deform`], with what is hidden at the time as if it were not.
+    pub fn deform_unhidden(&mut self, field: &Field, time: f64) -> Gaussians {
+        let tracks = field.tracks.as_ref().map(|tracks| tracks.at(time).unhidden());
+        self.posed_gaussians(field, tracks, time)
+    }
+
+    fn posed_gaussians(&mut self, field: &Field, tracks: Option<TracksAtTime<'_>>, time: f64) -> Gaussians {
+        let mut posed = PosedArrays::default();
+        pose(self.level, field, field.deformation.as_ref(), tracks, time, &mut posed);
+        let canonical = &field.gaussians;
+        fn or<T: Clone>(moved: Vec<T>, canonical: &[T]) -> Vec<T> {
+            if moved.is_empty() { canonical.to_vec() } else { moved }
+        }
+        Gaussians {
+            means: or(posed.means, &canonical.means),
+            log_scales: or(posed.log_scales, &canonical.log_scales),
+            quaternions: or(posed.quaternions, &canonical.quaternions),
+            opacity_logits: or(posed.opacity_logits, &canonical.opacity_logits),
+            occupancy_logits: or(posed.occupancy_logits, &canonical.occupancy_logits),
+            sh_coefficients: or(posed.sh_coefficients, &canonical.sh_coefficients),
+        }
+    }
+}
+
+/// The one place where Gaussians are moved to a time: learned deltas, then tracks. Arrays that nothing moves
+/// are left empty.
+pub(super) fn pose(
+    level: Level,
+    field: &Field,
+    deformation: Option<&Deformation>,
+    tracks: Option<TracksAtTime<'_>>,
+    time: f64,
+    posed: &mut PosedArrays,
+) {
+    let canonical = &field.gaussians;
+    match deformation {
+        Some(deformation) => DeformationAtTime::new(deformation, time).forward(level, canonical, posed),
+        None => *posed = PosedArrays::default(),
+    }
+    posed.occupancy_logits.clear();
+    let Some(tracks) = tracks.filter(TracksAtTime::changes_anything) else { return };
+    if deformation.is_none() {
+        posed.means.clone_from(&canonical.means);
+        posed.log_scales.clone_from(&canonical.log_scales);
+        posed.quaternions.clone_from(&canonical.quaternions);
+        posed.opacity_logits.clone_from(&canonical.opacity_logits);
+    }
+    posed.occupancy_logits.clone_from(&canonical.occupancy_logits);
+    if posed.sh_coefficients.is_empty() && tracks.changes_sh() {
+        posed.sh_coefficients.clone_from(&canonical.sh_coefficients);
+    }
+    let moved = GaussiansMut {
+        means: &mut posed.means,
+        log_scales: &mut posed.log_scales,
+        quaternions: &mut posed.quaternions,
+        opacity_logits: &mut posed.opacity_logits,
+        occupancy_logits: &mut posed.occupancy_logits,
+        sh_coefficients: &mut posed.sh_coefficients,
+    };
+    tracks.apply(canonical, moved);
+}
+
+/// Posed parameters by row, falling back to the canonical ones where nothing moves.
+pub(super) struct PosedView<'a> {
+    canonical: &'a Gaussians,
+    moved: &'a PosedArrays,
+}
+
+impl<'a> PosedView<'a> {
+    pub(super) fn new(canonical: &'a Gaussians, moved: &'a PosedArrays) -> Self {
+        Self { canonical, moved }
+    }
+
+    #[inline(always)]
+    pub(super) fn at(&self, row: usize) -> Posed<'a> {
+        let (canonical, moved) = (self.canonical, self.moved);
+        let occupancy_logit = *moved.occupancy_logits.get(row).unwrap_or(&canonical.occupancy_logits[row]);
+        let sh = moved.sh_coefficients.get(row).unwrap_or(&canonical.sh_coefficients[row]);
+        if moved.means.is_empty() {
+            Posed {
+                mean: canonical.means[row],
+                log_scale: canonical.log_scales[row],
+                quaternion: canonical.quaternions[row],
+                opacity_logit: canonical.opacity_logits[row],
+                occupancy_logit,
+                sh,
+            }
+        } else {
+            Posed {
+                mean: moved.means[row],
+                log_scale: moved.log_scales[row],
+                quaternion: moved.quaternions[row],
+                opacity_logit: moved.opacity_logits[row],
+                occupancy_logit,
+                sh,
+            }
+        }
+    }
+}

@@ -1,0 +1,348 @@
+//! A tile, its pixels, and how one splat falls on them and blends. Everything that walks a tile's splats
+//! (colour, instances, label mass, either direction) uses these steps, so that all take the same decisions.
+//! Source: methods reference 3.1.
+//!
+//! A tile's pixels are sixteen groups of two rows by eight columns: group `half * 8 + pair` holds rows
+//! `2 pair` and `2 pair + 1` of the left or right half. Sets of groups are bit sets with one bit per row of
+//! each half, `half * 16 + row`, of which the even rows are used: bit `2 group` is the group's.
+
+use fearless_simd::prelude::*;
+use fearless_simd::{f32x16, mask32x16};
+
+use super::pixels::{LANES, Lanes, exp2, load, splat};
+use super::project::Splat;
+use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
+
+/// Groups per tile.
+pub(super) const GROUPS: usize = (TILE * TILE) as usize / LANES;
+
+/// Columns of a group.
+const COLUMNS: usize = 8;
+
+/// Groups of a half tile.
+const PAIRS: usize = GROUPS / 2;
+
+/// One value per pixel of a tile.
+pub(super) type TilePixels = [Lanes; GROUPS];
+
+/// Pixel column and row of a lane inside its tile.
+pub(super) fn pixel_in_tile(group: usize, lane: usize) -> (u32, u32) {
+    ((group / PAIRS * COLUMNS + lane % COLUMNS) as u32, (group % PAIRS * 2 + lane / COLUMNS) as u32)
+}
+
+/// Which of the two blendings.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Pass {
+    Color = 0,
+    Instances = 1,
+}
+
+/// A set of groups.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Groups(u32);
+
+impl Groups {
+    /// Groups for which `holds`.
+    #[inline(always)]
+    pub(super) fn where_(holds: impl Fn(usize) -> bool) -> Self {
+        let mut groups = 0;
+        for group in 0..GROUPS {
+            groups |= u32::from(holds(group)) << (2 * group);
+        }
+        Self(groups)
+    }
+
+    #[inline(always)]
+    pub(super) fn is_empty(self) -> bool {
+        self.0 == 0
+    }
+
+    #[inline(always)]
+    pub(super) fn union(self, other: Self) -> Self {
+        Self(self.0 | other.0)
+    }
+
+    #[inline(always)]
+    pub(super) fn both(self, other: Self) -> Self {
+        Self(self.0 & other.0)
+    }
+
+    #[inline(always)]
+    pub(super) fn without(self, other: Self) -> Self {
+        Self(self.0 & !other.0)
+    }
+
+    /// Takes a group out when it is `finished`.
+    #[inline(always)]
+    pub(super) fn finish(&mut self, group: usize, finished: bool) {
+        self.0 &= !(u32::from(finished) << (2 * group));
+    }
+
+    #[inline(always)]
+    pub(super) fn pixels(self) -> u64 {
+        u64::from(self.0.count_ones()) * LANES as u64
+    }
+}
+
+impl Iterator for Groups {
+    type Item = usize;
+
+    #[inline(always)]
+    fn next(&mut self) -> Option<usize> {
+        if self.0 == 0 {
+            return None;
+        }
+        let group = self.0.trailing_zeros() as usize / 2;
+        self.0 &= self.0 - 1;
+        Some(group)
+    }
+}
+
+/// Where a tile lies in its image.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct TilePlace {
+    pub(super) x: u32,
+    pub(super) y: u32,
+    pub(super) width: u32,
+    pub(super) height: u32,
+}
+
+impl TilePlace {
+    /// Position in the image of a lane; `None` outside.
+    #[inline(always)]
+    pub(super) fn pixel(&self, group: usize, lane: usize) -> Option<usize> {
+        let (column, row) = pixel_in_tile(group, lane);
+        let (x, y) = (self.x + column, self.y + row);
+        (x < self.width && y < self.height).then(|| y as usize * self.width as usize + x as usize)
+    }
+
+    /// Transmittance at the start: 1 inside the image, -1 outside.
+    pub(super) fn initial_transmittance(&self) -> TilePixels {
+        std::array::from_fn(|group| {
+            std::array::from_fn(|lane| if self.pixel(group, lane).is_some() { 1.0 } else { -1.0 })
+        })
+    }
+}
+
+/// Groups with a pixel that still lets light through.
+pub(super) fn live(transmittance: &TilePixels) -> Groups {
+    Groups::where_(|group| transmittance[group].iter().any(|t| *t > 0.0))
+}
+
+/// First rows of the groups of a half tile.
+const PAIR_ROWS: [f32; PAIRS] = [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0];
+
+/// Column of each lane.
+const LANE_COLUMNS: Lanes = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0];
+
+/// Row of each lane inside its group.
+const LANE_ROWS: Lanes = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0];
+
+/// All rows of a tile.
+const ROWS: Lanes = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
+
+/// A splat prepared for one tile. The exponent of two of its footprint is `a dx^2 + b dx dy + c dy^2`.
+#[derive(Clone, Copy)]
+pub(super) struct SplatInTile<S: Simd> {
+    /// mean.x minus pixel centre, per half.
+    dx: [f32x16<S>; 2],
+    /// mean.y minus pixel centre of the first pair of rows.
+    dy: f32x16<S>,
+    /// a dx^2, per half.
+    square: [f32x16<S>; 2],
+    /// b dx, per half.
+    cross: [f32x16<S>; 2],
+    c: f32x16<S>,
+    /// Groups that the drawn ellipse of each pass may touch, of those asked for.
+    pub(super) groups: [Groups; 2],
+}
+
+/// The groups that the drawn ellipses of a splat may touch, of those `wanted` by each pass.
+///
+/// The interval of x drawn in each row is found for all rows at once: sigma <= reach is a quadratic in dx. It
+/// is a hair wider than exact, so that rounding never hides a drawn pixel; the gate itself decides.
+#[inline(always)]
+fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, wanted: [Groups; 2]) -> [Groups; 2] {
+    let [x00, x01, x11] = s.conic;
+    let inverse = 1.0 / x00;
+    let slope = x01 * inverse;
+    let row_dy = splat(simd, dy) - load(simd, &ROWS);
+    let bend = row_dy * row_dy * splat(simd, -(x11 - x01 * slope));
+    // Position of the drawn interval's centre, in pixels from the tile's first pixel centre.
+    let centre = row_dy.mul_add(splat(simd, slope), splat(simd, first));
+    let mut groups = [Groups::default(); 2];
+    for pass in 0..2 {
+        if wanted[pass].is_empty() {
+            continue;
+        }
+        let reach = splat(simd, s.reach[pass] * 2.0 * 1.000_02 + 2e-5);
+        let discriminant = (bend + reach) * splat(simd, inverse);
+        let reaches = discriminant.simd_gt(splat(simd, 0.0));
+        let half_width = discriminant.max(splat(simd, 0.0)).sqrt() + splat(simd, 1e-3);
+        let (low, high) = (centre - half_width, centre + half_width);
+        let mut rows = 0_u32;
+        for half in 0..2 {
+            let start = (half * COLUMNS) as f32;
+            let hits = reaches
+                & high.simd_ge(splat(simd, start))
+                & low.simd_le(splat(simd, start + (COLUMNS - 1) as f32));
+            rows |= (hits.to_bitmask() as u32) << (half * ROWS.len());
+        }
+        groups[pass] = Groups((rows | rows >> 1) & 0x5555_5555).both(wanted[pass]);
+    }
+    groups
+}
+
+/// Prepares a splat for a tile; `None` where it touches none of the groups that the passes want.
+#[inline(always)]
+pub(super) fn prepare<S: Simd>(
+    simd: S,
+    s: &Splat,
+    place: &TilePlace,
+    wanted: [Groups; 2],
+) -> Option<SplatInTile<S>> {
+    let first = s.mean[0] - (place.x as f32 + 0.5);
+    let first_dy = s.mean[1] - (place.y as f32 + 0.5);
+    let groups = touched(simd, s, first, first_dy, wanted);
+    if groups[0].union(groups[1]).is_empty() {
+        return None;
+    }
+    let [a, b, c] = s.exponent();
+    let columns = load(simd, &LANE_COLUMNS);
+    let dx = [splat(simd, first) - columns, splat(simd, first - COLUMNS as f32) - columns];
+    Some(SplatInTile {
+        dx,
+        dy: splat(simd, first_dy) - load(simd, &LANE_ROWS),
+        square: [dx[0] * dx[0] * splat(simd, a), dx[1] * dx[1] * splat(simd, a)],
+        cross: [dx[0] * splat(simd, b), dx[1] * splat(simd, b)],
+        c: splat(simd, c),
+        groups,
+    })
+}
+
+/// A splat on the pixels of a group.
+#[derive(Clone, Copy)]
+pub(super) struct Footprint<S: Simd> {
+    pub(super) dx: f32x16<S>,
+    pub(super) dy: f32x16<S>,
+    /// Footprint P.
+    pub(super) peak: f32x16<S>,
+    /// Pixels where P is valid (sigma >= 0).
+    pub(super) valid: mask32x16<S>,
+}
+
+impl<S: Simd> SplatInTile<S> {
+    #[inline(always)]
+    pub(super) fn footprint(&self, simd: S, group: usize) -> Footprint<S> {
+        let half = group / PAIRS;
+        let dy = self.dy - splat(simd, PAIR_ROWS[group % PAIRS]);
+        let exponent = self.c.mul_add(dy, self.cross[half]).mul_add(dy, self.square[half]);
+        Footprint {
+            dx: self.dx[half],
+            dy,
+            peak: exp2(simd, exponent),
+            valid: exponent.simd_le(splat(simd, 0.0)),
+        }
+    }
+}
+
+/// The blending rule. A pixel that is finished has its transmittance negated, so that one value says both how
+/// much light is left and whether anything still happens.
+#[derive(Clone, Copy)]
+pub(super) struct Blending<S: Simd> {
+    zero: f32x16<S>,
+    min_alpha: f32x16<S>,
+    max_alpha: f32x16<S>,
+    min_transmittance: f32x16<S>,
+}
+
+/// What one splat did to the pixels of a group.
+pub(super) struct Blended<S: Simd> {
+    /// Blending weight alpha, clamped, also where it is not drawn.
+    pub(super) alpha: f32x16<S>,
+    /// Transmittance before.
+    pub(super) transmittance: f32x16<S>,
+    /// Where it is drawn.
+    pub(super) drawn: mask32x16<S>,
+    /// T alpha where drawn, else 0.
+    pub(super) weight: f32x16<S>,
+    /// Whether no pixel of the group lets light through any more.
+    pub(super) finished: bool,
+}
+
+impl<S: Simd> Blending<S> {
+    #[inline(always)]
+    pub(super) fn new(simd: S) -> Self {
+        Self {
+            zero: splat(simd, 0.0),
+            min_alpha: splat(simd, MIN_ALPHA),
+            max_alpha: splat(simd, MAX_ALPHA),
+            min_transmittance: splat(simd, MIN_TRANSMITTANCE),
+        }
+    }
+
+    /// Blends a weight that is not clamped yet and steps the transmittance.
+    #[inline(always)]
+    pub(super) fn step(
+        &self,
+        simd: S,
+        unclamped: f32x16<S>,
+        valid: mask32x16<S>,
+        transmittance: &mut Lanes,
+    ) -> Blended<S> {
+        let alpha = unclamped.min(self.max_alpha);
+        let t = load(simd, transmittance);
+        let weight = t * alpha;
+        let next = t - weight;
+        let strong = valid & alpha.simd_ge(self.min_alpha);
+        // Negative for finished pixels, which are so neither drawn nor changed.
+        let drawn = strong & next.simd_ge(self.min_transmittance);
+        let after = drawn.select(next, strong.select(-t.abs(), t));
+        after.store_array(transmittance);
+        Blended {
+            alpha,
+            transmittance: t,
+            drawn,
+            weight: drawn.select(weight, self.zero),
+            finished: after.simd_gt(self.zero).to_bitmask() == 0,
+        }
+    }
+
+    /// Where a weight was not clamped, so that gradients flow through it.
+    #[inline(always)]
+    pub(super) fn unclamped(&self, weight: f32x16<S>) -> mask32x16<S> {
+        weight.simd_le(self.max_alpha)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lanes_cover_the_tile_once() {
+        let mut seen = [[false; TILE as usize]; TILE as usize];
+        for group in 0..GROUPS {
+            for lane in 0..LANES {
+                let (column, row) = pixel_in_tile(group, lane);
+                assert_eq!(column % 8, LANE_COLUMNS[lane] as u32);
+                assert_eq!(row, PAIR_ROWS[group % PAIRS] as u32 + LANE_ROWS[lane] as u32);
+                assert!(!std::mem::replace(&mut seen[row as usize][column as usize], true));
+            }
+        }
+    }
+
+    #[test]
+    fn sets_of_groups_list_their_members() {
+        let mut set = Groups::where_(|group| group % 5 == 1);
+        assert_eq!(set.collect::<Vec<_>>(), [1, 6, 11]);
+        assert_eq!(set.pixels(), 48);
+        set.finish(6, true);
+        set.finish(11, false);
+        assert_eq!(set.collect::<Vec<_>>(), [1, 11]);
+        let other = Groups::where_(|group| group > 10);
+        assert_eq!(set.both(other).collect::<Vec<_>>(), [11]);
+        assert_eq!(set.without(other).collect::<Vec<_>>(), [1]);
+        assert_eq!(set.union(other).collect::<Vec<_>>(), [1, 11, 12, 13, 14, 15]);
+    }
+}
