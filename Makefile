@@ -58,7 +58,7 @@ demo: build
 plugin:
 	$(PYTHON) plugin/blender/build.py out
 
-test: test-rust test-python
+test: test-rust test-python test-usd
 
 test-rust:
 	cargo test --locked --no-fail-fast
@@ -66,10 +66,18 @@ test-rust:
 test-python: build
 	$(BIN)/python -m pytest
 
+# What cif-usd writes and reads, in a Python that has usd-core.
+test-usd: build
+	PYO3_PYTHON=$(abspath $(BIN)/python) \
+	PYTHONPATH=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
+	LD_LIBRARY_PATH=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
+	cargo test --locked -p cif-usd --features python
+
 lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo fmt --all --check
 	cargo clippy --locked --all-targets -- -D warnings
 	cargo clippy --locked -p cif-python -- -D warnings
+	cargo clippy --locked -p cif-usd --features python --all-targets -- -D warnings
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 

@@ -59,7 +59,7 @@ def test_metadata(stage: Usd.Stage) -> None:
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, FRAMES - 1)
     assert stage.GetTimeCodesPerSecond() == stage.GetFramesPerSecond() == 12
-    assert stage.GetRootLayer().customLayerData["cif"]["layout"] == 1
+    assert stage.GetRootLayer().customLayerData["cif"]["layout"] == 2
 
 
 def test_one_prim_per_object(stage: Usd.Stage) -> None:
@@ -71,7 +71,10 @@ def test_one_prim_per_object(stage: Usd.Stage) -> None:
     assert mug.GetDisplayName() == "red mug"
     assert mug.GetAttribute("userProperties:label").Get() == "red mug"
     assert Usd.ModelAPI(mug).GetKind() == "component"
-    assert mug.GetCustomDataByKey("cif:motion:model") == "static"
+    assert "CifInstanceAPI" in mug.GetMetadata("apiSchemas").GetAddedOrExplicitItems()
+    assert mug.GetAttribute("cif:motion:model").Get() == "static"
+    assert (mug.GetAttribute("cif:id").Get(), mug.GetAttribute("cif:kind").Get()) == (1, "instance")
+    assert mug.GetVariantSets().GetVariantSet("lod").GetVariantSelection() == "full"
 
 
 def test_motion_model_is_the_cheapest(stage: Usd.Stage) -> None:

@@ -87,7 +87,7 @@ pub(crate) fn export<'py>(
     motion: Option<Bound<'py, PyAny>>,
     force: bool,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let export_options = cif_usd::ExportOptions { force };
+    let export_options = cif_usd::ExportOptions { force, ..cif_usd::ExportOptions::default() };
     cif_usd::check_target(path, export_options).map_err(cif_error)?;
     let graph = build(py, field, options, motion)?;
     let summary = py.detach(|| cif_usd::export(&graph, path, export_options)).map_err(cif_error)?;

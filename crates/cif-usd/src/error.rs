@@ -56,6 +56,12 @@ pub enum UsdError {
         /// The folder.
         path: PathBuf,
     },
+    /// A package holds its arrays itself.
+    #[error("{path}: a package has no payloads beside it; use .usda or .usdc, or leave out --payloads")]
+    PayloadsInPackage {
+        /// Given path.
+        path: PathBuf,
+    },
     /// The file to read is missing.
     #[error("{path}: no such file")]
     NotFound {
@@ -69,6 +75,61 @@ pub enum UsdError {
         path: PathBuf,
         /// What USD says.
         reason: String,
+    },
+    /// A stage without splats.
+    #[error("{path} holds no splats: no active ParticleField3DGaussianSplat prim with positions")]
+    NoSplats {
+        /// The stage.
+        path: PathBuf,
+    },
+    /// Something about a prim makes no sense.
+    #[error("{path}: {prim}: {problem}; {fix}")]
+    Prim {
+        /// The stage.
+        path: PathBuf,
+        /// Path of the prim.
+        prim: String,
+        /// What is wrong.
+        problem: String,
+        /// What to do about it.
+        fix: &'static str,
+    },
+    /// A layer that a stage is made of does not exist.
+    #[error("{path}: {layer} needs {asset}, which does not exist; put it back, or take the arc out")]
+    MissingAsset {
+        /// The stage.
+        path: PathBuf,
+        /// Layer that asks for it.
+        layer: String,
+        /// Asset as written there.
+        asset: String,
+    },
+    /// A layer that a stage is made of lies elsewhere.
+    #[error(
+        "{path}: {layer} needs {asset}, which lies outside the folder of the stage; move it there, or allow it with --follow-external"
+    )]
+    ExternalAsset {
+        /// The stage.
+        path: PathBuf,
+        /// Layer that asks for it.
+        layer: String,
+        /// Asset as written there.
+        asset: String,
+    },
+    /// A stage of ours in another layout.
+    #[error(
+        "{path} was written by {generator} in layout {found}, and this version reads layout {expected}: {}",
+        if found < expected { "export it again" } else { "use a newer cif" }
+    )]
+    Layout {
+        /// The stage.
+        path: PathBuf,
+        /// Program that wrote it.
+        generator: String,
+        /// Layout of the stage.
+        found: i64,
+        /// Layout that is read.
+        expected: i64,
     },
     /// Writing failed.
     #[error("{path} could not be written: {reason}; nothing was changed")]

@@ -5,17 +5,21 @@
 //! | [`tokens`] | which names are written |
 //! | [`conventions`] | how axes, quaternions and cameras differ from ours |
 //! | `pxr` | the Python modules of usd-core, and arrays as buffers |
+//! | `layer` | prims, properties and samples of one layer |
+//! | `primvars` | values per point: repetitions, colours and their checksum |
 //! | `author` | what a stage is made of |
-//! | `camera_prims` | cameras |
-//! | `write` | file kinds, atomic replacement, what may be replaced |
-//! | `read` | prims by label |
+//! | `write` | file kinds, payloads, atomic replacement, what may be replaced |
+//! | `read` | stages as scene graphs, and prims by label |
 //!
-//! The last five need the feature `python`. Without it every function returns [`UsdError::NotBuilt`].
+//! Those after `conventions` need the feature `python`. Without it every function returns [`UsdError::NotBuilt`].
 //!
 //! Layout of a stage: `/World` (assembly) holds one `Xform` (component) per instance and one for the background,
-//! each with `translate` and `orient` and the siblings `Splats` (`ParticleField3DGaussianSplat`) and `Proxy`
-//! (`Points`, purpose proxy), and the scope `Cameras`. Instances carry `SemanticsLabelsAPI` in the taxonomies
-//! `class` (category and human label) and `instance` (unique name).
+//! the scope `Cameras` and, where there are colliders, `PhysicsScene`. An instance has `translate` and `orient`,
+//! `SemanticsLabelsAPI` in the taxonomies `class` (category and human label) and `instance` (unique name),
+//! `CifInstanceAPI` (`schemas/cif`), and the children `Splats` (`ParticleField3DGaussianSplat`), `Proxy` (`Points`,
+//! purpose proxy) and `Collider` (`Mesh`, purpose guide). Where it moves in parts, every part is an `Xform` under it
+//! with such children of its own. The variant set `lod` chooses how many splats are loaded, `physics` how simulators
+//! treat the instance. Arrays stand in the root layer or, by payload, in one layer per instance.
 
 pub mod conventions;
 pub mod error;
@@ -24,11 +28,15 @@ pub mod tokens;
 #[cfg(feature = "python")]
 mod author;
 #[cfg(feature = "python")]
-mod camera_prims;
+mod layer;
+#[cfg(feature = "python")]
+mod primvars;
 #[cfg(feature = "python")]
 mod pxr;
 #[cfg(feature = "python")]
 mod read;
+#[cfg(all(test, feature = "python"))]
+mod tests;
 #[cfg(feature = "python")]
 mod write;
 
@@ -38,11 +46,40 @@ use cif_scene::{LabelMatch, LabelQuery, SceneGraph};
 
 pub use error::UsdError;
 
-/// How a stage is written.
+/// Where the arrays of instances go.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Payloads {
+    /// Beside `.usda`, so that it stays readable; inside `.usdc` and `.usdz`.
+    #[default]
+    ByKind,
+    /// One `.usdc` per instance in a folder beside the stage, `out.payloads` for `out.usda`.
+    Separate,
+    /// All in the stage itself.
+    SingleFile,
+}
+
+/// How a stage is written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ExportOptions {
     /// Replace an existing file even when it was not written by cif.
     pub force: bool,
+    /// Where the arrays of instances go.
+    pub payloads: Payloads,
+    /// Write the variants `half` and `quarter` of the set `lod` beside `full`.
+    pub levels_of_detail: bool,
+}
+
+impl Default for ExportOptions {
+    fn default() -> Self {
+        Self { force: false, payloads: Payloads::default(), levels_of_detail: true }
+    }
+}
+
+/// How a stage is read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ReadOptions {
+    /// Follow sublayers, references and payloads that lie outside the folder of the stage.
+    pub follow_external: bool,
 }
 
 /// What was written.
@@ -50,7 +87,7 @@ pub struct ExportOptions {
 pub struct ExportSummary {
     /// The file.
     pub path: PathBuf,
-    /// Its size.
+    /// Its size, payloads included.
     pub bytes: u64,
     /// Instances and background.
     pub nodes: usize,
@@ -100,7 +137,7 @@ pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError>
 /// that are known).
 pub fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdError> {
     #[cfg(feature = "python")]
-    return read::query(path, query);
+    return read::query::query(path, query);
     #[cfg(not(feature = "python"))]
     {
         let _ = (path, query);
@@ -113,7 +150,48 @@ pub fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdErro
 /// # Errors
 /// As [`export`].
 pub fn write_stage(graph: &SceneGraph, path: &Path) -> Result<(), UsdError> {
-    export(graph, path, ExportOptions { force: true }).map(|_| ())
+    export(graph, path, ExportOptions { force: true, ..ExportOptions::default() }).map(|_| ())
+}
+
+/// Reads a stage as a scene graph: one of ours exactly, also when it was edited, and any stage with Gaussian splats.
+///
+/// A stage of ours comes back as it was exported, in the state of its selected variants: splats and samples exact,
+/// rotations and camera lenses as single-precision numbers. What was done to it since is read as follows.
+/// - *Deleted or deactivated* prims have no node.
+/// - *Labels*: of `userProperties:label`, display name and class label, the first that is no longer what was
+///   exported counts.
+/// - *Recoloured*: display colours that differ from those that were written replace the DC coefficients; higher
+///   degrees stay.
+/// - *Moved*: any transform operations, also on ancestors. What is not rigid is baked into the splats.
+/// - *Duplicated*: a copy keeps the id and the rows of its original, under its own name; a warning tells so. The
+///   original is the one whose name is its `instance` label.
+/// - *Hidden*: by `visibility` of the prim or an ancestor, also over time.
+///
+/// In stages of others, or what others added to ours, a node is made from the nearest prim at or above each splat
+/// prim that has semantic labels, else that is a component model, else from the splat prim itself. A stage whose
+/// only splat prim has neither becomes the background. Labels come from the taxonomy `class` or any other, display
+/// name, or prim name. Without `primvars:cif:row` splats have [`cif_scene::Splats::NO_ROW`].
+/// Up axis and unit are those of the stage; nothing is turned or scaled.
+///
+/// # Errors
+/// Missing or unreadable file, no usd-core, no splats, values that make no sense (the error names the prim),
+/// layers that are missing or lie outside the stage's folder, another layout of ours.
+pub fn read_scene(path: &Path) -> Result<SceneGraph, UsdError> {
+    read_scene_with(path, ReadOptions::default())
+}
+
+/// As [`read_scene`], with options.
+///
+/// # Errors
+/// As [`read_scene`].
+pub fn read_scene_with(path: &Path, options: ReadOptions) -> Result<SceneGraph, UsdError> {
+    #[cfg(feature = "python")]
+    return read::scene(path, options);
+    #[cfg(not(feature = "python"))]
+    {
+        let _ = (path, options);
+        Err(UsdError::NotBuilt)
+    }
 }
 
 /// [`query`] by normalised time in [0, 1] instead of time code; a stage of ours knows when its samples are,
@@ -125,7 +203,7 @@ pub fn query_stage(path: &Path, pattern: &str, time: Option<f64>) -> Result<Vec<
     let of = |time_code| LabelQuery { pattern: pattern.to_owned(), time_code };
     #[cfg(feature = "python")]
     return match time {
-        Some(time) => query(path, &of(Some(read::time_code(path, time)?))),
+        Some(time) => query(path, &of(Some(read::query::time_code(path, time)?))),
         None => query(path, &of(None)),
     };
     #[cfg(not(feature = "python"))]

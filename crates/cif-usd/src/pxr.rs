@@ -1,22 +1,21 @@
 //! The Python modules of usd-core, and arrays handed over as buffers.
 
 use numpy::{PyArray1, PyArrayMethods};
-use pyo3::BoundObject;
 use pyo3::prelude::*;
-use pyo3::types::{PyDict, PyTuple};
+use pyo3::types::PyDict;
 
 use crate::{UsdError, conventions, tokens};
 
 /// The modules that stages are written and read with.
 pub(crate) struct Pxr<'py> {
     pub(crate) py: Python<'py>,
+    pub(crate) ar: Bound<'py, PyModule>,
     pub(crate) gf: Bound<'py, PyModule>,
     pub(crate) sdf: Bound<'py, PyModule>,
     pub(crate) usd: Bound<'py, PyModule>,
     pub(crate) usd_geom: Bound<'py, PyModule>,
     pub(crate) usd_semantics: Bound<'py, PyModule>,
     pub(crate) usd_utils: Bound<'py, PyModule>,
-    pub(crate) usd_vol: Bound<'py, PyModule>,
     pub(crate) vt: Bound<'py, PyModule>,
     pub(crate) version: String,
 }
@@ -59,13 +58,13 @@ impl<'py> Pxr<'py> {
         let module = |name: &str| py.import(name).map_err(missing);
         Ok(Self {
             py,
+            ar: module("pxr.Ar")?,
             gf: module("pxr.Gf")?,
             sdf: module("pxr.Sdf")?,
             usd,
             usd_geom: module("pxr.UsdGeom")?,
             usd_semantics: module("pxr.UsdSemantics")?,
             usd_utils: module("pxr.UsdUtils")?,
-            usd_vol: module("pxr.UsdVol")?,
             vt: module("pxr.Vt")?,
             version,
         })
@@ -126,55 +125,18 @@ impl<'py> Pxr<'py> {
         }
     }
 
+    /// The time at which a value without samples is itself, and a sampled one is its first sample.
+    pub(crate) fn earliest(&self) -> PyResult<Bound<'py, PyAny>> {
+        self.usd.getattr("TimeCode")?.call_method0("EarliestTime")
+    }
+
     /// `SdfValueTypeNames.<name>`.
     pub(crate) fn value_type(&self, name: &str) -> PyResult<Bound<'py, PyAny>> {
         self.sdf.getattr("ValueTypeNames")?.getattr(name)
     }
 
-    /// `Schema.Define(stage, path)` of a schema class.
-    pub(crate) fn define(
-        &self,
-        module: &Bound<'py, PyModule>,
-        schema: &str,
-        stage: &Bound<'py, PyAny>,
-        path: &str,
-    ) -> PyResult<Bound<'py, PyAny>> {
-        module.getattr(schema)?.call_method1("Define", (stage, path))
-    }
-
     /// A dictionary of simple values.
     pub(crate) fn dictionary(&self) -> Bound<'py, PyDict> {
         PyDict::new(self.py)
-    }
-}
-
-/// `object.CreateXAttr().Set(value)`: the default value of a schema attribute.
-pub(crate) fn set_default<'py>(
-    object: &Bound<'py, PyAny>,
-    create: &str,
-    value: impl IntoPyObject<'py>,
-) -> PyResult<Bound<'py, PyAny>> {
-    let attribute = object.call_method0(create)?;
-    set(&attribute, value, None)?;
-    Ok(attribute)
-}
-
-/// `attribute.Set(value[, time])`; an attribute that refuses is an error, not a missing value.
-pub(crate) fn set<'py>(
-    attribute: &Bound<'py, PyAny>,
-    value: impl IntoPyObject<'py>,
-    time_code: Option<f64>,
-) -> PyResult<()> {
-    let py = attribute.py();
-    let value = value.into_pyobject(py).map_err(Into::into)?.into_any().unbind();
-    let arguments = match time_code {
-        Some(time_code) => PyTuple::new(py, [value, time_code.into_pyobject(py)?.into_any().unbind()])?,
-        None => PyTuple::new(py, [value])?,
-    };
-    if attribute.call_method1("Set", arguments)?.is_truthy()? {
-        Ok(())
-    } else {
-        let name: String = attribute.call_method0("GetName")?.extract()?;
-        Err(pyo3::exceptions::PyRuntimeError::new_err(format!("{name} does not take its value")))
     }
 }

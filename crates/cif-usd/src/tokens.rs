@@ -3,49 +3,201 @@
 /// Oldest usd-core that knows Gaussian splats, (year, month).
 pub const MINIMUM_USD: (u32, u32) = (26, 3);
 
-/// Key in `customLayerData` and `customData` under which everything of ours stands; marks a layer as ours.
+/// Key in `customLayerData` under which everything of ours stands; marks a layer as ours.
 pub const CIF: &str = "cif";
+/// Program that wrote a layer, in `customLayerData`.
+pub const GENERATOR: &str = "generator";
+/// Version of the layout, in `customLayerData`.
+pub const LAYOUT: &str = "layout";
 /// Version of the layout described in the crate documentation.
-pub const LAYOUT_VERSION: i32 = 1;
+pub const LAYOUT_VERSION: i32 = 2;
+/// What a layer is for, in `customLayerData`: [`ROLE_ROOT`] or [`ROLE_PAYLOAD`].
+pub const ROLE: &str = "role";
+/// A layer that is opened.
+pub const ROLE_ROOT: &str = "root";
+/// A layer that holds the arrays of one instance.
+pub const ROLE_PAYLOAD: &str = "payload";
 /// Normalised times of the sampled time codes, in `customLayerData`.
 pub const SAMPLE_TIMES: &str = "sampleTimes";
 /// The sampled time codes, in `customLayerData`.
 pub const SAMPLE_CODES: &str = "sampleCodes";
+/// Colour behind everything, in `customLayerData`.
+pub const BACKGROUND_COLOR: &str = "backgroundColor";
+/// Labels of instances without a prim, in `customLayerData`.
+pub const OMITTED: &str = "omitted";
+/// What the user was told, in `customLayerData`.
+pub const WARNINGS: &str = "warnings";
+/// Fingerprint of the exported field, in `customLayerData`.
+pub const FIELD_FINGERPRINT: &str = "fieldFingerprint";
+/// Options of the export as JSON, in `customLayerData`.
+pub const OPTIONS: &str = "options";
+/// Order in which the splats were blended, in `customLayerData`.
+pub const SORT: &str = "sort";
 
 /// Default prim.
 pub const WORLD: &str = "/World";
 /// Scope of the cameras.
 pub const CAMERAS: &str = "/World/Cameras";
-/// Splat prim of a node.
+/// Gravity.
+pub const PHYSICS_SCENE: &str = "/World/PhysicsScene";
+/// Splat prim of a node or part.
 pub const SPLATS: &str = "Splats";
-/// Point proxy of a node.
+/// Point proxy of a node or part.
 pub const PROXY: &str = "Proxy";
+/// Convex hull of a node or part; further ones are numbered.
+pub const COLLIDER: &str = "Collider";
+/// Ending of the folder of payloads: `out.usda` has `out.payloads`.
+pub const PAYLOADS: &str = "payloads";
+/// Prim of a payload that every level of detail shares.
+pub const COMMON: &str = "/Common";
+
+/// Splats.
+pub const GAUSSIAN_SPLAT: &str = "ParticleField3DGaussianSplat";
 
 /// Model kind of the root.
 pub const KIND_ASSEMBLY: &str = "assembly";
 /// Model kind of a node.
 pub const KIND_COMPONENT: &str = "component";
 
+/// Schema of what no standard schema holds about an instance.
+pub const INSTANCE_API: &str = "CifInstanceAPI";
+/// Semantic labels in a taxonomy.
+pub const LABELS_API: &str = "SemanticsLabelsAPI";
+/// Properties of semantic labels, before the taxonomy.
+pub const LABELS: &str = "semantics:labels";
 /// Taxonomy of category and human label.
 pub const TAXONOMY_CLASS: &str = "class";
 /// Taxonomy of the unique instance name.
 pub const TAXONOMY_INSTANCE: &str = "instance";
 /// Human label, as a property that importers without semantics keep.
 pub const USER_LABEL: &str = "userProperties:label";
+/// Width of the captured pictures, pixels; property of cameras.
+pub const IMAGE_WIDTH: &str = "userProperties:imageWidth";
+/// Height of the captured pictures, pixels; property of cameras.
+pub const IMAGE_HEIGHT: &str = "userProperties:imageHeight";
+/// Time codes at which a camera was recorded.
+pub const CAMERA_CODES: &str = "cif:timeCodes";
+/// Position of a part among those of its instance.
+pub const PART_INDEX: &str = "cif:partIndex";
+/// Origin of a part's frame at the reference time, in the frame of its instance.
+pub const PART_PIVOT: &str = "cif:partPivot";
+
+/// Properties of [`INSTANCE_API`].
+pub mod instance {
+    /// `instance` or `background`.
+    pub const KIND: &str = "cif:kind";
+    /// Mask value.
+    pub const ID: &str = "cif:id";
+    /// Position in the table of instances.
+    pub const INDEX: &str = "cif:index";
+    /// Label when exported.
+    pub const LABEL: &str = "cif:label";
+    /// Class when exported.
+    pub const CATEGORY: &str = "cif:category";
+    /// Origin of the local frame at the reference time, world.
+    pub const PIVOT: &str = "cif:pivot";
+    /// First and last captured frame.
+    pub const SOURCE_FRAMES: &str = "cif:sourceFrames";
+    /// Opacity-weighted mean occupancy.
+    pub const MEAN_OCCUPANCY: &str = "cif:meanOccupancy";
+    /// Chosen motion model.
+    pub const MODEL: &str = "cif:motion:model";
+    /// Largest residual allowed.
+    pub const TOLERANCE: &str = "cif:motion:tolerance";
+    /// Size of the instance.
+    pub const SIZE: &str = "cif:motion:size";
+    /// Root of the mean squared residual.
+    pub const RESIDUAL_RMS: &str = "cif:motion:residualRms";
+    /// Residual that was held against the tolerance.
+    pub const RESIDUAL_DECISIVE: &str = "cif:motion:residualDecisive";
+    /// Largest residual.
+    pub const RESIDUAL_MAX: &str = "cif:motion:residualMax";
+    /// Share of the weight above the tolerance.
+    pub const OUTLIER_SHARE: &str = "cif:motion:outlierShare";
+    /// Number of time samples.
+    pub const SAMPLES: &str = "cif:motion:samples";
+    /// The whole motion report as JSON.
+    pub const REPORT: &str = "cif:motion:report";
+
+    /// Every property with its type and whether it is written where the value is known.
+    pub const ALL: [(&str, &str); 17] = [
+        (KIND, "token"),
+        (ID, "int"),
+        (INDEX, "int"),
+        (LABEL, "string"),
+        (CATEGORY, "string"),
+        (PIVOT, "double3"),
+        (SOURCE_FRAMES, "int2"),
+        (MEAN_OCCUPANCY, "float"),
+        (MODEL, "token"),
+        (TOLERANCE, "double"),
+        (SIZE, "double"),
+        (RESIDUAL_RMS, "double"),
+        (RESIDUAL_DECISIVE, "double"),
+        (RESIDUAL_MAX, "double"),
+        (OUTLIER_SHARE, "double"),
+        (SAMPLES, "int"),
+        (REPORT, "string"),
+    ];
+
+    /// Value of [`KIND`] of an instance.
+    pub const KIND_INSTANCE: &str = "instance";
+    /// Value of [`KIND`] of the background.
+    pub const KIND_BACKGROUND: &str = "background";
+}
+
+/// Variant sets of an instance.
+pub mod variants {
+    /// How simulators treat the instance.
+    pub const PHYSICS: &str = "physics";
+    /// No body: only the colliders, at rest.
+    pub const NONE: &str = "none";
+    /// A body on its recorded track.
+    pub const KINEMATIC: &str = "kinematic";
+    /// A body that starts at the initial pose with the initial velocity.
+    pub const DYNAMIC: &str = "dynamic";
+    /// How many splats are loaded.
+    pub const LOD: &str = "lod";
+    /// All splats.
+    pub const FULL: &str = "full";
+    /// The more important half.
+    pub const HALF: &str = "half";
+    /// The most important quarter.
+    pub const QUARTER: &str = "quarter";
+}
 
 /// Spherical-harmonics coefficients.
 pub const SH_COEFFICIENTS: &str = "radiance:sphericalHarmonicsCoefficients";
+/// Spherical-harmonics degree.
+pub const SH_DEGREE: &str = "radiance:sphericalHarmonicsDegree";
 /// Interpolation with one value per splat.
 pub const VERTEX: &str = "vertex";
+/// Interpolation with one value per corner of a face.
+pub const FACE_VARYING: &str = "faceVarying";
 /// Purpose of the point proxies.
 pub const PURPOSE_PROXY: &str = "proxy";
+/// Purpose of the colliders.
+pub const PURPOSE_GUIDE: &str = "guide";
 /// Projection that the splats were trained with.
 pub const PERSPECTIVE: &str = "perspective";
 /// Sorting by camera-space depth.
 pub const SORT_Z_DEPTH: &str = "zDepth";
 /// Sorting by distance to the camera centre.
 pub const SORT_CAMERA_DISTANCE: &str = "cameraDistance";
+/// View-independent colours.
+pub const DISPLAY_COLOR: &str = "primvars:displayColor";
 /// Primvar of occupancies.
-pub const PRIMVAR_OCCUPANCY: &str = "cif:occupancy";
+pub const PRIMVAR_OCCUPANCY: &str = "primvars:cif:occupancy";
 /// Primvar of the probability of the instance.
-pub const PRIMVAR_IDENTITY: &str = "cif:identity";
+pub const PRIMVAR_IDENTITY: &str = "primvars:cif:identity";
+/// Primvar of the row of every splat in the field.
+pub const PRIMVAR_ROW: &str = "primvars:cif:row";
+/// Primvar of the splat that a proxy point sits on, counted over the node.
+pub const PRIMVAR_SPLAT: &str = "primvars:cif:splat";
+/// Checksum of the display colours as written, by which a recolouring is recognised.
+pub const COLOR_CHECKSUM: &str = "cif:displayColorChecksum";
+
+/// Value of `visibility` where a prim can be seen.
+pub const INHERITED: &str = "inherited";
+/// Value of `visibility` where it cannot.
+pub const INVISIBLE: &str = "invisible";

@@ -1,13 +1,15 @@
 //! File kinds, atomic replacement, and what may be replaced.
 
+use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use cif_scene::SceneGraph;
 use pyo3::prelude::*;
 
+use crate::author::{self, Scene, Storage};
 use crate::pxr::{self, Pxr, reason};
-use crate::{ExportOptions, ExportSummary, UsdError, author, tokens};
+use crate::{ExportOptions, ExportSummary, Payloads, UsdError, tokens};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
@@ -34,6 +36,11 @@ fn folder_of(path: &Path) -> PathBuf {
     }
 }
 
+/// Folder of the payloads of a stage: `out.payloads` beside `out.usda`.
+fn payloads_of(path: &Path) -> PathBuf {
+    path.with_extension(tokens::PAYLOADS)
+}
+
 /// The root layer of a file, kept apart from layers that are open under the same name.
 fn is_ours(pxr: &Pxr<'_>, path: &Path) -> bool {
     let opened = pxr
@@ -46,12 +53,38 @@ fn is_ours(pxr: &Pxr<'_>, path: &Path) -> bool {
         .unwrap_or(false)
 }
 
-pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError> {
-    pxr::with(|pxr| checked_kind(pxr, path, options).map(|_| ()))
+/// Whether a folder holds nothing but layers of ours.
+fn is_folder_of_ours(pxr: &Pxr<'_>, folder: &Path) -> bool {
+    fs::read_dir(folder).is_ok_and(|mut entries| {
+        entries.all(|entry| {
+            entry.is_ok_and(|entry| {
+                let path = entry.path();
+                path.extension().is_some_and(|extension| extension == "usdc") && is_ours(pxr, &path)
+            })
+        })
+    })
 }
 
-fn checked_kind(pxr: &Pxr<'_>, path: &Path, options: ExportOptions) -> Result<Kind, UsdError> {
+pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError> {
+    pxr::with(|pxr| checked(pxr, path, options).map(|_| ()))
+}
+
+/// What will be written where.
+struct Target {
+    kind: Kind,
+    /// Whether arrays go to payloads.
+    split: bool,
+}
+
+fn checked(pxr: &Pxr<'_>, path: &Path, options: ExportOptions) -> Result<Target, UsdError> {
     let kind = kind_of(path)?;
+    let split = match (options.payloads, kind) {
+        (Payloads::Separate, Kind::Package) => {
+            return Err(UsdError::PayloadsInPackage { path: path.to_owned() });
+        }
+        (Payloads::Separate, _) | (Payloads::ByKind, Kind::Text) => true,
+        (Payloads::SingleFile, _) | (Payloads::ByKind, _) => false,
+    };
     let folder = folder_of(path);
     if !folder.is_dir() {
         return Err(UsdError::NoFolder { folder, path: path.to_owned() });
@@ -62,7 +95,11 @@ fn checked_kind(pxr: &Pxr<'_>, path: &Path, options: ExportOptions) -> Result<Ki
     if path.exists() && !options.force && !is_ours(pxr, path) {
         return Err(UsdError::Foreign { path: path.to_owned() });
     }
-    Ok(kind)
+    let payloads = payloads_of(path);
+    if split && payloads.exists() && !options.force && !is_folder_of_ours(pxr, &payloads) {
+        return Err(UsdError::Foreign { path: payloads });
+    }
+    Ok(Target { kind, split })
 }
 
 pub(crate) fn export(
@@ -71,18 +108,18 @@ pub(crate) fn export(
     options: ExportOptions,
 ) -> Result<ExportSummary, UsdError> {
     pxr::with(|pxr| {
-        let kind = checked_kind(pxr, path, options)?;
+        let target = checked(pxr, path, options)?;
         let failed = |reason: String| UsdError::Write { path: path.to_owned(), reason };
         let system = |error: std::io::Error| failed(error.to_string());
         // A folder of our own on the same disk: renaming is atomic, and a failure leaves nothing behind.
         let scratch =
             tempfile::Builder::new().prefix(".cif-export-").tempdir_in(folder_of(path)).map_err(system)?;
-        let written =
-            write(pxr, graph, kind, scratch.path()).map_err(|error| failed(reason(pxr.py, &error)))?;
-        let file = fs::File::open(&written).map_err(system)?;
-        file.sync_all().map_err(system)?;
-        let bytes = file.metadata().map_err(system)?.len();
-        fs::rename(&written, path).map_err(system)?;
+        let written = write(pxr, graph, path, &target, options, scratch.path())
+            .map_err(|error| failed(reason(pxr.py, &error)))?;
+        let bytes = written.sync().map_err(system)?;
+        written
+            .replace(path, scratch.path(), || is_folder_of_ours(pxr, &payloads_of(path)))
+            .map_err(system)?;
         Ok(ExportSummary {
             path: path.to_owned(),
             bytes,
@@ -94,22 +131,90 @@ pub(crate) fn export(
     })
 }
 
-/// Writes the stage into a folder; the path of the finished file.
-fn write(pxr: &Pxr<'_>, graph: &SceneGraph, kind: Kind, folder: &Path) -> PyResult<PathBuf> {
-    let layer = folder.join(if kind == Kind::Text { "scene.usda" } else { "scene.usdc" });
-    let stage = pxr.usd.getattr("Stage")?.call_method1("CreateNew", (layer.as_os_str(),))?;
-    author::author(pxr, &stage, graph)?;
-    let saved = stage.call_method0("GetRootLayer")?.call_method0("Save")?;
-    let failure = |what: &str| Err(pyo3::exceptions::PyOSError::new_err(what.to_owned()));
-    if !saved.is_truthy()? {
-        return failure("the layer could not be saved");
+/// A finished stage in the scratch folder.
+struct Written {
+    root: PathBuf,
+    payloads: Option<PathBuf>,
+}
+
+impl Written {
+    /// Puts everything on the disk; the bytes.
+    fn sync(&self) -> std::io::Result<u64> {
+        let sync = |path: &Path| -> std::io::Result<u64> {
+            let file = fs::File::open(path)?;
+            file.sync_all()?;
+            Ok(file.metadata()?.len())
+        };
+        let mut bytes = sync(&self.root)?;
+        if let Some(folder) = &self.payloads {
+            for entry in fs::read_dir(folder)? {
+                bytes += sync(&entry?.path())?;
+            }
+        }
+        Ok(bytes)
     }
-    drop(stage);
-    if kind != Kind::Package {
-        return Ok(layer);
+
+    /// Moves the stage into place. Old payloads step aside first and come back when something fails; `ours` tells
+    /// whether payloads that the new stage does not need may go.
+    fn replace(&self, path: &Path, scratch: &Path, ours: impl FnOnce() -> bool) -> std::io::Result<()> {
+        let (place, aside) = (payloads_of(path), scratch.join("replaced"));
+        let steps_aside = place.exists() && (self.payloads.is_some() || (place.is_dir() && ours()));
+        if steps_aside {
+            fs::rename(&place, &aside)?;
+        }
+        let moved = match &self.payloads {
+            Some(folder) => fs::rename(folder, &place),
+            None => Ok(()),
+        };
+        let moved = moved.and_then(|()| fs::rename(&self.root, path));
+        if moved.is_err() {
+            if let Some(folder) = &self.payloads
+                && place.exists()
+            {
+                fs::rename(&place, folder)?;
+            }
+            if steps_aside {
+                fs::rename(&aside, &place)?;
+            }
+        }
+        moved
+    }
+}
+
+/// Writes the stage into a folder.
+fn write(
+    pxr: &Pxr<'_>,
+    graph: &SceneGraph,
+    path: &Path,
+    target: &Target,
+    options: ExportOptions,
+    folder: &Path,
+) -> PyResult<Written> {
+    let root = folder.join(if target.kind == Kind::Text { "scene.usda" } else { "scene.usdc" });
+    let payloads = target.split.then(|| folder.join("payloads"));
+    let name = payloads_of(path).file_name().map(OsString::from).unwrap_or_default();
+    let Some(name) = name.to_str().filter(|name| !name.contains('@')) else {
+        return Err(pyo3::exceptions::PyOSError::new_err(
+            "USD cannot refer to files whose name is not Unicode or has an @ in it; choose another name",
+        ));
+    };
+    if let Some(payloads) = &payloads {
+        fs::create_dir(payloads)?;
+    }
+    let storage = Storage {
+        payloads: payloads.as_deref().map(|folder| (folder, name)),
+        levels: options.levels_of_detail,
+    };
+    author::author(&Scene { pxr, graph, storage }, &root)?;
+    if target.kind != Kind::Package {
+        return Ok(Written { root, payloads });
     }
     let package = folder.join("scene.usdz");
-    let asset = pxr.sdf.call_method1("AssetPath", (layer.as_os_str(),))?;
+    let asset = pxr.sdf.call_method1("AssetPath", (root.as_os_str(),))?;
     let zipped = pxr.usd_utils.call_method1("CreateNewUsdzPackage", (asset, package.as_os_str()))?;
-    if zipped.is_truthy()? { Ok(package) } else { failure("the package could not be written") }
+    if zipped.is_truthy()? {
+        Ok(Written { root: package, payloads: None })
+    } else {
+        Err(pyo3::exceptions::PyOSError::new_err("the package could not be written"))
+    }
 }

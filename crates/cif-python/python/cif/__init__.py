@@ -17,7 +17,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from . import _native
+from . import _native, _schema
 from ._native import Camera, CifError, Dataset, Field, __version__, open_dataset, query_stage, usd_version
 
 __all__ = [
@@ -31,6 +31,8 @@ __all__ = [
     "run",
     "usd_version",
 ]
+
+_schema.register()
 
 
 def run(arguments: Sequence[str | os.PathLike[str]]) -> int:

@@ -126,7 +126,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
 }
 
 fn writing(command: &Export) -> cif_usd::ExportOptions {
-    cif_usd::ExportOptions { force: command.force }
+    cif_usd::ExportOptions { force: command.force, ..cif_usd::ExportOptions::default() }
 }
 
 fn options(command: &Export) -> SceneOptions {

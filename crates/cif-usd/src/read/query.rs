@@ -7,6 +7,7 @@ use cif_scene::{LabelMatch, LabelQuery};
 use globset::GlobMatcher;
 use pyo3::prelude::*;
 
+use super::open::open;
 use crate::pxr::{self, Pxr, reason};
 use crate::{UsdError, conventions, tokens};
 
@@ -21,16 +22,6 @@ pub(crate) fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, 
         }
         Ok(found)
     })
-}
-
-fn open<'py>(pxr: &Pxr<'py>, path: &Path) -> Result<Bound<'py, PyAny>, UsdError> {
-    if !path.is_file() {
-        return Err(UsdError::NotFound { path: path.to_owned() });
-    }
-    pxr.usd
-        .getattr("Stage")
-        .and_then(|class| class.call_method1("Open", (path.as_os_str(),)))
-        .map_err(|error| UsdError::Unreadable { path: path.to_owned(), reason: reason(pxr.py, &error) })
 }
 
 /// Time code of a normalised time.

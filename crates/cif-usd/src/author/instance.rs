@@ -1,0 +1,167 @@
+//! One prim per instance: labels, our schema, variants, and where its arrays are kept.
+
+use cif_scene::{Motion, Node, NodeKind, PartsMotion};
+use pyo3::prelude::*;
+
+use super::levels::{LEVELS, Level};
+use super::{Scene, UNIFORM, VARYING, hulls, levels, metadata, physics, proxies, splats, transforms};
+use crate::layer::{Layer, Prim, child};
+use crate::tokens::{self, instance, variants};
+
+pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) -> PyResult<()> {
+    let pxr = scene.pxr;
+    let prim = layer.define(&format!("{}/{}", tokens::WORLD, node.name), "Xform")?;
+    prim.info("kind", tokens::KIND_COMPONENT)?;
+    prim.info("displayName", &node.label)?;
+    let taxonomy = |name: &str| format!("{}:{name}", tokens::LABELS_API);
+    prim.apply(&[
+        &taxonomy(tokens::TAXONOMY_CLASS),
+        &taxonomy(tokens::TAXONOMY_INSTANCE),
+        tokens::INSTANCE_API,
+    ])?;
+    // Both words find the object: the class ("mug") and what a person calls it ("red mug").
+    let mut class = vec![node.category.as_str()];
+    if node.label != node.category {
+        class.push(&node.label);
+    }
+    for (taxonomy, labels) in
+        [(tokens::TAXONOMY_CLASS, class), (tokens::TAXONOMY_INSTANCE, vec![node.name.as_str()])]
+    {
+        let labels = pxr.vt.call_method1("TokenArray", (labels,))?;
+        prim.set(&format!("{}:{taxonomy}", tokens::LABELS), "TokenArray", VARYING, labels)?;
+    }
+    prim.set_custom(tokens::USER_LABEL, "String", &node.label)?;
+    properties(scene, &prim, node)?;
+    visibility(&prim, node)?;
+    transforms::order(pxr, &prim)?;
+    for (index, part) in parts(node).map_or(&[][..], |motion| &motion.parts).iter().enumerate() {
+        let inside = layer.define(&child(prim.path(), &part.name), "Xform")?;
+        transforms::order(pxr, &inside)?;
+        // Composition orders children as it likes.
+        inside.set_custom(tokens::PART_INDEX, "Int", i32::try_from(index).unwrap_or(i32::MAX))?;
+        inside.set_custom(tokens::PART_PIVOT, "Double3", pxr.vec3d(part.pivot)?)?;
+    }
+    physics::author(scene, &prim, node)?;
+    contents(scene, &prim, layer, node)
+}
+
+/// The parts of a node that has some.
+pub(super) fn parts(node: &Node) -> Option<&PartsMotion> {
+    match &node.motion {
+        Motion::Parts(motion) => Some(motion),
+        Motion::Static | Motion::Rigid(_) | Motion::Dense(_) => None,
+    }
+}
+
+/// What no standard schema holds.
+fn properties(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
+    let (pxr, report) = (scene.pxr, &node.report);
+    let int = |value: usize| i32::try_from(value).unwrap_or(i32::MAX);
+    let kind = match node.kind {
+        NodeKind::Instance { id, index } => {
+            prim.set(instance::ID, "Int", UNIFORM, i32::from(id))?;
+            prim.set(instance::INDEX, "Int", UNIFORM, int(index))?;
+            instance::KIND_INSTANCE
+        }
+        NodeKind::Background => instance::KIND_BACKGROUND,
+    };
+    prim.set(instance::KIND, "Token", UNIFORM, kind)?;
+    prim.set(instance::LABEL, "String", UNIFORM, &node.label)?;
+    prim.set(instance::CATEGORY, "String", UNIFORM, &node.category)?;
+    prim.set(instance::PIVOT, "Double3", UNIFORM, pxr.vec3d(node.pivot)?)?;
+    let (first, last) = node.source_frames;
+    let frames = pxr.gf.call_method1("Vec2i", (int(first), int(last)))?;
+    prim.set(instance::SOURCE_FRAMES, "Int2", UNIFORM, frames)?;
+    prim.set(instance::MEAN_OCCUPANCY, "Float", UNIFORM, node.mean_occupancy)?;
+    prim.set(instance::MODEL, "Token", UNIFORM, node.model().to_string())?;
+    for (name, value) in [
+        (instance::TOLERANCE, report.tolerance),
+        (instance::SIZE, report.size),
+        (instance::RESIDUAL_RMS, report.residual.rms),
+        (instance::RESIDUAL_DECISIVE, report.residual.decisive),
+        (instance::RESIDUAL_MAX, report.residual.max),
+        (instance::OUTLIER_SHARE, report.residual.outlier_share),
+    ] {
+        prim.set(name, "Double", UNIFORM, value)?;
+    }
+    prim.set(instance::SAMPLES, "Int", UNIFORM, int(report.samples))?;
+    let report = serde_json::to_string(report)
+        .map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
+    prim.set(instance::REPORT, "String", UNIFORM, report)?;
+    Ok(())
+}
+
+fn visibility(prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
+    let token = |visible: bool| if visible { tokens::INHERITED } else { tokens::INVISIBLE };
+    let Some(first) = node.visibility.first() else { return Ok(()) };
+    let attribute = prim.set("visibility", "Token", VARYING, token(first.visible))?;
+    for sample in &node.visibility {
+        attribute.sample(sample.time_code, token(sample.visible))?;
+    }
+    Ok(())
+}
+
+/// Splats, proxies and colliders: in the root layer or in a payload; splats once per level of detail.
+fn contents(
+    scene: &Scene<'_, '_>,
+    prim: &Prim<'_, '_, '_>,
+    layer: &Layer<'_, '_>,
+    node: &Node,
+) -> PyResult<()> {
+    let levels = if scene.storage.levels { &LEVELS[..] } else { &LEVELS[..1] };
+    if scene.storage.levels {
+        prim.select(variants::LOD, variants::FULL)?;
+    }
+    let Some((folder, called)) = scene.storage.payloads else {
+        shared(scene, layer, prim.path(), node)?;
+        for level in levels {
+            let place = if scene.storage.levels {
+                prim.variant(variants::LOD, level.name)?.path().to_owned()
+            } else {
+                prim.path().to_owned()
+            };
+            splats_of(scene, layer, &place, node, level)?;
+        }
+        return Ok(());
+    };
+    let file = format!("{}.usdc", node.name);
+    let asset = format!("./{called}/{file}");
+    let payload = Layer::create(scene.pxr, &folder.join(&file))?;
+    metadata(scene, &payload, tokens::ROLE_PAYLOAD, LEVELS[0].prim)?;
+    payload.define(tokens::COMMON, "Xform")?;
+    shared(scene, &payload, tokens::COMMON, node)?;
+    prim.payload(&asset, tokens::COMMON)?;
+    for level in levels {
+        payload.define(level.prim, "Xform")?;
+        splats_of(scene, &payload, level.prim, node, level)?;
+        if scene.storage.levels {
+            prim.variant(variants::LOD, level.name)?.payload(&asset, level.prim)?;
+        } else {
+            prim.payload(&asset, level.prim)?;
+        }
+    }
+    payload.save()
+}
+
+/// What every level of detail has.
+fn shared(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, node: &Node) -> PyResult<()> {
+    proxies::author(scene, layer, place, node)?;
+    hulls::author(scene, layer, place, node)
+}
+
+fn splats_of(
+    scene: &Scene<'_, '_>,
+    layer: &Layer<'_, '_>,
+    place: &str,
+    node: &Node,
+    level: &Level,
+) -> PyResult<()> {
+    let kept = levels::kept(node, level);
+    let some = |part| levels::selection(node, part, level, kept.as_deref());
+    match parts(node) {
+        None => splats::author(scene, layer, place, &some(None)),
+        Some(motion) => motion.parts.iter().enumerate().try_for_each(|(index, part)| {
+            splats::author(scene, layer, &child(place, &part.name), &some(Some(index)))
+        }),
+    }
+}

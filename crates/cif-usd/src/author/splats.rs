@@ -1,0 +1,114 @@
+//! Splats: one `ParticleField3DGaussianSplat`.
+
+use cif_field::SortMetric;
+use cif_geometry::{Bounds, RigidTransform};
+use cif_scene::extent;
+use pyo3::prelude::*;
+
+use super::levels::Selection;
+use super::{Scene, UNIFORM, VARYING};
+use crate::layer::{Layer, Prim, child};
+use crate::pxr::Pxr;
+use crate::{primvars, tokens};
+
+/// Token of a blending order.
+pub(super) fn sorting(metric: SortMetric) -> &'static str {
+    match metric {
+        SortMetric::Z => tokens::SORT_Z_DEPTH,
+        SortMetric::Distance => tokens::SORT_CAMERA_DISTANCE,
+    }
+}
+
+fn box_array<'py>(pxr: &Pxr<'py>, bounds: &Bounds) -> PyResult<Bound<'py, PyAny>> {
+    pxr.vec3f_array(&extent::outward(bounds))
+}
+
+fn bounds(means: &[[f32; 3]], orientations: &[[f32; 4]], scales: &[[f32; 3]]) -> Bounds {
+    extent::ellipsoid_bounds(&RigidTransform::IDENTITY, means, orientations, scales)
+}
+
+pub(super) fn author(
+    scene: &Scene<'_, '_>,
+    layer: &Layer<'_, '_>,
+    place: &str,
+    selection: &Selection<'_>,
+) -> PyResult<()> {
+    let (pxr, splats) = (scene.pxr, selection.all());
+    let prim = layer.define(&child(place, tokens::SPLATS), tokens::GAUSSIAN_SPLAT)?;
+    let means = selection.of(&splats.means);
+    let turns = selection.of(&splats.orientations);
+    let sizes = selection.of(&splats.scales);
+    let positions = prim.set("positions", "Point3fArray", VARYING, pxr.vec3f_array(&means)?)?;
+    let orientations = prim.set("orientations", "QuatfArray", VARYING, pxr.quatf_array(&turns)?)?;
+    let scales = prim.set("scales", "Float3Array", VARYING, pxr.vec3f_array(&sizes)?)?;
+    let opacities = pxr.float_array(&selection.of(&splats.opacities))?;
+    prim.set("opacities", "FloatArray", VARYING, opacities)?;
+    let whole = bounds(&means, &turns, &sizes);
+    let extents = prim.set("extent", "Float3Array", VARYING, box_array(pxr, &whole)?)?;
+    for sample in selection.samples() {
+        let (time, means, turns) =
+            (sample.time_code, selection.of(&sample.means), selection.of(&sample.orientations));
+        positions.sample(time, pxr.vec3f_array(&means)?)?;
+        orientations.sample(time, pxr.quatf_array(&turns)?)?;
+        let extent = match &sample.scales {
+            Some(values) => {
+                let values = selection.of(values);
+                scales.sample(time, pxr.vec3f_array(&values)?)?;
+                bounds(&means, &turns, &values)
+            }
+            None if selection.is_whole() => sample.extent,
+            None => bounds(&means, &turns, &sizes),
+        };
+        extents.sample(time, box_array(pxr, &extent)?)?;
+    }
+    let degree = i32::from(selection.degree());
+    prim.set(tokens::SH_DEGREE, "Int", UNIFORM, degree)?;
+    let coefficients = selection.coefficients();
+    let sh = pxr.vec3f_array_flat(&coefficients)?;
+    let sh = prim.set(tokens::SH_COEFFICIENTS, "Float3Array", VARYING, sh)?;
+    sh.info("elementSize", (degree + 1) * (degree + 1))?;
+    sh.info("interpolation", tokens::VERTEX)?;
+    let colors = primvars::base_colors(&coefficients, selection.degree());
+    display_color(pxr, &prim, &colors)?;
+    prim.set_custom(tokens::COLOR_CHECKSUM, "String", primvars::checksum(&colors))?;
+    prim.set("projectionModeHint", "Token", UNIFORM, tokens::PERSPECTIVE)?;
+    prim.set("sortingModeHint", "Token", UNIFORM, sorting(scene.graph.sort_metric))?;
+    for (name, values) in [
+        (tokens::PRIMVAR_OCCUPANCY, &splats.occupancies),
+        (tokens::PRIMVAR_IDENTITY, &splats.identity_probabilities),
+    ] {
+        let values = selection.of(values);
+        let (unique, indices) = primvars::without_repetitions(values.as_chunks::<1>().0);
+        let attribute = prim.set(name, "FloatArray", VARYING, pxr.float_array(unique.as_flattened())?)?;
+        attribute.info("interpolation", tokens::VERTEX)?;
+        set_indices(pxr, &prim, name, indices)?;
+    }
+    let rows = primvars::as_ints(&selection.of(&splats.rows));
+    ints(pxr, &prim, tokens::PRIMVAR_ROW, &rows)
+}
+
+/// A primvar of integers, one per point, without repetitions among them.
+pub(super) fn ints(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, name: &str, values: &[i32]) -> PyResult<()> {
+    let attribute = prim.set(name, "IntArray", VARYING, pxr.int_array(values)?)?;
+    attribute.info("interpolation", tokens::VERTEX)
+}
+
+/// Colours for viewers that do not read spherical harmonics.
+pub(super) fn display_color(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, colors: &[[f32; 3]]) -> PyResult<()> {
+    let (unique, indices) = primvars::without_repetitions(colors);
+    let attribute = prim.set(tokens::DISPLAY_COLOR, "Color3fArray", VARYING, pxr.vec3f_array(&unique)?)?;
+    attribute.info("interpolation", tokens::VERTEX)?;
+    set_indices(pxr, prim, tokens::DISPLAY_COLOR, indices)
+}
+
+fn set_indices(
+    pxr: &Pxr<'_>,
+    prim: &Prim<'_, '_, '_>,
+    name: &str,
+    indices: Option<Vec<i32>>,
+) -> PyResult<()> {
+    if let Some(indices) = indices {
+        prim.set(&format!("{name}:indices"), "IntArray", VARYING, pxr.int_array(&indices)?)?;
+    }
+    Ok(())
+}

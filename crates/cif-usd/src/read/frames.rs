@@ -1,0 +1,360 @@
+//! Where prims are over time: exact tracks where the operations are ours, sampled ones otherwise.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+
+use cif_scene::PoseSample;
+use glam::{DAffine3, DQuat, DVec3};
+use pyo3::prelude::*;
+
+use super::bake::{self, Split};
+use super::values;
+use crate::pxr::Pxr;
+
+/// Most time codes that a track is sampled at between its keys.
+const MOST_FRAMES: f64 = 10_000.0;
+
+/// Transforms of a stage.
+pub(super) struct Frames<'a, 'py> {
+    pxr: &'a Pxr<'py>,
+    caches: RefCell<BTreeMap<u64, Bound<'py, PyAny>>>,
+    /// First and last time code of the stage.
+    range: (f64, f64),
+}
+
+/// Operations of one prim.
+enum Operations<'py> {
+    /// It stays in its parent's frame.
+    None,
+    /// `translate` and `orient`, as we write them.
+    Pose { translate: Bound<'py, PyAny>, orient: Bound<'py, PyAny> },
+    /// Anything else.
+    Other,
+}
+
+/// A frame that moves rigidly.
+#[derive(Clone, Debug)]
+pub(super) struct Track {
+    /// Where it is when nothing is sampled, or at the earliest time.
+    pub(super) rest: PoseSample,
+    /// Samples; empty where it stands still.
+    pub(super) samples: Vec<PoseSample>,
+}
+
+/// How a prim lies in the frame of its node.
+#[derive(Clone, Debug)]
+pub(super) enum Placement {
+    /// `node_from_prim = track * baked`.
+    Rigid { track: Track, baked: Option<DAffine3> },
+    /// Anything else, at every time.
+    Sampled(Vec<(f64, DAffine3)>),
+}
+
+impl Track {
+    fn still() -> Self {
+        let rest = PoseSample { time_code: 0.0, translation: DVec3::ZERO, rotation: DQuat::IDENTITY };
+        Self { rest, samples: Vec::new() }
+    }
+
+    /// Whether it stays at the origin.
+    pub(super) fn is_identity(&self) -> bool {
+        let PoseSample { translation, rotation, .. } = self.rest;
+        self.samples.is_empty() && translation == DVec3::ZERO && rotation == DQuat::IDENTITY
+    }
+}
+
+fn affine(pose: &PoseSample) -> DAffine3 {
+    DAffine3::from_rotation_translation(pose.rotation, pose.translation)
+}
+
+fn pose(time_code: f64, split: &Split) -> PoseSample {
+    PoseSample { time_code, translation: split.translation, rotation: split.rotation }
+}
+
+/// Successive rotations in one hemisphere, so that what is between them takes the shorter way.
+fn in_one_hemisphere(samples: &mut [PoseSample]) {
+    for index in 1..samples.len() {
+        if samples[index].rotation.dot(samples[index - 1].rotation) < 0.0 {
+            samples[index].rotation = -samples[index].rotation;
+        }
+    }
+}
+
+/// A pose that is a mirror or a collapse is none.
+fn usable(affine: &DAffine3) -> bool {
+    affine.is_finite() && affine.matrix3.determinant().abs() > f64::MIN_POSITIVE
+}
+
+impl<'a, 'py> Frames<'a, 'py> {
+    pub(super) fn new(pxr: &'a Pxr<'py>, range: (f64, f64)) -> Self {
+        Self { pxr, caches: RefCell::default(), range }
+    }
+
+    fn operations(&self, prim: &Bound<'py, PyAny>) -> PyResult<Operations<'py>> {
+        let xformable = self.pxr.usd_geom.getattr("Xformable")?.call1((prim,))?;
+        if !xformable.is_truthy()? {
+            return Ok(Operations::None);
+        }
+        let resets = xformable.call_method0("GetResetXformStack")?.is_truthy()?;
+        let ops: Vec<Bound<'py, PyAny>> = xformable.call_method0("GetOrderedXformOps")?.extract()?;
+        let names: Vec<String> =
+            ops.iter().map(|op| values::text(&op.call_method0("GetOpName")?)).collect::<PyResult<_>>()?;
+        match (&ops[..], resets) {
+            ([], false) => Ok(Operations::None),
+            ([translate, orient], false) if names == ["xformOp:translate", "xformOp:orient"] => {
+                let translate = translate.call_method0("GetAttr")?;
+                let orient = orient.call_method0("GetAttr")?;
+                Ok(Operations::Pose { translate, orient })
+            }
+            _ => Ok(Operations::Other),
+        }
+    }
+
+    /// Keys of a prim's own operations.
+    fn keys(&self, prim: &Bound<'py, PyAny>) -> PyResult<Vec<f64>> {
+        let xformable = self.pxr.usd_geom.getattr("Xformable")?.call1((prim,))?;
+        if xformable.is_truthy()? {
+            xformable.call_method0("GetTimeSamples")?.extract()
+        } else {
+            Ok(Vec::new())
+        }
+    }
+
+    /// Exact track of a prim in its parent's frame, where its operations are ours or none.
+    fn exact(&self, operations: &Operations<'py>) -> PyResult<Option<Track>> {
+        let (translate, orient) = match operations {
+            Operations::None => return Ok(Some(Track::still())),
+            Operations::Other => return Ok(None),
+            Operations::Pose { translate, orient } => (translate, orient),
+        };
+        let mut times = values::samples(translate)?;
+        times.extend(values::samples(orient)?);
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        let at = |time: &Bound<'py, PyAny>, time_code: f64| -> PyResult<Option<PoseSample>> {
+            let translation = translate.call_method1("Get", (time,))?;
+            let rotation = orient.call_method1("Get", (time,))?;
+            let translation = if translation.is_none() { DVec3::ZERO } else { values::vec3(&translation)? };
+            let rotation = if rotation.is_none() { DQuat::IDENTITY } else { values::quaternion(&rotation)? };
+            // Rounding to single precision is undone by nobody; anything worse is no rotation.
+            let close = (rotation.length() - 1.0).abs() < 1e-3;
+            Ok((close && translation.is_finite()).then_some(PoseSample { time_code, translation, rotation }))
+        };
+        let Some(rest) = at(&self.pxr.earliest()?, times.first().copied().unwrap_or(0.0))? else {
+            return Ok(None);
+        };
+        let mut samples = Vec::with_capacity(times.len());
+        for time_code in times {
+            match at(&self.pxr.time_code(Some(time_code))?, time_code)? {
+                Some(sample) => samples.push(sample),
+                None => return Ok(None),
+            }
+        }
+        Ok(Some(Track { rest, samples }))
+    }
+
+    /// `world_from_prim`; the earliest time for `None`.
+    pub(super) fn world(&self, prim: &Bound<'py, PyAny>, time: Option<f64>) -> PyResult<DAffine3> {
+        let key = time.map_or(u64::MAX, f64::to_bits);
+        let known = self.caches.borrow().get(&key).cloned();
+        let cache = match known {
+            Some(cache) => cache,
+            None => {
+                let time = match time {
+                    Some(time) => self.pxr.time_code(Some(time))?,
+                    None => self.pxr.earliest()?,
+                };
+                let cache = self.pxr.usd_geom.getattr("XformCache")?.call1((time,))?;
+                self.caches.borrow_mut().insert(key, cache.clone());
+                cache
+            }
+        };
+        let matrix = values::matrix(&cache.call_method1("GetLocalToWorldTransform", (prim,))?)?;
+        Ok(DAffine3::from_mat4(matrix))
+    }
+
+    /// Prims from `prim` up to, but without, `end` or the root.
+    fn chain(
+        &self,
+        prim: &Bound<'py, PyAny>,
+        end: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Vec<Bound<'py, PyAny>>> {
+        let mut chain = Vec::new();
+        let mut at = prim.clone();
+        loop {
+            let stop = match end {
+                Some(end) => at.eq(end)?,
+                None => at.call_method0("IsPseudoRoot")?.is_truthy()?,
+            };
+            if stop || !at.is_truthy()? || at.call_method0("IsPseudoRoot")?.is_truthy()? {
+                return Ok(chain);
+            }
+            chain.push(at.clone());
+            at = at.call_method0("GetParent")?;
+        }
+    }
+
+    /// Exact track of `prim` in the frame of `end` (the world for `None`), where only one prim between them has
+    /// operations, and those are ours.
+    fn exact_between(
+        &self,
+        prim: &Bound<'py, PyAny>,
+        end: Option<&Bound<'py, PyAny>>,
+    ) -> PyResult<Option<Track>> {
+        let mut found = None;
+        for prim in self.chain(prim, end)? {
+            let operations = self.operations(&prim)?;
+            match operations {
+                Operations::None => {}
+                _ if found.is_some() => return Ok(None),
+                _ => found = Some(operations),
+            }
+        }
+        self.exact(&found.unwrap_or(Operations::None))
+    }
+
+    /// Times at which anything between a prim and `end` is sampled. What is not linear between its keys is sampled
+    /// at every frame too.
+    fn times(&self, prim: &Bound<'py, PyAny>, end: Option<&Bound<'py, PyAny>>) -> PyResult<Vec<f64>> {
+        let (mut times, mut movers, mut bent) = (Vec::new(), 0, false);
+        for prim in self.chain(prim, end)? {
+            let keys = self.keys(&prim)?;
+            if keys.len() > 1 {
+                movers += 1;
+                bent |= matches!(self.operations(&prim)?, Operations::Other);
+            }
+            times.extend(keys);
+        }
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        if let (Some(&first), Some(&last)) = (times.first(), times.last())
+            && (movers > 1 || bent)
+        {
+            let (first, last) = (first.min(self.range.0.max(first)).ceil(), last.floor());
+            if last - first <= MOST_FRAMES {
+                let mut frame = first;
+                while frame <= last {
+                    times.push(frame);
+                    frame += 1.0;
+                }
+                times.sort_by(f64::total_cmp);
+                times.dedup();
+            }
+        }
+        Ok(times)
+    }
+
+    /// Track of a prim's frame in the world, without what is not rigid in it; `None` where it collapses.
+    pub(super) fn node(&self, prim: &Bound<'py, PyAny>) -> PyResult<Option<(Track, bool)>> {
+        if let Some(track) = self.exact_between(prim, None)? {
+            return Ok(Some((track, true)));
+        }
+        let first = self.world(prim, None)?;
+        if !usable(&first) {
+            return Ok(None);
+        }
+        let times = self.times(prim, None)?;
+        let rest = pose(times.first().copied().unwrap_or(0.0), &bake::split(&first));
+        let mut samples = Vec::with_capacity(times.len());
+        for &time in &times {
+            let world = self.world(prim, Some(time))?;
+            if !usable(&world) {
+                return Ok(None);
+            }
+            samples.push(pose(time, &bake::split(&world)));
+        }
+        in_one_hemisphere(&mut samples);
+        let moves = samples
+            .iter()
+            .any(|sample| sample.translation != rest.translation || sample.rotation != rest.rotation);
+        if !moves {
+            samples.clear();
+        }
+        Ok(Some((Track { rest, samples }, false)))
+    }
+
+    /// How a splat prim lies in the frame of its node; `None` where it collapses. `exact` tells whether the track is
+    /// that of the owner without loss.
+    pub(super) fn placement(
+        &self,
+        prim: &Bound<'py, PyAny>,
+        owner: &Bound<'py, PyAny>,
+        track: &Track,
+        exact: bool,
+    ) -> PyResult<Option<Placement>> {
+        if exact && let Some(track) = self.exact_between(prim, Some(owner))? {
+            return Ok(Some(Placement::Rigid { track, baked: None }));
+        }
+        let local = |time: Option<f64>| -> PyResult<DAffine3> {
+            let at = match time {
+                Some(time) => cif_scene::graph::pose_at(&track.samples, track.rest.translation, time),
+                None => track.rest,
+            };
+            let at = if track.samples.is_empty() { track.rest } else { at };
+            Ok(affine(&at).inverse() * self.world(prim, time)?)
+        };
+        let first = local(None)?;
+        if !usable(&first) {
+            return Ok(None);
+        }
+        let mut samples = Vec::new();
+        for time in self.times(prim, None)? {
+            let local = local(Some(time))?;
+            if !usable(&local) {
+                return Ok(None);
+            }
+            samples.push((time, local));
+        }
+        let same = |a: &DAffine3, b: &DAffine3| {
+            let scale = 1.0 + a.translation.length();
+            bake::is_identity(&(a.matrix3.inverse() * b.matrix3))
+                && (a.translation - b.translation).length() < 1e-6 * scale
+        };
+        if samples.iter().all(|(_, local)| same(&first, local)) {
+            let identity = bake::is_identity(&first.matrix3) && first.translation.length() < 1e-12;
+            let baked = (!identity).then_some(first);
+            return Ok(Some(Placement::Rigid { track: Track::still(), baked }));
+        }
+        let rest = bake::split(&first);
+        let splits: Vec<(f64, Split)> =
+            samples.iter().map(|(time, local)| (*time, bake::split(local))).collect();
+        if splits.iter().all(|(_, split)| bake::is_identity(&(rest.rest.inverse() * split.rest))) {
+            let mut samples: Vec<PoseSample> =
+                splits.iter().map(|(time, split)| pose(*time, split)).collect();
+            in_one_hemisphere(&mut samples);
+            let baked = (!bake::is_identity(&rest.rest)).then(|| DAffine3::from_mat3(rest.rest));
+            let track = Track { rest: pose(samples[0].time_code, &rest), samples };
+            return Ok(Some(Placement::Rigid { track, baked }));
+        }
+        Ok(Some(Placement::Sampled(samples)))
+    }
+}
+
+impl Placement {
+    /// `node_from_prim` at a time code.
+    pub(super) fn at(&self, time_code: f64) -> DAffine3 {
+        match self {
+            Self::Rigid { track, baked } => {
+                let at = if track.samples.is_empty() {
+                    track.rest
+                } else {
+                    cif_scene::graph::pose_at(&track.samples, track.rest.translation, time_code)
+                };
+                affine(&at) * baked.unwrap_or(DAffine3::IDENTITY)
+            }
+            Self::Sampled(samples) => {
+                let nearest =
+                    samples.iter().min_by(|a, b| (a.0 - time_code).abs().total_cmp(&(b.0 - time_code).abs()));
+                nearest.map_or(DAffine3::IDENTITY, |(_, affine)| *affine)
+            }
+        }
+    }
+
+    /// Times at which it is sampled.
+    pub(super) fn times(&self) -> Vec<f64> {
+        match self {
+            Self::Rigid { track, .. } => track.samples.iter().map(|sample| sample.time_code).collect(),
+            Self::Sampled(samples) => samples.iter().map(|(time, _)| *time).collect(),
+        }
+    }
+}

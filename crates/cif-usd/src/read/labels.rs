@@ -1,0 +1,158 @@
+//! What a prim is called, whose it is, and when it can be seen.
+
+use cif_scene::{MotionModel, VisibilitySample, naming};
+use pyo3::prelude::*;
+
+use super::values::{attribute, plain, samples, text, value};
+use crate::pxr::Pxr;
+use crate::tokens::{self, instance};
+
+/// What our schema says about a prim.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Recorded {
+    pub(super) background: bool,
+    pub(super) id: Option<u16>,
+    pub(super) index: Option<usize>,
+    pub(super) label: Option<String>,
+    pub(super) category: Option<String>,
+    pub(super) model: Option<MotionModel>,
+    pub(super) source_frames: Option<(usize, usize)>,
+    pub(super) mean_occupancy: Option<f32>,
+    pub(super) pivot: Option<glam::DVec3>,
+    pub(super) report: Option<String>,
+}
+
+/// Our properties, where they are authored: by name, so that the schema need not be installed.
+pub(super) fn recorded<'py>(pxr: &Pxr<'py>, prim: &Bound<'py, PyAny>) -> PyResult<Option<Recorded>> {
+    let time = pxr.earliest()?;
+    let Some(kind) = plain::<String>(prim, instance::KIND, &time)? else { return Ok(None) };
+    let int = |name: &str| plain::<i64>(prim, name, &time);
+    let pivot = value(prim, instance::PIVOT, &time)?.and_then(|value| super::values::vec3(&value).ok());
+    let frames = value(prim, instance::SOURCE_FRAMES, &time)?
+        .and_then(|value| super::values::vector::<2>(&value).ok())
+        .map(|[first, last]| (first.max(0.0) as usize, last.max(0.0) as usize));
+    let model = plain::<String>(prim, instance::MODEL, &time)?;
+    Ok(Some(Recorded {
+        background: kind == instance::KIND_BACKGROUND,
+        id: int(instance::ID)?.and_then(|id| u16::try_from(id).ok()).filter(|&id| id > 0),
+        index: int(instance::INDEX)?.and_then(|index| usize::try_from(index).ok()),
+        label: plain(prim, instance::LABEL, &time)?,
+        category: plain(prim, instance::CATEGORY, &time)?,
+        model: model.and_then(|model| serde_json::from_value(serde_json::Value::String(model)).ok()),
+        source_frames: frames,
+        mean_occupancy: plain(prim, instance::MEAN_OCCUPANCY, &time)?,
+        pivot: pivot.filter(|pivot| pivot.is_finite()),
+        report: plain(prim, instance::REPORT, &time)?,
+    }))
+}
+
+/// Semantic labels of a prim in a taxonomy.
+pub(super) fn in_taxonomy<'py>(
+    pxr: &Pxr<'py>,
+    prim: &Bound<'py, PyAny>,
+    taxonomy: &str,
+) -> PyResult<Vec<String>> {
+    let name = format!("{}:{taxonomy}", tokens::LABELS);
+    let Some(labels) = value(prim, &name, &pxr.earliest()?)? else { return Ok(Vec::new()) };
+    let Ok(labels) = labels.try_iter() else { return Ok(Vec::new()) };
+    labels.map(|label| text(&label?)).collect()
+}
+
+/// Taxonomies that a prim has labels in, in order of their names.
+pub(super) fn taxonomies(prim: &Bound<'_, PyAny>) -> PyResult<Vec<String>> {
+    let properties = prim.call_method1("GetAuthoredPropertiesInNamespace", (tokens::LABELS,))?;
+    let mut taxonomies = Vec::new();
+    for property in properties.try_iter()? {
+        let name = text(&property?.call_method0("GetName")?)?;
+        taxonomies.extend(
+            name.strip_prefix(tokens::LABELS).and_then(|rest| rest.strip_prefix(':')).map(str::to_owned),
+        );
+    }
+    taxonomies.sort();
+    Ok(taxonomies)
+}
+
+/// Human label and class of a prim.
+pub(super) fn names<'py>(
+    pxr: &Pxr<'py>,
+    prim: &Bound<'py, PyAny>,
+    recorded: &Recorded,
+) -> PyResult<(String, String)> {
+    let name = text(&prim.call_method0("GetName")?)?;
+    let display: String = text(&prim.call_method0("GetDisplayName")?)?;
+    let user: Option<String> = plain(prim, tokens::USER_LABEL, &pxr.earliest()?)?;
+    let mut class = in_taxonomy(pxr, prim, tokens::TAXONOMY_CLASS)?;
+    if class.is_empty() {
+        for taxonomy in taxonomies(prim)? {
+            if taxonomy != tokens::TAXONOMY_INSTANCE && class.is_empty() {
+                class = in_taxonomy(pxr, prim, &taxonomy)?;
+            }
+        }
+    }
+    let human = class.get(1).or(class.first()).cloned();
+    let spoken = [user, Some(display), human].map(|text| text.filter(|text| !text.trim().is_empty()));
+    let label = match &recorded.label {
+        // Ours says the same everywhere: what differs was changed.
+        Some(before) => {
+            spoken.into_iter().flatten().find(|text| text != before).unwrap_or_else(|| before.clone())
+        }
+        None => {
+            let instance = in_taxonomy(pxr, prim, tokens::TAXONOMY_INSTANCE)?.into_iter().next();
+            spoken.into_iter().flatten().next().or(instance).unwrap_or_else(|| name.clone())
+        }
+    };
+    let category = match (class.first(), &recorded.category) {
+        (Some(class), _) => class.clone(),
+        (None, Some(before)) => before.clone(),
+        (None, None) => label.clone(),
+    };
+    Ok((label, category))
+}
+
+/// Name of a node for a prim: its own, made usable and unique.
+pub(super) fn node_name(prim: &Bound<'_, PyAny>, taken: &[String]) -> PyResult<String> {
+    let name = text(&prim.call_method0("GetName")?)?;
+    let usable = name.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
+        && name.chars().all(|character| character.is_ascii_alphanumeric() || character == '_');
+    let name = if usable { name } else { naming::identifier(&name, "instance") };
+    Ok(naming::unique(name, |name| taken.iter().any(|taken| taken == name)))
+}
+
+/// Changes of visibility of a prim, through its own attribute and those of its ancestors.
+pub(super) fn visibility<'py>(
+    pxr: &Pxr<'py>,
+    prim: &Bound<'py, PyAny>,
+    start: f64,
+) -> PyResult<Vec<VisibilitySample>> {
+    let mut attributes = Vec::new();
+    let mut at = prim.clone();
+    while at.is_truthy()? && !at.call_method0("IsPseudoRoot")?.is_truthy()? {
+        attributes.extend(attribute(&at, "visibility")?);
+        at = at.call_method0("GetParent")?;
+    }
+    let mut times = Vec::new();
+    for attribute in &attributes {
+        times.extend(samples(attribute)?);
+    }
+    times.sort_by(f64::total_cmp);
+    times.dedup();
+    let visible = |time: &Bound<'py, PyAny>| -> PyResult<bool> {
+        for attribute in &attributes {
+            let value = attribute.call_method1("Get", (time,))?;
+            if !value.is_none() && text(&value)? == tokens::INVISIBLE {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    };
+    if times.is_empty() {
+        let visible = visible(&pxr.earliest()?)?;
+        return Ok(if visible { Vec::new() } else { vec![VisibilitySample { time_code: start, visible }] });
+    }
+    times
+        .into_iter()
+        .map(|time_code| {
+            Ok(VisibilitySample { time_code, visible: visible(&pxr.time_code(Some(time_code))?)? })
+        })
+        .collect()
+}

@@ -1,0 +1,15 @@
+//! Stages as scene graphs, and prims by label.
+
+mod arrays;
+mod bake;
+mod cameras;
+mod frames;
+mod labels;
+mod nodes;
+pub(crate) mod open;
+pub(crate) mod query;
+mod splats;
+mod stage;
+mod values;
+
+pub(crate) use stage::scene;

@@ -1,0 +1,385 @@
+//! A stage as a scene graph.
+
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use cif_field::SortMetric;
+use cif_scene::{Node, NodeKind, Origin, SceneGraph, SceneOptions, TimeCodes, UpAxis};
+use pyo3::prelude::*;
+
+use super::arrays::Arrays;
+use super::frames::Frames;
+use super::labels::{self, Recorded};
+use super::nodes::{self, Owner};
+use super::splats::SplatPrim;
+use super::values::{self, plain, text};
+use super::{cameras, open};
+use crate::pxr::{self, Pxr, reason};
+use crate::{ReadOptions, UsdError, tokens};
+
+/// Time codes per second where nobody says.
+const FRAMES_PER_SECOND: f64 = 24.0;
+
+/// What every part of the reader sees.
+pub(super) struct Reading<'a, 'py> {
+    pub(super) pxr: &'a Pxr<'py>,
+    path: &'a Path,
+    pub(super) arrays: Arrays<'a, 'py>,
+    pub(super) frames: Frames<'a, 'py>,
+    /// First time code.
+    pub(super) start: f64,
+    /// First and last frame, for nodes that do not say theirs.
+    pub(super) source_frames: (usize, usize),
+    warnings: RefCell<Vec<String>>,
+}
+
+impl Reading<'_, '_> {
+    pub(super) fn python(&self, error: &PyErr) -> UsdError {
+        UsdError::Python { reason: reason(self.pxr.py, error) }
+    }
+
+    pub(super) fn prim_error(&self, prim: &str, problem: String, fix: &'static str) -> UsdError {
+        UsdError::Prim { path: self.path.to_owned(), prim: prim.to_owned(), problem, fix }
+    }
+
+    pub(super) fn warn(&self, warning: String) {
+        self.warnings.borrow_mut().push(warning);
+    }
+}
+
+/// What our mark on a layer says.
+#[derive(Default)]
+struct Mark {
+    ours: bool,
+    generator: String,
+    layout: i64,
+    times: Vec<f64>,
+    codes: Vec<f64>,
+    background: [f32; 3],
+    omitted: Vec<String>,
+    warnings: Vec<String>,
+    sort: Option<String>,
+    origin: Origin,
+}
+
+pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, UsdError> {
+    pxr::with(|pxr| {
+        let (stage, bytes) = open::open_with_layers(pxr, path, options.follow_external)?;
+        let failed = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
+        let mark = mark(&stage).map_err(failed)?;
+        let expected = i64::from(tokens::LAYOUT_VERSION);
+        if mark.ours && mark.layout != expected {
+            let (path, generator, found) = (path.to_owned(), mark.generator, mark.layout);
+            return Err(UsdError::Layout { path, generator, found, expected });
+        }
+        let number =
+            |name: &str, fallback: f64| info::<f64>(&stage, name).map(|value| value.unwrap_or(fallback));
+        let start = number("startTimeCode", 0.0).map_err(failed)?;
+        let end = number("endTimeCode", start).map_err(failed)?;
+        let last =
+            |codes: &[f64], otherwise: f64| codes.last().copied().unwrap_or(otherwise).max(0.0) as usize;
+        let reading = Reading {
+            pxr,
+            path,
+            arrays: Arrays::new(pxr, bytes).map_err(failed)?,
+            frames: Frames::new(pxr, (start, end)),
+            start: mark.codes.first().copied().unwrap_or(start),
+            source_frames: (
+                mark.codes.first().copied().unwrap_or(start).max(0.0) as usize,
+                last(&mark.codes, end),
+            ),
+            warnings: RefCell::default(),
+        };
+        read(&reading, &stage, mark)
+    })
+}
+
+fn read<'py>(
+    reading: &Reading<'_, 'py>,
+    stage: &Bound<'py, PyAny>,
+    mark: Mark,
+) -> Result<SceneGraph, UsdError> {
+    let failed = |error: PyErr| reading.python(&error);
+    let (owners, camera_prims) = survey(reading, stage).map_err(failed)?;
+    if owners.is_empty() {
+        return Err(UsdError::NoSplats { path: reading.path.to_owned() });
+    }
+    let kinds = kinds(reading, &owners).map_err(failed)?;
+    let mut nodes: Vec<Node> = Vec::with_capacity(owners.len());
+    for (owner, kind) in owners.iter().zip(kinds) {
+        let taken: Vec<String> = nodes.iter().map(|node| node.name.clone()).collect();
+        nodes.push(nodes::read(reading, owner, kind, &taken)?);
+    }
+    let mut cameras = Vec::with_capacity(camera_prims.len());
+    for prim in &camera_prims {
+        let taken: Vec<String> =
+            cameras.iter().map(|camera: &cif_scene::CameraTrack| camera.name.clone()).collect();
+        cameras.extend(cameras::read(reading, prim, &taken).map_err(failed)?);
+    }
+    let text_info = |name: &str| info::<String>(stage, name).map_err(failed);
+    let up_axis = match text_info("upAxis")?.as_deref() {
+        Some("Z") => UpAxis::Z,
+        _ => UpAxis::Y,
+    };
+    // 0.01 is USD's own fallback.
+    let meters_per_unit = info::<f64>(stage, "metersPerUnit").map_err(failed)?.unwrap_or(0.01);
+    if !(meters_per_unit.is_finite() && meters_per_unit > 0.0) {
+        let problem = format!("metersPerUnit is {meters_per_unit}");
+        return Err(reading.prim_error("/", problem, "set it to the metres of one unit, for example 1"));
+    }
+    let rate = info::<f64>(stage, "timeCodesPerSecond").map_err(failed)?;
+    let frames_per_second = rate.filter(|rate| rate.is_finite() && *rate > 0.0).unwrap_or(FRAMES_PER_SECOND);
+    let sort = match &mark.sort {
+        Some(sort) => Some(sort.clone()),
+        None => plain(&owners[0].splats[0].prim, "sortingModeHint", &reading.pxr.earliest().map_err(failed)?)
+            .map_err(failed)?,
+    };
+    let time_codes = time_codes(&mark, &nodes, reading.start, frames_per_second);
+    let mut warnings = mark.warnings;
+    warnings.extend(reading.warnings.take());
+    Ok(SceneGraph {
+        up_axis,
+        meters_per_unit,
+        time_codes,
+        nodes,
+        cameras,
+        background_color: mark.background,
+        sort_metric: match sort.as_deref() {
+            Some(tokens::SORT_CAMERA_DISTANCE) => SortMetric::Distance,
+            _ => SortMetric::Z,
+        },
+        omitted: mark.omitted,
+        warnings,
+        origin: mark.origin,
+    })
+}
+
+/// Layers whose opinions count for the stage itself, strongest first.
+fn layers<'py>(stage: &Bound<'py, PyAny>) -> PyResult<Vec<Bound<'py, PyAny>>> {
+    stage.call_method1("GetLayerStack", (false,))?.try_iter()?.collect()
+}
+
+/// Metadata of the strongest layer that has it. USD itself looks at the root layer only, but a layer of edits over
+/// ours need not repeat what ours says.
+fn info<'py, T: for<'a> FromPyObject<'a, 'py>>(stage: &Bound<'py, PyAny>, name: &str) -> PyResult<Option<T>> {
+    for layer in layers(stage)? {
+        let root = layer.getattr("pseudoRoot")?;
+        if root.call_method1("HasInfo", (name,))?.is_truthy()? {
+            return Ok(root.call_method1("GetInfo", (name,))?.extract().ok());
+        }
+    }
+    Ok(None)
+}
+
+/// Our mark on the strongest layer that has it.
+fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
+    for layer in layers(stage)? {
+        let data = layer.getattr("customLayerData")?;
+        if !data.contains(tokens::CIF)? {
+            continue;
+        }
+        let ours = data.get_item(tokens::CIF)?;
+        let get = |key: &str| -> PyResult<Option<Bound<'_, PyAny>>> {
+            if ours.contains(key)? { ours.get_item(key).map(Some) } else { Ok(None) }
+        };
+        let string =
+            |key: &str| -> PyResult<Option<String>> { Ok(get(key)?.and_then(|value| value.extract().ok())) };
+        let list = |key: &str| -> PyResult<Vec<Bound<'_, PyAny>>> {
+            match get(key)? {
+                Some(values) => values.try_iter()?.collect(),
+                None => Ok(Vec::new()),
+            }
+        };
+        let numbers =
+            |key: &str| -> PyResult<Vec<f64>> { list(key)?.iter().map(|value| value.extract()).collect() };
+        let strings = |key: &str| -> PyResult<Vec<String>> { list(key)?.iter().map(text).collect() };
+        let background = match get(tokens::BACKGROUND_COLOR)? {
+            Some(color) => values::vector::<3>(&color)?.map(|channel| channel as f32),
+            None => [0.0; 3],
+        };
+        let options = string(tokens::OPTIONS)?;
+        return Ok(Mark {
+            ours: true,
+            generator: string(tokens::GENERATOR)?.unwrap_or_else(|| tokens::CIF.to_owned()),
+            layout: get(tokens::LAYOUT)?.and_then(|layout| layout.extract().ok()).unwrap_or(0),
+            times: numbers(tokens::SAMPLE_TIMES)?,
+            codes: numbers(tokens::SAMPLE_CODES)?,
+            background,
+            omitted: strings(tokens::OMITTED)?,
+            warnings: strings(tokens::WARNINGS)?,
+            sort: string(tokens::SORT)?,
+            origin: Origin {
+                field_fingerprint: string(tokens::FIELD_FINGERPRINT)?,
+                options: options.and_then(|text| serde_json::from_str::<SceneOptions>(&text).ok()),
+            },
+        });
+    }
+    Ok(Mark::default())
+}
+
+/// Sampled time codes: those of the export, else all at which a node is sampled.
+fn time_codes(mark: &Mark, nodes: &[Node], start: f64, frames_per_second: f64) -> TimeCodes {
+    if !mark.codes.is_empty() && mark.codes.len() == mark.times.len() {
+        return TimeCodes { samples: mark.codes.clone(), times: mark.times.clone(), frames_per_second };
+    }
+    let mut samples: Vec<f64> = Vec::new();
+    for node in nodes {
+        samples.extend(node.track().iter().map(|sample| sample.time_code));
+        samples.extend(node.visibility.iter().map(|sample| sample.time_code));
+        match &node.motion {
+            cif_scene::Motion::Dense(dense) => samples.extend(dense.samples.iter().map(|s| s.time_code)),
+            cif_scene::Motion::Parts(motion) => {
+                let tracks = motion.parts.iter().flat_map(|part| &part.track);
+                samples.extend(tracks.map(|sample| sample.time_code));
+            }
+            _ => {}
+        }
+    }
+    samples.sort_by(f64::total_cmp);
+    samples.dedup();
+    if samples.is_empty() {
+        samples.push(start);
+    }
+    let (first, last) = (samples[0], samples[samples.len() - 1]);
+    let length = if last > first { last - first } else { 1.0 };
+    let times = samples.iter().map(|code| (code - first) / length).collect();
+    TimeCodes { samples, times, frames_per_second }
+}
+
+/// Prims that become nodes, in stage order, and cameras.
+fn survey<'py>(
+    reading: &Reading<'_, 'py>,
+    stage: &Bound<'py, PyAny>,
+) -> PyResult<(Vec<Owner<'py>>, Vec<Bound<'py, PyAny>>)> {
+    let pxr = reading.pxr;
+    let predicate = pxr.usd.call_method1("TraverseInstanceProxies", ())?;
+    let (mut found, mut cameras) = (Vec::new(), Vec::new());
+    for prim in stage.call_method1("Traverse", (predicate,))?.try_iter()? {
+        let prim = prim?;
+        let type_name = text(&prim.call_method0("GetTypeName")?)?;
+        if type_name == "Camera" {
+            cameras.push(prim);
+        } else if type_name == tokens::GAUSSIAN_SPLAT {
+            let splats = SplatPrim { path: values::path(&prim)?, prim };
+            if splats.has_positions()? {
+                found.push(splats);
+            } else {
+                reading.warn(format!("{}: no positions, left out", splats.path));
+            }
+        }
+    }
+    let single = found.len() == 1;
+    let mut owners: Vec<Owner<'py>> = Vec::new();
+    let mut places: BTreeMap<String, usize> = BTreeMap::new();
+    for splats in found {
+        let (prim, recorded) = owner_of(pxr, &splats.prim, single)?;
+        let path = values::path(&prim)?;
+        let place = *places.entry(path.clone()).or_insert(owners.len());
+        if place == owners.len() {
+            owners.push(Owner { prim, path, recorded, splats: Vec::new() });
+        }
+        owners[place].splats.push(splats);
+    }
+    for owner in &mut owners {
+        if owner.splats.len() > 1 {
+            let mut numbered = Vec::with_capacity(owner.splats.len());
+            for splats in owner.splats.drain(..) {
+                let carrier = splats.carrier(&owner.prim)?;
+                let index: Option<i64> = plain(&carrier, tokens::PART_INDEX, &pxr.earliest()?)?;
+                numbered.push((index.unwrap_or(i64::MAX), splats));
+            }
+            numbered.sort_by_key(|(index, _)| *index);
+            owner.splats.extend(numbered.into_iter().map(|(_, splats)| splats));
+        }
+    }
+    Ok((owners, cameras))
+}
+
+/// The prim that a splat prim belongs to: with our schema, else with labels, else a component, else itself.
+fn owner_of<'py>(
+    pxr: &Pxr<'py>,
+    splats: &Bound<'py, PyAny>,
+    single: bool,
+) -> PyResult<(Bound<'py, PyAny>, Recorded)> {
+    let mut chain = Vec::new();
+    let mut at = splats.clone();
+    while at.is_truthy()? && !at.call_method0("IsPseudoRoot")?.is_truthy()? {
+        chain.push(at.clone());
+        at = at.call_method0("GetParent")?;
+    }
+    for prim in &chain {
+        if let Some(recorded) = labels::recorded(pxr, prim)? {
+            return Ok((prim.clone(), recorded));
+        }
+    }
+    for prim in &chain {
+        if !labels::taxonomies(prim)?.is_empty() {
+            return Ok((prim.clone(), Recorded::default()));
+        }
+    }
+    for prim in &chain {
+        let kind = pxr.usd.getattr("ModelAPI")?.call1((prim,))?.call_method0("GetKind")?;
+        if matches!(text(&kind)?.as_str(), "component" | "subcomponent") {
+            return Ok((prim.clone(), Recorded::default()));
+        }
+    }
+    // A plain scan is no object.
+    Ok((splats.clone(), Recorded { background: single, ..Recorded::default() }))
+}
+
+/// Kind of every node: recorded ids first, then free ones in order.
+fn kinds<'py>(reading: &Reading<'_, 'py>, owners: &[Owner<'py>]) -> PyResult<Vec<NodeKind>> {
+    let mut first: BTreeMap<u16, &str> = BTreeMap::new();
+    for owner in owners.iter().filter(|owner| !owner.recorded.background) {
+        let Some(id) = owner.recorded.id else { continue };
+        let original = is_original(reading.pxr, owner)?;
+        match first.get(&id) {
+            None => {
+                first.insert(id, &owner.path);
+            }
+            Some(known) => {
+                let (original, copy) =
+                    if original { (owner.path.as_str(), *known) } else { (*known, owner.path.as_str()) };
+                reading.warn(format!("{copy} is a copy of {original} (instance {id})"));
+                first.insert(id, original);
+            }
+        }
+    }
+    let mut indices =
+        owners.iter().filter_map(|owner| owner.recorded.index).max().map_or(0, |index| index + 1);
+    let mut next = 1_u16;
+    let mut kinds = Vec::with_capacity(owners.len());
+    for owner in owners {
+        let recorded = &owner.recorded;
+        if recorded.background {
+            kinds.push(NodeKind::Background);
+            continue;
+        }
+        let (id, index) = match (recorded.id, recorded.index) {
+            (Some(id), Some(index)) => (id, index),
+            (id, _) => {
+                let id = match id {
+                    Some(id) => id,
+                    None => {
+                        while first.contains_key(&next) && next < u16::MAX {
+                            next += 1;
+                        }
+                        first.insert(next, &owner.path);
+                        next
+                    }
+                };
+                indices += 1;
+                (id, indices - 1)
+            }
+        };
+        kinds.push(NodeKind::Instance { id, index });
+    }
+    Ok(kinds)
+}
+
+/// Whether a prim of ours is still called as its `instance` label says.
+fn is_original<'py>(pxr: &Pxr<'py>, owner: &Owner<'py>) -> PyResult<bool> {
+    let name = text(&owner.prim.call_method0("GetName")?)?;
+    Ok(labels::in_taxonomy(pxr, &owner.prim, tokens::TAXONOMY_INSTANCE)?.contains(&name))
+}
