@@ -62,6 +62,17 @@ pub(crate) fn motion_model(name: &str) -> PyResult<MotionModel> {
     }
 }
 
+pub(crate) fn payloads(name: &str) -> PyResult<cif_usd::Payloads> {
+    match name {
+        "by-kind" => Ok(cif_usd::Payloads::ByKind),
+        "separate" => Ok(cif_usd::Payloads::Separate),
+        "single-file" => Ok(cif_usd::Payloads::SingleFile),
+        _ => {
+            Err(PyValueError::new_err(format!("payloads '{name}': choose by-kind, separate or single-file")))
+        }
+    }
+}
+
 fn build(
     py: Python<'_>,
     field: &Field,
@@ -85,9 +96,8 @@ pub(crate) fn export<'py>(
     path: &Path,
     options: &SceneOptions,
     motion: Option<Bound<'py, PyAny>>,
-    force: bool,
+    export_options: cif_usd::ExportOptions,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let export_options = cif_usd::ExportOptions { force, ..cif_usd::ExportOptions::default() };
     cif_usd::check_target(path, export_options).map_err(cif_error)?;
     let graph = build(py, field, options, motion)?;
     let summary = py.detach(|| cif_usd::export(&graph, path, export_options)).map_err(cif_error)?;

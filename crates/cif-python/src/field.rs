@@ -337,7 +337,8 @@ impl Field {
 
     #[pyo3(signature = (path, *, tolerance="1%", motion=None, most_expensive_motion="dense", frames=None,
                         frame_step=1, up_axis="z", background_threshold=None, proxy_points=None, max_parts=8,
-                        reduce_keys=true, hulls=1, background_hulls=0, force=false))]
+                        reduce_keys=true, hulls=1, background_hulls=0, payloads="by-kind",
+                        levels_of_detail=true, force=false))]
     #[expect(clippy::too_many_arguments, reason = "keyword arguments of a method")]
     fn export<'py>(
         &self,
@@ -355,6 +356,8 @@ impl Field {
         reduce_keys: bool,
         hulls: usize,
         background_hulls: usize,
+        payloads: &str,
+        levels_of_detail: bool,
         force: bool,
     ) -> PyResult<Bound<'py, PyDict>> {
         let defaults = cif_scene::SceneOptions::default();
@@ -372,7 +375,9 @@ impl Field {
             background_hulls,
             ..defaults
         };
-        export::export(py, self, &path, &options, motion, force)
+        let export_options =
+            cif_usd::ExportOptions { force, payloads: export::payloads(payloads)?, levels_of_detail };
+        export::export(py, self, &path, &options, motion, export_options)
     }
 }
 

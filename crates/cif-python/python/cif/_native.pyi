@@ -7,7 +7,7 @@ Conventions: right-handed world in metres; cameras look along +z with x right an
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,13 +172,17 @@ class Field:
         reduce_keys: bool = True,
         hulls: int = 1,
         background_hulls: int = 0,
+        payloads: Literal["by-kind", "separate", "single-file"] = "by-kind",
+        levels_of_detail: bool = True,
         force: bool = False,
     ) -> dict[str, Any]:
         """Write a .usda, .usdc or .usdz stage with one prim per object.
 
         motion replaces the trained deformation by a function of time that returns means [N, 3] and quaternions
         [N, 4]. most_expensive_motion is static, rigid, parts or dense. hulls and background_hulls are the most
-        convex colliders of an object and of the background. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
+        convex colliders of an object and of the background. payloads puts the arrays of objects beside the
+        stage (by-kind: for .usda) or into it; levels_of_detail adds variants with half and a quarter of the
+        splats. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
         replaced with force.
         """
 

@@ -1,7 +1,11 @@
 //! Stages written, read back, edited and damaged; with a Python that has usd-core (`make test-usd`).
 
+mod damaged;
+mod edited;
+mod foreign;
 mod round_trip;
 mod scenes;
+mod schema;
 
 use std::path::Path;
 

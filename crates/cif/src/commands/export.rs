@@ -53,6 +53,16 @@ pub(super) struct Export {
     /// Splats with less instance mass are background
     #[arg(long, value_name = "MASS")]
     background_threshold: Option<f32>,
+    /// Put the arrays of every object into a file of its own, OUT.payloads/NAME.usdc, loaded on demand;
+    /// .usda does so anyway
+    #[arg(long, conflicts_with = "single_file")]
+    payloads: bool,
+    /// Keep everything in one file; .usdc and .usdz do so anyway
+    #[arg(long)]
+    single_file: bool,
+    /// Leave out the variants with half and a quarter of the splats
+    #[arg(long)]
+    no_lod: bool,
     /// Most points of an object's stand-in; 0 for none
     #[arg(long, value_name = "N")]
     proxy_points: Option<usize>,
@@ -126,7 +136,12 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
 }
 
 fn writing(command: &Export) -> cif_usd::ExportOptions {
-    cif_usd::ExportOptions { force: command.force, ..cif_usd::ExportOptions::default() }
+    let payloads = match (command.payloads, command.single_file) {
+        (true, _) => cif_usd::Payloads::Separate,
+        (_, true) => cif_usd::Payloads::SingleFile,
+        _ => cif_usd::Payloads::ByKind,
+    };
+    cif_usd::ExportOptions { force: command.force, payloads, levels_of_detail: !command.no_lod }
 }
 
 fn options(command: &Export) -> SceneOptions {

@@ -1,0 +1,242 @@
+//! Stages that cannot be read, each with an error that names the prim or file and the fix.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use super::{python, scenes::Maker, session};
+use crate::{ExportOptions, ReadOptions, UsdError, export, read_scene, read_scene_with};
+
+/// One splat prim of two splats under /World/Thing, with `change` made to it before saving.
+pub(super) fn stage_with(folder: &Path, change: &str) -> PathBuf {
+    let path = folder.join("thing.usda");
+    let program = format!(
+        "
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSemantics, UsdVol, Vt
+stage = Usd.Stage.CreateNew(path)
+UsdGeom.SetStageUpAxis(stage, 'Z')
+UsdGeom.SetStageMetersPerUnit(stage, 1)
+world = UsdGeom.Xform.Define(stage, '/World')
+stage.SetDefaultPrim(world.GetPrim())
+thing = UsdGeom.Xform.Define(stage, '/World/Thing')
+splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, '/World/Thing/Cloud')
+prim = splats.GetPrim()
+splats.CreatePositionsAttr([(0, 0, 0), (1, 2, 3)])
+splats.CreateOrientationsAttr([Gf.Quatf(1, 0, 0, 0), Gf.Quatf(0.6, 0.8, 0, 0)])
+splats.CreateScalesAttr([(0.1, 0.2, 0.3), (0.3, 0.2, 0.1)])
+splats.CreateOpacitiesAttr([0.5, 1])
+splats.CreateRadianceSphericalHarmonicsDegreeAttr(0)
+sh = splats.CreateRadianceSphericalHarmonicsCoefficientsAttr([(1, 0, 0), (0, 1, 0)])
+sh.SetMetadata('elementSize', 1)
+{change}
+stage.Save()
+"
+    );
+    python(&path, &program);
+    path
+}
+
+#[test]
+fn splats_that_make_no_sense_are_named() {
+    let _session = session();
+    let cases = [
+        (
+            "splats.GetPositionsAttr().Set([(0, 0, 0), (1, float('nan'), 3)])",
+            "/World/Thing/Cloud: position 1 is not finite",
+        ),
+        (
+            "splats.GetOrientationsAttr().Set([Gf.Quatf(0, 0, 0, 0), Gf.Quatf(1, 0, 0, 0)])",
+            "orientation 0 (0, 0, 0, 0) has no direction; make it a unit",
+        ),
+        ("splats.GetOrientationsAttr().Set([Gf.Quatf(1, 0, 0, 0)])", "2 positions, but 1 orientations"),
+        ("splats.GetScalesAttr().Set([(1, 1, 1)] * 3)", "2 positions, but 3 scales"),
+        (
+            "splats.GetScalesAttr().Set([(1, 1, 1), (-1, 1, 1)])",
+            "scale 1 [-1.0, 1.0, 1.0] is no standard deviation",
+        ),
+        ("splats.GetScalesAttr().Clear()", "no scales"),
+        ("splats.GetOpacitiesAttr().Set([0.5, 7])", "opacity 1 is 7; opacities are probabilities"),
+        ("splats.GetOpacitiesAttr().Set([0.5])", "2 positions, but 1 opacities"),
+        (
+            "splats.GetRadianceSphericalHarmonicsDegreeAttr().Set(9)",
+            "radiance:sphericalHarmonicsDegree is 9; degrees 0 to 3",
+        ),
+        (
+            "splats.GetRadianceSphericalHarmonicsDegreeAttr().Set(-1)",
+            "radiance:sphericalHarmonicsDegree is -1",
+        ),
+        (
+            "splats.GetRadianceSphericalHarmonicsDegreeAttr().Set(2)",
+            "elementSize of the coefficients is 1, and degree 2 has 9",
+        ),
+        ("sh.SetMetadata('elementSize', 1000000000)", "elementSize of the coefficients is 1000000000"),
+        ("sh.Set([(1, 0, 0)] * 5)", "2 positions, but 5 coefficients of degree 0"),
+        ("sh.Set([(1, 0, 0), (float('inf'), 0, 0)])", "coefficient of splat 1 is not finite"),
+        ("splats.GetPositionsAttr().Clear()", "holds no splats"),
+        ("prim.SetActive(False)", "holds no splats"),
+        ("stage.RemovePrim('/World/Thing')", "holds no splats"),
+        ("thing.AddScaleOp().Set(Gf.Vec3f(1, 0, 1))", "its transform flattens everything"),
+        ("UsdGeom.SetStageMetersPerUnit(stage, 0)", "metersPerUnit is 0"),
+        (
+            "splats.GetPositionsAttr().Set([(0, 0, 0), (1, 2, 3)], 1)\nsplats.GetPositionsAttr().Set([(0, 0, 0)], 2)\n",
+            "2 positions, but 1",
+        ),
+        (
+            "a = UsdGeom.PrimvarsAPI(prim).CreatePrimvar('cif:row', Sdf.ValueTypeNames.IntArray, 'vertex')\na.Set([1, 2])\na.SetIndices([0, 7])",
+            "an index of primvars:cif:row is outside its 2 values",
+        ),
+        (
+            "a = UsdGeom.PrimvarsAPI(prim).CreatePrimvar('cif:occupancy', Sdf.ValueTypeNames.FloatArray, 'vertex')\na.Set([1, -2])",
+            "primvars:cif:occupancy 1 is -2",
+        ),
+    ];
+    for (change, expected) in cases {
+        let folder = tempfile::tempdir().unwrap();
+        let path = stage_with(folder.path(), change);
+        let error = read_scene(&path).unwrap_err().to_string();
+        assert!(error.contains(expected) && error.contains("thing.usda"), "{change}: {error}");
+    }
+}
+
+#[test]
+fn files_that_are_no_stages_are_named() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let none = folder.path().join("none.usdc");
+    assert!(matches!(read_scene(&none), Err(UsdError::NotFound { .. })));
+    for (name, bytes) in [
+        ("text.usda", &b"hello"[..]),
+        ("short.usdc", b"PXR-USDC\0\0"),
+        ("zip.usdz", b"PK\x03\x04"),
+        ("empty.usda", b""),
+    ] {
+        let path = folder.path().join(name);
+        fs::write(&path, bytes).unwrap();
+        let error = read_scene(&path).unwrap_err();
+        assert!(matches!(error, UsdError::Unreadable { .. }), "{name}: {error}");
+        assert!(error.to_string().contains(name), "{error}");
+    }
+}
+
+#[test]
+fn claims_beyond_the_file_are_refused() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("claim.usdc");
+    python(
+        &path,
+        "
+import numpy as np, struct
+from pxr import Usd, UsdVol, Vt
+n, chance = 1000, np.random.default_rng(1)
+stage = Usd.Stage.CreateNew(path)
+splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, '/S')
+of = lambda columns: chance.random((n, columns), dtype=np.float32)
+splats.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(of(3)))
+splats.CreateScalesAttr(Vt.Vec3fArray.FromNumpy(of(3)))
+stage.Save()
+del stage, splats
+data = bytearray(open(path, 'rb').read())
+at = data.find(struct.pack('<Q', n))
+assert at > 0
+data[at:at + 8] = struct.pack('<Q', 10**9)
+open(path, 'wb').write(data)
+",
+    );
+    let error = read_scene(&path).unwrap_err().to_string();
+    assert!(error.contains("/S: positions cannot be read") && error.contains("out-of-bounds"), "{error}");
+}
+
+#[test]
+fn cut_files_are_refused() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("whole.usdc");
+    export(&Maker::new(5).scene(), &path, ExportOptions::default()).unwrap();
+    let whole = fs::read(&path).unwrap();
+    for share in [1, 10, 50, 90, 99] {
+        let cut = folder.path().join(format!("cut{share}.usdc"));
+        fs::write(&cut, &whole[..whole.len() * share / 100]).unwrap();
+        let error = read_scene(&cut).unwrap_err();
+        assert!(matches!(error, UsdError::Unreadable { .. }), "{share}: {error}");
+    }
+}
+
+#[test]
+fn missing_and_distant_layers_are_refused() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let inner = folder.path().join("inner");
+    fs::create_dir(&inner).unwrap();
+    let path = inner.join("a.usda");
+    let written = Maker::new(5).scene();
+    export(&written, &path, ExportOptions::default()).unwrap();
+    let payloads = inner.join("a.payloads");
+    // The folder leaves: a link to it is as far away as its target.
+    let away = folder.path().join("away");
+    fs::rename(&payloads, &away).unwrap();
+    let error = read_scene(&path).unwrap_err();
+    let UsdError::MissingAsset { asset, .. } = &error else { panic!("{error}") };
+    assert!(asset.ends_with(".usdc") && error.to_string().contains("does not exist"), "{error}");
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink(&away, &payloads).unwrap();
+        let error = read_scene(&path).unwrap_err();
+        assert!(matches!(error, UsdError::ExternalAsset { .. }), "{error}");
+        assert!(error.to_string().contains("--follow-external"), "{error}");
+        fs::remove_file(&payloads).unwrap();
+    }
+    fs::rename(&away, &payloads).unwrap();
+    // An override elsewhere that sublayers the stage.
+    let over = folder.path().join("inner/sub/over.usda");
+    fs::create_dir(over.parent().unwrap()).unwrap();
+    fs::write(&over, "#usda 1.0\n(\n    subLayers = [@../a.usda@]\n)\n").unwrap();
+    assert!(matches!(read_scene(&over), Err(UsdError::ExternalAsset { .. })));
+    let read = read_scene_with(&over, ReadOptions { follow_external: true }).unwrap();
+    assert_eq!(read.nodes, written.nodes);
+    // The same from above needs no permission.
+    let over = folder.path().join("over.usda");
+    fs::write(&over, "#usda 1.0\n(\n    subLayers = [@inner/a.usda@]\n)\n").unwrap();
+    assert_eq!(read_scene(&over).unwrap().nodes, written.nodes);
+}
+
+#[test]
+fn other_layouts_are_refused() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.usda");
+    let options = ExportOptions { payloads: crate::Payloads::SingleFile, ..ExportOptions::default() };
+    export(&Maker::new(5).scene(), &path, options).unwrap();
+    let text = fs::read_to_string(&path).unwrap();
+    for (version, expected) in [(1, "export it again"), (99, "use a newer cif")] {
+        let other = folder.path().join(format!("layout{version}.usda"));
+        fs::write(&other, text.replace("int layout = 2", &format!("int layout = {version}"))).unwrap();
+        let error = read_scene(&other).unwrap_err().to_string();
+        assert!(error.contains(&format!("in layout {version}")) && error.contains(expected), "{error}");
+    }
+}
+
+#[test]
+fn what_is_not_ours_is_kept() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.usda");
+    let scene = Maker::new(5).scene();
+    let payloads = folder.path().join("a.payloads");
+    fs::create_dir(&payloads).unwrap();
+    fs::write(payloads.join("precious.txt"), "keep").unwrap();
+    let error = export(&scene, &path, ExportOptions::default()).unwrap_err();
+    assert!(matches!(&error, UsdError::Foreign { path } if path.ends_with("a.payloads")), "{error}");
+    let single = ExportOptions { payloads: crate::Payloads::SingleFile, ..ExportOptions::default() };
+    export(&scene, &path, single).unwrap();
+    assert!(payloads.join("precious.txt").exists(), "not needed, not ours, not touched");
+    export(&scene, &path, ExportOptions { force: true, ..ExportOptions::default() }).unwrap();
+    assert!(!payloads.join("precious.txt").exists() && payloads.join("background.usdc").exists());
+    export(&scene, &path, single).unwrap();
+    assert!(!payloads.exists(), "payloads that the new stage does not need went with the old one");
+    let package = folder.path().join("a.usdz");
+    let separate = ExportOptions { payloads: crate::Payloads::Separate, ..ExportOptions::default() };
+    let error = export(&scene, &package, separate).unwrap_err();
+    assert!(matches!(error, UsdError::PayloadsInPackage { .. }), "{error}");
+    let left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(left, ["a.usda"], "no scratch is left behind");
+}
