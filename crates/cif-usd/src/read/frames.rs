@@ -18,8 +18,6 @@ const MOST_FRAMES: f64 = 10_000.0;
 pub(super) struct Frames<'a, 'py> {
     pxr: &'a Pxr<'py>,
     caches: RefCell<BTreeMap<u64, Bound<'py, PyAny>>>,
-    /// First and last time code of the stage.
-    range: (f64, f64),
 }
 
 /// Operations of one prim.
@@ -86,8 +84,8 @@ fn usable(affine: &DAffine3) -> bool {
 }
 
 impl<'a, 'py> Frames<'a, 'py> {
-    pub(super) fn new(pxr: &'a Pxr<'py>, range: (f64, f64)) -> Self {
-        Self { pxr, caches: RefCell::default(), range }
+    pub(super) fn new(pxr: &'a Pxr<'py>) -> Self {
+        Self { pxr, caches: RefCell::default() }
     }
 
     fn operations(&self, prim: &Bound<'py, PyAny>) -> PyResult<Operations<'py>> {
@@ -118,6 +116,22 @@ impl<'a, 'py> Frames<'a, 'py> {
         } else {
             Ok(Vec::new())
         }
+    }
+
+    /// Whether anything but `translate`, `scale` and `orient` is sampled, which are interpolated as poses are.
+    fn turns(&self, prim: &Bound<'py, PyAny>) -> PyResult<bool> {
+        let xformable = self.pxr.usd_geom.getattr("Xformable")?.call1((prim,))?;
+        for op in xformable.call_method0("GetOrderedXformOps")?.try_iter()? {
+            let op = op?;
+            let name = values::text(&op.call_method0("GetOpName")?)?;
+            let straight = ["translate", "scale", "orient"]
+                .iter()
+                .any(|kind| name.strip_prefix("xformOp:").is_some_and(|name| name.starts_with(kind)));
+            if !straight && op.call_method0("GetNumTimeSamples")?.extract::<usize>()? > 1 {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
 
     /// Exact track of a prim in its parent's frame, where its operations are ours or none.
@@ -221,7 +235,7 @@ impl<'a, 'py> Frames<'a, 'py> {
             let keys = self.keys(&prim)?;
             if keys.len() > 1 {
                 movers += 1;
-                bent |= matches!(self.operations(&prim)?, Operations::Other);
+                bent |= self.turns(&prim)?;
             }
             times.extend(keys);
         }
@@ -230,7 +244,7 @@ impl<'a, 'py> Frames<'a, 'py> {
         if let (Some(&first), Some(&last)) = (times.first(), times.last())
             && (movers > 1 || bent)
         {
-            let (first, last) = (first.min(self.range.0.max(first)).ceil(), last.floor());
+            let (first, last) = (first.ceil(), last.floor());
             if last - first <= MOST_FRAMES {
                 let mut frame = first;
                 while frame <= last {

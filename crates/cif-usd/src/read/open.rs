@@ -19,6 +19,22 @@ pub(crate) fn open<'py>(pxr: &Pxr<'py>, path: &Path) -> Result<Bound<'py, PyAny>
         .map_err(|error| UsdError::Unreadable { path: path.to_owned(), reason: reason(pxr.py, &error) })
 }
 
+/// A stage whose time codes per second are set from outside.
+pub(super) fn open_at_rate<'py>(
+    pxr: &Pxr<'py>,
+    path: &Path,
+    rate: f64,
+) -> Result<Bound<'py, PyAny>, UsdError> {
+    let open = || -> PyResult<Bound<'py, PyAny>> {
+        let layers = pxr.sdf.getattr("Layer")?;
+        let session = layers.call_method1("CreateAnonymous", (".usda",))?;
+        session.setattr("timeCodesPerSecond", rate)?;
+        let root = layers.call_method1("FindOrOpen", (path.as_os_str(),))?;
+        pxr.usd.getattr("Stage")?.call_method1("Open", (root, session))
+    };
+    open().map_err(|error| UsdError::Unreadable { path: path.to_owned(), reason: reason(pxr.py, &error) })
+}
+
 /// A stage whose layers all exist and, unless others are allowed, lie in its folder; and the size of their files.
 pub(crate) fn open_with_layers<'py>(
     pxr: &Pxr<'py>,

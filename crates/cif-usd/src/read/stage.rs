@@ -52,6 +52,8 @@ impl Reading<'_, '_> {
 #[derive(Default)]
 struct Mark {
     ours: bool,
+    /// Time codes per second of the layer that it stands on.
+    rate: Option<f64>,
     generator: String,
     layout: i64,
     times: Vec<f64>,
@@ -67,12 +69,22 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
     pxr::with(|pxr| {
         let (stage, bytes) = open::open_with_layers(pxr, path, options.follow_external)?;
         let failed = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
-        let mark = mark(&stage).map_err(failed)?;
+        let mut mark = mark(&stage).map_err(failed)?;
         let expected = i64::from(tokens::LAYOUT_VERSION);
         if mark.ours && mark.layout != expected {
             let (path, generator, found) = (path.to_owned(), mark.generator, mark.layout);
             return Err(UsdError::Layout { path, generator, found, expected });
         }
+        // A layer of edits that names no rate means ours; USD would take 24 for it and stretch what is below.
+        let root = stage.call_method0("GetRootLayer").map_err(failed)?;
+        let stage = match (rate(&root).map_err(failed)?, mark.rate) {
+            (None, Some(ours)) => open::open_at_rate(pxr, path, ours)?,
+            (Some(own), Some(ours)) => {
+                mark.codes.iter_mut().for_each(|code| *code *= own / ours);
+                stage
+            }
+            _ => stage,
+        };
         let number =
             |name: &str, fallback: f64| info::<f64>(&stage, name).map(|value| value.unwrap_or(fallback));
         let start = number("startTimeCode", 0.0).map_err(failed)?;
@@ -83,7 +95,7 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
             pxr,
             path,
             arrays: Arrays::new(pxr, bytes).map_err(failed)?,
-            frames: Frames::new(pxr, (start, end)),
+            frames: Frames::new(pxr),
             start: mark.codes.first().copied().unwrap_or(start),
             source_frames: (
                 mark.codes.first().copied().unwrap_or(start).max(0.0) as usize,
@@ -172,6 +184,19 @@ fn info<'py, T: for<'a> FromPyObject<'a, 'py>>(stage: &Bound<'py, PyAny>, name: 
     Ok(None)
 }
 
+/// Time codes per second that a layer gives itself.
+fn rate(layer: &Bound<'_, PyAny>) -> PyResult<Option<f64>> {
+    let authored = |name: &str| layer.call_method0(name).and_then(|has| has.is_truthy());
+    let rate = if authored("HasTimeCodesPerSecond")? {
+        layer.getattr("timeCodesPerSecond")?.extract()?
+    } else if authored("HasFramesPerSecond")? {
+        layer.getattr("framesPerSecond")?.extract()?
+    } else {
+        return Ok(None);
+    };
+    Ok(Some(rate).filter(|rate: &f64| rate.is_finite() && *rate > 0.0))
+}
+
 /// Our mark on the strongest layer that has it.
 fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
     for layer in layers(stage)? {
@@ -201,6 +226,7 @@ fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
         let options = string(tokens::OPTIONS)?;
         return Ok(Mark {
             ours: true,
+            rate: rate(&layer)?,
             generator: string(tokens::GENERATOR)?.unwrap_or_else(|| tokens::CIF.to_owned()),
             layout: get(tokens::LAYOUT)?.and_then(|layout| layout.extract().ok()).unwrap_or(0),
             times: numbers(tokens::SAMPLE_TIMES)?,

@@ -66,7 +66,7 @@ fn splats_that_make_no_sense_are_named() {
         ),
         (
             "splats.GetRadianceSphericalHarmonicsDegreeAttr().Set(2)",
-            "elementSize of the coefficients is 1, and degree 2 has 9",
+            "2 positions, but 2 coefficients of degree 2, which has 9 per splat",
         ),
         ("sh.SetMetadata('elementSize', 1000000000)", "elementSize of the coefficients is 1000000000"),
         ("sh.Set([(1, 0, 0)] * 5)", "2 positions, but 5 coefficients of degree 0"),
@@ -78,7 +78,7 @@ fn splats_that_make_no_sense_are_named() {
         ("UsdGeom.SetStageMetersPerUnit(stage, 0)", "metersPerUnit is 0"),
         (
             "splats.GetPositionsAttr().Set([(0, 0, 0), (1, 2, 3)], 1)\nsplats.GetPositionsAttr().Set([(0, 0, 0)], 2)\n",
-            "2 positions, but 1",
+            "1 positions, but 2 scales at time code 2",
         ),
         (
             "a = UsdGeom.PrimvarsAPI(prim).CreatePrimvar('cif:row', Sdf.ValueTypeNames.IntArray, 'vertex')\na.Set([1, 2])\na.SetIndices([0, 7])",

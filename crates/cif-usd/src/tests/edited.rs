@@ -51,6 +51,17 @@ fn an_empty_layer_changes_nothing() {
 }
 
 #[test]
+fn a_layer_with_its_own_rate_retimes_what_is_below() {
+    let _session = session();
+    let (before, after) = edited("layer.timeCodesPerSecond = 25");
+    let codes: Vec<f64> = before.time_codes.samples.iter().map(|code| code * 2.0).collect();
+    assert_eq!((after.time_codes.samples, after.time_codes.frames_per_second), (codes, 25.0));
+    let times: Vec<f64> = after.nodes[1].track().iter().map(|sample| sample.time_code).collect();
+    let twice: Vec<f64> = before.nodes[1].track().iter().map(|sample| sample.time_code * 2.0).collect();
+    assert_eq!(times, twice);
+}
+
+#[test]
 fn names_places_and_presence_follow_the_edits() {
     let _session = session();
     let (before, after) = edited(
@@ -105,6 +116,7 @@ fn copies_and_colours_are_recognised() {
         "
 source = stage.GetPrimAtPath('/World/red_mug_001')
 flat = stage.Flatten()
+Sdf.CreatePrimInLayer(layer, '/World')
 Sdf.CopySpec(flat, '/World/red_mug_001', layer, '/World/a_second_mug')
 colors = get('red_mug_016/Splats').GetAttribute('primvars:displayColor')
 primvar = UsdGeom.Primvar(colors)
@@ -142,6 +154,7 @@ fn strangers_may_join() {
     let (before, after) = edited(
         "
 flat = stage.Flatten()
+Sdf.CreatePrimInLayer(layer, '/World')
 Sdf.CopySpec(flat, '/World/red_mug_001/Splats', layer, '/World/visitor')
 for name in ['primvars:cif:row', 'cif:displayColorChecksum']:
     spec = layer.GetPrimAtPath('/World/visitor')

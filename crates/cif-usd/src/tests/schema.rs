@@ -76,7 +76,8 @@ assert ('CifInstanceAPI' in prim.GetAppliedSchemas()) == installed
 if installed:
     assert prim.GetAttribute('cif:index').GetDocumentation() or known.GetPropertyDocumentation('cif:index')
     assert prim.GetAttribute('cif:id').IsDefined() and not prim.GetAttribute('cif:id').IsCustom()
-    bare = Usd.Stage.CreateInMemory().DefinePrim('/A', 'Xform')
+    other = Usd.Stage.CreateInMemory()
+    bare = other.DefinePrim('/A', 'Xform')
     bare.AddAppliedSchema('CifInstanceAPI')
     assert bare.GetAttribute('cif:kind').Get() == 'instance' and bare.GetAttribute('cif:index').Get() == -1
 ";
