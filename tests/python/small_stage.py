@@ -132,7 +132,16 @@ quatf xformOp:orient.timeSamples = {{ {rotations} }}
 
 def _object(name: str, labels: list[str], number: int | None, pose: str, children: str) -> str:
     words = ", ".join(f'"{label}"' for label in labels)
-    data = f"customData = {{ dictionary cif = {{ int id = {number} }} }}" if number else ""
+    data = ""
+    schema = (
+        ""
+        if number is None
+        else f"""uniform int cif:id = {number}
+uniform token cif:motion:model = "rigid"
+uniform int2 cif:sourceFrames = (0, {FRAMES - 1})
+uniform string cif:motion:report = "{{}}"
+"""
+    )
     if selected := re.search(r"# selected: (\w+)", children):
         data += f"""
     variants = {{ string physics = "{selected[1]}" }}
@@ -146,7 +155,7 @@ def _object(name: str, labels: list[str], number: int | None, pose: str, childre
 token[] semantics:labels:class = [{words}]
 token[] semantics:labels:instance = ["{name}"]
 custom string userProperties:label = "{labels[-1]}"
-{pose}
+{schema}{pose}
 {children}
 }}
 """

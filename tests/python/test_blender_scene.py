@@ -252,7 +252,7 @@ def test_edits_by_hand_come_back(objects: dict, path: Path) -> None:
     assert after["red_mug_001"].display_name == "blue mug"
     assert after["background"].display_name == "studio"
     assert (after["toy_car_002_001"].label, after["toy_car_002"].label) == ("racer", "car")
-    assert not after["ball_008"].visibility.ever
+    assert not after["ball_008"].visibility.visible.any()
     part = after["box_003"].pieces[1].track.matrices(codes) - before["box_003"].pieces[1].track.matrices(codes)
     np.testing.assert_allclose(part[:, :3, 3], [[0, 0, 0.1]] * 17, atol=1e-5)
 

@@ -50,8 +50,9 @@ def test_stage_as_a_whole(small: scene.Scene) -> None:
 
 def test_labels_and_ids(small: scene.Scene) -> None:
     mug = by_name(small)["red_mug_001"]
-    assert (mug.label, mug.display_name, mug.instance, mug.data["id"]) == ("mug", "red mug", "red_mug_001", 1)
-    assert "id" not in by_name(small)["background"].data
+    assert (mug.label, mug.display_name, mug.instance) == ("mug", "red mug", "red_mug_001")
+    assert mug.data == {"id": 1, "motion_model": "rigid", "sourceFrames_first": 0, "sourceFrames_last": 8}
+    assert by_name(small)["background"].data == {}
 
 
 def test_splats_come_as_authored(small: scene.Scene) -> None:
@@ -242,7 +243,7 @@ def test_edits_come_back_through_the_layer(path: Path, small: scene.Scene) -> No
     np.testing.assert_allclose(
         edited["box_003"].pieces[1].track.translations[0], lid.track.translations[0] + [0, 0, 0.1], atol=1e-6
     )
-    assert not edited["background"].visibility.ever
+    assert not edited["background"].visibility.visible.any()
     # The stage itself is as it was.
     assert by_name(read.read_scene(path))["red_mug_001"].display_name == "red mug"
 

@@ -22,6 +22,8 @@ DEGREE = "radiance:sphericalHarmonicsDegree"
 CLASS_LABELS = "semantics:labels:class"
 INSTANCE_LABELS = "semantics:labels:instance"
 USER_LABEL = "userProperties:label"
+LEFT_OUT = ("cif:label", "cif:category", "cif:motion:report")
+"""Properties of our schema that are found elsewhere, or are too long to show."""
 MAX_SHEAR = 1e-4
 
 
@@ -142,23 +144,18 @@ def _frame(owner: Usd.Prim, piece: Usd.Prim) -> Usd.Prim:
 
 
 def _data(prim: Usd.Prim) -> dict[str, float | int | str]:
-    """What the stage says of an instance under the name `cif`: applied schema, custom data of older layouts."""
+    """What `CifInstanceAPI` says of an instance, as `motion_model` for `cif:motion:model`."""
     found: dict[str, float | int | str] = {}
-
-    def keep(key: str, value: object) -> None:
-        if isinstance(value, dict):
-            for inner, item in value.items():
-                keep(f"{key}_{inner}" if key else inner, item)
-        elif isinstance(value, bool | int | float | str):
-            found[key] = value
-        elif value is not None and len(value) == 2:  # ranges
-            found[f"{key}_first"], found[f"{key}_last"] = (float(item) for item in value)
-
-    keep("", prim.GetCustomDataByKey("cif") or {})
     for attribute in prim.GetAuthoredAttributes():
         name = attribute.GetName()
-        if name.startswith("cif:"):
-            keep(name.removeprefix("cif:").replace(":", "_"), attribute.Get())
+        if not name.startswith("cif:") or name in LEFT_OUT:
+            continue
+        key = name.removeprefix("cif:").replace(":", "_")
+        value = attribute.Get()
+        if isinstance(value, int | float | str):
+            found[key] = value
+        elif value is not None and len(value) == 2:  # a range
+            found[f"{key}_first"], found[f"{key}_last"] = (int(item) for item in value)
     return found
 
 

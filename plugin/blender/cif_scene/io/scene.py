@@ -72,11 +72,6 @@ class Visibility:
     visible: np.ndarray
     """State from each code on, [T] bool."""
 
-    @property
-    def ever(self) -> bool:
-        """Whether it can be seen at any time."""
-        return bool(self.visible.any())
-
 
 @dataclass(frozen=True)
 class Instance:
