@@ -117,6 +117,14 @@ fn visit_tiles(splat: &Splat, columns: u32, rows: u32, mut visit: impl FnMut(u32
     }
 }
 
+/// Tiles of a chunk of splats.
+struct ReachedTiles {
+    /// Tiles per splat.
+    counts: Vec<u32>,
+    /// Tiles of all splats in turn, and the passes that draw there, a bit each.
+    reached: Vec<(u32, u8)>,
+}
+
 impl TileLists {
     /// Builds the lists for depth-sorted splats of an image.
     pub(super) fn build(&mut self, splats: &[Splat], width: u32, height: u32) {
@@ -129,7 +137,7 @@ impl TileLists {
 
         // Tiles of every splat, in chunks so that threads share the tests.
         const CHUNK: usize = 1024;
-        let chunks: Vec<(Vec<u32>, Vec<(u32, u8)>)> = splats
+        let chunks: Vec<ReachedTiles> = splats
             .par_chunks(CHUNK)
             .map(|chunk| {
                 let (mut counts, mut reached) =
@@ -139,7 +147,7 @@ impl TileLists {
                     visit_tiles(splat, columns, rows, |tile, passes| reached.push((tile, passes)));
                     counts.push((reached.len() - before) as u32);
                 }
-                (counts, reached)
+                ReachedTiles { counts, reached }
             })
             .collect();
 
@@ -148,7 +156,7 @@ impl TileLists {
         self.tile_offsets.clear();
         self.tile_offsets.resize(tiles + 1, 0);
         let mut total = 0_u32;
-        for (counts, reached) in &chunks {
+        for ReachedTiles { counts, reached } in &chunks {
             for count in counts {
                 total = total.checked_add(*count).expect("more than 2^32 tile pairs: the image is too large");
                 self.splat_offsets.push(total);
@@ -166,7 +174,7 @@ impl TileLists {
         self.splat_pairs.clear();
         self.splat_pairs.reserve(total as usize);
         let mut rank = 0;
-        for (counts, reached) in &chunks {
+        for ReachedTiles { counts, reached } in &chunks {
             let mut reached = reached.iter();
             for count in counts {
                 for (tile, passes) in reached.by_ref().take(*count as usize) {

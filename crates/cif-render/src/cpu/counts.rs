@@ -1,12 +1,15 @@
 //! Label mass of Gaussians over views, as sparse rows: a Gaussian meets few of the instances there are.
 
+/// Label mass of a Gaussian: (dense instance index, pixels), ascending indices.
+pub(super) type LabelMasses = Vec<(u16, f64)>;
+
 /// Colour-weighted label mass per Gaussian (methods reference 5.1); add views, then normalise.
 ///
 /// Memory grows with the labels that each Gaussian really meets, never with N x K.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct IdentityCounts {
     instances: usize,
-    rows: Vec<Vec<(u16, f64)>>,
+    rows: Vec<LabelMasses>,
     total_mass: Vec<f64>,
 }
 
@@ -61,13 +64,13 @@ impl IdentityCounts {
     }
 
     /// The rows and the total masses, to add to in parallel.
-    pub(super) fn parts_mut(&mut self) -> (&mut [Vec<(u16, f64)>], &mut [f64]) {
+    pub(super) fn parts_mut(&mut self) -> (&mut [LabelMasses], &mut [f64]) {
         (&mut self.rows, &mut self.total_mass)
     }
 }
 
 /// Adds mass to an entry of a row, which is made where it is not there yet.
-pub(super) fn add_to(row: &mut Vec<(u16, f64)>, instance: u16, mass: f64) {
+pub(super) fn add_to(row: &mut LabelMasses, instance: u16, mass: f64) {
     match row.binary_search_by_key(&instance, |(label, _)| *label) {
         Ok(entry) => row[entry].1 += mass,
         Err(entry) => row.insert(entry, (instance, mass)),
