@@ -119,7 +119,7 @@ pub mod instance {
     /// The whole motion report as JSON.
     pub const REPORT: &str = "cif:motion:report";
 
-    /// Every property with its type and whether it is written where the value is known.
+    /// Every property with its type.
     pub const ALL: [(&str, &str); 17] = [
         (KIND, "token"),
         (ID, "int"),

@@ -337,12 +337,11 @@ fn report(recorded: &Recorded, motion: &Motion, splats: &Splats) -> MotionReport
     }
 }
 
+/// A prim, its name, and the part that it moves with.
+type Child<'py> = (Bound<'py, PyAny>, String, Option<usize>);
+
 /// Prims of a type under an owner and its parts whose name starts so, with the index of their part.
-fn children<'py>(
-    owner: &Owner<'py>,
-    motion: &Motion,
-    prefix: &str,
-) -> PyResult<Vec<(Bound<'py, PyAny>, String, Option<usize>)>> {
+fn children<'py>(owner: &Owner<'py>, motion: &Motion, prefix: &str) -> PyResult<Vec<Child<'py>>> {
     let mut places = vec![(owner.prim.clone(), None)];
     if let Motion::Parts(_) = motion {
         for (index, prim) in owner.splats.iter().enumerate() {

@@ -1,5 +1,7 @@
 //! Stages written, read back, edited and damaged; with a Python that has usd-core (`make test-usd`).
 
+#![expect(clippy::unwrap_used, reason = "tests; clippy knows only plain cfg(test)")]
+
 mod damaged;
 mod edited;
 mod foreign;
