@@ -15,8 +15,8 @@ def register() -> None:
     """Let usd-core find the schema, whether it is loaded already or not.
 
     Before usd-core is loaded the search path of its plugins is extended, which costs nothing and reaches child
-    processes; after that its registry is told. A registry of schemas that is in use already stays as it is: stages
-    open all the same.
+    processes; after that its registry is told. A registry of schemas that is in use already stays as it is:
+    stages open all the same.
     """
     known = [path for path in os.environ.get(_VARIABLE, "").split(os.pathsep) if path]
     if str(FOLDER) not in known:
