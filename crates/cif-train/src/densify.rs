@@ -65,6 +65,8 @@ pub struct Rearrangement {
     pub gaussians: Gaussians,
     /// Per new row, the old row whose optimiser state it keeps; `None` for fresh ones.
     pub origins: Vec<Option<u32>>,
+    /// Per new row, the old row that it stays, or is a copy or a child of.
+    pub parents: Vec<u32>,
     /// Old rows duplicated.
     pub cloned: usize,
     /// Old rows replaced by two.
@@ -122,7 +124,14 @@ pub fn add_gaussians(
             set.log_scales[row][axis] -= SPLIT_SHRINK.ln();
         }
     }
-    Some(Rearrangement { gaussians: set, origins, cloned: clones.len(), split: splits.len(), pruned: 0 })
+    Some(Rearrangement {
+        gaussians: set,
+        origins,
+        parents,
+        cloned: clones.len(),
+        split: splits.len(),
+        pruned: 0,
+    })
 }
 
 /// Removes transparent Gaussians and, once opacities were reset, those too large on screen or in space.
@@ -149,7 +158,8 @@ pub fn prune(
     (kept.len() < n).then(|| Rearrangement {
         gaussians: gaussians.gather(&kept),
         pruned: n - kept.len(),
-        origins: kept.into_iter().map(Some).collect(),
+        origins: kept.iter().copied().map(Some).collect(),
+        parents: kept,
         cloned: 0,
         split: 0,
     })

@@ -11,6 +11,7 @@
 //! | [`densify`] | cloning, splitting, pruning |
 //! | [`estimate`] | whose each Gaussian is, from masks |
 //! | [`resample`] | instance-guided resampling with volume conservation |
+//! | [`tracks`] | where objects travel, from masks alone |
 //! | [`metrics`] | how good a field is |
 //!
 //! ```no_run
@@ -38,6 +39,7 @@ pub mod metrics;
 mod random;
 pub mod resample;
 pub mod schedule;
+pub mod tracks;
 pub mod trainer;
 
 pub use config::{Ablation, Preset, TrainConfig};

@@ -15,6 +15,8 @@ pub(crate) enum Purpose {
     Resample = 3,
     /// Parameters of the deformation.
     Deformation = 4,
+    /// Points inside travelling objects.
+    Guidance = 5,
 }
 
 /// The stream of a purpose; `counter` tells its uses apart.

@@ -49,6 +49,8 @@ pub struct TrainConfig {
     pub adam: AdamConfig,
     /// Weights of the loss terms.
     pub loss: LossConfig,
+    /// Motion that masks tell.
+    pub motion: MotionConfig,
     /// Cloning, splitting and pruning of Gaussians in the coarse and fine stages.
     pub densify: DensifyConfig,
     /// Identity estimation.
@@ -169,6 +171,26 @@ pub struct LossConfig {
     pub time_smoothness: f32,
     /// Weight of the distance of the time planes from 1, default 1e-4.
     pub time_sparsity: f32,
+}
+
+/// Motion that masks tell. One moving camera leaves the depth of moving objects open, and colours alone are
+/// then explained by Gaussians that come and go at other depths. With guidance, objects that travel are left
+/// out of the coarse stage, start the fine stage with Gaussians of their own, and follow a path estimated from
+/// masks and contacts; everything else is held in place.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct MotionConfig {
+    /// Weight of the distance of travelling objects from their path, relative to the extent; default 0: no
+    /// guidance.
+    pub guidance: f32,
+    /// Share of `guidance` that is left at the end of the fine stage, default 0.1.
+    pub guidance_end: f32,
+    /// Weight of the displacement of everything that does not travel, relative to the extent; default 0.
+    pub stillness: f32,
+    /// Steps that teach the deformation the paths before the fine stage, default 300.
+    pub rehearsal: u32,
+    /// Gaussians that a travelling object starts with, default 300.
+    pub gaussians: u32,
 }
 
 /// Cloning, splitting and pruning (methods reference 1.5). Steps count from the start of each stage.

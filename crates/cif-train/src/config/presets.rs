@@ -4,8 +4,8 @@ use cif_dataset::Layout;
 use cif_field::{Heads, SortMetric, TimeEncoding};
 
 use super::{
-    AdamConfig, DensifyConfig, IdentityConfig, InstanceConfig, LossConfig, ModelConfig, Preset, RatesConfig,
-    ReportConfig, ResampleConfig, StagesConfig, TrainConfig,
+    AdamConfig, DensifyConfig, IdentityConfig, InstanceConfig, LossConfig, ModelConfig, MotionConfig, Preset,
+    RatesConfig, ReportConfig, ResampleConfig, StagesConfig, TrainConfig,
 };
 
 impl TrainConfig {
@@ -120,6 +120,7 @@ impl Default for TrainConfig {
             rates: RatesConfig::default(),
             adam: AdamConfig::default(),
             loss: LossConfig::default(),
+            motion: MotionConfig::default(),
             densify: DensifyConfig::default(),
             identity: IdentityConfig::default(),
             instance: InstanceConfig::default(),
@@ -183,6 +184,12 @@ impl Default for LossConfig {
             time_smoothness: 1e-3,
             time_sparsity: 1e-4,
         }
+    }
+}
+
+impl Default for MotionConfig {
+    fn default() -> Self {
+        Self { guidance: 0.0, guidance_end: 0.1, stillness: 0.0, rehearsal: 300, gaussians: 300 }
     }
 }
 

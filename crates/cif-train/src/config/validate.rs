@@ -96,6 +96,8 @@ impl TrainConfig {
             ("loss.plane_smoothness", self.loss.plane_smoothness),
             ("loss.time_smoothness", self.loss.time_smoothness),
             ("loss.time_sparsity", self.loss.time_sparsity),
+            ("motion.guidance", self.motion.guidance),
+            ("motion.stillness", self.motion.stillness),
             ("densify.gradient_threshold", densify.gradient_threshold),
             ("densify.split_scale", densify.split_scale),
             ("densify.prune_radius_px", densify.prune_radius_px),
@@ -107,6 +109,9 @@ impl TrainConfig {
             check(rate.is_finite() && rate >= 0.0, key, rate, "expected a finite number of at least 0")?;
         }
         within("loss.lambda_dssim", self.loss.lambda_dssim, 0.0..=1.0, "expected a number in [0, 1]")?;
+
+        within("motion.guidance_end", self.motion.guidance_end, 0.0..=1.0, "expected a number in [0, 1]")?;
+        at_least("motion.gaussians", self.motion.gaussians, 4, "expected at least 4")?;
 
         at_least("densify.every", densify.every, 1, "expected at least 1")?;
         at_least("densify.max_gaussians", densify.max_gaussians, 1, "expected at least 1")?;

@@ -1,5 +1,6 @@
-//! Colour losses of a view and their gradients. Source: methods reference 1.4.
+//! Losses and their gradients: of the colours of a view (methods reference 1.4), and of motion that is known.
 
+pub mod displacement;
 mod ssim;
 
 use cif_geometry::PixelGrid;

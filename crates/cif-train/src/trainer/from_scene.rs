@@ -81,6 +81,7 @@ impl Trainer {
         }
         if let Some((mut tensors, steps)) = state {
             restore(&mut trainer.optimiser, &mut tensors, &steps)?;
+            trainer.restore_guidance(&mut tensors)?;
         }
         trainer.warn_of_capture();
         trainer.begin(Stage::Identity);

@@ -6,6 +6,7 @@
 //! | `progress` | which stages there are, and where the run stands |
 //! | `step` | what one step does |
 //! | `optimiser` | which parameter groups there are, and how fast they move |
+//! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `state` | what is saved, and how a run resumes |
@@ -18,6 +19,7 @@
 mod evaluate;
 mod frames;
 mod from_scene;
+mod guidance;
 mod identity;
 mod initialize;
 mod measure;
@@ -36,6 +38,7 @@ use cif_render::Gradients;
 use cif_render::cpu::{Renderer, SimdLevel};
 
 use self::frames::FrameStore;
+use self::guidance::Guidance;
 pub use self::measure::InstancePass;
 use self::optimiser::Optimiser;
 use self::progress::{Plan, Progress};
@@ -67,6 +70,8 @@ pub struct Trainer {
     unseen: Vec<bool>,
     /// Labelled pixels per instance, of the frames that identities were estimated from.
     label_pixels: Vec<f64>,
+    /// Paths that Gaussians are held to.
+    guidance: Guidance,
     renderer: Renderer,
     gradients: Gradients,
     scratch: Scratch,
@@ -106,6 +111,7 @@ impl Trainer {
         let field = initialize::initial_field(&dataset, &config)?;
         let mut trainer = Self::assemble(dataset, config, field, None)?;
         trainer.warn_of_capture();
+        trainer.find_travelling()?;
         let first = trainer.plan.from(&trainer.config, Stage::Coarse);
         trainer.progress = Progress::at(first);
         trainer.enter(first)?;
@@ -133,6 +139,7 @@ impl Trainer {
             statistics: DensifyStatistics::zeros(n),
             unseen: Vec::new(),
             label_pixels: Vec::new(),
+            guidance: Guidance::default(),
             renderer: Renderer::new(SimdLevel::Auto),
             gradients: Gradients::zeros(&field),
             scratch: Scratch::new(),
@@ -387,6 +394,7 @@ impl Trainer {
             if self.plan.is_dynamic {
                 self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
             }
+            self.start_guidance()?;
             self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
             self.gradients = Gradients::zeros(&self.field);
         }

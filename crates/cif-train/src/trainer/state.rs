@@ -13,6 +13,7 @@ use super::progress::Progress;
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
+use crate::events::Stage;
 
 /// Version of the state.
 const VERSION: u32 = 1;
@@ -112,6 +113,17 @@ impl Trainer {
         Checkpoint { field, training: with_state.then(|| self.training_state()) }
     }
 
+    /// Paths that objects are held to.
+    pub(super) fn restore_guidance(
+        &mut self,
+        tensors: &mut BTreeMap<String, StateTensor>,
+    ) -> Result<(), TrainError> {
+        let (n, times) = (self.field.gaussians.len(), self.dataset.times.len());
+        self.guidance
+            .restore(tensors, n, times)
+            .ok_or_else(|| unusable("the paths of objects do not fit the capture"))
+    }
+
     fn training_state(&self) -> TrainingState {
         let mut tensors = BTreeMap::new();
         let mut adam_steps = BTreeMap::new();
@@ -128,6 +140,9 @@ impl Trainer {
         let unseen = self.unseen.iter().map(|unseen| u32::from(*unseen)).collect();
         tensors.insert("identity.unseen".into(), StateTensor::U32(unseen));
         tensors.insert("identity.label_pixels".into(), StateTensor::F64(self.label_pixels.clone()));
+        for (name, tensor) in self.guidance.tensors() {
+            tensors.insert(name.to_owned(), tensor);
+        }
         let state = State {
             version: VERSION,
             config: self.config.clone(),
@@ -158,6 +173,10 @@ impl Trainer {
             count: counters(&mut tensors, "densify.count", n)?,
             radius: floats(&mut tensors, "densify.radius", n)?,
         };
+        trainer.restore_guidance(&mut tensors)?;
+        if trainer.progress.stage == Stage::Coarse {
+            trainer.find_travelling()?;
+        }
         let has_rows = trainer.field.identities.is_some();
         let unseen = counters(&mut tensors, "identity.unseen", if has_rows { n } else { 0 })?;
         trainer.unseen = unseen.into_iter().map(|flag| flag != 0).collect();

@@ -25,7 +25,7 @@ const RENORMALISE_EVERY: u64 = 1_000;
 
 /// Memory kept between steps.
 pub(super) struct Scratch {
-    v_color: PixelGrid<[f32; 3]>,
+    pub(super) v_color: PixelGrid<[f32; 3]>,
     ssim: SsimScratch,
     /// Order of the training views of an epoch, by stage and epoch.
     order: Option<((Stage, u64), Vec<u32>)>,
@@ -112,14 +112,16 @@ impl Trainer {
         let weight = 1.0 / batch as f32;
         let mut loss = StepLoss::default();
         let (mut instance_loss, mut unsupported) = (0.0, 0);
+        let pull = self.guidance_weight(stage, iteration);
         for (index, data) in &views {
             let frame = &self.dataset.frames[*index];
+            let time = frame.time;
             let labels = data.labels.as_ref().filter(|_| data.labelled > 0);
             let with_instances = settings.instances.is_some() && labels.is_some();
             let settings =
                 RenderSettings { instances: settings.instances.filter(|_| with_instances), ..settings };
             let labels = labels.filter(|_| with_instances);
-            let pass = self.renderer.forward(&self.field, &frame.camera, frame.time, &settings, labels);
+            let pass = self.renderer.forward(&self.field, &frame.camera, time, &settings, labels);
             let mut since = Instant::now();
             let color = color_loss(
                 &pass.color,
@@ -135,6 +137,9 @@ impl Trainer {
             if stage == Stage::Instance && !self.config.instance.color_loss {
                 self.scratch.v_color.pixels.fill([0.0; 3]);
             }
+            if stage == Stage::Coarse {
+                self.leave_out_travelling(data);
+            }
             // The mean is over the labelled pixels of all views of the step (A4).
             let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
             instance_loss += share * pass.instance_loss;
@@ -142,7 +147,14 @@ impl Trainer {
             self.check_finite(color.loss, "the colour loss")?;
             self.check_finite(pass.instance_loss, "the instance loss")?;
             let instance_weight = (share * f64::from(self.config.loss.lambda_instance)) as f32;
-            self.renderer.backward(&self.field, &self.scratch.v_color, instance_weight, &mut self.gradients);
+            let v_displacements = self.displacement_gradients(time, pull);
+            self.renderer.backward_displaced(
+                &self.field,
+                &self.scratch.v_color,
+                instance_weight,
+                &v_displacements,
+                &mut self.gradients,
+            );
             self.times.add_view(self.field.gaussians.len(), &self.renderer.statistics());
         }
         self.times.add_render(&self.renderer.times());
@@ -272,6 +284,7 @@ impl Trainer {
     fn rearrange(&mut self, change: Rearrangement) {
         self.optimiser.gather(&change.origins);
         self.statistics.gather(&change.origins);
+        self.guidance.gather(&change.parents);
         self.field.gaussians = change.gaussians;
         self.gradients = Gradients::zeros(&self.field);
     }
@@ -304,6 +317,7 @@ impl Trainer {
         let relocated = apply(&mut self.field, &plan, &context, &mut rng);
         self.optimiser.relocate(&relocated.weak, &relocated.sources, &relocated.entry_origins);
         for pair in &plan.pairs {
+            self.guidance.copy(pair.weak, pair.source);
             self.unseen[pair.weak as usize] = self.unseen[pair.source as usize];
         }
         self.gradients = Gradients::zeros(&self.field);

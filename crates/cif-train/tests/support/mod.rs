@@ -25,20 +25,31 @@ pub(crate) struct Scene {
     pub(crate) masks: bool,
     /// Masks are written, but empty.
     pub(crate) empty_masks: bool,
+    /// The third ball rolls along x on a floor, this many metres forth and then back.
+    pub(crate) rolls: Option<f64>,
+    /// A single camera that is somewhere else at each time; there must be as many views as times.
+    pub(crate) one_camera: bool,
 }
 
 impl Default for Scene {
     fn default() -> Self {
-        Self { times: 5, views: 4, masks: true, empty_masks: false }
+        Self { times: 5, views: 4, masks: true, empty_masks: false, rolls: None, one_camera: false }
     }
 }
 
+/// Height of the floor; y points down.
+const FLOOR: f64 = 0.5;
+
 /// Centre, radius, colour of the balls at a time; mask ids are 4, 7, 9.
-fn balls(time: f64) -> [(DVec3, f64, [f64; 3], u8); 3] {
+fn balls(time: f64, rolls: Option<f64>) -> [(DVec3, f64, [f64; 3], u8); 3] {
+    let third = match rolls {
+        Some(travel) => DVec3::new(travel * ((std::f64::consts::PI * time).sin() - 0.5), FLOOR - 0.25, -0.75),
+        None => DVec3::new(0.1, -0.5 + 0.5 * time, -0.45),
+    };
     [
         (DVec3::new(-0.55, 0.0, 0.0), 0.4, [0.85, 0.2, 0.15], 4),
         (DVec3::new(0.5, 0.1, 0.3), 0.35, [0.2, 0.65, 0.25], 7),
-        (DVec3::new(0.1, -0.5 + 0.5 * time, -0.45), 0.25, [0.2, 0.3, 0.85], 9),
+        (third, 0.25, [0.2, 0.3, 0.85], 9),
     ]
 }
 
@@ -57,7 +68,7 @@ fn camera(angle: f64) -> PinholeCamera {
     }
 }
 
-fn write_frame(camera: &PinholeCamera, time: f64, image: &Path, mask: Option<&Path>) {
+fn write_frame(camera: &PinholeCamera, scene: Scene, time: f64, image: &Path, mask: Option<&Path>) {
     let mut rgb = image::RgbImage::from_pixel(WIDTH, HEIGHT, image::Rgb([255; 3]));
     let mut ids = image::GrayImage::new(WIDTH, HEIGHT);
     let world_from_camera = camera.camera_from_world.inverse();
@@ -68,7 +79,13 @@ fn write_frame(camera: &PinholeCamera, time: f64, image: &Path, mask: Option<&Pa
             let direction = (world_from_camera.rotation * ray).normalize();
             let origin = world_from_camera.translation;
             let mut nearest = f64::INFINITY;
-            for (centre, radius, color, id) in balls(time) {
+            let floor = origin + direction * ((FLOOR - origin.y) / direction.y);
+            if scene.rolls.is_some() && direction.y > 0.0 && floor.length() < 2.5 {
+                nearest = (floor - origin).length();
+                let light = 0.6 + 0.15 * (5.0 * floor.x).sin() + 0.15 * (4.0 * floor.z).cos();
+                rgb.put_pixel(x, y, image::Rgb([light * 200.0, light * 230.0, 160.0].map(|c| c as u8)));
+            }
+            for (centre, radius, color, id) in balls(time, scene.rolls) {
                 let to = centre - origin;
                 let along = to.dot(direction);
                 let squared = radius * radius - (to.length_squared() - along * along);
@@ -94,6 +111,9 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
     let mut frames = Vec::new();
     for view in 0..=scene.views {
         for (time_index, time) in times.iter().enumerate() {
+            if scene.one_camera && view != time_index && view != scene.views {
+                continue;
+            }
             // The last view is held out, between the others.
             let held_out = view == scene.views;
             let turn = if held_out { 0.5 } else { view as f64 };
@@ -101,7 +121,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
             let name = format!("{view}_{time_index}");
             let image = folder.join(format!("{name}.png"));
             let mask = scene.masks.then(|| folder.join(format!("{name}_mask.png")));
-            write_frame(&camera, *time, &image, mask.as_deref());
+            write_frame(&camera, scene, *time, &image, mask.as_deref());
             if let Some(mask) = mask.as_ref().filter(|_| scene.empty_masks) {
                 image::GrayImage::new(WIDTH, HEIGHT).save(mask).unwrap();
             }
@@ -121,7 +141,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
     }
     let label = |id| InstanceLabel { id, label: format!("ball {id}"), category: "ball".into() };
     let (mut positions, mut colors) = (Vec::new(), Vec::new());
-    for (centre, radius, color, _) in balls(0.0) {
+    for (centre, radius, color, _) in balls(0.0, scene.rolls) {
         for k in 0..150 {
             let z = 1.0 - (2.0 * f64::from(k) + 1.0) / 150.0;
             let (s, c) = (f64::from(k) * 2.399_963).sin_cos();
@@ -129,6 +149,10 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
             positions.push((centre + radius * DVec3::new(r * c, r * s, z)).as_vec3().to_array());
             colors.push(color.map(|c| (c * 200.0) as u8));
         }
+    }
+    for k in 0..if scene.rolls.is_some() { 625 } else { 0 } {
+        positions.push([(k % 25) as f32 * 0.15 - 1.8, FLOOR as f32, (k / 25) as f32 * 0.15 - 1.8]);
+        colors.push([120, 140, 160]);
     }
     Dataset {
         root: folder.to_owned(),

@@ -40,6 +40,22 @@ impl Renderer {
         instance_weight: f32,
         gradients: &mut Gradients,
     ) {
+        self.backward_displaced(field, v_color, instance_weight, &[], gradients);
+    }
+
+    /// [`Self::backward`] with gradients of its own by what the deformation adds to the centres, `[N, 3]`, or
+    /// empty: they train the deformation, and leave the canonical centres to the image.
+    ///
+    /// # Panics
+    /// As [`Self::backward`].
+    pub fn backward_displaced(
+        &mut self,
+        field: &Field,
+        v_color: &PixelGrid<[f32; 3]>,
+        instance_weight: f32,
+        v_displacements: &[[f32; 3]],
+        gradients: &mut Gradients,
+    ) {
         let (view, settings, time) = self.tape.view.expect("backward follows a forward pass");
         assert!(field.tracks.is_none(), "recorded motion has no gradients: trainers refuse such fields");
         assert_eq!((v_color.width, v_color.height), (view.width, view.height), "cotangent size");
@@ -58,6 +74,11 @@ impl Renderer {
         });
         if let Some(deformation) = deformation {
             timed(&mut times.deform_backward, || {
+                for (total, v) in
+                    v_posed.means.as_flattened_mut().iter_mut().zip(v_displacements.as_flattened())
+                {
+                    *total += v;
+                }
                 let active: Vec<u32> = (0..n as u32)
                     .filter(|&row| {
                         let row = row as usize;

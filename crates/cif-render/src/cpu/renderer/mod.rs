@@ -7,9 +7,11 @@
 //! | `images` | pictures from blended tiles, instance images |
 //! | `count` | label mass for identity estimation |
 //! | `pose` | Gaussians at the time of the view |
+//! | `displace` | motion without pictures |
 
 mod backward;
 mod count;
+mod displace;
 mod images;
 mod pose;
 

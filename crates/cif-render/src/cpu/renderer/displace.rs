@@ -1,0 +1,54 @@
+//! Motion without pictures: where the deformation puts the centres, and its gradients by that alone.
+
+use cif_field::Field;
+use cif_field::gaussians::SH_FLOATS;
+
+use super::super::deform::{DeformationAtTime, PosedArrayGradients};
+use super::Renderer;
+use crate::Gradients;
+
+impl Renderer {
+    /// Centres at the time of the last forward pass or [`Self::displace`]; empty where nothing moves.
+    #[must_use]
+    pub fn posed_means(&self) -> &[[f32; 3]] {
+        &self.tape.posed.means
+    }
+
+    /// Moves the Gaussians to a time without drawing them, for [`Self::posed_means`].
+    pub fn displace(&mut self, field: &Field, time: f64) {
+        if let Some(deformation) = &field.deformation {
+            let posed = &mut self.tape.posed;
+            DeformationAtTime::new(deformation, time).forward(self.level, &field.gaussians, posed);
+        }
+    }
+
+    /// Adds the gradients of the deformation alone, from those by what it adds to the centres, `[N, 3]`.
+    pub fn displace_backward(
+        &mut self,
+        field: &Field,
+        time: f64,
+        v_displacements: Vec<[f32; 3]>,
+        gradients: &mut Gradients,
+    ) {
+        let Some(deformation) = &field.deformation else { return };
+        let n = v_displacements.len();
+        let active: Vec<u32> =
+            (0..n as u32).filter(|row| v_displacements[*row as usize] != [0.0; 3]).collect();
+        let v_posed = PosedArrayGradients {
+            means: v_displacements,
+            log_scales: vec![[0.0; 3]; n],
+            quaternions: vec![[0.0; 4]; n],
+            opacity_logits: vec![0.0; n],
+            sh_coefficients: if deformation.config.heads.sh { vec![[0.0; SH_FLOATS]; n] } else { Vec::new() },
+        };
+        DeformationAtTime::new(deformation, time).backward(
+            self.level,
+            &field.gaussians,
+            &active,
+            &v_posed,
+            &mut gradients.planes,
+            &mut gradients.mlp,
+            &mut gradients.gaussians.means,
+        );
+    }
+}

@@ -1,0 +1,379 @@
+//! Paths of travelling objects: found in the masks, taught to the deformation, and held while it trains.
+
+use std::collections::BTreeMap;
+
+use cif_field::Gaussians;
+use cif_field::checkpoint::StateTensor;
+use cif_geometry::scalar::logit;
+use cif_render::{Channels, Gradients, RenderSettings, UNLABELLED};
+use glam::{DVec2, DVec3};
+use rand::RngExt;
+
+use super::Trainer;
+use super::frames::TrainFrame;
+use super::optimiser::{Optimiser, StepRates};
+use crate::adam::PlaneWeights;
+use crate::error::TrainError;
+use crate::events::Stage;
+use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
+use crate::random::{Purpose, stream};
+use crate::tracks::{Observation, Track, fit, travels};
+
+/// Fewest pixels of a mask that say where an object is.
+const FEWEST_PIXELS: f64 = 12.0;
+/// Share of the nearest depths around a mask that is taken for noise.
+const CONTACT_SHARE: f64 = 0.08;
+/// Distance from the path beyond which the pull no longer grows, relative to the extent.
+const PATH_REACH: f64 = 0.02;
+/// The same for the distance from the canonical place of what does not travel.
+const PLACE_REACH: f64 = 0.002;
+/// Opacity that injected Gaussians start with.
+const OPACITY: f32 = 0.4;
+/// Share of the frames in which a point of an object may fall beside its mask.
+const OUTSIDE: f64 = 0.15;
+
+/// A travelling object.
+pub(super) struct Guide {
+    track: Track,
+    /// Where its centre is in the canonical set.
+    reference: DVec3,
+}
+
+/// Everything that keeps objects on their paths; empty without guidance.
+#[derive(Default)]
+pub(super) struct Guidance {
+    /// Per label (dense index + 1), whether the instance travels.
+    travelling: Vec<bool>,
+    guides: Vec<Guide>,
+    /// Per Gaussian its guide + 1, 0 for what does not travel.
+    guide_of: Vec<u16>,
+}
+
+impl Guidance {
+    pub(super) fn gather(&mut self, parents: &[u32]) {
+        if !self.guide_of.is_empty() {
+            self.guide_of = parents.iter().map(|row| self.guide_of[*row as usize]).collect();
+        }
+    }
+
+    /// What a saved state needs to hold; nothing without guidance.
+    pub(super) fn tensors(&self) -> Vec<(&'static str, StateTensor)> {
+        if self.guide_of.is_empty() {
+            return Vec::new();
+        }
+        let floats = |guide: &Guide| -> Vec<f64> {
+            std::iter::once(&guide.reference).chain(&guide.track.centres).flat_map(|p| p.to_array()).collect()
+        };
+        let times = |guide: &Guide| -> Vec<u32> {
+            let indices = guide.track.time_indices.iter().map(|index| *index as u32);
+            std::iter::once(guide.track.time_indices.len() as u32).chain(indices).collect()
+        };
+        vec![
+            ("motion.guide_of", StateTensor::U32(self.guide_of.iter().map(|of| u32::from(*of)).collect())),
+            ("motion.times", StateTensor::U32(self.guides.iter().flat_map(times).collect())),
+            ("motion.places", StateTensor::F64(self.guides.iter().flat_map(floats).collect())),
+        ]
+    }
+
+    /// What [`Self::tensors`] stored, for `n` Gaussians and as many times as given; `None` when it does not fit.
+    pub(super) fn restore(
+        &mut self,
+        tensors: &mut BTreeMap<String, StateTensor>,
+        n: usize,
+        times: usize,
+    ) -> Option<()> {
+        let Some(guide_of) = tensors.remove("motion.guide_of") else { return Some(()) };
+        let stored = (guide_of, tensors.remove("motion.times")?, tensors.remove("motion.places")?);
+        let (StateTensor::U32(guide_of), StateTensor::U32(indices), StateTensor::F64(places)) = stored else {
+            return None;
+        };
+        let (mut indices, mut places) = (&indices[..], &places[..]);
+        let mut guides = Vec::new();
+        while let Some((count, rest)) = indices.split_first() {
+            let count = *count as usize;
+            let (own, rest) = rest.split_at_checked(count)?;
+            let (own_places, rest_places) = places.split_at_checked(3 * (count + 1))?;
+            (indices, places) = (rest, rest_places);
+            let fits = count > 0
+                && own.windows(2).all(|pair| pair[0] < pair[1])
+                && own.iter().all(|index| (*index as usize) < times)
+                && own_places.iter().all(|value| value.is_finite());
+            if !fits {
+                return None;
+            }
+            let mut points = own_places.chunks_exact(3).map(DVec3::from_slice);
+            guides.push(Guide {
+                reference: points.next()?,
+                track: Track {
+                    time_indices: own.iter().map(|index| *index as usize).collect(),
+                    centres: points.collect(),
+                    radius: 0.0,
+                },
+            });
+        }
+        let fits = guide_of.len() == n && guide_of.iter().all(|of| *of as usize <= guides.len());
+        (fits && places.is_empty()).then(|| {
+            self.guide_of = guide_of.into_iter().map(|of| of as u16).collect();
+            self.guides = guides;
+        })
+    }
+
+    pub(super) fn copy(&mut self, to: u32, from: u32) {
+        if !self.guide_of.is_empty() {
+            self.guide_of[to as usize] = self.guide_of[from as usize];
+        }
+    }
+}
+
+impl Trainer {
+    fn is_guided(&self) -> bool {
+        (self.config.motion.guidance > 0.0 || self.config.motion.stillness > 0.0) && self.plan.is_dynamic
+    }
+
+    /// Finds out which instances travel.
+    pub(super) fn find_travelling(&mut self) -> Result<(), TrainError> {
+        if self.config.motion.guidance <= 0.0 || !self.is_guided() || !self.plan.has_instances {
+            return Ok(());
+        }
+        let observations = self.observe(false)?;
+        self.guidance.travelling = std::iter::once(false)
+            .chain(observations.iter().map(|observations| travels(observations)))
+            .collect();
+        let names: Vec<&str> = (0..observations.len())
+            .filter(|k| self.guidance.travelling[k + 1])
+            .map(|k| self.field.instances[k].label.as_str())
+            .collect();
+        if !names.is_empty() {
+            self.warnings.push(format!("guided by their masks: {}", names.join(", ")));
+        }
+        Ok(())
+    }
+
+    /// Where every instance is seen, in the order of times; with contact depths if asked.
+    fn observe(&mut self, with_contacts: bool) -> Result<Vec<Vec<Observation>>, TrainError> {
+        let k = self.field.instances.len();
+        let mut observations = vec![Vec::new(); k];
+        for view in 0..self.frames.len() {
+            let data = self.frames.get(&self.dataset, view)?;
+            let Some(labels) = &data.labels else { continue };
+            let settings = RenderSettings { deform: false, ..self.color_settings() };
+            let frame = &self.dataset.frames[self.frames.index(view)];
+            let depth = with_contacts.then(|| {
+                let channels = Channels { depth: true, instances: false };
+                self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels)
+            });
+            let (mut sums, mut areas) = (vec![DVec2::ZERO; k], vec![0.0; k]);
+            let mut cut = vec![false; k];
+            let mut ring: Vec<Vec<f64>> = vec![Vec::new(); k];
+            let (width, height) = (labels.width, labels.height);
+            for y in 0..height {
+                for x in 0..width {
+                    let label = *labels.at(x, y);
+                    if label != UNLABELLED {
+                        let of = usize::from(label) - 1;
+                        sums[of] += DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
+                        areas[of] += 1.0;
+                        cut[of] |= x == 0 || y == 0 || x + 1 == width || y + 1 == height;
+                        continue;
+                    }
+                    let Some(depth) = &depth else { continue };
+                    let seen = depth.depth.as_ref().map_or(0.0, |depth| *depth.at(x, y));
+                    if seen <= 0.0 || *depth.alpha.at(x, y) < 0.5 {
+                        continue;
+                    }
+                    let mut beside = [x.wrapping_sub(1), x + 1, x, x]
+                        .into_iter()
+                        .zip([y, y, y.wrapping_sub(1), y + 1])
+                        .filter(|(x, y)| *x < width && *y < height)
+                        .map(|(x, y)| *labels.at(x, y))
+                        .filter(|label| *label != UNLABELLED)
+                        .collect::<Vec<_>>();
+                    beside.sort_unstable();
+                    beside.dedup();
+                    for label in beside {
+                        ring[usize::from(label) - 1].push(f64::from(seen));
+                    }
+                }
+            }
+            for of in (0..k).filter(|of| areas[*of] >= FEWEST_PIXELS) {
+                ring[of].sort_by(f64::total_cmp);
+                let nearest = (ring[of].len() as f64 * CONTACT_SHARE) as usize;
+                observations[of].push(Observation {
+                    time_index: frame.time_index,
+                    camera: frame.camera,
+                    centroid_px: sums[of] / areas[of],
+                    area_px: areas[of],
+                    cut: cut[of],
+                    contact_depth: ring[of].get(nearest).copied(),
+                });
+            }
+        }
+        for observations in &mut observations {
+            observations.sort_by_key(|o| o.time_index);
+        }
+        Ok(observations)
+    }
+
+    /// Keeps travelling objects out of the static set.
+    pub(super) fn leave_out_travelling(&mut self, data: &TrainFrame) {
+        if let (Some(labels), true) = (&data.labels, self.guidance.travelling.contains(&true)) {
+            for (v, label) in self.scratch.v_color.pixels.iter_mut().zip(&labels.pixels) {
+                if self.guidance.travelling[usize::from(*label)] {
+                    *v = [0.0; 3];
+                }
+            }
+        }
+    }
+
+    /// Estimates paths, gives travelling objects Gaussians of their own, and teaches the deformation.
+    pub(super) fn start_guidance(&mut self) -> Result<(), TrainError> {
+        if !self.is_guided() {
+            return Ok(());
+        }
+        self.guidance.guide_of = vec![0; self.field.gaussians.len()];
+        if self.guidance.travelling.contains(&true) {
+            let observations = self.observe(true)?;
+            for (of, observations) in observations.iter().enumerate() {
+                if self.guidance.travelling[of + 1]
+                    && let Some(track) = fit(observations)
+                {
+                    self.inject(of as u16 + 1, track, observations)?;
+                }
+            }
+        }
+        self.rehearse()
+    }
+
+    /// Gaussians for one travelling object, inside its masks wherever it goes.
+    fn inject(&mut self, label: u16, track: Track, seen: &[Observation]) -> Result<(), TrainError> {
+        let times = &self.dataset.times;
+        // The canonical pose is the one that shows most of it.
+        let Some(best) = seen.iter().max_by(|a, b| {
+            (!a.cut, a.area_px).partial_cmp(&(!b.cut, b.area_px)).unwrap_or(std::cmp::Ordering::Equal)
+        }) else {
+            return Ok(());
+        };
+        let reference = track.at(times, times[best.time_index]);
+        let mut rng = stream(self.config.seed, Purpose::Guidance, u64::from(label));
+        let wanted = self.config.motion.gaussians as usize;
+        let frames: Vec<_> = (0..self.frames.len())
+            .map(|view| Ok((self.frames.index(view), self.frames.get(&self.dataset, view)?)))
+            .collect::<Result<_, TrainError>>()?;
+        let (mut positions, mut colors) = (Vec::new(), Vec::new());
+        for _ in 0..wanted * 40 {
+            if positions.len() == wanted {
+                break;
+            }
+            let offset = DVec3::from(std::array::from_fn(|_| rng.random::<f64>() * 2.0 - 1.0));
+            let offset = offset * 1.5 * track.radius;
+            let (mut inside, mut outside, mut sum) = (0.0_f64, 0.0_f64, DVec3::ZERO);
+            for (index, data) in &frames {
+                let frame = &self.dataset.frames[*index];
+                let Some(labels) = &data.labels else { continue };
+                if !seen.iter().any(|o| o.time_index == frame.time_index) {
+                    continue;
+                }
+                let place = track.at(times, frame.time) + offset;
+                let Some((pixel, _)) = frame.camera.project(place) else { continue };
+                let (x, y) = (pixel.x.floor(), pixel.y.floor());
+                if x < 0.0 || y < 0.0 || x >= f64::from(labels.width) || y >= f64::from(labels.height) {
+                    continue;
+                }
+                let found = *labels.at(x as u32, y as u32);
+                if found == label {
+                    inside += 1.0;
+                    let color = data.image.at(x as u32, y as u32);
+                    sum += DVec3::from(color.map(|c| f64::from(c) / 255.0));
+                } else if found == UNLABELLED {
+                    outside += 1.0;
+                }
+            }
+            if inside > 0.0 && outside <= OUTSIDE * (inside + outside) {
+                positions.push((reference + offset).as_vec3().to_array());
+                colors.push((sum / inside).as_vec3().to_array());
+            }
+        }
+        if positions.len() < 4 {
+            return Ok(());
+        }
+        let mut fresh = Gaussians::from_points(&positions, &colors)?;
+        fresh.opacity_logits.fill(logit(OPACITY));
+        fresh.occupancy_logits.fill(logit(self.config.instance.occupancy));
+        let g = &mut self.field.gaussians;
+        g.means.extend(fresh.means);
+        g.log_scales.extend(fresh.log_scales);
+        g.quaternions.extend(fresh.quaternions);
+        g.opacity_logits.extend(fresh.opacity_logits);
+        g.occupancy_logits.extend(fresh.occupancy_logits);
+        g.sh_coefficients.extend(fresh.sh_coefficients);
+        self.guidance.guides.push(Guide { track, reference });
+        self.guidance.guide_of.resize(g.means.len(), self.guidance.guides.len() as u16);
+        Ok(())
+    }
+
+    /// Teaches the deformation the paths before it sees an image.
+    fn rehearse(&mut self) -> Result<(), TrainError> {
+        self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
+        self.gradients = Gradients::zeros(&self.field);
+        if self.guidance.guides.is_empty() {
+            return Ok(());
+        }
+        let rates = StepRates::at(&self.config, Stage::Fine, 1, self.field.extent);
+        let rates = StepRates { planes: rates.planes, mlp: rates.mlp, ..StepRates::default() };
+        let weights = PlaneWeights {
+            smoothness: self.config.loss.plane_smoothness,
+            time_smoothness: self.config.loss.time_smoothness,
+            time_sparsity: self.config.loss.time_sparsity,
+        };
+        let times = self.dataset.times.clone();
+        let mut rng = stream(self.config.seed, Purpose::Guidance, 0);
+        for _ in 0..self.config.motion.rehearsal {
+            let time = times[rng.random_range(0..times.len())];
+            self.renderer.displace(&self.field, time);
+            let guided = self.guidance.guide_of.iter().filter(|guide| **guide > 0).count().max(1) as f32;
+            let n = self.guidance.guide_of.len() as f32;
+            // Both kinds count alike here, however few Gaussians travel.
+            let v = self.displacement_gradients(time, [n / guided, 1.0]);
+            self.renderer.displace_backward(&self.field, time, v, &mut self.gradients);
+            self.optimiser
+                .step(&mut self.field, &mut self.gradients, &rates, &weights, false, &mut self.times)
+                .map_err(|tensor| TrainError::NotFinite { stage: Stage::Fine, iteration: 0, tensor })?;
+        }
+        Ok(())
+    }
+
+    /// Weights of guidance and stillness at a step of a stage.
+    pub(super) fn guidance_weight(&self, stage: Stage, iteration: u32) -> [f32; 2] {
+        let motion = &self.config.motion;
+        let done = match stage {
+            Stage::Fine => iteration as f32 / self.config.fine_iterations().max(1) as f32,
+            Stage::Instance => 1.0,
+            _ => return [0.0; 2],
+        };
+        [motion.guidance * motion.guidance_end.powf(done), motion.stillness]
+    }
+
+    /// Gradients by what the deformation adds to every centre at the renderer's present time; empty when
+    /// nothing pulls.
+    pub(super) fn displacement_gradients(&self, time: f64, [guidance, stillness]: [f32; 2]) -> Vec<[f32; 3]> {
+        let displaced = self.renderer.posed_means();
+        let (guides, pose_of) = (&self.guidance.guides, &self.guidance.guide_of);
+        if (guidance, stillness) == (0.0, 0.0) || pose_of.len() != displaced.len() {
+            return Vec::new();
+        }
+        let canonical = &self.field.gaussians.means;
+        let rotations = rotations(displaced, canonical, pose_of, guides.len());
+        let poses: Vec<Pose> = guides
+            .iter()
+            .zip(rotations)
+            .map(|(guide, rotation)| Pose {
+                shift: guide.track.at(&self.dataset.times, time) - guide.reference,
+                rotation,
+            })
+            .collect();
+        let extent = f64::from(self.field.extent);
+        let pull = |weight: f32, reach: f64| Pull { weight: f64::from(weight), reach: reach * extent };
+        let pulls = [pull(guidance, PATH_REACH), pull(stillness, PLACE_REACH)];
+        displacement_loss(displaced, canonical, pose_of, &poses, pulls, extent).1
+    }
+}

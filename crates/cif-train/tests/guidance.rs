@@ -1,0 +1,117 @@
+//! Travelling objects, seen by one moving camera.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
+
+mod support;
+
+use cif_dataset::Dataset;
+use cif_field::{Checkpoint, Field};
+use cif_train::{Control, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
+use glam::DVec3;
+use support::{Scene, capture, small_config, train};
+
+const TRAVEL: f64 = 0.9;
+
+fn dataset(folder: &std::path::Path, times: usize) -> Dataset {
+    let scene = Scene { times, views: times, rolls: Some(TRAVEL), one_camera: true, ..Scene::default() };
+    let mut dataset = capture(folder, scene);
+    // Nothing is known of the ball that moves.
+    dataset.points.positions.drain(300..450);
+    dataset.points.colors.drain(300..450);
+    dataset
+}
+
+fn guided() -> TrainConfig {
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (100, 300, 60);
+    (config.motion.guidance, config.motion.stillness, config.motion.rehearsal) = (10.0, 1.0, 100);
+    config.motion.gaussians = 100;
+    config.densify.max_gaussians = 1_500;
+    config
+}
+
+fn without_record(field: &Field) -> Field {
+    Field { provenance: serde_json::Value::Null, ..field.clone() }
+}
+
+/// How far the opaque Gaussians of an instance move until half-time, on average.
+fn path(field: &Field, instance: usize) -> DVec3 {
+    let [first, last] = [0.0, 0.5].map(|time| field.deformed(time).means);
+    let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
+    for row in field.members(instance) {
+        let row = row as usize;
+        // The floor is nobody's, but every Gaussian has a most probable instance.
+        if last[row][1] > 0.35 {
+            continue;
+        }
+        let opacity = 1.0 / (1.0 + f64::from(-field.gaussians.opacity_logits[row]).exp());
+        let point = |p: [f32; 3]| DVec3::from(p.map(f64::from));
+        sum += opacity * (point(last[row]) - point(first[row]));
+        weight += opacity;
+    }
+    sum / weight
+}
+
+#[test]
+fn a_travelling_object_is_followed() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = dataset(folder.path(), 12);
+    let truth = DVec3::new(TRAVEL, 0.0, 0.0);
+    let mut config = guided();
+    let mut warned = false;
+    let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+    trainer
+        .run(&mut |event, _| {
+            warned |= matches!(event, TrainEvent::Warning { message } if message.contains("ball 9"));
+            Control::Continue
+        })
+        .unwrap();
+    assert!(warned, "the user is told what is guided");
+    let field = trainer.into_field();
+    let followed = path(&field, 2);
+    assert!((followed - truth).length() < 0.15, "{followed}");
+    for still in [0, 1] {
+        assert!(path(&field, still).length() < 0.05, "{}", path(&field, still));
+    }
+    // Without guidance one camera is not enough.
+    (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
+    let unguided = train(dataset, config).into_field();
+    let strayed = (path(&unguided, 2) - truth).length();
+    assert!(strayed.is_nan() || strayed > 2.0 * (followed - truth).length(), "{strayed}");
+}
+
+#[test]
+fn neither_threads_nor_interruptions_change_the_result() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = dataset(folder.path(), 6);
+    let mut config = guided();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (30, 50, 30);
+    config.densify.from = 10;
+    config.motion.rehearsal = 20;
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| train(dataset.clone(), config.clone()).into_field())
+    };
+    let whole = on(1);
+    assert!(without_record(&on(2)) == without_record(&whole));
+    config.report.step_every = 1;
+    for stop_at in [11, 30, 60, 80, 95] {
+        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+        let mut steps = 0;
+        let outcome = trainer.run(&mut |event, _| {
+            steps += u64::from(matches!(event, TrainEvent::Step { .. }));
+            if steps >= stop_at { Control::Stop } else { Control::Continue }
+        });
+        assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+        let file = folder.path().join("stopped.cif");
+        trainer.checkpoint(true).save(&file).unwrap();
+        let finish = |mut trainer: Trainer| {
+            assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+            assert!(without_record(trainer.field()) == without_record(&whole), "stopped at {stop_at}");
+        };
+        let state = || Checkpoint::load(&file).unwrap();
+        finish(Trainer::resume(dataset.clone(), state()).unwrap());
+        if trainer.stage() == Stage::Identity {
+            finish(Trainer::from_scene(dataset.clone(), config.clone(), state(), "stopped.cif").unwrap());
+        }
+    }
+}
