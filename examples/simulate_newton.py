@@ -11,8 +11,8 @@ and back in the environment of cif:
 
 Every instance of a stage written by `cif export` has a variant set `physics`: *kinematic* ones follow the
 recorded motion, *none* only stand in the way, *dynamic* ones fall. The stage is loaded with the chosen
-variants; recorded motion is played by this program, because simulators read poses at the default time only. The
-background has no collider, so a plane stands for the table.
+variants; recorded motion is played by this program, because simulators read poses at the default time only. A
+plane stands for the table, which is background and has no collider unless `--background-hulls` gave it some.
 
 The layer has the stage as its sublayer and holds the poses of what fell, so that it opens anywhere as the scene
 with the simulated motion, Blender included.
@@ -135,6 +135,11 @@ def owner(prim: Usd.Prim) -> Usd.Prim:
     return prim
 
 
+def is_background(instance: Usd.Prim) -> bool:
+    """Whether a prim is what belongs to no instance."""
+    return not instance.GetAttribute("cif:id").HasAuthoredValue()
+
+
 def colliders(stage: Usd.Stage) -> dict[Sdf.Path, list[Usd.Prim]]:
     """Collision meshes by instance."""
     found: dict[Sdf.Path, list[Usd.Prim]] = {}
@@ -155,8 +160,9 @@ def check_colliders(stage: Usd.Stage) -> bool:
     time = Usd.TimeCode.Default()
     good = True
     for path, meshes in colliders(stage).items():
-        splats = [p for p in Usd.PrimRange(stage.GetPrimAtPath(path)) if p.GetTypeName() == SPLATS]
-        if not splats:
+        instance = stage.GetPrimAtPath(path)
+        splats = [prim for prim in Usd.PrimRange(instance) if prim.GetTypeName() == SPLATS]
+        if not splats or is_background(instance):
             continue
         points = np.concatenate([world_points(prim, "positions", time) for prim in splats])
         weights = np.concatenate([np.asarray(prim.GetAttribute("opacities").Get()) for prim in splats])
@@ -181,7 +187,8 @@ def ground_height(stage: Usd.Stage, falling: list[Sdf.Path], up: int) -> float:
     time = Usd.TimeCode.Default()
     hulls = colliders(stage)
     corners = [world_points(m, "points", time) for path in falling or hulls for m in hulls.get(path, [])]
-    backgrounds = [p for p in stage.Traverse() if p.GetTypeName() == SPLATS and owner(p).GetPath() not in hulls]
+    splats = [prim for prim in stage.Traverse() if prim.GetTypeName() == SPLATS]
+    backgrounds = [prim for prim in splats if is_background(owner(prim))]
     if not corners or not backgrounds:
         return 0.0
     reach = np.concatenate(corners)
