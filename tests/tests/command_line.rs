@@ -45,12 +45,34 @@ fn listing(folder: &Path) -> Vec<String> {
 fn help_teaches_the_tool() {
     let folder = folder();
     let help = cif(folder.path(), "--help").succeeds().stdout;
-    for word in
-        ["train", "eval", "render", "export", "query", "info", "masks", "bench", "A short tour", "Exit code"]
-    {
+    for word in [
+        "train",
+        "eval",
+        "render",
+        "export",
+        "import",
+        "diff",
+        "query",
+        "info",
+        "masks",
+        "bench",
+        "A short tour",
+        "Exit code",
+    ] {
         assert!(help.contains(word), "{word} in {help}");
     }
-    let commands = ["train", "eval", "render", "export", "query", "info", "masks zigzag", "masks split"];
+    let commands = [
+        "train",
+        "eval",
+        "render",
+        "export",
+        "import",
+        "diff",
+        "query",
+        "info",
+        "masks zigzag",
+        "masks split",
+    ];
     for command in commands.into_iter().chain(["bench step"]) {
         let help = cif(folder.path(), &format!("{command} --help")).succeeds().stdout;
         assert!(help.contains("Usage: cif"), "{help}");

@@ -7,6 +7,7 @@
 //! | `dataset` | captures |
 //! | `field` | trained scenes: arrays, rendering, queries |
 //! | `export` | scenes as USD, and stages by label |
+//! | `import` | files as scenes, edits coming home, differences |
 //! | `error` | `cif.CifError` |
 //!
 //! Everything is documented for its users in `python/cif/_native.pyi`. Work in Rust runs without the lock of the
@@ -18,6 +19,7 @@ mod dataset;
 mod error;
 mod export;
 mod field;
+mod import;
 
 use std::ffi::OsString;
 
@@ -40,6 +42,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(run, module)?)?;
     module.add_function(wrap_pyfunction!(dataset::open_dataset, module)?)?;
     module.add_function(wrap_pyfunction!(export::query_stage, module)?)?;
+    module.add_function(wrap_pyfunction!(import::import_scene, module)?)?;
+    module.add_function(wrap_pyfunction!(import::diff, module)?)?;
     module.add_function(wrap_pyfunction!(export::usd_version, module)?)?;
     Ok(())
 }

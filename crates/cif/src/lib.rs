@@ -9,12 +9,14 @@
 //! | [`output`] | files written whole, never over existing ones |
 //! | [`pictures`] | instance, depth and error colours, panels, PNG files |
 //! | [`camera_file`] | views that no capture has |
+//! | [`graph_file`] | scenes of any format as scene graphs |
 //! | [`ground_truth`] | exported motion against known motion |
 //! | [`error`] | what is reported, and the exit code |
 
 pub mod camera_file;
 pub mod commands;
 pub mod error;
+pub mod graph_file;
 pub mod ground_truth;
 pub mod interrupt;
 pub mod output;

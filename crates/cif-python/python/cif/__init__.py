@@ -9,6 +9,7 @@ Captures, trained scenes and stages are also here as objects with numpy arrays::
     name, time_index, camera = field.cameras[0]
     picture = field.render(camera, field.times[time_index])["color"]
     field.export("table.usdc")
+    edited, changes = cif.import_scene("table.usdc", base=field)
     cif.query_stage("table.usdc", "red mug", time_code=12)
 """
 
@@ -18,7 +19,18 @@ import os
 from collections.abc import Sequence
 
 from . import _native, _schema
-from ._native import Camera, CifError, Dataset, Field, __version__, open_dataset, query_stage, usd_version
+from ._native import (
+    Camera,
+    CifError,
+    Dataset,
+    Field,
+    __version__,
+    diff,
+    import_scene,
+    open_dataset,
+    query_stage,
+    usd_version,
+)
 
 __all__ = [
     "Camera",
@@ -26,6 +38,8 @@ __all__ = [
     "Dataset",
     "Field",
     "__version__",
+    "diff",
+    "import_scene",
     "open_dataset",
     "query_stage",
     "run",

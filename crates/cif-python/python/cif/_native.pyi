@@ -201,5 +201,22 @@ def query_stage(
 ) -> list[dict[str, Any]]:
     """Return the prims that carry a label (globs, any case); an unknown label lists the known ones."""
 
+def import_scene(
+    path: str | os.PathLike[str], *, base: Field | None = None, force_base: bool = False
+) -> tuple[Field, dict[str, Any] | None]:
+    """Read a USD, glTF or PLY file as a field.
+
+    With ``base``, the field that the file was exported from, what was changed in the file is applied to it, and
+    the second value lists the edits as ``diff`` does; otherwise it is None. ``force_base`` takes a base that the
+    file was not exported from.
+    """
+
+def diff(before: str | os.PathLike[str], after: str | os.PathLike[str]) -> dict[str, Any]:
+    """Compare two scenes, stages or glTF files object by object.
+
+    ``objects`` lists those that differ: what happened (``kind``), how far they moved over time, names, labels,
+    visibility, and counts of splats; ``unchanged`` counts the others.
+    """
+
 def usd_version() -> str:
     """Return the version of the usd-core in use, e.g. 26.11."""

@@ -2,8 +2,10 @@
 
 mod bench;
 mod bench_export;
+mod diff;
 mod eval;
 mod export;
+mod import;
 mod info;
 mod masks;
 mod model_options;
@@ -42,6 +44,7 @@ A short tour:
   cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
   cif eval table.cif captures/table --images pictures    score the held-out views, and look at them
   cif export table.cif --usd table.usda                  one moving prim per object
+  cif import table.usda --base table.cif -o new.cif      edits of that file come home
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
 
 A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
@@ -56,6 +59,8 @@ enum Command {
     Eval(eval::Eval),
     Render(render::Render),
     Export(export::Export),
+    Import(import::Import),
+    Diff(diff::Diff),
     Query(query::Query),
     Info(info::Info),
     Masks(masks::Masks),
@@ -130,6 +135,8 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
         Command::Eval(command) => eval::run(&command),
         Command::Render(command) => render::run(&command),
         Command::Export(command) => export::run(&command),
+        Command::Import(command) => import::run(&command),
+        Command::Diff(command) => diff::run(&command),
         Command::Query(command) => query::run(&command),
         Command::Info(command) => info::run(&command),
         Command::Masks(command) => masks::run(&command),

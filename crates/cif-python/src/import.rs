@@ -1,0 +1,52 @@
+//! Files of other tools as scenes, edits coming home, and differences.
+
+use std::path::{Path, PathBuf};
+
+use cif::graph_file;
+use pyo3::prelude::*;
+
+use crate::arrays;
+use crate::error::cif_error;
+use crate::field::Field;
+
+fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+/// A file as a field, and the edits that were applied to `base`.
+#[pyfunction]
+#[pyo3(signature = (path, *, base=None, force_base=false))]
+pub(crate) fn import_scene<'py>(
+    py: Python<'py>,
+    path: PathBuf,
+    base: Option<PyRef<'py, Field>>,
+    force_base: bool,
+) -> PyResult<(Field, Bound<'py, PyAny>)> {
+    let base = base.as_deref();
+    let (inner, changes) = py
+        .detach(|| {
+            let graph = graph_file::read(&path).map_err(|error| error.to_string())?;
+            let source = name_of(&path);
+            match base {
+                Some(base) => cif_scene::import_edits(&base.inner, &graph, &source, force_base)
+                    .map(|(field, changes)| (field, Some(changes))),
+                None => cif_scene::field_from_graph(&graph, &source).map(|field| (field, None)),
+            }
+            .map_err(|error| error.to_string())
+        })
+        .map_err(cif_error)?;
+    Ok((Field { inner }, arrays::to_python(py, &changes)?))
+}
+
+/// What differs between two files.
+#[pyfunction]
+pub(crate) fn diff<'py>(py: Python<'py>, before: PathBuf, after: PathBuf) -> PyResult<Bound<'py, PyAny>> {
+    let changes = py
+        .detach(|| {
+            graph_file::read_both(&before, &after)
+                .map(|[before, after]| cif_scene::diff::diff(&before, &after))
+                .map_err(|error| error.to_string())
+        })
+        .map_err(cif_error)?;
+    arrays::to_python(py, &changes)
+}

@@ -1,0 +1,58 @@
+//! `cif diff`: what differs between two scenes.
+
+use std::path::PathBuf;
+
+use cif_scene::SceneDiff;
+use clap::Args;
+use serde_json::json;
+
+use crate::error::Error;
+use crate::graph_file;
+
+/// Tell what differs between two scenes, object by object
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Objects are matched by id, else by name. Distances are in world units, the largest over time. A scene
+is compared as it would be exported; beside an exported file, with the options of that export.
+
+  cif diff table.cif table.usda
+  cif diff before.glb after.glb --json")]
+pub(super) struct Diff {
+    /// Scene, stage or glTF file
+    #[arg(value_name = "BEFORE")]
+    before: PathBuf,
+    /// Scene, stage or glTF file
+    #[arg(value_name = "AFTER")]
+    after: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+pub(super) fn run(command: &Diff) -> Result<(), Error> {
+    let [before, after] = graph_file::read_both(&command.before, &command.after)?;
+    let changes = cif_scene::diff::diff(&before, &after);
+    if command.json {
+        println!("{:#}", json!(changes));
+    } else {
+        print_changes(&changes);
+    }
+    Ok(())
+}
+
+/// The differences as a table, one line each.
+pub(super) fn print_changes(changes: &SceneDiff) {
+    if changes.is_empty() {
+        println!("no differences in {} objects", changes.unchanged);
+        return;
+    }
+    let mut table = super::table(["object", "label", "change"]);
+    for object in &changes.objects {
+        for (line, words) in object.describe().into_iter().enumerate() {
+            let named = |text: &str| if line == 0 { text.to_owned() } else { String::new() };
+            table.add_row([named(&object.name), named(&object.label), words]);
+        }
+    }
+    println!("{table}");
+    println!("{} objects differ, {} do not", changes.objects.len(), changes.unchanged);
+}

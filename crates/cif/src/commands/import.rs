@@ -1,0 +1,107 @@
+//! `cif import`: files of other tools as scenes, and edits coming home.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use serde_json::json;
+
+use super::diff::print_changes;
+use super::scene;
+use crate::error::Error;
+use crate::{graph_file, output};
+
+/// Turn USD, glTF or PLY into a scene, or bring edits of an exported file home
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Without --base the file becomes a scene of its own: splats, objects with their labels, motion as the
+file has it, cameras. It can be rendered, labelled, queried and exported, but not trained further.
+
+With --base, the scene that the file was exported from, only what was changed in the file is applied
+to it: objects moved (also over time), renamed, relabelled, hidden, deleted, duplicated or added, and
+splats recoloured, faded, resized, deleted or moved. Everything else keeps its learned motion.
+
+  cif import fox.ply -o fox.cif
+  cif export table.cif --usd table.usda        # then edit table.usda in any tool
+  cif import table.usda --base table.cif -o edited.cif
+  cif diff table.cif edited.cif")]
+pub(super) struct Import {
+    /// File to read: .usda, .usdc, .usdz, .glb, .gltf or .ply
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    /// Scene to write
+    #[arg(short, long, value_name = "SCENE.cif")]
+    output: PathBuf,
+    /// Scene that the file was exported from; it is not changed
+    #[arg(long, value_name = "ORIGINAL.cif")]
+    base: Option<PathBuf>,
+    /// Take the base although the file was exported from another scene
+    #[arg(long, requires = "base")]
+    force_base: bool,
+    /// Print the edits as JSON
+    #[arg(long)]
+    json: bool,
+    /// Replace an existing scene
+    #[arg(long)]
+    force: bool,
+}
+
+pub(super) fn run(command: &Import) -> Result<(), Error> {
+    if !scene::is_scene(&command.output) {
+        return Err(Error::usage(
+            format!("-o {}: a scene is written", command.output.display()),
+            "end its name in .cif",
+        ));
+    }
+    output::check_file(&command.output, command.force)?;
+    // Before the file is read, which may take longer.
+    let base = command.base.as_deref().map(scene::load).transpose()?;
+    let graph = graph_file::read(&command.file)?;
+    for warning in &graph.warnings {
+        eprintln!("warning: {warning}");
+    }
+    let source = name_of(&command.file);
+    let field = match &base {
+        Some(base) => {
+            let (field, changes) = cif_scene::import_edits(base, &graph, &source, command.force_base)
+                .map_err(|error| import_error(&error))?;
+            if command.json {
+                println!("{:#}", json!(changes));
+            } else {
+                print_changes(&changes);
+            }
+            field
+        }
+        None => {
+            if graph.origin.field_fingerprint.is_some() {
+                eprintln!(
+                    "note: cif exported this file; give the scene it came from with --base to keep what was learned"
+                );
+            }
+            cif_scene::field_from_graph(&graph, &source).map_err(Error::plain)?
+        }
+    };
+    field.save(&command.output).map_err(Error::plain)?;
+    eprintln!(
+        "wrote {}: {} Gaussians, {} instances, {} times",
+        command.output.display(),
+        field.len(),
+        field.instances.len(),
+        field.timeline.times.len()
+    );
+    Ok(())
+}
+
+/// What a scene records of the file: its name, not where it lies.
+fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
+fn import_error(error: &cif_scene::SceneError) -> Error {
+    match error {
+        cif_scene::SceneError::OtherBase { .. } => Error::failed(
+            error.to_string(),
+            "--force-base takes this base all the same; rows of the file then count its Gaussians",
+        ),
+        _ => Error::plain(error),
+    }
+}
