@@ -1,4 +1,5 @@
 //! A file that left comes home: as a scene of its own, and with its edits onto the scene that it came from.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::fs;
 use std::path::Path;
