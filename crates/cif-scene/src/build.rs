@@ -4,6 +4,7 @@ use cif_field::{Field, Gaussians};
 use cif_geometry::quaternion;
 use glam::DVec3;
 
+use crate::assignment::Identity;
 use crate::frames::{Frame, Frames};
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::motion::{MovingGroup, trimmed_box, vector};
@@ -88,7 +89,15 @@ pub fn build_from(
         .map(|index| field.instances[index].label.clone())
         .collect();
     if !omitted.is_empty() {
-        warnings.push(format!("no visible Gaussian belongs to: {}", omitted.join(", ")));
+        let hidden = hidden_rows(field, &identities, &visible);
+        let told: Vec<String> = (0..field.instances.len())
+            .filter(|index| !group_owners.contains(&Some(*index)))
+            .map(|index| match hidden[index] {
+                0 => field.instances[index].label.clone(),
+                count => format!("{} ({count} are too faint to be drawn)", field.instances[index].label),
+            })
+            .collect();
+        warnings.push(format!("no visible Gaussian belongs to: {}", told.join(", ")));
     }
     let code_of =
         |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then_some(index as f64);
@@ -104,6 +113,17 @@ pub fn build_from(
         warnings,
         origin: Origin { field_fingerprint: Some(field.fingerprint()), options: Some(options.clone()) },
     })
+}
+
+/// Per instance, how many Gaussians are most probably its own and cannot be drawn.
+fn hidden_rows(field: &Field, identities: &[Option<Identity>], visible: &[u32]) -> Vec<usize> {
+    let mut hidden = vec![0; field.instances.len()];
+    for (row, identity) in identities.iter().enumerate() {
+        if let Some(identity) = identity.filter(|_| visible.binary_search(&(row as u32)).is_err()) {
+            hidden[identity.index] += 1;
+        }
+    }
+    hidden
 }
 
 /// Hulls for simulators; told where there is no body to make one of.

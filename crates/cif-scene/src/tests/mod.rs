@@ -295,6 +295,15 @@ fn instances_without_gaussians_are_named() {
     let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
     assert_eq!(graph.omitted, ["ghost"]);
     assert_eq!(graph.nodes.len(), 2);
+    // Gaussians that are too faint are counted.
+    field.identities.as_mut().unwrap().labels[0..3].fill(1);
+    field.gaussians.opacity_logits[0..3].fill(-20.0);
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    assert!(
+        graph
+            .warnings
+            .contains(&"no visible Gaussian belongs to: ghost (3 are too faint to be drawn)".into())
+    );
 }
 
 #[test]
