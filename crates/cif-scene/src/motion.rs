@@ -131,17 +131,30 @@ impl MeanShape {
 
 /// Weighted RMS without the outlying share of the weight that has the largest values, and the share of the
 /// weight that it is taken over; zero without weight.
+///
+/// The value at the edge counts with the part of its weight that is inside, so that smaller values never give
+/// a larger RMS, and the triangle inequality holds (see [`crate::keys`]).
 pub(crate) fn trimmed_rms(distances: &[f64], weights: &[f64], trim: f64) -> (f64, f64) {
     let total: f64 = weights.iter().sum();
-    let cut = if trim > 0.0 { weighted_quantile(distances, weights, 1.0 - trim) } else { f64::INFINITY };
-    let (mut squares, mut inliers) = (0.0, 0.0);
-    for (distance, weight) in distances.iter().zip(weights) {
-        if *distance <= cut {
+    if total <= 0.0 {
+        return (0.0, 0.0);
+    }
+    let mut order: Vec<u32> = (0..distances.len() as u32).collect();
+    if trim > 0.0 {
+        order.sort_unstable_by(|&a, &b| {
+            distances[a as usize].total_cmp(&distances[b as usize]).then(a.cmp(&b))
+        });
+    }
+    let inside = (1.0 - trim) * total;
+    let (mut squares, mut left) = (0.0, inside);
+    for index in order {
+        let (distance, weight) = (distances[index as usize], weights[index as usize].min(left));
+        if weight > 0.0 {
             squares += weight * distance * distance;
-            inliers += weight;
+            left -= weight;
         }
     }
-    if inliers > 0.0 { ((squares / inliers).sqrt(), inliers / total) } else { (0.0, 0.0) }
+    ((squares / inside).sqrt(), 1.0 - trim)
 }
 
 /// Box of the centres of rows without the outermost weight on each side.
@@ -365,4 +378,38 @@ pub(crate) fn quaternion_of(rotation: &DMat3) -> [f64; 4] {
 
 pub(crate) fn dot(a: [f64; 4], b: [f64; 4]) -> f64 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn the_value_at_the_edge_counts_in_part() {
+        let (rms, share) = trimmed_rms(&[3.0, 1.0, 2.0], &[10.0, 75.0, 15.0], 0.05);
+        assert!((rms - ((75.0 + 15.0 * 4.0 + 5.0 * 9.0) / 95.0_f64).sqrt()).abs() < 1e-12, "{rms}");
+        assert!((share - 0.95).abs() < 1e-15);
+        assert_eq!(trimmed_rms(&[3.0, 4.0], &[1.0, 1.0], 0.0), (12.5_f64.sqrt(), 1.0));
+        assert_eq!(trimmed_rms(&[3.0], &[0.0], 0.05), (0.0, 0.0));
+    }
+
+    proptest! {
+        /// What the error bounds rest on: smaller distances never give a larger value, and sums stay below the
+        /// sum of the first value and the RMS of what is added, over all weight.
+        #[test]
+        fn trimmed_rms_is_monotone_and_obeys_the_triangle_inequality(
+            values in prop::collection::vec((0.0_f64..1.0, 0.0_f64..1.0, 0.01_f64..5.0), 1..30),
+        ) {
+            let pick = |f: &dyn Fn(&(f64, f64, f64)) -> f64| values.iter().map(f).collect::<Vec<_>>();
+            let (small, sum, weights) = (pick(&|v| v.0), pick(&|v| v.0 + v.1), pick(&|v| v.2));
+            let added = pick(&|v| v.1);
+            let (a, share) = trimmed_rms(&small, &weights, 0.05);
+            let (both, _) = trimmed_rms(&sum, &weights, 0.05);
+            prop_assert!(a <= both + 1e-12, "{} {}", a, both);
+            let total = trimmed_rms(&added, &weights, 0.0).0;
+            prop_assert!(both <= a + total / share.sqrt() + 1e-12, "{} {} {}", both, a, total);
+        }
+    }
 }
