@@ -100,6 +100,11 @@ fn what_is_not_understood_ends_with_2() {
     cif(folder.path(), "export a.cif").fails(2, &["--usd"]);
     cif(folder.path(), "export a.cif --usd out.glb").fails(2, &[".usda"]);
     cif(folder.path(), "export a.cif --usd out.usda --tolerance much").fails(2, &["1%"]);
+    cif(folder.path(), "export a.cif --gltf out.usda").fails(2, &[".glb"]);
+    cif(folder.path(), "export a.cif --ply out.splat").fails(2, &[".ply"]);
+    cif(folder.path(), "export a.cif --ply out.ply --ply-split").fails(2, &["folder"]);
+    cif(folder.path(), "export a.cif --ply out.ply --ply-time 2").fails(2, &["from 0"]);
+    cif(folder.path(), "export a.cif --report --ply-sequence").fails(2, &["--ply"]);
 }
 
 #[test]

@@ -110,6 +110,15 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     cif(path, "export scene.cif --usd out.usda").fails(1, &["USD"]);
     assert!(!path.join("out.usda").exists());
 
+    // glTF and PLY need nothing else; both come back as scenes with the same objects.
+    cif(path, "export scene.cif --gltf out.gltf --ply out.ply").succeeds();
+    cif(path, "export scene.cif --gltf out.gltf").fails(1, &["out.gltf exists", "--force"]);
+    let text = fs::read_to_string(path.join("out.gltf")).unwrap();
+    assert!(text.contains("KHR_gaussian_splatting:ROTATION") && text.contains("red ball"));
+    assert!(path.join("out.bin").metadata().unwrap().len() > 10_000);
+    cif(path, "export scene.cif --ply splats --ply-split").succeeds();
+    assert!(path.join("splats/background.ply").exists());
+
     // Nothing is overwritten unasked.
     cif(path, "eval scene.cif table --images pictures").fails(1, &["pictures", "--force"]);
     cif(path, "train table -o scene.cif").fails(1, &["scene.cif exists"]);

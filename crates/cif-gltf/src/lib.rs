@@ -26,6 +26,8 @@ mod arrays;
 mod author;
 mod document;
 mod extras;
+#[cfg(test)]
+mod foreign_tests;
 mod read;
 #[cfg(test)]
 mod testing;
@@ -35,13 +37,14 @@ mod write;
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::SceneGraph;
+use cif_scene::{MotionModel, SceneGraph};
 
 pub use error::GltfError;
-pub use read::UNKNOWN_ROW;
 
 /// The extension that holds the splats.
 pub const EXTENSION: &str = "KHR_gaussian_splatting";
+/// Most expensive motion that a file can hold: build graphs for glTF with no more than this.
+pub const MOST_EXPENSIVE_MOTION: MotionModel = MotionModel::Parts;
 /// Attribute with the row of every splat in the field: two unsigned shorts, the low one first.
 pub const ROW: &str = "_CIF_ROW";
 /// Attribute with the occupancy of every splat.
@@ -100,8 +103,9 @@ pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), GltfError
 /// without proxies and colliders. Of other files every node with splats becomes an instance that is labelled by
 /// the node's name, occupied and certain of its identity; a node that is turned but does not move gets a rigid
 /// track of one sample; scales that are not 1 are worked into the splats. The world then has glTF's axes and
-/// units (+y up, metres), 24 time codes per second, and [`cif_scene::Origin`] is empty. Whatever could not be
-/// taken over is said in [`SceneGraph::warnings`].
+/// units (+y up, metres), 24 time codes per second, and [`cif_scene::Origin`] is empty. Rows count the splats of
+/// such a file; in files of ours, splats that were added have [`cif_scene::Splats::NO_ROW`]. Whatever could not
+/// be taken over is said in [`SceneGraph::warnings`].
 ///
 /// # Errors
 /// Missing, truncated or inconsistent files, buffers outside the file's folder, extensions that must be known,

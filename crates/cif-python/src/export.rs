@@ -1,4 +1,4 @@
-//! Scenes as USD, and stages by label.
+//! Scenes as USD, glTF and PLY, and stages by label.
 
 use std::path::{Path, PathBuf};
 
@@ -98,6 +98,12 @@ pub(crate) fn export<'py>(
     motion: Option<Bound<'py, PyAny>>,
     export_options: cif_usd::ExportOptions,
 ) -> PyResult<Bound<'py, PyDict>> {
+    let force = export_options.force;
+    match ending(path).as_str() {
+        "glb" | "gltf" => return export_gltf(py, field, path, options, motion, force),
+        "ply" => return export_ply(py, field, path, options, motion, force),
+        _ => {}
+    }
     cif_usd::check_target(path, export_options).map_err(cif_error)?;
     let graph = build(py, field, options, motion)?;
     let summary = py.detach(|| cif_usd::export(&graph, path, export_options)).map_err(cif_error)?;
@@ -109,6 +115,58 @@ pub(crate) fn export<'py>(
     out.set_item("usd_version", summary.usd_version)?;
     out.set_item("warnings", &graph.warnings)?;
     out.set_item("motion", arrays::to_python(py, &graph.motion_table())?)?;
+    Ok(out)
+}
+
+fn ending(path: &Path) -> String {
+    path.extension().unwrap_or_default().to_string_lossy().to_lowercase()
+}
+
+/// glTF holds no motion splat by splat: what deforms leaves as a few rigid parts.
+fn export_gltf<'py>(
+    py: Python<'py>,
+    field: &Field,
+    path: &Path,
+    options: &SceneOptions,
+    motion: Option<Bound<'py, PyAny>>,
+    force: bool,
+) -> PyResult<Bound<'py, PyDict>> {
+    let export_options = cif_gltf::ExportOptions { force };
+    cif_gltf::check_target(path, export_options).map_err(cif_error)?;
+    let most_expensive_motion = options.most_expensive_motion.min(cif_gltf::MOST_EXPENSIVE_MOTION);
+    let options = SceneOptions { most_expensive_motion, ..options.clone() };
+    let graph = build(py, field, &options, motion)?;
+    let summary = py.detach(|| cif_gltf::export(&graph, path, export_options)).map_err(cif_error)?;
+    let out = PyDict::new(py);
+    out.set_item("path", summary.path)?;
+    out.set_item("files", summary.files)?;
+    out.set_item("bytes", summary.bytes)?;
+    out.set_item("splats", summary.splats)?;
+    out.set_item("samples", summary.samples)?;
+    out.set_item("warnings", &graph.warnings)?;
+    out.set_item("motion", arrays::to_python(py, &graph.motion_table())?)?;
+    Ok(out)
+}
+
+/// The scene as it stands at the first exported frame.
+fn export_ply<'py>(
+    py: Python<'py>,
+    field: &Field,
+    path: &Path,
+    options: &SceneOptions,
+    motion: Option<Bound<'py, PyAny>>,
+    force: bool,
+) -> PyResult<Bound<'py, PyDict>> {
+    let export_options = cif_ply::ExportOptions { force, ..cif_ply::ExportOptions::default() };
+    cif_ply::check_target(path, export_options).map_err(cif_error)?;
+    let graph = build(py, field, options, motion)?;
+    let summary = py.detach(|| cif_ply::export(&graph, path, export_options)).map_err(cif_error)?;
+    let out = PyDict::new(py);
+    out.set_item("path", path)?;
+    out.set_item("files", summary.files)?;
+    out.set_item("bytes", summary.bytes)?;
+    out.set_item("splats", summary.splats)?;
+    out.set_item("warnings", &graph.warnings)?;
     Ok(out)
 }
 

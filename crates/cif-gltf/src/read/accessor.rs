@@ -164,17 +164,17 @@ fn decode<const N: usize>(
     normalized: bool,
     count: usize,
 ) -> Vec<[f32; N]> {
-    let scale = |full: f32| if normalized { full.recip() } else { 1.0 };
+    let full = |largest: f32| if normalized { largest } else { 1.0 };
     match component {
         ComponentType::F32 => gather(layout, count, f32::from_le_bytes),
         ComponentType::U32 => gather(layout, count, |b| u32::from_le_bytes(b) as f32),
-        ComponentType::U8 => gather(layout, count, |[b]| f32::from(b) * scale(255.0)),
-        ComponentType::U16 => gather(layout, count, |b| f32::from(u16::from_le_bytes(b)) * scale(65_535.0)),
+        ComponentType::U8 => gather(layout, count, |[b]| f32::from(b) / full(255.0)),
+        ComponentType::U16 => gather(layout, count, |b| f32::from(u16::from_le_bytes(b)) / full(65_535.0)),
         ComponentType::I8 => {
-            gather(layout, count, |b| (f32::from(i8::from_le_bytes(b)) * scale(127.0)).max(least(normalized)))
+            gather(layout, count, |b| (f32::from(i8::from_le_bytes(b)) / full(127.0)).max(least(normalized)))
         }
         ComponentType::I16 => gather(layout, count, |b| {
-            (f32::from(i16::from_le_bytes(b)) * scale(32_767.0)).max(least(normalized))
+            (f32::from(i16::from_le_bytes(b)) / full(32_767.0)).max(least(normalized))
         }),
     }
 }

@@ -37,8 +37,6 @@ mod objects;
 mod source;
 mod splats;
 
-pub use splats::UNKNOWN_ROW;
-
 /// Time codes per second of files that have none.
 const FRAMES_PER_SECOND: f64 = 24.0;
 

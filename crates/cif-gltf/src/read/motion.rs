@@ -95,7 +95,7 @@ impl Stage<'_> {
             (None, []) => Decomposed::of(&DAffine3::IDENTITY),
             (None, &[node]) => match local(node) {
                 // Nothing is computed, so that numbers come back as they were written.
-                Local::Parts(translation, rotation, scale) if scale.cmpgt(DVec3::ZERO).all() => {
+                Local::Parts(translation, rotation, scale) if scale.cmpge(DVec3::ZERO).all() => {
                     Some(Decomposed { translation, rotation, stretch: DMat3::from_diagonal(scale) })
                 }
                 other => Decomposed::of(&other.affine()),

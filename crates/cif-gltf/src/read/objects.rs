@@ -13,7 +13,7 @@ use glam::{DAffine3, DMat3, DQuat, DVec3};
 use super::bake;
 use super::hierarchy::Placed;
 use super::motion::{Movement, Stage};
-use super::splats::{UNKNOWN_ROW, append};
+use super::splats::append;
 use crate::GltfError;
 use crate::extras::{Cif, Object};
 
@@ -156,7 +156,7 @@ impl Builder<'_> {
         let source = self.stage.source;
         match source.root.nodes[node].mesh {
             Some(mesh) if source.splat_count(mesh.value()).is_some() => {
-                Ok(source.mesh_splats(mesh.value(), self.warnings)?.splats)
+                source.mesh_splats(mesh.value(), self.warnings)
             }
             _ => Ok(Splats::default()),
         }
@@ -226,7 +226,7 @@ impl Builder<'_> {
         if let Some(next) = &mut self.next_row {
             for row in &mut splats.rows {
                 *row = *next;
-                *next = next.saturating_add(1).min(UNKNOWN_ROW - 1);
+                *next = next.saturating_add(1).min(Splats::NO_ROW - 1);
             }
         }
     }
@@ -252,24 +252,18 @@ impl Builder<'_> {
             }
         };
         let node_name = source.root.nodes[index].name.as_deref().unwrap_or(&object.name);
-        let mut label = object.label.clone();
-        if is_renamed(node_name, &object.name) {
-            self.warnings.push(format!(
-                "{} was called {}: its label '{label}' becomes '{node_name}'",
-                source.node_name(index),
-                object.name
-            ));
-            node_name.clone_into(&mut label);
-        }
-        let name = self.unique(if known.is_some() {
+        let name = if is_renamed(node_name, &object.name) {
+            naming::identifier(node_name, &object.name)
+        } else if known.is_some() {
             object.name.clone()
         } else {
-            naming::instance_name(&label, id)
-        });
+            naming::instance_name(&object.label, id)
+        };
+        let name = self.unique(name);
         Ok(Named {
             kind: NodeKind::Instance { id, index: position },
             name,
-            label,
+            label: object.label.clone(),
             category: object.category.clone(),
             pivot: Some(DVec3::from_array(object.pivot)),
             report: Some(object.motion.clone()),

@@ -14,16 +14,8 @@ use super::accessor::{ANY, Expected};
 use super::source::{Source, unknown_extension};
 use crate::{EXTENSION, GltfError, conventions};
 
-/// Row of a splat that was added to a file of ours, so that it has none in the field.
-pub const UNKNOWN_ROW: u32 = u32::MAX;
 /// Standard deviation in place of 0: a splat of no thickness cannot be inverted.
 const THINNEST: f32 = 1e-9;
-
-/// Splats of a mesh, and whether all of them know their row.
-pub(crate) struct MeshSplats {
-    pub(crate) splats: Splats,
-    pub(crate) traced: bool,
-}
 
 /// The extension object of a primitive.
 pub(crate) fn extension(primitive: &Primitive) -> Option<&Value> {
@@ -45,12 +37,8 @@ impl Source {
     }
 
     /// All splats of a mesh, primitive after primitive.
-    pub(crate) fn mesh_splats(
-        &self,
-        mesh: usize,
-        warnings: &mut Vec<String>,
-    ) -> Result<MeshSplats, GltfError> {
-        let mut all = MeshSplats { splats: Splats::default(), traced: true };
+    pub(crate) fn mesh_splats(&self, mesh: usize, warnings: &mut Vec<String>) -> Result<Splats, GltfError> {
+        let mut all = Splats::default();
         for (position, primitive) in self.root.meshes[mesh].primitives.iter().enumerate() {
             if let Some(settings) = extension(primitive) {
                 let object = match self.root.meshes[mesh].primitives.len() {
@@ -58,8 +46,7 @@ impl Source {
                     _ => format!("{}, primitive {position}", self.mesh_name(mesh)),
                 };
                 let part = Reader { source: self, object, primitive }.read(settings, warnings)?;
-                all.traced &= part.traced;
-                append(&mut all.splats, part.splats);
+                append(&mut all, part);
             }
         }
         Ok(all)
@@ -103,7 +90,7 @@ struct Reader<'a> {
 }
 
 impl Reader<'_> {
-    fn read(&self, settings: &Value, warnings: &mut Vec<String>) -> Result<MeshSplats, GltfError> {
+    fn read(&self, settings: &Value, warnings: &mut Vec<String>) -> Result<Splats, GltfError> {
         self.check_settings(settings, warnings)?;
         let positions = self.required("POSITION")?;
         // Positions of other types need KHR_mesh_quantization, which needs nothing else.
@@ -168,15 +155,14 @@ impl Reader<'_> {
         };
         splats.occupancies = share(&crate::OCCUPANCY[1..])?;
         splats.identity_probabilities = share(&crate::IDENTITY[1..])?;
-        let rows = self.accessor(crate::ROW);
-        splats.rows = match rows {
+        splats.rows = match self.accessor(crate::ROW) {
             Some(index) => {
                 let halves: Vec<[f32; 2]> = self.attribute(crate::ROW, index, Some(n), &[(U16, false)])?;
                 halves.into_iter().map(|[low, high]| low as u32 | ((high as u32) << 16)).collect()
             }
-            None => vec![UNKNOWN_ROW; n],
+            None => vec![Splats::NO_ROW; n],
         };
-        Ok(MeshSplats { splats, traced: rows.is_some() })
+        Ok(splats)
     }
 
     fn check_settings(&self, settings: &Value, warnings: &mut Vec<String>) -> Result<(), GltfError> {
@@ -322,7 +308,7 @@ fn display_from_linear(splats: &mut Splats) {
         for channel in 0..3 {
             let (display, slope) = conventions::srgb_from_linear(0.5 + band_0 * row[channel]);
             row[channel] = (display - 0.5) / band_0;
-            for coefficient in row[3 + channel..].iter_mut().step_by(3) {
+            for coefficient in row[3..].iter_mut().skip(channel).step_by(3) {
                 *coefficient *= slope;
             }
         }

@@ -176,7 +176,11 @@ class Field:
         levels_of_detail: bool = True,
         force: bool = False,
     ) -> dict[str, Any]:
-        """Write a .usda, .usdc or .usdz stage with one prim per object.
+        """Write the scene with one prim or node per object.
+
+        The ending decides the format: .usda, .usdc, .usdz (USD), .glb, .gltf (glTF) or .ply (splats).
+        glTF holds rigid motion only: what deforms leaves as a few rigid parts; the motion table says what that
+        misses. PLY holds all splats as they stand at the first exported frame.
 
         motion replaces the trained deformation by a function of time that returns means [N, 3] and quaternions
         [N, 4]. most_expensive_motion is static, rigid, parts or dense. hulls and background_hulls are the most

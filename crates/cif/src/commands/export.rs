@@ -1,4 +1,4 @@
-//! `cif export`: a scene as USD.
+//! `cif export`: a scene as USD, glTF and PLY.
 
 use std::path::{Path, PathBuf};
 
@@ -6,16 +6,19 @@ use cif_scene::{FrameRange, SceneGraph, SceneOptions, Tolerance, UpAxis};
 use clap::{ArgGroup, Args};
 use serde_json::json;
 
+use super::export_gltf::Gltf;
+use super::export_ply::Ply;
 use super::model_options::ModelOptions;
 use super::scene;
 use crate::error::Error;
 use crate::ground_truth::{self, MotionError};
 use crate::output;
 
-/// Export a scene as USD, one prim per object
+/// Export a scene as USD, glTF or PLY, one prim or node per object
 #[derive(Debug, Args)]
 #[command(
-    group = ArgGroup::new("result").required(true).multiple(true).args(["usd", "report", "report_json"]),
+    group = ArgGroup::new("result").required(true).multiple(true)
+        .args(["usd", "gltf", "ply", "report", "report_json"]),
     after_help = "\
 Every object gets the cheapest motion that stays inside the tolerance: static, rigid, parts (a few
 rigid bodies), or dense (a path for every splat). Samples that interpolation reproduces inside the
@@ -23,6 +26,9 @@ tolerance are left out. The table tells which motion was chosen, and what it mis
 
   cif export table.cif --usd table.usda
   cif export table.cif --usd table.usdz --tolerance 0.5%
+  cif export table.cif --gltf table.glb --usd table.usdc
+  cif export table.cif --ply table.ply --ply-time 0.5
+  cif export table.cif --ply frames --ply-sequence
   cif export table.cif --report --ground-truth motion.json"
 )]
 pub(super) struct Export {
@@ -32,6 +38,10 @@ pub(super) struct Export {
     /// Stage to write; the ending decides: .usda (text), .usdc (binary), .usdz (package)
     #[arg(long, value_name = "OUT.usda|usdc|usdz")]
     usd: Option<PathBuf>,
+    #[command(flatten)]
+    gltf: Gltf,
+    #[command(flatten)]
+    ply: Ply,
     /// Largest error of a simplified motion: 1% of the object's size, or 0.002 in world units
     #[arg(long, default_value = "1%", value_name = "TOLERANCE")]
     tolerance: Tolerance,
@@ -95,9 +105,14 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
         output::check_file(path, command.force)?;
     }
+    command.gltf.check(command.force)?;
+    command.ply.check(command.force)?;
     let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
     let field = scene::load(&command.scene)?;
-    let graph = cif_scene::build(&field, &options(command)).map_err(Error::plain)?;
+    let options = options(command);
+    let only_gltf = command.gltf.gltf.is_some() && command.usd.is_none() && command.ply.ply.is_none();
+    let options = if only_gltf { Gltf::options(&options) } else { options };
+    let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }
@@ -108,8 +123,12 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         Some(path) => Some(cif_usd::export(&graph, path, writing(command)).map_err(Error::plain)?),
         None => None,
     };
+    command.ply.write(&graph, command.force)?;
+    let of_gltf = command.gltf.write(&field, &graph, &options, command.force)?;
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
-    let tables = json!({ "motion": graph.motion_table(), "ground_truth": errors });
+    let of_gltf_table = of_gltf.as_ref().map(SceneGraph::motion_table);
+    let tables =
+        json!({ "motion": graph.motion_table(), "gltf_motion": of_gltf_table, "ground_truth": errors });
     if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
         output::write_file(path, format!("{tables:#}\n").as_bytes())?;
     }
@@ -117,6 +136,10 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         println!("{tables:#}");
     } else {
         print_motion(&graph);
+        if let Some(of_gltf) = &of_gltf {
+            println!("motion in the glTF, which holds no motion splat by splat:");
+            print_motion(of_gltf);
+        }
         if let Some(errors) = &errors {
             print_errors(errors);
         }

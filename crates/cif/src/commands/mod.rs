@@ -5,6 +5,8 @@ mod bench_export;
 mod diff;
 mod eval;
 mod export;
+mod export_gltf;
+mod export_ply;
 mod import;
 mod info;
 mod masks;

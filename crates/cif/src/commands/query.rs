@@ -75,7 +75,7 @@ fn in_scene(path: &Path, pattern: String, time: Option<f64>) -> Result<Vec<Label
 }
 
 /// Time code of a normalised time: linear between captured times, which need not be evenly spaced.
-fn code_at(times: &[f64], codes: &[f64], time: f64) -> f64 {
+pub(super) fn code_at(times: &[f64], codes: &[f64], time: f64) -> f64 {
     let after = times.partition_point(|captured| *captured <= time);
     if after == 0 {
         return codes.first().copied().unwrap_or(0.0);
