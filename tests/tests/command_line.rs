@@ -53,6 +53,7 @@ fn help_teaches_the_tool() {
         "import",
         "diff",
         "query",
+        "label",
         "info",
         "masks",
         "bench",
@@ -69,6 +70,7 @@ fn help_teaches_the_tool() {
         "import",
         "diff",
         "query",
+        "label",
         "info",
         "masks zigzag",
         "masks split",
@@ -94,9 +96,8 @@ fn what_is_not_understood_ends_with_2() {
     cif(folder.path(), "render a.cif -o out").fails(2, &["--capture"]);
     cif(folder.path(), "render a.cif --capture table -o out --time 3").fails(2, &["from 0"]);
     cif(folder.path(), "train table -o a.cif --simd widest").fails(2, &["avx2", "portable"]);
-    cif(folder.path(), "query a.cif").fails(2, &["--label"]);
     cif(folder.path(), "query a.cif --at 1,2").fails(2, &["three"]);
-    cif(folder.path(), "query a.usda --at 1,2,3").fails(2, &["--label"]);
+    cif(folder.path(), "label a.cif x").fails(2, &["--instance"]);
     cif(folder.path(), "export a.cif").fails(2, &["--usd"]);
     cif(folder.path(), "export a.cif --usd out.glb").fails(2, &[".usda"]);
     cif(folder.path(), "export a.cif --usd out.usda --tolerance much").fails(2, &["1%"]);

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, Package};
 
 /// Row of every crate; 0 is the lowest.
-const ROWS: [(&str, u32); 11] = [
+const ROWS: [(&str, u32); 12] = [
     ("cif-geometry", 0),
     ("cif-dataset", 1),
     ("cif-field", 1),
@@ -15,6 +15,7 @@ const ROWS: [(&str, u32); 11] = [
     ("cif-usd", 4),
     ("cif-gltf", 4),
     ("cif-ply", 4),
+    ("cif-exr", 4),
     ("cif", 5),
     ("cif-python", 6),
 ];

@@ -6,6 +6,8 @@ use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::cryptomatte::ObjectIds;
+
 /// The layouts that can be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -118,6 +120,8 @@ pub struct Dataset {
     pub frames_per_second: Option<f64>,
     /// Instances, ascending id; empty without masks.
     pub instances: Vec<InstanceLabel>,
+    /// Mask value of every object of Cryptomatte masks; empty for PNG masks.
+    pub mask_objects: ObjectIds,
     /// Initial points.
     pub points: PointCloud,
     /// Whether images carry alpha and are composited on the background when loaded.

@@ -8,8 +8,8 @@
 //! | nerfstudio, instant-ngp | `transforms.json` | its lists, else every eighth frame |
 //! | COLMAP | `sparse/0` | every eighth image |
 //!
-//! Masks are PNG files of instance ids, 0 for unlabelled; labels come from `instances.json`, which may also lie
-//! in the mask folder. Named groups of held-out frames come from `splits.json`. All cameras are ideal pinholes
+//! Masks are PNG files of instance ids, 0 for unlabelled, or EXR files with a [`cryptomatte`]; labels come from
+//! `instances.json`, which may also lie in the mask folder, or from the Cryptomatte. Named groups of held-out frames come from `splits.json`. All cameras are ideal pinholes
 //! in this project's axes once a frame is loaded; times are normalised to [0, 1].
 //!
 //! ```no_run
@@ -26,6 +26,7 @@
 //! ```
 
 mod camera_check;
+pub mod cryptomatte;
 mod dataset;
 mod error;
 mod files;

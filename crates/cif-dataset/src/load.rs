@@ -6,7 +6,7 @@ use cif_geometry::{PinholeCamera, PixelGrid};
 
 use crate::files::{image, mask};
 use crate::lens_removal::{undistort_image, undistort_mask};
-use crate::{Dataset, Error, FrameData};
+use crate::{Dataset, Error, FrameData, mask_files};
 
 impl Dataset {
     /// Loads image and mask of a frame.
@@ -52,7 +52,8 @@ impl Dataset {
         self.frames[index].mask.as_deref().map(|path| self.load_mask_file(index, path)).transpose()
     }
 
-    /// Loads a mask file as the mask of a frame, for masks of another folder (see [`Dataset::mask_paths`]).
+    /// Loads a mask file as the mask of a frame, for masks of another folder (see [`Dataset::mask_paths`]). Objects
+    /// of a Cryptomatte are those of [`Dataset::mask_objects`].
     ///
     /// # Errors
     /// When the file is missing, truncated, no mask, or has another aspect than the frame.
@@ -61,7 +62,7 @@ impl Dataset {
     /// When there is no frame `index`.
     pub fn load_mask_file(&self, index: usize, path: &Path) -> Result<PixelGrid<u16>, Error> {
         let frame = &self.frames[index];
-        let stored = mask::decode(path)?;
+        let stored = mask_files::decode(path, &self.mask_objects)?;
         let (width, height) = (frame.camera.width, frame.camera.height);
         if !same_aspect((stored.width, stored.height), (width, height)) {
             return Err(Error::MaskSize {

@@ -3,14 +3,61 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use cif_geometry::PixelGrid;
 use rayon::prelude::*;
 
+use crate::cryptomatte::{self, ObjectIds};
 use crate::files::{listing, mask};
 use crate::load::same_aspect;
 use crate::{Error, Frame, Layout};
 
 /// Mask folder that is taken where none is asked for.
 pub(crate) const DEFAULT_FOLDER: &str = "masks";
+
+/// Endings of mask files, first choice first.
+const EXTENSIONS: [&str; 2] = ["png", "exr"];
+
+/// Whether a mask is a Cryptomatte.
+pub(crate) fn is_cryptomatte(path: &Path) -> bool {
+    listing::has_extension(path, &["exr"])
+}
+
+/// Reads the header of a mask.
+///
+/// # Errors
+/// When the file is missing or no mask.
+fn probe(path: &Path) -> Result<mask::MaskHeader, Error> {
+    if !is_cryptomatte(path) {
+        return mask::probe(path);
+    }
+    let header = cryptomatte::read_header(path)?;
+    Ok(mask::MaskHeader { width: header.width, height: header.height, largest_id: u16::MAX })
+}
+
+/// Decodes a mask: a PNG file of ids, or a Cryptomatte whose objects have the ids of `objects`.
+///
+/// # Errors
+/// When the file is missing, truncated or no mask.
+pub(crate) fn decode(path: &Path, objects: &ObjectIds) -> Result<PixelGrid<u16>, Error> {
+    if is_cryptomatte(path) { Ok(cryptomatte::read(path)?.flatten(objects)) } else { mask::decode(path) }
+}
+
+/// Objects of all Cryptomatte masks by name; empty for PNG masks.
+///
+/// # Errors
+/// When a header cannot be read; the first in frame order is reported.
+pub(crate) fn manifests(frames: &[Frame]) -> Result<BTreeMap<String, u32>, Error> {
+    let headers: Vec<Result<cryptomatte::Header, Error>> = frames
+        .par_iter()
+        .filter_map(|frame| frame.mask.as_deref().filter(|path| is_cryptomatte(path)))
+        .map(cryptomatte::read_header)
+        .collect();
+    let mut objects = BTreeMap::new();
+    for header in headers {
+        objects.extend(header?.objects);
+    }
+    Ok(objects)
+}
 
 /// Pixels of each id of one mask, without 0.
 pub(crate) type PixelCounts = BTreeMap<u16, u64>;
@@ -21,14 +68,17 @@ pub(crate) struct MaskListing {
     pub(crate) paths: Vec<Option<PathBuf>>,
     /// Folder that holds `instances.json` for these masks, if it has one of its own.
     pub(crate) folder: Option<PathBuf>,
-    /// PNG files in the folder that belong to no frame.
+    /// PNG and EXR files in the folder that belong to no frame.
     pub(crate) strangers: usize,
+    /// Whether files are numbered in the order of the frames instead of named as them.
+    pub(crate) numbered: bool,
 }
 
 /// Finds the masks of a folder: a name inside the capture, or a path.
 ///
 /// Looked for, in this order: `<camera>/<folder>/<stem>.png` (Neu3D), `<folder>/<frame>.png`,
-/// `<folder>/<frame>.<image extension>.png` and, where stems are unique, `<folder>/<stem>.png`.
+/// `<folder>/<frame>.<image extension>.png` and, where stems are unique, `<folder>/<stem>.png`; each also with
+/// `.exr`. Where none fits, EXR files that are bare numbers count the frames from 0, as renderers number them.
 pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Path) -> MaskListing {
     let inside = root.join(folder);
     // A path relative to the working folder, where the capture has no such folder.
@@ -38,31 +88,56 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
     for stem in &stems {
         *occurrences.entry(stem).or_default() += 1;
     }
-    let paths: Vec<Option<PathBuf>> = frames
+    let mut paths: Vec<Option<PathBuf>> = frames
         .iter()
         .zip(&stems)
         .map(|(frame, stem)| {
             let mut candidates = Vec::new();
             if layout == Layout::Neu3d && folder.is_relative() {
-                candidates.push(root.join(&frame.camera_name).join(folder).join(format!("{stem}.png")));
+                candidates.push(root.join(&frame.camera_name).join(folder).join(stem));
             }
-            candidates.push(base.join(format!("{}.png", frame.name)));
+            candidates.push(base.join(&frame.name));
             if let Some(extension) = frame.image.extension() {
-                candidates.push(base.join(format!("{}.{}.png", frame.name, extension.to_string_lossy())));
+                candidates.push(base.join(format!("{}.{}", frame.name, extension.to_string_lossy())));
             }
             if occurrences[stem.as_str()] == 1 {
-                candidates.push(base.join(format!("{stem}.png")));
+                candidates.push(base.join(stem));
             }
-            candidates.into_iter().find(|candidate| candidate.is_file())
+            candidates.iter().find_map(|candidate| {
+                EXTENSIONS.iter().find_map(|extension| {
+                    let mut name = candidate.clone().into_os_string();
+                    name.push(".");
+                    name.push(extension);
+                    Some(PathBuf::from(name)).filter(|path| path.is_file())
+                })
+            })
         })
         .collect();
+    let numbered = paths.iter().all(Option::is_none) && number(&base, &mut paths);
     let strangers =
-        count_png(&base).saturating_sub(paths.iter().flatten().filter(|p| p.starts_with(&base)).count());
-    MaskListing { paths, folder: base.is_dir().then_some(base), strangers }
+        count_files(&base).saturating_sub(paths.iter().flatten().filter(|p| p.starts_with(&base)).count());
+    MaskListing { paths, folder: base.is_dir().then_some(base), strangers, numbered }
 }
 
-/// PNG files in a folder and its subfolders.
-fn count_png(folder: &Path) -> usize {
+/// Gives numbered EXR files to the frames they count; whether there are any.
+fn number(folder: &Path, paths: &mut [Option<PathBuf>]) -> bool {
+    if !folder.is_dir() {
+        return false;
+    }
+    for path in listing::entries(folder).unwrap_or_default() {
+        let digits = listing::stem(&path);
+        if listing::has_extension(&path, &["exr"])
+            && digits.bytes().all(|digit| digit.is_ascii_digit())
+            && let Some(place) = digits.parse::<usize>().ok().and_then(|index| paths.get_mut(index))
+        {
+            *place = Some(path);
+        }
+    }
+    paths.iter().any(Option::is_some)
+}
+
+/// Mask files in a folder and its subfolders.
+fn count_files(folder: &Path) -> usize {
     if !folder.is_dir() {
         return 0;
     }
@@ -70,7 +145,11 @@ fn count_png(folder: &Path) -> usize {
     entries
         .iter()
         .map(|path| {
-            if path.is_dir() { count_png(path) } else { usize::from(listing::has_extension(path, &["png"])) }
+            if path.is_dir() {
+                count_files(path)
+            } else {
+                usize::from(listing::has_extension(path, &EXTENSIONS))
+            }
         })
         .sum()
 }
@@ -82,7 +161,8 @@ pub(crate) fn folders_like_masks(root: &Path) -> Vec<String> {
         let inner = if entry.is_dir() { listing::entries(&entry).unwrap_or_default() } else { Vec::new() };
         for path in std::iter::once(entry).chain(inner) {
             let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-            if path.is_dir() && name.to_lowercase().contains("mask") {
+            let lower = name.to_lowercase();
+            if path.is_dir() && (lower.contains("mask") || lower.contains("cryptomatte")) {
                 names.insert(name);
             }
         }
@@ -113,7 +193,7 @@ pub(crate) struct ResizedMasks {
 /// When a mask is no PNG, a colour image, or has another aspect than its image.
 pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Result<MaskHeaders, Error> {
     let headers: Vec<Option<Result<mask::MaskHeader, Error>>> =
-        frames.par_iter().map(|frame| frame.mask.as_deref().map(mask::probe)).collect();
+        frames.par_iter().map(|frame| frame.mask.as_deref().map(probe)).collect();
     let mut result = MaskHeaders { largest_id: 0, resized: None };
     for ((frame, header), stored) in frames.iter().zip(headers).zip(stored_sizes) {
         let (Some(header), Some(path)) = (header, &frame.mask) else { continue };
@@ -149,12 +229,15 @@ pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Re
 ///
 /// # Errors
 /// When a mask cannot be decoded; the first in frame order is reported.
-pub(crate) fn count_pixels(frames: &[Frame]) -> Result<Vec<Option<(PixelCounts, u64)>>, Error> {
+pub(crate) fn count_pixels(
+    frames: &[Frame],
+    objects: &ObjectIds,
+) -> Result<Vec<Option<(PixelCounts, u64)>>, Error> {
     let counts: Vec<_> = frames
         .par_iter()
         .map(|frame| {
             frame.mask.as_deref().map(|path| {
-                mask::decode(path).map(|mask| {
+                decode(path, objects).map(|mask| {
                     let mut counts = PixelCounts::new();
                     // Runs of one id are long: one look-up per run.
                     for run in mask.pixels.chunk_by(|a, b| a == b) {

@@ -10,8 +10,8 @@ use crate::files::{image, json};
 use crate::formats::{self, Draft, Source, some_of};
 use crate::load::{centred, reduced_size};
 use crate::{
-    Dataset, Error, Frame, InstanceLabel, OpenOptions, PointCloud, PointSource, Split, camera_check,
-    instances, layout, mask_files, points,
+    Dataset, Error, Frame, OpenOptions, PointCloud, PointSource, Split, camera_check, cryptomatte, instances,
+    layout, mask_files, points,
 };
 
 impl Dataset {
@@ -43,6 +43,7 @@ impl Dataset {
             times,
             frames_per_second: draft.frames_per_second.filter(|rate| rate.is_finite() && *rate > 0.0),
             instances: Vec::new(),
+            mask_objects: cryptomatte::ObjectIds::new(),
             points: PointCloud { positions: Vec::new(), colors: Vec::new(), source: PointSource::Random },
             has_alpha,
             warnings,
@@ -101,7 +102,7 @@ impl Dataset {
                 folder: folder.to_owned(),
                 problem: if listing.folder.is_some() {
                     format!(
-                        "no mask in it belongs to a frame; masks are PNG files named as the frames, e.g. {example}.png"
+                        "no mask in it belongs to a frame; masks are PNG or Cryptomatte EXR files named as the frames, e.g. {example}.png"
                     )
                 } else {
                     format!("there is no such mask folder in {}; {known}", self.root.display())
@@ -188,7 +189,7 @@ impl Dataset {
             }
         } else if listing.folder.is_some() && listing.strangers > 0 {
             self.warnings.push(format!(
-                "{}: none of its {} PNG files is named as a frame, e.g. {}.png",
+                "{}: none of its {} files is named as a frame, e.g. {}.png",
                 self.root.join(name).display(),
                 listing.strangers,
                 self.frames[0].name
@@ -223,9 +224,24 @@ impl Dataset {
         }
         if listing.strangers > 0 && masked > 0 {
             self.warnings.push(format!(
-                "{}: {} PNG files belong to no frame",
+                "{}: {} mask files belong to no frame",
                 self.root.join(name).display(),
                 listing.strangers
+            ));
+        }
+        if listing.numbered {
+            let numbered: Vec<String> = self
+                .frames
+                .iter()
+                .filter_map(|frame| {
+                    let mask = frame.mask.as_ref()?;
+                    Some(format!("{} for {}", mask.file_name()?.to_string_lossy(), frame.name))
+                })
+                .collect();
+            self.warnings.push(format!(
+                "{}: the files are numbered, so they are taken in the order of the frames: {}",
+                self.root.join(name).display(),
+                some_of(numbered.iter().map(String::as_str))
             ));
         }
         let headers = mask_files::check_headers(&self.frames, stored_sizes)?;
@@ -240,7 +256,20 @@ impl Dataset {
                 resized.count
             ));
         }
-        let counts = mask_files::count_pixels(&self.frames)?;
+        let file = instances::file_for(&self.root, listing.folder.as_deref());
+        let mut named = match &file {
+            Some(file) => instances::read(file, &mut self.warnings)?,
+            None => BTreeMap::new(),
+        };
+        let manifests = mask_files::manifests(&self.frames)?;
+        self.mask_objects = cryptomatte::ObjectIds::new();
+        if !manifests.is_empty() {
+            let explicit = cryptomatte::explicit(listing.folder.as_deref())?;
+            let place = self.root.join(name);
+            self.mask_objects =
+                cryptomatte::assign(&manifests, &explicit, &mut named, &place, &mut self.warnings)?;
+        }
+        let counts = mask_files::count_pixels(&self.frames, &self.mask_objects)?;
         let found: BTreeSet<u16> =
             counts.iter().flatten().flat_map(|(counts, _)| counts.keys().copied()).collect();
         if found.is_empty() {
@@ -263,19 +292,12 @@ impl Dataset {
                 self.root.join(name).display()
             ));
         }
-        let file = instances::file_for(&self.root, listing.folder.as_deref());
-        let named: BTreeMap<u16, InstanceLabel> = match &file {
-            Some(file) => instances::read(file, &mut self.warnings)?,
-            None => {
-                if !found.is_empty() {
-                    self.warnings.push(format!(
-                        "{}: there is no instances.json, so instances are called instance_<id>",
-                        self.root.display()
-                    ));
-                }
-                BTreeMap::new()
-            }
-        };
+        if file.is_none() && named.is_empty() && !found.is_empty() {
+            self.warnings.push(format!(
+                "{}: there is no instances.json, so instances are called instance_<id>",
+                self.root.display()
+            ));
+        }
         self.instances =
             instances::complete(&found, headers.largest_id, named, file.as_deref(), &mut self.warnings);
         Ok(())

@@ -173,7 +173,7 @@ impl Dataset {
     }
 
     fn mask_summary(&self) -> Result<(Option<MaskSummary>, Vec<InstanceSummary>), Error> {
-        let counts = mask_files::count_pixels(&self.frames)?;
+        let counts = mask_files::count_pixels(&self.frames, &self.mask_objects)?;
         let mut instances: Vec<InstanceSummary> = self
             .instances
             .iter()

@@ -29,6 +29,7 @@ mod extras;
 #[cfg(test)]
 mod foreign_tests;
 mod read;
+mod relabel;
 #[cfg(test)]
 mod testing;
 #[cfg(test)]
@@ -40,6 +41,7 @@ use std::path::{Path, PathBuf};
 use cif_scene::{MotionModel, SceneGraph};
 
 pub use error::GltfError;
+pub use relabel::{Relabelled, relabel};
 
 /// The extension that holds the splats.
 pub const EXTENSION: &str = "KHR_gaussian_splatting";

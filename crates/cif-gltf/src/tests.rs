@@ -221,3 +221,47 @@ fn values_that_cannot_be_drawn_are_refused() {
     let error = export(&graph, &folder.path().join("a.glb"), ExportOptions::default()).unwrap_err();
     assert!(error.to_string().contains("thing_001 cannot be written"), "{error}");
 }
+
+#[test]
+fn labels_change_and_everything_else_stays() {
+    let graph = scene(recipe());
+    let instance = graph.nodes.iter().find(|node| node.kind != NodeKind::Background).unwrap();
+    let NodeKind::Instance { id, .. } = instance.kind else { unreachable!() };
+    for ending in ["glb", "gltf"] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(format!("scene.{ending}"));
+        export(&graph, &path, ExportOptions::default()).unwrap();
+        let before = read_scene(&path).unwrap();
+        let files = || std::fs::read_dir(folder.path()).unwrap().count();
+        let count = files();
+        let done = relabel(&path, &path, &id.to_string(), "blaue Tasse \u{676f}", Some("mug")).unwrap();
+        assert_eq!((&done.node, &done.before), (&instance.name, &instance.label));
+        assert_eq!(files(), count, "no temporary file is left");
+        let mut expected = before.clone();
+        for node in expected.nodes.iter_mut().filter(|node| node.name == instance.name) {
+            node.label = "blaue Tasse \u{676f}".to_owned();
+            node.category = "mug".to_owned();
+        }
+        assert_eq!(read_scene(&path).unwrap(), expected);
+
+        // Into another file, by name; a file beside a .gltf is not found from elsewhere.
+        let copy = folder.path().join(format!("copy.{ending}"));
+        relabel(&path, &copy, &instance.name, "cup", None).unwrap();
+        assert!(
+            read_scene(&copy).unwrap().nodes.iter().any(|node| node.label == "cup" && node.category == "mug")
+        );
+        let elsewhere = tempfile::tempdir().unwrap();
+        let moved =
+            relabel(&path, &elsewhere.path().join(format!("a.{ending}")), &instance.name, "cup", None);
+        assert_eq!(moved.is_ok(), ending == "glb");
+
+        let message = relabel(&path, &path, "60000", "x", None).unwrap_err().to_string();
+        assert!(message.contains("60000") && message.contains(&instance.name), "{message}");
+        let message = relabel(&path, Path::new("a.txt"), &instance.name, "x", None).unwrap_err().to_string();
+        assert!(message.contains("another ending"), "{message}");
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::write(&path, &bytes[..40]).unwrap();
+        assert!(relabel(&path, &path, &instance.name, "x", None).is_err());
+        assert_eq!(std::fs::read(&path).unwrap(), bytes[..40], "nothing is touched");
+    }
+}

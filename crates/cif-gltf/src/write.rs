@@ -32,7 +32,7 @@ fn kind_of(path: &Path) -> Result<Kind, GltfError> {
 }
 
 /// Folder of an output; `.` for a bare name.
-fn folder_of(path: &Path) -> PathBuf {
+pub(crate) fn folder_of(path: &Path) -> PathBuf {
     match path.parent() {
         Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
         _ => PathBuf::from("."),
@@ -148,7 +148,7 @@ pub(crate) fn export(
 }
 
 /// Writes a temporary file in the folder of `path`.
-fn written(
+pub(crate) fn written(
     path: &Path,
     write: impl FnOnce(&mut BufWriter<&mut NamedTempFile>) -> io::Result<()>,
 ) -> io::Result<NamedTempFile> {
@@ -166,7 +166,7 @@ fn written(
     Ok(file)
 }
 
-fn persist(file: NamedTempFile, path: &Path) -> io::Result<()> {
+pub(crate) fn persist(file: NamedTempFile, path: &Path) -> io::Result<()> {
     file.persist(path).map(drop).map_err(|error| error.error)
 }
 

@@ -14,6 +14,16 @@ pub struct Channels {
     pub instances: bool,
 }
 
+/// Whose weights values per Gaussian are blended with.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum BlendingWeights {
+    /// Those of colour: opacity and its transmittance.
+    #[default]
+    Color,
+    /// Those of the instance pass: occupancy and its transmittance.
+    Instances,
+}
+
 /// A rendered view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderedImage {
@@ -42,6 +52,14 @@ pub struct InstanceImage {
     pub foreground: PixelGrid<f32>,
     /// Entropy of M / A, nats; 0 without coverage.
     pub entropy: PixelGrid<f32>,
+}
+
+/// The most probable instances of every pixel, for layers that hold several objects per pixel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct InstanceRanks {
+    /// Most probable first: dense index + 1, or [`UNLABELLED`] where there are no more, and the rendered
+    /// probability M of that instance. Ties go to the lowest index.
+    pub ranks: Vec<(PixelGrid<u16>, PixelGrid<f32>)>,
 }
 
 /// Foreground from which a pixel is taken to belong to its most probable instance.

@@ -6,6 +6,7 @@
 //! | [`settings`] | what a render may vary |
 //! | [`gradients`] | where gradients of all parameters are kept |
 //! | [`image`] | what comes out per pixel |
+//! | [`motion`] | how far a Gaussian moves on screen between two views |
 //! | [`reference`] | the readable oracle, generic over `f32` and `f64` |
 //! | [`cpu`] | the fast path: tiles, SIMD, threads |
 //! | [`synthetic`] | small random scenes for tests and benchmarks |
@@ -14,10 +15,12 @@ pub mod constants;
 pub mod cpu;
 pub mod gradients;
 pub mod image;
+pub mod motion;
 pub mod reference;
 pub mod settings;
 pub mod synthetic;
 
 pub use gradients::Gradients;
-pub use image::{Channels, RenderedImage, UNLABELLED};
+pub use image::{BlendingWeights, Channels, InstanceImage, InstanceRanks, RenderedImage, UNLABELLED};
+pub use motion::screen_motion;
 pub use settings::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};

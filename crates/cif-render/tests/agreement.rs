@@ -14,8 +14,8 @@ use cif_render::reference::rasterize::{footprint, weight};
 use cif_render::reference::{self, ParameterGroup, Scene, SceneGradients};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::{
-    Channels, GeometryPath, Gradients, InstanceNormalisation, InstanceSettings, OccupancySource,
-    RenderSettings,
+    BlendingWeights, Channels, GeometryPath, Gradients, InstanceNormalisation, InstanceSettings,
+    OccupancySource, RenderSettings,
 };
 use common::{Cotangents, Mismatches, pixel_discontinuity, render};
 
@@ -460,6 +460,78 @@ fn images() {
                 }
                 mismatches.finish(&format!("images, K = {instances}, {heads:?}, {simd:?}"));
             }
+        }
+    }
+}
+
+#[test]
+fn blended_values_and_ranks() {
+    const RANKS: usize = 4;
+    for instances in [1, 6, 37] {
+        let synthetic = generate(&SyntheticConfig { instances, heads: Some(ALL_HEADS), ..config() });
+        let (settings, scene) = (settings(), Scene::<f64>::from_field(&synthetic.field));
+        let (camera, time) = (&synthetic.camera, synthetic.time);
+        let forward = reference::forward(&scene, camera, time, &settings, None);
+        let values: Vec<[f32; 2]> =
+            (0..synthetic.field.gaussians.len()).map(|row| [row as f32 * 0.7 - 3.0, 1.0]).collect();
+        let doubles: Vec<[f64; 2]> = values.iter().map(|value| value.map(f64::from)).collect();
+        let both = [BlendingWeights::Color, BlendingWeights::Instances];
+        let expected = both.map(|weights| {
+            let (width, height) = (camera.width, camera.height);
+            reference::rasterize::blend(&forward.splats, &forward.order, width, height, &doubles, weights)
+        });
+        let maps = rasterize_dense(
+            &forward.splats,
+            &forward.order,
+            camera.width,
+            camera.height,
+            forward.identities.as_ref().unwrap(),
+            instances,
+        );
+        let expected_ranks = reference::dense::instance_ranks(&maps, RANKS);
+        for simd in levels() {
+            let mut renderer = Renderer::new(simd);
+            let image = renderer.render(&synthetic.field, camera, time, &settings, CHANNELS);
+            let [blended, by_instances] = both.map(|weights| renderer.blend(&values, weights));
+            let ranks = renderer.instance_ranks(synthetic.field.identities.as_ref().unwrap(), RANKS);
+            let mut mismatches = Mismatches::default();
+            let mut covered = 0;
+            for position in 0..blended.pixels.len() {
+                if pixel_discontinuity(&forward, position, BAND).is_some() {
+                    continue;
+                }
+                let (e, a) = (expected[1].pixels[position], by_instances.pixels[position]);
+                mismatches.compare("instance value", position, e[0], a[0].into(), 1e-5, 1e-4);
+                let layers = image.instances.as_ref().unwrap();
+                let coverage = f64::from(layers.coverage.pixels[position]);
+                mismatches.compare("instance one", position, coverage, a[1].into(), 0.0, 2e-5);
+                let (e, a) = (expected[0].pixels[position], blended.pixels[position]);
+                mismatches.compare("value", position, e[0], a[0].into(), 1e-5, 1e-4);
+                // The blended 1 is alpha itself.
+                let alpha = f64::from(image.alpha.pixels[position]);
+                mismatches.compare("one", position, alpha, a[1].into(), 0.0, 2e-6);
+                covered += usize::from(a[1] > 0.5);
+                let mut row = maps.values[position * instances..(position + 1) * instances].to_vec();
+                row.sort_by(|a, b| b.total_cmp(a));
+                for rank in 0..RANKS {
+                    let ((labels, masses), (e_labels, e_masses)) =
+                        (&ranks.ranks[rank], &expected_ranks.ranks[rank]);
+                    let (e, a) = (e_masses.pixels[position], masses.pixels[position]);
+                    mismatches.compare("mass", position, e.into(), a.into(), 0.0, 2e-5);
+                    let value = |index: usize| row.get(index).copied().unwrap_or(0.0);
+                    let apart = value(rank) - value(rank + 1) > 1e-5
+                        && (rank == 0 || value(rank - 1) - value(rank) > 1e-5);
+                    if apart {
+                        let (e, a) = (e_labels.pixels[position], labels.pixels[position]);
+                        mismatches.compare("label", position, e.into(), a.into(), 0.0, 0.0);
+                    }
+                }
+                let instances = image.instances.as_ref().unwrap();
+                let first = (instances.label.pixels[position], instances.probability.pixels[position]);
+                assert_eq!(first, (ranks.ranks[0].0.pixels[position], ranks.ranks[0].1.pixels[position]));
+            }
+            assert!(covered > 20, "{covered} pixels are covered");
+            mismatches.finish(&format!("blended values and ranks, K = {instances}, {simd:?}"));
         }
     }
 }

@@ -58,6 +58,7 @@ pub mod procrustes;
 pub mod proxy;
 pub mod query;
 pub mod report;
+pub mod search;
 pub mod source;
 #[cfg(test)]
 mod testing;
@@ -81,5 +82,6 @@ pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
 pub use placement::PlacedSplats;
 pub use query::{LabelMatch, LabelQuery, QueryError, query};
 pub use report::{MotionReport, ResidualStatistics};
+pub use search::{ObjectMatch, ObjectQuery, VolumeOf, When, search};
 pub use source::MotionSource;
 pub use velocity::Velocity;

@@ -139,6 +139,14 @@ pub enum UsdError {
         /// What the system or USD says.
         reason: String,
     },
+    /// An object could not be given another label.
+    #[error("{path}: {problem}")]
+    Relabel {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, and what would work.
+        problem: String,
+    },
     /// usd-core did something unexpected.
     #[error("usd-core failed: {reason}")]
     Python {

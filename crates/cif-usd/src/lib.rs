@@ -28,6 +28,8 @@ pub mod tokens;
 #[cfg(feature = "python")]
 mod author;
 #[cfg(feature = "python")]
+mod find;
+#[cfg(feature = "python")]
 mod layer;
 #[cfg(feature = "python")]
 mod primvars;
@@ -35,6 +37,8 @@ mod primvars;
 mod pxr;
 #[cfg(feature = "python")]
 mod read;
+#[cfg(feature = "python")]
+mod relabel;
 #[cfg(all(test, feature = "python"))]
 mod tests;
 #[cfg(feature = "python")]
@@ -42,7 +46,7 @@ mod write;
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::{LabelMatch, LabelQuery, SceneGraph};
+use cif_scene::{LabelMatch, LabelQuery, ObjectMatch, ObjectQuery, SceneGraph};
 
 pub use error::UsdError;
 
@@ -141,6 +145,57 @@ pub fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdErro
     #[cfg(not(feature = "python"))]
     {
         let _ = (path, query);
+        Err(UsdError::NotBuilt)
+    }
+}
+
+/// Prims of any stage with semantic labels that meet every condition, in stage order; foreign stages need no splats.
+/// Over an interval, labels count that hold at any time in it (`UsdSemantics.LabelsQuery`).
+///
+/// # Errors
+/// As [`query`].
+pub fn search(path: &Path, wanted: &ObjectQuery) -> Result<Vec<ObjectMatch>, UsdError> {
+    #[cfg(feature = "python")]
+    return find::search(path, wanted);
+    #[cfg(not(feature = "python"))]
+    {
+        let _ = (path, wanted);
+        Err(UsdError::NotBuilt)
+    }
+}
+
+/// What [`relabel`] changed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Relabelled {
+    /// Path of the prim.
+    pub path: String,
+    /// The label before.
+    pub before: String,
+    /// The label now.
+    pub label: String,
+    /// The class now.
+    pub category: String,
+}
+
+/// Gives an object of a stage another label, and another class where one is given: as semantic labels, display name
+/// and user property. `object` is a mask value, a unique name or a prim path. The root layer is edited in a copy
+/// beside `output`, which then takes its place; `output` may be `path` itself.
+///
+/// # Errors
+/// No usd-core, a file that is missing, unreadable or a package, no such object or several, an output in another
+/// folder while the layer names files beside it. Nothing existing is touched then.
+pub fn relabel(
+    path: &Path,
+    output: &Path,
+    object: &str,
+    label: &str,
+    category: Option<&str>,
+) -> Result<Relabelled, UsdError> {
+    #[cfg(feature = "python")]
+    return relabel::relabel(path, output, object, label, category);
+    #[cfg(not(feature = "python"))]
+    {
+        let _ = (path, output, object, label, category);
         Err(UsdError::NotBuilt)
     }
 }

@@ -10,15 +10,19 @@
 //! | [`pictures`] | instance, depth and error colours, panels, PNG files |
 //! | [`camera_file`] | views that no capture has |
 //! | [`graph_file`] | scenes of any format as scene graphs |
+//! | [`mask_query`] | which objects 2D masks show |
+//! | [`detector`] | a command that makes such masks |
 //! | [`ground_truth`] | exported motion against known motion |
 //! | [`error`] | what is reported, and the exit code |
 
 pub mod camera_file;
 pub mod commands;
+pub mod detector;
 pub mod error;
 pub mod graph_file;
 pub mod ground_truth;
 pub mod interrupt;
+pub mod mask_query;
 pub mod output;
 pub mod pictures;
 pub mod progress;

@@ -103,6 +103,26 @@ pub(crate) fn decode(path: &Path) -> Result<PixelGrid<u16>, Error> {
     Ok(PixelGrid::from_pixels(frame.width, frame.height, pixels))
 }
 
+/// Decodes what a detector found, in a PNG file of any kind: 1 where the colour is not black, else 0. Alpha does
+/// not count.
+///
+/// # Errors
+/// When the file is missing, truncated or no PNG.
+pub(crate) fn decode_binary(path: &Path) -> Result<PixelGrid<u16>, Error> {
+    let damaged = |error: image::ImageError| {
+        Error::mask(path, format!("it cannot be decoded ({error}); export it again"))
+    };
+    let file = File::open(path).map_err(Error::read(path))?;
+    let mut reader = image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
+    let mut limits = image::Limits::default();
+    (limits.max_image_width, limits.max_image_height) = (Some(1 << 16), Some(1 << 16));
+    reader.limits(limits);
+    // 16 bits, so that small values of deep files are not rounded to black.
+    let picture = reader.decode().map_err(damaged)?.into_rgb16();
+    let pixels = picture.pixels().map(|pixel| u16::from(pixel.0 != [0; 3])).collect();
+    Ok(PixelGrid::from_pixels(picture.width(), picture.height(), pixels))
+}
+
 /// Nearest-neighbour resize: never invents an id (methods reference 7, row 39).
 pub(crate) fn nearest_resize(mask: &PixelGrid<u16>, width: u32, height: u32) -> PixelGrid<u16> {
     if (mask.width, mask.height) == (width, height) {

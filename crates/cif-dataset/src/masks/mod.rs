@@ -1,13 +1,15 @@
-//! Masks from a video tracker: one sequence out of all views, and its ids back per view.
+//! Masks from a video tracker: one sequence out of all views, and its ids back per view; and what a detector found.
 //!
 //! Source: methods reference 10.1. The masks of every view, the held-out ones included, come from one tracker
 //! pass: scores on them measure agreement with a consistent tracker, not with human truth.
 
 mod folder;
+mod found;
 mod split;
 mod view_order;
 mod zigzag;
 
+pub use found::{flat_name, found_masks};
 pub use split::{KeptInstance, RemovedInstance, SplitReport, split_tracker_masks};
 pub use view_order::{ViewOrder, ordered_views};
 pub use zigzag::{INDEX_FILE, ZigzagEntry, ZigzagIndex, frame_of, position_of, write_zigzag, zigzag_order};

@@ -19,6 +19,8 @@ pub(super) struct InstanceTile {
     pub(super) coverage: TilePixels,
     pub(super) foreground: TilePixels,
     pub(super) entropy: TilePixels,
+    /// The most probable instances, most probable first: dense index + 1 (0 = none) and their probability.
+    pub(super) ranks: Vec<[[(u16, f32); LANES]; GROUPS]>,
 }
 
 impl Default for InstanceTile {
@@ -30,11 +32,12 @@ impl Default for InstanceTile {
             coverage: zero,
             foreground: zero,
             entropy: zero,
+            ranks: Vec::new(),
         }
     }
 }
 
-/// Blends the identities of a tile.
+/// Blends the identities of a tile; `tile.ranks` keeps as many instances per pixel as it has places.
 #[simd]
 pub(super) fn instance_tile<S: Simd>(
     simd: S,
@@ -108,6 +111,7 @@ pub(super) fn instance_tile<S: Simd>(
         }
     }
 
+    let mut ranked: Vec<(u16, f32)> = Vec::new();
     for group in 0..GROUPS {
         for lane in 0..LANES {
             let (mut best, mut most, mut total) = (0_u16, 0.0_f32, 0.0_f32);
@@ -125,6 +129,21 @@ pub(super) fn instance_tile<S: Simd>(
                     if share > 0.0 {
                         entropy -= share * share.ln();
                     }
+                }
+            }
+            if !tile.ranks.is_empty() {
+                ranked.clear();
+                ranked.extend(
+                    labels
+                        .iter()
+                        .zip(&masses)
+                        .map(|(label, mass)| (label + 1, mass[group][lane]))
+                        .filter(|(_, mass)| *mass > 0.0),
+                );
+                // Stable, so that ties go to the lowest index.
+                ranked.sort_by(|a, b| b.1.total_cmp(&a.1));
+                for (rank, place) in tile.ranks.iter_mut().enumerate() {
+                    place[group][lane] = ranked.get(rank).copied().unwrap_or_default();
                 }
             }
             tile.label[group][lane] = best;

@@ -8,7 +8,7 @@ use super::identity::IdentityProbabilities;
 use super::project::{Splat2d, SplatGradient};
 use super::rasterize::{conic_backward, footprint, mean_backward, weight};
 use crate::constants::{MIN_LABEL_PROBABILITY, MIN_TRANSMITTANCE};
-use crate::image::{InstanceImage, UNLABELLED};
+use crate::image::{InstanceImage, InstanceRanks, UNLABELLED};
 use crate::settings::{GeometryPath, InstanceNormalisation};
 
 /// Rendered identities M_k.
@@ -231,6 +231,28 @@ pub fn instance_image<R: Real>(maps: &DenseMaps<R>) -> InstanceImage {
         image.probability.pixels[pixel] = values[best].to_double() as f32;
         image.coverage.pixels[pixel] = coverage.to_double() as f32;
         image.entropy.pixels[pixel] = entropy.to_double() as f32;
+    }
+    image
+}
+
+/// The most probable instances of every pixel, most probable first, ties by index.
+#[must_use]
+pub fn instance_ranks<R: Real>(maps: &DenseMaps<R>, ranks: usize) -> InstanceRanks {
+    let empty = || {
+        (
+            PixelGrid::filled(maps.width, maps.height, UNLABELLED),
+            PixelGrid::filled(maps.width, maps.height, 0.0),
+        )
+    };
+    let mut image = InstanceRanks { ranks: (0..ranks).map(|_| empty()).collect() };
+    for pixel in 0..maps.transmittances.len() {
+        let values = &maps.values[pixel * maps.instances..(pixel + 1) * maps.instances];
+        let mut order: Vec<usize> = (0..values.len()).filter(|k| values[*k] > R::zero()).collect();
+        order.sort_by(|a, b| values[*b].to_double().total_cmp(&values[*a].to_double()));
+        for ((labels, probabilities), instance) in image.ranks.iter_mut().zip(order) {
+            labels.pixels[pixel] = instance as u16 + 1;
+            probabilities.pixels[pixel] = values[instance].to_double() as f32;
+        }
     }
     image
 }

@@ -9,6 +9,7 @@ mod export_gltf;
 mod export_ply;
 mod import;
 mod info;
+mod label;
 mod masks;
 mod model_options;
 mod query;
@@ -48,9 +49,10 @@ A short tour:
   cif export table.cif --usd table.usda                  one moving prim per object
   cif import table.usda --base table.cif -o new.cif      edits of that file come home
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
+  cif label table.usda --instance 3 'blue mug'           give it another name
 
 A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
-instance masks (PNG, value = instance id, 0 = unlabelled) in its folder masks/. `cif masks` helps to
+instance masks (PNG, value = instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/. `cif masks` helps to
 make them with a video tracker.
 Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 `cif COMMAND --help` explains one command.";
@@ -64,6 +66,7 @@ enum Command {
     Import(import::Import),
     Diff(diff::Diff),
     Query(query::Query),
+    Label(label::Label),
     Info(info::Info),
     Masks(masks::Masks),
     Bench(bench::Bench),
@@ -140,6 +143,7 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
         Command::Import(command) => import::run(&command),
         Command::Diff(command) => diff::run(&command),
         Command::Query(command) => query::run(&command),
+        Command::Label(command) => label::run(&command),
         Command::Info(command) => info::run(&command),
         Command::Masks(command) => masks::run(&command),
         Command::Bench(command) => bench::run(&command),
@@ -158,7 +162,8 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
 /// Which capture, and how it is read.
 #[derive(Clone, Debug, Args)]
 struct CaptureOptions {
-    /// Mask folder: a name inside the capture, such as masks_tracker, or a path [default: masks]
+    /// Mask folder: a name inside the capture, such as masks_tracker, or a path; it holds PNG files of ids
+    /// or EXR files with a Cryptomatte, whose objects are matched with the labels of instances.json [default: masks]
     #[arg(long, value_name = "NAME")]
     masks: Option<std::path::PathBuf>,
     /// Read no masks

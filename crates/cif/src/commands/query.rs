@@ -1,76 +1,197 @@
 //! `cif query`: where is an object, and what is at a place?
 
+mod by_masks;
+
 use std::path::{Path, PathBuf};
 
 use cif_field::Field;
-use cif_scene::{LabelMatch, LabelQuery, SceneOptions};
-use clap::{ArgGroup, Args};
+use cif_geometry::Bounds;
+use cif_scene::{ObjectMatch, ObjectQuery, SceneOptions, When};
+use clap::Args;
+use glam::{DMat3, DQuat, DVec3};
 use serde_json::json;
 
-use super::scene;
+use super::scene::{self, Format};
 use crate::error::Error;
 
-/// Find objects by label, or tell what is at a place
+/// Find objects by label, time, place, or masks; or tell what is at a place
 #[derive(Debug, Args)]
-#[command(
-    group = ArgGroup::new("question").required(true).args(["label", "at"]),
-    after_help = "\
-Labels match the name, class or unique name of an object; case does not matter, * and ? are
-wildcards. Boxes hold the splats to three standard deviations.
-Time in a stage is its time code, which counts captured frames; in a .cif it runs from 0 (first
-captured time) to 1 (last).
+#[command(after_help = "\
+Without conditions every object is listed; several conditions must all hold. Labels match the name,
+class or unique name of an object; case does not matter, * and ? are wildcards. Boxes hold the splats
+to three standard deviations; volumes are those of the colliders, where there are any, else of the
+boxes; speeds are world units per second. Stages of other programs need semantic labels only.
+Time in a stage or glTF file is its time code, which counts captured frames; in a .cif it runs from 0
+(first captured time) to 1 (last).
 
   cif query table.usda --label 'red mug' --time 36
+  cif query table.usda --taxonomy class --label mug --interval 0:20
+  cif query table.glb --box -0.2,-0.2,0,0.2,0.2,0.3
   cif query table.cif --label '*box' --json
-  cif query table.cif --at 0.1,0.2,0.05 --time 0.5"
-)]
+  cif query table.cif --point 0.1,0.2,0.05 --time 0.5
+
+By masks: DIR holds what a 2D detector found on frames of the capture, as PNG files (black = not
+found) named FRAME.png, FRAME_*.png or FRAME/*.png. Instances are chosen that lie mostly inside the
+masks of training frames; --eval renders them from held-out frames and compares with the masks there.
+
+  cif query table.cif --masks found --capture captures/table --eval
+  cif query table.cif --prompt 'steel jug' --capture captures/table \\
+      --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'")]
 pub(super) struct Query {
-    /// Exported stage (.usda, .usdc, .usdz) or trained scene (.cif)
-    #[arg(value_name = "STAGE|SCENE.cif")]
+    /// Trained scene (.cif), stage (.usda, .usdc, .usdz) or glTF file (.glb, .gltf)
+    #[arg(value_name = "FILE")]
     path: PathBuf,
     /// Label to look for
     #[arg(long, value_name = "GLOB")]
     label: Option<String>,
-    /// Place in the world; needs a .cif
-    #[arg(long, value_name = "X,Y,Z", value_delimiter = ',', num_args = 1, allow_hyphen_values = true)]
-    at: Option<Vec<f64>>,
+    /// Labels that count: class (classes and human labels), instance (unique names), or another taxonomy of a stage
+    #[arg(long, value_name = "NAME")]
+    taxonomy: Option<String>,
+    /// Place in the world: what is there, with its probability in a .cif
+    #[arg(
+        long,
+        alias = "at",
+        value_name = "X,Y,Z",
+        value_delimiter = ',',
+        num_args = 1,
+        allow_hyphen_values = true
+    )]
+    point: Option<Vec<f64>>,
+    /// Box in the world that objects touch, by two opposite corners
+    #[arg(
+        long = "box",
+        value_name = "X,Y,Z,X,Y,Z",
+        value_delimiter = ',',
+        num_args = 1,
+        allow_hyphen_values = true
+    )]
+    region: Option<Vec<f64>>,
     /// Time: time code of a stage, 0 to 1 in a .cif [default: the first]
     #[arg(long, value_name = "T", allow_hyphen_values = true)]
     time: Option<f64>,
+    /// Interval of time: objects that are there at any time in it
+    #[arg(long, value_name = "FROM:TO", conflicts_with = "time", allow_hyphen_values = true)]
+    interval: Option<String>,
     /// Print JSON
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    by_masks: by_masks::ByMasks,
 }
 
 pub(super) fn run(command: &Query) -> Result<(), Error> {
-    if scene::is_scene(&command.path) {
-        scene::check_time(command.time)?;
+    if command.by_masks.is_asked() {
+        return by_masks::run(command);
     }
-    if let Some(place) = &command.at {
+    let format = scene::format(&command.path)?;
+    let wanted = question(command, format)?;
+    if let (Format::Scene, Some(place)) = (format, wanted.point) {
+        if command.label.is_some() || wanted.region.is_some() || command.interval.is_some() {
+            return Err(Error::usage(
+                "--point in a .cif asks the field itself, without other conditions than --time",
+                "leave --label, --box and --interval out, or query an exported stage",
+            ));
+        }
         return at(command, place);
     }
-    let pattern = command.label.clone().unwrap_or_default();
-    let matches = if scene::is_scene(&command.path) {
-        in_scene(&command.path, pattern, command.time)?
-    } else {
-        let query = LabelQuery { pattern, time_code: command.time };
-        cif_usd::query(&command.path, &query).map_err(Error::plain)?
+    let place = command.path.display().to_string();
+    let found = match format {
+        Format::Scene => in_scene(&command.path, wanted)?,
+        Format::Usd => cif_usd::search(&command.path, &wanted).map_err(Error::plain)?,
+        Format::Gltf => {
+            let graph = cif_gltf::read_scene(&command.path).map_err(Error::plain)?;
+            cif_scene::search(&graph, &wanted, &place, str::to_owned).map_err(Error::plain)?
+        }
     };
     if command.json {
-        println!("{:#}", json!(matches));
+        println!("{:#}", json!(found));
+    } else if found.is_empty() {
+        println!("nothing is there in {place}");
     } else {
-        matches.iter().for_each(print_match);
+        print_table(&found);
     }
     Ok(())
 }
 
-fn in_scene(path: &Path, pattern: String, time: Option<f64>) -> Result<Vec<LabelMatch>, Error> {
+/// The conditions of the command line; times of a `.cif` are still normalised.
+fn question(command: &Query, format: Format) -> Result<ObjectQuery, Error> {
+    if format == Format::Scene {
+        scene::check_time(command.time)?;
+    }
+    let when = match (command.time, &command.interval) {
+        (Some(time), _) if !time.is_finite() => {
+            return Err(Error::usage("--time needs a finite number", "for example --time 12"));
+        }
+        (Some(time), _) => When::At(time),
+        (None, Some(text)) => interval(text, format)?,
+        (None, None) => When::Default,
+    };
+    let point = command.point.as_deref().map(|numbers| corner("--point", numbers)).transpose()?;
+    let region = match command.region.as_deref() {
+        None => None,
+        Some(&[ax, ay, az, bx, by, bz]) => {
+            let (a, b) = (corner("--box", &[ax, ay, az])?, corner("--box", &[bx, by, bz])?);
+            Some(Bounds { low: a.min(b), high: a.max(b) })
+        }
+        Some(numbers) => {
+            return Err(Error::usage(
+                format!("--box has {} numbers", numbers.len()),
+                "give six, two opposite corners: --box -0.1,-0.1,0,0.1,0.1,0.2",
+            ));
+        }
+    };
+    Ok(ObjectQuery { label: command.label.clone(), taxonomy: command.taxonomy.clone(), when, point, region })
+}
+
+fn interval(text: &str, format: Format) -> Result<When, Error> {
+    let ends: Option<(f64, f64)> = text
+        .split_once(':')
+        .and_then(|(from, to)| Some((from.trim().parse().ok()?, to.trim().parse().ok()?)));
+    let example = if format == Format::Scene { "--interval 0:0.5" } else { "--interval 0:20" };
+    match ends {
+        Some((from, to)) if from.is_finite() && to.is_finite() && from <= to => {
+            if format == Format::Scene {
+                scene::check_time(Some(from))?;
+                scene::check_time(Some(to))?;
+            }
+            Ok(When::Over(from, to))
+        }
+        _ => Err(Error::usage(
+            format!("--interval {text}: two times are needed, the earlier one first"),
+            format!("for example {example}"),
+        )),
+    }
+}
+
+fn corner(option: &str, numbers: &[f64]) -> Result<DVec3, Error> {
+    let &[x, y, z] = numbers else {
+        return Err(Error::usage(
+            format!("{option} has {} numbers", numbers.len()),
+            format!("give three, separated by commas: {option} 0.1,0.2,0.05"),
+        ));
+    };
+    if [x, y, z].iter().all(|value| value.is_finite()) {
+        Ok(DVec3::new(x, y, z))
+    } else {
+        Err(Error::usage(
+            format!("{option} needs finite numbers"),
+            format!("for example {option} 0.1,0.2,0.05"),
+        ))
+    }
+}
+
+fn in_scene(path: &Path, mut wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
     let field = scene::load(path)?;
     let options = SceneOptions { proxy_points: 0, ..SceneOptions::default() };
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
     let codes = &graph.time_codes;
-    let time_code = time.map(|time| code_at(&codes.times, &codes.samples, time));
-    cif_scene::query(&graph, &LabelQuery { pattern, time_code }, &path.display().to_string())
+    let code = |time| code_at(&codes.times, &codes.samples, time);
+    wanted.when = match wanted.when {
+        When::Default => When::Default,
+        When::At(time) => When::At(code(time)),
+        When::Over(from, to) => When::Over(code(from), code(to)),
+    };
+    cif_scene::search(&graph, &wanted, &path.display().to_string(), |name| format!("/World/{name}"))
         .map_err(Error::plain)
 }
 
@@ -87,25 +208,10 @@ pub(super) fn code_at(times: &[f64], codes: &[f64], time: f64) -> f64 {
     codes[after - 1] + fraction * (codes[after] - codes[after - 1])
 }
 
-fn at(command: &Query, place: &[f64]) -> Result<(), Error> {
-    let &[x, y, z] = place else {
-        return Err(Error::usage(
-            format!("--at has {} numbers", place.len()),
-            "give three, separated by commas: --at 0.1,0.2,0.05",
-        ));
-    };
-    if ![x, y, z].iter().all(|value| value.is_finite()) {
-        return Err(Error::usage("--at needs finite numbers", "for example --at 0.1,0.2,0.05"));
-    }
-    if !scene::is_scene(&command.path) {
-        return Err(Error::usage(
-            format!("--at needs a trained scene (.cif), and {} is none", command.path.display()),
-            "a stage knows its objects by label: --label",
-        ));
-    }
+fn at(command: &Query, place: DVec3) -> Result<(), Error> {
     let field: Field = scene::load(&command.path)?;
     let time = command.time.unwrap_or(0.0);
-    let answers = field.query(&[glam::DVec3::new(x, y, z)], time);
+    let answers = field.query(&[place], time);
     let answer = &answers[0];
     let named: Vec<_> = answer
         .identity
@@ -120,7 +226,7 @@ fn at(command: &Query, place: &[f64]) -> Result<(), Error> {
             })
             .collect();
         let report = json!({
-            "at": [x, y, z], "time": time, "existence": answer.existence,
+            "at": place.to_array(), "time": time, "existence": answer.existence,
             "gaussians": answer.gaussians, "instances": instances,
         });
         println!("{report:#}");
@@ -133,22 +239,46 @@ fn at(command: &Query, place: &[f64]) -> Result<(), Error> {
     Ok(())
 }
 
-fn print_match(found: &LabelMatch) {
-    println!(
-        "{}  label '{}'  class '{}'  instance '{}'",
-        found.path, found.label, found.class, found.instance
-    );
-    for row in &found.transform {
-        println!("  [{:>10.5} {:>10.5} {:>10.5} {:>10.5}]", row[0], row[1], row[2], row[3]);
+fn print_table(found: &[ObjectMatch]) {
+    let mut table = super::table([
+        "object",
+        "label",
+        "class",
+        "position",
+        "rotation w,x,y,z",
+        "box from",
+        "box to",
+        "volume",
+        "speed",
+    ]);
+    for object in found {
+        let one = &object.found;
+        let rows = &one.transform;
+        let axis = |column: usize| DVec3::new(rows[0][column], rows[1][column], rows[2][column]);
+        let turn = [0, 1, 2].map(axis).map(|axis| axis.try_normalize().unwrap_or(DVec3::ZERO));
+        let rotation = DQuat::from_mat3(&DMat3::from_cols(turn[0], turn[1], turn[2]));
+        let corner = |corner: &Option<[f64; 3]>| corner.as_ref().map_or("no extent".to_owned(), |p| point(p));
+        table.add_row([
+            one.path.clone(),
+            one.label.clone(),
+            one.class.clone(),
+            point(&axis(3).to_array()),
+            if rotation.is_finite() {
+                format!("{:.3}, {:.3}, {:.3}, {:.3}", rotation.w, rotation.x, rotation.y, rotation.z)
+            } else {
+                "none".to_owned()
+            },
+            corner(&one.low),
+            corner(&one.high),
+            object.volume.map_or("n/a".to_owned(), |volume| format!("{volume:.3e}")),
+            format!("{:.4}", object.speed),
+        ]);
     }
-    match (&found.low, &found.high) {
-        (Some(low), Some(high)) => println!("  box {} to {}", point(low), point(high)),
-        _ => println!("  no extent"),
-    }
+    println!("{table}");
 }
 
 fn point(p: &[f64; 3]) -> String {
-    format!("({:.4}, {:.4}, {:.4})", p[0], p[1], p[2])
+    format!("{:.4}, {:.4}, {:.4}", p[0], p[1], p[2])
 }
 
 #[cfg(test)]
@@ -163,5 +293,15 @@ mod tests {
         }
         assert_eq!(code_at(&[0.5], &[3.0], 0.0), 3.0);
         assert_eq!(code_at(&[0.5], &[3.0], 1.0), 3.0);
+    }
+
+    #[test]
+    fn intervals_are_two_times_in_order() {
+        assert_eq!(interval("2:7.5", Format::Usd).unwrap(), When::Over(2.0, 7.5));
+        assert_eq!(interval("-3:-3", Format::Usd).unwrap(), When::Over(-3.0, -3.0));
+        for text in ["7:2", "3", "a:b", "nan:1", "0:inf"] {
+            assert!(interval(text, Format::Usd).is_err(), "{text}");
+        }
+        assert!(interval("0:2", Format::Scene).is_err(), "times of a .cif end at 1");
     }
 }

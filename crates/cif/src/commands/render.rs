@@ -3,10 +3,14 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use cif_dataset::cryptomatte::BACKGROUND;
+use cif_exr::ColorEncoding;
 use cif_field::Field;
 use cif_geometry::PixelGrid;
+use cif_render::constants::MIN_COVERAGE;
 use cif_render::cpu::Renderer;
-use cif_render::{Channels, RenderedImage};
+use cif_render::{BlendingWeights, Channels, RenderSettings, RenderedImage, screen_motion};
+use cif_scene::naming::instance_name;
 use cif_train::metrics::mask_ids;
 use clap::{ArgGroup, Args, ValueEnum};
 
@@ -42,9 +46,15 @@ pub(super) struct Render {
     /// Folder to write into: DIR/WHAT/VIEW.png
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// What to write, comma separated
-    #[arg(long, value_delimiter = ',', default_value = "rgb", value_name = "WHAT")]
+    /// What to write, comma separated [default: rgb, or nothing beside --exr]
+    #[arg(long, value_delimiter = ',', value_name = "WHAT")]
     what: Vec<What>,
+    /// Write DIR/exr/VIEW.exr: beauty, depth, motion, instances and Cryptomatte in one file per view
+    #[arg(long)]
+    exr: bool,
+    /// Colours of the EXR files
+    #[arg(long, value_name = "COLOR", default_value = "linear", requires = "exr")]
+    exr_color: ExrColor,
     /// Write into a folder that holds files already
     #[arg(long)]
     force: bool,
@@ -80,6 +90,24 @@ enum What {
     Entropy,
 }
 
+/// Colours of EXR files.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum ExrColor {
+    /// Linear light, as compositors expect of EXR files: the sRGB curve of the captured colours is undone
+    Linear,
+    /// As captured and trained, display-referred
+    Display,
+}
+
+impl From<ExrColor> for ColorEncoding {
+    fn from(color: ExrColor) -> Self {
+        match color {
+            ExrColor::Linear => Self::Linear,
+            ExrColor::Display => Self::Display,
+        }
+    }
+}
+
 impl What {
     fn of_instances(self) -> bool {
         matches!(
@@ -96,7 +124,12 @@ impl What {
 
 fn after_help() -> String {
     format!(
-        "Values beyond what 16 bits hold are written as 65535.\n\n  \
+        "Values beyond what 16 bits hold are written as 65535.\n\n\
+         EXR files hold 32-bit floats: colour multiplied by alpha without the background colour, Z (1e10\n\
+         where nothing is), forward.u and .v (pixels to the next view of the same camera, u to the right,\n\
+         v up; 0 in the last), the instance layers, and the Cryptomatte uCryptoObject, whose names are the\n\
+         labels (unique names where labels repeat, `background` for the rest).\n\n  \
+         cif render table.cif --capture captures/table -o out --exr\n  \
          cif render table.cif --capture captures/table --split val -o out --what rgb,instance,depth\n  \
          cif render table.cif --camera views.json --time 0.5 -o out\n\n{FORMAT_HELP}"
     )
@@ -105,9 +138,12 @@ fn after_help() -> String {
 pub(super) fn run(command: &Render) -> Result<(), Error> {
     scene::check_time(command.time)?;
     let field = scene::load(&command.scene)?;
-    let what: BTreeSet<What> = command.what.iter().copied().collect();
-    let instances = what.iter().any(|what| what.of_instances());
-    if instances && field.identities.is_none() {
+    let mut what: BTreeSet<What> = command.what.iter().copied().collect();
+    if what.is_empty() && !command.exr {
+        what.insert(What::Rgb);
+    }
+    let wanted = what.iter().any(|what| what.of_instances());
+    if wanted && field.identities.is_none() {
         return Err(Error::failed(
             format!("{} was trained without masks, so it has no instances to show", command.scene.display()),
             "leave instance, foreground, coverage, probability and entropy out of --what, or train with masks",
@@ -115,11 +151,12 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     }
     let views = views(command, &field)?;
     output::check_folder(&command.output, command.force)?;
-    let depth = what.contains(&What::Depth) || what.contains(&What::DepthColor);
+    let depth = command.exr || what.contains(&What::Depth) || what.contains(&What::DepthColor);
+    let instances = wanted || (command.exr && field.identities.is_some());
     let settings = scene::render_settings(&field);
     let mut renderer = Renderer::new(command.simd.into());
     interrupt::watch();
-    for view in &views {
+    for (index, Shot { view, .. }) in views.iter().enumerate() {
         if interrupt::requested() {
             return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
         }
@@ -128,14 +165,25 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         for what in &what {
             write(*what, &field, &image, &command.output, &view.name)?;
         }
+        if command.exr {
+            let place = Place { field: &field, views: &views, index, time: command.time };
+            write_exr(&mut renderer, &image, &settings, &place, command)?;
+        }
     }
     eprintln!("rendered {} views into {}", views.len(), command.output.display());
     Ok(())
 }
 
-fn views(command: &Render, field: &Field) -> Result<Vec<View>, Error> {
+/// A view, and the camera that it belongs to.
+struct Shot {
+    view: View,
+    camera: String,
+}
+
+fn views(command: &Render, field: &Field) -> Result<Vec<Shot>, Error> {
     if let Some(path) = &command.camera {
-        return camera_file::read(path);
+        let views = camera_file::read(path)?;
+        return Ok(views.into_iter().map(|view| Shot { view, camera: String::new() }).collect());
     }
     let Some(capture) = &command.capture else {
         return Err(Error::usage("no views", "give --capture or --camera"));
@@ -146,11 +194,14 @@ fn views(command: &Render, field: &Field) -> Result<Vec<View>, Error> {
     let dataset = options.open(capture)?;
     print_warnings(&dataset);
     let split = command.split.into();
-    let views: Vec<View> = dataset
+    let views: Vec<Shot> = dataset
         .frames
         .iter()
         .filter(|frame| frame.split == split)
-        .map(|frame| View { name: frame.name.clone(), time: Some(frame.time), camera: frame.camera })
+        .map(|frame| Shot {
+            view: View { name: frame.name.clone(), time: Some(frame.time), camera: frame.camera },
+            camera: frame.camera_name.clone(),
+        })
         .collect();
     if views.is_empty() {
         return Err(Error::failed(
@@ -159,6 +210,90 @@ fn views(command: &Render, field: &Field) -> Result<Vec<View>, Error> {
         ));
     }
     Ok(views)
+}
+
+/// Which of the views is written.
+struct Place<'a> {
+    field: &'a Field,
+    views: &'a [Shot],
+    index: usize,
+    /// Time of all views.
+    time: Option<f64>,
+}
+
+impl Place<'_> {
+    /// The next view of the same camera.
+    fn next(&self) -> Option<&View> {
+        let next = self.views.get(self.index + 1)?;
+        (next.camera == self.views[self.index].camera).then_some(&next.view)
+    }
+
+    fn time_of(&self, view: &View) -> f64 {
+        self.time.or(view.time).unwrap_or(0.0)
+    }
+}
+
+/// Writes the EXR file of a view; `image` is what `renderer` rendered last.
+fn write_exr(
+    renderer: &mut Renderer,
+    image: &RenderedImage,
+    settings: &RenderSettings,
+    place: &Place<'_>,
+    command: &Render,
+) -> Result<(), Error> {
+    let (field, view) = (place.field, &place.views[place.index].view);
+    let ranks = field
+        .identities
+        .as_ref()
+        .map(|identities| renderer.instance_ranks(identities, cif_exr::cryptomatte::RANKS));
+    let motion = motion(renderer, image, place);
+    let path = command.output.join("exr").join(format!("{}.exr", view.name));
+    let folder = output::folder_of(&path);
+    std::fs::create_dir_all(&folder).map_err(Error::io("create the folder", &folder))?;
+    let frame = cif_exr::Frame {
+        name: &view.name,
+        time: place.time_of(view),
+        image,
+        background: settings.background,
+        objects: &objects(field),
+        ranks: ranks.as_ref(),
+        motion: Some(&motion),
+        encoding: command.exr_color.into(),
+    };
+    cif_exr::write(&path, &frame).map_err(Error::plain)
+}
+
+/// Motion to the next view: that of the Gaussians, weighted as their colours are.
+fn motion(renderer: &mut Renderer, image: &RenderedImage, place: &Place<'_>) -> cif_exr::Motion {
+    let view = &place.views[place.index].view;
+    let (width, height) = (view.camera.width, view.camera.height);
+    let Some(next) = place.next() else {
+        return cif_exr::Motion { vectors: PixelGrid::filled(width, height, [0.0; 2]), next: None };
+    };
+    let means = renderer.deform(place.field, place.time_of(view)).means;
+    let next_means = renderer.deform(place.field, place.time_of(next)).means;
+    let moved = screen_motion(&view.camera, &means, &next.camera, &next_means);
+    let mut vectors = renderer.blend(&moved, BlendingWeights::Color);
+    for (vector, alpha) in vectors.pixels.iter_mut().zip(&image.alpha.pixels) {
+        *vector = if *alpha > MIN_COVERAGE { vector.map(|sum| sum / alpha) } else { [0.0; 2] };
+    }
+    cif_exr::Motion { vectors, next: Some(next.name.clone()) }
+}
+
+/// Instances with their names in a Cryptomatte: the label, or the name of the node where labels repeat.
+fn objects(field: &Field) -> Vec<cif_exr::Object> {
+    let repeated = |label: &str| {
+        label == BACKGROUND || field.instances.iter().filter(|instance| instance.label == label).count() > 1
+    };
+    let named = field.instances.iter().map(|instance| cif_exr::Object {
+        id: instance.id,
+        name: if repeated(&instance.label) {
+            instance_name(&instance.label, instance.id)
+        } else {
+            instance.label.clone()
+        },
+    });
+    named.collect()
 }
 
 fn write(what: What, field: &Field, image: &RenderedImage, folder: &Path, name: &str) -> Result<(), Error> {

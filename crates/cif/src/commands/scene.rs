@@ -26,6 +26,44 @@ pub(super) fn is_scene(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("cif"))
 }
 
+/// What a file is, by its extension.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Format {
+    /// A trained scene.
+    Scene,
+    /// A stage.
+    Usd,
+    /// A glTF file.
+    Gltf,
+}
+
+/// Extensions of every format.
+const FORMATS: [(&str, Format); 7] = [
+    ("cif", Format::Scene),
+    ("usda", Format::Usd),
+    ("usdc", Format::Usd),
+    ("usdz", Format::Usd),
+    ("usd", Format::Usd),
+    ("glb", Format::Gltf),
+    ("gltf", Format::Gltf),
+];
+
+/// Tells what a file is.
+///
+/// # Errors
+/// When its extension is none of ours.
+pub(super) fn format(path: &Path) -> Result<Format, Error> {
+    let extension = path.extension().map(|extension| extension.to_string_lossy().to_lowercase());
+    let known = FORMATS.iter().find(|(name, _)| extension.as_deref() == Some(name));
+    known.map(|(_, format)| *format).ok_or_else(|| {
+        let names: Vec<String> = FORMATS.iter().map(|(name, _)| format!(".{name}")).collect();
+        Error::usage(
+            format!("{}: the extension does not say what the file is", path.display()),
+            format!("files that can be asked end with {}", names.join(", ")),
+        )
+    })
+}
+
 /// The settings that a scene is to be rendered with: those of its training.
 pub(super) fn render_settings(field: &Field) -> RenderSettings {
     cif_train::metrics::trained_settings(field)

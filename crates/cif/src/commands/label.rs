@@ -1,0 +1,117 @@
+//! `cif label`: other names for objects.
+
+use std::path::{Path, PathBuf};
+
+use cif_field::{Checkpoint, Instance};
+use clap::Args;
+
+use super::scene::{self, Format};
+use crate::error::Error;
+use crate::output;
+
+/// Give an object another label
+#[derive(Debug, Args)]
+#[command(after_help = "\
+The file is written anew beside itself and then takes its own place; nothing is lost when that fails.
+Prims of a stage keep their names and paths; what changes is the semantic class label, the display
+name and userProperties:label. In glTF it is `extras.cif`; nodes of other programs get another name.
+
+  cif label table.cif --instance 3 'blue mug'
+  cif label table.usda --instance red_mug_003 'blue mug' --category mug
+  cif label table.cif --instance 3 'blue mug' -o renamed.cif")]
+pub(super) struct Label {
+    /// Trained scene (.cif), stage (.usda, .usdc) or glTF file (.glb, .gltf)
+    #[arg(value_name = "FILE")]
+    path: PathBuf,
+    /// Object: its mask value, its unique name, or the path of its prim
+    #[arg(long, value_name = "ID|NAME")]
+    instance: String,
+    /// New label
+    #[arg(value_name = "LABEL")]
+    label: String,
+    /// New class [default: the old one, or the label where class and label were the same]
+    #[arg(long, value_name = "CLASS")]
+    category: Option<String>,
+    /// Write to another file and leave this one as it is
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// Replace OUT where it exists
+    #[arg(long, requires = "output")]
+    force: bool,
+}
+
+pub(super) fn run(command: &Label) -> Result<(), Error> {
+    let label = checked(&command.label, "the label")?;
+    let category = command.category.as_deref().map(|category| checked(category, "--category")).transpose()?;
+    if let Some(output) = &command.output {
+        output::check_file(output, command.force)?;
+    }
+    let target = command.output.as_deref().unwrap_or(&command.path);
+    let (before, after) = match scene::format(&command.path)? {
+        Format::Scene => in_scene(&command.path, target, &command.instance, label, category)?,
+        Format::Usd => {
+            let done = cif_usd::relabel(&command.path, target, &command.instance, label, category)
+                .map_err(Error::plain)?;
+            (done.before, format!("'{}', class '{}' ({})", done.label, done.category, done.path))
+        }
+        Format::Gltf => {
+            let done = cif_gltf::relabel(&command.path, target, &command.instance, label, category)
+                .map_err(Error::plain)?;
+            (done.before, format!("'{}', class '{}' ({})", done.label, done.category, done.node))
+        }
+    };
+    println!("{}: '{before}' is now {after}", target.display());
+    Ok(())
+}
+
+/// A label without surrounding space.
+fn checked<'a>(text: &'a str, what: &str) -> Result<&'a str, Error> {
+    let text = text.trim();
+    if text.is_empty() || text.chars().any(char::is_control) {
+        return Err(Error::usage(
+            format!("{what} is empty or holds control characters"),
+            "give a name that people can read, for example 'blue mug'",
+        ));
+    }
+    Ok(text)
+}
+
+fn in_scene(
+    path: &Path,
+    target: &Path,
+    object: &str,
+    label: &str,
+    category: Option<&str>,
+) -> Result<(String, String), Error> {
+    // The whole file, so that a training state in it stays.
+    let mut checkpoint = Checkpoint::load(path).map_err(Error::plain)?;
+    let instances = &mut checkpoint.field.instances;
+    let index = find(instances, object).ok_or_else(|| {
+        let known: Vec<String> =
+            instances.iter().map(|instance| format!("{} {}", instance.id, instance.label)).collect();
+        let known = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
+        Error::failed(
+            format!("{} has no instance '{object}'; instances: {known}", path.display()),
+            "give the number of one of them",
+        )
+    })?;
+    let instance = &mut instances[index];
+    let before = std::mem::replace(&mut instance.label, label.to_owned());
+    if let Some(category) = category {
+        category.clone_into(&mut instance.category);
+    } else if instance.category == before {
+        label.clone_into(&mut instance.category);
+    }
+    let after = format!("'{}', class '{}' (id {})", instance.label, instance.category, instance.id);
+    checkpoint.save(target).map_err(Error::plain)?;
+    Ok((before, after))
+}
+
+/// An instance by mask value or unique name, as exports name its node.
+fn find(instances: &[Instance], object: &str) -> Option<usize> {
+    let node = object.rsplit('/').next().unwrap_or(object);
+    instances.iter().position(|instance| {
+        object.parse() == Ok(instance.id)
+            || cif_scene::naming::instance_name(&instance.label, instance.id) == node
+    })
+}
