@@ -257,7 +257,7 @@ fn print_table(found: &[ObjectMatch]) {
         let axis = |column: usize| DVec3::new(rows[0][column], rows[1][column], rows[2][column]);
         let turn = [0, 1, 2].map(axis).map(|axis| axis.try_normalize().unwrap_or(DVec3::ZERO));
         let rotation = DQuat::from_mat3(&DMat3::from_cols(turn[0], turn[1], turn[2]));
-        let corner = |corner: &Option<[f64; 3]>| corner.as_ref().map_or("no extent".to_owned(), |p| point(p));
+        let corner = |corner: &Option<[f64; 3]>| corner.as_ref().map_or("no extent".to_owned(), point);
         table.add_row([
             one.path.clone(),
             one.label.clone(),
