@@ -100,5 +100,5 @@ def stage_path(
     request: pytest.FixtureRequest, field: cif.Field, motion, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     path = tmp_path_factory.mktemp("stage") / f"scene.{request.param}"
-    field.export(path, motion=motion)
+    field.export(path, motion=motion, reduce_keys=False)
     return path

@@ -64,7 +64,7 @@ def test_metadata(stage: Usd.Stage) -> None:
 
 def test_one_prim_per_object(stage: Usd.Stage) -> None:
     names = [prim.GetName() for prim in stage.GetDefaultPrim().GetChildren()]
-    assert names == [*NODES, "Cameras"]
+    assert names == [*NODES, "Cameras", "PhysicsScene"]
     counts = [len(splats_of(stage, name).GetAttribute("positions").Get()) for name in NODES]
     assert counts == [PER_OBJECT] * 3 + [100]
     mug = stage.GetPrimAtPath("/World/red_mug_001")

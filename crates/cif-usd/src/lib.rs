@@ -56,7 +56,8 @@ pub enum Payloads {
     /// Beside `.usda`, so that it stays readable; inside `.usdc` and `.usdz`.
     #[default]
     ByKind,
-    /// One `.usdc` per instance in a folder beside the stage, `out.payloads` for `out.usda`.
+    /// One `.usdc` per instance in a folder beside the stage: `out.payloads` for `out.usda`, `out.usdc.payloads` for
+    /// `out.usdc`.
     Separate,
     /// All in the stage itself.
     SingleFile,

@@ -46,7 +46,7 @@ pub const SPLATS: &str = "Splats";
 pub const PROXY: &str = "Proxy";
 /// Convex hull of a node or part; further ones are numbered.
 pub const COLLIDER: &str = "Collider";
-/// Ending of the folder of payloads: `out.usda` has `out.payloads`.
+/// Ending of the folder of payloads: `out.usda` has `out.payloads`, `out.usdc` has `out.usdc.payloads`.
 pub const PAYLOADS: &str = "payloads";
 /// Prim of a payload that every level of detail shares.
 pub const COMMON: &str = "/Common";

@@ -36,9 +36,16 @@ fn folder_of(path: &Path) -> PathBuf {
     }
 }
 
-/// Folder of the payloads of a stage: `out.payloads` beside `out.usda`.
+/// Folder of the payloads of a stage: `out.payloads` beside `out.usda`, `out.usdc.payloads` beside `out.usdc`, so
+/// that stages with one name and several endings do not share it.
 fn payloads_of(path: &Path) -> PathBuf {
-    path.with_extension(tokens::PAYLOADS)
+    if kind_of(path).is_ok_and(|kind| kind == Kind::Text) {
+        return path.with_extension(tokens::PAYLOADS);
+    }
+    let mut name = path.file_name().map(OsString::from).unwrap_or_default();
+    name.push(".");
+    name.push(tokens::PAYLOADS);
+    path.with_file_name(name)
 }
 
 /// The root layer of a file, kept apart from layers that are open under the same name.

@@ -240,3 +240,26 @@ fn what_is_not_ours_is_kept() {
     let left: Vec<_> = fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
     assert_eq!(left, ["a.usda"], "no scratch is left behind");
 }
+
+#[test]
+fn stages_of_one_name_keep_their_payloads_apart() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let (first, second) = (Maker::new(5).scene(), Maker::new(6).scene());
+    let text = folder.path().join("a.usda");
+    export(&first, &text, ExportOptions::default()).unwrap();
+    let separate = ExportOptions { payloads: crate::Payloads::Separate, ..ExportOptions::default() };
+    for (name, options) in
+        [("a.usdc", ExportOptions::default()), ("a.usdz", ExportOptions::default()), ("a.usdc", separate)]
+    {
+        let path = folder.path().join(name);
+        export(&second, &path, options).unwrap();
+        assert_eq!(read_scene(&path).unwrap().nodes, second.nodes, "{name}");
+        assert_eq!(read_scene(&text).unwrap().nodes, first.nodes, "after {name}");
+    }
+    export(&second, &folder.path().join("a.usdc"), ExportOptions::default()).unwrap();
+    let mut left: Vec<_> =
+        fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    left.sort();
+    assert_eq!(left, ["a.payloads", "a.usda", "a.usdc", "a.usdz"]);
+}

@@ -63,7 +63,7 @@ pub(super) struct Export {
     /// Splats with less instance mass are background
     #[arg(long, value_name = "MASS")]
     background_threshold: Option<f32>,
-    /// Put the arrays of every object into a file of its own, OUT.payloads/NAME.usdc, loaded on demand;
+    /// Put the arrays of every object into a file of its own in OUT.usdc.payloads, loaded on demand;
     /// .usda does so anyway
     #[arg(long, conflicts_with = "single_file")]
     payloads: bool,
