@@ -51,6 +51,14 @@ impl Format {
 /// # Errors
 /// When the file is missing or broken, is a `.cif`, or its ending is not known.
 pub fn read(path: &Path) -> Result<SceneGraph, Error> {
+    read_following(path, false)
+}
+
+/// As [`read`]; with `follow_external` stages may bring in layers from outside their folder.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_following(path: &Path, follow_external: bool) -> Result<SceneGraph, Error> {
     if path.is_dir() {
         return Err(Error::failed(
             format!("{} is a folder; a file is expected here", path.display()),
@@ -58,7 +66,10 @@ pub fn read(path: &Path) -> Result<SceneGraph, Error> {
         ));
     }
     match Format::of(path)? {
-        Format::Usd => cif_usd::read_scene(path).map_err(Error::plain),
+        Format::Usd => {
+            let options = cif_usd::ReadOptions { follow_external };
+            cif_usd::read_scene_with(path, options).map_err(Error::plain)
+        }
         Format::Gltf => cif_gltf::read_scene(path).map_err(Error::plain),
         Format::Ply => cif_ply::read(path).map_err(Error::plain),
         Format::Field => Err(Error::usage(

@@ -211,8 +211,8 @@ def import_scene(
     """Read a USD, glTF or PLY file as a field.
 
     With ``base``, the field that the file was exported from, what was changed in the file is applied to it, and
-    the second value lists the edits as ``diff`` does; otherwise it is None. ``force_base`` takes a base that the
-    file was not exported from.
+    the second value lists the edits as ``diff`` does; otherwise it is None. ``force_base`` takes a base that
+    the file was not exported from.
     """
 
 def diff(before: str | os.PathLike[str], after: str | os.PathLike[str]) -> dict[str, Any]:

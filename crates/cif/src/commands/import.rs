@@ -37,6 +37,9 @@ pub(super) struct Import {
     /// Take the base although the file was exported from another scene
     #[arg(long, requires = "base")]
     force_base: bool,
+    /// Read layers that a stage brings in from outside its folder
+    #[arg(long)]
+    follow_external: bool,
     /// Print the edits as JSON
     #[arg(long)]
     json: bool,
@@ -55,7 +58,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     output::check_file(&command.output, command.force)?;
     // Before the file is read, which may take longer.
     let base = command.base.as_deref().map(scene::load).transpose()?;
-    let graph = graph_file::read(&command.file)?;
+    let graph = graph_file::read_following(&command.file, command.follow_external)?;
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }
