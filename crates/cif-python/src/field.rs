@@ -37,7 +37,7 @@ fn logits(name: &str, probabilities: &[f32]) -> PyResult<Vec<f32>> {
     Ok(probabilities.iter().map(logit).collect())
 }
 
-/// `[N, K]` probabilities as sparse rows; a row without any probability holds all instances equally.
+/// `[N, K]` probabilities as sparse rows; what a row lacks of one belongs to no instance.
 fn sparse_identities(probabilities: &PyReadonlyArrayDyn<'_, f32>, instances: usize) -> PyResult<Identities> {
     let shape = probabilities.shape();
     if shape.len() != 2 || shape[1] != instances || instances == 0 {
@@ -52,9 +52,14 @@ fn sparse_identities(probabilities: &PyReadonlyArrayDyn<'_, f32>, instances: usi
         log_calibrations: Vec::new(),
     };
     for row in arrays::values(probabilities).chunks_exact(instances) {
+        // What a row lacks of one belongs to no instance.
         let sum: f32 = row.iter().sum();
+        if sum <= 0.0 {
+            identities.push_told(None);
+            continue;
+        }
         for (label, &probability) in row.iter().enumerate() {
-            let probability = if sum > 0.0 { probability / sum } else { 1.0 / instances as f32 };
+            let probability = probability / sum.max(1.0);
             if probability > 0.0 {
                 identities.labels.push(u16::try_from(label).map_err(cif_error)?);
                 identities.log_estimates.push(probability.ln());

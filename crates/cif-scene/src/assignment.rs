@@ -1,14 +1,14 @@
 //! Which node a Gaussian belongs to.
 //!
 //! 1. A Gaussian's instance is its most probable one (ties to the lowest index).
-//! 2. It is *background* when its instance mass gamma = pi p_max is below
-//!    [`SceneOptions::background_threshold`], or when it was seen on labelled pixels for less than half of its
-//!    image (see [`cif_field::Identities::labelled_shares`]; a tiny instance may have less). Pixels without a
-//!    label give no loss, so Gaussians outside all masks keep the occupancy at which training started,
-//!    although they have identity rows (methods reference 4.4, 5.4 and A2).
-//! 3. Gaussians inside an object are hardly ever seen, so that they too keep their first occupancy. One that
-//!    lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of that
-//!    instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
+//! 2. It is *background* when it was seen on labelled pixels for less than half of its image (see
+//!    [`cif_field::Identities::labelled_shares`]; a tiny instance may have less), or when its instance mass
+//!    gamma = pi p_max is below [`SceneOptions::background_threshold`], where one is asked for. Pixels without
+//!    a label give no loss, so Gaussians outside all masks have identity rows too (methods reference 4.4, 5.4
+//!    and A2).
+//! 3. Gaussians inside an object are hardly ever seen, so that they keep their first occupancy. One below the
+//!    threshold that lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of
+//!    that instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
 //!
 //! Rows whose owner was told ([`cif_field::Identities::told_owner`]: what came from a file that names its objects)
 //! belong to it, whatever their occupancy.

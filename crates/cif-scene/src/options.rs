@@ -124,9 +124,9 @@ pub struct SceneOptions {
     /// Gaussians below this occupancy are left out. Default 0: none.
     pub min_occupancy: f32,
     /// Gaussians whose instance mass (occupancy times probability of the most probable instance) is below
-    /// this are background, unless they are enclosed by an instance (see [`crate::assignment`]). Default 0.05,
-    /// two and a half times the occupancy at which training starts: what the masks never spoke for stays near
-    /// its start.
+    /// this are background, unless they are enclosed by an instance (see [`crate::assignment`]). Default 0: the
+    /// share of labelled pixels decides alone. Colour is drawn by opacity, so that many splats of an object keep
+    /// occupancies near their start of 0.02; a threshold above leaves their colour behind when the object moves.
     pub background_threshold: f32,
     /// Most rigid parts of an instance, 2 to 64; what needs more becomes dense. Default 8.
     pub max_parts: usize,
@@ -156,7 +156,7 @@ impl Default for SceneOptions {
             most_expensive_motion: MotionModel::Dense,
             min_opacity: 1.0 / 255.0,
             min_occupancy: 0.0,
-            background_threshold: 0.05,
+            background_threshold: 0.0,
             max_parts: 8,
             reduce_keys: true,
             hulls_per_instance: 1,

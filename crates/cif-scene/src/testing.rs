@@ -172,6 +172,8 @@ pub(crate) fn learned_field(objects: usize, seed: u64) -> Field {
         }
         entries.sort_by_key(|(label, _)| *label);
         for (label, share) in entries {
+            // The background was hardly seen inside masks.
+            let share = if is_background { 0.05 * share } else { share };
             identities.labels.push(label);
             identities.log_estimates.push(share.ln());
             identities.log_calibrations.push(0.1);

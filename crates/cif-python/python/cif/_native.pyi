@@ -101,8 +101,8 @@ class Field:
         """Make a static field.
 
         [N, 3] means, standard deviations and colours, [N, 4] quaternions, [N] opacities and occupancies
-        (opacities by default), [N, K] identity probabilities; instances have id, label and category; cameras
-        are (name, index into times, camera).
+        (opacities by default), [N, K] identity probabilities, where what a row lacks of 1 belongs to no
+        instance; instances have id, label and category; cameras are (name, index into times, camera).
         """
     def __len__(self) -> int: ...
     @property

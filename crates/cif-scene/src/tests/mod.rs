@@ -30,7 +30,8 @@ fn field(objects: usize) -> Field {
         gaussians.occupancy_logits.push(logit(occupancy));
         gaussians.sh_coefficients.push([0.25; 48]);
         identities.labels.push(owner as u16);
-        identities.log_estimates.push(0.0);
+        // What belongs to nothing was hardly seen inside masks.
+        identities.log_estimates.push(if occupancy < 0.05 { 0.05_f32.ln() } else { 0.0 });
         identities.log_calibrations.push(0.0);
         identities.row_offsets.push(identities.labels.len() as u32);
     };
@@ -201,14 +202,17 @@ fn what_the_masks_never_spoke_for_is_background() {
     field.gaussians.occupancy_logits[5] = logit(0.02);
     field.gaussians.occupancy_logits[50] = logit(0.02);
     field.gaussians.means[50] = [0.0, 3.1, 0.0];
-    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    let massive = SceneOptions { background_threshold: 0.05, ..SceneOptions::default() };
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &massive).unwrap();
     let counts: Vec<_> = graph.nodes.iter().map(|node| node.splats.len()).collect();
     assert_eq!(counts, [59, 60, 41]);
     assert!(graph.nodes[0].splats.rows.contains(&5));
     assert_eq!(graph.nodes[2].kind, NodeKind::Background);
-    let all = SceneOptions { background_threshold: 0.0, ..SceneOptions::default() };
+    // Faint occupancy alone leaves nothing behind: what the masks show of a Gaussian decides.
+    let all = SceneOptions::default();
     let graph = build_from(&field, &mut |_| field.gaussians.clone(), &all).unwrap();
-    assert_eq!(graph.nodes.len(), 2, "threshold 0 leaves no background");
+    let counts: Vec<_> = graph.nodes.iter().map(|node| node.splats.len()).collect();
+    assert_eq!(counts, [60, 60, 40]);
 
     field.identities = None;
     field.instances.clear();
@@ -248,8 +252,9 @@ fn an_object_narrower_than_its_gaussians_keeps_the_best_of_them() {
 fn untrained_occupancy_falls_back_to_opacity() {
     let mut field = field(1);
     field.gaussians.occupancy_logits.fill(logit(0.02));
-    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
-    assert_eq!(graph.nodes[0].splats.len(), 100);
+    let massive = SceneOptions { background_threshold: 0.05, ..SceneOptions::default() };
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &massive).unwrap();
+    assert_eq!(graph.nodes[0].splats.len(), 60);
 }
 
 #[test]

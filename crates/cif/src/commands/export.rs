@@ -60,7 +60,7 @@ pub(super) struct Export {
     /// Leave out splats below this opacity [default: 1/255]
     #[arg(long, value_name = "OPACITY")]
     min_opacity: Option<f32>,
-    /// Splats with less instance mass are background
+    /// Splats with less instance mass are background too [default: 0, the share of labelled pixels decides]
     #[arg(long, value_name = "MASS")]
     background_threshold: Option<f32>,
     /// Put the arrays of every object into a file of its own in OUT.usdc.payloads, loaded on demand;
