@@ -86,11 +86,17 @@ pub(super) fn rebuild(
 }
 
 /// A row without the entries of removed instances. A row that belongs to one that stays keeps its labelled
-/// share, so that it goes on belonging to it.
+/// share, so that it goes on belonging to it; one of the background does not fall to its second best.
 fn keep(to: &mut Identities, from: &Identities, row: usize, renumbered: &[Owner], owned: bool) {
     let range = from.range(row);
     let share = |entries: &[f32]| entries.iter().map(|log| f64::from(*log).exp()).sum::<f64>();
     let first = to.labels.len();
+    let score = |entry: usize| from.log_estimates[entry] + from.log_calibrations[entry];
+    let best = range.clone().max_by(|a, b| score(*a).total_cmp(&score(*b)));
+    if !owned && best.is_some_and(|entry| renumbered[usize::from(from.labels[entry])].is_none()) {
+        to.push_told(None);
+        return;
+    }
     for entry in range.clone() {
         if let Some(label) = renumbered[usize::from(from.labels[entry])] {
             to.labels.push(label);
@@ -110,4 +116,28 @@ fn keep(to: &mut Identities, from: &Identities, row: usize, renumbered: &[Owner]
         }
     }
     to.row_offsets.push(to.labels.len() as u32);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn background_does_not_fall_to_the_second_best_of_what_is_removed() {
+        let mut from = Identities::empty();
+        from.labels.extend([0, 1]);
+        from.log_estimates.extend([0.3_f32.ln(), 0.1_f32.ln()]);
+        from.log_calibrations.extend([0.0, 0.0]);
+        from.row_offsets.push(2);
+        let kept = |renumbered: &[Owner], owned| {
+            let mut to = Identities::empty();
+            keep(&mut to, &from, 0, renumbered, owned);
+            to
+        };
+        assert_eq!(kept(&[None, Some(0)], false).told_owner(0), Some(None));
+        let second = kept(&[Some(0), None], false);
+        assert_eq!((second.told_owner(0), second.labels), (None, vec![0]));
+        let owned = kept(&[None, Some(0)], true);
+        assert!((owned.labelled_shares()[0] - 0.4).abs() < 1e-6, "an owned row keeps its share");
+    }
 }

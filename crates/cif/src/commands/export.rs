@@ -116,9 +116,6 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }
-    if !graph.omitted.is_empty() {
-        eprintln!("warning: nothing visible belongs to {}", graph.omitted.join(", "));
-    }
     let written = match &command.usd {
         Some(path) => Some(cif_usd::export(&graph, path, writing(command)).map_err(Error::plain)?),
         None => None,

@@ -52,8 +52,8 @@ A short tour:
   cif label table.usda --instance 3 'blue mug'           give it another name
 
 A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
-instance masks (PNG, value = instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/. `cif masks` helps to
-make them with a video tracker.
+instance masks (PNG, value = instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/.
+`cif masks` helps to make them with a video tracker.
 Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 `cif COMMAND --help` explains one command.";
 
