@@ -101,7 +101,8 @@ impl<'py> Walk<'_, 'py> {
             if self.seen.insert(format!("file {file}")) {
                 self.bytes += std::fs::metadata(file).map_or(0, |data| data.len());
             }
-            for asset in assets {
+            // A reference to another prim of the same stage names no file.
+            for asset in assets.into_iter().filter(|asset| !asset.is_empty()) {
                 let resolved = self.resolve(&layer, &asset).map_err(|error| self.unreadable(&error))?;
                 let layer_name = identifier.clone();
                 if resolved.is_empty() {

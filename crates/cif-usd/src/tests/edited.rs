@@ -110,6 +110,20 @@ UsdGeom.Xformable(stage.GetPrimAtPath('/World')).AddScaleOp().Set(Gf.Vec3f(2, 2,
 }
 
 #[test]
+fn copies_by_reference_are_recognised() {
+    let _session = session();
+    let (before, after) = edited(
+        "
+Sdf.CreatePrimInLayer(layer, '/World')
+copy = stage.DefinePrim('/World/a_second_mug')
+copy.GetReferences().AddInternalReference('/World/red_mug_001')
+",
+    );
+    let (copy, original) = (node(&after, "a_second_mug"), node(&before, "red_mug_001"));
+    assert_eq!((copy.kind, &copy.splats), (original.kind, &original.splats));
+}
+
+#[test]
 fn copies_and_colours_are_recognised() {
     let _session = session();
     let (before, after) = edited(
