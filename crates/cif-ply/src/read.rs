@@ -5,10 +5,9 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
 use cif_geometry::spherical_harmonics::coefficient_count;
-use cif_geometry::{Bounds, RigidTransform, quaternion};
+use cif_geometry::{RigidTransform, quaternion};
 use cif_scene::{
-    Motion, MotionModel, MotionReport, Node, NodeKind, Origin, ResidualStatistics, SceneGraph, Splats,
-    TimeCodes, UpAxis, extent, naming,
+    Motion, MotionReport, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes, UpAxis, extent, naming,
 };
 use glam::DVec3;
 use ply_rs_bw::parser::{ParseError, Parser, Reader};
@@ -305,21 +304,7 @@ fn scene(path: &Path, splats: Splats, left_out: usize) -> SceneGraph {
         &splats.orientations,
         &splats.scales,
     );
-    let centres = splats.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)));
-    let report = MotionReport {
-        model: MotionModel::Static,
-        gaussians: splats.len(),
-        size: Bounds::around(centres).size().length(),
-        tolerance: 0.0,
-        residual: ResidualStatistics::default(),
-        static_residual: ResidualStatistics::default(),
-        rigid_residual: None,
-        samples: 0,
-        motion_bytes: 0,
-        parts_residual: None,
-        parts: 0,
-        seconds: 0.0,
-    };
+    let report = MotionReport::unfitted(&splats, 0);
     let node = Node {
         kind: NodeKind::Instance { id: 1, index: 0 },
         name: naming::instance_name(&label, 1),

@@ -1,8 +1,10 @@
 //! What the chosen motion models cost and miss.
 
+use cif_geometry::Bounds;
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::{MotionModel, Node, SceneGraph};
+use crate::{MotionModel, Node, SceneGraph, Splats};
 
 /// How far a motion model is from the trained motion, world units.
 ///
@@ -91,6 +93,28 @@ impl PartialEq for MotionReport {
             (model, gaussians, size, tolerance, residuals, parts, samples, motion_bytes)
         };
         known(self) == known(other)
+    }
+}
+
+impl MotionReport {
+    /// What there is to say about motion that was read from a file of others, not fitted: `samples` poses.
+    #[must_use]
+    pub fn unfitted(splats: &Splats, samples: usize) -> Self {
+        let centres = splats.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)));
+        Self {
+            model: MotionModel::Static,
+            gaussians: splats.len(),
+            size: Bounds::around(centres).size().length(),
+            tolerance: 0.0,
+            residual: ResidualStatistics::default(),
+            static_residual: ResidualStatistics::default(),
+            rigid_residual: None,
+            samples,
+            motion_bytes: samples * 28,
+            parts_residual: None,
+            parts: 0,
+            seconds: 0.0,
+        }
     }
 }
 

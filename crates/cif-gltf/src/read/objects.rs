@@ -5,8 +5,7 @@ use std::collections::BTreeSet;
 use cif_geometry::{Bounds, RigidTransform};
 use cif_scene::graph::pose_at;
 use cif_scene::{
-    Motion, MotionModel, MotionReport, Node, NodeKind, Part, PartsMotion, PoseSample, ResidualStatistics,
-    Splats, extent, naming,
+    Motion, MotionModel, MotionReport, Node, NodeKind, Part, PartsMotion, PoseSample, Splats, extent, naming,
 };
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 
@@ -357,7 +356,7 @@ impl Builder<'_> {
             Motion::Rigid(track) => (track.len(), MotionModel::Rigid),
             Motion::Dense(dense) => (dense.samples.len(), MotionModel::Dense),
         };
-        let mut report = named.report.unwrap_or_else(|| foreign_report(&splats, samples));
+        let mut report = named.report.unwrap_or_else(|| MotionReport::unfitted(&splats, samples));
         report.model = model;
         Node {
             kind: named.kind,
@@ -449,23 +448,4 @@ fn mean_occupancy(splats: &Splats) -> f32 {
         (sum + f64::from(occupancy * opacity), total + f64::from(*opacity))
     });
     if total > 0.0 { (sum / total) as f32 } else { 0.0 }
-}
-
-/// What there is to say about motion that was not fitted.
-fn foreign_report(splats: &Splats, samples: usize) -> MotionReport {
-    let centres = splats.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)));
-    MotionReport {
-        model: MotionModel::Static,
-        gaussians: splats.len(),
-        size: Bounds::around(centres).size().length(),
-        tolerance: 0.0,
-        residual: ResidualStatistics::default(),
-        static_residual: ResidualStatistics::default(),
-        rigid_residual: None,
-        samples,
-        motion_bytes: samples * 28,
-        parts_residual: None,
-        parts: 0,
-        seconds: 0.0,
-    }
 }
