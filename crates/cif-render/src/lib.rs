@@ -9,6 +9,7 @@
 //! | [`motion`] | how far a Gaussian moves on screen between two views |
 //! | [`reference`] | the readable oracle, generic over `f32` and `f64` |
 //! | [`cpu`] | the fast path: tiles, SIMD, threads |
+//! | `wgpu` | the GPU path, with the feature of that name |
 //! | [`synthetic`] | small random scenes for tests and benchmarks |
 
 pub mod constants;
@@ -19,6 +20,8 @@ pub mod motion;
 pub mod reference;
 pub mod settings;
 pub mod synthetic;
+#[cfg(feature = "wgpu")]
+pub mod wgpu;
 
 pub use gradients::Gradients;
 pub use image::{BlendingWeights, Channels, InstanceImage, InstanceRanks, RenderedImage, UNLABELLED};

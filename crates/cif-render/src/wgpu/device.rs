@@ -1,0 +1,285 @@
+//! The GPU: which one, what it can do, and what went wrong on it.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use super::error::GpuError;
+
+/// Interfaces that are asked for GPUs. OpenGL is left out: its drivers are listed twice where Vulkan is there, and
+/// compute is optional in it.
+const BACKENDS: wgpu::Backends =
+    wgpu::Backends::VULKAN.union(wgpu::Backends::METAL).union(wgpu::Backends::DX12);
+
+/// Features that are used where an adapter has them and never required.
+const WELCOME: wgpu::Features =
+    wgpu::Features::SUBGROUP.union(wgpu::Features::TIMESTAMP_QUERY).union(wgpu::Features::SHADER_F16);
+
+/// What an adapter is called and can do, for `cif info --gpu` and logs.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AdapterFacts {
+    /// Name as the driver says it.
+    pub name: String,
+    /// Vulkan, Metal or Direct3D 12.
+    pub interface: String,
+    /// Discrete, integrated, virtual, software or other.
+    pub kind: &'static str,
+    /// Driver and its version.
+    pub driver: String,
+    /// Whether the processor does the work: no GPU at all, then.
+    pub software: bool,
+    /// Whether kernels can be timed on the device.
+    pub timestamps: bool,
+    /// Sizes of its subgroups, where kernels can use them.
+    pub subgroups: Option<(u32, u32)>,
+    /// Whether 16-bit floats can be computed with.
+    pub half_floats: bool,
+    /// Limits that decide how large a scene may be and how kernels are cut.
+    pub limits: [(&'static str, u64); 6],
+    /// What is missing for the kernels to run; empty when they do.
+    pub missing: Vec<String>,
+}
+
+impl AdapterFacts {
+    fn of(adapter: &wgpu::Adapter) -> Self {
+        let info = adapter.get_info();
+        let features = adapter.features();
+        let limits = adapter.limits();
+        Self {
+            kind: kind(info.device_type),
+            software: info.device_type == wgpu::DeviceType::Cpu,
+            interface: interface(info.backend).to_owned(),
+            driver: format!("{} {}", info.driver, info.driver_info).trim().to_owned(),
+            timestamps: features.contains(wgpu::Features::TIMESTAMP_QUERY),
+            subgroups: features
+                .contains(wgpu::Features::SUBGROUP)
+                .then_some((info.subgroup_min_size, info.subgroup_max_size)),
+            half_floats: features.contains(wgpu::Features::SHADER_F16),
+            limits: named_limits(&limits),
+            missing: missing(&limits),
+            name: info.name,
+        }
+    }
+}
+
+fn kind(device_type: wgpu::DeviceType) -> &'static str {
+    match device_type {
+        wgpu::DeviceType::DiscreteGpu => "discrete GPU",
+        wgpu::DeviceType::IntegratedGpu => "integrated GPU",
+        wgpu::DeviceType::VirtualGpu => "virtual GPU",
+        wgpu::DeviceType::Cpu => "software on the processor",
+        wgpu::DeviceType::Other => "GPU of unknown kind",
+    }
+}
+
+fn interface(backend: wgpu::Backend) -> &'static str {
+    match backend {
+        wgpu::Backend::Vulkan => "Vulkan",
+        wgpu::Backend::Metal => "Metal",
+        wgpu::Backend::Dx12 => "Direct3D 12",
+        _ => "another interface",
+    }
+}
+
+fn named_limits(limits: &wgpu::Limits) -> [(&'static str, u64); 6] {
+    [
+        ("storage buffers per kernel", u64::from(limits.max_storage_buffers_per_shader_stage)),
+        ("bytes per binding", limits.max_storage_buffer_binding_size),
+        ("bytes per buffer", limits.max_buffer_size),
+        ("bytes of workgroup memory", u64::from(limits.max_compute_workgroup_storage_size)),
+        ("invocations per workgroup", u64::from(limits.max_compute_invocations_per_workgroup)),
+        ("workgroups per dimension", u64::from(limits.max_compute_workgroups_per_dimension)),
+    ]
+}
+
+/// Limits below the core of WebGPU, each with what was found.
+fn missing(limits: &wgpu::Limits) -> Vec<String> {
+    named_limits(limits)
+        .into_iter()
+        .zip(named_limits(&wgpu::Limits::defaults()))
+        .filter(|((_, found), (_, needed))| found < needed)
+        .map(|((name, found), (_, needed))| format!("{found} {name}, {needed} are needed"))
+        .collect()
+}
+
+/// The first fault that the driver told, kept until someone asks.
+type Fault = Arc<Mutex<Option<GpuError>>>;
+
+/// A device with its queue. Clones share it.
+#[derive(Clone, Debug)]
+pub struct Gpu {
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    facts: Arc<AdapterFacts>,
+    fault: Fault,
+}
+
+impl Gpu {
+    /// Every adapter that Vulkan, Metal or Direct3D 12 offers, GPUs before software.
+    #[must_use]
+    pub fn adapters() -> Vec<AdapterFacts> {
+        adapters().iter().map(AdapterFacts::of).collect()
+    }
+
+    /// Opens the best adapter: discrete before integrated before virtual before software. The environment variable
+    /// `WGPU_ADAPTER_NAME` restricts the choice to adapters whose name contains it.
+    ///
+    /// # Errors
+    /// When there is none, when it is below the core limits of WebGPU, or when the driver refuses.
+    pub fn open() -> Result<Self, GpuError> {
+        let wanted = std::env::var("WGPU_ADAPTER_NAME").unwrap_or_default();
+        let all = adapters();
+        let names: Vec<String> = all.iter().map(|adapter| adapter.get_info().name).collect();
+        let matches = |name: &str| name.to_lowercase().contains(&wanted.to_lowercase());
+        let Some(adapter) = all.into_iter().find(|adapter| matches(&adapter.get_info().name)) else {
+            let found = if names.is_empty() {
+                "nothing answered".to_owned()
+            } else {
+                format!("{} does not contain WGPU_ADAPTER_NAME={wanted}", names.join(", "))
+            };
+            return Err(GpuError::NoAdapter { backends: "Vulkan, Metal and Direct3D 12".to_owned(), found });
+        };
+        Self::of(&adapter)
+    }
+
+    fn of(adapter: &wgpu::Adapter) -> Result<Self, GpuError> {
+        let facts = AdapterFacts::of(adapter);
+        if !facts.missing.is_empty() {
+            return Err(GpuError::TooSmall { adapter: facts.name, missing: facts.missing.join("; ") });
+        }
+        let found = adapter.limits();
+        // Exactly the core limits, so that a kernel that needs more fails everywhere and not on small GPUs only;
+        // buffers alone may be as large as the adapter allows.
+        let limits = wgpu::Limits {
+            max_storage_buffer_binding_size: found
+                .max_storage_buffer_binding_size
+                .min(u64::from(u32::MAX) & !3),
+            max_buffer_size: found.max_buffer_size,
+            ..wgpu::Limits::defaults()
+        };
+        let descriptor = wgpu::DeviceDescriptor {
+            label: Some("cif"),
+            required_features: adapter.features() & WELCOME,
+            required_limits: limits,
+            ..Default::default()
+        };
+        let (device, queue) = pollster::block_on(adapter.request_device(&descriptor)).map_err(|error| {
+            GpuError::NoDevice { adapter: facts.name.clone(), message: error.to_string() }
+        })?;
+        let fault = Fault::default();
+        let keep = |fault: &Fault, error: GpuError| {
+            // The first fault is the cause; what follows are its consequences.
+            fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+        };
+        let kept = Arc::clone(&fault);
+        device.on_uncaptured_error(Arc::new(move |error| {
+            keep(
+                &kept,
+                match error {
+                    wgpu::Error::OutOfMemory { source } => GpuError::OutOfMemory(source.to_string()),
+                    wgpu::Error::Validation { description, .. }
+                    | wgpu::Error::Internal { description, .. } => GpuError::Rejected(description),
+                },
+            );
+        }));
+        let kept = Arc::clone(&fault);
+        device.set_device_lost_callback(move |reason, message| {
+            if reason != wgpu::DeviceLostReason::Destroyed {
+                keep(&kept, GpuError::Lost(message));
+            }
+        });
+        Ok(Self { device, queue, facts: Arc::new(facts), fault })
+    }
+
+    /// The device.
+    #[must_use]
+    pub fn device(&self) -> &wgpu::Device {
+        &self.device
+    }
+
+    /// The queue.
+    #[must_use]
+    pub fn queue(&self) -> &wgpu::Queue {
+        &self.queue
+    }
+
+    /// What the adapter is called and can do.
+    #[must_use]
+    pub fn facts(&self) -> &AdapterFacts {
+        &self.facts
+    }
+
+    /// Largest storage binding, bytes.
+    #[must_use]
+    pub fn largest_binding(&self) -> u64 {
+        let limits = self.device.limits();
+        limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !15
+    }
+
+    /// Whether kernels may use the timestamps of the device.
+    #[must_use]
+    pub fn has_timestamps(&self) -> bool {
+        self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)
+    }
+
+    /// The first fault since the device was opened, if any: out of memory, lost, rejected command.
+    ///
+    /// # Errors
+    /// That fault.
+    pub fn check(&self) -> Result<(), GpuError> {
+        match &*self.fault.lock().unwrap_or_else(PoisonError::into_inner) {
+            Some(fault) => Err(fault.clone()),
+            None => Ok(()),
+        }
+    }
+
+    /// Waits until everything submitted is done.
+    ///
+    /// # Errors
+    /// When the device is lost or a command was rejected.
+    pub fn wait(&self) -> Result<(), GpuError> {
+        self.device
+            .poll(wgpu::PollType::wait_indefinitely())
+            .map_err(|error| GpuError::Lost(error.to_string()))?;
+        self.check()
+    }
+
+    /// Lets finished read-backs arrive, without waiting.
+    ///
+    /// # Errors
+    /// When the device is lost or a command was rejected.
+    pub fn poll(&self) -> Result<(), GpuError> {
+        self.device.poll(wgpu::PollType::Poll).map_err(|error| GpuError::Lost(error.to_string()))?;
+        self.check()
+    }
+}
+
+/// Adapters, best first; equal ones in the order of the driver.
+fn adapters() -> Vec<wgpu::Adapter> {
+    let descriptor = wgpu::InstanceDescriptor {
+        backends: BACKENDS,
+        // No validation layers: naga validates every kernel, and layers would print to the console.
+        flags: wgpu::InstanceFlags::empty().with_env(),
+        ..wgpu::InstanceDescriptor::new_without_display_handle()
+    };
+    let instance = wgpu::Instance::new(descriptor);
+    let mut adapters = pollster::block_on(instance.enumerate_adapters(BACKENDS));
+    adapters.sort_by_key(|adapter| match adapter.get_info().device_type {
+        wgpu::DeviceType::DiscreteGpu => 0,
+        wgpu::DeviceType::IntegratedGpu => 1,
+        wgpu::DeviceType::VirtualGpu => 2,
+        wgpu::DeviceType::Other => 3,
+        wgpu::DeviceType::Cpu => 4,
+    });
+    adapters
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn limits_below_the_core_are_named_with_what_was_found() {
+        assert!(missing(&wgpu::Limits::defaults()).is_empty());
+        let small = wgpu::Limits { max_storage_buffers_per_shader_stage: 4, ..wgpu::Limits::defaults() };
+        assert_eq!(missing(&small), ["4 storage buffers per kernel, 8 are needed"]);
+    }
+}

@@ -1,0 +1,66 @@
+//! What can go wrong on a GPU, in words for the person at the keyboard.
+
+/// Error of the wgpu backend.
+#[derive(Clone, Debug, thiserror::Error, PartialEq, Eq)]
+pub enum GpuError {
+    /// No adapter at all.
+    #[error(
+        "no GPU was found through {backends}: {found}. Install the driver of your GPU (on Linux its Vulkan driver; \
+         `vulkaninfo --summary` shows what is there), or use the CPU with --backend cpu"
+    )]
+    NoAdapter {
+        /// Interfaces that were asked.
+        backends: String,
+        /// What was found instead.
+        found: String,
+    },
+    /// An adapter below what every kernel needs.
+    #[error(
+        "the GPU {adapter} is too small: {missing}. These are the core limits of WebGPU; use another GPU \
+         (WGPU_ADAPTER_NAME selects by name), or the CPU with --backend cpu"
+    )]
+    TooSmall {
+        /// Name of the adapter.
+        adapter: String,
+        /// Each limit that is too low, with what was found.
+        missing: String,
+    },
+    /// The driver refused a device.
+    #[error("the driver of the GPU {adapter} gives no device: {message}")]
+    NoDevice {
+        /// Name of the adapter.
+        adapter: String,
+        /// What the driver says.
+        message: String,
+    },
+    /// Something does not fit the limits of the device.
+    #[error(
+        "{what}: {count} x {item_bytes} bytes = {bytes} bytes, but this GPU binds at most {limit} bytes at a time; \
+         use {advice}, or the CPU with --backend cpu"
+    )]
+    TooLarge {
+        /// What was to be held.
+        what: String,
+        /// Elements.
+        count: u64,
+        /// Bytes of an element.
+        item_bytes: u64,
+        /// Their product.
+        bytes: u128,
+        /// Largest binding, bytes.
+        limit: u64,
+        /// What would be smaller.
+        advice: String,
+    },
+    /// Memory of the device is used up.
+    #[error(
+        "the GPU is out of memory: {0}; close other programs that use it, or use the CPU with --backend cpu"
+    )]
+    OutOfMemory(String),
+    /// The device is gone: driver reset, unplugged, hung.
+    #[error("the GPU was lost: {0}; what was computed on it since the last save is gone")]
+    Lost(String),
+    /// A kernel or a command that the device rejects; a fault of this program or of the driver.
+    #[error("the GPU rejected a command, which is a fault of this program or of the driver: {0}")]
+    Rejected(String),
+}

@@ -1,0 +1,192 @@
+//! Parses and validates WGSL modules without a GPU, and compares what they declare with what Rust believes.
+
+use std::fmt::Write as _;
+
+use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::{AddressSpace, StorageAccess, TypeInner};
+
+use super::kernel::{Access, Module};
+use super::layout::Layout;
+
+/// Storage buffers of an entry point in the core of WebGPU.
+const MAX_STORAGE_BUFFERS: usize = 8;
+/// Bytes of workgroup memory of an entry point in the core of WebGPU.
+const MAX_WORKGROUP_BYTES: u32 = 16_384;
+/// Invocations of a workgroup in the core of WebGPU.
+const MAX_INVOCATIONS: u32 = 256;
+
+/// Checks that a module is valid WGSL without any optional feature, that its bindings and entry points are the listed
+/// ones, that structures lie as in Rust, and that every entry point keeps to the core limits of WebGPU.
+///
+/// # Errors
+/// With everything that is wrong, a line each.
+pub fn validate(module: &Module, layouts: &[Layout]) -> Result<(), String> {
+    let source = module.source();
+    let parsed = naga::front::wgsl::parse_str(&source)
+        .map_err(|error| format!("{}.wgsl: {}", module.name, error.emit_to_string(&source)))?;
+    let information = Validator::new(ValidationFlags::all(), Capabilities::empty())
+        .validate(&parsed)
+        .map_err(|error| format!("{}.wgsl: {}", module.name, error.emit_to_string(&source)))?;
+    let mut wrong = String::new();
+    let mut complain = |what: String| {
+        let _ = writeln!(wrong, "{}.wgsl: {what}", module.name);
+    };
+
+    for (index, access) in module.bindings.iter().enumerate() {
+        let declared = parsed.global_variables.iter().find(|(_, variable)| {
+            variable.binding.as_ref().is_some_and(|b| b.group == 0 && b.binding == index as u32)
+        });
+        let found = declared.and_then(|(_, variable)| match variable.space {
+            AddressSpace::Uniform => Some(Access::Uniform),
+            AddressSpace::Storage { access } if access.contains(StorageAccess::STORE) => {
+                Some(Access::ReadWrite)
+            }
+            AddressSpace::Storage { .. } => Some(Access::Read),
+            _ => None,
+        });
+        if found != Some(*access) {
+            complain(format!("binding {index} is {found:?}, Rust binds {access:?}"));
+        }
+    }
+    for (_, variable) in parsed.global_variables.iter() {
+        if let Some(binding) = &variable.binding
+            && (binding.group != 0 || binding.binding as usize >= module.bindings.len())
+        {
+            complain(format!("{:?} is bound at {binding:?}, which Rust does not know", variable.name));
+        }
+    }
+
+    for (_, ty) in parsed.types.iter() {
+        let TypeInner::Struct { members, span } = &ty.inner else { continue };
+        let Some(name) = &ty.name else { continue };
+        let Some(layout) = layouts.iter().find(|layout| layout.name == name) else { continue };
+        if *span as usize != layout.size {
+            complain(format!("{name} has {span} bytes, in Rust {}", layout.size));
+        }
+        for (member, expected) in members.iter().zip(&layout.members) {
+            if member.name.as_deref() != Some(expected.name) || member.offset as usize != expected.offset {
+                complain(format!("{name}.{:?} lies at {}, in Rust {expected:?}", member.name, member.offset));
+            }
+        }
+        if members.len() != layout.members.len() {
+            complain(format!("{name} has {} members, in Rust {}", members.len(), layout.members.len()));
+        }
+    }
+
+    let entries: Vec<&str> = parsed.entry_points.iter().map(|entry| entry.name.as_str()).collect();
+    if entries != module.entries {
+        complain(format!("entry points are {entries:?}, Rust knows {:?}", module.entries));
+    }
+    let mut layouter = naga::proc::Layouter::default();
+    if let Err(error) = layouter.update(parsed.to_ctx()) {
+        complain(format!("sizes are unknown: {error}"));
+    }
+    for (index, entry) in parsed.entry_points.iter().enumerate() {
+        let invocations: u32 = entry.workgroup_size.iter().product();
+        if invocations > MAX_INVOCATIONS {
+            complain(format!("{} has {invocations} invocations per workgroup", entry.name));
+        }
+        let uses = information.get_entry_point(index);
+        let (mut storage, mut shared) = (0, 0);
+        for (handle, variable) in parsed.global_variables.iter() {
+            if uses[handle].is_empty() {
+                continue;
+            }
+            match variable.space {
+                AddressSpace::Storage { .. } => storage += 1,
+                AddressSpace::WorkGroup => shared += layouter[variable.ty].to_stride(),
+                _ => {}
+            }
+        }
+        // The layout of a module binds all its buffers, whichever an entry point uses.
+        let bound = module.bindings.iter().filter(|access| **access != Access::Uniform).count();
+        if storage.max(bound) > MAX_STORAGE_BUFFERS {
+            complain(format!("{} binds {} storage buffers", entry.name, storage.max(bound)));
+        }
+        if shared > MAX_WORKGROUP_BYTES {
+            complain(format!("{} uses {shared} bytes of workgroup memory", entry.name));
+        }
+    }
+    if wrong.is_empty() { Ok(()) } else { Err(wrong) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wgpu::layout::Shared;
+    use crate::wgpu::{LAYOUTS, MODULES, structures};
+
+    crate::shared_struct! {
+        /// A scalar, a vector that needs alignment, and an array.
+        struct Probe {
+            a: [f32; 4],
+            b: [u32; 2],
+            c: f32,
+            d: u32,
+            e: [[f32; 4]; 3],
+        }
+    }
+
+    const GOOD: &str = "#import probe\n\
+        @group(0) @binding(0) var<uniform> probe: Probe;\n\
+        @group(0) @binding(1) var<storage, read_write> out: array<f32>;\n\
+        @compute @workgroup_size(64)\n\
+        fn run(@builtin(local_invocation_index) i: u32) { out[i] = probe.e[2].x + probe.c; }\n";
+
+    const PROBE: Module = Module {
+        name: "probe",
+        text: GOOD,
+        imports: &[crate::wgpu::Snippet { name: "probe", text: || structures(&[Probe::layout()]) }],
+        bindings: &[Access::Uniform, Access::ReadWrite],
+        entries: &["run"],
+    };
+
+    #[test]
+    fn every_module_is_valid_and_lies_as_in_rust() {
+        let layouts: Vec<Layout> = LAYOUTS.iter().map(|layout| layout()).collect();
+        let wrong: String = MODULES.iter().filter_map(|module| validate(module, &layouts).err()).collect();
+        assert!(wrong.is_empty(), "{wrong}");
+        for module in MODULES {
+            assert!(
+                module.text.starts_with("// "),
+                "{}.wgsl opens with a paragraph on what it does and names its Rust twin",
+                module.name
+            );
+        }
+    }
+
+    #[test]
+    fn a_good_module_passes() {
+        assert_eq!(validate(&PROBE, &[Probe::layout()]), Ok(()));
+    }
+
+    #[test]
+    fn every_kind_of_mistake_is_found() {
+        let fails = |module: Module, layouts: &[Layout], expected: &str| {
+            let text = validate(&module, layouts).expect_err(expected);
+            assert!(text.contains(expected), "{expected} not in: {text}");
+        };
+        let layout = [Probe::layout()];
+        fails(Module { text: "fn f( {}", ..PROBE }, &layout, "probe.wgsl");
+        fails(Module { bindings: &[Access::Uniform, Access::Read], ..PROBE }, &layout, "binding 1");
+        fails(Module { bindings: &[Access::Uniform], ..PROBE }, &layout, "does not know");
+        fails(Module { entries: &["walk"], ..PROBE }, &layout, "entry points");
+        let mut moved = Probe::layout();
+        moved.members[2].offset += 4;
+        fails(PROBE, &[moved], "Probe");
+        let mut larger = Probe::layout();
+        larger.size += 16;
+        fails(PROBE, &[larger], "bytes, in Rust");
+        let greedy = "#import probe\n\
+            @group(0) @binding(0) var<uniform> probe: Probe;\n\
+            @group(0) @binding(1) var<storage, read_write> out: array<f32>;\n\
+            var<workgroup> shared_values: array<f32, 5000>;\n\
+            @compute @workgroup_size(512)\n\
+            fn run(@builtin(local_invocation_index) i: u32) { shared_values[i] = 1.0; out[i] = shared_values[0]; }\n";
+        fails(Module { text: greedy, ..PROBE }, &layout, "20000 bytes");
+        fails(Module { text: greedy, ..PROBE }, &layout, "512 invocations");
+        // Validity at all: a uniform that is written.
+        let invalid = GOOD.replace("out[i] = ", "probe.c = ");
+        fails(Module { text: Box::leak(invalid.into_boxed_str()), ..PROBE }, &layout, "probe.wgsl");
+    }
+}
