@@ -115,3 +115,20 @@ fn neither_threads_nor_interruptions_change_the_result() {
         }
     }
 }
+
+#[test]
+fn without_anything_to_guide_nothing_changes() {
+    let folder = tempfile::tempdir().unwrap();
+    let still = capture(folder.path(), Scene { times: 4, views: 6, rolls: Some(0.0), ..Scene::default() });
+    let mut config = guided();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (30, 50, 30);
+    let mut run = |guidance: f32, stillness: f32, rehearsal: u32, gaussians: u32| {
+        (config.motion.guidance, config.motion.stillness) = (guidance, stillness);
+        (config.motion.rehearsal, config.motion.gaussians) = (rehearsal, gaussians);
+        without_record(&train(still.clone(), config.clone()).into_field())
+    };
+    let off = run(0.0, 0.0, 300, 300);
+    assert!(run(0.0, 0.0, 7, 9) == off, "the other settings act without weights");
+    assert!(run(10.0, 0.0, 7, 9) == off, "guidance acts on what stands still");
+    assert!(run(0.0, 1.0, 7, 9) != off, "stillness does nothing");
+}
