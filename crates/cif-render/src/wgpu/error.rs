@@ -52,6 +52,24 @@ pub enum GpuError {
         /// What would be smaller.
         advice: String,
     },
+    /// A deformation network whose activations do not fit the memory of a workgroup.
+    #[error(
+        "the deformation network is too wide for the wgpu backend: {rows} Gaussians x ({features} features + 3 x \
+         width {width}) x 4 bytes = {bytes} bytes of activations, and a workgroup has {limit}; use a smaller \
+         `width` or fewer `channels`, or the CPU with --backend cpu"
+    )]
+    NetworkTooWide {
+        /// Gaussians that a workgroup takes at least.
+        rows: u32,
+        /// Features, levels times channels, padded to 4.
+        features: u32,
+        /// Width, padded to 4.
+        width: u32,
+        /// Their product.
+        bytes: u64,
+        /// Bytes there are.
+        limit: u32,
+    },
     /// Memory of the device is used up.
     #[error(
         "the GPU is out of memory: {0}; close other programs that use it, or use the CPU with --backend cpu"

@@ -121,11 +121,20 @@ impl Kernel {
     /// # Errors
     /// When the driver rejects it.
     pub fn compile(gpu: &Gpu, module: &Module) -> Result<Vec<Self>, GpuError> {
+        Self::compile_with(gpu, module, "")
+    }
+
+    /// As [`Self::compile`], with declarations before the file: constants that depend on the scene.
+    ///
+    /// # Errors
+    /// When the driver rejects it.
+    pub fn compile_with(gpu: &Gpu, module: &Module, declarations: &str) -> Result<Vec<Self>, GpuError> {
+        let source = format!("{declarations}{}", module.source());
         let device = gpu.device();
         let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
         let shader = device.create_shader_module(wgpu::ShaderModuleDescriptor {
             label: Some(module.name),
-            source: wgpu::ShaderSource::Wgsl(module.source().into()),
+            source: wgpu::ShaderSource::Wgsl(source.into()),
         });
         let entries: Vec<wgpu::BindGroupLayoutEntry> = module
             .bindings

@@ -4,6 +4,8 @@
 //! |---|---|
 //! | [`device`] | which GPU, what it can do, what went wrong on it |
 //! | [`kernel`] | kernels from WGSL files, recorded commands, times on the device |
+//! | [`gaussians`] | Gaussians and their gradients on the device |
+//! | [`deform`] | canonical Gaussians to the time of a view, and back |
 //! | [`buffers`] | typed arrays that grow, uploads and read-backs |
 //! | [`layout`] | structures that Rust and WGSL share |
 //! | [`testing`] | the GPU that tests run on |
@@ -14,16 +16,20 @@
 //! invocations per workgroup.
 
 pub mod buffers;
+pub mod deform;
 pub mod device;
 pub mod error;
+pub mod gaussians;
 pub mod kernel;
 pub mod layout;
 pub mod testing;
 pub mod validation;
 
 pub use buffers::{Arriving, GpuVec, Recorded, Uniform};
+pub use deform::{DeformationGradients, GpuDeformation};
 pub use device::{AdapterFacts, Gpu};
 pub use error::GpuError;
+pub use gaussians::GpuGaussians;
 pub use kernel::{
     Access, Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Stage, Timestamps, constants,
     structures, workgroups,

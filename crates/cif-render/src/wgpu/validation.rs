@@ -21,7 +21,15 @@ const MAX_INVOCATIONS: u32 = 256;
 /// # Errors
 /// With everything that is wrong, a line each.
 pub fn validate(module: &Module, layouts: &[Layout]) -> Result<(), String> {
-    let source = module.source();
+    validate_with(module, "", layouts)
+}
+
+/// As [`validate`], with declarations before the file: constants that depend on the scene.
+///
+/// # Errors
+/// As [`validate`].
+pub fn validate_with(module: &Module, declarations: &str, layouts: &[Layout]) -> Result<(), String> {
+    let source = format!("{declarations}{}", module.source());
     let parsed = naga::front::wgsl::parse_str(&source)
         .map_err(|error| format!("{}.wgsl: {}", module.name, error.emit_to_string(&source)))?;
     let information = Validator::new(ValidationFlags::all(), Capabilities::empty())

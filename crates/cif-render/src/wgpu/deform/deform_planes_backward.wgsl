@@ -1,0 +1,131 @@
+// Carries the features' gradients of a chunk to the nodes of planes and lines and to the canonical centres, and adds
+// the direct path of the geometry. Prefix and suffix products, never a division: a value may be 0. Source: methods
+// reference 2.2; twins: look_up_rows_backward and scatter_plane in cpu/deform.rs, reference/deform.rs.
+
+#import deformation
+#import moment
+
+@group(0) @binding(0) var<uniform> deformation: Deformation;
+@group(0) @binding(1) var<uniform> moment: Moment;
+@group(0) @binding(2) var<storage, read> canonical: array<vec4<f32>>;
+@group(0) @binding(3) var<storage, read> planes: array<f32>;
+@group(0) @binding(4) var<storage, read> lines: array<f32>;
+@group(0) @binding(5) var<storage, read> scratch: array<vec4<f32>>;
+@group(0) @binding(6) var<storage, read> v_posed: array<vec4<f32>>;
+// Nodes of the planes, then of the lines.
+@group(0) @binding(7) var<storage, read_write> sums: array<atomic<u32>>;
+@group(0) @binding(8) var<storage, read_write> v_canonical: array<vec4<f32>>;
+@group(0) @binding(9) var<storage, read_write> faults: array<atomic<u32>>;
+
+#import hexplane
+#import fixed_point
+
+// Threads per Gaussian, and Gaussians per workgroup of 64.
+const LANES: u32 = 16u;
+const TOGETHER: u32 = 4u;
+
+var<workgroup> slopes: array<vec3<f32>, 64>;
+
+// Adds a plane's gradient to its four nodes; returns d value / d (column, row) coordinates, in nodes.
+fn spread(first: u32, columns: u32, column: AxisTap, row: AxisTap, v: f32) -> vec2<f32> {
+    let f = column.fraction;
+    let g = row.fraction;
+    let next = first + columns * CHANNELS;
+    add_fixed(first, (1.0 - f) * (1.0 - g) * v);
+    add_fixed(first + CHANNELS, f * (1.0 - g) * v);
+    add_fixed(next, (1.0 - f) * g * v);
+    add_fixed(next + CHANNELS, f * g * v);
+    let a = planes[first];
+    let b = planes[first + CHANNELS];
+    let c = planes[next];
+    let d = planes[next + CHANNELS];
+    return v * vec2<f32>((1.0 - g) * (b - a) + g * (d - c), (1.0 - f) * (c - a) + f * (d - b));
+}
+
+fn spread_line(first: u32, tap: AxisTap, v: f32) -> f32 {
+    add_fixed(PLANE_FLOATS + first, (1.0 - tap.fraction) * v);
+    add_fixed(PLANE_FLOATS + first + CHANNELS, tap.fraction * v);
+    return v * (lines[first + CHANNELS] - lines[first]);
+}
+
+fn feature_backward(position: vec3<f32>, feature: u32, v_feature: f32) -> vec3<f32> {
+    let level = feature / CHANNELS;
+    let channel = feature % CHANNELS;
+    let x = axis_tap(level, 0u, position.x);
+    let y = axis_tap(level, 1u, position.y);
+    let z = axis_tap(level, 2u, position.z);
+    let columns_x = u32(deformation.last[level].x) + 1u;
+    let columns_y = u32(deformation.last[level].y) + 1u;
+    let starts = deformation.planes[level];
+    let line_starts = deformation.lines[level];
+    let first_xy = first_node(starts.x, columns_x, x, y) + channel;
+    let first_xz = first_node(starts.y, columns_x, x, z) + channel;
+    let first_yz = first_node(starts.z, columns_y, y, z) + channel;
+    let first_x = line_starts.x + x.node * CHANNELS + channel;
+    let first_y = line_starts.y + y.node * CHANNELS + channel;
+    let first_z = line_starts.z + z.node * CHANNELS + channel;
+    var values: array<f32, 6>;
+    values[0] = bilinear(first_xy, columns_x, x, y);
+    values[1] = bilinear(first_xz, columns_x, x, z);
+    values[2] = bilinear(first_yz, columns_y, y, z);
+    values[3] = linear(first_x, x);
+    values[4] = linear(first_y, y);
+    values[5] = linear(first_z, z);
+    var v: array<f32, 6>;
+    var running = v_feature;
+    for (var k = 0u; k < 6u; k++) {
+        v[k] = running;
+        running *= values[k];
+    }
+    running = 1.0;
+    for (var k = 0u; k < 6u; k++) {
+        v[5u - k] *= running;
+        running *= values[5u - k];
+    }
+    let xy = spread(first_xy, columns_x, x, y, v[0]);
+    let xz = spread(first_xz, columns_x, x, z, v[1]);
+    let yz = spread(first_yz, columns_y, y, z, v[2]);
+    let along_x = xy.x + xz.x + spread_line(first_x, x, v[3]);
+    let along_y = xy.y + yz.x + spread_line(first_y, y, v[4]);
+    let along_z = xz.y + yz.y + spread_line(first_z, z, v[5]);
+    return vec3<f32>(along_x * x.slope, along_y * y.slope, along_z * z.slope);
+}
+
+@compute @workgroup_size(64)
+fn main(
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) thread: u32,
+) {
+    let local_row = (group.y * groups.x + group.x) * TOGETHER + thread / LANES;
+    let row = moment.first + local_row;
+    let mine = local_row < CHUNK_ROWS && row < moment.gaussians;
+    let block = local_row / ROWS * BLOCK_QUADS;
+    var slope = vec3<f32>(0.0);
+    if mine {
+        if scratch[block].x != 0.0 {
+            let position = canonical[row * 3u].xyz;
+            let quad = local_row % ROWS / 4u;
+            for (var feature = thread % LANES; feature < FEATURES; feature += LANES) {
+                let at = block + 1u + (V_FEATURE_COLUMN + feature) * ROW_QUADS + quad;
+                let v_feature = scratch[at][local_row % 4u];
+                // By its bits, for NaN is a fault that add_fixed finds.
+                if (bitcast<u32>(v_feature) & 0x7fffffffu) != 0u {
+                    slope += feature_backward(position, feature, v_feature);
+                }
+            }
+        }
+    }
+    slopes[thread] = slope;
+    workgroupBarrier();
+    if mine && thread % LANES == 0u {
+        var total = vec3<f32>(0.0);
+        for (var lane = 0u; lane < LANES; lane++) {
+            total += slopes[thread + lane];
+        }
+        let at = row * 3u;
+        v_canonical[at] += v_posed[at] + vec4<f32>(total, 0.0);
+        v_canonical[at + 1u] += v_posed[at + 1u];
+        v_canonical[at + 2u] += v_posed[at + 2u];
+    }
+}

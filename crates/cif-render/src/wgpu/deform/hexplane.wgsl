@@ -1,0 +1,59 @@
+// Hexplane lookup at the time of a view. Source: methods reference 2.2 and 11 (idea 4). Shared by the stages of
+// the deformation; twins: cpu/deform.rs, reference/deform.rs.
+//
+// All Gaussians of a view share its time, so the time planes are lines here, `[columns, CHANNELS]`, interpolated by
+// deform_prepare. Spatial planes are `[rows, columns, CHANNELS]`.
+
+struct AxisTap {
+    node: u32,
+    fraction: f32,
+    // d coordinate / d position; 0 where clamped.
+    slope: f32,
+}
+
+fn axis_tap(level: u32, axis: u32, position: f32) -> AxisTap {
+    let last = deformation.last[level][axis];
+    let slope = deformation.slope[level][axis];
+    let unclamped = ((position - deformation.low[axis]) - deformation.low_rest[axis]) * slope;
+    // A border that single precision just misses is still the border, where no gradient reaches the position.
+    let inside = unclamped > 0.0 && unclamped < last * (1.0 - 2.4e-7);
+    let coordinate = clamp(unclamped, 0.0, last);
+    let node = min(u32(coordinate), u32(last) - 1u);
+    return AxisTap(node, coordinate - f32(node), select(0.0, slope, inside));
+}
+
+// First floats of a bilinear tap: node (row, column), and the distance to the next row.
+fn first_node(start: u32, columns: u32, column: AxisTap, row: AxisTap) -> u32 {
+    return start + (row.node * columns + column.node) * CHANNELS;
+}
+
+fn bilinear(first: u32, columns: u32, column: AxisTap, row: AxisTap) -> f32 {
+    let f = column.fraction;
+    let g = row.fraction;
+    let next = first + columns * CHANNELS;
+    return (1.0 - f) * (1.0 - g) * planes[first] + f * (1.0 - g) * planes[first + CHANNELS]
+        + (1.0 - f) * g * planes[next] + f * g * planes[next + CHANNELS];
+}
+
+fn linear(first: u32, tap: AxisTap) -> f32 {
+    return (1.0 - tap.fraction) * lines[first] + tap.fraction * lines[first + CHANNELS];
+}
+
+// Feature `level * CHANNELS + channel` at a canonical position: the product of the six plane values.
+fn look_up(position: vec3<f32>, feature: u32) -> f32 {
+    let level = feature / CHANNELS;
+    let channel = feature % CHANNELS;
+    let x = axis_tap(level, 0u, position.x);
+    let y = axis_tap(level, 1u, position.y);
+    let z = axis_tap(level, 2u, position.z);
+    let columns_x = u32(deformation.last[level].x) + 1u;
+    let columns_y = u32(deformation.last[level].y) + 1u;
+    let starts = deformation.planes[level];
+    let line_starts = deformation.lines[level];
+    return bilinear(first_node(starts.x, columns_x, x, y) + channel, columns_x, x, y)
+        * bilinear(first_node(starts.y, columns_x, x, z) + channel, columns_x, x, z)
+        * bilinear(first_node(starts.z, columns_y, y, z) + channel, columns_y, y, z)
+        * linear(line_starts.x + x.node * CHANNELS + channel, x)
+        * linear(line_starts.y + y.node * CHANNELS + channel, y)
+        * linear(line_starts.z + z.node * CHANNELS + channel, z);
+}
