@@ -13,15 +13,18 @@ pub const COEFFICIENTS: usize = 16;
 /// Basis value of degree 0.
 pub const BAND_0: f64 = 0.282_094_791_773_878_14;
 
-const BAND_1: f64 = 0.488_602_511_902_919_9;
-const BAND_2: [f64; 5] = [
+/// Basis factor of degree 1, up to its signs.
+pub const BAND_1: f64 = 0.488_602_511_902_919_9;
+/// Basis factors of degree 2, in order.
+pub const BAND_2: [f64; 5] = [
     1.092_548_430_592_079_2,
     -1.092_548_430_592_079_2,
     0.315_391_565_252_520_05,
     -1.092_548_430_592_079_2,
     0.546_274_215_296_039_6,
 ];
-const BAND_3: [f64; 7] = [
+/// Basis factors of degree 3, in order.
+pub const BAND_3: [f64; 7] = [
     -0.590_043_589_926_643_5,
     2.890_611_442_640_554,
     -0.457_045_799_464_465_8,

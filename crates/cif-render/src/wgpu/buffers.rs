@@ -287,6 +287,12 @@ impl<T: Pod> Uniform<T> {
         gpu.queue().write_buffer(&self.buffer, 0, bytemuck::bytes_of(value));
     }
 
+    /// The allocation.
+    #[must_use]
+    pub fn buffer(&self) -> &wgpu::Buffer {
+        &self.buffer
+    }
+
     /// The block as a binding.
     #[must_use]
     pub fn binding(&self) -> wgpu::BindingResource<'_> {

@@ -4,40 +4,73 @@
 //! |---|---|
 //! | [`device`] | which GPU, what it can do, what went wrong on it |
 //! | [`kernel`] | kernels from WGSL files, recorded commands, times on the device |
-//! | [`gaussians`] | Gaussians and their gradients on the device |
+//! | [`gaussians`], [`identities`] | Gaussians and their gradients, and identities, on the device |
 //! | [`deform`] | canonical Gaussians to the time of a view, and back |
 //! | [`buffers`] | typed arrays that grow, uploads and read-backs |
 //! | [`layout`] | structures that Rust and WGSL share |
 //! | [`testing`] | the GPU that tests run on |
 //! | [`validation`] | checks of WGSL files without a GPU |
 //! | [`error`] | what can go wrong |
+//! | [`view`] | the view, splats, constants: what all stages share |
+//! | [`stages`] | the WGSL files of rendering |
+//! | [`sort`] | prefix sums and radix sorts |
+//! | [`rasterizer`] | the stages in order, in both directions |
+//! | [`renderer`] | pictures of fields |
 //!
 //! Kernels need the core limits of WebGPU and no more: 8 storage buffers, 16 KiB of workgroup memory and 256
 //! invocations per workgroup.
 
 pub mod buffers;
+pub mod cache;
 pub mod deform;
 pub mod device;
 pub mod error;
 pub mod gaussians;
+pub mod identities;
 pub mod kernel;
 pub mod layout;
+pub mod rasterizer;
+pub mod renderer;
+pub mod sort;
+pub mod stages;
 pub mod testing;
 pub mod validation;
+pub mod view;
 
 pub use buffers::{Arriving, GpuVec, Recorded, Uniform};
+pub use cache::{BindCache, Place, UniformCache};
 pub use deform::{DeformationGradients, GpuDeformation};
 pub use device::{AdapterFacts, Gpu};
 pub use error::GpuError;
 pub use gaussians::GpuGaussians;
+pub use identities::{DeviceIdentities, packed_entries};
 pub use kernel::{
     Access, Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Stage, Timestamps, constants,
     structures, workgroups,
 };
 pub use layout::{Layout, Member, Shared, WgslType};
+pub use rasterizer::{GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput};
+pub use renderer::GpuRenderer;
+pub use sort::{Count, RadixSort, Scan, SortArrays};
+pub use view::{Splat, View};
 
 /// Every WGSL file of this crate, for the test that validates them.
-pub const MODULES: &[&Module] = &[];
+pub const MODULES: &[&Module] = &[
+    &stages::PROJECT,
+    &stages::SCAN,
+    &stages::SORT,
+    &stages::BIN,
+    &stages::EMIT,
+    &stages::RANGES,
+    &stages::RASTERIZE,
+    &stages::DENSE,
+    &stages::COTANGENTS,
+    &stages::RASTERIZE_BACKWARD,
+    &stages::GATHER_GRADIENTS,
+    &stages::IDENTITY_BACKWARD,
+    &stages::PROJECT_BACKWARD,
+];
 
 /// Every structure that Rust and WGSL share.
-pub const LAYOUTS: &[fn() -> Layout] = &[];
+pub const LAYOUTS: &[fn() -> Layout] =
+    &[View::layout, Splat::layout, view::ScanParameters::layout, view::SortParameters::layout];

@@ -1,0 +1,160 @@
+//! Renders fields on a GPU. Gaussians are posed on the device; those of fields with recorded motion by the processor.
+
+use cif_field::Field;
+use cif_geometry::{PinholeCamera, PixelGrid};
+
+use super::deform::GpuDeformation;
+use super::device::Gpu;
+use super::error::GpuError;
+use super::gaussians::GpuGaussians;
+use super::identities::DeviceIdentities;
+use super::kernel::Commands;
+use super::rasterizer::{PosedInput, Rasterizer, ViewInput};
+use crate::constants::MIN_COVERAGE;
+use crate::cpu::{Renderer, SimdLevel};
+use crate::image::InstanceImage;
+use crate::{Channels, RenderSettings, RenderedImage};
+
+/// Renders views of one field.
+#[derive(Debug)]
+pub struct GpuRenderer {
+    gpu: Gpu,
+    rasterizer: Rasterizer,
+    poser: Renderer,
+    canonical: GpuGaussians,
+    deformation: Option<GpuDeformation>,
+    /// At the time of the view, where anything moves.
+    posed: GpuGaussians,
+    identities: Option<DeviceIdentities>,
+}
+
+impl GpuRenderer {
+    /// Takes a field to the device.
+    ///
+    /// # Errors
+    /// When the field exceeds what the device binds, with the arithmetic; when the driver rejects the kernels.
+    pub fn new(gpu: &Gpu, field: &Field) -> Result<Self, GpuError> {
+        let identities = field
+            .identities
+            .as_ref()
+            .map(|identities| DeviceIdentities::from_identities(gpu, identities, field.instances.len()))
+            .transpose()?;
+        Ok(Self {
+            rasterizer: Rasterizer::new(gpu)?,
+            poser: Renderer::new(SimdLevel::Auto),
+            canonical: GpuGaussians::upload(gpu, &field.gaussians)?,
+            deformation: field
+                .deformation
+                .as_ref()
+                .filter(|_| field.tracks.is_none())
+                .map(|deformation| GpuDeformation::new(gpu, deformation))
+                .transpose()?,
+            posed: GpuGaussians::zeros(gpu, 0)?,
+            identities,
+            gpu: gpu.clone(),
+        })
+    }
+
+    /// Renders a view for looking at or measuring; `field` is the one that the renderer was made for.
+    ///
+    /// # Errors
+    /// When the view exceeds what the device binds, with the arithmetic; when the device is out of memory or lost.
+    pub fn render(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        channels: Channels,
+    ) -> Result<RenderedImage, GpuError> {
+        let wants_instances = channels.instances && field.identities.is_some();
+        let settings = RenderSettings {
+            instances: if wants_instances { settings.instances.or(Some(Default::default())) } else { None },
+            ..*settings
+        };
+        let (width, height) = (camera.width, camera.height);
+        let pixels = width as usize * height as usize;
+        let input = ViewInput { camera, settings: &settings, labels: None };
+        let identities = self.identities.as_ref().filter(|_| wants_instances);
+        let mut commands = Commands::new(&self.gpu, None);
+        let posed = if field.tracks.is_some() {
+            let poser = &mut self.poser;
+            let moved = if settings.deform || field.deformation.is_none() {
+                poser.deform(field, time)
+            } else {
+                poser.deform(&Field { deformation: None, ..field.clone() }, time)
+            };
+            self.posed.replace(&self.gpu, &moved)?;
+            (&self.posed).into()
+        } else if let Some(deformation) = self.deformation.as_ref().filter(|_| settings.deform) {
+            self.posed.geometry.resize(&self.gpu, self.canonical.len())?;
+            if deformation.moves_sh() {
+                self.posed.sh.resize(&self.gpu, self.canonical.len())?;
+            }
+            deformation.forward(&self.gpu, &mut commands, time, &self.canonical, &self.posed);
+            let sh = if deformation.moves_sh() { &self.posed.sh } else { &self.canonical.sh };
+            PosedInput { geometry: &self.posed.geometry, sh }
+        } else {
+            (&self.canonical).into()
+        };
+        self.rasterizer.project(&self.gpu, &mut commands, posed, identities, &input)?;
+        self.rasterizer.measure(&self.gpu, commands)?;
+        let mut commands = Commands::new(&self.gpu, None);
+        self.rasterizer.rasterize(&self.gpu, &mut commands, identities, None)?;
+        if let Some(identities) = identities {
+            self.rasterizer.render_instances(&self.gpu, &mut commands, identities)?;
+        }
+        let rasterizer = &self.rasterizer;
+        let colors = rasterizer.colors().read_later(&self.gpu, commands.encoder(), 0, pixels);
+        let blended =
+            channels.depth.then(|| rasterizer.blended().read_later(&self.gpu, commands.encoder(), 0, pixels));
+        let instances = identities.map(|_| {
+            (
+                rasterizer.instance_images().read_later(&self.gpu, commands.encoder(), 0, pixels),
+                rasterizer.foregrounds().read_later(&self.gpu, commands.encoder(), 0, pixels),
+            )
+        });
+        commands.submit();
+        let colors = colors.start();
+        let blended = blended.map(super::Recorded::start);
+        let instances = instances.map(|(images, foregrounds)| (images.start(), foregrounds.start()));
+
+        let colors = colors.wait(&self.gpu)?;
+        let grid = |values: Vec<f32>| PixelGrid::from_pixels(width, height, values);
+        let depth = match blended {
+            Some(blended) => {
+                let blended = blended.wait(&self.gpu)?;
+                let expected = colors.iter().zip(&blended).map(|(color, blended)| {
+                    let coverage = 1.0 - color[3];
+                    if coverage > MIN_COVERAGE { blended[0] / coverage } else { 0.0 }
+                });
+                Some(grid(expected.collect()))
+            }
+            None => None,
+        };
+        let instances = match instances {
+            Some((images, foregrounds)) => {
+                let images = images.wait(&self.gpu)?;
+                let part = |channel: usize| grid(images.iter().map(|image| image[channel]).collect());
+                Some(InstanceImage {
+                    label: part(0).map(|label| *label as u16),
+                    probability: part(1),
+                    coverage: part(2),
+                    entropy: part(3),
+                    foreground: grid(foregrounds.wait(&self.gpu)?),
+                })
+            }
+            None => None,
+        };
+        Ok(RenderedImage {
+            alpha: grid(colors.iter().map(|color| 1.0 - color[3]).collect()),
+            color: PixelGrid::from_pixels(
+                width,
+                height,
+                colors.into_iter().map(|[red, green, blue, _]| [red, green, blue]).collect(),
+            ),
+            depth,
+            instances,
+        })
+    }
+}

@@ -1,0 +1,58 @@
+// A Gaussian on the image, and how it blends into a pixel. Every kernel that walks the splats of a tile uses these
+// functions, so that all take the same decisions. Rust twin: cpu/tile.rs. Source: methods reference 3.1.
+
+const COLOR_PASS: u32 = 1u;
+const INSTANCE_PASS: u32 = 2u;
+const PASS_SHIFT: u32 = 30u;
+const INDEX_MASK: u32 = 0x3fffffffu;
+const NO_SPLAT: u32 = 0xffffffffu;
+
+// Smallest sigma over a rectangle of pixel centres.
+fn smallest_sigma(splat: Splat, first: vec2f, last: vec2f) -> f32 {
+    let low = first - splat.mean;
+    let high = last - splat.mean;
+    let inside = (low <= vec2f(0.0)) & (high >= vec2f(0.0));
+    if (all(inside)) {
+        return 0.0;
+    }
+    let xx = splat.conic.x;
+    let xy = splat.conic.y;
+    let yy = splat.conic.z;
+    var smallest = 3.4e38;
+    if (!inside.x) {
+        let x = select(high.x, low.x, low.x > 0.0);
+        let y = clamp(-xy * x / yy, low.y, high.y);
+        smallest = min(smallest, 0.5 * (xx * x * x + yy * y * y) + xy * x * y);
+    }
+    if (!inside.y) {
+        let y = select(high.y, low.y, low.y > 0.0);
+        let x = clamp(-xy * y / xx, low.x, high.x);
+        smallest = min(smallest, 0.5 * (xx * x * x + yy * y * y) + xy * x * y);
+    }
+    return smallest;
+}
+
+// Passes that draw the splat somewhere in a rectangle of pixel centres, a bit each; a hair more than the gate, so that
+// rounding never drops a drawn pixel.
+fn passes_in(splat: Splat, first: vec2f, last: vec2f) -> u32 {
+    let sigma = smallest_sigma(splat, first, last);
+    let reach = splat.reach * 1.00001 + 1e-5;
+    return select(0u, COLOR_PASS, sigma <= reach.x) | select(0u, INSTANCE_PASS, sigma <= reach.y);
+}
+
+// Footprint P at an offset from the mean; 0 where rounding makes sigma negative, which is then not drawn.
+fn peak_at(conic: vec3f, d: vec2f) -> f32 {
+    let sigma = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
+    return select(0.0, exp(-sigma), sigma >= 0.0);
+}
+
+// First pixel of a quadrant of a tile: 0 and 1 above, 2 and 3 below.
+fn quadrant_origin(tile: vec2u, quadrant: u32) -> vec2u {
+    return tile * TILE + vec2u(quadrant & 1u, quadrant >> 1u) * HALF_TILE;
+}
+
+// Passes of a splat in a quadrant.
+fn passes_in_quadrant(splat: Splat, origin: vec2u) -> u32 {
+    let first = vec2f(origin) + 0.5;
+    return passes_in(splat, first, first + f32(HALF_TILE - 1u));
+}

@@ -1,0 +1,173 @@
+//! The WGSL files of rendering: their bindings and entry points, and the kernels made of them.
+
+use super::device::Gpu;
+use super::error::GpuError;
+use super::kernel::Access::{Read, ReadWrite, Uniform};
+use super::kernel::{Kernel, Module};
+use super::view::{
+    CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, STAGING,
+    TILES, VIEW,
+};
+
+/// Projection.
+pub const PROJECT: Module = Module {
+    name: "project",
+    text: include_str!("project.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT],
+    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["project"],
+};
+
+/// Prefix sum.
+pub const SCAN: Module = Module {
+    name: "scan",
+    text: include_str!("scan.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, SCAN_PARAMETERS],
+    bindings: &[Uniform, Read, ReadWrite, ReadWrite],
+    entries: &["reduce", "spine", "spread"],
+};
+
+/// A pass of the radix sort.
+pub const SORT: Module = Module {
+    name: "sort",
+    text: include_str!("sort.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, SORT_PARAMETERS],
+    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["histogram", "scatter"],
+};
+
+/// Tile counts and the plan of work.
+pub const BIN: Module = Module {
+    name: "bin",
+    text: include_str!("bin.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, TILES],
+    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["count", "gather", "plan"],
+};
+
+/// Pairs.
+pub const EMIT: Module = Module {
+    name: "emit",
+    text: include_str!("emit.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, TILES],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["emit"],
+};
+
+/// Tile ranges.
+pub const RANGES: Module = Module {
+    name: "ranges",
+    text: include_str!("ranges.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, VIEW],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite],
+    entries: &["ranges"],
+};
+
+/// Blending.
+pub const RASTERIZE: Module = Module {
+    name: "rasterize",
+    text: include_str!("rasterize.wgsl"),
+    imports: &[CONSTANTS, VIEW, SPLAT, STAGING, IDENTITY],
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
+    entries: &["rasterize"],
+};
+
+/// Instance images.
+pub const DENSE: Module = Module {
+    name: "dense",
+    text: include_str!("dense.wgsl"),
+    imports: &[CONSTANTS, VIEW, SPLAT, STAGING],
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
+    entries: &["dense"],
+};
+
+/// Gradients of pixels.
+pub const COTANGENTS: Module = Module {
+    name: "cotangents",
+    text: include_str!("cotangents.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, VIEW],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite],
+    entries: &["cotangents_of_pixels"],
+};
+
+/// Gradients of pairs.
+pub const RASTERIZE_BACKWARD: Module = Module {
+    name: "rasterize_backward",
+    text: include_str!("rasterize_backward.wgsl"),
+    imports: &[CONSTANTS, VIEW, SPLAT, IDENTITY],
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
+    entries: &["rasterize_backward"],
+};
+
+/// Gradients of splats.
+pub const GATHER_GRADIENTS: Module = Module {
+    name: "gather_gradients",
+    text: include_str!("gather_gradients.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT],
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite],
+    entries: &["gather_gradients"],
+};
+
+/// Gradients of calibrations.
+pub const IDENTITY_BACKWARD: Module = Module {
+    name: "identity_backward",
+    text: include_str!("identity_backward.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, VIEW],
+    bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite],
+    entries: &["identity_backward"],
+};
+
+/// Gradients of Gaussians.
+pub const PROJECT_BACKWARD: Module = Module {
+    name: "project_backward",
+    text: include_str!("project_backward.wgsl"),
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["project_backward"],
+};
+
+/// Kernels of rendering.
+#[derive(Debug)]
+pub(crate) struct Kernels {
+    pub(crate) project: Kernel,
+    pub(crate) count: Kernel,
+    pub(crate) gather: Kernel,
+    pub(crate) plan: Kernel,
+    pub(crate) emit: Kernel,
+    pub(crate) ranges: Kernel,
+    pub(crate) rasterize: Kernel,
+    pub(crate) dense: Kernel,
+    pub(crate) cotangents: Kernel,
+    pub(crate) rasterize_backward: Kernel,
+    pub(crate) gather_gradients: Kernel,
+    pub(crate) identity_backward: Kernel,
+    pub(crate) project_backward: Kernel,
+}
+
+impl Kernels {
+    pub(crate) fn compile(gpu: &Gpu) -> Result<Self, GpuError> {
+        let [count, gather, plan] = entries(gpu, &BIN)?;
+        let one = |module: &Module| entries(gpu, module).map(|[kernel]| kernel);
+        Ok(Self {
+            project: one(&PROJECT)?,
+            count,
+            gather,
+            plan,
+            emit: one(&EMIT)?,
+            ranges: one(&RANGES)?,
+            rasterize: one(&RASTERIZE)?,
+            dense: one(&DENSE)?,
+            cotangents: one(&COTANGENTS)?,
+            rasterize_backward: one(&RASTERIZE_BACKWARD)?,
+            gather_gradients: one(&GATHER_GRADIENTS)?,
+            identity_backward: one(&IDENTITY_BACKWARD)?,
+            project_backward: one(&PROJECT_BACKWARD)?,
+        })
+    }
+}
+
+/// The kernels of a module, as many as it has entry points.
+pub(crate) fn entries<const N: usize>(gpu: &Gpu, module: &Module) -> Result<[Kernel; N], GpuError> {
+    let kernels = Kernel::compile(gpu, module)?;
+    Ok(<[Kernel; N]>::try_from(kernels).expect("as many kernels as entry points, and the module lists those"))
+}

@@ -1,0 +1,854 @@
+//! The GPU path against the double-precision reference: every stage on the reference's own inputs, then whole views in
+//! both directions. `CIF_TEST_GPU=off|auto|require` says whether a GPU (or lavapipe) is used.
+//!
+//! Tolerances are set from the worst errors seen on lavapipe (Mesa 22.3.6, LLVM 15), which each test prints, with a
+//! margin of at least three; WGSL allows exp, log and division a few units in the last place.
+#![cfg(feature = "wgpu")]
+
+mod common;
+
+use std::collections::BTreeMap;
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+
+use cif_field::SortMetric;
+use cif_geometry::PixelGrid;
+use cif_render::reference::rasterize::{footprint, weight};
+use cif_render::reference::{self, Forward, ParameterGroup, Scene, SceneGradients};
+use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
+use cif_render::wgpu::{
+    Commands, DeviceIdentities, Gpu, GpuError, GpuGaussians, GpuRenderer, GpuStatistics, GpuVec, LabelInput,
+    Rasterizer, Splat, ViewInput, testing,
+};
+use cif_render::{
+    Channels, GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings,
+};
+use common::{Cotangents, Mismatches, pixel_discontinuity, render};
+
+/// Relative width of the boundary band: above the rounding of a weight in single precision.
+const BAND: f64 = 1e-3;
+
+/// What one decision at a threshold can change of a pixel: 1/255 of the largest colour here (about 3).
+const ONE_DECISION: f64 = 0.013;
+
+const CHANNELS: Channels = Channels { depth: true, instances: true };
+
+fn settings() -> RenderSettings {
+    RenderSettings {
+        background: [0.2, 0.5, 0.9],
+        instances: Some(InstanceSettings::default()),
+        ..RenderSettings::default()
+    }
+}
+
+/// Many small Gaussians over several tiles, also partial ones.
+fn config() -> SyntheticConfig {
+    SyntheticConfig {
+        seed: 11,
+        gaussians: 250,
+        instances: 6,
+        width: 71,
+        height: 53,
+        screen_size: (0.01, 0.08),
+        ..SyntheticConfig::default()
+    }
+}
+
+/// The device and its kernels, compiled once; tests take turns, and each view meets the memory of the one before.
+fn device() -> Option<MutexGuard<'static, (Gpu, Rasterizer)>> {
+    static DEVICE: OnceLock<Option<Mutex<(Gpu, Rasterizer)>>> = OnceLock::new();
+    let device = DEVICE.get_or_init(|| {
+        let gpu = testing::gpu()?;
+        let rasterizer = Rasterizer::new(&gpu).expect("the kernels compile");
+        Some(Mutex::new((gpu, rasterizer)))
+    });
+    if device.is_none() {
+        eprintln!("skipped: no GPU");
+    }
+    device.as_ref().map(|device| device.lock().unwrap_or_else(PoisonError::into_inner))
+}
+
+/// Everything that comes back of a view.
+struct Outcome {
+    colors: Vec<[f32; 4]>,
+    blended: Vec<[f32; 4]>,
+    splats: Vec<Splat>,
+    order: Vec<u32>,
+    posed: Vec<[f32; 12]>,
+    sh: Vec<[f32; 48]>,
+    screen: Vec<[f32; 4]>,
+    calibrations: Vec<f32>,
+    statistics: GpuStatistics,
+    tile_ranges: Vec<[u32; 2]>,
+    entries: Vec<[u32; 4]>,
+}
+
+/// Renders a view forward and backward; `edit` may change the splats before they are blended.
+fn run(
+    device: &mut (Gpu, Rasterizer),
+    scene: &SyntheticScene,
+    settings: &RenderSettings,
+    cotangents: &Cotangents,
+    edit: impl FnOnce(&mut Vec<Splat>),
+) -> Result<Outcome, GpuError> {
+    let (gpu, rasterizer) = (&device.0, &mut device.1);
+    let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians)?;
+    let k = scene.field.instances.len();
+    let identities = scene.field.identities.as_ref().filter(|_| settings.instances.is_some());
+    let identities = identities.map(|rows| DeviceIdentities::from_identities(gpu, rows, k)).transpose()?;
+    let label_map: Vec<u32> = scene.labels.pixels.iter().map(|label| u32::from(*label)).collect();
+    let labelled_pixels = label_map.iter().filter(|label| **label != 0).count();
+    let label_map = GpuVec::from_slice(gpu, "labels", &label_map)?;
+    let labels = identities.is_some().then_some(LabelInput {
+        labels: &label_map,
+        labelled_pixels,
+        weight: cotangents.instance_weight as f32,
+    });
+    let input = ViewInput { camera: &scene.camera, settings, labels };
+    let mut commands = Commands::new(gpu, None);
+    rasterizer.project(gpu, &mut commands, (&gaussians).into(), identities.as_ref(), &input)?;
+    rasterizer.measure(gpu, commands)?;
+    let mut splats = rasterizer.splats().read(gpu)?;
+    edit(&mut splats);
+    rasterizer.splats().write(gpu, 0, &splats);
+    let v_colors: Vec<[f32; 4]> =
+        cotangents.color.pixels.iter().map(|v| [v[0] as f32, v[1] as f32, v[2] as f32, f32::NAN]).collect();
+    let v_colors = GpuVec::from_slice(gpu, "cotangents", &v_colors)?;
+    let mut commands = Commands::new(gpu, None);
+    rasterizer.rasterize(gpu, &mut commands, identities.as_ref(), labels)?;
+    rasterizer.backward(gpu, &mut commands, (&gaussians).into(), identities.as_ref(), labels, &v_colors)?;
+    let counts = rasterizer.read_statistics(gpu, &mut commands);
+    commands.submit();
+    let statistics = GpuStatistics::of(&counts.start().wait(gpu)?);
+    let gradients = rasterizer.gradients();
+    Ok(Outcome {
+        colors: rasterizer.colors().read(gpu)?,
+        blended: rasterizer.blended().read(gpu)?,
+        splats,
+        order: rasterizer.depth_order().read(gpu)?,
+        posed: gradients.gaussians.geometry.read(gpu)?,
+        sh: gradients.gaussians.sh.read(gpu)?,
+        screen: gradients.screen.read(gpu)?,
+        calibrations: if labels.is_some() && labelled_pixels > 0 && cotangents.instance_weight != 0.0 {
+            gradients.calibrations.read(gpu)?
+        } else {
+            vec![0.0; identities.map_or(0, |rows| rows.entries.len())]
+        },
+        statistics,
+        tile_ranges: rasterizer.tile_ranges().read(gpu)?,
+        entries: rasterizer.entries().read_range(gpu, 0, statistics.pairs as usize)?,
+    })
+}
+
+/// Scalar `index` of a group of gradients.
+fn gradient(outcome: &Outcome, group: ParameterGroup, index: usize) -> f64 {
+    f64::from(match group {
+        ParameterGroup::Means => outcome.posed[index / 3][index % 3],
+        ParameterGroup::LogScales => outcome.posed[index / 3][4 + index % 3],
+        ParameterGroup::Quaternions => outcome.posed[index / 4][8 + index % 4],
+        ParameterGroup::OpacityLogits => outcome.posed[index][3],
+        ParameterGroup::OccupancyLogits => outcome.posed[index][7],
+        ParameterGroup::ShCoefficients => outcome.sh.as_flattened()[index],
+        ParameterGroup::LogCalibrations => *outcome.calibrations.get(index).unwrap_or(&0.0),
+        ParameterGroup::Planes | ParameterGroup::Mlp => unreachable!("posed Gaussians have no deformation"),
+    })
+}
+
+const GROUPS: [ParameterGroup; 7] = [
+    ParameterGroup::Means,
+    ParameterGroup::LogScales,
+    ParameterGroup::Quaternions,
+    ParameterGroup::OpacityLogits,
+    ParameterGroup::OccupancyLogits,
+    ParameterGroup::ShCoefficients,
+    ParameterGroup::LogCalibrations,
+];
+
+/// Worst differences by quantity, printed at the end of a test.
+#[derive(Default)]
+struct Worst(BTreeMap<String, f64>);
+
+impl Worst {
+    fn see(&mut self, what: &str, difference: f64) {
+        let worst = self.0.entry(what.to_owned()).or_default();
+        *worst = worst.max(difference);
+    }
+
+    fn tell(&self, name: &str) {
+        for (what, worst) in &self.0 {
+            println!("{name}: worst {what} {worst:.1e}");
+        }
+    }
+}
+
+struct Tolerances {
+    color: f64,
+    gradient: f64,
+}
+
+const USUAL: Tolerances = Tolerances { color: 3e-5, gradient: 2e-3 };
+
+fn check(
+    name: &str,
+    config: &SyntheticConfig,
+    settings: &RenderSettings,
+    edit: impl Fn(&mut SyntheticScene),
+) {
+    check_within(&USUAL, name, config, settings, edit);
+}
+
+/// The reference's view with cotangents and labels away from the boundary band.
+struct Expected {
+    synthetic: SyntheticScene,
+    band: Vec<bool>,
+    cotangents: Cotangents,
+    forward: Forward<f64>,
+    gradients: SceneGradients<f64>,
+}
+
+fn expected(
+    name: &str,
+    config: &SyntheticConfig,
+    settings: &RenderSettings,
+    edit: impl Fn(&mut SyntheticScene),
+) -> Expected {
+    let mut synthetic = generate(config);
+    edit(&mut synthetic);
+    let double = Scene::<f64>::from_field(&synthetic.field);
+    let unmasked = render(&double, &synthetic, settings);
+    let band: Vec<bool> = (0..unmasked.pixels.pixels.len())
+        .map(|position| pixel_discontinuity(&unmasked, position, BAND).is_some())
+        .collect();
+    let share = band.iter().filter(|near| **near).count() as f64 / band.len() as f64;
+    assert!(share < 0.5, "{name}: {share} of the pixels lie in the boundary band");
+    let mut cotangents = Cotangents::random(3, config.width, config.height);
+    (cotangents.depth, cotangents.alpha) = (None, None);
+    for (position, near) in band.iter().enumerate() {
+        if *near {
+            cotangents.color.pixels[position] = [0.0; 3];
+            synthetic.labels.pixels[position] = 0;
+        }
+    }
+    let forward = render(&double, &synthetic, settings);
+    let gradients = cotangents.backward(&double, &forward);
+    Expected { synthetic, band, cotangents, forward, gradients }
+}
+
+/// Colour, label probabilities and gradients of a training view.
+fn check_within(
+    tolerances: &Tolerances,
+    name: &str,
+    config: &SyntheticConfig,
+    settings: &RenderSettings,
+    edit: impl Fn(&mut SyntheticScene),
+) {
+    let Some(mut device) = device() else { return };
+    let expected = expected(name, config, settings, edit);
+    let actual = run(&mut device, &expected.synthetic, settings, &expected.cotangents, |_| {})
+        .expect("the view is drawn");
+    let mut mismatches = Mismatches::default();
+    let mut worst = Worst::default();
+    compare_pixels(&expected, &actual, tolerances.color, &mut mismatches, &mut worst);
+    compare_gradients(&expected, &actual, tolerances.gradient, &mut mismatches, &mut worst);
+    worst.tell(name);
+    mismatches.finish(name);
+}
+
+fn compare_pixels(
+    expected: &Expected,
+    actual: &Outcome,
+    tolerance: f64,
+    mismatches: &mut Mismatches,
+    worst: &mut Worst,
+) {
+    let forward = &expected.forward;
+    for position in 0..actual.colors.len() {
+        let near = expected.band[position];
+        let state = &forward.pixels.pixels[position];
+        let mut compare = |what: &str, e: f64, a: f32, tolerance: f64| {
+            mismatches.compare(what, position, e, a.into(), 0.0, tolerance);
+            if !near {
+                worst.see(what, (e - f64::from(a)).abs());
+            }
+        };
+        let color = &actual.colors[position];
+        for channel in 0..3 {
+            let tolerance = if near { ONE_DECISION } else { tolerance };
+            compare("colour", forward.color.pixels[position][channel], color[channel], tolerance);
+        }
+        if !near {
+            let blended = &actual.blended[position];
+            compare("transmittance", state.transmittance, color[3], tolerance);
+            compare("depth", state.depth, blended[0], 10.0 * tolerance);
+            compare("label probability", state.label_probability, blended[1], tolerance);
+            compare("instance transmittance", state.instance_transmittance, blended[2], tolerance);
+        }
+    }
+}
+
+fn compare_gradients(
+    expected: &Expected,
+    actual: &Outcome,
+    relative: f64,
+    mismatches: &mut Mismatches,
+    worst: &mut Worst,
+) {
+    for group in GROUPS {
+        let parameters = &expected.gradients.parameters;
+        let values: Vec<f64> = (0..parameters.len(group)).map(|index| parameters.get(group, index)).collect();
+        // Sums of terms of both signs are as exact as their largest term, not as their result.
+        let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
+        for (index, e) in values.into_iter().enumerate() {
+            let a = gradient(actual, group, index);
+            mismatches.compare(&format!("{group:?}"), index, e, a, relative, 2e-5 * largest + 1e-9);
+            if largest > 0.0 {
+                worst.see(&format!("gradient of {group:?} over the largest"), (e - a).abs() / largest);
+            }
+        }
+    }
+    let screen = &expected.gradients.screen;
+    let largest = screen.as_flattened().iter().fold(0.0_f64, |largest, v| largest.max(v.abs()));
+    for (index, e) in screen.iter().enumerate() {
+        for axis in 0..2 {
+            let a = f64::from(actual.screen[index][axis]);
+            mismatches.compare("screen", index, e[axis], a, relative, 2e-5 * largest);
+        }
+    }
+    for (index, splat) in expected.forward.splats.iter().enumerate() {
+        // A splat whose box meets the image without reaching any pixel may count as invisible.
+        if let Some(splat) = splat
+            && actual.screen[index][3] > 0.0
+        {
+            let a = f64::from(actual.screen[index][2]);
+            mismatches.compare("radius", index, splat.radius, a, 1e-4, 0.0);
+        }
+    }
+}
+
+#[test]
+fn project_on_the_inputs_of_the_reference() {
+    let Some(mut device) = device() else { return };
+    for antialiased in [false, true] {
+        let settings = RenderSettings { antialiased, ..settings() };
+        let config = SyntheticConfig { gaussians: 2000, ..config() };
+        let expected = expected("project", &config, &settings, |_| {});
+        let actual = run(&mut device, &expected.synthetic, &settings, &expected.cotangents, |_| {}).unwrap();
+        let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
+        let mut visible = 0;
+        for (index, splat) in actual.splats.iter().enumerate() {
+            let Some(e) = &expected.forward.splats[index] else {
+                assert_eq!(splat.radius, 0.0, "{index} is not visible");
+                continue;
+            };
+            // What just touches the border of the image, or 1/255, may fall on either side.
+            let faint = e.opacity.max(e.occupancy) < 1.001 / 255.0;
+            if splat.radius == 0.0 {
+                let size = [71.0, 53.0];
+                let at_border = (0..2).any(|axis| {
+                    (e.mean2d[axis] + e.extents[axis]).abs() < 1e-2
+                        || (e.mean2d[axis] - e.extents[axis] - size[axis]).abs() < 1e-2
+                });
+                assert!(at_border || faint, "{index} is visible");
+                continue;
+            }
+            visible += 1;
+            let mut compare = |what: &str, e: f64, a: f32, relative: f64, absolute: f64| {
+                mismatches.compare(what, index, e, a.into(), relative, absolute);
+                worst.see(what, (e - f64::from(a)).abs() / e.abs().max(1e-2));
+            };
+            for axis in 0..2 {
+                compare("mean, relative", e.mean2d[axis], splat.mean[axis], 1e-5, 1e-4);
+                if !faint {
+                    compare("extent, relative", e.extents[axis], splat.extent[axis], 1e-3, 1e-4);
+                }
+            }
+            let largest = e.conic.iter().fold(0.0_f64, |largest, v| largest.max(v.abs()));
+            for k in 0..3 {
+                compare("conic, relative", e.conic[k], splat.conic[k], 2e-5, 2e-5 * largest);
+                compare("colour, relative", e.color[k], splat.color[k], 1e-5, 1e-5);
+            }
+            compare("opacity, relative", e.opacity, splat.conic[3], 2e-5, 0.0);
+            compare("occupancy, relative", e.occupancy, splat.color[3], 1e-5, 0.0);
+            compare("depth, relative", e.depth, splat.depth, 1e-6, 0.0);
+            compare("radius, relative", e.radius, splat.radius, 1e-5, 0.0);
+        }
+        assert!(visible > 1500, "{visible}");
+        worst.tell("project");
+        mismatches.finish("project");
+    }
+}
+
+#[test]
+fn depth_order_is_exact_on_equal_keys() {
+    let Some(mut device) = device() else { return };
+    for (gaussians, sort_metric) in [(1, SortMetric::Z), (5000, SortMetric::Z), (4097, SortMetric::Distance)]
+    {
+        let settings = RenderSettings { sort_metric, instances: None, ..settings() };
+        let mut scene = generate(&SyntheticConfig { gaussians, ..config() });
+        // Many ties: all stand on seven places.
+        for row in 7..gaussians {
+            scene.field.gaussians.means[row] = scene.field.gaussians.means[row % 7];
+        }
+        let cotangents = Cotangents::random(3, 71, 53);
+        let actual = run(&mut device, &scene, &settings, &cotangents, |_| {}).unwrap();
+        let key = |row: &u32| {
+            let splat = &actual.splats[*row as usize];
+            let depth = match sort_metric {
+                SortMetric::Z => splat.depth,
+                SortMetric::Distance => {
+                    let mean = glam::DVec3::from(scene.field.gaussians.means[*row as usize].map(f64::from));
+                    (mean - scene.camera.centre()).length() as f32
+                }
+            };
+            // Distances that agree to rounding are the same place here.
+            (splat.radius == 0.0, (depth * 1e4).round() as u32, *row)
+        };
+        let mut order: Vec<u32> = (0..gaussians as u32).collect();
+        order.sort_by_key(key);
+        assert_eq!(actual.order, order, "{gaussians} {sort_metric:?}");
+    }
+}
+
+#[test]
+fn tile_lists_hold_every_drawn_pair_once_and_in_order() {
+    let Some(mut device) = device() else { return };
+    for gaussians in [250, 5000] {
+        let scene = generate(&SyntheticConfig { gaussians, ..config() });
+        let settings = settings();
+        let forward = render(&Scene::<f64>::from_field(&scene.field), &scene, &settings);
+        let actual = run(&mut device, &scene, &settings, &Cotangents::random(3, 71, 53), |_| {}).unwrap();
+        let rank: BTreeMap<u32, usize> = actual.order.iter().enumerate().map(|(r, row)| (*row, r)).collect();
+        let (columns, rows) = (71_u32.div_ceil(16), 53_u32.div_ceil(16));
+        assert_eq!(actual.tile_ranges.len(), (columns * rows) as usize);
+        let (mut pairs, mut next) = (Vec::new(), 0);
+        for [first, end] in &actual.tile_ranges {
+            if first == end {
+                continue;
+            }
+            assert_eq!(*first, next, "ranges follow each other");
+            next = *end;
+            let list = &actual.entries[*first as usize..*end as usize];
+            let ranks: Vec<usize> = list.iter().map(|entry| rank[&(entry[1] & 0x3fff_ffff)]).collect();
+            assert!(ranks.windows(2).all(|pair| pair[0] < pair[1]), "front to back");
+            pairs.extend(list.iter().map(|entry| entry[0]));
+        }
+        assert_eq!(next as usize, actual.entries.len(), "every pair lies in a tile");
+        pairs.sort_unstable();
+        assert!(pairs.iter().copied().eq(0..next), "every pair once");
+        let mut drawn = 0;
+        for (row, splat) in forward.splats.iter().enumerate() {
+            let Some(splat) = splat else { continue };
+            for y in 0..53 {
+                for x in 0..71 {
+                    let Some(at) = footprint(splat, [x, y]) else { continue };
+                    for (strength, pass) in [(splat.opacity, 1_u32), (splat.occupancy, 2)] {
+                        // A hair above the gate, so that rounding does not matter.
+                        if weight(strength * 0.999, at.peak).is_none() {
+                            continue;
+                        }
+                        let [first, end] = actual.tile_ranges[(y / 16 * columns + x / 16) as usize];
+                        let found = actual.entries[first as usize..end as usize]
+                            .iter()
+                            .any(|entry| entry[1] & 0x3fff_ffff == row as u32 && entry[1] >> 30 & pass != 0);
+                        assert!(found, "splat {row} is drawn at {x}, {y} by pass {pass}");
+                        drawn += 1;
+                    }
+                }
+            }
+        }
+        assert!(drawn > 1000, "{drawn}");
+    }
+}
+
+/// Splats as the reference made them, rounded to single precision.
+fn rounded(forward: &Forward<f64>, splats: &mut [Splat]) {
+    for (splat, e) in splats.iter_mut().zip(&forward.splats) {
+        let (Some(e), true) = (e, splat.radius > 0.0) else { continue };
+        let single = |v: f64| v as f32;
+        splat.mean = e.mean2d.map(single);
+        splat.conic = [e.conic[0], e.conic[1], e.conic[2], e.opacity].map(single);
+        splat.color = [e.color[0], e.color[1], e.color[2], e.occupancy].map(single);
+        splat.depth = single(e.depth);
+    }
+}
+
+#[test]
+fn rasterize_in_both_directions_on_the_splats_of_the_reference() {
+    let Some(mut device) = device() else { return };
+    let settings = settings();
+    let expected = expected("rasterize", &config(), &settings, |_| {});
+    let actual = run(&mut device, &expected.synthetic, &settings, &expected.cotangents, |splats| {
+        rounded(&expected.forward, splats);
+    })
+    .unwrap();
+    let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
+    compare_pixels(&expected, &actual, 1e-5, &mut mismatches, &mut worst);
+    compare_gradients(&expected, &actual, 1e-3, &mut mismatches, &mut worst);
+    worst.tell("rasterize");
+    mismatches.finish("rasterize");
+}
+
+/// A comparison that cannot fail proves nothing.
+#[test]
+fn the_comparison_notices_small_mistakes() {
+    let Some(mut device) = device() else { return };
+    let settings = settings();
+    let expected = expected("mistakes", &config(), &settings, |_| {});
+    type Mistake = (&'static str, fn(&mut Vec<Splat>));
+    let mistakes: [Mistake; 5] = [
+        ("a dropped splat", |splats| splats[3].conic[3] = 0.0),
+        ("a mean half a hundredth of a pixel off", |splats| {
+            splats.iter_mut().for_each(|s| s.mean[0] += 5e-3)
+        }),
+        ("swapped axes", |splats| splats.iter_mut().for_each(|s| s.conic.swap(0, 2))),
+        ("red and blue swapped", |splats| splats.iter_mut().for_each(|s| s.color.swap(0, 2))),
+        ("occupancy one part in a hundred off", |splats| splats.iter_mut().for_each(|s| s.color[3] *= 1.01)),
+    ];
+    for (name, mistake) in mistakes {
+        let actual = run(&mut device, &expected.synthetic, &settings, &expected.cotangents, mistake).unwrap();
+        let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
+        compare_pixels(&expected, &actual, USUAL.color, &mut mismatches, &mut worst);
+        compare_gradients(&expected, &actual, USUAL.gradient, &mut mismatches, &mut worst);
+        let caught = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| mismatches.finish(name)));
+        assert!(caught.is_err(), "{name} goes unnoticed");
+    }
+}
+
+#[test]
+fn static_scene() {
+    check("static", &config(), &settings(), |_| {});
+}
+
+#[test]
+fn colour_only() {
+    let settings = RenderSettings { instances: None, ..settings() };
+    check("colour only", &SyntheticConfig { instances: 0, ..config() }, &settings, |_| {});
+    check("colour only, identities unused", &config(), &settings, |_| {});
+}
+
+#[test]
+fn every_image_setting() {
+    check("antialiased", &config(), &RenderSettings { antialiased: true, ..settings() }, |_| {});
+    let by_distance = RenderSettings { sort_metric: SortMetric::Distance, ..settings() };
+    check("distance", &config(), &by_distance, |_| {});
+    for sh_degree in 0..3 {
+        check("degree", &config(), &RenderSettings { sh_degree, ..settings() }, |_| {});
+    }
+}
+
+#[test]
+fn every_instance_setting() {
+    for normalisation in [InstanceNormalisation::None, InstanceNormalisation::Coverage] {
+        for geometry in [GeometryPath::Full, GeometryPath::MeansOnly, GeometryPath::Off] {
+            for occupancy in [OccupancySource::Own, OccupancySource::Opacity] {
+                let instances = InstanceSettings { occupancy, geometry, normalisation };
+                let settings = RenderSettings { instances: Some(instances), ..settings() };
+                check(&format!("{instances:?}"), &config(), &settings, |_| {});
+            }
+        }
+    }
+    let instances = InstanceSettings { occupancy: OccupancySource::Opacity, ..InstanceSettings::default() };
+    let settings = RenderSettings { antialiased: true, instances: Some(instances), ..settings() };
+    check("antialiased, opacity as occupancy", &config(), &settings, |_| {});
+}
+
+#[test]
+fn few_and_many_instances() {
+    for instances in [1, 2, 9, 40, 300] {
+        let config = SyntheticConfig { instances, ..config() };
+        check(&format!("K = {instances}"), &config, &settings(), |scene| {
+            // Labels that change at every pixel: far more than 8 in a tile.
+            for (position, label) in scene.labels.pixels.iter_mut().enumerate() {
+                *label = (position * 7 % (instances + 1)) as u16;
+            }
+        });
+    }
+}
+
+/// Rows of identities longer than the eight entries that are summed side by side.
+#[test]
+fn long_identity_rows() {
+    let config = SyntheticConfig { instances: 21, ..config() };
+    check("long rows", &config, &settings(), |scene| {
+        let rows = scene.field.identities.as_mut().unwrap();
+        let n = rows.len();
+        rows.row_offsets = (0..=n as u32).map(|row| 21 * row).collect();
+        rows.labels = (0..n).flat_map(|_| 0..21).collect();
+        rows.log_estimates =
+            (0..21 * n).map(|entry| (1.0 / 30.0 + (entry % 5) as f32 * 0.005).ln()).collect();
+        rows.log_calibrations = (0..21 * n).map(|entry| (entry % 7) as f32 * 0.1 - 0.3).collect();
+    });
+}
+
+#[test]
+fn large_saturated_gaussians_and_stops() {
+    let config = SyntheticConfig { gaussians: 60, screen_size: (0.1, 0.5), ..config() };
+    check("saturated", &config, &settings(), |scene| {
+        scene.field.gaussians.opacity_logits.fill(5.5);
+        scene.field.gaussians.occupancy_logits.fill(6.0);
+    });
+}
+
+#[test]
+fn faint_but_occupied_gaussians_are_not_cut() {
+    // The extent must follow max(o, pi).
+    check("faint colour", &config(), &settings(), |scene| {
+        scene.field.gaussians.opacity_logits.iter_mut().step_by(2).for_each(|logit| *logit = -7.0);
+    });
+    check("faint occupancy", &config(), &settings(), |scene| {
+        scene.field.gaussians.occupancy_logits.iter_mut().step_by(2).for_each(|logit| *logit = -7.0);
+    });
+}
+
+#[test]
+fn small_and_odd_images() {
+    for (width, height) in [(16, 16), (17, 33), (15, 2), (130, 3)] {
+        let config = SyntheticConfig { width, height, gaussians: 20, screen_size: (0.1, 0.5), ..config() };
+        check(&format!("{width} x {height}"), &config, &settings(), |_| {});
+    }
+    let Some(device) = device() else { return };
+    let one = generate(&SyntheticConfig {
+        width: 1,
+        height: 1,
+        gaussians: 20,
+        screen_size: (0.1, 0.5),
+        ..config()
+    });
+    let (camera, time) = (&one.camera, one.time);
+    let e = reference::render::<f64>(&one.field, camera, time, &settings(), CHANNELS);
+    let mut renderer = GpuRenderer::new(&device.0, &one.field).unwrap();
+    let a = renderer.render(&one.field, camera, time, &settings(), CHANNELS).unwrap();
+    for channel in 0..3 {
+        let (a, e) = (a.color.pixels[0][channel], e.color.pixels[0][channel]);
+        assert!((a - e).abs() < 2e-5, "{a} {e}");
+    }
+}
+
+#[test]
+fn needles() {
+    // As on the processor: the gradient of the covariance of a needle 40 times as long as wide loses the square of that
+    // ratio in single precision.
+    let tolerances = Tolerances { gradient: 2e-2, ..USUAL };
+    check_within(&tolerances, "needles", &config(), &settings(), |scene| {
+        for log_scale in scene.field.gaussians.log_scales.iter_mut().step_by(5) {
+            *log_scale = [log_scale[0] + 1.5, -9.0, -9.0];
+        }
+    });
+}
+
+#[test]
+fn clamps_of_projection() {
+    check("clamps", &config(), &settings(), |scene| {
+        let gaussians = &mut scene.field.gaussians;
+        gaussians.sh_coefficients.iter_mut().step_by(3).for_each(|sh| sh[1] = -2.5);
+        let world_from_camera = scene.camera.camera_from_world.inverse();
+        for index in 0..20 {
+            let angle = f64::from(index) * 0.314 + 0.1;
+            let point =
+                glam::DVec3::new(1.9 * angle.cos(), 1.6 * angle.sin(), 1.0) * (2.5 + 0.05 * f64::from(index));
+            gaussians.means[index as usize] = world_from_camera.apply(point).as_vec3().to_array();
+            gaussians.log_scales[index as usize] = [0.2, 0.0, -0.4];
+        }
+    });
+}
+
+/// Rows 12 and 13: long needles whose sigma may round below 0, and clamped scales.
+#[test]
+fn extreme_scales_stay_finite_and_carry_no_gradient_outside_their_range() {
+    let Some(mut device) = device() else { return };
+    let mut scene = generate(&config());
+    scene.field.gaussians.log_scales[0] = [12.0, -25.0, -2.0];
+    scene.field.gaussians.log_scales[1] = [60.0, f32::MAX, -3.0];
+    for log_scale in scene.field.gaussians.log_scales[2..].iter_mut().step_by(5) {
+        *log_scale = [log_scale[0] + 6.0, -9.0, -9.0];
+    }
+    let actual = run(&mut device, &scene, &settings(), &Cotangents::random(3, 71, 53), |_| {}).unwrap();
+    assert!(actual.screen[0][3] > 0.0 && actual.screen[1][3] > 0.0, "both are drawn");
+    assert_eq!([actual.posed[0][4], actual.posed[0][5], actual.posed[1][4], actual.posed[1][5]], [0.0; 4]);
+    assert_all_finite("extreme scales", &actual);
+}
+
+fn assert_all_finite(name: &str, outcome: &Outcome) {
+    let numbers = [
+        ("colour", outcome.colors.as_flattened()),
+        ("blended", outcome.blended.as_flattened()),
+        ("geometry gradients", outcome.posed.as_flattened()),
+        ("colour gradients", outcome.sh.as_flattened()),
+        ("screen", outcome.screen.as_flattened()),
+        ("calibrations", &outcome.calibrations),
+    ];
+    for (what, values) in numbers {
+        assert!(values.iter().all(|v| v.is_finite()), "{name}: {what}");
+    }
+}
+
+#[test]
+fn poison_never_spreads() {
+    let Some(mut device) = device() else { return };
+    let poisons =
+        [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, 1e-40, 0.0, 1e20, -1e20, 100.0, -100.0];
+    let config = SyntheticConfig { gaussians: 6 + 7 * poisons.len(), width: 20, height: 18, ..config() };
+    let mut scene = generate(&config);
+    let gaussians = &mut scene.field.gaussians;
+    for (index, poison) in poisons.into_iter().enumerate() {
+        let row = 6 + 7 * index;
+        gaussians.means[row][0] = poison;
+        gaussians.means[row + 1][2] = poison;
+        gaussians.log_scales[row + 2][1] = poison;
+        gaussians.quaternions[row + 3][3] = poison;
+        gaussians.opacity_logits[row + 4] = poison;
+        gaussians.occupancy_logits[row + 5] = poison;
+        // A colour of 1e20 is drawn as asked; its gradient by the direction may overflow.
+        if !(poison.abs() > 1e19 && poison.is_finite()) {
+            gaussians.sh_coefficients[row + 6][7] = poison;
+        }
+    }
+    let actual = run(&mut device, &scene, &settings(), &Cotangents::random(3, 20, 18), |_| {}).unwrap();
+    assert_all_finite("poison", &actual);
+    for group in 0..7 {
+        assert_eq!(actual.splats[6 + group].radius, 0.0, "not a number in group {group} draws nothing");
+    }
+    assert!(actual.splats[..6].iter().any(|splat| splat.radius > 0.0));
+}
+
+#[test]
+fn empty_scenes() {
+    let Some(mut device) = device() else { return };
+    for (gaussians, labelled) in [(0, true), (3, false), (3, true)] {
+        let mut scene = generate(&SyntheticConfig { gaussians, ..config() });
+        if !labelled {
+            scene.labels.pixels.fill(0);
+        }
+        // Everything behind the camera.
+        let behind = scene.camera.centre() - scene.camera.forward();
+        scene.field.gaussians.means.fill(behind.as_vec3().to_array());
+        let actual = run(&mut device, &scene, &settings(), &Cotangents::random(3, 71, 53), |_| {}).unwrap();
+        let [red, green, blue] = settings().background;
+        assert!(actual.colors.iter().all(|color| *color == [red, green, blue, 1.0]));
+        assert_eq!(actual.statistics, GpuStatistics::default());
+        assert!(actual.posed.as_flattened().iter().chain(actual.sh.as_flattened()).all(|v| *v == 0.0));
+        assert!(actual.calibrations.iter().all(|v| *v == 0.0));
+        assert!(actual.blended.iter().all(|blended| *blended == [0.0, 0.0, 1.0, 0.0]));
+    }
+}
+
+#[test]
+fn images() {
+    let Some(device) = device() else { return };
+    for (instances, heads) in [(1, None), (6, Some(ALL_HEADS)), (37, None)] {
+        let synthetic = generate(&SyntheticConfig { instances, heads, ..config() });
+        let (settings, scene) = (settings(), Scene::<f64>::from_field(&synthetic.field));
+        let (camera, time) = (&synthetic.camera, synthetic.time);
+        let forward = reference::forward(&scene, camera, time, &settings, None);
+        let expected = reference::render::<f64>(&synthetic.field, camera, time, &settings, CHANNELS);
+        let mut renderer = GpuRenderer::new(&device.0, &synthetic.field).unwrap();
+        let actual = renderer.render(&synthetic.field, camera, time, &settings, CHANNELS).unwrap();
+        let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
+        let (a, e) = (actual.instances.as_ref().unwrap(), expected.instances.as_ref().unwrap());
+        let depths = (actual.depth.as_ref().unwrap(), expected.depth.as_ref().unwrap());
+        let mut ties = 0;
+        for position in 0..actual.color.pixels.len() {
+            if pixel_discontinuity(&forward, position, BAND).is_some() {
+                continue;
+            }
+            let mut compare = |what: &str, e: f32, a: f32, tolerance: f64| {
+                mismatches.compare(what, position, e.into(), a.into(), 0.0, tolerance);
+                worst.see(what, f64::from((e - a).abs()));
+            };
+            for channel in 0..3 {
+                let (e, a) = (&expected.color.pixels[position], &actual.color.pixels[position]);
+                compare("colour", e[channel], a[channel], 3e-5);
+            }
+            let at = |grid: &PixelGrid<f32>| grid.pixels[position];
+            compare("alpha", at(&expected.alpha), at(&actual.alpha), 3e-5);
+            compare("depth", at(depths.1), at(depths.0), 2e-4);
+            compare("probability", at(&e.probability), at(&a.probability), 3e-5);
+            compare("coverage", at(&e.coverage), at(&a.coverage), 3e-5);
+            compare("foreground", at(&e.foreground), at(&a.foreground), 1e-4);
+            compare("entropy", at(&e.entropy), at(&a.entropy), 2e-4);
+            if e.label.pixels[position] != a.label.pixels[position] {
+                ties += 1;
+            }
+        }
+        assert!(ties <= 1 + actual.color.pixels.len() / 500, "{ties} labels differ");
+        worst.tell(&format!("images, K = {instances}"));
+        mismatches.finish(&format!("images, K = {instances}"));
+        // The same renderer again, at another time and without instances.
+        let plain = renderer.render(&synthetic.field, camera, 0.9, &settings, Channels::default()).unwrap();
+        let e = reference::render::<f64>(&synthetic.field, camera, 0.9, &settings, Channels::default());
+        let far = plain.color.pixels.iter().zip(&e.color.pixels).filter(|(a, e)| (a[0] - e[0]).abs() > 1e-4);
+        assert!(far.count() < plain.color.pixels.len() / 20);
+        assert!(plain.depth.is_none() && plain.instances.is_none());
+    }
+}
+
+/// Nothing depends on the order in which the device runs workgroups.
+#[test]
+fn two_runs_give_the_same_bits() {
+    let Some(mut device) = device() else { return };
+    let scene = generate(&SyntheticConfig { gaussians: 3000, ..config() });
+    let cotangents = Cotangents::random(3, 71, 53);
+    let bits = |outcome: &Outcome| -> Vec<u32> {
+        let all = [
+            outcome.colors.as_flattened(),
+            outcome.posed.as_flattened(),
+            outcome.sh.as_flattened(),
+            &outcome.calibrations,
+        ];
+        all.into_iter().flatten().map(|v| v.to_bits()).collect()
+    };
+    let first = bits(&run(&mut device, &scene, &settings(), &cotangents, |_| {}).unwrap());
+    for _ in 0..3 {
+        assert!(bits(&run(&mut device, &scene, &settings(), &cotangents, |_| {}).unwrap()) == first);
+    }
+    let moved = |splats: &mut Vec<Splat>| splats[0].mean[0] += 1e-3;
+    assert!(bits(&run(&mut device, &scene, &settings(), &cotangents, moved).unwrap()) != first);
+}
+
+/// Row 34: a view with more pairs than the device holds is refused with the arithmetic, counted in 64 bits.
+#[test]
+fn too_many_pairs_are_refused_with_the_arithmetic() {
+    let Some(mut device) = device() else { return };
+    let mut scene = generate(&SyntheticConfig { gaussians: 150_000, width: 2800, height: 2800, ..config() });
+    scene.field.gaussians.log_scales.fill([4.0; 3]);
+    scene.field.gaussians.opacity_logits.fill(5.0);
+    let settings = RenderSettings { instances: None, ..settings() };
+    let (gpu, rasterizer) = &mut *device;
+    let gpu: &Gpu = gpu;
+    let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians).unwrap();
+    let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None };
+    let mut commands = Commands::new(gpu, None);
+    let result = rasterizer.project(gpu, &mut commands, (&gaussians).into(), None, &input);
+    let refused = result.and_then(|()| rasterizer.measure(gpu, commands)).unwrap_err();
+    let GpuError::TooLarge { count, bytes, .. } = refused.clone() else { panic!("{refused}") };
+    // 175 x 175 tiles each, more than 2^32 pairs together.
+    assert_eq!(count, 150_000 * 175 * 175);
+    assert_eq!(bytes, 150_000 * 175 * 175 * 48);
+    gpu.check().expect("the device is still fine");
+}
+
+/// Without a wait in between: what does not fit is not drawn, and the counts say so.
+#[test]
+fn a_view_that_does_not_fit_is_told_and_leaves_no_gradient() {
+    let Some(device) = device() else { return };
+    let scene = generate(&config());
+    let settings = RenderSettings { instances: None, ..settings() };
+    let gpu = &device.0;
+    let mut rasterizer = Rasterizer::new(gpu).unwrap();
+    let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians).unwrap();
+    let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None };
+    let v_colors = GpuVec::from_slice(gpu, "v", &vec![[1.0_f32; 4]; 71 * 53]).unwrap();
+    for room in [10, 100_000] {
+        rasterizer.reserve(gpu, room, 0).unwrap();
+        let mut commands = Commands::new(gpu, None);
+        rasterizer.project(gpu, &mut commands, (&gaussians).into(), None, &input).unwrap();
+        rasterizer.rasterize(gpu, &mut commands, None, None).unwrap();
+        rasterizer.backward(gpu, &mut commands, (&gaussians).into(), None, None, &v_colors).unwrap();
+        let counts = rasterizer.read_statistics(gpu, &mut commands);
+        commands.submit();
+        let statistics = GpuStatistics::of(&counts.start().wait(gpu).unwrap());
+        let gradients = rasterizer.gradients().gaussians.geometry.read(gpu).unwrap();
+        let moved = gradients.as_flattened().iter().any(|v| *v != 0.0);
+        assert!(statistics.wanted_pairs > 100, "{statistics:?}");
+        assert_eq!((statistics.fits(), moved), (room > 10, room > 10), "{statistics:?}");
+    }
+}
