@@ -132,3 +132,14 @@ fn without_anything_to_guide_nothing_changes() {
     assert!(run(10.0, 0.0, 7, 9) == off, "guidance acts on what stands still");
     assert!(run(0.0, 1.0, 7, 9) != off, "stillness does nothing");
 }
+
+#[test]
+fn without_masks_nothing_is_held() {
+    let folder = tempfile::tempdir().unwrap();
+    let moving = capture(folder.path(), Scene { times: 4, views: 4, masks: false, ..Scene::default() });
+    let mut config = guided();
+    (config.stages.coarse, config.stages.fine) = (30, 50);
+    let held = train(moving.clone(), config.clone()).into_field();
+    (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
+    assert!(without_record(&train(moving, config).into_field()) == without_record(&held));
+}

@@ -176,16 +176,16 @@ pub struct LossConfig {
 /// Motion that masks tell. One moving camera leaves the depth of moving objects open, and colours alone are
 /// then explained by Gaussians that come and go at other depths. With guidance, objects that travel are left
 /// out of the coarse stage, start the fine stage with Gaussians of their own, and follow a path estimated from
-/// masks and contacts; everything else is held in place.
+/// masks and contacts; everything else is held in place. Without masks neither acts.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct MotionConfig {
-    /// Weight of the distance of travelling objects from their path, relative to the extent; default 0: no
-    /// guidance.
+    /// Weight of the distance of travelling objects from their path, relative to the extent; default 10; 0 for
+    /// no guidance, as in `paper`.
     pub guidance: f32,
     /// Share of `guidance` that is left at the end of the fine stage, default 0.1.
     pub guidance_end: f32,
-    /// Weight of the displacement of everything that does not travel, relative to the extent; default 0.
+    /// Weight of the displacement of everything that does not travel, relative to the extent; default 1.
     pub stillness: f32,
     /// Steps that teach the deformation the paths before the fine stage, default 300.
     pub rehearsal: u32,

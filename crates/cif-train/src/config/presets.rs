@@ -65,6 +65,8 @@ fn paper(layout: Layout) -> TrainConfig {
         ..config.densify
     };
     config.resample = ResampleConfig { from: 100, until: 2_500, every: 100, ..config.resample };
+    // The published method has no such losses.
+    config.motion = MotionConfig { guidance: 0.0, stillness: 0.0, ..config.motion };
     match layout {
         Layout::DNerf => {
             config.model.multipliers = vec![1, 2];
@@ -189,7 +191,7 @@ impl Default for LossConfig {
 
 impl Default for MotionConfig {
     fn default() -> Self {
-        Self { guidance: 0.0, guidance_end: 0.1, stillness: 0.0, rehearsal: 300, gaussians: 300 }
+        Self { guidance: 10.0, guidance_end: 0.1, stillness: 1.0, rehearsal: 300, gaussians: 300 }
     }
 }
 

@@ -25,7 +25,8 @@ impl Trainer {
     /// place the learning rates.
     ///
     /// A scene saved with its state where the reconstruction ended keeps the moments of the optimiser too: the
-    /// run then ends bit for bit where one run through all stages ends.
+    /// run then ends bit for bit where one run through all stages ends. Without it, the paths that guided the
+    /// reconstruction are not known any more, and nothing is held to them or in place.
     ///
     /// # Errors
     /// When a setting cannot work; when the scene is of other times, frames or cameras than the capture, does

@@ -127,12 +127,14 @@ impl Guidance {
 
 impl Trainer {
     fn is_guided(&self) -> bool {
-        (self.config.motion.guidance > 0.0 || self.config.motion.stillness > 0.0) && self.plan.is_dynamic
+        // Without masks nobody knows what may be held in place.
+        let is_asked = self.config.motion.guidance > 0.0 || self.config.motion.stillness > 0.0;
+        is_asked && self.plan.is_dynamic && self.plan.has_instances
     }
 
     /// Finds out which instances travel.
     pub(super) fn find_travelling(&mut self) -> Result<(), TrainError> {
-        if self.config.motion.guidance <= 0.0 || !self.is_guided() || !self.plan.has_instances {
+        if self.config.motion.guidance <= 0.0 || !self.is_guided() {
             return Ok(());
         }
         let observations = self.observe(false)?;
