@@ -121,6 +121,44 @@ fn the_instance_pass_is_compared_for_any_number_of_instances() {
 }
 
 #[test]
+fn the_ladder_of_tolerances_tells_what_gltf_misses() {
+    let folder = with_capture();
+    let path = folder.path();
+    let tiny = "--iterations-coarse 6 --iterations-fine 6 --iterations-instance 6 \
+                --set model.spatial_resolution=[8,8,8]";
+    cif(path, &format!("train table -o scene.cif {tiny}")).succeeds();
+    let line = "bench export scene.cif --tolerances 0.000001,50%";
+    let report = json(&cif(path, &format!("{line} --json -")).succeeds().stdout);
+    let rungs = report["rungs"].as_array().unwrap();
+    assert_eq!(rungs.len(), 2);
+    for rung in rungs {
+        let files = rung["files"].as_array().unwrap();
+        let gltf = files.iter().find(|file| file["format"] == "glTF").unwrap();
+        assert!(
+            gltf["bytes"].as_u64().unwrap() > 1000 && gltf["seconds"].as_f64().unwrap() >= 0.0,
+            "{gltf:#}"
+        );
+        let dense =
+            rung["models"].as_array().unwrap().iter().find(|count| count["model"] == "dense").unwrap();
+        let is_dense = dense["nodes"].as_u64().unwrap() > 0;
+        assert_eq!(gltf["simplified"].is_object(), is_dense, "{rung:#}");
+        let outside = gltf["nodes_outside"].as_u64().unwrap();
+        assert_eq!(outside > 0, gltf["worst_share"].as_f64().unwrap() > 1.0, "{gltf:#}");
+        for row in gltf["simplified"]["nodes"].as_array().into_iter().flatten() {
+            assert_ne!(row["model"], "dense", "{row:#}");
+        }
+    }
+    assert!(
+        rungs[0]["files"].as_array().unwrap().iter().any(|file| file["simplified"].is_object()),
+        "{report:#}"
+    );
+    let table = cif(path, line).succeeds().stdout;
+    assert!(table.contains("glTF") && table.contains("worst") && table.contains("decisive"), "{table}");
+    let bare = json(&cif(path, &format!("{line} --no-files --json -")).succeeds().stdout);
+    assert!(bare["rungs"].as_array().unwrap().iter().all(|rung| rung["files"] == serde_json::json!([])));
+}
+
+#[test]
 fn wrong_input_is_named() {
     let folder = with_capture();
     let path = folder.path();

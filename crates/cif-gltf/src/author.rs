@@ -14,6 +14,7 @@ use serde_json::{Value, json};
 use crate::arrays::Array;
 use crate::document::{self, Document};
 use crate::extras::{self, Cif, Extras};
+use crate::rotation_keys::{self, Inserted, SamplerExtras};
 use crate::{EXTENSION, GENERATOR, GltfError, conventions};
 
 /// A document and the arrays that follow each other in its only buffer.
@@ -113,6 +114,7 @@ impl<'a> Author<'a> {
             ..document::Node::default()
         });
         let all = 0..node.splats.len();
+        let error = rotation_keys::allowed_error(&node.report);
         match &node.motion {
             Motion::Static | Motion::Rigid(_) => {
                 self.document.nodes[index].mesh = self.mesh(&name, &node.splats, all);
@@ -139,12 +141,12 @@ impl<'a> Author<'a> {
                         ..document::Node::default()
                     });
                     self.document.nodes[index].children.push(child);
-                    self.pose_channels(child, &part.track, &node.name)?;
+                    self.pose_channels(child, &part.track, &node.name, error)?;
                 }
             }
             Motion::Dense(_) => return Err(GltfError::Dense { node: node.name.clone() }),
         }
-        self.pose_channels(index, track, &node.name)?;
+        self.pose_channels(index, track, &node.name, error)?;
         self.visibility_channel(index, &node.visibility, &node.name)?;
         Ok(index)
     }
@@ -254,32 +256,49 @@ impl<'a> Author<'a> {
             pose.translation == poses[0].translation && pose.rotation == poses[0].rotation
         };
         if !poses.iter().all(same) {
-            self.pose_channels(node, &poses, &track.name)?;
+            self.pose_channels(node, &poses, &track.name, rotation_keys::LARGEST_ERROR)?;
         }
         Ok(node)
     }
 
-    /// LINEAR translation and rotation. A single sample stands in the node itself.
-    fn pose_channels(&mut self, node: usize, track: &[PoseSample], name: &str) -> Result<(), GltfError> {
+    /// LINEAR translation and rotation. A single sample stands in the node itself. `error`: radians by which
+    /// viewers that draw straight lines between quaternions may be off.
+    fn pose_channels(
+        &mut self,
+        node: usize,
+        track: &[PoseSample],
+        name: &str,
+        error: f64,
+    ) -> Result<(), GltfError> {
         if track.len() < 2 {
             return Ok(());
         }
+        let finite = |pose: &PoseSample| pose.translation.is_finite() && pose.rotation.is_finite();
         let translations: Vec<f32> =
             track.iter().flat_map(|pose| pose.translation.as_vec3().to_array()).collect();
-        let rotations: Vec<f32> =
-            track.iter().flat_map(|pose| conventions::gltf_quaternion(pose.rotation)).collect();
-        if !translations.iter().chain(&rotations).all(|value| value.is_finite()) {
+        if !track.iter().all(finite) || !translations.iter().all(|value| value.is_finite()) {
             return Err(GltfError::Inconsistent {
                 node: name.to_owned(),
                 what: "its track is not finite".to_owned(),
             });
         }
-        let input = self.input(track.iter().map(|pose| pose.time_code), name)?;
-        let count = track.len();
-        let output = self.accessor(Array::Keys(translations), document::FLOAT, "VEC3", count);
+        let times = self.key_times(track.iter().map(|pose| pose.time_code), name)?;
+        let rotations: Vec<DQuat> = track.iter().map(|pose| pose.rotation).collect();
+        let filled = rotation_keys::filled(&times, &rotations, error);
+        let input = self.input(times);
+        let output = self.accessor(Array::Keys(translations), document::FLOAT, "VEC3", track.len());
         self.channel(node, "translation", input, output, "LINEAR");
+        let count = filled.seconds.len();
+        let input = self.input(filled.seconds);
+        let rotations =
+            filled.rotations.iter().flat_map(|rotation| conventions::gltf_quaternion(*rotation)).collect();
         let output = self.accessor(Array::Keys(rotations), document::FLOAT, "VEC4", count);
         self.channel(node, "rotation", input, output, "LINEAR");
+        if !filled.inserted.is_empty()
+            && let Some(sampler) = self.samplers.last_mut()
+        {
+            sampler.extras = Some(SamplerExtras { cif: Inserted { inserted: filled.inserted } });
+        }
         Ok(())
     }
 
@@ -293,7 +312,8 @@ impl<'a> Author<'a> {
         if samples.is_empty() {
             return Ok(());
         }
-        let input = self.input(samples.iter().map(|sample| sample.time_code), name)?;
+        let times = self.key_times(samples.iter().map(|sample| sample.time_code), name)?;
+        let input = self.input(times);
         let scale = |sample: &VisibilitySample| if sample.visible { 1.0 } else { conventions::HIDDEN_SCALE };
         let scales = samples.iter().flat_map(|sample| [scale(sample); 3]).collect();
         let output = self.accessor(Array::Keys(scales), document::FLOAT, "VEC3", samples.len());
@@ -310,12 +330,12 @@ impl<'a> Author<'a> {
         interpolation: &'static str,
     ) {
         let sampler = self.samplers.len();
-        self.samplers.push(document::Sampler { input, output, interpolation });
+        self.samplers.push(document::Sampler { input, output, interpolation, extras: None });
         self.channels.push(document::Channel { sampler, target: document::Target { node, path } });
     }
 
-    /// Accessor of key times, seconds.
-    fn input(&mut self, codes: impl Iterator<Item = f64>, name: &str) -> Result<usize, GltfError> {
+    /// Key times, seconds.
+    fn key_times(&self, codes: impl Iterator<Item = f64>, name: &str) -> Result<Vec<f32>, GltfError> {
         let rate = self.graph.time_codes.frames_per_second;
         let times: Vec<f32> =
             codes.map(|code| conventions::seconds(code, self.first_time_code, rate)).collect();
@@ -326,9 +346,14 @@ impl<'a> Author<'a> {
                 what: "its time codes do not ascend in single precision".to_owned(),
             });
         }
+        Ok(times)
+    }
+
+    /// Accessor of key times; at least one.
+    fn input(&mut self, times: Vec<f32>) -> usize {
         let bits: Vec<u32> = times.iter().map(|time| time.to_bits()).collect();
         if let Some(&accessor) = self.inputs.get(&bits) {
-            return Ok(accessor);
+            return accessor;
         }
         let count = times.len();
         let (min, max) = (f64::from(times[0]), f64::from(times[count - 1]));
@@ -336,7 +361,7 @@ impl<'a> Author<'a> {
         self.document.accessors[accessor].min = Some(vec![min]);
         self.document.accessors[accessor].max = Some(vec![max]);
         self.inputs.insert(bits, accessor);
-        Ok(accessor)
+        accessor
     }
 
     fn accessor(&mut self, array: Array<'a>, component_type: u32, kind: &'static str, count: usize) -> usize {

@@ -8,6 +8,7 @@ use serde::Serialize;
 use serde_json::Value;
 
 use crate::extras::Extras;
+use crate::rotation_keys::SamplerExtras;
 
 /// `componentType` float.
 pub(crate) const FLOAT: u32 = 5126;
@@ -119,6 +120,8 @@ pub(crate) struct Sampler {
     pub(crate) input: usize,
     pub(crate) output: usize,
     pub(crate) interpolation: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) extras: Option<SamplerExtras>,
 }
 
 #[derive(Serialize)]

@@ -6,6 +6,7 @@
 //! | `extras` | what stands in `extras.cif`, because glTF has no place for it |
 //! | `document` | the objects of glTF that are written |
 //! | `author` | which nodes, meshes, cameras and tracks a scene becomes |
+//! | `rotation_keys` | keys between those of a track, for viewers that do not slerp |
 //! | `arrays` | what the buffer holds |
 //! | `write` | file kinds, atomic replacement, what may be replaced |
 //! | `read` | files, ours and others', to scene graphs |
@@ -30,6 +31,7 @@ mod extras;
 mod foreign_tests;
 mod read;
 mod relabel;
+mod rotation_keys;
 #[cfg(test)]
 mod testing;
 #[cfg(test)]

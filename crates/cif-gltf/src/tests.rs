@@ -179,6 +179,55 @@ fn a_moved_world_moves_everything() {
     assert!(read.warnings.iter().any(|warning| warning.contains("was moved")));
 }
 
+/// Numbers of an accessor of floats.
+fn floats(json: &Value, bytes: &[u8], accessor: &Value) -> Vec<f64> {
+    let accessor = &json["accessors"][accessor.as_u64().unwrap() as usize];
+    let view = &json["bufferViews"][accessor["bufferView"].as_u64().unwrap() as usize];
+    let start = view["byteOffset"].as_u64().unwrap() as usize;
+    let end = start + view["byteLength"].as_u64().unwrap() as usize;
+    bytes[start..end].chunks_exact(4).map(|b| f64::from(f32::from_le_bytes(b.try_into().unwrap()))).collect()
+}
+
+#[test]
+fn viewers_that_do_not_slerp_turn_objects_as_the_file_says() {
+    // Random tracks turn by up to half a turn between their keys.
+    let graph = scene(Recipe { nodes: 8, frames: 9, ..recipe() });
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.gltf");
+    export(&graph, &path, ExportOptions::default()).unwrap();
+    let json: Value = serde_json::from_slice(&std::fs::read(&path).unwrap()).unwrap();
+    let bytes = std::fs::read(path.with_extension("bin")).unwrap();
+    let animation = &json["animations"][0];
+    let (mut checked, mut inserted) = (0, 0);
+    for channel in animation["channels"].as_array().unwrap() {
+        let name =
+            json["nodes"][channel["target"]["node"].as_u64().unwrap() as usize]["name"].as_str().unwrap();
+        let Some(node) = graph.nodes.iter().find(|node| node.name == name) else { continue };
+        if channel["target"]["path"] != "rotation" {
+            continue;
+        }
+        let sampler = &animation["samplers"][channel["sampler"].as_u64().unwrap() as usize];
+        inserted += sampler["extras"]["cif"]["inserted"].as_array().map_or(0, Vec::len);
+        let times = floats(&json, &bytes, &sampler["input"]);
+        let values = floats(&json, &bytes, &sampler["output"]);
+        let allowed = 1.02 * rotation_keys::allowed_error(&node.report) + 1e-6;
+        for (key, ends) in times.windows(2).enumerate() {
+            for t in [0.11, 0.21, 0.5, 0.79, 0.93] {
+                // What PlayCanvas does: component by component, then to unit length.
+                let at = |k: usize| glam::DVec4::from_slice(&values[4 * k..4 * k + 4]);
+                let drawn = glam::DQuat::from_vec4(at(key).lerp(at(key + 1), t)).normalize();
+                let code = 10.0 + 30.0 * (ends[0] + t * (ends[1] - ends[0]));
+                let meant = cif_scene::graph::pose_at(node.track(), node.pivot, code).rotation;
+                let apart = meant.inverse() * drawn;
+                let angle = 2.0 * DVec3::new(apart.x, apart.y, apart.z).length().asin();
+                assert!(angle < allowed, "{name} at {code}: {angle} > {allowed}");
+                checked += 1;
+            }
+        }
+    }
+    assert!(checked > 100 && inserted > 50, "{checked} {inserted}");
+}
+
 #[test]
 fn dense_motion_is_refused() {
     let mut graph = scene(recipe());

@@ -107,14 +107,26 @@ pub(crate) fn export<'py>(
     cif_usd::check_target(path, export_options).map_err(cif_error)?;
     let graph = build(py, field, options, motion)?;
     let summary = py.detach(|| cif_usd::export(&graph, path, export_options)).map_err(cif_error)?;
-    let out = PyDict::new(py);
-    out.set_item("path", summary.path)?;
-    out.set_item("bytes", summary.bytes)?;
-    out.set_item("splats", summary.splats)?;
+    let out = told(py, &graph, &summary.path, summary.bytes, summary.splats)?;
     out.set_item("samples", summary.samples)?;
     out.set_item("usd_version", summary.usd_version)?;
-    out.set_item("warnings", &graph.warnings)?;
     out.set_item("motion", arrays::to_python(py, &graph.motion_table())?)?;
+    Ok(out)
+}
+
+/// What every export tells.
+fn told<'py>(
+    py: Python<'py>,
+    graph: &SceneGraph,
+    path: &Path,
+    bytes: u64,
+    splats: usize,
+) -> PyResult<Bound<'py, PyDict>> {
+    let out = PyDict::new(py);
+    out.set_item("path", path)?;
+    out.set_item("bytes", bytes)?;
+    out.set_item("splats", splats)?;
+    out.set_item("warnings", &graph.warnings)?;
     Ok(out)
 }
 
@@ -137,13 +149,9 @@ fn export_gltf<'py>(
     let options = SceneOptions { most_expensive_motion, ..options.clone() };
     let graph = build(py, field, &options, motion)?;
     let summary = py.detach(|| cif_gltf::export(&graph, path, export_options)).map_err(cif_error)?;
-    let out = PyDict::new(py);
-    out.set_item("path", summary.path)?;
+    let out = told(py, &graph, &summary.path, summary.bytes, summary.splats)?;
     out.set_item("files", summary.files)?;
-    out.set_item("bytes", summary.bytes)?;
-    out.set_item("splats", summary.splats)?;
     out.set_item("samples", summary.samples)?;
-    out.set_item("warnings", &graph.warnings)?;
     out.set_item("motion", arrays::to_python(py, &graph.motion_table())?)?;
     Ok(out)
 }
@@ -161,12 +169,8 @@ fn export_ply<'py>(
     cif_ply::check_target(path, export_options).map_err(cif_error)?;
     let graph = build(py, field, options, motion)?;
     let summary = py.detach(|| cif_ply::export(&graph, path, export_options)).map_err(cif_error)?;
-    let out = PyDict::new(py);
-    out.set_item("path", path)?;
+    let out = told(py, &graph, path, summary.bytes, summary.splats)?;
     out.set_item("files", summary.files)?;
-    out.set_item("bytes", summary.bytes)?;
-    out.set_item("splats", summary.splats)?;
-    out.set_item("warnings", &graph.warnings)?;
     Ok(out)
 }
 

@@ -10,6 +10,7 @@ use gltf::json::validation::Checked;
 use super::accessor::Expected;
 use super::hierarchy::{Local, vector};
 use super::source::Source;
+use crate::rotation_keys::{SamplerExtras, drop_inserted};
 use crate::{GltfError, conventions};
 
 /// A value over time.
@@ -133,6 +134,12 @@ impl Curves {
     }
 }
 
+/// Keys that our writer put between those of a track.
+fn inserted(sampler: &gltf::json::animation::Sampler) -> Vec<usize> {
+    let extras = sampler.extras.as_ref().map(|extras| serde_json::from_str::<SamplerExtras>(extras.get()));
+    extras.and_then(Result::ok).map_or_else(Vec::new, |extras| extras.cif.inserted)
+}
+
 impl Curve {
     fn read(
         source: &Source,
@@ -147,7 +154,7 @@ impl Curve {
             );
         };
         let expected = Expected { object, count: None, types: &[(F32, false)] };
-        let times: Vec<f32> = source.numbers::<1>(sampler.input.value(), &expected)?.into_flattened();
+        let mut times: Vec<f32> = source.numbers::<1>(sampler.input.value(), &expected)?.into_flattened();
         let ascending = times.windows(2).all(|pair| pair[0] < pair[1]);
         if times.is_empty() || !ascending || !times.iter().all(|time| time.is_finite() && *time >= 0.0) {
             return Err(
@@ -170,7 +177,7 @@ impl Curve {
                 source.invalid(object.to_owned(), format!("key {} is not finite; delete it", key / per_key))
             );
         }
-        let (values, tangents) = if per_key == 3 {
+        let (mut values, tangents): (Vec<DVec4>, _) = if per_key == 3 {
             values.chunks_exact(3).map(|key| (key[1], [key[0], key[2]])).unzip()
         } else {
             (values, Vec::new())
@@ -181,6 +188,9 @@ impl Curve {
         {
             return Err(source
                 .invalid(object.to_owned(), format!("the rotation of key {key} has no length; delete it")));
+        }
+        if is_rotation && interpolation == Interpolation::Linear {
+            drop_inserted(&mut times, &mut values, &inserted(sampler));
         }
         Ok(Self { times, values, tangents, interpolation, path })
     }

@@ -320,21 +320,8 @@ fn report(recorded: &Recorded, motion: &Motion, splats: &Splats) -> MotionReport
     if let Some(before) = before.filter(|before| before.model == model) {
         return before;
     }
-    let centres = Bounds::around(splats.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))));
-    MotionReport {
-        model,
-        gaussians: splats.len(),
-        size: centres.size().length(),
-        tolerance: 0.0,
-        residual: Default::default(),
-        static_residual: Default::default(),
-        rigid_residual: None,
-        parts_residual: None,
-        parts: if let Motion::Parts(parts) = motion { parts.parts.len() } else { 0 },
-        samples,
-        motion_bytes: 0,
-        seconds: 0.0,
-    }
+    let parts = if let Motion::Parts(parts) = motion { parts.parts.len() } else { 0 };
+    MotionReport { model, parts, ..MotionReport::unfitted(splats, samples) }
 }
 
 /// A prim, its name, and the part that it moves with.

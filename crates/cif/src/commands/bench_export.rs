@@ -3,12 +3,14 @@
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use cif_field::Field;
+use cif_scene::report::ReportRow;
 use cif_scene::{MotionModel, SceneGraph, SceneOptions, Tolerance};
 use clap::Args;
 use serde::Serialize;
 
 use super::model_options::ModelOptions;
-use super::scene;
+use super::{motion_table, scene};
 use crate::error::Error;
 use crate::output;
 
@@ -18,7 +20,8 @@ use crate::output;
 The scene is built once per tolerance. Residuals are distances in world units: decisive is what the
 tolerance is held against (worst time, without the outermost 5 % of an object's weight). KB are the
 sampled values; write times and file sizes come with every format that this build can write, into a
-temporary folder.
+temporary folder. glTF holds no motion splat by splat: what is dense leaves as rigid parts there, and
+the lines of glTF tell what that misses (worst: largest decisive residual as a share of what is allowed).
 
   cif bench export table.cif
   cif bench export table.cif --tolerances 0.5%,2% --motion parts
@@ -52,7 +55,7 @@ struct Rung {
     samples: usize,
     motion_bytes: usize,
     models: Vec<ModelCount>,
-    nodes: Vec<cif_scene::report::ReportRow>,
+    nodes: Vec<ReportRow>,
     files: Vec<WrittenFile>,
 }
 
@@ -69,23 +72,91 @@ struct WrittenFile {
     format: &'static str,
     bytes: u64,
     seconds: f64,
+    /// Samples in the file.
+    samples: usize,
+    /// Largest decisive residual of a node, as a share of what the tolerance allows it.
+    worst_share: f64,
+    /// Nodes that miss more than the tolerance allows.
+    nodes_outside: usize,
+    /// The scene as this format holds it, where that is another one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    simplified: Option<Simplified>,
 }
 
-/// A format: its name, the ending of its files, and what writes them.
+/// A scene without the motion that a format does not know.
+#[derive(Debug, Serialize)]
+struct Simplified {
+    /// Seconds for the scene graph.
+    graph_seconds: f64,
+    nodes: Vec<ReportRow>,
+}
+
+/// A format: its name, the ending of its files, what it can hold, and what writes them.
 struct Format {
     name: &'static str,
     ending: &'static str,
+    most_expensive_motion: MotionModel,
     /// Bytes written, payloads included.
     write: fn(&SceneGraph, &Path) -> Result<u64, String>,
 }
 
-/// Formats that hold every motion model.
-const FORMATS: [Format; 1] = [Format { name: "USD", ending: "usdc", write: write_usd }];
+/// Formats that hold moving objects.
+const FORMATS: [Format; 2] = [
+    Format { name: "USD", ending: "usdc", most_expensive_motion: MotionModel::Dense, write: write_usd },
+    Format {
+        name: "glTF",
+        ending: "glb",
+        most_expensive_motion: cif_gltf::MOST_EXPENSIVE_MOTION,
+        write: write_gltf,
+    },
+];
 
 fn write_usd(graph: &SceneGraph, path: &Path) -> Result<u64, String> {
     cif_usd::export(graph, path, cif_usd::ExportOptions::default())
         .map(|written| written.bytes)
         .map_err(|error| error.to_string())
+}
+
+fn write_gltf(graph: &SceneGraph, path: &Path) -> Result<u64, String> {
+    cif_gltf::export(graph, path, cif_gltf::ExportOptions::default())
+        .map(|written| written.bytes)
+        .map_err(|error| error.to_string())
+}
+
+impl Format {
+    /// Writes a rung; a graph with motion that the format does not know is built again without it.
+    fn measure(
+        &self,
+        field: &Field,
+        graph: &SceneGraph,
+        options: &SceneOptions,
+        path: &Path,
+    ) -> Result<WrittenFile, String> {
+        let start = Instant::now();
+        let rebuilt = if graph.nodes.iter().any(|node| node.model() > self.most_expensive_motion) {
+            let most_expensive_motion = self.most_expensive_motion;
+            let options = SceneOptions { most_expensive_motion, ..options.clone() };
+            Some(cif_scene::build(field, &options).map_err(|error| error.to_string())?)
+        } else {
+            None
+        };
+        let graph_seconds = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let bytes = (self.write)(rebuilt.as_ref().unwrap_or(graph), path)?;
+        let seconds = start.elapsed().as_secs_f64();
+        let nodes = rebuilt.as_ref().unwrap_or(graph).motion_table();
+        let share = |row: &ReportRow| row.motion.residual.decisive / row.motion.tolerance;
+        let shares: Vec<f64> = nodes.iter().map(share).filter(|share| share.is_finite()).collect();
+        Ok(WrittenFile {
+            format: self.name,
+            bytes,
+            seconds,
+            samples: nodes.iter().map(|row| row.motion.samples).sum(),
+            worst_share: shares.iter().copied().fold(0.0, f64::max),
+            nodes_outside: shares.iter().filter(|share| **share > 1.0).count(),
+            simplified: rebuilt.is_some().then_some(Simplified { graph_seconds, nodes }),
+        })
+    }
 }
 
 pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
@@ -106,11 +177,9 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
         let mut rung = Rung::of(tolerance, start.elapsed().as_secs_f64(), &graph);
         formats.retain(|format| {
             let path = folder.path().join(format!("rung_{}.{}", rungs.len(), format.ending));
-            let start = Instant::now();
-            match (format.write)(&graph, &path) {
-                Ok(bytes) => {
-                    let seconds = start.elapsed().as_secs_f64();
-                    rung.files.push(WrittenFile { format: format.name, bytes, seconds });
+            match format.measure(&field, &graph, &options, &path) {
+                Ok(file) => {
+                    rung.files.push(file);
                     true
                 }
                 Err(reason) => {
@@ -158,35 +227,20 @@ fn name_of(tolerance: Tolerance) -> String {
 }
 
 fn print_ladder(rungs: &[Rung]) {
-    let mut table = super::table([
-        "tolerance",
-        "object",
-        "motion",
-        "parts",
-        "allowed",
-        "decisive",
-        "error RMS",
-        "max",
-        "samples",
-        "KB",
-        "seconds",
-    ]);
+    let mut table = super::table(["tolerance", "format", "object"].into_iter().chain(motion_table::HEADINGS));
     for rung in rungs {
-        for row in &rung.nodes {
-            let motion = &row.motion;
-            table.add_row([
-                name_of(rung.tolerance),
-                row.name.clone(),
-                motion.model.to_string(),
-                if motion.parts > 0 { motion.parts.to_string() } else { String::new() },
-                format!("{:.5}", motion.tolerance),
-                format!("{:.5}", motion.residual.decisive),
-                format!("{:.5}", motion.residual.rms),
-                format!("{:.5}", motion.residual.max),
-                motion.samples.to_string(),
-                format!("{:.1}", motion.motion_bytes as f64 / 1e3),
-                format!("{:.3}", row.seconds),
-            ]);
+        let others =
+            rung.files.iter().filter_map(|file| Some((file.format, &file.simplified.as_ref()?.nodes)));
+        // Lines of a format that holds another motion tell only of the objects whose motion that is.
+        let differs = |row: &&ReportRow| {
+            !rung.nodes.iter().any(|here| here.name == row.name && here.motion == row.motion)
+        };
+        let rows = rung.nodes.iter().map(|row| ("", row));
+        let of_others =
+            others.flat_map(|(format, rows)| rows.iter().filter(differs).map(move |row| (format, row)));
+        for (format, row) in rows.chain(of_others) {
+            let object = [name_of(rung.tolerance), format.to_owned(), row.name.clone()];
+            table.add_row(object.into_iter().chain(motion_table::cells(row)));
         }
     }
     println!("{table}\n");
@@ -202,6 +256,9 @@ fn print_ladder(rungs: &[Rung]) {
         "format",
         "file, KB",
         "write, s",
+        "samples",
+        "worst",
+        "outside",
     ]);
     for rung in rungs {
         let count = |index: usize| rung.models[index].nodes.to_string();
@@ -221,6 +278,9 @@ fn print_ladder(rungs: &[Rung]) {
                 file.format.to_owned(),
                 format!("{:.1}", file.bytes as f64 / 1e3),
                 format!("{:.2}", file.seconds),
+                file.samples.to_string(),
+                format!("{:.2}", file.worst_share),
+                file.nodes_outside.to_string(),
             ]);
             table.add_row(row);
         }

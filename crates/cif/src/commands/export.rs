@@ -9,7 +9,7 @@ use serde_json::json;
 use super::export_gltf::Gltf;
 use super::export_ply::Ply;
 use super::model_options::ModelOptions;
-use super::scene;
+use super::{motion_table, scene};
 use crate::error::Error;
 use crate::ground_truth::{self, MotionError};
 use crate::output;
@@ -191,38 +191,10 @@ fn check_stage_name(path: &Path) -> Result<(), Error> {
 }
 
 fn print_motion(graph: &SceneGraph) {
-    let mut table = super::table([
-        "object",
-        "label",
-        "splats",
-        "motion",
-        "parts",
-        "size",
-        "tolerance",
-        "error RMS",
-        "decisive",
-        "max",
-        "samples",
-        "KB",
-        "seconds",
-    ]);
+    let mut table = super::table(["object", "label", "splats"].into_iter().chain(motion_table::HEADINGS));
     for row in graph.motion_table() {
-        let motion = &row.motion;
-        table.add_row([
-            row.name.clone(),
-            row.label.clone(),
-            motion.gaussians.to_string(),
-            motion.model.to_string(),
-            if motion.parts > 0 { motion.parts.to_string() } else { String::new() },
-            format!("{:.4}", motion.size),
-            format!("{:.5}", motion.tolerance),
-            format!("{:.5}", motion.residual.rms),
-            format!("{:.5}", motion.residual.decisive),
-            format!("{:.5}", motion.residual.max),
-            motion.samples.to_string(),
-            format!("{:.1}", motion.motion_bytes as f64 / 1e3),
-            format!("{:.3}", row.seconds),
-        ]);
+        let object = [row.name.clone(), row.label.clone(), row.motion.gaussians.to_string()];
+        table.add_row(object.into_iter().chain(motion_table::cells(&row)));
     }
     println!("{table}");
 }

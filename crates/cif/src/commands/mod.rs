@@ -12,6 +12,7 @@ mod info;
 mod label;
 mod masks;
 mod model_options;
+mod motion_table;
 mod query;
 mod render;
 mod scene;
@@ -217,7 +218,7 @@ fn print_warnings(dataset: &cif_dataset::Dataset) {
 }
 
 /// A plain table with a heading.
-fn table<const N: usize>(heading: [&str; N]) -> comfy_table::Table {
+fn table<'a>(heading: impl IntoIterator<Item = &'a str>) -> comfy_table::Table {
     let mut table = comfy_table::Table::new();
     table.load_style(comfy_table::presets::NOTHING).set_header(heading);
     table
