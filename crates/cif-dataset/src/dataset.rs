@@ -7,6 +7,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::cryptomatte::ObjectIds;
+use crate::placement::CaptureFrame;
 
 /// The layouts that can be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -128,6 +129,8 @@ pub struct Dataset {
     pub has_alpha: bool,
     /// Oddities met while reading, one sentence each, naming the file.
     pub warnings: Vec<String>,
+    /// Where cameras and points lie in the coordinates of the capture; the identity for ordinary captures.
+    pub frame: CaptureFrame,
 }
 
 /// A loaded frame.

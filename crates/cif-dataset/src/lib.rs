@@ -38,6 +38,7 @@ mod load;
 mod mask_files;
 pub mod masks;
 mod open;
+mod placement;
 mod points;
 mod summary;
 
@@ -45,4 +46,5 @@ pub use dataset::{
     Dataset, Frame, FrameData, InstanceLabel, Layout, OpenOptions, PointCloud, PointSource, Split,
 };
 pub use error::Error;
+pub use placement::CaptureFrame;
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

@@ -10,8 +10,8 @@ use crate::files::{image, json};
 use crate::formats::{self, Draft, Source, some_of};
 use crate::load::{centred, reduced_size};
 use crate::{
-    Dataset, Error, Frame, OpenOptions, PointCloud, PointSource, Split, camera_check, cryptomatte, instances,
-    layout, mask_files, points,
+    CaptureFrame, Dataset, Error, Frame, OpenOptions, PointCloud, PointSource, Split, camera_check,
+    cryptomatte, instances, layout, mask_files, points,
 };
 
 impl Dataset {
@@ -47,6 +47,7 @@ impl Dataset {
             points: PointCloud { positions: Vec::new(), colors: Vec::new(), source: PointSource::Random },
             has_alpha,
             warnings,
+            frame: CaptureFrame::default(),
         };
         for frame in &mut dataset.frames {
             frame.time_index = dataset
@@ -64,6 +65,7 @@ impl Dataset {
             dataset.attach_masks(options.masks.as_deref(), &stored_sizes)?;
         }
         dataset.points = dataset.initial_points(draft.points, draft.random_box)?;
+        dataset.enter_own_frame();
         Ok(dataset)
     }
 

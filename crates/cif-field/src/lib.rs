@@ -12,6 +12,7 @@
 //! | [`field`] | all of it together |
 //! | [`fingerprint`] | whether two fields are the same |
 //! | [`validate`] | which rules every field keeps |
+//! | [`health`] | what is numerically broken or odd, and how broken parts are repaired |
 //! | [`query`] | what exists at a place and time, and whose it is |
 //! | [`checkpoint`] | how `.cif` files are laid out, read and written |
 //!
@@ -55,6 +56,7 @@ pub mod deformation;
 pub mod field;
 pub mod fingerprint;
 pub mod gaussians;
+pub mod health;
 pub mod identity;
 pub mod instance;
 pub mod neighbours;

@@ -6,6 +6,7 @@ use thiserror::Error;
 
 use crate::Stage;
 use crate::config::ConfigError;
+use crate::trainer::{Fault, Hint};
 
 /// Errors of training.
 #[derive(Debug, Error)]
@@ -47,6 +48,23 @@ pub enum TrainError {
         iteration: u32,
         /// Loss or gradient, by name.
         tensor: &'static str,
+    },
+    /// Step after step left the finite numbers.
+    #[error(
+        "{stage} stage, step {iteration}: {in_a_row} steps in a row met values that are not finite, the last in \
+         {fault}; the field of the last finite step is kept. {hint}"
+    )]
+    Diverged {
+        /// Stage.
+        stage: Stage,
+        /// The last such step, from 1.
+        iteration: u32,
+        /// How many.
+        in_a_row: u32,
+        /// What the last one met.
+        fault: Fault,
+        /// What to try.
+        hint: Hint,
     },
     /// All Gaussians were pruned.
     #[error(

@@ -3,6 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::Trainer;
+use crate::trainer::Fault;
 
 /// Parts of a run, in order (methods reference 1.3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -125,6 +126,19 @@ pub enum TrainEvent {
         /// Occupancies raised to their floor.
         floored: usize,
     },
+    /// A step met a value that is not finite; parameters and moments are those before it, and the run goes on.
+    RolledBack {
+        /// Stage.
+        stage: Stage,
+        /// The step, from 1; it counts as done.
+        iteration: u32,
+        /// What was met, and where.
+        fault: Fault,
+        /// Such steps since the last good one.
+        in_a_row: u32,
+        /// Such steps in the whole run.
+        total: u64,
+    },
     /// Held-out frames were scored.
     Evaluated {
         /// Stage.
@@ -166,6 +180,8 @@ pub enum TrainEvent {
         psnr: f64,
         /// Largest resident memory of the process, MB; none where the system does not tell.
         peak_rss_mb: Option<f64>,
+        /// Steps that were rolled back.
+        rolled_back: u64,
     },
 }
 

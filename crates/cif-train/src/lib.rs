@@ -28,6 +28,10 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+// So that unit tests can use the capture of the integration tests.
+#[cfg(test)]
+extern crate self as cif_train;
+
 pub mod adam;
 pub mod config;
 pub mod densify;
@@ -45,4 +49,4 @@ pub mod trainer;
 pub use config::{Ablation, Preset, TrainConfig};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
-pub use trainer::{InstancePass, StepTimes, Trainer};
+pub use trainer::{Fault, InstancePass, StepTimes, Trainer};

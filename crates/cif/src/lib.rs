@@ -13,6 +13,7 @@
 //! | [`mask_query`] | which objects 2D masks show |
 //! | [`detector`] | a command that makes such masks |
 //! | [`ground_truth`] | exported motion against known motion |
+//! | [`hard_captures`] | captures changed in ways that must not matter or must not break a run |
 //! | [`error`] | what is reported, and the exit code |
 
 pub mod camera_file;
@@ -21,6 +22,7 @@ pub mod detector;
 pub mod error;
 pub mod graph_file;
 pub mod ground_truth;
+pub mod hard_captures;
 pub mod interrupt;
 pub mod mask_query;
 pub mod output;

@@ -106,10 +106,20 @@ impl Progress {
                     optional(*miou)
                 ));
             }
+            TrainEvent::RolledBack { stage, iteration, fault, in_a_row, .. } => {
+                let repeated = if *in_a_row > 1 { format!(" ({in_a_row} in a row)") } else { String::new() };
+                self.line(&format!("warning: {stage} {iteration} rolled back{repeated}: {fault}"));
+            }
             TrainEvent::Warning { message } => self.line(&format!("warning: {message}")),
-            TrainEvent::Finished { wall_s, iterations, gaussians, psnr, peak_rss_mb } => {
+            TrainEvent::Finished { wall_s, iterations, gaussians, psnr, peak_rss_mb, rolled_back } => {
                 self.clear();
                 let memory = peak_rss_mb.map_or(String::new(), |mb| format!(", peak memory {mb:.0} MB"));
+                if *rolled_back > 0 {
+                    self.line(&format!(
+                        "warning: {rolled_back} of {iterations} steps met values that are not finite and were rolled \
+                         back; the scene's provenance names the last"
+                    ));
+                }
                 self.plain_or_bar(&format!(
                     "trained {iterations} steps in {}: {gaussians} Gaussians, PSNR of training views {psnr:.2}{memory}",
                     duration(*wall_s)

@@ -93,6 +93,15 @@ impl Checkpoint {
         read::load(path.as_ref(), true)
     }
 
+    /// Reads a file whose values may be broken, to be looked at and repaired (see [`crate::health`]). Nothing else
+    /// may be done with such a field.
+    ///
+    /// # Errors
+    /// When it cannot be read or is not a whole `.cif` file.
+    pub fn load_unchecked(path: impl AsRef<Path>) -> Result<Self, CheckpointError> {
+        read::load_unchecked(path.as_ref(), true)
+    }
+
     /// Writes the bytes of a `.cif` file to any sink; `path` is only named in errors.
     ///
     /// # Errors

@@ -20,6 +20,21 @@ use crate::gaussians::SH_FLOATS;
 use crate::{Deformation, Field, Gaussians, Identities, Tracks};
 
 pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
+    let checkpoint = load_unchecked(path, with_training)?;
+    validated(checkpoint, path)
+}
+
+/// Refuses values that no cif writes.
+fn validated(checkpoint: Checkpoint, path: &Path) -> Result<Checkpoint, CheckpointError> {
+    checkpoint
+        .field
+        .validate()
+        .map_err(|source| CheckpointError::InvalidField { path: path.to_owned(), source })?;
+    Ok(checkpoint)
+}
+
+/// As [`load`], with whatever values the file holds; shapes and sizes are right.
+pub(super) fn load_unchecked(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
     let failed = |source: io::Error| CheckpointError::Read { path: path.to_owned(), source };
     let file = File::open(path).map_err(failed)?;
     let metadata = file.metadata().map_err(failed)?;
@@ -27,10 +42,18 @@ pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, Check
         let message = if metadata.is_dir() { "it is a folder" } else { "it is not a regular file" };
         return Err(failed(io::Error::other(message)));
     }
-    read(&mut BufReader::new(file), path, with_training)
+    read_unchecked(&mut BufReader::new(file), path, with_training)
 }
 
 pub(super) fn read<S: Read + Seek>(
+    source: &mut S,
+    path: &Path,
+    with_training: bool,
+) -> Result<Checkpoint, CheckpointError> {
+    validated(read_unchecked(source, path, with_training)?, path)
+}
+
+fn read_unchecked<S: Read + Seek>(
     source: &mut S,
     path: &Path,
     with_training: bool,
@@ -44,7 +67,6 @@ pub(super) fn read<S: Read + Seek>(
         serde_json::from_str(json).map_err(|error| reader.damaged(format!("`{FIELD_KEY}`: {error}")))?;
 
     let field = read_field(&mut reader, json)?;
-    field.validate().map_err(|source| CheckpointError::InvalidField { path: path.to_owned(), source })?;
     let training = match metadata.get(TRAINING_KEY) {
         Some(json) if with_training => Some(read_training(&mut reader, json)?),
         _ => None,

@@ -1,5 +1,7 @@
 //! Depth order and tile lists. Source: methods reference 3.1 (sorting, exact tile test).
 
+use std::sync::atomic::{AtomicU64, Ordering};
+
 use rayon::prelude::*;
 
 use super::project::Splat;
@@ -66,6 +68,9 @@ pub(super) fn sort_by_depth(splats: &mut [Splat]) {
     });
 }
 
+/// Most (tile, splat) pairs of a view: positions are 32-bit.
+const MAX_PAIRS: u64 = u32::MAX as u64;
+
 /// Smallest sigma of a splat over a tile's pixel centres' bounding rectangle.
 fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
     let [x00, x01, x11] = splat.conic;
@@ -127,7 +132,14 @@ struct ReachedTiles {
 
 impl TileLists {
     /// Builds the lists for depth-sorted splats of an image.
+    ///
+    /// # Panics
+    /// When there are too many pairs, before memory is.
     pub(super) fn build(&mut self, splats: &[Splat], width: u32, height: u32) {
+        self.build_within(MAX_PAIRS, splats, width, height);
+    }
+
+    fn build_within(&mut self, limit: u64, splats: &[Splat], width: u32, height: u32) {
         self.columns = width.div_ceil(TILE);
         self.rows = height.div_ceil(TILE);
         let (columns, rows) = (self.columns, self.rows);
@@ -137,6 +149,7 @@ impl TileLists {
 
         // Tiles of every splat, in chunks so that threads share the tests.
         const CHUNK: usize = 1024;
+        let pairs = AtomicU64::new(0);
         let chunks: Vec<ReachedTiles> = splats
             .par_chunks(CHUNK)
             .map(|chunk| {
@@ -147,9 +160,19 @@ impl TileLists {
                     visit_tiles(splat, columns, rows, |tile, passes| reached.push((tile, passes)));
                     counts.push((reached.len() - before) as u32);
                 }
+                if pairs.fetch_add(reached.len() as u64, Ordering::Relaxed) + reached.len() as u64 > limit {
+                    return ReachedTiles { counts: Vec::new(), reached: Vec::new() };
+                }
                 ReachedTiles { counts, reached }
             })
             .collect();
+        let pairs = pairs.into_inner();
+        assert!(
+            pairs <= limit,
+            "{} visible Gaussians reach {pairs} (tile, Gaussian) pairs of {width} x {height} pixels, more than \
+             {limit}: render a smaller image, or fewer and smaller Gaussians",
+            splats.len()
+        );
 
         self.splat_offsets.clear();
         self.splat_offsets.push(0);
@@ -158,7 +181,7 @@ impl TileLists {
         let mut total = 0_u32;
         for ReachedTiles { counts, reached } in &chunks {
             for count in counts {
-                total = total.checked_add(*count).expect("more than 2^32 tile pairs: the image is too large");
+                total = total.checked_add(*count).expect("the pairs were counted above");
                 self.splat_offsets.push(total);
             }
             for (tile, _) in reached {
@@ -215,5 +238,44 @@ impl TileLists {
     /// First pixel (x, y) of a tile.
     pub(super) fn origin(&self, tile: usize) -> (u32, u32) {
         ((tile as u32 % self.columns) * TILE, (tile as u32 / self.columns) * TILE)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A splat that fills any image.
+    fn filling(gaussian: u32) -> Splat {
+        Splat {
+            mean: [40.0, 40.0],
+            conic: [1e-8, 0.0, 1e-8],
+            color: [0.5; 3],
+            opacity: 0.5,
+            occupancy: 0.5,
+            depth: 2.0,
+            order: 2.0,
+            reach: [4.0; 2],
+            extent: [1e5; 2],
+            radius: 1e5,
+            gaussian,
+        }
+    }
+
+    #[test]
+    fn row_34_pairs_are_counted_before_they_overflow() {
+        let splats: Vec<Splat> = (0..3000).map(filling).collect();
+        let mut lists = TileLists::default();
+        // 5 x 5 tiles.
+        lists.build_within(75_000, &splats, 80, 80);
+        assert_eq!(lists.entries.len(), 75_000);
+        let refused = std::panic::catch_unwind(|| {
+            TileLists::default().build_within(74_999, &splats, 80, 80);
+        });
+        let message = *refused.unwrap_err().downcast::<String>().unwrap();
+        assert!(
+            message.contains("3000 visible Gaussians") && message.contains("80 x 80 pixels"),
+            "{message}"
+        );
     }
 }

@@ -217,3 +217,31 @@ fn planes_at_one_feel_no_sparsity() {
     assert!(planes.iter().all(|p| *p == 1.0));
     assert_eq!(plane_penalty(&planes, &config, &WEIGHTS), 0.0);
 }
+
+#[test]
+fn row_37_penalties_of_large_planes_are_summed_in_double_precision() {
+    let config = DeformationConfig {
+        spatial_resolution: [256; 3],
+        channels: 8,
+        ..small_planes(TimeEncoding::Compact)
+    };
+    let (levels, floats) = config.plane_layout();
+    // Every second row lies 2^-10 higher: all second differences are plus or minus 2^-9, exactly.
+    let mut planes = vec![1.0_f32; floats];
+    for layout in levels.iter().flatten() {
+        let row_len = layout.columns * config.channels as usize;
+        for row in (0..layout.rows).step_by(2) {
+            let start = layout.offset + row * row_len;
+            planes[start..start + row_len].fill(1.0 + 1.0 / 1024.0);
+        }
+    }
+    assert!(floats > 1_000_000, "{floats}");
+    let weights = PlaneWeights { smoothness: 1.0, time_smoothness: 0.0, time_sparsity: 0.0 };
+    // The mean of equal squares, times three planes on each level.
+    let expected = (1.0_f64 / 512.0).powi(2) * 3.0 * levels.len() as f64;
+    let penalty = plane_penalty(&planes, &config, &weights);
+    assert!((penalty / expected - 1.0).abs() < 1e-9, "{penalty} {expected}");
+    // A sum in single precision would not pass.
+    let tenths: f32 = (0..floats).map(|_| 0.1_f32).sum();
+    assert!((f64::from(tenths) / (0.1 * floats as f64) - 1.0).abs() > 1e-6);
+}

@@ -6,6 +6,7 @@
 //! | `progress` | which stages there are, and where the run stands |
 //! | `step` | what one step does |
 //! | `optimiser` | which parameter groups there are, and how fast they move |
+//! | `guard` | what happens to a step that leaves the finite numbers |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
@@ -19,6 +20,9 @@
 mod evaluate;
 mod frames;
 mod from_scene;
+mod guard;
+#[cfg(test)]
+mod guard_tests;
 mod guidance;
 mod identity;
 mod initialize;
@@ -38,6 +42,7 @@ use cif_render::Gradients;
 use cif_render::cpu::{Renderer, SimdLevel};
 
 use self::frames::FrameStore;
+pub use self::guard::{Fault, Hint, MAX_ROLLBACKS_IN_A_ROW};
 use self::guidance::Guidance;
 pub use self::measure::InstancePass;
 use self::optimiser::Optimiser;
@@ -77,6 +82,8 @@ pub struct Trainer {
     scratch: Scratch,
     /// Where the time of steps went.
     times: StepTimes,
+    /// Whether every array of a step is looked at.
+    debug_validation: bool,
     /// Off only while the cost of the pass is measured.
     instance_pass: InstancePass,
     /// Warnings not sent yet.
@@ -144,6 +151,7 @@ impl Trainer {
             gradients: Gradients::zeros(&field),
             scratch: Scratch::new(),
             times: StepTimes::default(),
+            debug_validation: false,
             instance_pass: InstancePass::On,
             warnings: Vec::new(),
             dataset,
@@ -232,6 +240,7 @@ impl Trainer {
     /// differ by rounding.
     pub fn set_simd(&mut self, simd: SimdLevel) {
         self.renderer = Renderer::new(simd);
+        self.renderer.set_inspection(self.debug_validation);
     }
 
     /// Name of the vector instructions in use.
@@ -254,7 +263,8 @@ impl Trainer {
     /// Runs all stages that are left; `observer` sees every event and may stop the run.
     ///
     /// # Errors
-    /// When a frame cannot be read, or a loss or gradient is not finite; the field then still is finite.
+    /// When a frame cannot be read, or too many steps in a row leave the finite numbers; the field then still is
+    /// finite.
     pub fn run(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
         let result = self.run_stages(observer);
         self.field.provenance = self.provenance();
@@ -310,6 +320,7 @@ impl Trainer {
             gaussians: self.field.gaussians.len(),
             psnr: self.progress.psnr.unwrap_or(0.0),
             peak_rss_mb: provenance::peak_rss_mb(),
+            rolled_back: self.progress.rollbacks.total,
         };
         self.emit(observer, &finished);
         Ok(Outcome::Finished)

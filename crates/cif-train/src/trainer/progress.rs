@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
+use super::guard::Rollbacks;
 use crate::config::TrainConfig;
 use crate::events::Stage;
 
@@ -29,6 +30,9 @@ pub(super) struct Progress {
     pub psnr: Option<f64>,
     /// Whether the user was told about unsupported pixels.
     pub warned_of_unsupported: bool,
+    /// Steps that were rolled back.
+    #[serde(default, skip_serializing_if = "Rollbacks::is_empty")]
+    pub rollbacks: Rollbacks,
     /// The scene whose Gaussians and deformation the run began with, where it began with one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub source: Option<Source>,
@@ -64,6 +68,7 @@ impl Progress {
             opacities_were_reset: false,
             psnr: None,
             warned_of_unsupported: false,
+            rollbacks: Rollbacks::default(),
             source: None,
         }
     }

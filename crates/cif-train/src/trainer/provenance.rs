@@ -39,6 +39,13 @@ impl Trainer {
             },
             "config": self.config,
         });
+        if !dataset.frame.is_identity() {
+            record["dataset"]["frame"] = json!(dataset.frame);
+        }
+        if !self.progress.rollbacks.is_empty() {
+            let rollbacks = &self.progress.rollbacks;
+            record["train"]["rolled_back"] = json!({ "steps": rollbacks.total, "last": rollbacks.last });
+        }
         if let Some(source) = &self.progress.source {
             record["train"]["from"] = json!(source);
         }

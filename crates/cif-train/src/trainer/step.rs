@@ -7,6 +7,7 @@ use cif_geometry::{PixelGrid, quaternion};
 use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
 use rand::seq::SliceRandom;
 
+use super::guard::gradient_fault;
 use super::optimiser::StepRates;
 use super::times::lap;
 use super::{InstancePass, Trainer};
@@ -113,7 +114,12 @@ impl Trainer {
         let mut loss = StepLoss::default();
         let (mut instance_loss, mut unsupported) = (0.0, 0);
         let pull = self.guidance_weight(stage, iteration);
+        let (psnr_before, snapshot) = (self.progress.psnr, self.snapshot());
+        let mut fault = self.fault_before_step();
         for (index, data) in &views {
+            if fault.is_some() {
+                break;
+            }
             let frame = &self.dataset.frames[*index];
             let time = frame.time;
             let labels = data.labels.as_ref().filter(|_| data.labelled > 0);
@@ -144,8 +150,10 @@ impl Trainer {
             let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
             instance_loss += share * pass.instance_loss;
             unsupported += pass.unsupported_pixels;
-            self.check_finite(color.loss, "the colour loss")?;
-            self.check_finite(pass.instance_loss, "the instance loss")?;
+            fault = self.fault_of_view(color.loss, pass.instance_loss);
+            if fault.is_some() {
+                break;
+            }
             let instance_weight = (share * f64::from(self.config.loss.lambda_instance)) as f32;
             let v_displacements = self.displacement_gradients(time, pull);
             self.renderer.backward_displaced(
@@ -155,6 +163,7 @@ impl Trainer {
                 &v_displacements,
                 &mut self.gradients,
             );
+            fault = self.fault_of_backward();
             self.times.add_view(self.field.gaussians.len(), &self.renderer.statistics());
         }
         self.times.add_render(&self.renderer.times());
@@ -164,25 +173,33 @@ impl Trainer {
             loss.unsupported = Some(unsupported as f64 / labelled as f64);
             loss.total += f64::from(self.config.loss.lambda_instance) * instance_loss;
         }
-        if matches!(stage, Stage::Coarse | Stage::Fine) && iteration < self.config.densify.until {
-            self.statistics.add(&self.gradients);
-        }
         let rates = StepRates::at(&self.config, stage, iteration, self.field.extent);
         let weights = PlaneWeights {
             smoothness: self.config.loss.plane_smoothness,
             time_smoothness: self.config.loss.time_smoothness,
             time_sparsity: self.config.loss.time_sparsity,
         };
-        self.optimiser
-            .step(
-                &mut self.field,
-                &mut self.gradients,
-                &rates,
-                &weights,
-                self.config.adam.visible_rows_only,
-                &mut self.times,
-            )
-            .map_err(|tensor| self.not_finite(tensor))?;
+        fault = fault.or_else(|| gradient_fault(&self.gradients, &rates));
+        if fault.is_none() {
+            if matches!(stage, Stage::Coarse | Stage::Fine) && iteration < self.config.densify.until {
+                self.statistics.add(&self.gradients);
+            }
+            self.optimiser
+                .step(
+                    &mut self.field,
+                    &mut self.gradients,
+                    &rates,
+                    &weights,
+                    self.config.adam.visible_rows_only,
+                    &mut self.times,
+                )
+                .map_err(|tensor| self.not_finite(tensor))?;
+            fault = self.fault_after_step();
+        }
+        match fault {
+            Some(fault) => self.roll_back(fault, snapshot, psnr_before, events)?,
+            None => self.progress.rollbacks.in_a_row = 0,
+        }
         self.gradients.screen.fill([0.0; 2]);
         self.gradients.radii.fill(0.0);
 
@@ -199,10 +216,6 @@ impl Trainer {
         self.times.total += start.elapsed();
         self.times.steps += 1;
         Ok(loss)
-    }
-
-    fn check_finite(&mut self, value: f64, tensor: &'static str) -> Result<(), TrainError> {
-        if value.is_finite() { Ok(()) } else { Err(self.not_finite(tensor)) }
     }
 
     fn not_finite(&mut self, tensor: &'static str) -> TrainError {

@@ -1,4 +1,5 @@
-//! `cif bench`: what a training step costs, and where; what accuracy of exported motion costs.
+//! `cif bench`: what a training step costs, and where; what accuracy of exported motion costs; how hard captures
+//! fare.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -15,7 +16,7 @@ use crate::error::Error;
 use crate::output;
 use crate::settings::Layers;
 
-/// Measure what a training step or an export costs
+/// Measure what a training step or an export costs, and how hard captures fare
 #[derive(Debug, Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub(super) struct Bench {
@@ -27,6 +28,7 @@ pub(super) struct Bench {
 enum What {
     Step(Step),
     Export(super::bench_export::BenchExport),
+    Hardness(super::bench_hardness::BenchHardness),
 }
 
 /// Tell where the time of a training step goes
@@ -101,6 +103,7 @@ pub(super) fn run(command: &Bench) -> Result<(), Error> {
     match &command.what {
         What::Step(command) => step(command),
         What::Export(command) => super::bench_export::run(command),
+        What::Hardness(command) => super::bench_hardness::run(command),
     }
 }
 

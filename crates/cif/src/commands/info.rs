@@ -85,6 +85,7 @@ fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
         ("points_from".to_owned(), json!(source)),
         ("points_box".to_owned(), corners(&points)),
         ("camera_box".to_owned(), corners(&centres)),
+        ("frame".to_owned(), json!((!dataset.frame.is_identity()).then_some(dataset.frame))),
         ("warnings".to_owned(), json!(dataset.warnings)),
     ])
 }

@@ -2,6 +2,8 @@
 
 mod bench;
 mod bench_export;
+mod bench_hardness;
+mod check;
 mod diff;
 mod eval;
 mod export;
@@ -51,6 +53,7 @@ A short tour:
   cif import table.usda --base table.cif -o new.cif      edits of that file come home
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
   cif label table.usda --instance 3 'blue mug'           give it another name
+  cif check table.cif                                    is it numerically sound?
 
 A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
 instance masks (PNG, value = instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/.
@@ -69,6 +72,7 @@ enum Command {
     Query(query::Query),
     Label(label::Label),
     Info(info::Info),
+    Check(check::Check),
     Masks(masks::Masks),
     Bench(bench::Bench),
 }
@@ -146,6 +150,7 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
         Command::Query(command) => query::run(&command),
         Command::Label(command) => label::run(&command),
         Command::Info(command) => info::run(&command),
+        Command::Check(command) => check::run(&command),
         Command::Masks(command) => masks::run(&command),
         Command::Bench(command) => bench::run(&command),
     };

@@ -55,6 +55,10 @@ pub(super) struct Train {
     /// Write every event as a line of JSON
     #[arg(long, value_name = "FILE.jsonl")]
     log: Option<PathBuf>,
+    /// Look at every array of every step, and name the part, the tensor and the index of the first value that
+    /// is not finite. Slower; the scene is the same. Without it such steps are rolled back and counted, too
+    #[arg(long)]
+    debug_validation: bool,
     /// Show no progress
     #[arg(short, long)]
     quiet: bool,
@@ -182,6 +186,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     }
     .map_err(Error::plain)?;
     trainer.set_simd(command.simd.into());
+    trainer.set_debug_validation(command.debug_validation);
 
     let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
     interrupt::watch();

@@ -63,6 +63,7 @@ impl Renderer {
         let (pairs, label_mass) = timed(&mut times.rasterize_backward, || {
             self.rasterize_backward(field, v_color, instance_weight, &settings)
         });
+        self.inspect_pairs(&pairs, &label_mass.values);
 
         let n = field.gaussians.len();
         let deformation =
@@ -72,6 +73,7 @@ impl Renderer {
             self.project_backward(field, &view, &pairs, gradients, &mut v_posed);
             self.calibration_backward(field, &label_mass, gradients);
         });
+        self.inspect_posed_gradients(&v_posed, gradients);
         if let Some(deformation) = deformation {
             timed(&mut times.deform_backward, || {
                 for (total, v) in
@@ -100,6 +102,7 @@ impl Renderer {
                     &mut gradients.gaussians.means,
                 );
             });
+            self.inspect_deformation_gradients(gradients);
         }
         self.times = times;
     }

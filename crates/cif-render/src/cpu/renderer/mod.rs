@@ -8,11 +8,13 @@
 //! | `count` | label mass for identity estimation |
 //! | `pose` | Gaussians at the time of the view |
 //! | `displace` | motion without pictures |
+//! | `inspect` | the first value that is not finite |
 
 mod backward;
 mod count;
 mod displace;
 mod images;
+mod inspect;
 mod pose;
 
 use cif_field::{Field, Identities};
@@ -20,6 +22,7 @@ use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
+pub use self::inspect::NotFinite;
 use self::pose::{PosedView, pose};
 use super::bin::{TileLists, sort_by_depth};
 use super::deform::PosedArrays;
@@ -86,6 +89,7 @@ pub struct Renderer {
     times: StageTimes,
     statistics: ViewStatistics,
     tape: Tape,
+    inspection: inspect::Inspection,
 }
 
 impl std::fmt::Debug for Renderer {
@@ -109,6 +113,7 @@ impl Renderer {
             times: StageTimes::default(),
             statistics: ViewStatistics::default(),
             tape: Tape::default(),
+            inspection: inspect::Inspection::default(),
         }
     }
 
@@ -207,6 +212,8 @@ impl Renderer {
             ..ViewStatistics::default()
         };
         self.times = times;
+        self.inspect_posed();
+        self.inspect_splats();
     }
 
     fn place(&self, tile: usize) -> TilePlace {
@@ -265,6 +272,7 @@ impl Renderer {
                 .pixels;
         });
         self.times = times;
+        self.inspect_image();
     }
 
     /// Mean loss over labelled pixels, and how many of them no covering Gaussian supports.

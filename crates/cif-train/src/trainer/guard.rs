@@ -1,0 +1,319 @@
+//! Steps that leave the finite numbers: found before anything has moved, told, counted.
+//!
+//! The gradients of a step are looked at before the optimiser touches anything, so that a bad step leaves
+//! parameters and moments exactly as they were. The run then goes on with the next views, since a single view
+//! may be at fault; after [`MAX_ROLLBACKS_IN_A_ROW`] bad steps it stops.
+//!
+//! [`Trainer::set_debug_validation`] also looks at every array on the way from the field to the gradients and
+//! back, which tells where the value first appeared.
+
+use cif_field::Field;
+use cif_render::Gradients;
+use cif_render::cpu::NotFinite;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::Trainer;
+use super::optimiser::{Optimiser, StepRates};
+use crate::error::TrainError;
+use crate::events::TrainEvent;
+
+/// Bad steps in a row after which a run stops.
+pub const MAX_ROLLBACKS_IN_A_ROW: u32 = 10;
+
+/// Largest gradient whose square is finite in single precision, with a margin; what is larger counts as not
+/// finite, because it would make a moment infinite for ever.
+const MAX_GRADIENT: f32 = 1e18;
+
+/// Largest learning rate: a step moves by a few times the rate, so that parameters below stay finite.
+const MAX_RATE: f32 = 1e30;
+
+/// Floats that one task looks at.
+const CHUNK: usize = 1 << 14;
+
+/// A value that is not finite, where it was first met.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Fault {
+    /// Part of the step: `deform`, `project`, `rasterize`, `losses`, `rasterize backward`, `project backward`,
+    /// `deform backward`, `gradients` (any of the backward parts), `parameters`, `optimiser`.
+    pub part: &'static str,
+    /// Array, by name.
+    pub tensor: &'static str,
+    /// Position in the array, all its floats counted in their order.
+    pub index: usize,
+    /// The value, as text because JSON has no word for it.
+    pub value: String,
+}
+
+impl std::fmt::Display for Fault {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}: {}[{}] is {}", self.part, self.tensor, self.index, self.value)
+    }
+}
+
+impl From<NotFinite> for Fault {
+    fn from(found: NotFinite) -> Self {
+        let NotFinite { part, tensor, index, value } = found;
+        Self { part, tensor, index, value: value.to_string() }
+    }
+}
+
+/// Steps rolled back; saved with the progress of a run.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Rollbacks {
+    /// In the whole run.
+    pub total: u64,
+    /// Since the last good step.
+    pub in_a_row: u32,
+    /// What was found last.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub last: Option<String>,
+}
+
+impl Rollbacks {
+    /// Whether there were none.
+    pub(super) fn is_empty(&self) -> bool {
+        self.total == 0
+    }
+}
+
+/// What a step may have to go back to, where the gradients alone do not tell in time.
+pub(super) struct Snapshot {
+    field: Field,
+    optimiser: Optimiser,
+}
+
+/// The first value above a limit or not a number.
+fn first_beyond(values: &[f32], limit: f32) -> Option<usize> {
+    let within = |values: &[f32]| values.iter().fold(true, |all, value| all & (value.abs() <= limit));
+    values.par_chunks(CHUNK).enumerate().find_map_first(|(chunk, values)| {
+        if within(values) {
+            return None;
+        }
+        let position = values.iter().position(|value| !within(std::slice::from_ref(value)))?;
+        Some(chunk * CHUNK + position)
+    })
+}
+
+fn fault(part: &'static str, tensor: &'static str, values: &[f32], limit: f32) -> Option<Fault> {
+    let index = first_beyond(values, limit)?;
+    Some(Fault { part, tensor, index, value: values[index].to_string() })
+}
+
+/// The first gradient that a group which moves cannot take, or rate that would leave the finite numbers.
+pub(super) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option<Fault> {
+    let g = &gradients.gaussians;
+    let groups: [(&'static str, &[f32], f32); 9] = [
+        ("means", g.means.as_flattened(), rates.means),
+        ("log_scales", g.log_scales.as_flattened(), rates.log_scales),
+        ("quaternions", g.quaternions.as_flattened(), rates.quaternions),
+        ("opacity_logits", &g.opacity_logits, rates.opacity),
+        ("occupancy_logits", &g.occupancy_logits, rates.occupancy),
+        ("sh_coefficients", g.sh_coefficients.as_flattened(), rates.sh_base.max(rates.sh_rest)),
+        ("log_calibrations", &gradients.log_calibrations, rates.calibration),
+        ("planes", &gradients.planes, rates.planes),
+        ("mlp", &gradients.mlp, rates.mlp),
+    ];
+    groups.into_iter().filter(|(_, _, rate)| *rate != 0.0).find_map(|(tensor, values, rate)| {
+        if !(rate.abs() <= MAX_RATE) {
+            return Some(Fault {
+                part: "optimiser",
+                tensor: rate_name(tensor),
+                index: 0,
+                value: rate.to_string(),
+            });
+        }
+        fault("gradients", gradient_name(tensor), values, MAX_GRADIENT)
+    })
+}
+
+/// `gradient of ...` without allocation.
+fn gradient_name(tensor: &str) -> &'static str {
+    match tensor {
+        "means" => "gradient of means",
+        "log_scales" => "gradient of log_scales",
+        "quaternions" => "gradient of quaternions",
+        "opacity_logits" => "gradient of opacity_logits",
+        "occupancy_logits" => "gradient of occupancy_logits",
+        "sh_coefficients" => "gradient of sh_coefficients",
+        "log_calibrations" => "gradient of log_calibrations",
+        "planes" => "gradient of planes",
+        _ => "gradient of mlp",
+    }
+}
+
+/// `learning rate of ...` without allocation.
+fn rate_name(tensor: &str) -> &'static str {
+    match tensor {
+        "means" => "learning rate of means",
+        "log_scales" => "learning rate of log_scales",
+        "quaternions" => "learning rate of quaternions",
+        "opacity_logits" => "learning rate of opacity_logits",
+        "occupancy_logits" => "learning rate of occupancy_logits",
+        "sh_coefficients" => "learning rate of sh_coefficients",
+        "log_calibrations" => "learning rate of log_calibrations",
+        "planes" => "learning rate of planes",
+        _ => "learning rate of mlp",
+    }
+}
+
+/// The first parameter that is not finite.
+fn parameter_fault(part: &'static str, field: &Field) -> Option<Fault> {
+    let g = &field.gaussians;
+    let calibrations = field.identities.as_ref().map_or(&[][..], |rows| &rows.log_calibrations);
+    let (planes, mlp) = field.deformation.as_ref().map_or((&[][..], &[][..]), |d| (&d.planes, &d.mlp));
+    [
+        ("means", g.means.as_flattened()),
+        ("log_scales", g.log_scales.as_flattened()),
+        ("quaternions", g.quaternions.as_flattened()),
+        ("opacity_logits", &g.opacity_logits),
+        ("occupancy_logits", &g.occupancy_logits),
+        ("sh_coefficients", g.sh_coefficients.as_flattened()),
+        ("log_calibrations", calibrations),
+        ("planes", planes),
+        ("mlp", mlp),
+    ]
+    .into_iter()
+    .find_map(|(tensor, values)| fault(part, tensor, values, f32::MAX))
+}
+
+/// The first moment that is not finite.
+fn moment_fault(optimiser: &Optimiser) -> Option<Fault> {
+    optimiser.groups().into_iter().find_map(|(_, moments)| {
+        fault("optimiser", "first moments", &moments.first, f32::MAX)
+            .or_else(|| fault("optimiser", "second moments", &moments.second, f32::MAX))
+    })
+}
+
+impl Trainer {
+    /// Looks at every array of a step, so that a value which is not finite is told with the part, the tensor and
+    /// the index where it first appeared. Costs time and a second copy of field and moments; results do not
+    /// change.
+    pub fn set_debug_validation(&mut self, on: bool) {
+        self.debug_validation = on;
+        self.renderer.set_inspection(on);
+    }
+
+    /// Steps rolled back so far, over interruptions.
+    #[must_use]
+    pub fn rolled_back(&self) -> u64 {
+        self.progress.rollbacks.total
+    }
+
+    /// A copy to go back to, under debug validation.
+    pub(super) fn snapshot(&self) -> Option<Snapshot> {
+        self.debug_validation
+            .then(|| Snapshot { field: self.field.clone(), optimiser: self.optimiser.clone() })
+    }
+
+    /// What was wrong with the parameters before a step, under debug validation.
+    pub(super) fn fault_before_step(&self) -> Option<Fault> {
+        if self.debug_validation { parameter_fault("parameters", &self.field) } else { None }
+    }
+
+    /// What the renderer met, then a loss that is not finite.
+    pub(super) fn fault_of_view(&mut self, color_loss: f64, instance_loss: f64) -> Option<Fault> {
+        if let Some(found) = self.renderer.take_not_finite() {
+            return Some(found.into());
+        }
+        [("colour loss", color_loss), ("instance loss", instance_loss)]
+            .into_iter()
+            .find(|(_, value)| !value.is_finite())
+            .map(|(tensor, value)| Fault { part: "losses", tensor, index: 0, value: value.to_string() })
+            .or_else(|| {
+                let v_color = self.scratch.v_color.pixels.as_flattened();
+                self.debug_validation.then(|| fault("losses", "gradient of colour", v_color, f32::MAX))?
+            })
+    }
+
+    /// What the renderer met on the way back.
+    pub(super) fn fault_of_backward(&mut self) -> Option<Fault> {
+        self.renderer.take_not_finite().map(Fault::from)
+    }
+
+    /// What the optimiser made, under debug validation.
+    pub(super) fn fault_after_step(&self) -> Option<Fault> {
+        if !self.debug_validation {
+            return None;
+        }
+        parameter_fault("optimiser", &self.field).or_else(|| moment_fault(&self.optimiser))
+    }
+
+    /// Undoes the step that met a fault: parameters and moments are those before it, which views it had counts
+    /// as done. Too many in a row end the run.
+    pub(super) fn roll_back(
+        &mut self,
+        fault: Fault,
+        snapshot: Option<Snapshot>,
+        psnr_before: Option<f64>,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        if let Some(Snapshot { field, optimiser }) = snapshot {
+            (self.field, self.optimiser) = (field, optimiser);
+        }
+        // Leftovers of the failed step must not reach another one.
+        self.gradients.reset();
+        self.progress.psnr = psnr_before;
+        let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
+        let rollbacks = &mut self.progress.rollbacks;
+        rollbacks.total += 1;
+        rollbacks.in_a_row += 1;
+        rollbacks.last = Some(format!("{stage} stage, step {iteration}: {fault}"));
+        let (in_a_row, total) = (rollbacks.in_a_row, rollbacks.total);
+        if in_a_row >= MAX_ROLLBACKS_IN_A_ROW {
+            // A resumed run gets as many attempts again.
+            rollbacks.in_a_row = 0;
+            let hint = if self.debug_validation { Hint::Rates } else { Hint::Validate };
+            return Err(TrainError::Diverged { stage, iteration, in_a_row, fault, hint });
+        }
+        events.push(TrainEvent::RolledBack { stage, iteration, fault, in_a_row, total });
+        Ok(())
+    }
+}
+
+/// What to try next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Hint {
+    /// Look more closely.
+    Validate,
+    /// The place is known.
+    Rates,
+}
+
+impl std::fmt::Display for Hint {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Validate => {
+                "--debug-validation tells in which part it first appears; a smaller learning rate or another \
+                 seed may help"
+            }
+            Self::Rates => "a smaller learning rate or another seed may help",
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_bad_float_is_found_on_any_number_of_threads() {
+        let mut values = vec![0.5_f32; 3 * CHUNK + 7];
+        assert_eq!(first_beyond(&values, MAX_GRADIENT), None);
+        for (index, value) in [(3 * CHUNK + 6, f32::NAN), (CHUNK + 1, f32::NEG_INFINITY), (5, -2e18)] {
+            values[index] = value;
+            for threads in [1, 2] {
+                let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+                assert_eq!(pool.install(|| first_beyond(&values, MAX_GRADIENT)), Some(index));
+            }
+        }
+        assert_eq!(first_beyond(&values[..5], MAX_GRADIENT), None);
+    }
+
+    #[test]
+    fn faults_read_well() {
+        let fault = Fault { part: "project", tensor: "splats", index: 17, value: f32::NAN.to_string() };
+        assert_eq!(fault.to_string(), "project: splats[17] is NaN");
+    }
+}

@@ -1,0 +1,316 @@
+//! `cif bench hardness`: trains a capture that was changed in ways which must not matter or must not break.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use cif_dataset::{Dataset, Layout};
+use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
+use cif_train::{Control, Outcome, TrainConfig, TrainEvent, Trainer};
+use clap::Args;
+use serde::Serialize;
+use serde_json::json;
+
+use super::{CaptureOptions, print_warnings, train};
+use crate::error::Error;
+use crate::hard_captures::{Demand, HARD_CAPTURES, HardCapture, Unfit};
+use crate::settings::Layers;
+use crate::{interrupt, output};
+
+/// What scale, place and axes may cost, dB.
+const MAX_PSNR_LOSS: f64 = 0.3;
+
+/// What scale, place and axes may cost, percent of mIoU.
+const MAX_MIOU_LOSS: f64 = 1.0;
+
+/// Train hard variants of a capture and compare them with the capture itself
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Every variant is trained with the same settings and seed, and scored on the same held-out frames.
+Scaling, moving and turning the capture must not change PSNR by 0.3 dB or mIoU by 1 point; every
+variant must end with a finite scene. Exit code 1 when one does not.
+
+  cif bench hardness captures/table -o hardness
+  cif bench hardness captures/table -o hardness --quick --only moved,wrong-camera
+
+The folder gets report.json and report.md. --quick trains half of the variants with a schedule of
+480 steps; without it the draft preset decides, unless --preset names another.")]
+pub(super) struct BenchHardness {
+    /// Folder of the capture
+    capture: PathBuf,
+    /// Folder of the report
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Write into a folder that is not empty
+    #[arg(long)]
+    force: bool,
+    /// Fewer variants and a short schedule
+    #[arg(long)]
+    quick: bool,
+    /// Only these variants
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
+    only: Vec<String>,
+    /// Named settings: draft, standard or paper [default: draft]
+    #[arg(long, value_name = "NAME")]
+    preset: Option<String>,
+    /// Any setting by its key in SCENE.train.toml, e.g. --set stages.fine=500
+    #[arg(long, value_name = "TABLE.KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+}
+
+/// How a variant went.
+#[derive(Clone, Debug, Default, Serialize)]
+struct Row {
+    name: &'static str,
+    what: &'static str,
+    /// `same`, `ok`, `differs`, `failed` or `skipped`.
+    verdict: &'static str,
+    psnr: Option<f64>,
+    psnr_change: Option<f64>,
+    miou: Option<f64>,
+    miou_change: Option<f64>,
+    gaussians: usize,
+    rolled_back: u64,
+    seconds: f64,
+    /// What stopped the run, what it lacks, or what it warned of.
+    notes: Vec<String>,
+}
+
+pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
+    let names: Vec<&str> = HARD_CAPTURES.iter().map(|hard| hard.name).collect();
+    if let Some(unknown) = command.only.iter().find(|name| !names.contains(&name.as_str())) {
+        return Err(Error::usage(
+            format!("--only {unknown}: there is no such variant"),
+            format!("the variants are {}", names.join(", ")),
+        ));
+    }
+    resolve(command, Layout::HyperNerf)?;
+    let dataset = command.capture_options.open(&command.capture)?;
+    print_warnings(&dataset);
+    if dataset.val_frames().is_empty() {
+        return Err(Error::failed(
+            format!(
+                "{}: no frame is held out, so that variants cannot be compared",
+                command.capture.display()
+            ),
+            "give a capture with held-out frames",
+        ));
+    }
+    output::check_folder(&command.output, command.force)?;
+    let config = resolve(command, dataset.layout)?;
+    let chosen: Vec<&HardCapture> = HARD_CAPTURES
+        .iter()
+        .filter(|hard| {
+            if command.only.is_empty() {
+                !command.quick || hard.quick
+            } else {
+                command.only.contains(&hard.name.to_owned())
+            }
+        })
+        .collect();
+
+    interrupt::watch();
+    let mut baseline = Row { name: "as it is", what: "the capture itself", verdict: "ok", ..Row::default() };
+    measure(&mut baseline, &dataset, &config)?;
+    if baseline.verdict == "failed" {
+        return Err(Error::plain(format!("{}: {}", command.capture.display(), baseline.notes.join("; "))));
+    }
+    tell(&baseline);
+    let mut rows = vec![baseline.clone()];
+    for hard in chosen {
+        let folder = tempfile::tempdir()
+            .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
+        let mut row = Row { name: hard.name, what: hard.what, verdict: "ok", ..Row::default() };
+        match hard.of(&dataset, folder.path()) {
+            Ok(changed) => {
+                row.notes.extend(changed.warnings.iter().cloned());
+                measure(&mut row, &changed, &config)?;
+            }
+            Err(Unfit::Lacks(what)) => {
+                row.verdict = "skipped";
+                row.notes.push(format!("the capture has no {what}").replace("no a ", "no "));
+            }
+            Err(Unfit::Failed(error)) => return Err(error),
+        }
+        let change = |now: Option<f64>, before: Option<f64>| Some(now? - before?);
+        row.psnr_change = change(row.psnr, baseline.psnr);
+        row.miou_change = change(row.miou, baseline.miou);
+        if hard.demand == Demand::Same && row.verdict == "ok" {
+            // Written so that a missing score counts as a difference.
+            let within = |change: Option<f64>, known: Option<f64>, limit: f64| {
+                known.is_none() || change.is_some_and(|change| change.abs() < limit)
+            };
+            let same = within(row.psnr_change, baseline.psnr, MAX_PSNR_LOSS)
+                && within(row.miou_change, baseline.miou, MAX_MIOU_LOSS);
+            row.verdict = if same { "same" } else { "differs" };
+        }
+        tell(&row);
+        rows.push(row);
+    }
+    write_report(command, &config, &rows)?;
+    let bad: Vec<&str> =
+        rows.iter().filter(|row| ["failed", "differs"].contains(&row.verdict)).map(|row| row.name).collect();
+    if bad.is_empty() {
+        return Ok(());
+    }
+    Err(Error::failed(
+        format!("{} of {} variants went wrong: {}", bad.len(), rows.len() - 1, bad.join(", ")),
+        format!("{} says how", command.output.join("report.md").display()),
+    ))
+}
+
+/// Settings of the preset, then what was typed.
+fn resolve(command: &BenchHardness, layout: Layout) -> Result<TrainConfig, Error> {
+    let name = command.preset.as_deref().unwrap_or("draft");
+    let mut config = TrainConfig::preset(train::preset(name, "--preset")?, layout);
+    if command.quick {
+        (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 300, 120);
+        config.model.sh_interval = 60;
+        config.model.max_initial_points = 2_000;
+        config.densify.max_gaussians = 2_500;
+        (config.densify.from, config.densify.every, config.densify.until) = (30, 30, 240);
+        (config.resample.from, config.resample.every, config.resample.until) = (20, 20, 100);
+    }
+    let mut layers = Layers::new(config);
+    for assignment in &command.set {
+        layers.assignment(assignment)?;
+    }
+    let config = layers.finish();
+    config.validate().map_err(Error::plain)?;
+    Ok(config)
+}
+
+/// Trains and scores one capture; whatever goes wrong is noted.
+///
+/// # Errors
+/// Only when interrupted.
+fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(), Error> {
+    let start = Instant::now();
+    // A panic is a finding here, not an end.
+    let result = catch_unwind(AssertUnwindSafe(|| train_and_score(row, dataset, config)));
+    if interrupt::requested() {
+        return Err(Error::Interrupted {
+            message: "interrupted; no report was written".to_owned(),
+            help: None,
+        });
+    }
+    row.seconds = start.elapsed().as_secs_f64();
+    match result {
+        Ok(Ok(())) => {}
+        Ok(Err(message)) => {
+            row.verdict = "failed";
+            row.notes.push(message);
+        }
+        Err(_) => {
+            row.verdict = "failed";
+            row.notes.push("panicked".to_owned());
+        }
+    }
+    Ok(())
+}
+
+fn train_and_score(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(), String> {
+    let mut trainer = Trainer::new(dataset.clone(), config.clone()).map_err(|error| error.to_string())?;
+    let mut notes = Vec::new();
+    let outcome = trainer.run(&mut |event, _| {
+        if let TrainEvent::Warning { message } = event {
+            notes.push(message.clone());
+        }
+        if interrupt::requested() { Control::Stop } else { Control::Continue }
+    });
+    row.rolled_back = trainer.rolled_back();
+    row.notes.append(&mut notes);
+    match outcome {
+        Ok(Outcome::Finished) => {}
+        Ok(Outcome::Interrupted) => return Ok(()),
+        Err(error) => return Err(error.to_string()),
+    }
+    let field = trainer.into_field();
+    row.gaussians = field.len();
+    field.validate().map_err(|error| error.to_string())?;
+    let options = EvaluationOptions::held_out(&field);
+    let scores =
+        evaluate::<EvaluationError>(&field, dataset, &options, |_| Ok(())).map_err(|e| e.to_string())?;
+    (row.psnr, row.miou) = (scores.overall.psnr, scores.overall.instance.miou);
+    if row.psnr.is_some_and(|psnr| !psnr.is_finite()) {
+        return Err("a held-out view has values that are not finite".to_owned());
+    }
+    Ok(())
+}
+
+fn number(value: Option<f64>) -> String {
+    value.map_or("n/a".to_owned(), |value| format!("{value:.2}"))
+}
+
+fn signed(value: Option<f64>) -> String {
+    value.map_or(String::new(), |value| format!("{value:+.2}"))
+}
+
+fn tell(row: &Row) {
+    eprintln!(
+        "{:>18}  {:<8} PSNR {} {}  mIoU {} {}  {:.0} s",
+        row.name,
+        row.verdict,
+        number(row.psnr),
+        signed(row.psnr_change),
+        number(row.miou),
+        signed(row.miou_change),
+        row.seconds
+    );
+}
+
+fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> Result<(), Error> {
+    let mut table = super::table([
+        "variant",
+        "verdict",
+        "PSNR",
+        "change",
+        "mIoU",
+        "change",
+        "Gaussians",
+        "rolled back",
+        "seconds",
+    ]);
+    let mut text = String::from(
+        "| variant | what | verdict | PSNR, dB | change | mIoU, % | change | Gaussians | rolled back |\n\
+         |---|---|---|---|---|---|---|---|---|\n",
+    );
+    for row in rows {
+        let (psnr, psnr_change) = (number(row.psnr), signed(row.psnr_change));
+        let (miou, miou_change) = (number(row.miou), signed(row.miou_change));
+        text += &format!(
+            "| {} | {} | {} | {psnr} | {psnr_change} | {miou} | {miou_change} | {} | {} |\n",
+            row.name, row.what, row.verdict, row.gaussians, row.rolled_back
+        );
+        table.add_row([
+            row.name,
+            row.verdict,
+            &psnr,
+            &psnr_change,
+            &miou,
+            &miou_change,
+            &row.gaussians.to_string(),
+            &row.rolled_back.to_string(),
+            &format!("{:.0}", row.seconds),
+        ]);
+    }
+    let notes =
+        rows.iter().flat_map(|row| row.notes.iter().map(move |note| format!("- {}: {note}\n", row.name)));
+    text += "\n";
+    text.extend(notes);
+    println!("{table}");
+    let report = json!({
+        "capture": command.capture,
+        "limits": { "psnr_db": MAX_PSNR_LOSS, "miou_percent": MAX_MIOU_LOSS },
+        "config": config,
+        "variants": rows,
+    });
+    write(&command.output.join("report.json"), &format!("{report:#}\n"))?;
+    write(&command.output.join("report.md"), &text)
+}
+
+fn write(path: &Path, text: &str) -> Result<(), Error> {
+    output::write_file(path, text.as_bytes())
+}
