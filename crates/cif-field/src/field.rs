@@ -86,7 +86,7 @@ impl Field {
     pub fn gather(&self, sources: &[u32]) -> Self {
         Self {
             gaussians: self.gaussians.gather(sources),
-            deformation: self.deformation.clone(),
+            deformation: self.deformation.as_ref().map(|deformation| deformation.gather(sources)),
             tracks: self.tracks.as_ref().and_then(|tracks| tracks.gather(sources).compact()),
             identities: self.identities.as_ref().map(|identities| identities.gather(sources)),
             instances: self.instances.clone(),

@@ -28,6 +28,11 @@ impl Field {
             hash.json(&(&deformation.config, deformation.bounds));
             hash.array(&deformation.planes);
             hash.array(&deformation.mlp);
+            if deformation.still.contains(&true) {
+                hash.array(
+                    &(0..gaussians.len()).map(|row| u8::from(deformation.is_still(row))).collect::<Vec<_>>(),
+                );
+            }
         }
         hash.array(&[u8::from(self.deformation.is_some()), u8::from(self.tracks.is_some())]);
         if let Some(tracks) = &self.tracks {

@@ -49,19 +49,28 @@ impl Identities {
     pub fn probabilities(&self) -> Vec<f32> {
         let mut probabilities = vec![0.0; self.labels.len()];
         for row in 0..self.len() {
-            let range = self.range(row);
-            let logit = |entry: usize| self.log_estimates[entry] + self.log_calibrations[entry];
-            let largest = range.clone().map(logit).fold(f32::NEG_INFINITY, f32::max);
-            let mut sum = 0.0;
-            for entry in range.clone() {
-                probabilities[entry] = (logit(entry) - largest).exp();
-                sum += probabilities[entry];
-            }
-            for entry in range {
-                probabilities[entry] /= sum;
-            }
+            self.row_probabilities(row, &mut probabilities[self.range(row)]);
         }
         probabilities
+    }
+
+    /// Probabilities of the entries of one row, see [`Self::probabilities`].
+    ///
+    /// # Panics
+    /// When `probabilities` has another length than the row.
+    pub fn row_probabilities(&self, row: usize, probabilities: &mut [f32]) {
+        let range = self.range(row);
+        assert_eq!(probabilities.len(), range.len(), "one probability per entry");
+        let logit = |entry: usize| self.log_estimates[entry] + self.log_calibrations[entry];
+        let largest = range.clone().map(logit).fold(f32::NEG_INFINITY, f32::max);
+        let mut sum = 0.0;
+        for (probability, entry) in probabilities.iter_mut().zip(range) {
+            *probability = (logit(entry) - largest).exp();
+            sum += *probability;
+        }
+        for probability in probabilities {
+            *probability /= sum;
+        }
     }
 
     /// Most probable label of every row; the lowest one where several are. Rows must not be empty.

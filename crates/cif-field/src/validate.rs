@@ -119,6 +119,10 @@ impl Field {
         self.gaussians.validate()?;
         if let Some(deformation) = &self.deformation {
             deformation.validate()?;
+            let (found, expected) = (deformation.still.len(), self.gaussians.len());
+            if found > expected {
+                return Err(FieldError::Length { array: "deformation.still", found, expected });
+            }
         }
         if let Some(tracks) = &self.tracks {
             tracks.validate(self.gaussians.len())?;

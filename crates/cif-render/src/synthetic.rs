@@ -191,6 +191,7 @@ fn deformation(heads: Heads, gaussians: &Gaussians, random: &mut Pcg64Mcg) -> De
         mlp: vec![0.0; mlp.len],
         bounds,
         config,
+        still: Vec::new(),
     };
     let mut fill = |range: std::ops::Range<usize>, size: f32| {
         for value in &mut deformation.mlp[range] {

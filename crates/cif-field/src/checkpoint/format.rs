@@ -10,16 +10,36 @@ use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Time
 
 /// Newest version of the layout, which this crate writes where it is needed; it reads all up to it.
 ///
-/// 1 is the first; 2 adds recorded motion ([`crate::Tracks`]). A field without tracks is written as 1, so that
-/// older software reads it.
-pub const FORMAT: u32 = 2;
+/// 1 is the first; 2 adds recorded motion ([`crate::Tracks`]); 3 adds Gaussians that stand still
+/// ([`crate::Deformation::still`]). A field without these is written as 1 or 2, so that older software reads it.
+pub const FORMAT: u32 = 3;
+
+/// The layout before Gaussians could stand still.
+const FORMAT_WITH_TRACKS: u32 = 2;
 
 /// The layout before there were tracks.
 const FORMAT_WITHOUT_TRACKS: u32 = 1;
 
 /// Oldest layout that holds a field.
 pub(super) fn format_of(field: &Field) -> u32 {
-    if field.tracks.is_some() { FORMAT } else { FORMAT_WITHOUT_TRACKS }
+    if stands_still(field) {
+        FORMAT
+    } else if field.tracks.is_some() {
+        FORMAT_WITH_TRACKS
+    } else {
+        FORMAT_WITHOUT_TRACKS
+    }
+}
+
+/// Whether any Gaussian of a deformed field stands still.
+fn stands_still(field: &Field) -> bool {
+    field.deformation.as_ref().is_some_and(|deformation| deformation.still.contains(&true))
+}
+
+/// Per Gaussian, 1 where it stands still; nothing when none does.
+pub(super) fn still_rows(field: &Field) -> Option<Vec<u8>> {
+    let deformation = field.deformation.as_ref().filter(|_| stands_still(field))?;
+    Some((0..field.len()).map(|row| u8::from(deformation.is_still(row))).collect())
 }
 
 /// Longest header, bytes; the limit of the safetensors format.
@@ -38,6 +58,7 @@ pub(super) const OCCUPANCY_LOGITS: &str = "gaussians.occupancy_logits";
 pub(super) const SH_COEFFICIENTS: &str = "gaussians.sh_coefficients";
 pub(super) const PLANES: &str = "deformation.planes";
 pub(super) const MLP: &str = "deformation.mlp";
+pub(super) const STILL: &str = "deformation.still";
 pub(super) const TRACK_GROUPS: &str = "tracks.group_of";
 pub(super) const TRACK_POSES: &str = "tracks.poses";
 pub(super) const TRACK_MEANS: &str = "tracks.means";
@@ -73,6 +94,9 @@ pub(super) struct FieldJson {
 pub(super) struct DeformationJson {
     pub(super) config: DeformationConfig,
     pub(super) bounds: Bounds,
+    /// Whether there is a tensor of Gaussians that stand still.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub(super) has_still: bool,
 }
 
 /// The part of a [`TrackGroup`] that is not a tensor.
@@ -180,6 +204,7 @@ impl FieldJson {
             deformation: field.deformation.as_ref().map(|deformation| DeformationJson {
                 config: deformation.config.clone(),
                 bounds: deformation.bounds,
+                has_still: stands_still(field),
             }),
             tracks: field
                 .tracks

@@ -18,6 +18,7 @@
 //! | `gaussians.opacity_logits`, `gaussians.occupancy_logits` | F32 | `[N]` |
 //! | `gaussians.sh_coefficients` | F32 | `[N, 16, 3]` |
 //! | `deformation.planes`, `deformation.mlp` | F32 | `[floats]`; absent in a static scene |
+//! | `deformation.still` | U8 | `[N]`, 1 where the deformation leaves a Gaussian as it is; absent where it moves all |
 //! | `tracks.group_of` | U32 | `[N]`, 2^32 - 1 without a group; absent without recorded motion, as the next four |
 //! | `tracks.poses` | F64 | `[poses, 8]`: time, translation x y z, quaternion w x y z; group after group |
 //! | `tracks.means`, `tracks.log_scales` | F32 | `[rows, 3]`, dense samples, group after group |

@@ -12,7 +12,7 @@ use safetensors::tensor::{Metadata, TensorInfo};
 use super::format::{
     FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES,
     MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS,
-    SH_COEFFICIENTS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS,
+    SH_COEFFICIENTS, STILL, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS,
     TRAINING_KEY, TRAINING_PREFIX, TrackArrays, TrackGroupJson, VERSION_KEY,
 };
 use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
@@ -110,6 +110,7 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
                 mlp: reader.values(MLP, Dtype::F32, mlp, &[])?,
                 config: shape.config,
                 bounds: shape.bounds,
+                still: if shape.has_still { read_still(reader, n)? } else { Vec::new() },
             })
         }
     };
@@ -143,6 +144,14 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
         extent: json.extent,
         provenance: json.provenance,
     })
+}
+
+fn read_still<S: Read + Seek>(reader: &mut Reader<'_, S>, n: usize) -> Result<Vec<bool>, CheckpointError> {
+    let flags: Vec<u8> = reader.values(STILL, Dtype::U8, n, &[])?;
+    match flags.iter().find(|flag| **flag > 1) {
+        Some(flag) => Err(reader.tensor_error(STILL, &format!("holds {flag}, where 0 or 1 must be"))),
+        None => Ok(flags.into_iter().map(|flag| flag != 0).collect()),
+    }
 }
 
 fn read_tracks<S: Read + Seek>(

@@ -12,8 +12,8 @@ use serde::Serialize;
 use super::format::{
     FIELD_KEY, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES, MAX_HEADER, MEANS,
     MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS, SH_COEFFICIENTS,
-    TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY,
-    TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of,
+    STILL, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY,
+    TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of, still_rows,
 };
 use super::{CheckpointError, StateTensor, TrainingState};
 use crate::Field;
@@ -123,6 +123,15 @@ pub(super) fn write(
     ]);
     let track_arrays = field.tracks.as_ref().map(TrackArrays::of);
     let mut tensors = field_tensors(field, track_arrays.as_ref());
+    let still = still_rows(field);
+    if let Some(rows) = &still {
+        tensors.push(Tensor {
+            name: STILL.to_owned(),
+            dtype: Dtype::U8,
+            shape: vec![rows.len()],
+            bytes: rows,
+        });
+    }
     if let Some(training) = training {
         metadata.insert(TRAINING_KEY, json(serde_json::to_string(&training.json))?);
         tensors.extend(training.tensors.iter().map(|(name, tensor)| state_tensor(name, tensor)));

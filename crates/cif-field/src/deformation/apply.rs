@@ -17,7 +17,9 @@ impl Deformation {
     #[must_use]
     pub fn apply(&self, canonical: &Gaussians, time: f64) -> Gaussians {
         let mut deformed = canonical.clone();
-        for (row, deltas) in self.deltas_at(&canonical.means, time).iter().enumerate() {
+        let rows: Vec<usize> = self.moving_rows(canonical.len()).map(|row| row as usize).collect();
+        let positions: Vec<[f32; 3]> = rows.iter().map(|row| canonical.means[*row]).collect();
+        for (row, deltas) in rows.into_iter().zip(&self.deltas_at(&positions, time)) {
             add(&mut deformed.means[row], &deltas.position);
             add(&mut deformed.log_scales[row], &deltas.scale);
             add(&mut deformed.quaternions[row], &deltas.rotation);

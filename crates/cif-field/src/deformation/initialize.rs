@@ -81,6 +81,6 @@ impl Deformation {
                 mlp[head.output.weights.start..head.output.biases.end].fill(0.0);
             }
         }
-        Ok(Self { config, bounds: widen_bounds(bounds, extent), planes, mlp })
+        Ok(Self { config, bounds: widen_bounds(bounds, extent), planes, mlp, still: Vec::new() })
     }
 }

@@ -249,6 +249,37 @@ pub struct Deformation {
     pub planes: Vec<f32>,
     /// All weights and biases, see [`DeformationConfig::mlp_layout`].
     pub mlp: Vec<f32>,
+    /// Gaussians that stand still, `[N]`: the network moves every row but these, whose canonical parameters
+    /// hold at all times. Rows beyond the list move; empty when all do.
+    pub still: Vec<bool>,
+}
+
+impl Deformation {
+    /// Whether the network leaves a Gaussian where it is.
+    #[must_use]
+    pub fn is_still(&self, row: usize) -> bool {
+        self.still.get(row).copied().unwrap_or(false)
+    }
+
+    /// The deformation of the Gaussians `sources[0], sources[1], ...`, which keep standing still.
+    #[must_use]
+    pub fn gather(&self, sources: &[u32]) -> Self {
+        Self { still: self.gather_still(sources), ..self.clone() }
+    }
+
+    /// [`Self::still`] of the Gaussians `sources[0], sources[1], ...`.
+    #[must_use]
+    pub fn gather_still(&self, sources: &[u32]) -> Vec<bool> {
+        if self.still.is_empty() {
+            return Vec::new();
+        }
+        sources.iter().map(|row| self.is_still(*row as usize)).collect()
+    }
+
+    /// Rows among `0..n` that the network moves, ascending.
+    pub fn moving_rows(&self, n: usize) -> impl Iterator<Item = u32> {
+        (0..n as u32).filter(|row| !self.is_still(*row as usize))
+    }
 }
 
 #[cfg(test)]

@@ -19,7 +19,8 @@ use super::matrix::{Left, Shape, Start, multiply, padded, transpose};
 /// Rows that go through the network together; sized so that activations stay in the second-level cache.
 const BLOCK: usize = 256;
 
-/// Rows whose weight gradients are summed by one task, in blocks.
+/// Rows that one task takes, in blocks: those whose weight gradients it sums, and those among which it looks for
+/// rows that move.
 const CHUNK: usize = 1024;
 
 /// The deformation at one time: shapes, and time planes interpolated to lines.
@@ -177,6 +178,11 @@ impl<'a> DeformationAtTime<'a> {
         Self { deformation, axes, mlp, trunk, heads, levels, channels, lines, time_row, time_fraction }
     }
 
+    /// Whether the network moves a row.
+    pub(super) fn moves(&self, row: usize) -> bool {
+        !self.deformation.is_still(row)
+    }
+
     #[inline(always)]
     fn axis_tap(&self, level: usize, axis: usize, position: f32) -> AxisTap {
         let scale = &self.axes[level][axis];
@@ -231,7 +237,7 @@ impl<'a> DeformationAtTime<'a> {
         }
     }
 
-    /// Fills `posed` with raw parameters at the time, deltas added.
+    /// Fills `posed` with raw parameters at the time, deltas added to the rows that do not stand still.
     pub(super) fn forward(&self, level: Level, gaussians: &Gaussians, posed: &mut PosedArrays) {
         posed.means.clone_from(&gaussians.means);
         posed.log_scales.clone_from(&gaussians.log_scales);
@@ -244,23 +250,33 @@ impl<'a> DeformationAtTime<'a> {
             posed.sh_coefficients.clear();
         }
         let n = gaussians.len();
+        // Fewer rows of a chunk go through the network where many stand still.
+        let stands = self.deformation.still.contains(&true);
+        let chunk_rows = if stands { CHUNK } else { BLOCK };
         let sh_chunks: Vec<&mut [[f32; SH_FLOATS]]> = if moves_sh {
-            posed.sh_coefficients.chunks_mut(BLOCK).collect()
+            posed.sh_coefficients.chunks_mut(chunk_rows).collect()
         } else {
-            (0..n.div_ceil(BLOCK)).map(|_| Default::default()).collect()
+            (0..n.div_ceil(chunk_rows)).map(|_| Default::default()).collect()
         };
         gaussians
             .means
-            .par_chunks(BLOCK)
-            .zip(posed.means.par_chunks_mut(BLOCK))
-            .zip(posed.log_scales.par_chunks_mut(BLOCK))
-            .zip(posed.quaternions.par_chunks_mut(BLOCK))
-            .zip(posed.opacity_logits.par_chunks_mut(BLOCK))
+            .par_chunks(chunk_rows)
+            .zip(posed.means.par_chunks_mut(chunk_rows))
+            .zip(posed.log_scales.par_chunks_mut(chunk_rows))
+            .zip(posed.quaternions.par_chunks_mut(chunk_rows))
+            .zip(posed.opacity_logits.par_chunks_mut(chunk_rows))
             .zip(sh_chunks)
-            .for_each_init(
-                Activations::default,
-                |block, (((((positions, means), log_scales), quaternions), opacities), sh)| {
-                    self.forward_block(level, positions, block);
+            .enumerate()
+            .for_each_init(Activations::default, |block, (chunk, arrays)| {
+                let (((((positions, means), log_scales), quaternions), opacities), sh) = arrays;
+                let first = chunk * chunk_rows;
+                let rows: Vec<usize> =
+                    (0..positions.len()).filter(|row| !self.deformation.is_still(first + row)).collect();
+                let mut moving = Vec::with_capacity(BLOCK);
+                for rows in rows.chunks(BLOCK) {
+                    moving.clear();
+                    moving.extend(rows.iter().map(|row| positions[*row]));
+                    self.forward_block(level, &moving, block);
                     for (head, output) in self.mlp.heads.iter().zip(&block.outputs) {
                         let target = match head.kind {
                             HeadKind::Position => means.as_flattened_mut(),
@@ -270,16 +286,15 @@ impl<'a> DeformationAtTime<'a> {
                             HeadKind::Sh => sh.as_flattened_mut(),
                         };
                         let outputs = head.kind.outputs();
-                        for (target, output) in
-                            target.chunks_exact_mut(outputs).zip(output.chunks_exact(padded(outputs)))
-                        {
+                        for (row, output) in rows.iter().zip(output.chunks_exact(padded(outputs))) {
+                            let target = &mut target[row * outputs..(row + 1) * outputs];
                             for (value, delta) in target.iter_mut().zip(output) {
                                 *value += delta;
                             }
                         }
                     }
-                },
-            );
+                }
+            });
     }
 
     /// Adds gradients of planes, MLP and canonical centres (through the lookup) from the gradients of the

@@ -25,6 +25,8 @@ pub(super) struct TileImage {
     pub(super) instance_transmittance: TilePixels,
     /// Evaluated (pixel, splat) pairs.
     pub(super) evaluated: u64,
+    /// Those of them evaluated for identities.
+    pub(super) evaluated_instances: u64,
 }
 
 impl Default for TileImage {
@@ -37,6 +39,7 @@ impl Default for TileImage {
             label_probability: zero,
             instance_transmittance: zero,
             evaluated: 0,
+            evaluated_instances: 0,
         }
     }
 }
@@ -120,7 +123,7 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
         image.depth = [[0.0; LANES]; GROUPS];
     }
     image.transmittance = place.initial_transmittance();
-    image.evaluated = 0;
+    (image.evaluated, image.evaluated_instances) = (0, 0);
     let blending = Blending::new(simd);
     let mut probabilities = Vec::new();
     let mut live_color = live(&image.transmittance);
@@ -145,6 +148,9 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
         let prepared: SplatInTile<S> = prepared;
         let [in_color, in_instances] = prepared.groups;
         image.evaluated += in_color.union(in_instances).pixels();
+        if INSTANCES {
+            image.evaluated_instances += in_instances.pixels();
+        }
         if INSTANCES
             && !in_instances.is_empty()
             && let Some((tile_labels, rows)) = labels

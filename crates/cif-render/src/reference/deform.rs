@@ -21,7 +21,7 @@ pub struct Deformed<R> {
 pub fn deform<R: Real>(scene: &Scene<R>, index: usize, time: f64, active: bool) -> Deformed<R> {
     let parameters = &scene.parameters;
     let mut gaussian = parameters.gaussians[index].clone();
-    let Some(deformation) = scene.deformation.as_ref().filter(|_| active) else {
+    let Some(deformation) = scene.deformation.as_ref().filter(|d| active && !d.is_still(index)) else {
         return Deformed { gaussian, tape: None };
     };
     let tape = deformation.evaluate(&parameters.planes, &parameters.mlp, gaussian.mean, R::of(time));

@@ -225,6 +225,7 @@ impl<R: Real> Scene<R> {
                 bounds: d.bounds,
                 planes: Vec::new(),
                 mlp: Vec::new(),
+                still: d.still.clone(),
             }),
             tracks: field.tracks.clone(),
             instances: field.instances.len(),

@@ -84,11 +84,15 @@ impl Renderer {
                 let active: Vec<u32> = (0..n as u32)
                     .filter(|&row| {
                         let row = row as usize;
-                        v_posed.means[row] != [0.0; 3]
+                        let has_gradient = v_posed.means[row] != [0.0; 3]
                             || v_posed.log_scales[row] != [0.0; 3]
                             || v_posed.quaternions[row] != [0.0; 4]
                             || v_posed.opacity_logits[row] != 0.0
-                            || v_posed.sh_coefficients.get(row).is_some_and(|sh| sh.iter().any(|v| *v != 0.0))
+                            || v_posed
+                                .sh_coefficients
+                                .get(row)
+                                .is_some_and(|sh| sh.iter().any(|v| *v != 0.0));
+                        has_gradient && deformation.moves(row)
                     })
                     .collect();
                 self.statistics.deformed_backward = active.len();

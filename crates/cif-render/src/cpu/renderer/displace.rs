@@ -33,7 +33,7 @@ impl Renderer {
         let Some(deformation) = &field.deformation else { return };
         let n = v_displacements.len();
         let active: Vec<u32> =
-            (0..n as u32).filter(|row| v_displacements[*row as usize] != [0.0; 3]).collect();
+            deformation.moving_rows(n).filter(|row| v_displacements[*row as usize] != [0.0; 3]).collect();
         let v_posed = PosedArrayGradients {
             means: v_displacements,
             log_scales: vec![[0.0; 3]; n],

@@ -50,8 +50,17 @@ pub struct ViewStatistics {
     pub tile_pairs: usize,
     /// (pixel, Gaussian) pairs whose footprint was evaluated in the forward pass.
     pub evaluated_pairs: u64,
+    /// Gaussians that went through the deformation network: none without one, and none that stand still.
+    pub deformed: usize,
     /// Gaussians whose deformation was differentiated in the last backward pass.
     pub deformed_backward: usize,
+    /// Tiles that blended identities, because a pixel of theirs carries a label.
+    pub labelled_tiles: usize,
+    /// Gaussians whose identity row was evaluated: the visible ones of a view with labels.
+    pub identity_rows: usize,
+    /// (pixel, Gaussian) pairs whose footprint was evaluated for identities in the forward pass; part of
+    /// [`Self::evaluated_pairs`].
+    pub instance_pairs: u64,
 }
 
 /// What the forward pass of a training view returns.
@@ -180,10 +189,12 @@ impl Renderer {
         let tape = &mut self.tape;
         let view = ViewConstants::new(camera, settings);
         tape.view = Some((view, *settings, time));
+        let mut deformed = 0;
         timed(&mut times.deform, || {
             let deformation = field.deformation.as_ref().filter(|_| settings.deform);
             let tracks = field.tracks.as_ref().map(|tracks| tracks.at(time));
             pose(level, field, deformation, tracks, time, &mut tape.posed);
+            deformed = deformation.map_or(0, |deformation| deformation.moving_rows(field.len()).count());
         });
         timed(&mut times.project, || {
             let posed = PosedView::new(&field.gaussians, &tape.posed);
@@ -209,6 +220,7 @@ impl Renderer {
         self.statistics = ViewStatistics {
             visible: tape.splats.len(),
             tile_pairs: tape.lists.entries.len(),
+            deformed,
             ..ViewStatistics::default()
         };
         self.times = times;
@@ -237,7 +249,16 @@ impl Renderer {
         timed(&mut times.rasterize, || {
             let level = self.level;
             let tiles = self.tape.lists.tiles();
-            self.tape.probabilities = labels.map(|(_, rows)| rows.probabilities()).unwrap_or_default();
+            self.tape.probabilities.clear();
+            if let Some((_, rows)) = labels {
+                // Only what is seen is asked for below.
+                self.tape.probabilities.resize(rows.labels.len(), 0.0);
+                for splat in &self.tape.splats {
+                    let range = rows.range(splat.gaussian as usize);
+                    rows.row_probabilities(splat.gaussian as usize, &mut self.tape.probabilities[range]);
+                }
+                self.statistics.identity_rows = self.tape.splats.len();
+            }
             self.tape.labels = match labels {
                 Some((map, _)) => {
                     (0..tiles).into_par_iter().map(|tile| TileLabels::new(map, &self.place(tile))).collect()
@@ -262,6 +283,9 @@ impl Renderer {
             });
             self.tape.tiles = images;
             self.statistics.evaluated_pairs = self.tape.tiles.iter().map(|tile| tile.evaluated).sum();
+            self.statistics.instance_pairs =
+                self.tape.tiles.iter().map(|tile| tile.evaluated_instances).sum();
+            self.statistics.labelled_tiles = self.tape.labels.iter().flatten().count();
             let (view, settings, _) = self.tape.view.expect("a view was prepared");
             let background = settings.background;
             self.tape.color = self
