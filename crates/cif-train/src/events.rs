@@ -139,6 +139,34 @@ pub enum TrainEvent {
         /// Such steps in the whole run.
         total: u64,
     },
+    /// Gaussians were tested for standing still.
+    Settled {
+        /// Stage.
+        stage: Stage,
+        /// Steps done in the stage.
+        iteration: u32,
+        /// Gaussians that stand still now: they skip the deformation network.
+        still: usize,
+        /// Of these, those found by this test.
+        settled: usize,
+        /// Gaussians that stood still and move again.
+        released: usize,
+        /// Gaussians.
+        gaussians: usize,
+    },
+    /// Something had to show that it helps.
+    Judged {
+        /// Stage.
+        stage: Stage,
+        /// Steps done in the stage.
+        iteration: u32,
+        /// What was judged.
+        what: String,
+        /// What it gains on held-out pixels of training views, dB.
+        gain_db: f64,
+        /// Whether it stays; else it is removed for good.
+        kept: bool,
+    },
     /// Held-out frames were scored.
     Evaluated {
         /// Stage.

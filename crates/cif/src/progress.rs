@@ -127,6 +127,8 @@ impl Progress {
             }
             TrainEvent::Densified { .. }
             | TrainEvent::Resampled { .. }
+            | TrainEvent::Settled { .. }
+            | TrainEvent::Judged { .. }
             | TrainEvent::CheckpointDue { .. } => {}
         }
     }

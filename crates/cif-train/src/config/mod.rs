@@ -59,6 +59,8 @@ pub struct TrainConfig {
     pub instance: InstanceConfig,
     /// Instance-guided resampling.
     pub resample: ResampleConfig,
+    /// What a run may leave out where the capture does not call for it.
+    pub effects: EffectsConfig,
     /// What is reported, evaluated and saved on the way.
     pub report: ReportConfig,
 }
@@ -291,6 +293,33 @@ pub struct ResampleConfig {
     pub label_shares: LabelShares,
     /// Standard deviation of a replica's offset, in standard deviations of its source, default 0.5 (A12).
     pub offset: f32,
+}
+
+/// What a run may leave out where the capture does not call for it. By default nothing is left out; `cif plan`
+/// shows what a capture calls for.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EffectsConfig {
+    /// Whether anything moves, default yes; without, a capture of several times is trained as if it had one.
+    pub motion: bool,
+    /// Whether instances are trained where there are masks, default yes.
+    pub instances: bool,
+    /// Steps between tests for Gaussians that stand still, which then skip the deformation network; default 0:
+    /// every Gaussian goes through it.
+    pub still_every: u32,
+    /// Share of the fine steps before the first test, default 0.15.
+    pub still_from: f32,
+    /// Displacement from its mean, as a fraction of the extent, up to which a Gaussian stands still, default 1e-3.
+    pub still_displacement: f32,
+    /// Change of log-scales, of the unit quaternion, of the opacity logit and of the colour coefficients up to
+    /// which a Gaussian stands still, default 0.05.
+    pub still_shape: f32,
+    /// Gain, dB on held-out pixels of training views, that a degree of spherical harmonics must bring before the
+    /// next one comes; else it is taken back. Default 0: degrees come by steps alone.
+    pub sh_gain: f32,
+    /// Gain, likewise, that the motion of scales, rotations, opacities and colours must each bring at the first
+    /// test for Gaussians that stand still; else it is removed. Default 0: all stay.
+    pub head_gain: f32,
 }
 
 /// What is reported, evaluated and saved on the way.

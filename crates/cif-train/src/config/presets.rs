@@ -4,8 +4,8 @@ use cif_dataset::Layout;
 use cif_field::{Heads, SortMetric, TimeEncoding};
 
 use super::{
-    AdamConfig, DensifyConfig, IdentityConfig, InstanceConfig, LossConfig, ModelConfig, MotionConfig, Preset,
-    RatesConfig, ReportConfig, ResampleConfig, StagesConfig, TrainConfig,
+    AdamConfig, DensifyConfig, EffectsConfig, IdentityConfig, InstanceConfig, LossConfig, ModelConfig,
+    MotionConfig, Preset, RatesConfig, ReportConfig, ResampleConfig, StagesConfig, TrainConfig,
 };
 
 impl TrainConfig {
@@ -127,6 +127,7 @@ impl Default for TrainConfig {
             identity: IdentityConfig::default(),
             instance: InstanceConfig::default(),
             resample: ResampleConfig::default(),
+            effects: EffectsConfig::default(),
             report: ReportConfig::default(),
         }
     }
@@ -256,6 +257,21 @@ impl Default for ResampleConfig {
             scale_correction: super::ScaleCorrection::Off,
             label_shares: super::LabelShares::Equal,
             offset: 0.5,
+        }
+    }
+}
+
+impl Default for EffectsConfig {
+    fn default() -> Self {
+        Self {
+            motion: true,
+            instances: true,
+            still_every: 0,
+            still_from: 0.15,
+            still_displacement: 1e-3,
+            still_shape: 0.05,
+            sh_gain: 0.0,
+            head_gain: 0.0,
         }
     }
 }

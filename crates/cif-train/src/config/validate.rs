@@ -105,6 +105,10 @@ impl TrainConfig {
             ("identity.min_mass", identity.min_mass),
             ("identity.neighbour_distance", identity.neighbour_distance),
             ("resample.offset", resample.offset),
+            ("effects.still_displacement", self.effects.still_displacement),
+            ("effects.still_shape", self.effects.still_shape),
+            ("effects.sh_gain", self.effects.sh_gain),
+            ("effects.head_gain", self.effects.head_gain),
         ] {
             check(rate.is_finite() && rate >= 0.0, key, rate, "expected a finite number of at least 0")?;
         }
@@ -112,6 +116,8 @@ impl TrainConfig {
 
         within("motion.guidance_end", self.motion.guidance_end, 0.0..=1.0, "expected a number in [0, 1]")?;
         at_least("motion.gaussians", self.motion.gaussians, 4, "expected at least 4")?;
+
+        within("effects.still_from", self.effects.still_from, 0.0..=1.0, "expected a number in [0, 1]")?;
 
         at_least("densify.every", densify.every, 1, "expected at least 1")?;
         at_least("densify.max_gaussians", densify.max_gaussians, 1, "expected at least 1")?;

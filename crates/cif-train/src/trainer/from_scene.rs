@@ -60,7 +60,7 @@ impl Trainer {
                 _ => {}
             }
         }
-        if dataset.times.len() > 1 && field.deformation.is_none() {
+        if config.effects.motion && dataset.times.len() > 1 && field.deformation.is_none() {
             return Err(TrainError::NoMotion {
                 scene: name.to_owned(),
                 times: dataset.times.len(),

@@ -56,7 +56,7 @@ impl Trainer {
         }
         if stage == Stage::Coarse {
             field.deformation = None;
-        } else if field.deformation.is_none() && dataset.times.len() > 1 {
+        } else if field.deformation.is_none() && dataset.times.len() > 1 && config.effects.motion {
             field.deformation = Some(initialize::initial_deformation(&dataset, &config)?);
         }
         let mut trainer = Self::assemble(dataset, config, field, None)?;

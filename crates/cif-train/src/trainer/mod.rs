@@ -7,6 +7,8 @@
 //! | `step` | what one step does |
 //! | `optimiser` | which parameter groups there are, and how fast they move |
 //! | `guard` | what happens to a step that leaves the finite numbers |
+//! | `still` | which Gaussians skip the deformation network |
+//! | `earned` | what has to show that it helps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
@@ -17,6 +19,7 @@
 //! run that was interrupted and resumed ends bit for bit where an uninterrupted one ends, on any number of
 //! threads.
 
+mod earned;
 mod evaluate;
 mod frames;
 mod from_scene;
@@ -32,6 +35,7 @@ mod progress;
 mod provenance;
 mod state;
 mod step;
+mod still;
 mod times;
 
 use std::time::Instant;
@@ -137,10 +141,11 @@ impl Trainer {
         }
         let budget = u64::from(config.frame_memory_mib) << 20;
         let frames = FrameStore::open(&dataset, config.background, budget)?;
-        let has_instances = !dataset.instances.is_empty() && frames.has_labels(&dataset);
+        let has_instances =
+            config.effects.instances && !dataset.instances.is_empty() && frames.has_labels(&dataset);
         let n = field.gaussians.len();
         Ok(Self {
-            plan: Plan { is_dynamic: dataset.times.len() > 1, has_instances },
+            plan: Plan { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
             progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
             optimiser: Optimiser::new(&field, config.adam.fresh_row_bias_correction),
             statistics: DensifyStatistics::zeros(n),
@@ -163,7 +168,9 @@ impl Trainer {
 
     fn warn_of_capture(&mut self) {
         if !self.plan.has_instances {
-            let why = if self.dataset.instances.is_empty() {
+            let why = if !self.config.effects.instances {
+                "instances are switched off"
+            } else if self.dataset.instances.is_empty() {
                 "the capture has no masks"
             } else {
                 "no training mask has a labelled pixel"
@@ -171,7 +178,12 @@ impl Trainer {
             self.warnings.push(format!("{why}: colour only, without identity and instance stages"));
         }
         if !self.plan.is_dynamic {
-            self.warnings.push("the capture has a single time: trained without deformation".into());
+            let why = if self.dataset.times.len() > 1 {
+                "motion is switched off"
+            } else {
+                "the capture has a single time"
+            };
+            self.warnings.push(format!("{why}: trained without deformation"));
         }
         if self.frames.len() == 1 {
             self.warnings.push("one training frame: depth and occluded parts are not determined".into());
@@ -234,6 +246,11 @@ impl Trainer {
     #[must_use]
     pub fn steps_left(&self) -> u64 {
         self.plan.steps_left(&self.config, self.progress.stage, self.progress.iteration)
+    }
+
+    /// Records what was planned for the capture, for the field's provenance.
+    pub fn record_effects(&mut self, plan: serde_json::Value) {
+        self.progress.effects = Some(plan);
     }
 
     /// Chooses the vector instructions of the renderer, the widest there are by default. Results of two levels

@@ -24,6 +24,15 @@ pub(super) struct Progress {
     pub wall_s: BTreeMap<String, f64>,
     /// Spherical-harmonics degree at the start of the stage.
     pub sh_start: u8,
+    /// Highest degree of spherical harmonics that was judged.
+    #[serde(default)]
+    pub sh_judged: u8,
+    /// Highest degree that is left, once one did not help.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub sh_cap: Option<u8>,
+    /// What was planned for the capture, as recorded.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub effects: Option<serde_json::Value>,
     /// Whether opacities were reset in this stage.
     pub opacities_were_reset: bool,
     /// Running mean PSNR of training views, dB.
@@ -65,6 +74,9 @@ impl Progress {
             steps: BTreeMap::new(),
             wall_s: BTreeMap::new(),
             sh_start: 0,
+            sh_judged: 0,
+            sh_cap: None,
+            effects: None,
             opacities_were_reset: false,
             psnr: None,
             warned_of_unsupported: false,

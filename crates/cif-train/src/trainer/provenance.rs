@@ -46,6 +46,9 @@ impl Trainer {
             let rollbacks = &self.progress.rollbacks;
             record["train"]["rolled_back"] = json!({ "steps": rollbacks.total, "last": rollbacks.last });
         }
+        if let Some(effects) = &self.progress.effects {
+            record["train"]["effects"] = effects.clone();
+        }
         if let Some(source) = &self.progress.source {
             record["train"]["from"] = json!(source);
         }

@@ -95,7 +95,9 @@ impl Trainer {
         let iteration = self.progress.iteration + 1;
         let batch = self.config.stages.batch;
         if matches!(stage, Stage::Coarse | Stage::Fine) {
-            self.field.sh_degree = sh_degree(&self.config, self.progress.sh_start, iteration);
+            self.judge_sh(stage, iteration, events)?;
+            let degree = sh_degree(&self.config, self.progress.sh_start, iteration);
+            self.field.sh_degree = self.progress.sh_cap.map_or(degree, |cap| degree.min(cap));
         }
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
@@ -146,6 +148,7 @@ impl Trainer {
             if stage == Stage::Coarse {
                 self.leave_out_travelling(data);
             }
+            self.leave_out_judged();
             // The mean is over the labelled pixels of all views of the step (A4).
             let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
             instance_loss += share * pass.instance_loss;
@@ -212,6 +215,8 @@ impl Trainer {
             Stage::Instance => self.instance_events(iteration, events)?,
             _ => self.densify(stage, iteration, events)?,
         }
+        self.judge_heads(stage, iteration, events)?;
+        self.settle(stage, iteration, events);
         lap(&mut self.times.rearrange, &mut since);
         self.times.total += start.elapsed();
         self.times.steps += 1;
@@ -298,6 +303,7 @@ impl Trainer {
         self.optimiser.gather(&change.origins);
         self.statistics.gather(&change.origins);
         self.guidance.gather(&change.parents);
+        self.gather_still(&change.parents);
         self.field.gaussians = change.gaussians;
         self.gradients = Gradients::zeros(&self.field);
     }
@@ -331,6 +337,7 @@ impl Trainer {
         self.optimiser.relocate(&relocated.weak, &relocated.sources, &relocated.entry_origins);
         for pair in &plan.pairs {
             self.guidance.copy(pair.weak, pair.source);
+            self.copy_still(pair.weak, pair.source);
             self.unseen[pair.weak as usize] = self.unseen[pair.source as usize];
         }
         self.gradients = Gradients::zeros(&self.field);

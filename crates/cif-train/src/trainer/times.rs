@@ -34,8 +34,16 @@ pub struct StepTimes {
     pub tile_pairs: u64,
     /// (pixel, Gaussian) pairs evaluated in the forward pass.
     pub evaluated_pairs: u64,
+    /// Gaussians that went through the deformation network.
+    pub deformed: u64,
     /// Gaussians whose deformation was differentiated.
     pub deformed_backward: u64,
+    /// Tiles that blended identities.
+    pub labelled_tiles: u64,
+    /// Gaussians whose identity row was evaluated.
+    pub identity_rows: u64,
+    /// (pixel, Gaussian) pairs evaluated for identities in the forward pass.
+    pub instance_pairs: u64,
 }
 
 impl StepTimes {
@@ -76,7 +84,11 @@ impl StepTimes {
         self.visible += view.visible as u64;
         self.tile_pairs += view.tile_pairs as u64;
         self.evaluated_pairs += view.evaluated_pairs;
+        self.deformed += view.deformed as u64;
         self.deformed_backward += view.deformed_backward as u64;
+        self.labelled_tiles += view.labelled_tiles as u64;
+        self.identity_rows += view.identity_rows as u64;
+        self.instance_pairs += view.instance_pairs;
     }
 }
 

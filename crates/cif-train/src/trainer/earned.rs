@@ -1,0 +1,268 @@
+//! What has to show that it helps: a degree of spherical harmonics before the next one comes, and the optional
+//! outputs of the deformation once it has learnt for a while. Both are judged on pixels of training views that
+//! the colour loss leaves out.
+
+use cif_dataset::Dataset;
+use cif_field::deformation::HeadKind;
+use cif_field::{Deformation, Field};
+use cif_geometry::spherical_harmonics::coefficient_count;
+use cif_render::cpu::Renderer;
+use cif_render::{Channels, RenderSettings};
+
+use super::Trainer;
+use super::frames::FrameStore;
+use super::still::{first_test, probe, probe_times};
+use crate::error::TrainError;
+use crate::events::{Stage, TrainEvent};
+use crate::schedule::falls_on;
+
+/// Every so many columns and rows there is a pixel that the colour loss leaves out.
+const SPACING: u32 = 8;
+
+/// Where the first of them is.
+const FIRST: (u32, u32) = (3, 5);
+
+/// Views that are compared.
+const VIEWS: usize = 8;
+
+/// Outputs that may go, the least needed first.
+const OPTIONAL: [HeadKind; 4] = [HeadKind::Sh, HeadKind::Opacity, HeadKind::Scale, HeadKind::Rotation];
+
+/// Positions in an image of the pixels that are left out of the colour loss.
+fn held_out(width: u32, height: u32) -> impl Iterator<Item = usize> {
+    let rows = (FIRST.1..height).step_by(SPACING as usize);
+    rows.flat_map(move |y| {
+        (FIRST.0..width).step_by(SPACING as usize).map(move |x| y as usize * width as usize + x as usize)
+    })
+}
+
+impl Trainer {
+    /// Whether pixels are held out to judge by.
+    fn judges(&self) -> bool {
+        self.config.effects.sh_gain > 0.0 || self.config.effects.head_gain > 0.0
+    }
+
+    /// Keeps the pixels that are judged by out of the colour gradient.
+    pub(super) fn leave_out_judged(&mut self) {
+        if self.judges() {
+            let grid = &mut self.scratch.v_color;
+            for pixel in held_out(grid.width, grid.height) {
+                grid.pixels[pixel] = [0.0; 3];
+            }
+        }
+    }
+
+    /// Judges the present degree of spherical harmonics where the next one is due, and lowers it for good when
+    /// it does not help.
+    pub(super) fn judge_sh(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        let degree = self.field.sh_degree;
+        let due = matches!(stage, Stage::Coarse | Stage::Fine)
+            && self.config.effects.sh_gain > 0.0
+            && falls_on(iteration, self.config.model.sh_interval)
+            && self.progress.sh_cap.is_none()
+            && degree > self.progress.sh_judged;
+        if !due {
+            return Ok(());
+        }
+        let settings = self.color_settings();
+        let lower = RenderSettings { sh_degree: degree - 1, ..settings };
+        let views = (&self.frames, &self.dataset);
+        let with = judged_error(&mut self.renderer, views, &self.field, &settings)?;
+        let without = judged_error(&mut self.renderer, views, &self.field, &lower)?;
+        let gain_db = gain(without, with);
+        let kept = gain_db >= f64::from(self.config.effects.sh_gain);
+        self.progress.sh_judged = degree;
+        if !kept {
+            self.progress.sh_cap = Some(degree - 1);
+            let first = 3 * coefficient_count(degree - 1);
+            for coefficients in &mut self.field.gaussians.sh_coefficients {
+                coefficients[first..].fill(0.0);
+            }
+            self.field.sh_degree = degree - 1;
+        }
+        let what = format!("view-dependent colour of degree {degree}");
+        events.push(TrainEvent::Judged { stage, iteration, what, gain_db, kept });
+        Ok(())
+    }
+
+    /// Judges the optional outputs of the deformation, once, when the first test for Gaussians that stand still
+    /// falls due, and removes those that do not help.
+    pub(super) fn judge_heads(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        let effects = &self.config.effects;
+        let gain_wanted = f64::from(effects.head_gain);
+        let due = stage == Stage::Fine
+            && gain_wanted > 0.0
+            && iteration == first_test(effects.still_from, self.plan.iterations(&self.config, stage));
+        if !due || self.field.deformation.is_none() {
+            return Ok(());
+        }
+        let settings = self.color_settings();
+        let times = probe_times(&self.dataset.times);
+        for kind in OPTIONAL {
+            let Some(trial) = without_output(&self.field, kind, &times) else { continue };
+            let views = (&self.frames, &self.dataset);
+            let with = judged_error(&mut self.renderer, views, &self.field, &settings)?;
+            let without = judged_error(&mut self.renderer, views, &trial.field, &settings)?;
+            let gain_db = gain(without, with);
+            let kept = gain_db >= gain_wanted;
+            if !kept {
+                self.field = trial.field;
+                let mlp = &mut self.optimiser.mlp;
+                mlp.first.drain(trial.removed.clone());
+                mlp.second.drain(trial.removed.clone());
+                self.gradients.mlp.drain(trial.removed);
+            }
+            let what = format!("motion of {}", name(kind));
+            events.push(TrainEvent::Judged { stage, iteration, what, gain_db, kept });
+        }
+        Ok(())
+    }
+}
+
+/// Mean squared colour error of a field over the held-out pixels of evenly spread training views.
+fn judged_error(
+    renderer: &mut Renderer,
+    (frames, dataset): (&FrameStore, &Dataset),
+    field: &Field,
+    settings: &RenderSettings,
+) -> Result<f64, TrainError> {
+    let count = frames.len().min(VIEWS);
+    let (mut squares, mut values) = (0.0, 0_u64);
+    for k in 0..count {
+        let view = k * frames.len() / count;
+        let data = frames.get(dataset, view)?;
+        let frame = &dataset.frames[frames.index(view)];
+        let channels = Channels { depth: false, instances: false };
+        let rendered = renderer.render(field, &frame.camera, frame.time, settings, channels);
+        for pixel in held_out(data.image.width, data.image.height) {
+            for channel in 0..3 {
+                let target = f64::from(data.image.pixels[pixel][channel]) / 255.0;
+                squares += (f64::from(rendered.color.pixels[pixel][channel]) - target).powi(2);
+            }
+            values += 3;
+        }
+    }
+    Ok(squares / values.max(1) as f64)
+}
+
+/// A field without an output of its deformation.
+struct Trial {
+    field: Field,
+    /// What the output took of the network's floats.
+    removed: std::ops::Range<usize>,
+}
+
+/// The field with the mean of an output of its deformation in its place; nothing where there is no such output,
+/// or no other.
+fn without_output(field: &Field, kind: HeadKind, times: &[f64]) -> Option<Trial> {
+    let deformation = field.deformation.as_ref()?;
+    let layout = deformation.config.mlp_layout();
+    let head = layout.heads.iter().find(|head| head.kind == kind).filter(|_| layout.heads.len() > 1)?;
+    let removed = head.hidden.weights.start..head.output.biases.end;
+    let mut field = field.clone();
+    let rows: Vec<u32> = deformation.moving_rows(field.len()).collect();
+    let motions = probe(deformation, &field.gaussians, &rows, times);
+    let gaussians = &mut field.gaussians;
+    for (row, motion) in rows.iter().zip(&motions) {
+        let row = *row as usize;
+        let (values, deltas): (&mut [f32], &[f32]) = match kind {
+            HeadKind::Position => (&mut gaussians.means[row], &motion.mean.position),
+            HeadKind::Scale => (&mut gaussians.log_scales[row], &motion.mean.scale),
+            HeadKind::Rotation => (&mut gaussians.quaternions[row], &motion.mean.rotation),
+            HeadKind::Opacity => {
+                (&mut gaussians.opacity_logits[row..=row], std::slice::from_ref(&motion.mean.opacity))
+            }
+            HeadKind::Sh => (&mut gaussians.sh_coefficients[row], &motion.mean.sh),
+        };
+        for (value, delta) in values.iter_mut().zip(deltas) {
+            *value += delta;
+        }
+    }
+    let mut config = deformation.config.clone();
+    let heads = &mut config.heads;
+    match kind {
+        HeadKind::Position => heads.position = false,
+        HeadKind::Scale => heads.scale = false,
+        HeadKind::Rotation => heads.rotation = false,
+        HeadKind::Opacity => heads.opacity = false,
+        HeadKind::Sh => heads.sh = false,
+    }
+    let mut mlp = deformation.mlp.clone();
+    mlp.drain(removed.clone());
+    field.deformation = Some(Deformation { config, mlp, ..deformation.clone() });
+    Some(Trial { field, removed })
+}
+
+fn name(kind: HeadKind) -> &'static str {
+    match kind {
+        HeadKind::Position => "centres",
+        HeadKind::Scale => "scales",
+        HeadKind::Rotation => "rotations",
+        HeadKind::Opacity => "opacities",
+        HeadKind::Sh => "colours",
+    }
+}
+
+/// Gain of a smaller error, dB.
+fn gain(without: f64, with: f64) -> f64 {
+    10.0 * (without.max(1e-12) / with.max(1e-12)).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_render::synthetic;
+
+    use super::*;
+
+    #[test]
+    fn one_pixel_of_sixty_four_is_held_out() {
+        let pixels: Vec<usize> = held_out(64, 48).collect();
+        assert_eq!(pixels.len(), 64 * 48 / 64);
+        assert_eq!(pixels[0], 5 * 64 + 3);
+        assert!(held_out(3, 5).next().is_none(), "tiny images have none");
+    }
+
+    #[test]
+    fn a_smaller_error_is_a_gain() {
+        assert!((gain(0.02, 0.01) - 3.0103).abs() < 1e-3);
+        assert_eq!(gain(0.0, 0.0), 0.0);
+        assert!(gain(0.01, 0.02) < 0.0);
+    }
+
+    #[test]
+    fn an_output_leaves_its_mean_behind_and_the_others_as_they_were() {
+        let field =
+            synthetic::generate(&synthetic::SyntheticConfig { gaussians: 40, ..Default::default() }).field;
+        let times = [0.0, 0.5, 1.0];
+        let trial = without_output(&field, HeadKind::Scale, &times).unwrap();
+        trial.field.validate().unwrap();
+        let deformation = trial.field.deformation.as_ref().unwrap();
+        assert!(!deformation.config.heads.scale && deformation.config.heads.position);
+        let before = field.deformation.as_ref().unwrap();
+        assert_eq!(deformation.mlp.len() + trial.removed.len(), before.mlp.len());
+        for time in times {
+            let (now, then) = (trial.field.deformed(time), field.deformed(time));
+            assert_eq!(now.means, then.means);
+            assert_eq!(now.quaternions, then.quaternions);
+        }
+        let mean = |row: usize, axis: usize| {
+            times.iter().map(|time| field.deformed(*time).log_scales[row][axis]).sum::<f32>() / 3.0
+        };
+        for row in 0..40 {
+            for axis in 0..3 {
+                assert!((trial.field.gaussians.log_scales[row][axis] - mean(row, axis)).abs() < 1e-4);
+            }
+        }
+        assert!(without_output(&trial.field, HeadKind::Scale, &times).is_none(), "it is gone already");
+    }
+}
