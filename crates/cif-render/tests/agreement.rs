@@ -217,6 +217,81 @@ fn deformed_scene() {
 }
 
 #[test]
+fn gaussians_that_stand_still() {
+    let config = SyntheticConfig { heads: Some(ALL_HEADS), ..config() };
+    for every in [1, 2, 7] {
+        check(&format!("every {every}th stands still"), &config, &settings(), |scene| {
+            let n = scene.field.len();
+            let deformation = scene.field.deformation.as_mut().unwrap();
+            deformation.still = (0..n).map(|row| row % every == 0).collect();
+        });
+    }
+    // More rows than a task takes, and a list that ends before they do.
+    let mut field = generate(&SyntheticConfig { gaussians: 2_500, ..config }).field;
+    let still: Vec<bool> = (0..2_400).map(|row| row % 5 != 1 && row / 300 != 3).collect();
+    let moved = field.deformed(0.3);
+    field.deformation.as_mut().unwrap().still.clone_from(&still);
+    for simd in levels() {
+        let posed = Renderer::new(simd).deform(&field, 0.3);
+        for row in 0..field.len() {
+            if still.get(row) == Some(&true) {
+                assert_eq!(posed.means[row], field.gaussians.means[row], "row {row}");
+                assert_eq!(posed.log_scales[row], field.gaussians.log_scales[row], "row {row}");
+                assert_eq!(posed.sh_coefficients[row], field.gaussians.sh_coefficients[row], "row {row}");
+                continue;
+            }
+            for axis in 0..3 {
+                let (a, e) = (posed.means[row][axis], moved.means[row][axis]);
+                assert!((a - e).abs() < 1e-4, "row {row}: {a} {e}");
+            }
+            assert_ne!(posed.means[row], field.gaussians.means[row], "row {row} moves");
+        }
+    }
+}
+
+#[test]
+fn what_does_not_run_costs_nothing() {
+    let mut scene = generate(&SyntheticConfig { heads: Some(ALL_HEADS), ..config() });
+    let n = scene.field.len();
+    // A quarter of the Gaussians moves, another lies behind the camera; labels are in one corner.
+    let behind = scene.camera.camera_from_world.inverse().apply(glam::DVec3::new(0.0, 0.0, -3.0));
+    for row in (1..n).step_by(4) {
+        scene.field.gaussians.means[row] = behind.as_vec3().to_array();
+    }
+    let deformation = scene.field.deformation.as_mut().unwrap();
+    deformation.still = (0..n).map(|row| row % 4 != 0).collect();
+    let width = scene.labels.width as usize;
+    for (position, label) in scene.labels.pixels.iter_mut().enumerate() {
+        *label = u16::from(position % width < 16 && position / width < 16);
+    }
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    let mut run = |scene: &SyntheticScene, settings: &RenderSettings| {
+        let mut gradients = Gradients::zeros(&scene.field);
+        let labels = Some(&scene.labels);
+        let forward = renderer.forward(&scene.field, &scene.camera, scene.time, settings, labels);
+        renderer.backward(&scene.field, &forward.color, 1.0, &mut gradients);
+        renderer.statistics()
+    };
+    let seen = run(&scene, &settings());
+    assert_eq!(seen.deformed, n.div_ceil(4));
+    assert!(seen.deformed_backward > 0 && seen.deformed_backward <= seen.deformed);
+    assert!(seen.visible > 0 && seen.visible <= n - n / 4, "{seen:?}");
+    assert_eq!((seen.labelled_tiles, seen.identity_rows), (1, seen.visible));
+    assert!(seen.instance_pairs > 0 && seen.instance_pairs < seen.evaluated_pairs / 4, "{seen:?}");
+
+    let colour = run(&scene, &RenderSettings { instances: None, ..settings() });
+    assert_eq!((colour.labelled_tiles, colour.identity_rows, colour.instance_pairs), (0, 0, 0));
+    scene.labels.pixels.fill(0);
+    let unlabelled = run(&scene, &settings());
+    assert_eq!((unlabelled.labelled_tiles, unlabelled.instance_pairs), (0, 0));
+    scene.field.deformation.as_mut().unwrap().still.fill(true);
+    let still = run(&scene, &settings());
+    assert_eq!((still.deformed, still.deformed_backward), (0, 0));
+    scene.field.deformation = None;
+    assert_eq!(run(&scene, &settings()).deformed, 0);
+}
+
+#[test]
 fn colour_only() {
     let settings = RenderSettings { instances: None, ..settings() };
     check("colour only", &SyntheticConfig { instances: 0, ..config() }, &settings, |_| {});

@@ -3,6 +3,7 @@
 //! | module | answers |
 //! |---|---|
 //! | [`config`] | every setting, and the presets |
+//! | [`plan`] | which effects a capture calls for |
 //! | [`trainer`] | how a run goes through its stages, stops and resumes |
 //! | [`events`] | what a run tells its observer |
 //! | [`schedule`] | learning rates, spherical-harmonics degree |
@@ -40,6 +41,7 @@ pub mod estimate;
 pub mod events;
 pub mod losses;
 pub mod metrics;
+pub mod plan;
 mod random;
 pub mod resample;
 pub mod schedule;
@@ -49,4 +51,5 @@ pub mod trainer;
 pub use config::{Ablation, Preset, TrainConfig};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
+pub use plan::{EffectChoice, EffectPlan};
 pub use trainer::{Fault, InstancePass, StepTimes, Trainer};

@@ -67,7 +67,7 @@ pub(super) fn initial_deformation(
 ) -> Result<Deformation, TrainError> {
     let model = &config.model;
     let time_resolution = match model.time_resolution {
-        0 => dataset.times.len().clamp(TIME_NODES.0, TIME_NODES.1) as u32,
+        0 => automatic_time_nodes(dataset.times.len()),
         nodes => nodes,
     };
     let shape = DeformationConfig {
@@ -83,6 +83,11 @@ pub(super) fn initial_deformation(
     let bounds = Bounds::around(positions.iter().map(|p| DVec3::from_array(p.map(f64::from))));
     let seed = derive(config.seed, Purpose::Deformation, 0);
     Ok(Deformation::new(shape, bounds, dataset.extent(), seed, model.zero_initial_heads)?)
+}
+
+/// Nodes of the time planes where the settings leave them to the capture.
+pub(crate) fn automatic_time_nodes(times: usize) -> u32 {
+    times.clamp(TIME_NODES.0, TIME_NODES.1) as u32
 }
 
 /// Points of the capture with colours in [0, 1], thinned to the wanted number.

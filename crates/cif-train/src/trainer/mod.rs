@@ -48,6 +48,7 @@ use cif_render::cpu::{Renderer, SimdLevel};
 use self::frames::FrameStore;
 pub use self::guard::{Fault, Hint, MAX_ROLLBACKS_IN_A_ROW};
 use self::guidance::Guidance;
+pub(crate) use self::initialize::automatic_time_nodes;
 pub use self::measure::InstancePass;
 use self::optimiser::Optimiser;
 use self::progress::{Plan, Progress};

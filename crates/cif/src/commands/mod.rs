@@ -15,6 +15,7 @@ mod label;
 mod masks;
 mod model_options;
 mod motion_table;
+mod plan;
 mod query;
 mod render;
 mod scene;
@@ -47,6 +48,7 @@ pub struct Arguments {
 const TOUR: &str = "\
 A short tour:
   cif info captures/table                                what is in this folder?
+  cif plan captures/table                                which effects does it call for?
   cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
   cif eval table.cif captures/table --images pictures    score the held-out views, and look at them
   cif export table.cif --usd table.usda                  one moving prim per object
@@ -63,6 +65,7 @@ Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Plan(plan::Plan),
     Train(train::Train),
     Eval(eval::Eval),
     Render(render::Render),
@@ -141,6 +144,7 @@ impl From<Simd> for SimdLevel {
 /// Whatever keeps the command from doing what was asked.
 pub fn run(arguments: Arguments) -> Result<(), Error> {
     let run = || match arguments.command {
+        Command::Plan(command) => plan::run(&command),
         Command::Train(command) => train::run(&command),
         Command::Eval(command) => eval::run(&command),
         Command::Render(command) => render::run(&command),

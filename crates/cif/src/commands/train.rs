@@ -2,9 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
-use cif_dataset::Layout;
+use cif_dataset::{Dataset, Layout};
 use cif_field::Checkpoint;
-use cif_train::{Control, Outcome, Preset, TrainConfig, TrainError, TrainEvent, Trainer};
+use cif_train::plan::Basis;
+use cif_train::{
+    Control, EffectChoice, EffectPlan, Outcome, Preset, TrainConfig, TrainError, TrainEvent, Trainer,
+};
 use clap::{Args, ValueEnum};
 
 use super::{CaptureOptions, Simd, print_warnings, scene};
@@ -16,7 +19,8 @@ use crate::{interrupt, output};
 /// Train a scene on a capture
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Settings come from the preset, then the --config file, then what is typed here; the result is
+Settings come from the preset, then from what the capture calls for (`cif plan`), then the --config file,
+then what is typed here; the result is
 written beside the scene as SCENE.train.toml, which --config accepts again.
 
   cif train captures/table -o table.cif --preset draft
@@ -68,6 +72,11 @@ pub(super) struct Train {
     /// Settings file; only what differs needs to be in it
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    /// Effects: all (as the preset says), auto (as the capture calls for, see `cif plan`) or none, then single
+    /// ones on or off, as in auto,+motion,-instances; typed settings and those of a file win
+    /// [default: auto; all with --preset paper]
+    #[arg(long, value_name = "LIST", allow_hyphen_values = true, conflicts_with_all = ["resume", "from"])]
+    effects: Option<EffectChoice>,
     /// Any setting by its key in SCENE.train.toml, e.g. --set rates.opacity=0.02
     #[arg(long, value_name = "TABLE.KEY=VALUE")]
     set: Vec<String>,
@@ -151,13 +160,13 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     if checkpoint.is_none() {
         output::check_file(&settings_path, command.force)?;
         // Typing errors show before a long look at the capture; the layout only shifts preset values.
-        resolve(command, base.as_ref(), Layout::HyperNerf)?;
+        resolve(command, base.as_ref(), Layout::HyperNerf, None)?;
     }
 
     let mut capture = command.capture_options.clone();
     let wanted = match &checkpoint {
         Some(checkpoint) => scene::trained_downscale(&checkpoint.field),
-        None => resolve(command, base.as_ref(), Layout::HyperNerf)?.downscale,
+        None => resolve(command, base.as_ref(), Layout::HyperNerf, None)?.downscale,
     };
     capture.downscale = capture.downscale.or(wanted);
     let dataset = capture.open(&command.capture)?;
@@ -169,7 +178,11 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     let mut trainer = match checkpoint {
         Some(checkpoint) => Trainer::resume(dataset, checkpoint),
         None => {
-            let config = resolve(command, base.as_ref(), dataset.layout)?;
+            let plan = match &source {
+                Some(_) => None,
+                None => Some(plan(command, &dataset)?),
+            };
+            let config = resolve(command, base.as_ref(), dataset.layout, plan.as_ref())?;
             let text = toml::to_string_pretty(&config).expect("settings serialise to TOML");
             let trainer = match (source, &command.from) {
                 (Some(source), Some(path)) => {
@@ -181,7 +194,12 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
             if trainer.is_ok() {
                 output::write_file(&settings_path, text.as_bytes())?;
             }
-            trainer
+            trainer.map(|mut trainer| {
+                if let Some(plan) = &plan {
+                    trainer.record_effects(serde_json::json!(plan));
+                }
+                trainer
+            })
         }
     }
     .map_err(Error::plain)?;
@@ -335,14 +353,32 @@ fn load_source(path: &Path) -> Result<Checkpoint, Error> {
     Checkpoint::load(path).map_err(Error::plain)
 }
 
-/// Preset or the settings of the scene to begin with, file, flags.
-fn resolve(command: &Train, source: Option<&TrainConfig>, layout: Layout) -> Result<TrainConfig, Error> {
+/// What the capture calls for.
+fn plan(command: &Train, dataset: &Dataset) -> Result<EffectPlan, Error> {
+    let config = resolve(command, None, dataset.layout, None)?;
+    let choice = command.effects.clone().unwrap_or_else(|| EffectChoice {
+        basis: if config.preset == Preset::Paper { Basis::All } else { Basis::Auto },
+        ..EffectChoice::default()
+    });
+    EffectPlan::new(dataset, &config, &choice).map_err(Error::plain)
+}
+
+/// Preset or the settings of the scene to begin with, what the capture calls for, file, flags.
+fn resolve(
+    command: &Train,
+    source: Option<&TrainConfig>,
+    layout: Layout,
+    plan: Option<&EffectPlan>,
+) -> Result<TrainConfig, Error> {
     let typed = command.preset.as_deref().map(|name| preset(name, "--preset")).transpose()?;
     let from_file = command.config.as_deref().map(preset_in_file).transpose()?.flatten();
-    let base = match (typed.or(from_file), source) {
+    let mut base = match (typed.or(from_file), source) {
         (None, Some(source)) => source.clone(),
         (named, _) => TrainConfig::preset(named.unwrap_or_default(), layout),
     };
+    if let Some(plan) = plan {
+        plan.apply(&mut base);
+    }
     let mut layers = Layers::new(base);
     if let Some(path) = &command.config {
         layers.file(path)?;

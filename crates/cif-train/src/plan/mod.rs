@@ -1,0 +1,470 @@
+//! Which effects a capture calls for, found before anything is trained.
+//!
+//! | file | answers |
+//! |---|---|
+//! | this | which effects there are, what is decided of each, and which settings that means |
+//! | `evidence` | what the capture shows |
+//! | `choice` | what the user says instead |
+//!
+//! A new effect needs a kind here, its evidence, its decision and its settings; an effect that changes nothing
+//! has no place in the list.
+
+mod choice;
+mod evidence;
+
+use cif_dataset::Dataset;
+use cif_field::TimeEncoding;
+use serde::ser::{Serialize, Serializer};
+
+pub use choice::{Basis, EffectChoice};
+
+use self::evidence::Evidence;
+use crate::config::TrainConfig;
+use crate::error::TrainError;
+use crate::trainer::automatic_time_nodes;
+
+/// Steps between tests for Gaussians that stand still.
+const STILL_EVERY: u32 = 500;
+
+/// Gain that a degree of spherical harmonics must bring, dB.
+const SH_GAIN: f32 = 0.02;
+
+/// Gain that an optional output of the deformation must bring, dB.
+const HEAD_GAIN: f32 = 0.02;
+
+/// Share of changed pixels up to which a fixed camera sees nothing move.
+const STATIC_CHANGE: f64 = 5e-4;
+
+/// Angle between views up to which colour cannot be told to depend on the view, degrees.
+const FEW_DIRECTIONS: f64 = 4.0;
+
+/// Ratio of footprints from which the low-pass filter of the nearest views would hide detail, or that of the
+/// farthest would thicken it.
+const FOOTPRINTS: f64 = 4.0;
+
+/// Weights of motion guidance where it is switched on.
+const GUIDANCE: f32 = 10.0;
+const STILLNESS: f32 = 1.0;
+
+/// An effect that a capture may or may not call for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum EffectKind {
+    /// The deformation network.
+    Motion,
+    /// Its outputs beside the centres: scales, rotations, opacities, colours.
+    Shape,
+    /// Nodes of the time planes.
+    TimePlanes,
+    /// Spherical harmonics above degree 0.
+    ViewDependence,
+    /// Identities, occupancy, calibration, resampling.
+    Instances,
+    /// Paths of travelling objects from their masks.
+    Guidance,
+    /// Compensation of opacity for the low-pass filter.
+    Antialiasing,
+    /// Removal of lens distortion.
+    Lens,
+    /// Colour behind everything.
+    Background,
+}
+
+impl EffectKind {
+    /// Those that `--effects` switches.
+    pub const SWITCHED: [Self; 6] = [
+        Self::Motion,
+        Self::Shape,
+        Self::ViewDependence,
+        Self::Instances,
+        Self::Guidance,
+        Self::Antialiasing,
+    ];
+
+    /// Name, as in `--effects` and in JSON.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Motion => "motion",
+            Self::Shape => "shape",
+            Self::TimePlanes => "time-planes",
+            Self::ViewDependence => "view-dependence",
+            Self::Instances => "instances",
+            Self::Guidance => "guidance",
+            Self::Antialiasing => "antialiasing",
+            Self::Lens => "lens",
+            Self::Background => "background",
+        }
+    }
+}
+
+impl Serialize for EffectKind {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+/// What was decided of an effect.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Decision {
+    /// Throughout.
+    On,
+    /// Not at all.
+    Off,
+    /// As far as the words say.
+    Value(String),
+}
+
+impl std::fmt::Display for Decision {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::On => f.write_str("on"),
+            Self::Off => f.write_str("off"),
+            Self::Value(words) => f.write_str(words),
+        }
+    }
+}
+
+impl Serialize for Decision {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(self)
+    }
+}
+
+/// An effect, and what is to be done about it.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct Effect {
+    /// Which.
+    pub effect: EffectKind,
+    /// What was decided.
+    pub decision: Decision,
+    /// Why.
+    pub evidence: String,
+    /// What it costs where it is on throughout, in time and memory.
+    pub cost: String,
+    /// What decides otherwise; empty where nothing does.
+    pub flag: String,
+}
+
+/// All effects of a capture. Serialises as `{"effects": [{effect, decision, evidence, cost, flag}, ...]}`.
+#[derive(Clone, Debug, PartialEq, Eq, serde::Serialize)]
+pub struct EffectPlan {
+    /// In the order of [`EffectKind`].
+    pub effects: Vec<Effect>,
+}
+
+/// How far an effect goes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Extent {
+    /// Not at all.
+    Off,
+    /// Only where it shows that it helps.
+    Needed,
+    /// Throughout, as the preset says.
+    Full,
+}
+
+impl EffectPlan {
+    /// Looks at a capture; `config` are the settings that it would be trained with.
+    ///
+    /// # Errors
+    /// When a mask or an image that must be looked at cannot be read.
+    pub fn new(dataset: &Dataset, config: &TrainConfig, choice: &EffectChoice) -> Result<Self, TrainError> {
+        let evidence = Evidence::of(dataset)?;
+        Ok(Self { effects: decide(&evidence, config, choice) })
+    }
+
+    /// What was decided of an effect.
+    #[must_use]
+    pub fn decision(&self, kind: EffectKind) -> Option<&Decision> {
+        self.effects.iter().find(|effect| effect.effect == kind).map(|effect| &effect.decision)
+    }
+
+    /// Lays the decisions over settings.
+    pub fn apply(&self, config: &mut TrainConfig) {
+        for effect in &self.effects {
+            let extent = match &effect.decision {
+                Decision::Off => Extent::Off,
+                Decision::On => Extent::Full,
+                Decision::Value(_) => Extent::Needed,
+            };
+            set(effect.effect, extent, config);
+        }
+    }
+}
+
+/// The settings that an effect means.
+fn set(kind: EffectKind, extent: Extent, config: &mut TrainConfig) {
+    let only_if = |condition: bool, value: f32| if condition { value } else { 0.0 };
+    let needed = extent == Extent::Needed;
+    match kind {
+        EffectKind::Motion => {
+            config.effects.motion = extent != Extent::Off;
+            config.effects.still_every = if needed { STILL_EVERY } else { 0 };
+        }
+        EffectKind::Shape => {
+            config.effects.head_gain = only_if(needed, HEAD_GAIN);
+            if extent == Extent::Off {
+                let heads = &mut config.model.heads;
+                (heads.scale, heads.rotation, heads.opacity, heads.sh) = (false, false, false, false);
+            }
+        }
+        EffectKind::ViewDependence => {
+            config.effects.sh_gain = only_if(needed, SH_GAIN);
+            if extent == Extent::Off {
+                config.model.sh_degree = 0;
+            }
+        }
+        EffectKind::Instances => config.effects.instances = extent != Extent::Off,
+        EffectKind::Guidance => {
+            if extent == Extent::Off {
+                (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
+            } else if config.motion.guidance == 0.0 {
+                (config.motion.guidance, config.motion.stillness) = (GUIDANCE, STILLNESS);
+            }
+        }
+        EffectKind::Antialiasing => config.antialiased = extent != Extent::Off,
+        // Told, and set elsewhere: by the number of times, by the capture, by the background.
+        EffectKind::TimePlanes | EffectKind::Lens | EffectKind::Background => {}
+    }
+}
+
+fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<Effect> {
+    let deformation_mb = deformation_megabytes(config, found.times);
+    let effect =
+        |kind: EffectKind, auto: Extent, full: Extent, words: &str, evidence: String, cost: String| {
+            let extent = match choice.switched.get(&kind) {
+                Some(true) => Extent::Full,
+                Some(false) => Extent::Off,
+                None => match choice.basis {
+                    Basis::All => full,
+                    Basis::Auto => auto,
+                    Basis::None => Extent::Off,
+                },
+            };
+            let decision = match extent {
+                Extent::Off => Decision::Off,
+                Extent::Full => Decision::On,
+                Extent::Needed => Decision::Value(words.to_owned()),
+            };
+            let sign = if extent == Extent::Off { '+' } else { '-' };
+            let flag = match extent {
+                Extent::Needed => format!("--effects +{0} or -{0}", kind.name()),
+                _ => format!("--effects {sign}{}", kind.name()),
+            };
+            Effect { effect: kind, decision, evidence, cost, flag }
+        };
+    let mut effects = Vec::new();
+
+    let (moves, why) = motion(found);
+    let full_motion = if found.times > 1 { Extent::Full } else { Extent::Off };
+    let cost = if found.times > 1 {
+        format!("more than half of a step, {deformation_mb:.0} MB; a tenth of that where little moves")
+    } else {
+        "none".to_owned()
+    };
+    effects.push(effect(
+        EffectKind::Motion,
+        if moves { Extent::Needed } else { Extent::Off },
+        full_motion,
+        "where it is",
+        why.clone(),
+        cost,
+    ));
+    let moves_now = effects[0].decision != Decision::Off;
+
+    let heads = config.model.heads;
+    let optional: Vec<&str> = [
+        (heads.scale, "scales"),
+        (heads.rotation, "rotations"),
+        (heads.opacity, "opacities"),
+        (heads.sh, "colours"),
+    ]
+    .into_iter()
+    .filter_map(|(on, name)| on.then_some(name))
+    .collect();
+    if moves_now && !optional.is_empty() {
+        effects.push(effect(
+            EffectKind::Shape,
+            Extent::Needed,
+            Extent::Full,
+            &format!("{} while they help", optional.join(", ")),
+            "judged in training, on pixels that are held out".to_owned(),
+            "a tenth of a step each".to_owned(),
+        ));
+    }
+    if moves_now {
+        let nodes = match config.model.time_resolution {
+            0 => automatic_time_nodes(found.times),
+            nodes => nodes,
+        };
+        effects.push(Effect {
+            effect: EffectKind::TimePlanes,
+            decision: Decision::Value(format!("{nodes} nodes")),
+            evidence: format!("{} times{}", found.times, speed(found)),
+            cost: format!("{:.1} MB", time_plane_megabytes(config, nodes)),
+            flag: "--set model.time_resolution=N".to_owned(),
+        });
+    }
+
+    let degree = config.model.sh_degree;
+    if degree > 0 {
+        let few = found.view_angle < FEW_DIRECTIONS;
+        effects.push(effect(
+            EffectKind::ViewDependence,
+            if few { Extent::Off } else { Extent::Needed },
+            Extent::Full,
+            &format!("up to degree {degree} while it helps"),
+            if few {
+                format!("views differ by {:.1} degrees at most", found.view_angle)
+            } else {
+                format!(
+                    "views differ by up to {:.0} degrees; degrees are judged in training, on pixels that are \
+                     held out",
+                    found.view_angle
+                )
+            },
+            "a twentieth of a step, 540 bytes per Gaussian and moment at degree 3".to_owned(),
+        ));
+    }
+
+    let has_masks = found.masked > 0 && found.instances > 0;
+    let extent = if has_masks { Extent::Full } else { Extent::Off };
+    let mut instances = effect(
+        EffectKind::Instances,
+        extent,
+        extent,
+        "",
+        if has_masks {
+            format!(
+                "{} of {} training frames have masks, of {} instances",
+                found.masked, found.frames, found.instances
+            )
+        } else {
+            "no masks".to_owned()
+        },
+        format!("{} steps, each a tenth to a fifth longer", config.stages.instance),
+    );
+    if !has_masks {
+        // Nothing can be switched on.
+        instances.decision = Decision::Off;
+        instances.flag = "--masks NAME".to_owned();
+    }
+    effects.push(instances);
+
+    if moves_now && has_masks {
+        let preset = if config.motion.guidance > 0.0 { Extent::Full } else { Extent::Off };
+        effects.push(effect(
+            EffectKind::Guidance,
+            preset,
+            preset,
+            "",
+            match (&found.travelling[..], found.moving_cameras) {
+                ([], _) => "no instance travels".to_owned(),
+                (labels, 1) if found.fixed_cameras == 0 => {
+                    format!("one moving camera, and these travel: {}", labels.join(", "))
+                }
+                (labels, _) => format!("several cameras see what travels: {}", labels.join(", ")),
+            },
+            format!("{} steps before the fine stage", config.motion.rehearsal),
+        ));
+    }
+
+    let preset = if config.antialiased { Extent::Full } else { Extent::Off };
+    effects.push(effect(
+        EffectKind::Antialiasing,
+        if found.footprint_ratio >= FOOTPRINTS { Extent::Full } else { preset },
+        preset,
+        "",
+        format!("views differ {:.1} times in pixels per metre", found.footprint_ratio),
+        "none; viewers of exported files do not compensate".to_owned(),
+    ));
+    if found.lenses > 0 {
+        effects.push(Effect {
+            effect: EffectKind::Lens,
+            decision: Decision::On,
+            evidence: format!("{} of {} training frames have distortion", found.lenses, found.frames),
+            cost: "when images are read".to_owned(),
+            flag: String::new(),
+        });
+    }
+    let [red, green, blue] = config.background;
+    effects.push(Effect {
+        effect: EffectKind::Background,
+        decision: Decision::Value(format!("{red} {green} {blue}")),
+        evidence: if found.has_alpha {
+            "images have alpha and are laid over it".to_owned()
+        } else {
+            "images are opaque: it shows only where no Gaussian is".to_owned()
+        },
+        cost: "none".to_owned(),
+        flag: "--set background=[R,G,B]".to_owned(),
+    });
+    effects
+}
+
+/// Whether anything may move, and why.
+fn motion(found: &Evidence) -> (bool, String) {
+    if found.times < 2 {
+        return (false, "a single time".to_owned());
+    }
+    match found.change {
+        Some(change) if change <= STATIC_CHANGE => {
+            (false, format!("{} times, but fixed cameras see nothing change", found.times))
+        }
+        Some(change) => (
+            true,
+            format!("{} times; up to {:.1} % of a fixed camera's pixels change", found.times, 100.0 * change),
+        ),
+        None if !found.travelling.is_empty() => (
+            true,
+            format!("{} times; by their masks these travel: {}", found.times, found.travelling.join(", ")),
+        ),
+        None => (true, format!("{} times; the cameras move, so that training must tell", found.times)),
+    }
+}
+
+/// How fast things are, in words.
+fn speed(found: &Evidence) -> String {
+    match found.travelling.len() {
+        0 => String::new(),
+        count => format!(", {count} of {} instances travel", found.instances),
+    }
+}
+
+/// Memory of the deformation with gradients and moments, megabytes.
+fn deformation_megabytes(config: &TrainConfig, times: usize) -> f64 {
+    let nodes = match config.model.time_resolution {
+        0 => automatic_time_nodes(times),
+        nodes => nodes,
+    };
+    let model = &config.model;
+    let spatial: f64 = model
+        .multipliers
+        .iter()
+        .map(|factor| {
+            let [x, y, z] = model.spatial_resolution.map(|nodes| f64::from(nodes * factor));
+            (x * y + x * z + y * z) * f64::from(model.channels)
+        })
+        .sum();
+    TENSORS * 4.0 * spatial / 1e6 + time_plane_megabytes(config, nodes)
+}
+
+/// Values, gradients and two moments.
+const TENSORS: f64 = 4.0;
+
+fn time_plane_megabytes(config: &TrainConfig, nodes: u32) -> f64 {
+    let model = &config.model;
+    let rows = match model.time_encoding {
+        TimeEncoding::Compact => nodes - nodes.saturating_sub(1) / 2,
+        TimeEncoding::Compat => nodes,
+    };
+    let columns: f64 = model
+        .multipliers
+        .iter()
+        .map(|factor| model.spatial_resolution.iter().map(|nodes| f64::from(nodes * factor)).sum::<f64>())
+        .sum();
+    TENSORS * 4.0 * columns * f64::from(rows) * f64::from(model.channels) / 1e6
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,113 @@
+use super::*;
+
+fn found() -> Evidence {
+    Evidence {
+        times: 60,
+        frames: 60,
+        fixed_cameras: 0,
+        moving_cameras: 1,
+        change: None,
+        masked: 60,
+        instances: 5,
+        travelling: vec!["ball".to_owned()],
+        footprint_ratio: 1.3,
+        view_angle: 50.0,
+        lenses: 0,
+        has_alpha: false,
+    }
+}
+
+fn plan(found: &Evidence, choice: &str) -> (EffectPlan, TrainConfig) {
+    let mut config = TrainConfig::default();
+    let plan = EffectPlan { effects: decide(found, &config, &choice.parse().unwrap()) };
+    plan.apply(&mut config);
+    config.validate().unwrap();
+    (plan, config)
+}
+
+#[test]
+fn all_leaves_the_settings_as_they_are() {
+    assert_eq!(plan(&found(), "all").1, TrainConfig::default());
+}
+
+#[test]
+fn auto_goes_as_far_as_the_evidence() {
+    let (plan, config) = plan(&found(), "auto");
+    assert_eq!(plan.decision(EffectKind::Motion), Some(&Decision::Value("where it is".to_owned())));
+    assert!(config.effects.motion && config.effects.instances);
+    assert!(config.effects.still_every > 0 && config.effects.sh_gain > 0.0 && config.effects.head_gain > 0.0);
+    assert_eq!(config.motion.guidance, 0.0);
+    assert!(!config.antialiased);
+    assert!(plan.effects[0].evidence.contains("ball"), "{}", plan.effects[0].evidence);
+}
+
+#[test]
+fn a_static_capture_without_masks_needs_plain_splats() {
+    for choice in ["auto", "all"] {
+        let still = Evidence { times: 1, masked: 0, instances: 0, travelling: Vec::new(), ..found() };
+        let (plan, config) = plan(&still, choice);
+        assert_eq!(plan.decision(EffectKind::Motion), Some(&Decision::Off), "{choice}");
+        assert_eq!(plan.decision(EffectKind::Instances), Some(&Decision::Off), "{choice}");
+        assert!(
+            plan.decision(EffectKind::Shape).is_none() && plan.decision(EffectKind::TimePlanes).is_none()
+        );
+        assert!(!config.effects.motion && !config.effects.instances);
+    }
+}
+
+#[test]
+fn fixed_cameras_that_see_no_change_need_no_motion() {
+    let fixed = |change| Evidence { moving_cameras: 0, fixed_cameras: 3, change: Some(change), ..found() };
+    assert!(!plan(&fixed(1e-4), "auto").1.effects.motion);
+    assert!(plan(&fixed(1e-4), "all").1.effects.motion, "all takes no evidence");
+    assert!(plan(&fixed(0.01), "auto").1.effects.motion);
+}
+
+#[test]
+fn switches_win_over_the_evidence() {
+    let (plan, config) = plan(&found(), "auto,+motion,-instances,+guidance,-view-dependence,-shape");
+    assert_eq!(plan.decision(EffectKind::Motion), Some(&Decision::On));
+    assert_eq!((config.effects.still_every, config.effects.instances), (0, false));
+    assert_eq!((config.motion.guidance, config.model.sh_degree), (GUIDANCE, 0));
+    assert!(!config.model.heads.scale && config.model.heads.position);
+    let none = self::plan(&found(), "none").1;
+    assert!(!none.effects.motion && !none.effects.instances && none.model.sh_degree == 0);
+}
+
+#[test]
+fn few_directions_and_many_footprints_count() {
+    let flat = Evidence { view_angle: 1.0, footprint_ratio: 6.0, ..found() };
+    let (_, config) = plan(&flat, "auto");
+    assert_eq!(config.model.sh_degree, 0);
+    assert!(config.antialiased);
+    let (_, config) = plan(&flat, "all");
+    assert_eq!((config.model.sh_degree, config.antialiased), (3, false));
+}
+
+#[test]
+fn every_effect_says_why_and_what_decides_otherwise() {
+    let lens = Evidence { lenses: 3, has_alpha: true, ..found() };
+    let (plan, _) = plan(&lens, "auto");
+    for effect in &plan.effects {
+        assert!(!effect.evidence.is_empty() && !effect.cost.is_empty(), "{effect:?}");
+        assert!(effect.flag.starts_with("--") || effect.effect == EffectKind::Lens, "{effect:?}");
+    }
+    let json = serde_json::to_value(&plan).unwrap();
+    let names: Vec<&str> =
+        json["effects"].as_array().unwrap().iter().map(|e| e["effect"].as_str().unwrap()).collect();
+    assert_eq!(
+        names,
+        [
+            "motion",
+            "shape",
+            "time-planes",
+            "view-dependence",
+            "instances",
+            "guidance",
+            "antialiasing",
+            "lens",
+            "background"
+        ]
+    );
+    assert_eq!(json["effects"][4]["decision"], "on");
+}

@@ -1,0 +1,191 @@
+//! Effects that a capture does not call for are not run, and what is left out costs no quality.
+
+mod support;
+
+use cif_field::Field;
+use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
+use cif_train::plan::EffectKind;
+use cif_train::{Control, EffectChoice, EffectPlan, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
+use support::{Scene, capture, small_config, train};
+
+/// The settings with what a capture calls for.
+fn planned(dataset: &cif_dataset::Dataset, config: &TrainConfig, choice: &str) -> TrainConfig {
+    let choice: EffectChoice = choice.parse().unwrap();
+    let mut config = config.clone();
+    EffectPlan::new(dataset, &config, &choice).unwrap().apply(&mut config);
+    config
+}
+
+/// [`small_config`] with tests that fall into its few steps.
+fn still_config() -> TrainConfig {
+    let mut config = small_config();
+    config.effects.still_every = 40;
+    config.effects.still_from = 0.3;
+    config.effects.still_displacement = 5e-3;
+    config.effects.still_shape = 0.2;
+    config
+}
+
+#[test]
+fn a_static_capture_without_masks_trains_plain_splats_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 1, masks: false, ..Scene::default() });
+    let config = planned(&dataset, &small_config(), "auto");
+    let trainer = train(dataset, config);
+    let times = trainer.times();
+    assert!(times.steps > 0 && times.evaluated_pairs > 0);
+    assert_eq!((times.deformed, times.deformed_backward), (0, 0));
+    assert_eq!((times.labelled_tiles, times.identity_rows, times.instance_pairs), (0, 0, 0));
+    assert!(trainer.field().deformation.is_none() && trainer.field().identities.is_none());
+}
+
+#[test]
+fn motion_and_instances_can_be_switched_off() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let config = planned(&dataset, &small_config(), "none");
+    let mut stages = Vec::new();
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    trainer
+        .run(&mut |event, _| {
+            if let TrainEvent::StageStarted { stage, .. } = event {
+                stages.push(*stage);
+            }
+            Control::Continue
+        })
+        .unwrap();
+    assert_eq!(stages, [Stage::Fine]);
+    assert_eq!((trainer.times().deformed, trainer.times().identity_rows), (0, 0));
+    assert_eq!(trainer.field().sh_degree, 0);
+}
+
+#[test]
+fn the_plan_of_a_capture_follows_what_is_in_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let moving = capture(folder.path(), Scene { times: 6, views: 3, ..Scene::default() });
+    let config = small_config();
+    let plan =
+        |dataset: &cif_dataset::Dataset| EffectPlan::new(dataset, &config, &EffectChoice::default()).unwrap();
+    let words = |plan: &EffectPlan, kind| plan.decision(kind).map(ToString::to_string);
+    let found = plan(&moving);
+    assert_eq!(words(&found, EffectKind::Motion).unwrap(), "where it is");
+    assert_eq!(words(&found, EffectKind::Instances).unwrap(), "on");
+    let motion = &found.effects[0].evidence;
+    assert!(motion.starts_with("6 times; up to ") && motion.contains("fixed camera"), "{motion}");
+    // The same pictures at every time: fixed cameras see nothing change.
+    let mut still = moving.clone();
+    for frame in &mut still.frames {
+        frame.image = folder.path().join(format!("{}_0.png", frame.name.split('_').next().unwrap()));
+    }
+    assert_eq!(words(&plan(&still), EffectKind::Motion).unwrap(), "off");
+    // One camera that moves sees the third ball roll, by its masks.
+    let rolls = tempfile::tempdir().unwrap();
+    let scene = Scene { times: 12, views: 12, rolls: Some(1.5), one_camera: true, ..Scene::default() };
+    let found = plan(&capture(rolls.path(), scene));
+    assert!(found.effects[0].evidence.contains("ball 9"), "{}", found.effects[0].evidence);
+}
+
+#[test]
+fn what_stands_still_skips_the_network_and_what_moves_does_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene::default());
+    let score = |trainer: &Trainer| {
+        let field = trainer.field();
+        let options = EvaluationOptions::held_out(field);
+        evaluate::<EvaluationError>(field, trainer.dataset(), &options, |_| Ok(()))
+            .unwrap()
+            .overall
+            .psnr
+            .unwrap()
+    };
+    let mut settled = Vec::new();
+    let mut trainer = Trainer::new(dataset.clone(), still_config()).unwrap();
+    let outcome = trainer.run(&mut |event, _| {
+        if let TrainEvent::Settled { still, .. } = event {
+            settled.push(*still);
+        }
+        Control::Continue
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Finished);
+    let whole = train(dataset, small_config());
+    assert!(!settled.is_empty() && settled[settled.len() - 1] > 0, "{settled:?}");
+
+    let (part, all) = (trainer.times(), whole.times());
+    assert!((part.deformed as f64) < 0.8 * all.deformed as f64, "{} of {}", part.deformed, all.deformed);
+    assert!(part.deformed_backward < all.deformed_backward);
+    let field = trainer.field();
+    let still = |row: u32| field.deformation.as_ref().unwrap().is_still(row as usize);
+    let share = |instance: usize| {
+        let members = field.members(instance);
+        members.iter().filter(|row| still(**row)).count() as f64 / members.len() as f64
+    };
+    // The third ball moves, the others do not.
+    assert!(share(2) < 0.3 && share(0) > 0.5, "{} {} {}", share(0), share(1), share(2));
+    let (with, without) = (score(&trainer), score(&whole));
+    assert!(with > without - 0.5, "{with} dB against {without} dB");
+}
+
+/// Everything but times and sizes of the run.
+fn without_record(field: &Field) -> Field {
+    Field { provenance: serde_json::Value::Null, ..field.clone() }
+}
+
+#[test]
+fn a_resumed_run_keeps_what_stands_still_and_what_was_judged() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = still_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (40, 110, 60);
+    (config.densify.from, config.densify.every) = (10, 20);
+    (config.effects.still_every, config.resample.every) = (20, 10);
+    config.model.sh_interval = 30;
+    // What no output and no degree can gain.
+    (config.effects.sh_gain, config.effects.head_gain) = (90.0, 90.0);
+    config.report.step_every = 1;
+    let (mut judged, mut stopped) = (Vec::new(), 0);
+    let mut whole = Trainer::new(dataset.clone(), config.clone()).unwrap();
+    whole
+        .run(&mut |event, _| {
+            if let TrainEvent::Judged { what, kept, .. } = event {
+                judged.push((what.clone(), *kept));
+            }
+            Control::Continue
+        })
+        .unwrap();
+    assert!(judged.iter().all(|(_, kept)| !kept), "{judged:?}");
+    assert_eq!(judged.len(), 3, "degree 1, scales and rotations: {judged:?}");
+    let deformation = whole.field().deformation.as_ref().unwrap();
+    assert!(deformation.still.contains(&true) && !deformation.config.heads.rotation);
+    assert_eq!(whole.field().sh_degree, 0);
+    for stop_at in [72_u64, 73, 95, 131, 175] {
+        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+        let mut steps = 0;
+        let outcome = trainer.run(&mut |event, _| {
+            steps += u64::from(matches!(event, TrainEvent::Step { .. }));
+            if steps >= stop_at { Control::Stop } else { Control::Continue }
+        });
+        assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+        let path = folder.path().join("stopped.cif");
+        trainer.checkpoint(true).save(&path).unwrap();
+        let loaded = cif_field::Checkpoint::load(&path).unwrap();
+        let mut resumed = Trainer::resume(dataset.clone(), loaded).unwrap();
+        assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+        assert_eq!(without_record(resumed.field()), without_record(whole.field()), "stopped after {stop_at}");
+        stopped += 1;
+    }
+    assert_eq!(stopped, 5);
+}
+
+#[test]
+fn threads_do_not_change_what_stands_still() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = still_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (40, 100, 30);
+    (config.effects.sh_gain, config.effects.head_gain) = (0.01, 0.01);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| without_record(train(dataset.clone(), config.clone()).field()))
+    };
+    assert_eq!(on(1), on(3));
+}

@@ -1,0 +1,60 @@
+//! `cif plan`: which effects a capture calls for.
+
+use std::path::PathBuf;
+
+use cif_train::{EffectChoice, EffectPlan, TrainConfig};
+use clap::Args;
+use serde_json::json;
+
+use super::{CaptureOptions, print_warnings};
+use crate::error::Error;
+
+/// Tell which effects a capture calls for, and what they cost
+#[derive(Debug, Args)]
+#[command(after_help = "\
+`cif train` follows this plan and records it in the scene. Each line tells the flag of `cif train` that
+decides otherwise; settings that are typed or in a --config file win over the plan.
+
+  cif plan captures/table
+  cif train captures/table -o table.cif --effects auto,-instances")]
+pub(super) struct Plan {
+    /// Folder of the capture
+    capture: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Named settings that the capture would be trained with: draft, standard or paper
+    #[arg(long, value_name = "NAME", default_value = "standard")]
+    preset: String,
+    /// Effects: all (as the preset says), auto (as the capture calls for) or none, then single ones
+    /// on or off, as in auto,+motion,-instances
+    #[arg(long, value_name = "LIST", default_value = "auto", allow_hyphen_values = true)]
+    effects: EffectChoice,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+}
+
+pub(super) fn run(command: &Plan) -> Result<(), Error> {
+    let preset = super::train::preset(&command.preset, "--preset")?;
+    let dataset = command.capture_options.open(&command.capture)?;
+    print_warnings(&dataset);
+    let config = TrainConfig::preset(preset, dataset.layout);
+    let plan = EffectPlan::new(&dataset, &config, &command.effects).map_err(Error::plain)?;
+    if command.json {
+        println!("{:#}", json!(plan));
+        return Ok(());
+    }
+    let mut table = super::table(["effect", "decision", "evidence", "cost", "otherwise"]);
+    table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
+    for effect in &plan.effects {
+        table.add_row([
+            effect.effect.name(),
+            &effect.decision.to_string(),
+            &effect.evidence,
+            &effect.cost,
+            &effect.flag,
+        ]);
+    }
+    println!("{table}");
+    Ok(())
+}
