@@ -21,8 +21,7 @@ fn still_config() -> TrainConfig {
     let mut config = small_config();
     config.effects.still_every = 40;
     config.effects.still_from = 0.3;
-    config.effects.still_displacement = 5e-3;
-    config.effects.still_shape = 0.2;
+    config.effects.still_loss = 0.1;
     config
 }
 

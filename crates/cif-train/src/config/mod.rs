@@ -307,13 +307,17 @@ pub struct EffectsConfig {
     /// Steps between tests for Gaussians that stand still, which then skip the deformation network; default 0:
     /// every Gaussian goes through it.
     pub still_every: u32,
-    /// Share of the fine steps before the first test, default 0.15.
+    /// Share of the fine steps before the first test, default 0.25.
     pub still_from: f32,
-    /// Displacement from its mean, as a fraction of the extent, up to which a Gaussian stands still, default 1e-3.
+    /// Displacement from its mean, as a fraction of the extent, up to which a Gaussian may be taken to stand
+    /// still, default 0.03. Less counts, down to 0.001, where that much shows.
     pub still_displacement: f32,
     /// Change of log-scales, of the unit quaternion, of the opacity logit and of the colour coefficients up to
-    /// which a Gaussian stands still, default 0.05.
+    /// which, likewise, a Gaussian may be taken to stand still, default 0.5.
     pub still_shape: f32,
+    /// Loss, dB on held-out pixels of training views, up to which a test takes Gaussians to stand still, default
+    /// 0.02.
+    pub still_loss: f32,
     /// Gain, dB on held-out pixels of training views, that a degree of spherical harmonics must bring before the
     /// next one comes; else it is taken back. Default 0: degrees come by steps alone.
     pub sh_gain: f32,

@@ -107,6 +107,7 @@ impl TrainConfig {
             ("resample.offset", resample.offset),
             ("effects.still_displacement", self.effects.still_displacement),
             ("effects.still_shape", self.effects.still_shape),
+            ("effects.still_loss", self.effects.still_loss),
             ("effects.sh_gain", self.effects.sh_gain),
             ("effects.head_gain", self.effects.head_gain),
         ] {

@@ -141,7 +141,7 @@ pub struct Effect {
     pub evidence: String,
     /// What it costs where it is on throughout, in time and memory.
     pub cost: String,
-    /// What decides otherwise; empty where nothing does.
+    /// What decides otherwise; empty where nothing can.
     pub flag: String,
 }
 
@@ -270,6 +270,10 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
         why.clone(),
         cost,
     ));
+    if found.times < 2 {
+        // Nothing can be switched on.
+        (effects[0].decision, effects[0].flag) = (Decision::Off, String::new());
+    }
     let moves_now = effects[0].decision != Decision::Off;
 
     let heads = config.model.heads;

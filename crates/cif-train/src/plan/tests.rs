@@ -43,7 +43,7 @@ fn auto_goes_as_far_as_the_evidence() {
 
 #[test]
 fn a_static_capture_without_masks_needs_plain_splats() {
-    for choice in ["auto", "all"] {
+    for choice in ["auto", "all", "auto,+motion,+instances"] {
         let still = Evidence { times: 1, masked: 0, instances: 0, travelling: Vec::new(), ..found() };
         let (plan, config) = plan(&still, choice);
         assert_eq!(plan.decision(EffectKind::Motion), Some(&Decision::Off), "{choice}");
@@ -52,7 +52,10 @@ fn a_static_capture_without_masks_needs_plain_splats() {
             plan.decision(EffectKind::Shape).is_none() && plan.decision(EffectKind::TimePlanes).is_none()
         );
         assert!(!config.effects.motion && !config.effects.instances);
+        assert!(plan.effects[0].flag.is_empty(), "no flag gives a capture more times");
     }
+    let still = Evidence { times: 1, ..found() };
+    assert!(!plan(&still, "+motion").1.effects.motion);
 }
 
 #[test]

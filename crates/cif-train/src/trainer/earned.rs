@@ -39,7 +39,8 @@ fn held_out(width: u32, height: u32) -> impl Iterator<Item = usize> {
 impl Trainer {
     /// Whether pixels are held out to judge by.
     fn judges(&self) -> bool {
-        self.config.effects.sh_gain > 0.0 || self.config.effects.head_gain > 0.0
+        let effects = &self.config.effects;
+        effects.sh_gain > 0.0 || effects.head_gain > 0.0 || effects.still_every > 0
     }
 
     /// Keeps the pixels that are judged by out of the colour gradient.
@@ -130,7 +131,7 @@ impl Trainer {
 }
 
 /// Mean squared colour error of a field over the held-out pixels of evenly spread training views.
-fn judged_error(
+pub(super) fn judged_error(
     renderer: &mut Renderer,
     (frames, dataset): (&FrameStore, &Dataset),
     field: &Field,
@@ -214,7 +215,7 @@ fn name(kind: HeadKind) -> &'static str {
 }
 
 /// Gain of a smaller error, dB.
-fn gain(without: f64, with: f64) -> f64 {
+pub(super) fn gain(without: f64, with: f64) -> f64 {
     10.0 * (without.max(1e-12) / with.max(1e-12)).log10()
 }
 
@@ -241,8 +242,12 @@ mod tests {
 
     #[test]
     fn an_output_leaves_its_mean_behind_and_the_others_as_they_were() {
-        let field =
-            synthetic::generate(&synthetic::SyntheticConfig { gaussians: 40, ..Default::default() }).field;
+        let field = synthetic::generate(&synthetic::SyntheticConfig {
+            gaussians: 40,
+            heads: Some(synthetic::ALL_HEADS),
+            ..Default::default()
+        })
+        .field;
         let times = [0.0, 0.5, 1.0];
         let trial = without_output(&field, HeadKind::Scale, &times).unwrap();
         trial.field.validate().unwrap();

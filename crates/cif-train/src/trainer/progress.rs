@@ -30,6 +30,9 @@ pub(super) struct Progress {
     /// Highest degree that is left, once one did not help.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sh_cap: Option<u8>,
+    /// Rung of the ladder of limits that held at the last test for Gaussians that stand still.
+    #[serde(default)]
+    pub still_rung: u32,
     /// What was planned for the capture, as recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effects: Option<serde_json::Value>,
@@ -76,6 +79,7 @@ impl Progress {
             sh_start: 0,
             sh_judged: 0,
             sh_cap: None,
+            still_rung: 0,
             effects: None,
             opacities_were_reset: false,
             psnr: None,

@@ -216,7 +216,7 @@ impl Trainer {
             _ => self.densify(stage, iteration, events)?,
         }
         self.judge_heads(stage, iteration, events)?;
-        self.settle(stage, iteration, events);
+        self.settle(stage, iteration, events)?;
         lap(&mut self.times.rearrange, &mut since);
         self.times.total += start.elapsed();
         self.times.steps += 1;

@@ -10,7 +10,9 @@ use cif_field::deformation::evaluate::Deltas;
 use cif_field::{Field, Gaussians};
 
 use super::Trainer;
+use super::earned::{gain, judged_error};
 use crate::config::EffectsConfig;
+use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::schedule::falls_on;
 
@@ -20,9 +22,12 @@ const PROBES: usize = 8;
 /// Gaussians probed together, which bounds the memory.
 const CHUNK: usize = 4_096;
 
-/// Motion, in thresholds, from which a Gaussian that stands still is handed back; more than 1, so that none goes
-/// back and forth.
+/// Motion, in highest limits, from which a Gaussian that stands still is handed back; more than 1, so that none
+/// goes back and forth.
 const RELEASE: f32 = 2.0;
+
+/// Rungs of the ladder of limits, each half of the one above.
+pub(super) const RUNGS: u32 = 6;
 
 /// What the network does to a Gaussian over the probe times.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,19 +41,50 @@ pub(super) struct Motion {
 }
 
 impl Trainer {
-    /// The test for Gaussians that stand still, where it falls on this step.
-    pub(super) fn settle(&mut self, stage: Stage, iteration: u32, events: &mut Vec<TrainEvent>) {
+    /// The test for Gaussians that stand still, where it falls on this step: of a ladder of limits, the highest
+    /// one counts that does not show in the held-out pixels.
+    pub(super) fn settle(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
         let last = self.plan.iterations(&self.config, stage);
-        if !falls_due(&self.config.effects, stage, iteration, last) {
-            return;
-        }
+        let due = falls_due(&self.config.effects, stage, iteration, last);
+        let Some(deformation) = self.field.deformation.as_ref().filter(|_| due) else { return Ok(()) };
         let effects = &self.config.effects;
-        let limits = [effects.still_displacement * self.field.extent, effects.still_shape];
-        let times = probe_times(&self.dataset.times);
-        let Some((settled, released)) = settle(&mut self.field, &times, limits) else { return };
+        let highest = Limits {
+            displacement: effects.still_displacement * self.field.extent,
+            shape: effects.still_shape,
+        };
+        let rows: Vec<u32> = (0..self.field.len() as u32).collect();
+        let motions = probe(deformation, &self.field.gaussians, &rows, &probe_times(&self.dataset.times));
+        let settings = self.color_settings();
+        let views = (&self.frames, &self.dataset);
+        let before = judged_error(&mut self.renderer, views, &self.field, &settings)?;
+        // Not far above the rung that held last time, so that few are tried in vain.
+        let (mut rung, mut settled, mut released) = (self.progress.still_rung.saturating_sub(1), 0, 0);
+        while rung < RUNGS {
+            let limits = highest.scaled(0.5_f32.powi(rung as i32));
+            let mut trial = self.field.clone();
+            let counts = rest(&mut trial, &motions, limits, highest.scaled(RELEASE));
+            if counts == (0, 0) {
+                break;
+            }
+            let views = (&self.frames, &self.dataset);
+            let after = judged_error(&mut self.renderer, views, &trial, &settings)?;
+            if gain(after, before) <= f64::from(effects.still_loss) {
+                self.field = trial;
+                (settled, released) = counts;
+                break;
+            }
+            rung += 1;
+        }
+        self.progress.still_rung = rung.min(RUNGS - 1);
         let still = self.field.deformation.as_ref().map_or(0, |d| d.still.iter().filter(|s| **s).count());
         let gaussians = self.field.len();
         events.push(TrainEvent::Settled { stage, iteration, still, settled, released, gaussians });
+        Ok(())
     }
 
     /// Follows a change of the set of Gaussians: copies and children of what stands still stand still.
@@ -97,24 +133,36 @@ pub(super) fn probe_times(times: &[f64]) -> Vec<f64> {
     probes
 }
 
-/// Settles what does not move and releases what does, by limits of displacement (metres) and shape; returns their
-/// numbers, or nothing without a deformation.
-fn settle(field: &mut Field, times: &[f64], limits: [f32; 2]) -> Option<(usize, usize)> {
-    let n = field.len();
-    let deformation = field.deformation.as_ref()?;
-    let rows: Vec<u32> = (0..n as u32).collect();
-    let motions = probe(deformation, &field.gaussians, &rows, times);
-    let deformation = field.deformation.as_mut()?;
-    deformation.still.resize(n, false);
+/// Limits of motion.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Limits {
+    /// Metres.
+    displacement: f32,
+    shape: f32,
+}
+
+impl Limits {
+    fn scaled(self, factor: f32) -> Self {
+        Self { displacement: factor * self.displacement, shape: factor * self.shape }
+    }
+
+    fn hold(self, motion: &Motion) -> bool {
+        motion.displacement <= self.displacement && motion.shape <= self.shape
+    }
+}
+
+/// Settles what moves inside one limit and releases what moves beyond another; returns their numbers. A field
+/// without a deformation stays as it is.
+fn rest(field: &mut Field, motions: &[Motion], settle: Limits, release: Limits) -> (usize, usize) {
+    let Some(deformation) = &mut field.deformation else { return (0, 0) };
+    deformation.still.resize(motions.len(), false);
     let (mut settled, mut released) = (0, 0);
     for (row, motion) in motions.iter().enumerate() {
-        let within =
-            |factor: f32| motion.displacement <= factor * limits[0] && motion.shape <= factor * limits[1];
         let still = &mut deformation.still[row];
-        if !*still && within(1.0) {
+        if !*still && settle.hold(motion) {
             add(&mut field.gaussians, row, &motion.mean, 1.0);
             (*still, settled) = (true, settled + 1);
-        } else if *still && !within(RELEASE) {
+        } else if *still && !release.hold(motion) {
             add(&mut field.gaussians, row, &motion.mean, -1.0);
             (*still, released) = (false, released + 1);
         }
@@ -122,7 +170,7 @@ fn settle(field: &mut Field, times: &[f64], limits: [f32; 2]) -> Option<(usize, 
     if !deformation.still.contains(&true) {
         deformation.still.clear();
     }
-    Some((settled, released))
+    (settled, released)
 }
 
 /// What the network does to rows over some times, whether they stand still or not.
@@ -198,9 +246,15 @@ mod tests {
 
     use super::*;
 
+    const ALL: Limits = Limits { displacement: f32::INFINITY, shape: f32::INFINITY };
+
     fn field() -> Field {
-        let mut field =
-            synthetic::generate(&synthetic::SyntheticConfig { gaussians: 60, ..Default::default() }).field;
+        let mut field = synthetic::generate(&synthetic::SyntheticConfig {
+            gaussians: 60,
+            heads: Some(synthetic::ALL_HEADS),
+            ..Default::default()
+        })
+        .field;
         field.extent = 1.0;
         field
     }
@@ -239,8 +293,8 @@ mod tests {
         let mut sizes: Vec<f32> = motions.iter().map(|motion| motion.displacement).collect();
         sizes.sort_by(f32::total_cmp);
         let limit = sizes[30];
-        let (settled, released) = settle(&mut field, &times, [limit, f32::INFINITY]).unwrap();
-        assert_eq!((settled, released), (31, 0));
+        let limits = Limits { displacement: limit, shape: f32::INFINITY };
+        assert_eq!(rest(&mut field, &motions, limits, limits), (31, 0));
         for (row, motion) in motions.iter().enumerate() {
             let is_still = motion.displacement <= limit;
             assert_eq!(field.deformation.as_ref().unwrap().is_still(row), is_still);
@@ -260,16 +314,20 @@ mod tests {
     fn what_the_network_moves_again_is_released_near_where_it_was() {
         let mut field = field();
         let times = [0.0, 0.25, 0.5, 0.75, 1.0];
-        let first = settle(&mut field, &times, [f32::INFINITY; 2]).unwrap();
-        assert_eq!(first, (60, 0));
+        let motions = |field: &Field| {
+            let rows: Vec<u32> = (0..60).collect();
+            probe(field.deformation.as_ref().unwrap(), &field.gaussians, &rows, &times)
+        };
+        let (none, all) = (Limits { displacement: 0.0, shape: 0.0 }, ALL);
+        let first = motions(&field);
+        assert_eq!(rest(&mut field, &first, all, all), (60, 0));
         let still = field.deformed(0.4);
         assert_eq!(still, field.gaussians, "nothing goes through the network");
-        let none = settle(&mut field, &times, [0.0; 2]).unwrap();
-        assert_eq!(none, (0, 60));
+        let second = motions(&field);
+        assert_eq!(rest(&mut field, &second, none, none), (0, 60));
         assert!(field.deformation.as_ref().unwrap().still.is_empty());
-        let (rows, mut farthest) = ((0..60).collect::<Vec<u32>>(), 0.0_f32);
-        let motions = probe(field.deformation.as_ref().unwrap(), &field.gaussians, &rows, &times);
-        let largest = motions.iter().map(|motion| motion.displacement).fold(0.0, f32::max);
+        let mut farthest = 0.0_f32;
+        let largest = motions(&field).iter().map(|motion| motion.displacement).fold(0.0, f32::max);
         for time in times {
             let moved = field.deformed(time);
             for row in 0..60 {
@@ -282,8 +340,11 @@ mod tests {
     #[test]
     fn shape_counts_like_displacement() {
         let mut field = field();
-        assert_eq!(settle(&mut field, &[0.0, 0.5, 1.0], [f32::INFINITY, 0.0]), Some((0, 0)));
+        let rows: Vec<u32> = (0..60).collect();
+        let motions = probe(field.deformation.as_ref().unwrap(), &field.gaussians, &rows, &[0.0, 0.5, 1.0]);
+        let only = Limits { displacement: f32::INFINITY, shape: 0.0 };
+        assert_eq!(rest(&mut field, &motions, only, ALL), (0, 0));
         field.deformation = None;
-        assert_eq!(settle(&mut field, &[0.0, 1.0], [1.0; 2]), None);
+        assert_eq!(rest(&mut field, &motions, ALL, ALL), (0, 0));
     }
 }
