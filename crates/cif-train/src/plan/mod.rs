@@ -293,7 +293,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
             Extent::Full,
             &format!("{} while they help", optional.join(", ")),
             "judged in training, on pixels that are held out".to_owned(),
-            "a tenth of a step each".to_owned(),
+            "a twentieth to a tenth of a step each".to_owned(),
         ));
     }
     if moves_now {
@@ -363,7 +363,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
             preset,
             "",
             match (&found.travelling[..], found.moving_cameras) {
-                ([], _) => "no instance travels".to_owned(),
+                ([], _) => "no instance travels by its masks: everything is held in place".to_owned(),
                 (labels, 1) if found.fixed_cameras == 0 => {
                     format!("one moving camera, and these travel: {}", labels.join(", "))
                 }

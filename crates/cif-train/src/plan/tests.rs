@@ -36,7 +36,7 @@ fn auto_goes_as_far_as_the_evidence() {
     assert_eq!(plan.decision(EffectKind::Motion), Some(&Decision::Value("where it is".to_owned())));
     assert!(config.effects.motion && config.effects.instances);
     assert!(config.effects.still_every > 0 && config.effects.sh_gain > 0.0 && config.effects.head_gain > 0.0);
-    assert_eq!(config.motion.guidance, 0.0);
+    assert_eq!(config.motion, TrainConfig::default().motion);
     assert!(!config.antialiased);
     assert!(plan.effects[0].evidence.contains("ball"), "{}", plan.effects[0].evidence);
 }
@@ -68,11 +68,14 @@ fn fixed_cameras_that_see_no_change_need_no_motion() {
 
 #[test]
 fn switches_win_over_the_evidence() {
-    let (plan, config) = plan(&found(), "auto,+motion,-instances,+guidance,-view-dependence,-shape");
+    let (plan, config) = plan(&found(), "auto,+motion,-instances,-guidance,-view-dependence,-shape");
     assert_eq!(plan.decision(EffectKind::Motion), Some(&Decision::On));
     assert_eq!((config.effects.still_every, config.effects.instances), (0, false));
-    assert_eq!((config.motion.guidance, config.model.sh_degree), (GUIDANCE, 0));
+    assert_eq!((config.motion.guidance, config.model.sh_degree), (0.0, 0));
     assert!(!config.model.heads.scale && config.model.heads.position);
+    let mut paper = TrainConfig::preset(crate::Preset::Paper, cif_dataset::Layout::HyperNerf);
+    EffectPlan { effects: decide(&found(), &paper, &"all,+guidance".parse().unwrap()) }.apply(&mut paper);
+    assert_eq!((paper.motion.guidance, paper.motion.stillness), (GUIDANCE, STILLNESS));
     let none = self::plan(&found(), "none").1;
     assert!(!none.effects.motion && !none.effects.instances && none.model.sh_degree == 0);
 }

@@ -158,8 +158,13 @@ impl GpuDeformation {
     /// A copy of a deformation, ready to move Gaussians.
     ///
     /// # Errors
-    /// When it does not fit the device, with the arithmetic.
+    /// When it does not fit the device, with the arithmetic; when Gaussians stand still, which the kernels do not
+    /// know.
     pub fn new(gpu: &Gpu, deformation: &FieldDeformation) -> Result<Self, GpuError> {
+        let still = deformation.still.iter().filter(|still| **still).count();
+        if still > 0 {
+            return Err(GpuError::StandStill { still });
+        }
         let shape = Shape::new(deformation, gpu.largest_binding())?;
         let declarations = shape.forward_declarations();
         Ok(Self {
