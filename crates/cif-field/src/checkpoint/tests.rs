@@ -293,6 +293,43 @@ fn recorded_motion_survives_and_raises_the_format() {
 }
 
 #[test]
+fn what_stands_still_survives_and_raises_the_format() {
+    let format = |bytes: &[u8]| {
+        let (_, header) = safetensors::SafeTensors::read_metadata(bytes).unwrap();
+        header.metadata().clone().unwrap()["cif.format"].clone()
+    };
+    for field in [testing::field(20, 4), testing::tracked_field(20, 4)] {
+        let mut partly = Checkpoint { field, training: None };
+        let other = partly.field.fingerprint();
+        partly.field.deformation.as_mut().unwrap().still = (0..20).map(|row| row % 3 == 1).collect();
+        assert_ne!(partly.field.fingerprint(), other);
+        let bytes = bytes_of(&partly);
+        assert_eq!(format(&bytes), "3");
+        let loaded = read_bytes(&bytes).unwrap();
+        assert_eq!(loaded, partly);
+        assert_eq!(bytes_of(&loaded), bytes);
+        // Rows keep standing still wherever they go.
+        let gathered = loaded.field.gather(&[4, 0, 1, 1]);
+        assert_eq!(gathered.deformation.as_ref().unwrap().still, [true, false, true, true]);
+        assert_eq!(gathered.deformed(0.7).means[0], loaded.field.deformed(0.7).means[4]);
+    }
+    let mut field = testing::field(20, 4);
+    field.deformation.as_mut().unwrap().still = vec![false; 20];
+    assert_eq!(format(&bytes_of(&Checkpoint { field: field.clone(), training: None })), "1");
+    field.deformation.as_mut().unwrap().still = vec![true; 21];
+    let error = field.validate().unwrap_err().to_string();
+    assert!(error.contains("deformation.still"), "{error}");
+
+    let mut field = testing::field(20, 4);
+    field.deformation.as_mut().unwrap().still = vec![true; 20];
+    let mut bytes = bytes_of(&Checkpoint { field, training: None });
+    // Bytes are the narrowest tensor, so that they come last.
+    *bytes.last_mut().unwrap() = 7;
+    let refused = message(read_bytes(&bytes));
+    assert!(refused.contains("deformation.still") && refused.contains('7'), "{refused}");
+}
+
+#[test]
 fn tracks_that_do_not_fit_their_tensors_are_refused() {
     let bytes = bytes_of(&Checkpoint { field: testing::tracked_field(20, 4), training: None });
     let change = |change: &dyn Fn(&mut serde_json::Value)| {
