@@ -168,10 +168,21 @@ fn mean_occupancy(splats: &Splats) -> f32 {
     if total > 0.0 { (sum / total) as f32 } else { 0.0 }
 }
 
+/// Highest degree of spherical harmonics, up to `highest`, that any of the rows has: bands of zeros are not written.
+fn used_degree(gaussians: &Gaussians, rows: &[u32], highest: u8) -> u8 {
+    let first = |degree| 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
+    let is_used = |degree: u8| {
+        let band = first(degree - 1)..first(degree);
+        rows.iter()
+            .any(|row| gaussians.sh_coefficients[*row as usize][band.clone()].iter().any(|v| *v != 0.0))
+    };
+    (1..=highest.min(3)).rev().find(|degree| is_used(*degree)).unwrap_or(0)
+}
+
 /// Everything about the splats that no motion model changes.
 fn appearance(input: &NodeInput<'_>, is_instance: bool, rows: Vec<u32>) -> Splats {
     let gaussians = input.reference;
-    let degree = input.field.sh_degree;
+    let degree = used_degree(gaussians, &rows, input.field.sh_degree);
     let floats = 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
     let mut splats = Splats { sh_degree: degree, ..Splats::default() };
     for &row in &rows {

@@ -349,6 +349,34 @@ fn splats_hold_the_degree_in_use_and_extents_hold_the_splats() {
 }
 
 #[test]
+fn bands_of_zeros_are_not_written_and_what_stands_still_has_no_samples() {
+    let mut field = crate::testing::learned_field(3, 8);
+    field.sh_degree = 3;
+    let members = field.members(1);
+    for (row, coefficients) in field.gaussians.sh_coefficients.iter_mut().enumerate() {
+        let used = if members.contains(&(row as u32)) { 12 } else { 3 };
+        coefficients[..used].fill(0.2);
+        coefficients[used..].fill(0.0);
+    }
+    // The network moves the second object only.
+    let n = field.len();
+    let still: Vec<bool> = (0..n as u32).map(|row| !members.contains(&row)).collect();
+    field.deformation.as_mut().unwrap().still = still;
+    let graph = build(&field, &SceneOptions::default()).unwrap();
+    let mut found = 0;
+    for node in &graph.nodes {
+        let moves = !matches!(node.motion, Motion::Static);
+        let is_second = node.splats.rows.iter().all(|row| members.contains(row));
+        assert_eq!(moves, is_second, "{}", node.name);
+        assert_eq!(node.splats.sh_degree, u8::from(is_second), "{}", node.name);
+        let floats = if is_second { 12 } else { 3 };
+        assert_eq!(node.splats.sh_coefficients.len(), floats * node.splats.rows.len());
+        found += usize::from(is_second);
+    }
+    assert_eq!(found, 1);
+}
+
+#[test]
 fn labels_are_found_by_any_case_and_by_glob() {
     let field = field(2);
     let graph = build_from(&field, &mut |time| moved(&field, 60..120, &pose(time)), &SceneOptions::default());
