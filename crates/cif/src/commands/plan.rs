@@ -12,7 +12,7 @@ use crate::error::Error;
 /// Tell which effects a capture calls for, and what they cost
 #[derive(Debug, Args)]
 #[command(after_help = "\
-`cif train` follows this plan and records it in the scene. Each line tells the flag of `cif train` that
+`cif train --effects auto` follows this plan and records it in the scene. Each line tells the flag of `cif train` that
 decides otherwise; settings that are typed or in a --config file win over the plan.
 
   cif plan captures/table

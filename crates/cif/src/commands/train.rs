@@ -74,7 +74,7 @@ pub(super) struct Train {
     config: Option<PathBuf>,
     /// Effects: all (as the preset says), auto (as the capture calls for, see `cif plan`) or none, then single
     /// ones on or off, as in auto,+motion,-instances; typed settings and those of a file win
-    /// [default: auto; all with --preset paper]
+    /// [default: all]
     #[arg(long, value_name = "LIST", allow_hyphen_values = true, conflicts_with_all = ["resume", "from"])]
     effects: Option<EffectChoice>,
     /// Any setting by its key in SCENE.train.toml, e.g. --set rates.opacity=0.02
@@ -356,10 +356,10 @@ fn load_source(path: &Path) -> Result<Checkpoint, Error> {
 /// What the capture calls for.
 fn plan(command: &Train, dataset: &Dataset) -> Result<EffectPlan, Error> {
     let config = resolve(command, None, dataset.layout, None)?;
-    let choice = command.effects.clone().unwrap_or_else(|| EffectChoice {
-        basis: if config.preset == Preset::Paper { Basis::All } else { Basis::Auto },
-        ..EffectChoice::default()
-    });
+    let choice = command
+        .effects
+        .clone()
+        .unwrap_or_else(|| EffectChoice { basis: Basis::All, ..EffectChoice::default() });
     EffectPlan::new(dataset, &config, &choice).map_err(Error::plain)
 }
 
