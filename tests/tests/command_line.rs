@@ -75,7 +75,7 @@ fn help_teaches_the_tool() {
         "masks zigzag",
         "masks split",
     ];
-    for command in commands.into_iter().chain(["bench step"]) {
+    for command in commands.into_iter().chain(["bench step", "bench accuracy"]) {
         let help = cif(folder.path(), &format!("{command} --help")).succeeds().stdout;
         assert!(help.contains("Usage: cif"), "{help}");
     }

@@ -184,6 +184,16 @@ pub enum TrainEvent {
         /// mAcc-pix, percent.
         macc_pix: Option<f64>,
     },
+    /// A point of the run's curve was measured, see [`crate::curve`].
+    Measured {
+        /// The point.
+        #[serde(flatten)]
+        point: crate::curve::CurvePoint,
+        /// Frames that it was measured on.
+        frames: usize,
+        /// Wall time that measuring took so far, which the point does not count, seconds.
+        measuring_s: f64,
+    },
     /// Something that the user should know; the run goes on.
     Warning {
         /// One sentence.

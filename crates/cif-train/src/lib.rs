@@ -8,6 +8,9 @@
 //! | [`events`] | what a run tells its observer |
 //! | [`schedule`] | learning rates, spherical-harmonics degree |
 //! | [`losses`] | colour losses and their gradients |
+//! | [`budget`] | how a run fits into the time there is |
+//! | [`curve`] | what a run had reached when |
+//! | [`clock`] | where it reads time |
 //! | [`adam`] | the optimiser, and the regularisers of the planes |
 //! | [`densify`] | cloning, splitting, pruning |
 //! | [`estimate`] | whose each Gaussian is, from masks |
@@ -34,7 +37,10 @@
 extern crate self as cif_train;
 
 pub mod adam;
+pub mod budget;
+pub mod clock;
 pub mod config;
+pub mod curve;
 pub mod densify;
 pub mod error;
 pub mod estimate;
@@ -48,7 +54,9 @@ pub mod schedule;
 pub mod tracks;
 pub mod trainer;
 
+pub use clock::{Clock, Seconds, SystemClock};
 pub use config::{Ablation, Preset, TrainConfig};
+pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
 pub use plan::{EffectChoice, EffectPlan};

@@ -2,9 +2,11 @@
 //!
 //! | module | answers |
 //! |---|---|
+//! | [`accuracy`] | what accuracy costs, as a report |
 //! | [`commands`] | one file per subcommand |
 //! | [`settings`] | preset, file, flags: which value counts |
 //! | [`progress`] | bars, plain lines and JSON lines of a training run |
+//! | [`quality`] | renders that take shortcuts |
 //! | [`interrupt`] | what Ctrl-C does |
 //! | [`output`] | files written whole, never over existing ones |
 //! | [`pictures`] | instance, depth and error colours, panels, PNG files |
@@ -16,6 +18,7 @@
 //! | [`hard_captures`] | captures changed in ways that must not matter or must not break a run |
 //! | [`error`] | what is reported, and the exit code |
 
+pub mod accuracy;
 pub mod camera_file;
 pub mod commands;
 pub mod detector;
@@ -28,6 +31,7 @@ pub mod mask_query;
 pub mod output;
 pub mod pictures;
 pub mod progress;
+pub mod quality;
 pub mod settings;
 
 use std::ffi::OsString;

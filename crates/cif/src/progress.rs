@@ -110,6 +110,7 @@ impl Progress {
                 let repeated = if *in_a_row > 1 { format!(" ({in_a_row} in a row)") } else { String::new() };
                 self.line(&format!("warning: {stage} {iteration} rolled back{repeated}: {fault}"));
             }
+            TrainEvent::Measured { point, .. } => self.miou = point.miou.or(self.miou),
             TrainEvent::Warning { message } => self.line(&format!("warning: {message}")),
             TrainEvent::Finished { wall_s, iterations, gaussians, psnr, peak_rss_mb, rolled_back } => {
                 self.clear();

@@ -336,6 +336,13 @@ pub struct ReportConfig {
     pub evaluate_every: u32,
     /// Held-out frames per evaluation, evenly spread, default 8.
     pub evaluate_frames: u32,
+    /// Frames that points of the run's curve are measured on, default 4; 0 records no curve. Results do not
+    /// depend on it.
+    pub curve_frames: u32,
+    /// Training frames, evenly spread, that are withheld from training and that the curve is measured on,
+    /// default 0: the curve is measured on held-out frames of the capture, or on training frames where it has
+    /// none.
+    pub withhold: u32,
     /// Steps between requests to save a checkpoint, default 0: never.
     pub checkpoint_every: u32,
 }

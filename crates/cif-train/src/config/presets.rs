@@ -279,6 +279,13 @@ impl Default for EffectsConfig {
 
 impl Default for ReportConfig {
     fn default() -> Self {
-        Self { step_every: 10, evaluate_every: 0, evaluate_frames: 8, checkpoint_every: 0 }
+        Self {
+            step_every: 10,
+            evaluate_every: 0,
+            evaluate_frames: 8,
+            curve_frames: 4,
+            withhold: 0,
+            checkpoint_every: 0,
+        }
     }
 }

@@ -1,35 +1,169 @@
-//! Scores on held-out frames while training goes on.
+//! Scores while training goes on: on held-out frames when asked, and the points of the run's curve.
 
-use cif_dataset::Split;
+use cif_dataset::{Dataset, FrameData, Split};
 use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
+use crate::config::TrainConfig;
+use crate::curve::{CurveFrames, CurvePoint};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::metrics::evaluate::mask_ids;
 use crate::metrics::image::{psnr, ssim, unit_color};
 use crate::metrics::{FrameConfusion, instance_metrics};
 
+/// PSNR that equal images count as, dB.
+const MAX_PSNR: f64 = 100.0;
+
+/// Least training frames per withheld one.
+const FRAMES_PER_WITHHELD: usize = 4;
+
+/// Frames that the curve is measured on, decoded once.
+#[derive(Default)]
+pub(super) struct Yardstick {
+    /// Training frames that are not trained on, as indices of the capture.
+    withheld: Vec<usize>,
+    /// Index in the capture, and what was captured; none before the first point.
+    frames: Option<Vec<(usize, FrameData)>>,
+}
+
+/// Means over frames.
+struct MeanScores {
+    psnr: Option<f64>,
+    ssim: Option<f64>,
+    miou: Option<f64>,
+    macc_pix: Option<f64>,
+}
+
+impl Yardstick {
+    /// Takes the frames to withhold out of the training split.
+    pub(super) fn withhold(dataset: &mut Dataset, config: &TrainConfig) -> Self {
+        let of_split = |dataset: &Dataset| -> Vec<usize> {
+            let frames = dataset.frames.iter().enumerate();
+            frames.filter(|(_, frame)| frame.split == Split::Train).map(|(index, _)| index).collect()
+        };
+        let training = of_split(dataset);
+        let count = (config.report.withhold as usize).min(training.len() / FRAMES_PER_WITHHELD);
+        // Frames with masks tell more; where they are few, all of them are needed for training.
+        let masked: Vec<usize> =
+            training.iter().copied().filter(|index| dataset.frames[*index].mask.is_some()).collect();
+        let pool = if masked.len() >= FRAMES_PER_WITHHELD * count { &masked } else { &training };
+        let withheld: Vec<usize> = (0..count).map(|k| pool[(2 * k + 1) * pool.len() / (2 * count)]).collect();
+        for index in &withheld {
+            dataset.frames[*index].split = Split::Val;
+        }
+        Self { withheld, frames: None }
+    }
+
+    /// Whether a frame belongs to the training split of the capture, though it is not trained on.
+    pub(super) fn withholds(&self, index: usize) -> bool {
+        self.withheld.contains(&index)
+    }
+
+    fn select(&self, dataset: &Dataset, count: usize) -> (CurveFrames, Vec<usize>) {
+        let spread = |pool: Vec<usize>| -> Vec<usize> {
+            let count = count.min(pool.len());
+            (0..count).map(|k| pool[(2 * k + 1) * pool.len() / (2 * count)]).collect()
+        };
+        let of = |split| -> Vec<usize> {
+            let frames = dataset.frames.iter().enumerate();
+            frames.filter(|(_, frame)| frame.split == split).map(|(index, _)| index).collect()
+        };
+        if !self.withheld.is_empty() {
+            return (CurveFrames::Withheld, self.withheld.clone());
+        }
+        match of(Split::Val) {
+            held_out if !held_out.is_empty() => (CurveFrames::HeldOut, spread(held_out)),
+            _ => (CurveFrames::Training, spread(of(Split::Train))),
+        }
+    }
+}
+
 impl Trainer {
     /// Scores evenly spread held-out frames.
     pub(super) fn evaluate(&mut self, stage: Stage) -> Result<TrainEvent, TrainError> {
         let held_out: Vec<usize> = (0..self.dataset.frames.len())
-            .filter(|index| self.dataset.frames[*index].split == Split::Val)
+            .filter(|index| {
+                self.dataset.frames[*index].split == Split::Val && !self.yardstick.withholds(*index)
+            })
             .collect();
         let count = held_out.len().min(self.config.report.evaluate_frames as usize);
+        let frames = (0..count)
+            .map(|k| {
+                let index = held_out[k * held_out.len() / count];
+                Ok((index, self.dataset.load_frame(index, self.config.background)?))
+            })
+            .collect::<Result<Vec<_>, TrainError>>()?;
+        let scores = self.score(&frames);
+        Ok(TrainEvent::Evaluated {
+            stage,
+            iteration: self.progress.iteration,
+            frames: count,
+            psnr: scores.psnr,
+            ssim: scores.ssim,
+            miou: scores.miou,
+            macc_pix: scores.macc_pix,
+        })
+    }
+
+    /// Measures a point of the curve, where one is due or the stage `ends`.
+    pub(super) fn measure_curve(
+        &mut self,
+        stage: Stage,
+        ends: bool,
+    ) -> Result<Option<TrainEvent>, TrainError> {
+        let count = self.config.report.curve_frames.max(self.yardstick.withheld.len() as u32);
+        let (iteration, step) = (self.progress.iteration, self.progress.total_steps);
+        let curve = &self.progress.curve;
+        let due = curve.is_due(stage, iteration, !self.progress.goals.targets.is_empty()) || ends;
+        if count == 0 || !due || curve.holds(stage, step) {
+            return Ok(None);
+        }
+        let start = self.clock.now();
+        let frames = match self.yardstick.frames.take() {
+            Some(frames) => frames,
+            None => {
+                let (kind, indices) = self.yardstick.select(&self.dataset, count as usize);
+                let name = |index: &usize| self.dataset.frames[*index].name.clone();
+                self.progress.curve.frames = kind;
+                self.progress.curve.frame_names = indices.iter().map(name).collect();
+                let load = |index| Ok((index, self.dataset.load_frame(index, self.config.background)?));
+                indices.into_iter().map(load).collect::<Result<_, TrainError>>()?
+            }
+        };
+        let scores = self.score(&frames);
+        let point = CurvePoint {
+            stage,
+            iteration,
+            step,
+            wall_s: self.progress.total_wall_s(),
+            cpu_s: self.progress.total_cpu_s(),
+            gaussians: self.field.gaussians.len(),
+            psnr: scores.psnr,
+            ssim: scores.ssim,
+            miou: scores.miou,
+        };
+        let count = frames.len();
+        self.yardstick.frames = Some(frames);
+        self.progress.curve.points.push(point.clone());
+        self.progress.curve.measuring += self.clock.now() - start;
+        let measuring_s = self.progress.curve.measuring.wall_s;
+        Ok(Some(TrainEvent::Measured { point, frames: count, measuring_s }))
+    }
+
+    /// Renders frames of the capture and compares them.
+    fn score(&mut self, frames: &[(usize, FrameData)]) -> MeanScores {
         let settings = RenderSettings {
             instances: self.field.identities.as_ref().map(|_| self.instance_settings()),
             ..self.color_settings()
         };
         let channels = Channels { depth: false, instances: settings.instances.is_some() };
         let (mut psnrs, mut ssims, mut confusions) = (Vec::new(), Vec::new(), Vec::new());
-        for k in 0..count {
-            let index = held_out[k * held_out.len() / count];
-            let frame = &self.dataset.frames[index];
-            let truth = self.dataset.load_frame(index, self.config.background)?;
+        for (index, truth) in frames {
+            let frame = &self.dataset.frames[*index];
             let rendered = self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels);
             let target = unit_color(&truth.image);
-            psnrs.push(psnr(&rendered.color, &target));
+            psnrs.push(psnr(&rendered.color, &target).min(MAX_PSNR));
             ssims.push(ssim(&rendered.color, &target));
             if let (Some(mask), Some(instances)) = (&truth.mask, &rendered.instances) {
                 let predicted = mask_ids(&self.field, &instances.label);
@@ -39,14 +173,6 @@ impl Trainer {
         let mean =
             |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
         let scores = instance_metrics(&confusions);
-        Ok(TrainEvent::Evaluated {
-            stage,
-            iteration: self.progress.iteration,
-            frames: count,
-            psnr: mean(&psnrs),
-            ssim: mean(&ssims),
-            miou: scores.miou,
-            macc_pix: scores.macc_pix,
-        })
+        MeanScores { psnr: mean(&psnrs), ssim: mean(&ssims), miou: scores.miou, macc_pix: scores.macc_pix }
     }
 }

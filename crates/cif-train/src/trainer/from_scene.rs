@@ -6,6 +6,7 @@ use cif_field::{Checkpoint, Field};
 use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::logit;
 
+use super::evaluate::Yardstick;
 use super::progress::{Progress, Source};
 use super::state::{State, restore};
 use super::{Trainer, initialize};
@@ -33,12 +34,13 @@ impl Trainer {
     /// not move, or is not reconstructed yet; when no training mask has a labelled pixel; or when a frame cannot
     /// be read.
     pub fn from_scene(
-        dataset: Dataset,
+        mut dataset: Dataset,
         config: TrainConfig,
         scene: Checkpoint,
         name: &str,
     ) -> Result<Self, TrainError> {
         config.validate()?;
+        let yardstick = Yardstick::withhold(&mut dataset, &config);
         let Checkpoint { mut field, training } = scene;
         check_capture(&field, &dataset)?;
         let mut progress = Progress::at(Stage::Identity);
@@ -76,7 +78,7 @@ impl Trainer {
         field.instances = initialize::instances(&dataset);
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
         (field.background, field.sort_metric) = (config.background, config.sort_metric);
-        let mut trainer = Self::assemble(dataset, config, field, Some(progress))?;
+        let mut trainer = Self::assemble(dataset, yardstick, config, field, Some(progress))?;
         if !trainer.plan.has_instances {
             return Err(TrainError::NoLabels { root: trainer.dataset.root });
         }

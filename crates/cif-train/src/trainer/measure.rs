@@ -6,6 +6,7 @@ use cif_dataset::Dataset;
 use cif_field::{Field, Identities, Instance};
 use cif_render::UNLABELLED;
 
+use super::evaluate::Yardstick;
 use super::state::check_instances;
 use super::{StepTimes, Trainer, initialize};
 use crate::config::TrainConfig;
@@ -35,7 +36,7 @@ impl Trainer {
     /// # Panics
     /// When `stage` is none that has steps.
     pub fn for_measuring(
-        dataset: Dataset,
+        mut dataset: Dataset,
         config: TrainConfig,
         scene: Option<Field>,
         stage: Stage,
@@ -43,6 +44,7 @@ impl Trainer {
     ) -> Result<Self, TrainError> {
         assert!(!matches!(stage, Stage::Identity | Stage::Done), "the {stage} stage has no steps");
         config.validate()?;
+        let yardstick = Yardstick::withhold(&mut dataset, &config);
         let is_trained = scene.is_some();
         let mut field = match scene {
             Some(field) => field,
@@ -59,7 +61,7 @@ impl Trainer {
         } else if field.deformation.is_none() && dataset.times.len() > 1 && config.effects.motion {
             field.deformation = Some(initialize::initial_deformation(&dataset, &config)?);
         }
-        let mut trainer = Self::assemble(dataset, config, field, None)?;
+        let mut trainer = Self::assemble(dataset, yardstick, config, field, None)?;
         if stage == Stage::Instance {
             if !trainer.plan.has_instances {
                 return Err(TrainError::NoLabels { root: trainer.dataset.root.clone() });

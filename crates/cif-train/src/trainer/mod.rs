@@ -13,6 +13,8 @@
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `state` | what is saved, and how a run resumes |
+//! | `evaluate` | what a run has reached, on a few frames |
+//! | `pacing` | when stages end by time, or by what was reached |
 //! | `times`, `measure` | where the time of a step goes |
 //!
 //! Random choices depend on the seed and the step alone (see `random`), and all sums have a fixed order: a
@@ -31,6 +33,7 @@ mod identity;
 mod initialize;
 mod measure;
 mod optimiser;
+mod pacing;
 mod progress;
 mod provenance;
 mod state;
@@ -38,23 +41,27 @@ mod step;
 mod still;
 mod times;
 
-use std::time::Instant;
+use std::sync::Arc;
 
 use cif_dataset::Dataset;
 use cif_field::Field;
 use cif_render::Gradients;
 use cif_render::cpu::{Renderer, SimdLevel};
 
+use self::evaluate::Yardstick;
 use self::frames::FrameStore;
 pub use self::guard::{Fault, Hint, MAX_ROLLBACKS_IN_A_ROW};
 use self::guidance::Guidance;
 pub(crate) use self::initialize::automatic_time_nodes;
 pub use self::measure::InstancePass;
 use self::optimiser::Optimiser;
+use self::pacing::Pacing;
 use self::progress::{Plan, Progress};
 use self::step::{Scratch, StepLoss};
 pub use self::times::StepTimes;
+use crate::clock::{Clock, SystemClock};
 use crate::config::TrainConfig;
+use crate::curve::{Curve, MIN_GAP};
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent, TrainerView};
@@ -91,6 +98,12 @@ pub struct Trainer {
     debug_validation: bool,
     /// Off only while the cost of the pass is measured.
     instance_pass: InstancePass,
+    /// Where the run reads time.
+    clock: Arc<dyn Clock>,
+    /// Frames that the curve is measured on.
+    yardstick: Yardstick,
+    /// A budget that stages keep to.
+    pacing: Option<Pacing>,
     /// Warnings not sent yet.
     warnings: Vec<String>,
 }
@@ -118,10 +131,11 @@ impl Trainer {
     /// # Errors
     /// When a setting cannot work, the capture has no training frame or no initial point, or a frame cannot
     /// be read.
-    pub fn new(dataset: Dataset, config: TrainConfig) -> Result<Self, TrainError> {
+    pub fn new(mut dataset: Dataset, config: TrainConfig) -> Result<Self, TrainError> {
         config.validate()?;
+        let yardstick = Yardstick::withhold(&mut dataset, &config);
         let field = initialize::initial_field(&dataset, &config)?;
-        let mut trainer = Self::assemble(dataset, config, field, None)?;
+        let mut trainer = Self::assemble(dataset, yardstick, config, field, None)?;
         trainer.warn_of_capture();
         trainer.find_travelling()?;
         let first = trainer.plan.from(&trainer.config, Stage::Coarse);
@@ -130,9 +144,10 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// Everything but the state of the optimiser.
+    /// Everything but the state of the optimiser; frames of `yardstick` are no training frames of `dataset`.
     fn assemble(
         dataset: Dataset,
+        yardstick: Yardstick,
         config: TrainConfig,
         field: Field,
         progress: Option<Progress>,
@@ -159,6 +174,9 @@ impl Trainer {
             times: StepTimes::default(),
             debug_validation: false,
             instance_pass: InstancePass::On,
+            clock: Arc::new(SystemClock::start()),
+            yardstick,
+            pacing: None,
             warnings: Vec::new(),
             dataset,
             config,
@@ -261,10 +279,27 @@ impl Trainer {
         self.renderer.set_inspection(self.debug_validation);
     }
 
+    /// Reads time from another clock; times of the run and its curve follow it.
+    pub fn set_clock(&mut self, clock: Arc<dyn Clock>) {
+        self.clock = clock;
+    }
+
+    /// What the run reached when, so far.
+    #[must_use]
+    pub fn curve(&self) -> &Curve {
+        &self.progress.curve
+    }
+
     /// Name of the vector instructions in use.
     #[must_use]
     pub fn simd_name(&self) -> String {
         self.renderer.simd_name()
+    }
+
+    /// Name of the vector instructions that runs take unless told otherwise.
+    #[must_use]
+    pub fn vector_instructions() -> String {
+        Renderer::new(SimdLevel::Auto).simd_name()
     }
 
     /// Where the time of the steps since [`Self::reset_times`] went, and what they did.
@@ -311,9 +346,9 @@ impl Trainer {
                 if requests.stop {
                     return Ok(Outcome::Interrupted);
                 }
-                let start = Instant::now();
+                let start = self.clock.now();
                 let event = self.estimate_identities(true)?;
-                self.progress.add_wall(stage, start.elapsed().as_secs_f64());
+                self.progress.add_time(stage, self.clock.now() - start);
                 requests.add(self.emit(observer, &event));
                 if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
                     && !empty_instances.is_empty()
@@ -324,13 +359,21 @@ impl Trainer {
                     );
                     requests.add(self.emit(observer, &TrainEvent::Warning { message }));
                 }
-            } else if self.run_steps(stage, iterations, observer, &mut requests)? == Outcome::Interrupted {
+            } else if self.run_steps(stage, observer, &mut requests)? == Outcome::Interrupted {
                 return Ok(Outcome::Interrupted);
             }
-            self.enter(self.plan.after(&self.config, stage))?;
+            let next = self.plan.after(&self.config, stage);
+            let ends = stage == Stage::Identity || next == Stage::Done || self.progress.iteration >= MIN_GAP;
+            if ends {
+                self.follow_curve(stage, true, observer, &mut requests)?;
+            }
+            self.enter(next)?;
             if requests.stop && self.progress.stage != Stage::Done {
                 return Ok(Outcome::Interrupted);
             }
+        }
+        if let Some(message) = self.missed_targets() {
+            self.emit(observer, &TrainEvent::Warning { message });
         }
         let finished = TrainEvent::Finished {
             wall_s: self.progress.total_wall_s(),
@@ -348,25 +391,27 @@ impl Trainer {
     fn run_steps(
         &mut self,
         stage: Stage,
-        iterations: u32,
         observer: &mut Observer<'_>,
         requests: &mut Requests,
     ) -> Result<Outcome, TrainError> {
         let mut events = Vec::new();
         let (mut lap, mut lap_steps) = (0.0, 0);
-        while self.progress.iteration < iterations {
+        self.pace_stage(stage);
+        // A budget or a target may change how many there are.
+        while self.progress.iteration < self.plan.iterations(&self.config, stage) {
             if requests.stop {
                 return Ok(Outcome::Interrupted);
             }
-            let start = Instant::now();
+            let start = self.clock.now();
             let loss = self.step(&mut events)?;
-            let seconds = start.elapsed().as_secs_f64();
-            self.progress.add_wall(stage, seconds);
-            (lap, lap_steps) = (lap + seconds, lap_steps + 1);
+            let spent = self.clock.now() - start;
+            self.progress.add_time(stage, spent);
+            (lap, lap_steps) = (lap + spent.wall_s, lap_steps + 1);
             for event in events.drain(..) {
                 requests.add(self.emit(observer, &event));
             }
             let iteration = self.progress.iteration;
+            let iterations = self.plan.iterations(&self.config, stage);
             if falls_on(iteration, self.config.report.step_every) || iteration == iterations {
                 let rate = f64::from(lap_steps) / lap.max(1e-9);
                 let event = self.step_event(stage, iterations, &loss, rate);
@@ -384,6 +429,8 @@ impl Trainer {
                 );
                 requests.add(self.emit(observer, &TrainEvent::Warning { message }));
             }
+            self.follow_curve(stage, false, observer, requests)?;
+            self.follow_budget(stage);
             let total = (self.progress.total_steps % u64::from(u32::MAX)) as u32;
             if falls_on(total, self.config.report.evaluate_every) {
                 let event = self.evaluate(stage)?;
@@ -395,6 +442,24 @@ impl Trainer {
             }
         }
         Ok(Outcome::Finished)
+    }
+
+    /// Measures a point of the curve where one is due, and acts on it.
+    fn follow_curve(
+        &mut self,
+        stage: Stage,
+        ends: bool,
+        observer: &mut Observer<'_>,
+        requests: &mut Requests,
+    ) -> Result<(), TrainError> {
+        let Some(event) = self.measure_curve(stage, ends)? else { return Ok(()) };
+        requests.add(self.emit(observer, &event));
+        if let TrainEvent::Measured { point, .. } = &event
+            && let Some(message) = self.follow_targets(point)
+        {
+            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+        }
+        Ok(())
     }
 
     fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, rate: f64) -> TrainEvent {

@@ -5,7 +5,10 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use super::guard::Rollbacks;
+use super::pacing::Goals;
+use crate::clock::Seconds;
 use crate::config::TrainConfig;
+use crate::curve::Curve;
 use crate::events::Stage;
 
 /// Counters of a run; saved with its state.
@@ -22,6 +25,15 @@ pub(super) struct Progress {
     pub steps: BTreeMap<String, u64>,
     /// Wall time per stage, seconds.
     pub wall_s: BTreeMap<String, f64>,
+    /// Processor time per stage, all threads together, seconds.
+    #[serde(default)]
+    pub cpu_s: BTreeMap<String, f64>,
+    /// What was reached when.
+    #[serde(default)]
+    pub curve: Curve,
+    /// What is to be reached.
+    #[serde(default)]
+    pub goals: Goals,
     /// Spherical-harmonics degree at the start of the stage.
     pub sh_start: u8,
     /// Highest degree of spherical harmonics that was judged.
@@ -76,6 +88,9 @@ impl Progress {
             total_steps: 0,
             steps: BTreeMap::new(),
             wall_s: BTreeMap::new(),
+            cpu_s: BTreeMap::new(),
+            curve: Curve::default(),
+            goals: Goals::default(),
             sh_start: 0,
             sh_judged: 0,
             sh_cap: None,
@@ -94,8 +109,13 @@ impl Progress {
         self.psnr = Some(self.psnr.map_or(psnr, |mean| mean + PSNR_SHARE * (psnr - mean)));
     }
 
-    pub(super) fn add_wall(&mut self, stage: Stage, seconds: f64) {
-        *self.wall_s.entry(stage.name().to_owned()).or_default() += seconds;
+    pub(super) fn add_time(&mut self, stage: Stage, spent: Seconds) {
+        *self.wall_s.entry(stage.name().to_owned()).or_default() += spent.wall_s;
+        *self.cpu_s.entry(stage.name().to_owned()).or_default() += spent.cpu_s;
+    }
+
+    pub(super) fn total_cpu_s(&self) -> f64 {
+        self.cpu_s.values().sum()
     }
 
     pub(super) fn total_wall_s(&self) -> f64 {

@@ -32,6 +32,8 @@ impl Trainer {
                 "iterations_by_stage": self.progress.steps,
                 "wall_s": self.progress.total_wall_s(),
                 "wall_s_by_stage": self.progress.wall_s,
+                "cpu_s": self.progress.total_cpu_s(),
+                "cpu_s_by_stage": self.progress.cpu_s,
                 "peak_rss_mb": peak_rss_mb(),
                 "simd": self.simd_name(),
                 "gaussians": self.field.gaussians.len(),
@@ -48,6 +50,13 @@ impl Trainer {
         }
         if let Some(effects) = &self.progress.effects {
             record["train"]["effects"] = effects.clone();
+        }
+        if !self.progress.curve.points.is_empty() {
+            record["curve"] = json!(self.progress.curve);
+        }
+        let goals = self.goals_record();
+        if !goals.is_null() {
+            record["train"]["goals"] = goals;
         }
         if let Some(source) = &self.progress.source {
             record["train"]["from"] = json!(source);

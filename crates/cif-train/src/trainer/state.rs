@@ -8,6 +8,7 @@ use cif_field::checkpoint::{Checkpoint, StateTensor, TrainingState};
 use serde::{Deserialize, Serialize};
 
 use super::Trainer;
+use super::evaluate::Yardstick;
 use super::optimiser::Optimiser;
 use super::progress::Progress;
 use crate::config::TrainConfig;
@@ -159,12 +160,14 @@ impl Trainer {
     /// # Errors
     /// When the checkpoint has no training state, is damaged, or belongs to another capture; or when a frame
     /// cannot be read.
-    pub fn resume(dataset: Dataset, checkpoint: Checkpoint) -> Result<Self, TrainError> {
+    pub fn resume(mut dataset: Dataset, checkpoint: Checkpoint) -> Result<Self, TrainError> {
         let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
         let state = State::parse(json)?;
         state.config.validate()?;
+        let yardstick = Yardstick::withhold(&mut dataset, &state.config);
         state.capture.check(&Capture::of(&dataset), &dataset)?;
-        let mut trainer = Self::assemble(dataset, state.config, checkpoint.field, Some(state.progress))?;
+        let mut trainer =
+            Self::assemble(dataset, yardstick, state.config, checkpoint.field, Some(state.progress))?;
 
         let n = trainer.field.gaussians.len();
         restore(&mut trainer.optimiser, &mut tensors, &state.adam_steps)?;

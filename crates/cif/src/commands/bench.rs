@@ -1,5 +1,5 @@
-//! `cif bench`: what a training step costs, and where; what accuracy of exported motion costs; how hard captures
-//! fare.
+//! `cif bench`: what a training step costs, and where; what accuracy costs, of scenes and of exported motion; how
+//! hard captures fare.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -16,7 +16,7 @@ use crate::error::Error;
 use crate::output;
 use crate::settings::Layers;
 
-/// Measure what a training step or an export costs, and how hard captures fare
+/// Measure what a training step, an export or accuracy costs, and how hard captures fare
 #[derive(Debug, Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub(super) struct Bench {
@@ -29,6 +29,7 @@ enum What {
     Step(Step),
     Export(super::bench_export::BenchExport),
     Hardness(super::bench_hardness::BenchHardness),
+    Accuracy(super::bench_accuracy::BenchAccuracy),
 }
 
 /// Tell where the time of a training step goes
@@ -104,6 +105,7 @@ pub(super) fn run(command: &Bench) -> Result<(), Error> {
         What::Step(command) => step(command),
         What::Export(command) => super::bench_export::run(command),
         What::Hardness(command) => super::bench_hardness::run(command),
+        What::Accuracy(command) => super::bench_accuracy::run(command),
     }
 }
 

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use cif_dataset::{Dataset, PointSource, Split};
 use cif_field::{Checkpoint, Field};
 use cif_geometry::Bounds;
+use cif_train::Curve;
 use clap::Args;
 use glam::DVec3;
 use serde_json::{Value, json};
@@ -124,6 +125,7 @@ fn scene_facts(checkpoint: &Checkpoint) -> Facts {
         ("extent".to_owned(), json!(field.extent)),
         ("instances".to_owned(), json!(instances)),
         ("resumable".to_owned(), json!(checkpoint.training.is_some())),
+        ("curve".to_owned(), field.provenance.get("curve").cloned().unwrap_or_default()),
         ("provenance".to_owned(), field.provenance.clone()),
     ]
 }
@@ -160,9 +162,42 @@ fn print(facts: &Facts) {
             Value::Object(items) if name == "provenance" => {
                 println!("{name:>28}  {}", items.keys().cloned().collect::<Vec<_>>().join(", "));
             }
+            Value::Null if name == "curve" => {}
+            value if name == "curve" => print_curve(value),
             value => println!("{name:>28}  {}", one_line(value)),
         }
     }
+}
+
+/// What the run reached when.
+fn print_curve(curve: &Value) {
+    let Ok(curve) = serde_json::from_value::<Curve>(curve.clone()) else {
+        println!("{:>28}  not readable", "curve");
+        return;
+    };
+    println!(
+        "{:>28}  {} {}; measuring took {:.1} s, which the points do not count",
+        "curve",
+        curve.frame_names.len(),
+        curve.frames.describe(),
+        curve.measuring.wall_s
+    );
+    let mut table =
+        super::table(["stage", "step", "wall s", "CPU s", "Gaussians", "PSNR dB", "SSIM", "mIoU %"]);
+    let number = |value: Option<f64>, digits| value.map_or("n/a".to_owned(), |v| format!("{v:.digits$}"));
+    for point in &curve.points {
+        table.add_row([
+            point.stage.to_string(),
+            point.step.to_string(),
+            format!("{:.1}", point.wall_s),
+            format!("{:.1}", point.cpu_s),
+            point.gaussians.to_string(),
+            number(point.psnr, 2),
+            number(point.ssim, 4),
+            number(point.miou, 1),
+        ]);
+    }
+    println!("{table}");
 }
 
 /// An instance in one line.

@@ -1,6 +1,7 @@
 //! The subcommands, one file each.
 
 mod bench;
+mod bench_accuracy;
 mod bench_export;
 mod bench_hardness;
 mod check;
@@ -20,6 +21,7 @@ mod query;
 mod render;
 mod scene;
 mod train;
+mod train_budget;
 
 use cif_render::cpu::SimdLevel;
 use clap::builder::{EnumValueParser, TypedValueParser};

@@ -2,6 +2,7 @@
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use cif_dataset::cryptomatte::BACKGROUND;
 use cif_exr::ColorEncoding;
@@ -11,6 +12,7 @@ use cif_render::constants::MIN_COVERAGE;
 use cif_render::cpu::Renderer;
 use cif_render::{BlendingWeights, Channels, RenderSettings, RenderedImage, screen_motion};
 use cif_scene::naming::instance_name;
+use cif_train::metrics::image::psnr;
 use cif_train::metrics::mask_ids;
 use clap::{ArgGroup, Args, ValueEnum};
 
@@ -19,6 +21,7 @@ use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
 use crate::pictures::{depth_picture, instance_picture, rgb_picture, save_grey, save_rgb};
+use crate::quality::{self, Quality};
 use crate::{interrupt, output};
 
 /// Render a scene from captured or new views
@@ -52,6 +55,9 @@ pub(super) struct Render {
     /// Write DIR/exr/VIEW.exr: beauty, depth, motion, instances and Cryptomatte in one file per view
     #[arg(long)]
     exr: bool,
+    /// How much care is taken; what a draft loses is measured on some of the views and told
+    #[arg(long, value_name = "QUALITY", default_value = "final")]
+    quality: QualityName,
     /// Colours of the EXR files
     #[arg(long, value_name = "COLOR", default_value = "linear", requires = "exr")]
     exr_color: ExrColor,
@@ -88,6 +94,16 @@ enum What {
     Probability,
     /// Entropy of the instance distribution, 16-bit grey, thousandths of a nat
     Entropy,
+}
+
+/// Care of a render.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum QualityName {
+    /// Half the size and enlarged, colours that hardly depend on the view (degree 1), without Gaussians of
+    /// opacity and occupancy below 0.05
+    Draft,
+    /// Everything that the scene holds
+    Final,
 }
 
 /// Colours of EXR files.
@@ -131,6 +147,7 @@ fn after_help() -> String {
          labels (unique names where labels repeat, `background` for the rest).\n\n  \
          cif render table.cif --capture captures/table -o out --exr\n  \
          cif render table.cif --capture captures/table --split val -o out --what rgb,instance,depth\n  \
+         cif render table.cif --capture captures/table -o look --quality draft\n  \
          cif render table.cif --camera views.json --time 0.5 -o out\n\n{FORMAT_HELP}"
     )
 }
@@ -149,19 +166,40 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
             "leave instance, foreground, coverage, probability and entropy out of --what, or train with masks",
         ));
     }
+    if command.exr && command.quality == QualityName::Draft {
+        return Err(Error::usage(
+            "--exr writes what compositors measure in, which a draft is not",
+            "leave --quality draft or --exr away",
+        ));
+    }
     let views = views(command, &field)?;
     output::check_folder(&command.output, command.force)?;
     let depth = command.exr || what.contains(&What::Depth) || what.contains(&What::DepthColor);
     let instances = wanted || (command.exr && field.identities.is_some());
     let settings = scene::render_settings(&field);
     let mut renderer = Renderer::new(command.simd.into());
+    let quality = match command.quality {
+        QualityName::Draft => quality::DRAFT,
+        QualityName::Final => quality::FINAL,
+    };
+    if command.quality == QualityName::Draft {
+        tell_draft(&mut renderer, &field, &views, &settings, command.time);
+    }
+    let field = quality.thin(&field);
     interrupt::watch();
     for (index, Shot { view, .. }) in views.iter().enumerate() {
         if interrupt::requested() {
             return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
         }
         let time = command.time.or(view.time).unwrap_or(0.0);
-        let image = renderer.render(&field, &view.camera, time, &settings, Channels { depth, instances });
+        let image = quality.render(
+            &mut renderer,
+            &field,
+            &view.camera,
+            time,
+            &settings,
+            Channels { depth, instances },
+        );
         for what in &what {
             write(*what, &field, &image, &command.output, &view.name)?;
         }
@@ -172,6 +210,44 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     }
     eprintln!("rendered {} views into {}", views.len(), command.output.display());
     Ok(())
+}
+
+/// Renders some of the views in both qualities and says what the draft loses and gains.
+fn tell_draft(
+    renderer: &mut Renderer,
+    field: &Field,
+    views: &[Shot],
+    settings: &RenderSettings,
+    time: Option<f64>,
+) {
+    const MEASURED: usize = 3;
+    let settings = RenderSettings { instances: None, ..*settings };
+    let count = views.len().min(MEASURED);
+    let thinned = quality::DRAFT.thin(field);
+    let mut seconds = [0.0; 2];
+    let (mut worst, mut mean) = (f64::INFINITY, 0.0);
+    for k in 0..count {
+        let view = &views[(2 * k + 1) * views.len() / (2 * count)].view;
+        let time = time.or(view.time).unwrap_or(0.0);
+        let mut render = |quality: Quality, field: &Field, seconds: &mut f64| {
+            let channels = Channels::default();
+            let start = Instant::now();
+            let image = quality.render(renderer, field, &view.camera, time, &settings, channels);
+            *seconds += start.elapsed().as_secs_f64();
+            image.color
+        };
+        let exact = render(quality::FINAL, field, &mut seconds[0]);
+        let exact = exact.map(|pixel| pixel.map(|value| value.clamp(0.0, 1.0)));
+        let draft = render(quality::DRAFT, &thinned, &mut seconds[1]);
+        let psnr = psnr(&draft, &exact).min(100.0);
+        worst = worst.min(psnr);
+        mean += psnr / count as f64;
+    }
+    eprintln!(
+        "draft: PSNR {mean:.1} dB against final quality, {worst:.1} in the worst of {count} views measured; \
+         {:.1} times as fast",
+        seconds[0] / seconds[1].max(1e-9)
+    );
 }
 
 /// A view, and the camera that it belongs to.

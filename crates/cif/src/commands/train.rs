@@ -10,6 +10,7 @@ use cif_train::{
 };
 use clap::{Args, ValueEnum};
 
+use super::train_budget::{Goals, Timing};
 use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::error::Error;
 use crate::progress::Progress;
@@ -33,6 +34,13 @@ are those of the scene it comes from):
   cif train captures/table -o table.cif --no-masks
   cif train captures/table -o exact.cif --from table.cif
   cif train captures/table -o fixed.cif --from table.cif --ablate no-resampling
+
+As good as it gets in a minute and a half, or only as long as it has to:
+
+  cif train captures/table -o table.cif --budget 90s
+  cif train captures/table -o table.cif --target-psnr 28 --target-miou 85 --budget 10m
+
+With --resume, a budget is for the rest. SCENE.train.toml then holds the settings that came of it.
 
 Ctrl-C saves and stops; the same command with --resume goes on as if nothing had happened.")]
 pub(super) struct Train {
@@ -86,6 +94,8 @@ pub(super) struct Train {
     /// rounding
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
+    #[command(flatten)]
+    goals: Goals,
     #[command(flatten)]
     settings: Settings,
 }
@@ -148,6 +158,7 @@ enum AblationName {
 }
 
 pub(super) fn run(command: &Train) -> Result<(), Error> {
+    let mut timing = Timing::start();
     // Everything that can be refused is refused before the first image is read.
     output::check_file(&command.output, command.force || command.resume)?;
     let settings_path = command.output.with_extension("train.toml");
@@ -169,7 +180,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         None => resolve(command, base.as_ref(), Layout::HyperNerf, None)?.downscale,
     };
     capture.downscale = capture.downscale.or(wanted);
-    let dataset = capture.open(&command.capture)?;
+    let mut dataset = capture.open(&command.capture)?;
     print_warnings(&dataset);
     if dataset.frames.iter().all(|frame| frame.mask.is_none()) {
         eprintln!("note: the capture has no masks, so colour and motion are trained, but no instances");
@@ -182,7 +193,13 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
                 Some(_) => None,
                 None => Some(plan(command, &dataset)?),
             };
-            let config = resolve(command, base.as_ref(), dataset.layout, plan.as_ref())?;
+            let mut config = resolve(command, base.as_ref(), dataset.layout, plan.as_ref())?;
+            command.goals.prepare(&mut config);
+            if source.is_none() {
+                let preset = TrainConfig::preset(config.preset, dataset.layout);
+                let (goals, options) = (&command.goals, &command.capture_options);
+                dataset = goals.fit(&mut timing, &mut config, &preset, dataset, options, command.quiet)?;
+            }
             let text = toml::to_string_pretty(&config).expect("settings serialise to TOML");
             let trainer = match (source, &command.from) {
                 (Some(source), Some(path)) => {
@@ -205,6 +222,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     .map_err(Error::plain)?;
     trainer.set_simd(command.simd.into());
     trainer.set_debug_validation(command.debug_validation);
+    command.goals.apply(&timing, &mut trainer)?;
 
     let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
     interrupt::watch();
@@ -215,6 +233,13 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     }
     let outcome = outcome.map_err(|error| stopped_by(&error, &trainer, &command.output))?;
     save(&trainer.checkpoint(outcome == Outcome::Interrupted), &command.output)?;
+    if command.goals.changes_steps() {
+        let text = toml::to_string_pretty(trainer.config()).expect("settings serialise to TOML");
+        output::write_file(&settings_path, text.as_bytes())?;
+        if !command.quiet {
+            command.goals.report(&timing, &trainer);
+        }
+    }
     let saved = command.output.display();
     match outcome {
         Outcome::Finished => eprintln!("saved {saved}"),

@@ -1,0 +1,269 @@
+//! Stages that end by time or by what was reached, rather than after a number of steps.
+//!
+//! The schedule of everything else follows: learning rates, densification and resampling run over the steps
+//! that a stage is expected to have, so that a run that is cut short ends settled. With a budget the number of
+//! steps depends on the machine, and so does the result.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+use super::Trainer;
+use crate::budget::{Budget, Pacer, Targets, weights};
+use crate::curve::CurvePoint;
+use crate::error::TrainError;
+use crate::events::Stage;
+
+/// Points of a stage before its trend is believed.
+const POINTS_OF_TREND: usize = 6;
+
+/// Share of all steps after which a target may be called out of reach.
+const EARLIEST_VERDICT: f64 = 0.3;
+
+/// A trend may be so much too low, dB and points of mIoU.
+const MARGIN: (f64, f64) = (0.5, 2.0);
+
+/// What a run is held to; saved with its state, but for the budget, which is one of a single call.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(super) struct Goals {
+    /// What is to be reached.
+    pub targets: Targets,
+    /// Whether all of it was.
+    pub reached: bool,
+    /// Whether the user was told that a target is out of reach.
+    pub doubted: bool,
+}
+
+/// Lengths that follow the steps of a stage, as shares of them.
+#[derive(Clone, Copy, Debug)]
+struct Shares {
+    /// Last densification, of the fine stage.
+    densify: f64,
+    /// Instance stage, of the fine stage.
+    instance: f64,
+    /// Schedule of learning rates, of the fine stage; 0 where it follows the stages anyway.
+    schedule: f64,
+    /// Last resampling, of the instance stage.
+    resample: f64,
+}
+
+/// A budget under way.
+pub(super) struct Pacing {
+    pacer: Pacer,
+    shares: Shares,
+}
+
+impl Trainer {
+    /// Makes the stages that are left end inside a budget, each with its share. Steps of the settings are where
+    /// it starts from, see [`crate::budget::choose`]; [`Self::config`] has those that came of it.
+    pub fn set_budget(&mut self, budget: Budget) {
+        let fine = f64::from(self.plan.iterations(&self.config, Stage::Fine).max(1));
+        let instance = f64::from(self.config.stages.instance.max(1));
+        let shares = Shares {
+            densify: f64::from(self.config.densify.until) / fine,
+            instance: f64::from(self.config.stages.instance) / fine,
+            schedule: f64::from(self.config.rates.schedule_steps) / fine,
+            resample: f64::from(self.config.resample.until) / instance,
+        };
+        self.pacing = Some(Pacing { pacer: Pacer::new(budget), shares });
+    }
+
+    /// Ends stages as soon as the curve reaches targets. The fine stage ends with the PSNR reached, the
+    /// instance stage with all of them; the curve is best measured on withheld frames then
+    /// (`report.withhold`).
+    ///
+    /// # Errors
+    /// When mIoU is a target and the capture has no labels.
+    pub fn set_targets(&mut self, targets: Targets) -> Result<(), TrainError> {
+        if targets.miou.is_some() && !self.plan.has_instances {
+            return Err(TrainError::NoLabels { root: self.dataset.root.clone() });
+        }
+        self.progress.goals = Goals { targets, ..Goals::default() };
+        Ok(())
+    }
+
+    /// What the run is to reach.
+    #[must_use]
+    pub fn targets(&self) -> Targets {
+        self.progress.goals.targets
+    }
+
+    /// Whether the run has targets and reached all of them.
+    #[must_use]
+    pub fn reached_targets(&self) -> bool {
+        self.progress.goals.reached
+    }
+
+    /// Gives a stage that begins, or goes on, its deadline.
+    pub(super) fn pace_stage(&mut self, stage: Stage) {
+        let Some(pacing) = &mut self.pacing else { return };
+        let steps: Vec<(Stage, u32)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
+            .into_iter()
+            .filter(|other| *other >= stage)
+            .map(|other| (other, self.plan.iterations(&self.config, other)))
+            .map(|(other, steps)| {
+                let done = if other == stage { self.progress.iteration } else { 0 };
+                (other, steps.saturating_sub(done))
+            })
+            .filter(|(other, steps)| *steps > 0 || *other == stage)
+            .collect();
+        let frames = if self.plan.has_instances && stage < Stage::Identity {
+            self.frames.len().div_ceil(self.config.identity.stride.max(1) as usize)
+        } else {
+            0
+        };
+        pacing.pacer.enter(&weights(&steps), self.progress.iteration, frames, self.clock.now());
+    }
+
+    /// Stretches or ends the stage as the budget says.
+    pub(super) fn follow_budget(&mut self, stage: Stage) {
+        let now = self.clock.now();
+        let Some(pacing) = &mut self.pacing else { return };
+        let Some(steps) = pacing.pacer.after_step(self.progress.iteration, now) else { return };
+        let shares = pacing.shares;
+        self.set_steps(stage, steps);
+        let scaled = |share: f64, steps: u32| (share * f64::from(steps)).round() as u32;
+        if stage == Stage::Fine {
+            self.config.densify.until = scaled(shares.densify, steps);
+            self.config.stages.instance =
+                scaled(shares.instance, steps).max(u32::from(shares.instance > 0.0));
+            self.config.rates.schedule_steps = scaled(shares.schedule, steps);
+        }
+        self.config.resample.until = scaled(shares.resample, self.config.stages.instance);
+    }
+
+    /// Gives a stage another number of steps.
+    fn set_steps(&mut self, stage: Stage, steps: u32) {
+        let stages = &mut self.config.stages;
+        match stage {
+            Stage::Coarse => stages.coarse = steps,
+            Stage::Fine if self.plan.is_dynamic && stages.fine_includes_coarse => {
+                stages.fine = steps.saturating_add(stages.coarse);
+            }
+            Stage::Fine if self.plan.is_dynamic => stages.fine = steps,
+            Stage::Fine => (stages.coarse, stages.fine, stages.fine_includes_coarse) = (0, steps, false),
+            Stage::Instance => stages.instance = steps,
+            Stage::Identity | Stage::Done => {}
+        }
+    }
+
+    /// Ends the stage when a point reaches what it is to reach; a warning when that is out of reach.
+    pub(super) fn follow_targets(&mut self, point: &CurvePoint) -> Option<String> {
+        let targets = self.progress.goals.targets;
+        if targets.is_empty() {
+            return None;
+        }
+        let (stage, last) = (point.stage, self.last_stage());
+        self.progress.goals.reached = targets.reached_by(point.psnr, point.miou);
+        let psnr_reached = Targets { miou: None, ..targets }.reached_by(point.psnr, None);
+        let ends = match stage {
+            Stage::Fine if last == Stage::Fine => self.progress.goals.reached,
+            // What instances add is measured only behind the fine stage.
+            Stage::Fine => targets.psnr.is_some() && psnr_reached,
+            Stage::Instance => self.progress.goals.reached,
+            _ => false,
+        };
+        if ends {
+            let planned = self.plan.iterations(&self.config, stage).max(1);
+            if stage == Stage::Fine && self.plan.has_instances {
+                let share = f64::from(point.iteration) / f64::from(planned);
+                let shortened = |steps: u32| (f64::from(steps) * share).ceil() as u32;
+                self.config.stages.instance = shortened(self.config.stages.instance);
+                self.config.resample.until = shortened(self.config.resample.until);
+            }
+            self.set_steps(stage, point.iteration);
+            return None;
+        }
+        self.doubt(point)
+    }
+
+    /// The last stage with steps.
+    fn last_stage(&self) -> Stage {
+        if self.plan.iterations(&self.config, Stage::Instance) > 0 { Stage::Instance } else { Stage::Fine }
+    }
+
+    /// Says once that the trend does not lead to a target.
+    fn doubt(&mut self, point: &CurvePoint) -> Option<String> {
+        let curve = &self.progress.curve;
+        let of_stage = curve.points.iter().filter(|other| other.stage == point.stage).count();
+        let all = self.progress.total_steps + self.steps_left();
+        let early = (point.step as f64) < EARLIEST_VERDICT * all as f64;
+        if self.progress.goals.doubted || of_stage < POINTS_OF_TREND || early {
+            return None;
+        }
+        let targets = self.progress.goals.targets;
+        let short = |name: &str,
+                     unit: &str,
+                     target: Option<f64>,
+                     now: Option<f64>,
+                     end: Option<f64>,
+                     margin| {
+            let (target, now, end) = (target?, now?, end?);
+            (end + margin < target).then(|| {
+                format!(
+                    "{name} {target} is out of reach of these settings: it is {now:.2}{unit} now, and by its \
+                     trend {end:.1}{unit} after all {all} steps; more Gaussians, more steps or larger images may \
+                     help"
+                )
+            })
+        };
+        let psnr =
+            short("PSNR", " dB", targets.psnr, point.psnr, curve.trend(|point| point.psnr, all), MARGIN.0);
+        let miou =
+            short("mIoU", " %", targets.miou, point.miou, curve.trend(|point| point.miou, all), MARGIN.1);
+        let message = psnr.or(miou)?;
+        self.progress.goals.doubted = true;
+        Some(message)
+    }
+
+    /// What to say of targets at the end; none when there are none or all were reached.
+    pub(super) fn missed_targets(&self) -> Option<String> {
+        let goals = &self.progress.goals;
+        if goals.targets.is_empty() || goals.reached {
+            return None;
+        }
+        let last = self.progress.curve.points.last();
+        let mut missed = Vec::new();
+        let values = [
+            ("PSNR", " dB", goals.targets.psnr, last.and_then(|point| point.psnr)),
+            ("mIoU", " %", goals.targets.miou, last.and_then(|point| point.miou)),
+        ];
+        for (name, unit, target, value) in values {
+            match (target, value) {
+                (Some(target), Some(value)) if value < target => {
+                    missed.push(format!("{name} {value:.2} of {target}{unit}"));
+                }
+                (Some(target), None) => {
+                    missed.push(format!("{name} of {target}{unit} could not be measured"))
+                }
+                _ => {}
+            }
+        }
+        Some(format!(
+            "not reached on {}: {}; more Gaussians, more steps or larger images may help",
+            self.progress.curve.frames.describe(),
+            missed.join(", ")
+        ))
+    }
+
+    /// Budget and targets as recorded; null without.
+    pub(super) fn goals_record(&self) -> Value {
+        let budget = self.pacing.as_ref().map(|pacing| {
+            let budget = pacing.pacer.budget();
+            json!({
+                "seconds": budget.seconds,
+                "clock": budget.clock,
+                "threads": budget.threads,
+                "used_s": budget.used(self.clock.now()),
+            })
+        });
+        let goals = &self.progress.goals;
+        let targets = (!goals.targets.is_empty()).then(
+            || json!({ "psnr": goals.targets.psnr, "miou": goals.targets.miou, "reached": goals.reached }),
+        );
+        match (budget, targets) {
+            (None, None) => Value::Null,
+            (budget, targets) => json!({ "budget": budget, "targets": targets }),
+        }
+    }
+}

@@ -1,0 +1,435 @@
+//! The ladders. A rung changes settings of one base, or what is done with the scene that the base trains.
+
+use cif_scene::Tolerance;
+
+/// What a rung does.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Work {
+    /// Trains with settings, each `key=value`, over those of the base; none is the base itself.
+    Train(Vec<String>),
+    /// Trains with another preset.
+    Preset(&'static str),
+    /// Renders the base with the reference, in `f64` or `f32`.
+    Reference {
+        /// In 64 bits rather than 32.
+        double: bool,
+    },
+    /// Stores parts of the base in 16 bits.
+    Store {
+        /// Planes and network of the deformation.
+        planes: bool,
+        /// Everything of the Gaussians but their centres.
+        splats: bool,
+        /// Their centres.
+        centres: bool,
+    },
+    /// Renders the base with less.
+    Render {
+        /// Factor by which images are smaller.
+        reduction: u32,
+        /// Highest degree of colours; none for that of the scene.
+        sh_degree: Option<u8>,
+        /// Gaussians below are left out.
+        min_opacity: f32,
+    },
+    /// Exports the base inside a tolerance.
+    Export(Tolerance),
+}
+
+/// One way to do it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rung {
+    /// File name, unique in a report.
+    pub id: String,
+    /// As tables and plots call it.
+    pub label: String,
+    /// What it does.
+    pub work: Work,
+}
+
+/// Rungs that change one thing.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Ladder {
+    /// As `--ladders` calls it.
+    pub name: &'static str,
+    /// Heading.
+    pub title: &'static str,
+    /// What is changed and what stays, in a sentence or two.
+    pub about: &'static str,
+    /// Ascending cost, as far as that is known before.
+    pub rungs: Vec<Rung>,
+}
+
+/// Identifier of the rung that trains the base.
+pub const BASE: &str = "base";
+
+/// Names of all ladders, in the order of the report.
+pub const NAMES: [&str; 12] = [
+    "presets",
+    "iterations",
+    "resolution",
+    "gaussians",
+    "deformation",
+    "sh",
+    "instance",
+    "speedups",
+    "precision",
+    "storage",
+    "render",
+    "export",
+];
+
+/// Settings of the base over `draft` in a quick report: enough to show every effect, small enough for minutes.
+pub const QUICK_BASE: [&str; 15] = [
+    "stages.coarse=60",
+    "stages.fine=600",
+    "stages.instance=200",
+    "model.max_initial_points=2500",
+    "model.spatial_resolution=[32,32,32]",
+    "model.sh_interval=60",
+    "densify.from=60",
+    "densify.until=400",
+    "densify.every=40",
+    "densify.prune_every=40",
+    "densify.max_gaussians=3000",
+    "resample.from=20",
+    "resample.every=20",
+    "resample.until=160",
+    "report.curve_frames=4",
+];
+
+/// What the base has of everything that rungs multiply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Base {
+    /// Fewer rungs.
+    pub quick: bool,
+    /// Steps: coarse, fine, instance.
+    pub steps: [u32; 3],
+    /// Last densification, last resampling.
+    pub until: [u32; 2],
+    /// Most Gaussians.
+    pub gaussians: u32,
+    /// Nodes of the planes along x.
+    pub nodes: u32,
+    /// Network width.
+    pub width: u32,
+    /// Spherical-harmonics degree.
+    pub sh_degree: u8,
+    /// Image reduction.
+    pub downscale: u32,
+    /// The capture moves.
+    pub is_dynamic: bool,
+    /// The capture has masks.
+    pub has_instances: bool,
+}
+
+fn train(id: &str, label: impl Into<String>, settings: &[String]) -> Rung {
+    let work = Work::Train(settings.to_vec());
+    Rung { id: if settings.is_empty() { BASE.to_owned() } else { id.to_owned() }, label: label.into(), work }
+}
+
+fn rung(id: &str, label: &str, work: Work) -> Rung {
+    Rung { id: id.to_owned(), label: label.to_owned(), work }
+}
+
+/// All ladders that say something of such a base; those that train come first.
+#[must_use]
+pub fn ladders(base: &Base) -> Vec<Ladder> {
+    NAMES.iter().map(|name| ladder(name, base)).filter(|ladder| ladder.rungs.len() > 1).collect()
+}
+
+fn ladder(name: &'static str, base: &Base) -> Ladder {
+    let quick = base.quick;
+    let factors = |all: &[f64], few: &[f64]| if quick { few.to_vec() } else { all.to_vec() };
+    let scaled = |value: u32, factor: f64| (f64::from(value) * factor).round().max(1.0) as u32;
+    let (title, about, rungs) = match name {
+        "presets" => {
+            let named = |name: &'static str| rung(&format!("preset-{name}"), name, Work::Preset(name));
+            let rungs = if quick {
+                vec![train("", "quick base", &[]), named("draft")]
+            } else {
+                vec![named("draft"), named("standard")]
+            };
+            ("Presets", "Named settings, all of them at once.", rungs)
+        }
+        "iterations" => (
+            "Iterations",
+            "Steps of all stages, with everything that counts in steps stretched alike.",
+            factors(&[0.25, 0.5, 1.0, 2.0], &[0.5, 1.0, 2.0])
+                .into_iter()
+                .map(|factor| {
+                    let [coarse, fine, instance] = base.steps.map(|steps| scaled(steps, factor));
+                    let [densify, resample] = base.until.map(|step| scaled(step, factor));
+                    let settings: Vec<String> = [
+                        format!("stages.coarse={coarse}"),
+                        format!("stages.fine={fine}"),
+                        format!("stages.instance={instance}"),
+                        format!("densify.until={densify}"),
+                        format!("resample.until={resample}"),
+                    ]
+                    .into();
+                    let label = format!("{} steps", coarse + fine + instance);
+                    let settings = if factor == 1.0 { &[][..] } else { &settings };
+                    train(&format!("iterations-{factor}"), label, settings)
+                })
+                .collect(),
+        ),
+        "resolution" => (
+            "Resolution",
+            "Training images reduced; scored on the images of the base all the same.",
+            factors(&[4.0, 2.0, 1.0], &[2.0, 1.0])
+                .into_iter()
+                .map(|factor| {
+                    let downscale = scaled(base.downscale, factor);
+                    let settings = [format!("downscale={downscale}")];
+                    let label = if factor == 1.0 { "full".to_owned() } else { format!("1/{factor}") };
+                    let settings = if factor == 1.0 { &[][..] } else { &settings };
+                    train(&format!("resolution-{factor}"), label, settings)
+                })
+                .collect(),
+        ),
+        "gaussians" => (
+            "Gaussians",
+            "The most Gaussians that densification may add up to.",
+            factors(&[0.25, 0.5, 1.0, 2.0], &[0.5, 1.0, 2.0])
+                .into_iter()
+                .map(|factor| {
+                    let most = scaled(base.gaussians, factor);
+                    let settings = [format!("densify.max_gaussians={most}")];
+                    let settings = if factor == 1.0 { &[][..] } else { &settings };
+                    train(&format!("gaussians-{factor}"), most.to_string(), settings)
+                })
+                .collect(),
+        ),
+        "deformation" => {
+            let nodes = |count: u32| format!("model.spatial_resolution=[{count},{count},{count}]");
+            let half = base.nodes / 2;
+            let width = |width: u32| format!("model.width={width}");
+            let mut rungs = vec![
+                train(
+                    "deformation-none",
+                    "none",
+                    &[
+                        format!("stages.coarse={}", base.steps[0] + base.steps[1]),
+                        "stages.fine=0".to_owned(),
+                        format!("rates.schedule_steps={}", base.steps.iter().sum::<u32>()),
+                    ],
+                ),
+                train(
+                    "deformation-small",
+                    format!("planes {half}, width {}", base.width / 2),
+                    &[nodes(half), width(base.width / 2)],
+                ),
+                train("deformation-planes-half", format!("planes {half}"), &[nodes(half)]),
+            ];
+            if !quick {
+                rungs.push(train("deformation-channels", "8 channels", &["model.channels=8".to_owned()]));
+            }
+            rungs.push(train("", format!("planes {}, width {}", base.nodes, base.width), &[]));
+            rungs.push(train(
+                "deformation-wide",
+                format!("width {}", base.width * 2),
+                &[width(base.width * 2)],
+            ));
+            (
+                "Deformation",
+                "Nodes of the feature planes and width of the network that move Gaussians.",
+                if base.is_dynamic { rungs } else { Vec::new() },
+            )
+        }
+        "sh" => (
+            "View-dependent colour",
+            "Highest degree of the spherical harmonics.",
+            (0..=base.sh_degree)
+                .filter(|degree| !quick || [0, 1, base.sh_degree].contains(degree))
+                .map(|degree| {
+                    let settings = [format!("model.sh_degree={degree}")];
+                    let settings = if degree == base.sh_degree { &[][..] } else { &settings };
+                    train(&format!("sh-{degree}"), format!("degree {degree}"), settings)
+                })
+                .collect(),
+        ),
+        "instance" => (
+            "Instance stage",
+            "Steps with instances, after one and the same reconstruction.",
+            if base.has_instances {
+                factors(&[0.2, 0.5, 1.0, 2.0], &[0.25, 1.0, 2.0])
+                    .into_iter()
+                    .map(|factor| {
+                        let steps = scaled(base.steps[2], factor);
+                        let until = scaled(base.until[1], factor);
+                        let settings =
+                            [format!("stages.instance={steps}"), format!("resample.until={until}")];
+                        let settings = if factor == 1.0 { &[][..] } else { &settings };
+                        train(&format!("instance-{factor}"), format!("{steps} steps"), settings)
+                    })
+                    .collect()
+            } else {
+                Vec::new()
+            },
+        ),
+        "speedups" => ("Approximations", "Settings that save time in training, one by one.", {
+            let mut rungs = vec![train("", "none", &[])];
+            let one = |id: &str, label: &str, setting: &str| train(id, label, &[setting.to_owned()]);
+            if base.has_instances {
+                rungs.push(one("speedup-stride", "identities from every 4th frame", "identity.stride=4"));
+                rungs.push(one(
+                    "speedup-geometry",
+                    "instances leave geometry alone",
+                    "instance.geometry=off",
+                ));
+            }
+            rungs.push(one("speedup-visible", "only visible rows move", "adam.visible_rows_only=true"));
+            rungs
+        }),
+        "precision" => (
+            "Precision",
+            "One held-out frame of the base, rendered by the fast path in 32 bits and by the readable \
+             reference in 32 and 64 bits. The residual is the largest difference of a colour to 64 bits.",
+            vec![
+                rung(
+                    "precision-fast",
+                    "fast path, f32",
+                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.0 },
+                ),
+                rung("precision-f32", "reference, f32", Work::Reference { double: false }),
+                rung("precision-f64", "reference, f64", Work::Reference { double: true }),
+            ],
+        ),
+        "storage" => (
+            "Storage",
+            "Parameters of the base rounded to 16-bit floats, then scored; bytes are those of the parameters.",
+            vec![
+                rung("storage-all", "all in f16", Work::Store { planes: true, splats: true, centres: true }),
+                rung(
+                    "storage-but-centres",
+                    "all but centres in f16",
+                    Work::Store { planes: true, splats: true, centres: false },
+                ),
+                rung(
+                    "storage-planes",
+                    "deformation in f16",
+                    Work::Store { planes: true, splats: false, centres: false },
+                ),
+                rung(
+                    "storage-f32",
+                    "all in f32",
+                    Work::Store { planes: false, splats: false, centres: false },
+                ),
+            ],
+        ),
+        "render" => (
+            "Rendering",
+            "Held-out frames of the base rendered with less. The residual is the largest difference of a \
+             colour to the final quality; seconds are those of a frame.",
+            vec![
+                rung(
+                    "render-draft",
+                    "half size, degree 1, opacity from 0.05",
+                    Work::Render { reduction: 2, sh_degree: Some(1), min_opacity: 0.05 },
+                ),
+                rung(
+                    "render-half",
+                    "half size",
+                    Work::Render { reduction: 2, sh_degree: None, min_opacity: 0.0 },
+                ),
+                rung(
+                    "render-opaque",
+                    "opacity from 0.05",
+                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.05 },
+                ),
+                rung(
+                    "render-degree",
+                    "degree 1",
+                    Work::Render { reduction: 1, sh_degree: Some(1), min_opacity: 0.0 },
+                ),
+                rung(
+                    "render-final",
+                    "final",
+                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.0 },
+                ),
+            ],
+        ),
+        _ => (
+            "Export tolerance",
+            "Motion of objects in a glTF file inside a tolerance, percent of each object's size. The residual is \
+             the largest decisive one, world units; bytes are those of the file, seconds those of building and \
+             writing it.",
+            [10.0, 3.0, 1.0, 0.3]
+                .into_iter()
+                .map(|percent| {
+                    rung(
+                        &format!("export-{percent}"),
+                        &format!("{percent} %"),
+                        Work::Export(Tolerance::Percent(percent)),
+                    )
+                })
+                .collect(),
+        ),
+    };
+    Ladder { name, title, about, rungs }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+
+    fn base(quick: bool) -> Base {
+        Base {
+            quick,
+            steps: [300, 7_000, 1_500],
+            until: [4_000, 1_250],
+            gaussians: 12_000,
+            nodes: 64,
+            width: 64,
+            sh_degree: 3,
+            downscale: 1,
+            is_dynamic: true,
+            has_instances: true,
+        }
+    }
+
+    #[test]
+    fn every_ladder_has_rungs_and_equal_files_do_equal_work() {
+        for quick in [true, false] {
+            let all = ladders(&base(quick));
+            assert_eq!(all.iter().map(|ladder| ladder.name).collect::<Vec<_>>(), NAMES);
+            let mut work: BTreeMap<String, Work> = BTreeMap::new();
+            for rung in all.iter().flat_map(|ladder| &ladder.rungs) {
+                let first = work.entry(rung.id.clone()).or_insert_with(|| rung.work.clone());
+                assert_eq!(*first, rung.work, "{}", rung.id);
+            }
+            assert_eq!(work[BASE], Work::Train(Vec::new()));
+        }
+    }
+
+    #[test]
+    fn settings_of_rungs_exist_and_can_work() {
+        use cif_train::TrainConfig;
+
+        use crate::settings::Layers;
+        let mut trained = 0;
+        for rung in ladders(&base(false)).into_iter().flat_map(|ladder| ladder.rungs) {
+            let Work::Train(settings) = rung.work else { continue };
+            let mut layers = Layers::new(TrainConfig::default());
+            for setting in settings.iter().filter(|setting| !setting.starts_with("downscale")) {
+                layers.assignment(setting).unwrap();
+            }
+            layers.finish().validate().unwrap();
+            trained += 1;
+        }
+        assert!(trained > 20);
+        let mut layers = Layers::new(TrainConfig::default());
+        QUICK_BASE.iter().for_each(|setting| layers.assignment(setting).unwrap());
+        layers.finish().validate().unwrap();
+    }
+
+    #[test]
+    fn a_still_capture_without_masks_has_fewer_ladders() {
+        let still = Base { is_dynamic: false, has_instances: false, ..base(true) };
+        let names: Vec<&str> = ladders(&still).iter().map(|ladder| ladder.name).collect();
+        assert!(!names.contains(&"deformation") && !names.contains(&"instance"), "{names:?}");
+    }
+}

@@ -1,0 +1,20 @@
+//! What accuracy costs: one scene trained, stored, rendered and exported in many ways, and the report of it.
+//!
+//! | file | answers |
+//! |---|---|
+//! | `ladders` | which ladders there are, and what their rungs change |
+//! | `measure` | how a rung is measured |
+//! | `record` | what is kept of a rung, so that a report can be interrupted |
+//! | `pareto` | which rungs nothing else beats, and what the next dB costs |
+//! | `plots` | pictures of it |
+//! | `report` | the page, the table and the JSON |
+
+pub mod ladders;
+pub mod measure;
+mod pareto;
+mod plots;
+pub mod record;
+pub mod report;
+
+pub use ladders::{Ladder, Rung, Work, ladders};
+pub use record::Record;

@@ -1,0 +1,617 @@
+//! The report: a page that needs nothing else, JSON, and a table for spreadsheets.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use serde_json::{Value, json};
+
+use super::ladders::{BASE, Ladder, Work};
+use super::pareto::{Climb, amount, front, sentence};
+use super::plots::{Plot, Series, svg};
+use super::record::{Folder, Record};
+use crate::error::Error;
+use crate::output;
+
+/// What a report is of.
+#[derive(Clone, Debug)]
+pub struct Subject {
+    /// Name of the capture.
+    pub capture: String,
+    /// One line on it.
+    pub description: String,
+    /// Command that made the report.
+    pub command: String,
+    /// Threads used.
+    pub threads: usize,
+    /// Vector instructions used.
+    pub simd: String,
+    /// Rungs that are not measured yet.
+    pub missing: usize,
+}
+
+/// Ladders with what was measured of their rungs, in their order.
+pub type Measured = Vec<(Ladder, Vec<Option<Record>>)>;
+
+/// Which columns a ladder has, and along which cost it is climbed.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Train,
+    Bytes,
+    Frame,
+    Export,
+}
+
+fn kind(ladder: &Ladder) -> Kind {
+    match ladder.rungs.first().map(|rung| &rung.work) {
+        Some(Work::Store { .. }) => Kind::Bytes,
+        Some(Work::Render { .. } | Work::Reference { .. }) => Kind::Frame,
+        Some(Work::Export(_)) => Kind::Export,
+        _ => Kind::Train,
+    }
+}
+
+fn cost(kind: Kind, record: &Record) -> (f64, &'static str) {
+    match kind {
+        Kind::Bytes | Kind::Export => (record.bytes.unwrap_or(0) as f64, "B"),
+        Kind::Train | Kind::Frame => (record.cpu_s, "s"),
+    }
+}
+
+/// A rung as all outputs see it.
+struct Row<'a> {
+    ladder: &'a Ladder,
+    id: &'a str,
+    label: &'a str,
+    record: &'a Record,
+    /// On the front of PSNR, of mIoU.
+    front: [bool; 2],
+    /// What climbing to it from the rung below costs.
+    climb: Option<String>,
+}
+
+fn rows(measured: &Measured) -> Vec<Row<'_>> {
+    let mut rows = Vec::new();
+    for (ladder, records) in measured {
+        let present: Vec<(&str, &str, &Record)> = ladder
+            .rungs
+            .iter()
+            .zip(records)
+            .filter_map(|(rung, record)| Some((rung.id.as_str(), rung.label.as_str(), record.as_ref()?)))
+            .collect();
+        for (k, (id, label, record)) in present.iter().copied().enumerate() {
+            let climb = k.checked_sub(1).map(|below| {
+                let (_, from, lower) = present[below];
+                let (cost_now, unit) = cost(kind(ladder), record);
+                let (cost_below, _) = cost(kind(ladder), lower);
+                let gain = |a: Option<f64>, b: Option<f64>| Some(a? - b?);
+                let climb = Climb {
+                    cost: cost_now - cost_below,
+                    psnr: gain(record.psnr, lower.psnr),
+                    miou: gain(record.miou, lower.miou),
+                };
+                let mut text = sentence(from, label, &climb, unit);
+                if kind(ladder) == Kind::Export
+                    && let (Some(now), Some(before)) = (record.residual, lower.residual)
+                {
+                    text = text.trim_end_matches('.').to_owned()
+                        + &format!("; the residual goes from {before:.5} to {now:.5}.");
+                }
+                text
+            });
+            rows.push(Row { ladder, id, label, record, front: [false; 2], climb });
+        }
+    }
+    mark_fronts(&mut rows);
+    rows
+}
+
+/// Marks the fronts of everything that was trained, each scene counted once.
+fn mark_fronts(rows: &mut [Row<'_>]) {
+    let trained: Vec<usize> = (0..rows.len()).filter(|row| kind(rows[*row].ladder) == Kind::Train).collect();
+    let values: [fn(&Record) -> Option<f64>; 2] = [|record| record.psnr, |record| record.miou];
+    for (which, value) in values.iter().enumerate() {
+        let points: Vec<(f64, Option<f64>)> =
+            trained.iter().map(|row| (rows[*row].record.cpu_s, value(rows[*row].record))).collect();
+        for (row, on_front) in trained.iter().zip(front(&points)) {
+            rows[*row].front[which] = on_front;
+        }
+    }
+}
+
+/// Writes `report.html`, `report.json`, `rungs.csv` and the plots.
+///
+/// # Errors
+/// When a file cannot be written or a picture not be read.
+pub fn write(folder: &Path, rungs: &Folder, subject: &Subject, measured: &Measured) -> Result<(), Error> {
+    let rows = rows(measured);
+    let plots = plots(measured, &rows);
+    for (name, _, text) in &plots {
+        output::write_file(&folder.join(format!("{name}.svg")), text.as_bytes())?;
+    }
+    output::write_file(&folder.join("report.json"), format!("{:#}\n", json_of(subject, &rows)).as_bytes())?;
+    output::write_file(&folder.join("rungs.csv"), csv(&rows).as_bytes())?;
+    let page = page(rungs, subject, measured, &rows, &plots)?;
+    output::write_file(&folder.join("report.html"), page.as_bytes())
+}
+
+fn json_of(subject: &Subject, rows: &[Row<'_>]) -> Value {
+    let rungs: Vec<Value> = rows
+        .iter()
+        .map(|row| {
+            let mut value = json!(row.record);
+            if let Some(table) = value.as_object_mut() {
+                table.remove("fingerprint");
+                table.remove("pictures");
+            }
+            value["ladder"] = json!(row.ladder.name);
+            value["rung"] = json!(row.label);
+            value["id"] = json!(row.id);
+            value["front_psnr"] = json!(row.front[0]);
+            value["front_miou"] = json!(row.front[1]);
+            value["climb"] = json!(row.climb);
+            value
+        })
+        .collect();
+    json!({
+        "capture": subject.capture,
+        "description": subject.description,
+        "command": subject.command,
+        "threads": subject.threads,
+        "simd": subject.simd,
+        "rungs_missing": subject.missing,
+        "rungs": rungs,
+    })
+}
+
+fn csv(rows: &[Row<'_>]) -> String {
+    let mut text = String::from(
+        "ladder,rung,cpu_s,wall_s,psnr_db,ssim,miou_percent,gaussians,bytes,residual,psnr_to_exact_db,render_ms,\
+         front_psnr,front_miou\n",
+    );
+    let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
+    for row in rows {
+        let record = row.record;
+        let quoted = format!("\"{}\"", row.label.replace('"', "\"\""));
+        let _ = writeln!(
+            text,
+            "{},{quoted},{},{},{},{},{},{},{},{},{},{},{},{}",
+            row.ladder.name,
+            record.cpu_s,
+            record.wall_s,
+            number(record.psnr),
+            number(record.ssim),
+            number(record.miou),
+            number(record.gaussians.map(|count| count as f64)),
+            number(record.bytes.map(|count| count as f64)),
+            number(record.residual),
+            number(record.psnr_to_exact),
+            number(record.render_ms),
+            row.front[0],
+            row.front[1],
+        );
+    }
+    text
+}
+
+/// File name, caption and SVG of every plot; the overviews first.
+fn plots(measured: &Measured, rows: &[Row<'_>]) -> Vec<(String, String, String)> {
+    let mut found = Vec::new();
+    let mut add = |name: String, caption: String, plot: &Plot<'_>| {
+        if let Some(text) = svg(plot) {
+            found.push((name, caption, text));
+        }
+    };
+    type Value = fn(&Record) -> Option<f64>;
+    let overviews: [(&str, &str, Value, usize); 2] = [
+        ("psnr", "PSNR of held-out frames, dB", |record| record.psnr, 0),
+        ("miou", "mIoU of held-out frames, %", |record| record.miou, 1),
+    ];
+    for (name, axis, value, which) in overviews {
+        let series: Vec<Series> = measured
+            .iter()
+            .filter(|(ladder, _)| kind(ladder) == Kind::Train)
+            .map(|(ladder, _)| Series {
+                name: ladder.title.to_owned(),
+                points: rows
+                    .iter()
+                    .filter(|row| row.ladder.name == ladder.name)
+                    .filter_map(|row| {
+                        // The base stands in most ladders; it is named once.
+                        let named = row.front[which] && (row.id != BASE || ladder.name == "iterations");
+                        let name = if named { row.label.to_owned() } else { String::new() };
+                        Some((row.record.cpu_s, value(row.record)?, name))
+                    })
+                    .collect(),
+                line: false,
+            })
+            .filter(|series| !series.points.is_empty())
+            .collect();
+        let mut front: Vec<(f64, f64)> = rows
+            .iter()
+            .filter(|row| row.front[which])
+            .filter_map(|row| Some((row.record.cpu_s, value(row.record)?)))
+            .collect();
+        front.sort_by(|a, b| a.0.total_cmp(&b.0));
+        front.dedup();
+        let plot = Plot {
+            axes: ["processor time of training, s (all threads together)", axis],
+            log: true,
+            series,
+            front,
+            size: (900, 470),
+        };
+        add(
+            format!("overview-{name}"),
+            format!(
+                "Every trained rung: {axis}, against processor time. The dashed line joins what nothing else beats; \
+                 its rungs are named."
+            ),
+            &plot,
+        );
+    }
+    for (ladder, records) in measured {
+        let present = || ladder.rungs.iter().zip(records).filter_map(|(rung, r)| Some((rung, r.as_ref()?)));
+        match kind(ladder) {
+            Kind::Train => {
+                let series = present()
+                    .filter_map(|(rung, record)| {
+                        let curve = record.curve.as_ref()?;
+                        let points = curve.points.iter();
+                        let points = points.filter_map(|p| Some((p.cpu_s, p.psnr?, String::new()))).collect();
+                        Some(Series { name: rung.label.clone(), points, line: true })
+                    })
+                    .collect();
+                let plot = Plot {
+                    axes: ["processor time, s", "PSNR of the curve's frames, dB"],
+                    log: false,
+                    series,
+                    front: Vec::new(),
+                    size: (640, 340),
+                };
+                let caption = "Quality while training went on, each rung measured on a few held-out frames.";
+                add(format!("ladder-{}", ladder.name), caption.to_owned(), &plot);
+            }
+            kind => {
+                let (axes, value): ([&str; 2], Value) = match kind {
+                    Kind::Export => {
+                        (["size of the file, kB", "largest residual, world units"], |record| record.residual)
+                    }
+                    Kind::Bytes => {
+                        (["size of the parameters, kB", "PSNR of held-out frames, dB"], |r| r.psnr)
+                    }
+                    _ => (["processor time of a frame, ms", "PSNR of held-out frames, dB"], |record| {
+                        record.psnr
+                    }),
+                };
+                // Both bytes and seconds are shown in thousands or thousandths.
+                let scale = if kind == Kind::Frame { 1e3 } else { 1e-3 };
+                let points = present()
+                    .filter_map(|(rung, record)| {
+                        Some((scale * cost(kind, record).0, value(record)?, rung.label.clone()))
+                    })
+                    .collect();
+                let series = vec![Series { name: ladder.title.to_owned(), points, line: false }];
+                let log = kind == Kind::Frame;
+                let plot = Plot { axes, log, series, front: Vec::new(), size: (640, 300) };
+                add(format!("ladder-{}", ladder.name), "What accuracy costs here.".to_owned(), &plot);
+            }
+        }
+    }
+    found
+}
+
+const STYLE: &str = include_str!("report.css");
+
+fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+fn page(
+    rungs: &Folder,
+    subject: &Subject,
+    measured: &Measured,
+    rows: &[Row<'_>],
+    plots: &[(String, String, String)],
+) -> Result<String, Error> {
+    let mut page = String::new();
+    let title = format!("What accuracy costs: {}", escape(&subject.capture));
+    let _ = write!(
+        page,
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"viewport\" \
+         content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n<style>\n{STYLE}</style>\n\
+         </head>\n<body>\n<header>\n<h1>{title}</h1>\n<p>{}</p>\n<p class=\"how\">Measured on {} with {}. Made \
+         by <code>{}</code>.</p>\n",
+        escape(&subject.description),
+        if subject.threads == 1 { "one thread".to_owned() } else { format!("{} threads", subject.threads) },
+        escape(&subject.simd),
+        escape(&subject.command),
+    );
+    if subject.missing > 0 {
+        let _ = writeln!(
+            page,
+            "<p class=\"missing\">{} rungs are not measured yet; the same command goes on with them.</p>",
+            subject.missing
+        );
+    }
+    page += "<nav>";
+    for (ladder, records) in measured.iter().filter(|(_, records)| records.iter().any(Option::is_some)) {
+        debug_assert_eq!(ladder.rungs.len(), records.len());
+        let _ = write!(page, "<a href=\"#{}\">{}</a>", ladder.name, escape(ladder.title));
+    }
+    page += "</nav>\n</header>\n<main>\n";
+    page += SUMMARY_OPEN;
+    for line in summary(rows) {
+        let _ = writeln!(page, "<li>{}</li>", escape(&line));
+    }
+    page += "</ul>\n";
+    figures(&mut page, plots, "overview-");
+    page += "</section>\n";
+    for (ladder, records) in measured {
+        let of_ladder: Vec<&Row<'_>> = rows.iter().filter(|row| row.ladder.name == ladder.name).collect();
+        if of_ladder.is_empty() {
+            continue;
+        }
+        let _ = write!(
+            page,
+            "<section id=\"{}\">\n<h2>{}</h2>\n<p>{}</p>\n",
+            ladder.name,
+            escape(ladder.title),
+            escape(ladder.about)
+        );
+        table(&mut page, kind(ladder), &of_ladder);
+        page += "<ul class=\"climbs\">\n";
+        for climb in of_ladder.iter().filter_map(|row| row.climb.as_ref()) {
+            let _ = writeln!(page, "<li>{}</li>", escape(climb));
+        }
+        page += "</ul>\n<div class=\"beside\">\n";
+        figures(&mut page, plots, &format!("ladder-{}", ladder.name));
+        page += "</div>\n";
+        pictures(&mut page, rungs, &of_ladder)?;
+        page += "</section>\n";
+        debug_assert!(records.len() >= of_ladder.len());
+    }
+    page += "</main>\n<footer>PSNR and SSIM are means over the held-out frames; mIoU is over pairs of instance and \
+             frame. Processor time counts all threads together and no measuring. Filled dots mark the fronts: no other \
+             trained rung is both cheaper and better.</footer>\n</body>\n</html>\n";
+    Ok(page)
+}
+
+const SUMMARY_OPEN: &str = "<section id=\"summary\">\n<h2>In short</h2>\n<ul class=\"climbs\">\n";
+
+/// The front from cheap to dear, in sentences.
+fn summary(rows: &[Row<'_>]) -> Vec<String> {
+    let mut lines = Vec::new();
+    type Value = fn(&Record) -> Option<f64>;
+    let values: [(&str, &str, Value); 2] =
+        [("PSNR", "dB", |record| record.psnr), ("mIoU", "%", |record| record.miou)];
+    for (which, (name, unit, value)) in values.into_iter().enumerate() {
+        let mut on_front: Vec<&Row<'_>> = rows.iter().filter(|row| row.front[which]).collect();
+        on_front.sort_by(|a, b| a.record.cpu_s.total_cmp(&b.record.cpu_s));
+        on_front.dedup_by(|a, b| a.id == b.id);
+        let describe = |row: &&Row<'_>| {
+            let value = value(row.record).unwrap_or(f64::NAN);
+            let what = match row.id {
+                BASE => "the base".to_owned(),
+                _ => format!("{} {}", row.ladder.title.to_lowercase(), row.label),
+            };
+            format!("{what} {value:.2} {unit} in {}", amount(row.record.cpu_s, "s"))
+        };
+        if !on_front.is_empty() {
+            let steps: Vec<String> = on_front.iter().map(describe).collect();
+            lines.push(format!("{name}, best for its time: {}.", steps.join("; ")));
+        }
+    }
+    lines
+}
+
+fn figures(page: &mut String, plots: &[(String, String, String)], prefix: &str) {
+    for (name, caption, text) in plots.iter().filter(|(name, ..)| name.starts_with(prefix)) {
+        let whole = name == prefix || prefix.ends_with('-');
+        if whole {
+            let _ = write!(page, "<figure>{text}<figcaption>{}</figcaption></figure>\n", escape(caption));
+        }
+    }
+}
+
+fn table(page: &mut String, kind: Kind, rows: &[&Row<'_>]) {
+    let number =
+        |value: Option<f64>, digits: usize| value.map_or("–".to_owned(), |v| format!("{v:.digits$}"));
+    type Cell = Box<dyn Fn(&Row<'_>) -> String>;
+    let mark = |on: bool| if on { " ●" } else { "" };
+    let mut columns: Vec<(&str, Cell)> = vec![("", Box::new(|row| escape(row.label)))];
+    match kind {
+        Kind::Train => {
+            columns.push(("processor time, s", Box::new(|row| format!("{:.1}", row.record.cpu_s))));
+            columns.push(("wall time, s", Box::new(|row| format!("{:.1}", row.record.wall_s))));
+            columns.push(("PSNR, dB", Box::new(move |row| number(row.record.psnr, 2) + mark(row.front[0]))));
+            columns.push(("SSIM", Box::new(move |row| number(row.record.ssim, 4))));
+            columns.push(("mIoU, %", Box::new(move |row| number(row.record.miou, 1) + mark(row.front[1]))));
+            columns.push((
+                "Gaussians",
+                Box::new(|row| row.record.gaussians.map_or("–".into(), |n| n.to_string())),
+            ));
+            columns.push((
+                "parameters, MB",
+                Box::new(move |row| number(row.record.bytes.map(|b| b as f64 / 1e6), 2)),
+            ));
+            columns.push(("a frame, ms", Box::new(move |row| number(row.record.render_ms, 1))));
+            columns.push((
+                "settings over the base",
+                Box::new(|row| {
+                    let settings = row.record.settings.iter().map(|s| escape(s));
+                    settings.map(|setting| format!("<code>{setting}</code>")).collect::<Vec<_>>().join(" ")
+                }),
+            ));
+        }
+        Kind::Bytes => {
+            columns.push((
+                "parameters, MB",
+                Box::new(move |row| number(row.record.bytes.map(|b| b as f64 / 1e6), 3)),
+            ));
+            columns.push(("PSNR, dB", Box::new(move |row| number(row.record.psnr, 3))));
+            columns.push(("SSIM", Box::new(move |row| number(row.record.ssim, 4))));
+            columns.push(("mIoU, %", Box::new(move |row| number(row.record.miou, 2))));
+        }
+        Kind::Frame => {
+            columns.push(("processor time, ms", Box::new(|row| format!("{:.2}", 1e3 * row.record.cpu_s))));
+            columns.push(("wall time, ms", Box::new(|row| format!("{:.2}", 1e3 * row.record.wall_s))));
+            columns.push(("PSNR, dB", Box::new(move |row| number(row.record.psnr, 3))));
+            columns.push((
+                "PSNR to the exact picture, dB",
+                Box::new(move |row| number(row.record.psnr_to_exact, 1)),
+            ));
+            columns.push((
+                "largest difference of a colour",
+                Box::new(|row| {
+                    row.record.residual.map_or("–".into(), |value| {
+                        if value == 0.0 { "0".into() } else { format!("{value:.1e}") }
+                    })
+                }),
+            ));
+            columns.push((
+                "Gaussians",
+                Box::new(|row| row.record.gaussians.map_or("–".into(), |n| n.to_string())),
+            ));
+        }
+        Kind::Export => {
+            columns
+                .push(("file, kB", Box::new(move |row| number(row.record.bytes.map(|b| b as f64 / 1e3), 1))));
+            columns.push(("wall time, s", Box::new(|row| format!("{:.2}", row.record.wall_s))));
+            columns
+                .push(("largest residual, world units", Box::new(move |row| number(row.record.residual, 5))));
+        }
+    }
+    page.push_str("<div class=\"wide\"><table>\n<thead><tr>");
+    for (name, _) in &columns {
+        let _ = write!(page, "<th>{name}</th>");
+    }
+    page.push_str("</tr></thead>\n<tbody>\n");
+    for row in rows {
+        page.push_str(if row.id == BASE { "<tr class=\"base\">" } else { "<tr>" });
+        for (_, cell) in &columns {
+            let _ = write!(page, "<td>{}</td>", cell(row));
+        }
+        page.push_str("</tr>\n");
+    }
+    page.push_str("</tbody></table></div>\n");
+}
+
+/// The same frame of every rung that has pictures, the captured one first.
+fn pictures(page: &mut String, rungs: &Folder, rows: &[&Row<'_>]) -> Result<(), Error> {
+    if rows.iter().all(|row| row.record.pictures.is_empty()) {
+        return Ok(());
+    }
+    page.push_str("<div class=\"pictures\">\n");
+    let truth = rungs.file("truth.png");
+    if truth.is_file() {
+        picture(page, &truth, "captured")?;
+    }
+    for row in rows {
+        for name in &row.record.pictures {
+            let what = if name.ends_with(".instances.png") { ", instances" } else { "" };
+            picture(page, &rungs.file(name), &format!("{}{what}", row.label))?;
+        }
+    }
+    page.push_str("</div>\n");
+    Ok(())
+}
+
+fn picture(page: &mut String, path: &Path, caption: &str) -> Result<(), Error> {
+    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
+    let caption = escape(caption);
+    let _ = write!(
+        page,
+        "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>{caption}</figcaption></figure>\n",
+        STANDARD.encode(bytes)
+    );
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::ladders::{Base, ladders};
+    use super::*;
+
+    fn measured() -> Measured {
+        let base = Base {
+            quick: true,
+            steps: [60, 600, 200],
+            until: [400, 160],
+            gaussians: 3_000,
+            nodes: 32,
+            width: 64,
+            sh_degree: 3,
+            downscale: 1,
+            is_dynamic: true,
+            has_instances: true,
+        };
+        let record = |k: usize| Record {
+            cpu_s: 1.0 + k as f64,
+            wall_s: 1.0,
+            psnr: Some(20.0 + (k as f64).sqrt()),
+            miou: Some(60.0 + k as f64),
+            bytes: Some(1_000 * (k as u64 + 1)),
+            residual: Some(0.1 / (k + 1) as f64),
+            ..Record::default()
+        };
+        ladders(&base)
+            .into_iter()
+            .map(|ladder| {
+                let records =
+                    (0..ladder.rungs.len()).map(|k| (k != 1 || ladder.rungs.len() > 2).then(|| record(k)));
+                let records = records.collect();
+                (ladder, records)
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_report_is_whole_without_a_network() {
+        let folder = tempfile::tempdir().unwrap();
+        let rungs = Folder::inside(folder.path()).unwrap();
+        let subject = Subject {
+            capture: "table <1>".into(),
+            description: "80 frames".into(),
+            command: "cif bench accuracy table".into(),
+            threads: 2,
+            simd: "Avx2".into(),
+            missing: 1,
+        };
+        let measured = measured();
+        write(folder.path(), &rungs, &subject, &measured).unwrap();
+        let page = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
+        assert!(page.contains("What accuracy costs: table &lt;1&gt;"));
+        for (ladder, _) in &measured {
+            assert!(page.contains(&format!("<section id=\"{}\"", ladder.name)), "{}", ladder.name);
+        }
+        // The name space of SVG is no address that is loaded.
+        let loaded = page.replace("http://www.w3.org/2000/svg", "");
+        for outside in ["http:", "https:", "<script", "@import", "<link"] {
+            assert!(!loaded.contains(outside), "{outside}");
+        }
+        assert!(page.contains("1 rungs are not measured yet") && page.contains("●"));
+        let report: Value =
+            serde_json::from_str(&std::fs::read_to_string(folder.path().join("report.json")).unwrap())
+                .unwrap();
+        let rungs = report["rungs"].as_array().unwrap();
+        let present: usize = measured.iter().flat_map(|(_, records)| records).flatten().count();
+        assert_eq!(rungs.len(), present);
+        assert!(rungs.iter().any(|rung| rung["climb"].as_str().is_some_and(|text| text.contains("per dB"))));
+        let table = std::fs::read_to_string(folder.path().join("rungs.csv")).unwrap();
+        assert_eq!(table.lines().count(), present + 1);
+        assert!(folder.path().join("overview-psnr.svg").is_file());
+    }
+
+    #[test]
+    fn the_front_is_marked_only_among_what_was_trained() {
+        let measured = measured();
+        let rows = rows(&measured);
+        assert!(rows.iter().any(|row| row.front[0] && row.front[1]));
+        assert!(rows.iter().filter(|row| kind(row.ladder) != Kind::Train).all(|row| row.front == [false; 2]));
+        let lines = summary(&rows);
+        assert_eq!(lines.len(), 2);
+        assert!(lines[0].starts_with("PSNR, best for its time: "), "{lines:?}");
+    }
+}

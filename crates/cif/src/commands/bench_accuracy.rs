@@ -1,0 +1,424 @@
+//! `cif bench accuracy`: what accuracy costs, measured on a capture of one's own.
+
+use std::collections::BTreeMap;
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+
+use cif_dataset::{Dataset, Split};
+use cif_field::Field;
+use cif_render::RenderedImage;
+use cif_train::metrics::trained_settings;
+use cif_train::{Preset, TrainConfig, Trainer};
+use clap::Args;
+use serde_json::{Value, json};
+
+use super::{CaptureOptions, print_warnings, train};
+use crate::accuracy::ladders::{BASE, Base, NAMES, QUICK_BASE};
+use crate::accuracy::measure::{self, Training};
+use crate::accuracy::record::{Folder, Record};
+use crate::accuracy::report::{self, Measured, Subject};
+use crate::accuracy::{Rung, Work, ladders};
+use crate::error::Error;
+use crate::quality::{FINAL, Quality};
+use crate::settings::Layers;
+use crate::{interrupt, output};
+
+/// Measure what accuracy costs in time and bytes, and write a report with plots
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Ladders change one thing each and keep the rest: presets, iterations, resolution, gaussians,
+deformation, sh, instance, speedups train a scene per rung; precision, storage, render and export use
+the scene that the base trains. Every rung is scored on the held-out frames.
+
+  cif bench accuracy captures/table -o report --quick
+  cif bench accuracy captures/table -o report --ladders iterations,gaussians
+  cif bench accuracy captures/table -o report --preset draft --set seed=3
+
+DIR holds report.html (needs no network), report.json, rungs.csv, the plots as SVG, and the rungs:
+finished ones are not measured again, and Ctrl-C keeps the one under way, so that the same command goes
+on where it stopped. --quick trains small scenes in a few minutes: it shows how costs and scores move,
+not how good a scene can get. Without it, a capture takes about thirty times a training run.
+
+Processor time counts all threads together, so that other work on the machine disturbs it little.")]
+pub(super) struct BenchAccuracy {
+    /// Folder of the capture
+    capture: PathBuf,
+    /// Folder to write into
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Small scenes and fewer rungs
+    #[arg(long, conflicts_with = "preset")]
+    quick: bool,
+    /// Ladders to measure, comma separated [default: all that say something of the capture]
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',', value_parser = clap::builder::PossibleValuesParser::new(NAMES))]
+    ladders: Vec<String>,
+    /// Named settings of the base: draft, standard or paper [default: standard]
+    #[arg(long, value_name = "NAME")]
+    preset: Option<String>,
+    /// Any setting of the base by its key in SCENE.train.toml, e.g. --set seed=3
+    #[arg(long, value_name = "TABLE.KEY=VALUE")]
+    set: Vec<String>,
+    /// Write into a folder that holds other files already
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+}
+
+pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
+    base_config(command, cif_dataset::Layout::HyperNerf)?;
+    let goes_on = command.output.join("rungs").is_dir();
+    output::check_folder(&command.output, command.force || goes_on)?;
+    let mut options = command.capture_options.clone();
+    options.downscale = options.downscale.or(base_config(command, cif_dataset::Layout::HyperNerf)?.downscale);
+    let dataset = options.open(&command.capture)?;
+    print_warnings(&dataset);
+    if !dataset.frames.iter().any(|frame| frame.split == Split::Val) {
+        return Err(Error::failed(
+            format!("{}: no frame is held out, so nothing can be scored", command.capture.display()),
+            "hold frames out in the split lists of the capture",
+        ));
+    }
+    let mut config = base_config(command, dataset.layout)?;
+    config.downscale = options.downscale;
+    let base = Base {
+        quick: command.quick,
+        steps: [config.stages.coarse, config.fine_iterations(), config.stages.instance],
+        until: [config.densify.until, config.resample.until],
+        gaussians: config.densify.max_gaussians,
+        nodes: config.model.spatial_resolution[0],
+        width: config.model.width,
+        sh_degree: config.model.sh_degree,
+        downscale: config.downscale.unwrap_or(1),
+        is_dynamic: dataset.times.len() > 1,
+        has_instances: dataset.frames.iter().any(|frame| frame.mask.is_some()),
+    };
+    let mut all = ladders(&base);
+    all.retain(|ladder| command.ladders.is_empty() || command.ladders.iter().any(|name| name == ladder.name));
+    if all.is_empty() {
+        return Err(Error::failed(
+            "none of these ladders says anything of this capture",
+            "it has a single time or no masks; leave --ladders away for those that fit",
+        ));
+    }
+    let rungs = Folder::inside(&command.output)?;
+    measure::save_truth(&dataset, config.background, &rungs.file("truth.png"))?;
+    let mut bench = Bench {
+        capture: options,
+        dataset,
+        config,
+        rungs,
+        base: None,
+        exact: None,
+        is_terminal: std::io::stderr().is_terminal(),
+    };
+    interrupt::watch();
+    let whole: BTreeMap<&str, &Rung> =
+        all.iter().flat_map(|ladder| &ladder.rungs).map(|rung| (rung.id.as_str(), rung)).collect();
+    let mut records: BTreeMap<String, Record> = BTreeMap::new();
+    let mut stopped = false;
+    let mut number = 0;
+    'all: for ladder in &all {
+        for rung in &ladder.rungs {
+            if records.contains_key(&rung.id) {
+                continue;
+            }
+            number += 1;
+            let heading = format!("[{number}/{}] {}: {}", whole.len(), ladder.name, rung.label);
+            let Some(record) = bench.record(rung, &heading)? else {
+                stopped = true;
+                break 'all;
+            };
+            records.insert(rung.id.clone(), record);
+        }
+    }
+    let measured: Measured = all
+        .into_iter()
+        .map(|ladder| {
+            let of_ladder = ladder.rungs.iter().map(|rung| records.get(&rung.id).cloned()).collect();
+            (ladder, of_ladder)
+        })
+        .collect();
+    let missing = measured.iter().flat_map(|(_, records)| records).filter(|record| record.is_none()).count();
+    let subject = bench.subject(command, missing);
+    report::write(&command.output, &bench.rungs, &subject, &measured)?;
+    let page = command.output.join("report.html");
+    if stopped {
+        return Err(Error::Interrupted {
+            message: format!("interrupted; {} holds what is measured so far", page.display()),
+            help: Some("the same command goes on".to_owned()),
+        });
+    }
+    eprintln!("wrote {}", page.display());
+    Ok(())
+}
+
+/// Settings that all ladders start from.
+fn base_config(command: &BenchAccuracy, layout: cif_dataset::Layout) -> Result<TrainConfig, Error> {
+    let preset = match &command.preset {
+        Some(name) => train::preset(name, "--preset")?,
+        None if command.quick => Preset::Draft,
+        None => Preset::Standard,
+    };
+    let mut layers = Layers::new(TrainConfig::preset(preset, layout));
+    if command.quick {
+        for setting in QUICK_BASE {
+            layers.assignment(setting)?;
+        }
+    }
+    for assignment in &command.set {
+        layers.assignment(assignment)?;
+    }
+    let config = layers.finish();
+    config.validate().map_err(Error::plain)?;
+    Ok(config)
+}
+
+/// A report under way.
+struct Bench {
+    capture: CaptureOptions,
+    /// Capture that everything is scored on.
+    dataset: Dataset,
+    config: TrainConfig,
+    rungs: Folder,
+    /// The scene of the base, once it is needed.
+    base: Option<Field>,
+    /// The shown frame in 64 bits, once it is needed.
+    exact: Option<RenderedImage>,
+    is_terminal: bool,
+}
+
+impl Bench {
+    /// What is kept of a rung, measured where it is not kept yet; none when interrupted.
+    fn record(&mut self, rung: &Rung, heading: &str) -> Result<Option<Record>, Error> {
+        if interrupt::requested() {
+            return Ok(None);
+        }
+        let fingerprint = self.fingerprint(rung);
+        if let Some(record) = self.rungs.find(&rung.id, &fingerprint)
+            && (rung.id != BASE || self.base_file().is_file())
+        {
+            eprintln!("{heading}: kept, {}", told(&record));
+            return Ok(Some(record));
+        }
+        let Some(mut record) = self.measure(rung, heading)? else { return Ok(None) };
+        record.fingerprint = fingerprint;
+        self.rungs.keep(&rung.id, &record)?;
+        self.show(&format!("{heading}: {}", told(&record)), true);
+        Ok(Some(record))
+    }
+
+    fn show(&self, text: &str, ends: bool) {
+        // Overwritten on terminals; elsewhere only what is finished.
+        if self.is_terminal {
+            eprint!("\r\x1b[K{text}{}", if ends { "\n" } else { "" });
+            let _ = std::io::stderr().flush();
+        } else if ends {
+            eprintln!("{text}");
+        }
+    }
+
+    fn base_file(&self) -> PathBuf {
+        self.rungs.file("base.cif")
+    }
+
+    /// Everything that a record depends on.
+    fn fingerprint(&self, rung: &Rung) -> Value {
+        let training = match &rung.work {
+            Work::Train(_) | Work::Preset(_) => {
+                self.settings(rung).map(|config| json!(config)).unwrap_or_default()
+            }
+            _ => json!(self.config),
+        };
+        json!({
+            "version": env!("CARGO_PKG_VERSION"),
+            "capture": self.dataset.root.canonicalize().unwrap_or_else(|_| self.dataset.root.clone()),
+            "frames": self.dataset.frames.len(),
+            "masks": self.dataset.frames.iter().filter_map(|frame| frame.mask.as_ref()).next(),
+            "work": format!("{:?}", rung.work),
+            "settings": training,
+        })
+    }
+
+    /// Settings that a rung trains with.
+    fn settings(&self, rung: &Rung) -> Result<TrainConfig, Error> {
+        let config = match &rung.work {
+            Work::Preset(name) => {
+                let mut config =
+                    TrainConfig::preset(train::preset(name, "ladder presets")?, self.dataset.layout);
+                config.seed = self.config.seed;
+                config.downscale = config.downscale.or(self.config.downscale);
+                config
+            }
+            Work::Train(settings) => {
+                let mut layers = Layers::new(self.config.clone());
+                for setting in settings {
+                    layers.assignment(setting)?;
+                }
+                layers.finish()
+            }
+            _ => self.config.clone(),
+        };
+        config.validate().map_err(Error::plain)?;
+        Ok(config)
+    }
+
+    fn measure(&mut self, rung: &Rung, heading: &str) -> Result<Option<Record>, Error> {
+        if let Work::Train(settings) = &rung.work {
+            return self.train(rung, settings.clone(), heading);
+        }
+        if let Work::Preset(name) = &rung.work {
+            return self.train(rung, vec![format!("preset={name}")], heading);
+        }
+        if self.base.is_none() {
+            let base =
+                Rung { id: BASE.to_owned(), label: "the base".to_owned(), work: Work::Train(Vec::new()) };
+            if self.record(&base, "first the base")?.is_none() {
+                return Ok(None);
+            }
+            self.base = Some(Field::load(&self.base_file()).map_err(Error::plain)?);
+        }
+        let Some(field) = &self.base else { return Ok(None) };
+        let mut record = Record { gaussians: Some(field.len()), ..Record::default() };
+        match rung.work {
+            Work::Store { planes, splats, centres } => {
+                let (stored, bytes) = measure::store(field, planes, splats, centres);
+                let settings = trained_settings(field);
+                measure::score(&stored, &settings, &self.dataset, &rung.id, &self.rungs, &mut record)?;
+                record.bytes = Some(bytes);
+            }
+            Work::Render { reduction: 1, sh_degree: None, min_opacity }
+                if min_opacity <= 0.0 && rung.id.starts_with("precision") =>
+            {
+                let exact = exact(&mut self.exact, field, &self.dataset);
+                if let (Some(exact), Some((image, spent))) =
+                    (exact, measure::fast(field, &self.dataset, FINAL))
+                {
+                    (record.cpu_s, record.wall_s) = (spent.cpu_s, spent.wall_s);
+                    measure::against_exact(&image, exact, &self.dataset, &mut record)?;
+                }
+            }
+            Work::Render { reduction, sh_degree, min_opacity } => {
+                let quality = Quality { reduction, sh_degree, min_opacity };
+                measure::render(field, &self.dataset, quality, &mut record)?;
+            }
+            Work::Reference { double } => {
+                let rendered = measure::with_reference(field, &self.dataset, double);
+                let exact = exact(&mut self.exact, field, &self.dataset);
+                if let (Some(exact), Some((image, spent))) = (exact, rendered) {
+                    (record.cpu_s, record.wall_s) = (spent.cpu_s, spent.wall_s);
+                    measure::against_exact(&image, exact, &self.dataset, &mut record)?;
+                }
+            }
+            Work::Export(tolerance) => measure::export(field, tolerance, &mut record)?,
+            Work::Train(_) | Work::Preset(_) => unreachable!("handled above"),
+        }
+        Ok(Some(record))
+    }
+
+    fn train(&mut self, rung: &Rung, settings: Vec<String>, heading: &str) -> Result<Option<Record>, Error> {
+        let config = self.settings(rung)?;
+        let dataset = if config.downscale == self.config.downscale {
+            self.dataset.clone()
+        } else {
+            let options = CaptureOptions { downscale: config.downscale, ..self.capture.clone() };
+            options.open(&self.dataset.root)?
+        };
+        let training = Training { id: &rung.id, dataset, config };
+        let mut last = 0;
+        let trained = measure::train(&self.rungs, training, &mut |done, whole| {
+            let percent = 100 * done / whole.max(1);
+            if percent > last {
+                last = percent;
+                self.show(&format!("{heading}: {percent} %"), false);
+            }
+        })?;
+        let Some((field, mut record)) = trained else { return Ok(None) };
+        let scored = trained_settings(&field);
+        measure::score(&field, &scored, &self.dataset, &rung.id, &self.rungs, &mut record)?;
+        record.settings = settings;
+        if rung.id == BASE {
+            field.save(&self.base_file()).map_err(Error::plain)?;
+            (self.base, self.exact) = (Some(field), None);
+        }
+        Ok(Some(record))
+    }
+
+    fn subject(&self, command: &BenchAccuracy, missing: usize) -> Subject {
+        let dataset = &self.dataset;
+        let name = dataset.root.file_name().map_or_else(|| "capture".into(), |name| name.to_string_lossy());
+        let count = |split| dataset.frames.iter().filter(|frame| frame.split == split).count();
+        let size = dataset.frames.first().map_or([0; 2], |frame| [frame.camera.width, frame.camera.height]);
+        let stages = &self.config.stages;
+        let description = format!(
+            "{} training frames and {} held-out ones of {} x {} pixels at {} times, {} instances. The base of all \
+             ladders: {} steps without motion, {} with it, {} with instances, up to {} Gaussians.",
+            count(Split::Train),
+            count(Split::Val),
+            size[0],
+            size[1],
+            dataset.times.len(),
+            dataset.instances.len(),
+            stages.coarse,
+            self.config.fine_iterations(),
+            stages.instance,
+            self.config.densify.max_gaussians
+        );
+        let folder = |path: &Path| {
+            path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
+        };
+        let mut line =
+            format!("cif bench accuracy {} -o {}", folder(&command.capture), folder(&command.output));
+        if command.quick {
+            line += " --quick";
+        }
+        if !command.ladders.is_empty() {
+            line += &format!(" --ladders {}", command.ladders.join(","));
+        }
+        if let Some(preset) = &command.preset {
+            line += &format!(" --preset {preset}");
+        }
+        for assignment in &command.set {
+            line += &format!(" --set {assignment}");
+        }
+        let simd = Trainer::vector_instructions();
+        Subject {
+            capture: name.into_owned(),
+            description,
+            command: line,
+            threads: rayon::current_num_threads(),
+            simd,
+            missing,
+        }
+    }
+}
+
+/// The shown frame in 64 bits, rendered once.
+fn exact<'a>(
+    known: &'a mut Option<RenderedImage>,
+    field: &Field,
+    dataset: &Dataset,
+) -> Option<&'a RenderedImage> {
+    if known.is_none() {
+        *known = measure::with_reference(field, dataset, true).map(|(image, _)| image);
+    }
+    known.as_ref()
+}
+
+/// A record in a line.
+fn told(record: &Record) -> String {
+    let mut parts = Vec::new();
+    parts.push(if record.cpu_s >= 1.0 {
+        format!("{:.1} s", record.cpu_s)
+    } else {
+        format!("{:.2} ms", 1e3 * record.cpu_s)
+    });
+    let mut add = |value: Option<f64>, text: &dyn Fn(f64) -> String| parts.extend(value.map(text));
+    add(record.psnr, &|value| format!("{value:.2} dB"));
+    add(record.miou, &|value| format!("mIoU {value:.1} %"));
+    add(record.bytes.map(|bytes| bytes as f64 / 1e6), &|value| format!("{value:.2} MB"));
+    if record.curve.is_none() {
+        add(record.residual, &|value| format!("residual {value:.2e}"));
+    }
+    parts.join(", ")
+}

@@ -1,0 +1,151 @@
+//! What accuracy costs, told: the curve of a run, budgets and targets, drafts, and the report of ladders. How long
+//! anything takes is not tested.
+
+use std::fs;
+use std::path::Path;
+
+use cif_test::capture;
+use cif_test::command::{Run, run};
+use serde_json::Value;
+
+const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
+
+/// A small model and short stages.
+const SMALL: &str = "--set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4";
+
+fn cif(folder: &Path, line: &str) -> Run {
+    run(CIF, folder, line.split_whitespace())
+}
+
+fn with_capture() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    capture::write(&folder.path().join("table"), 8);
+    folder
+}
+
+fn json(text: &str) -> Value {
+    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error} in {text}"))
+}
+
+#[test]
+fn a_run_tells_its_curve_and_a_draft_its_error() {
+    let folder = with_capture();
+    let path = folder.path();
+    let steps = "--iterations-coarse 10 --iterations-fine 120 --iterations-instance 30 --set stages.batch=1";
+    cif(path, &format!("train table -o table.cif --log run.jsonl {steps} {SMALL}")).succeeds();
+    let text = cif(path, "info table.cif").succeeds().stdout;
+    assert!(text.contains("2 held-out frames; measuring took"), "{text}");
+    assert!(
+        text.contains("PSNR dB") && text.lines().any(|line| line.trim_start().starts_with("fine")),
+        "{text}"
+    );
+    let facts = json(&cif(path, "info table.cif --json").succeeds().stdout);
+    let points = facts["curve"]["points"].as_array().expect("a list of points");
+    let at: Vec<(&str, u64)> =
+        points.iter().map(|p| (p["stage"].as_str().unwrap(), p["step"].as_u64().unwrap())).collect();
+    assert_eq!(at, [("fine", 110), ("fine", 130), ("identity", 130), ("instance", 160)]);
+    assert!(points[0]["miou"].is_null() && points[3]["miou"].is_number());
+    assert!(points.windows(2).all(|pair| pair[0]["wall_s"].as_f64() <= pair[1]["wall_s"].as_f64()));
+    let log = fs::read_to_string(path.join("run.jsonl")).unwrap();
+    let measured: Vec<Value> = log.lines().map(json).filter(|event| event["event"] == "measured").collect();
+    assert_eq!(measured.len(), 4);
+    assert_eq!(measured[1]["psnr"], points[1]["psnr"]);
+
+    let told = cif(path, "render table.cif --capture table -o draft --quality draft").succeeds().stderr;
+    assert!(told.contains("draft: PSNR") && told.contains("of 2 views measured"), "{told}");
+    cif(path, "render table.cif --capture table -o final").succeeds();
+    let picture = |folder: &str| image_size(&path.join(folder).join("rgb/000002.png"));
+    assert_eq!(picture("draft"), picture("final"));
+    cif(path, "render table.cif --capture table -o x --exr --quality draft").fails(2, &["--exr", "draft"]);
+}
+
+fn image_size(path: &Path) -> (u32, u32) {
+    image::image_dimensions(path).expect("a picture")
+}
+
+#[test]
+fn a_budget_says_what_it_buys_and_writes_the_settings_that_came_of_it() {
+    let folder = with_capture();
+    let path = folder.path();
+    let told = cif(path, &format!("train table -o table.cif --budget 2s {SMALL}")).succeeds().stderr;
+    assert!(told.contains("budget 2 s: the settings of standard would take about"), "{told}");
+    assert!(told.contains("of the budget of 2 s: coarse"), "{told}");
+    let settings = fs::read_to_string(path.join("table.train.toml")).unwrap();
+    let settings: toml::Table = settings.parse().unwrap();
+    let facts = json(&cif(path, "info table.cif --json").succeeds().stdout);
+    let steps = &facts["provenance"]["train"]["iterations_by_stage"];
+    for stage in ["coarse", "fine", "instance"] {
+        assert_eq!(settings["stages"][stage].as_integer(), steps[stage].as_i64(), "{stage}: {steps}");
+        assert!(steps[stage].as_i64() > Some(0));
+    }
+    assert_eq!(facts["provenance"]["train"]["goals"]["budget"]["seconds"], 2.0);
+
+    cif(path, "train table -o b.cif --budget soon").fails(2, &["--budget"]);
+    cif(path, "train table -o b.cif --budget 9s --iterations-fine 3").fails(2, &["--iterations-fine"]);
+    cif(path, "train table -o b.cif --target-miou 120").fails(2, &["100 percent"]);
+    cif(path, "train table -o b.cif --no-masks --target-miou 50")
+        .fails(1, &["--target-miou", "labelled pixel"]);
+}
+
+#[test]
+fn a_target_stops_a_run() {
+    let folder = with_capture();
+    let path = folder.path();
+    let line = format!("train table -o table.cif --target-psnr 8 --target-miou 5 {SMALL}");
+    let told = cif(path, &line).succeeds().stderr;
+    assert!(told.contains("targets reached on 1 training frames withheld from training: PSNR"), "{told}");
+    let facts = json(&cif(path, "info table.cif --json").succeeds().stdout);
+    let train = &facts["provenance"]["train"];
+    assert!(train["iterations"].as_u64() < Some(2_500), "{train:#}");
+    assert_eq!(train["goals"]["targets"]["reached"], true);
+}
+
+#[test]
+fn a_report_holds_its_ladders_and_goes_on_where_it_stopped() {
+    let folder = with_capture();
+    let path = folder.path();
+    let short = "--set stages.coarse=5 --set stages.fine=20 --set stages.instance=10";
+    let line = format!(
+        "bench accuracy table -o report --quick --ladders sh,storage,precision,render,export {short} {SMALL}"
+    );
+    let told = cif(path, &line).succeeds().stderr;
+    // Three degrees, of which the highest is the base; four, three, five and four of the others.
+    assert!(told.contains("[1/19] sh: degree 0: ") && told.contains("[19/19] export: 0.3 %: "), "{told}");
+    let page = fs::read_to_string(path.join("report/report.html")).unwrap();
+    for word in [
+        "View-dependent colour",
+        "Storage",
+        "Precision",
+        "Rendering",
+        "Export tolerance",
+        "<svg",
+        "data:image/png",
+    ] {
+        assert!(page.contains(word), "{word}");
+    }
+    let report = json(&fs::read_to_string(path.join("report/report.json")).unwrap());
+    let rungs = report["rungs"].as_array().unwrap();
+    assert_eq!(rungs.len(), 19);
+    let rung =
+        |id: &str| rungs.iter().find(|rung| rung["id"] == id).unwrap_or_else(|| panic!("{id}: {report:#}"));
+    assert!(rungs.iter().any(|rung| rung["front_psnr"] == true));
+    assert!(rung("storage-all")["bytes"].as_u64() < rung("storage-f32")["bytes"].as_u64());
+    assert_eq!(rung("storage-f32")["psnr"], rung("base")["psnr"]);
+    assert_eq!(rung("precision-f64")["residual"], 0.0);
+    let fast = rung("precision-fast")["residual"].as_f64().unwrap();
+    assert!(fast > 0.0 && fast < 2e-3, "{fast}");
+    assert_eq!(rung("render-final")["residual"], 0.0);
+    assert!(rung("render-half")["residual"].as_f64() > Some(0.0));
+    assert!(rung("export-0.3")["residual"].as_f64() <= rung("export-10")["residual"].as_f64());
+    let table = fs::read_to_string(path.join("report/rungs.csv")).unwrap();
+    assert_eq!(table.lines().count(), 20);
+
+    // Everything is kept; a record that is gone is measured again, other settings make all of them void.
+    fs::remove_file(path.join("report/rungs/sh-1.json")).unwrap();
+    let told = cif(path, &line).succeeds().stderr;
+    assert_eq!(told.matches(": kept, ").count(), 18, "{told}");
+    let told = cif(path, &format!("{line} --set seed=5")).succeeds().stderr;
+    assert_eq!(told.matches(": kept, ").count(), 0, "{told}");
+    cif(path, "bench accuracy table -o table --quick").fails(1, &["not empty"]);
+    cif(path, "bench accuracy table -o report --ladders none").fails(2, &["iterations", "export"]);
+}
