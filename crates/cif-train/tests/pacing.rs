@@ -111,7 +111,7 @@ fn with_target(targets: Targets, config: TrainConfig) -> (Trainer, Vec<String>) 
     trainer
         .run(&mut |event, _| {
             if let TrainEvent::Warning { message } = event
-                && !message.contains("labelled pixels of step")
+                && message.contains("reach")
             {
                 warnings.push(message.clone());
             }
