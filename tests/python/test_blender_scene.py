@@ -257,6 +257,63 @@ def test_edits_by_hand_come_back(objects: dict, path: Path) -> None:
     np.testing.assert_allclose(part[:, :3, 3], [[0, 0, 0.1]] * 17, atol=1e-5)
 
 
+def test_recoloured_splats_come_back(objects: dict, path: Path) -> None:
+    from cif_scene.blender import nodes
+    from cif_scene.io.color import BAND_0, display_from_linear, linear_from_display
+    from pxr import Usd, UsdGeom
+
+    mug, car, lid = (objects[name] for name in ("red_mug_001", "toy_car_002", "box_003.part_01"))
+    factor = np.array([0.5, 1.0, 2.0])
+    nodes.set_input(mug.modifiers["Splats"], nodes.TINT, (*factor, 1.0))
+    nodes.set_input(lid.modifiers["Splats"], nodes.TINT, (0.0, 0.0, 0.0, 1.0))
+    car.data.attributes["colour"].data[3].color = (0.0, 1.0, 0.25, 1.0)
+    copy = objects["ball_008"].copy()
+    bpy.data.collections["ball"].objects.link(copy)
+    nodes.set_input(copy.modifiers["Splats"], nodes.TINT, (1.0, 0.0, 1.0, 1.0))
+    edits = {(edit.path, edit.copy_name): edit for edit in exporter.collect_edits(path)}
+    assert set(edits) == {
+        ("/World/red_mug_001", None),
+        ("/World/toy_car_002", None),
+        ("/World/box_003", None),
+        ("/World/ball_008", copy.name),
+    }
+    assert all(edit.track is None for edit in edits.values()), "nothing moved"
+    stage = Usd.Stage.Open(str(import_cif.export_edits(path, path.with_name("edits.usda"))))
+    red = np.clip(0.5 + BAND_0 * np.array([1.2, -1.0, -1.2]), 0, None)
+
+    def colors(prim: str) -> np.ndarray:
+        primvar = UsdGeom.Primvar(stage.GetPrimAtPath(f"/World/{prim}").GetAttribute("primvars:displayColor"))
+        assert primvar.GetInterpolation() == "vertex"
+        return np.array(primvar.ComputeFlattened())
+
+    expected = display_from_linear(linear_from_display(red) * factor)
+    np.testing.assert_allclose(colors("red_mug_001/Splats"), [expected] * COUNT, atol=1e-5)
+    painted = colors("toy_car_002/Splats")
+    np.testing.assert_allclose(painted[3], display_from_linear(np.array([0, 1, 0.25])), atol=1e-5)
+    np.testing.assert_allclose(np.delete(painted, 3, 0), [red] * (COUNT - 1), atol=1e-6)
+    part = reread(path)["box_003"].pieces[1].path
+    np.testing.assert_allclose(colors(part.removeprefix("/World/")), 0, atol=1e-6)
+    np.testing.assert_allclose(colors("ball_008_001/Splats")[:, 1], 0, atol=1e-6)
+    # White again: nothing is left of it.
+    for obj in (mug, lid):
+        nodes.set_input(obj.modifiers["Splats"], nodes.TINT, (1.0, 1.0, 1.0, 1.0))
+    assert {edit.path for edit in exporter.collect_edits(path)} == {"/World/toy_car_002", "/World/ball_008"}
+    # Colours of other vertices mean nothing.
+    car.data.attributes.remove(car.data.attributes["colour"])
+    with pytest.raises(exporter.EditError, match="'colour'"):
+        exporter.collect_edits(path)
+
+
+def test_a_tint_shows(objects: dict) -> None:
+    from cif_scene.blender import material, nodes
+
+    mug = objects["red_mug_001"]
+    before = drawn(mug, material.COLOR, 3)
+    nodes.set_input(mug.modifiers["Splats"], nodes.TINT, (0.5, 1.0, 0.25, 1.0))
+    mug.update_tag()
+    np.testing.assert_allclose(drawn(mug, material.COLOR, 3), before * [0.5, 1.0, 0.25], atol=1e-6)
+
+
 def test_edits_survive_saving(objects: dict, path: Path, tmp_path: Path) -> None:
     objects["toy_car_002"].rotation_quaternion = turned(0.5)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))

@@ -4,12 +4,14 @@
 //! the field where both graphs come from the same one, else by position where their numbers agree. Differences
 //! that come from storing numbers in single precision are none.
 
+mod cameras;
 mod pair;
 pub(crate) mod splats;
 pub(crate) mod units;
 
 use serde::Serialize;
 
+pub use cameras::{CameraChange, CameraChangeKind};
 pub use pair::{Pair, pairs};
 pub use splats::SplatChanges;
 
@@ -143,10 +145,12 @@ pub struct SceneDiff {
     pub objects: Vec<ObjectChange>,
     /// Objects that do not.
     pub unchanged: usize,
+    /// Cameras that differ. They are told only: cameras of a scene are those of its capture.
+    pub cameras: Vec<CameraChange>,
 }
 
 impl SceneDiff {
-    /// Whether nothing differs.
+    /// Whether no object differs.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.objects.is_empty()
@@ -156,7 +160,7 @@ impl SceneDiff {
 /// Compares two graphs.
 #[must_use]
 pub fn diff(before: &SceneGraph, after: &SceneGraph) -> SceneDiff {
-    let mut result = SceneDiff::default();
+    let mut result = SceneDiff { cameras: cameras::changes(before, after), ..SceneDiff::default() };
     for pair in pairs(before, after) {
         let change = compare(before, after, &pair);
         if change.is_change() {

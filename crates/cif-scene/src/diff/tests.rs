@@ -45,6 +45,39 @@ fn differences_are_told_in_words_and_numbers() {
 }
 
 #[test]
+fn cameras_that_differ_are_told_and_are_no_edit() {
+    let mut field = learned_field(2, 7);
+    let first = field.cameras[0].clone();
+    for (name, times) in [("left", 0..2), ("right", 0..1), ("gone", 0..1), ("zoomed", 0..1)] {
+        field.cameras.extend(
+            times.map(|time_index| cif_field::RecordedCamera { name: name.into(), time_index, ..first.clone() }),
+        );
+    }
+    let before = build(&field, &SceneOptions::default()).unwrap();
+    let mut after = before.clone();
+    // What single precision leaves of them is no difference.
+    for sample in after.cameras.iter_mut().flat_map(|track| &mut track.samples) {
+        let pose = &mut sample.camera.camera_from_world;
+        pose.translation = pose.translation.as_vec3().as_dvec3();
+        pose.rotation = pose.rotation.as_mat3().as_dmat3();
+    }
+    assert_eq!(diff(&before, &after).cameras, []);
+    let track = |graph: &SceneGraph, name: &str| graph.cameras.iter().position(|t| t.name == name).unwrap();
+    let (left, zoomed) = (track(&after, "left"), track(&after, "zoomed"));
+    after.cameras[left].samples[1].camera.camera_from_world.translation.x += 0.01;
+    after.cameras[zoomed].samples[0].camera.focal_px *= 1.1;
+    let mut new = after.cameras[zoomed].clone();
+    new.name = "new".into();
+    after.cameras.push(new);
+    after.cameras.remove(track(&after, "gone"));
+    let found = diff(&before, &after);
+    assert!(found.is_empty());
+    let mut words: Vec<String> = found.cameras.iter().map(ToString::to_string).collect();
+    words.sort();
+    assert_eq!(words, ["gone (removed)", "left (moved)", "new (added)", "zoomed (another lens)"]);
+}
+
+#[test]
 fn files_of_others_are_compared_by_name_and_position() {
     let mut before = graph(2);
     before.origin = Origin::default();

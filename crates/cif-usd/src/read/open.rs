@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use pyo3::prelude::*;
+use pyo3::types::PyList;
 
 use crate::UsdError;
 use crate::pxr::{Pxr, reason};
@@ -92,7 +93,7 @@ impl<'py> Walk<'_, 'py> {
     fn visit(&mut self, root: &Bound<'py, PyAny>) -> Result<(), UsdError> {
         let mut open = vec![root.clone()];
         while let Some(layer) = open.pop() {
-            let (identifier, real, assets) = described(&layer).map_err(|error| self.unreadable(&error))?;
+            let (identifier, real, mut assets) = described(&layer).map_err(|error| self.unreadable(&error))?;
             if !self.seen.insert(identifier.clone()) {
                 continue;
             }
@@ -100,6 +101,12 @@ impl<'py> Walk<'_, 'py> {
             let file = outer(&real);
             if self.seen.insert(format!("file {file}")) {
                 self.bytes += std::fs::metadata(file).map_or(0, |data| data.len());
+            }
+            for clip in clips(self.pxr, &layer).map_err(|error| self.unreadable(&error))? {
+                match clip {
+                    Clip::Asset(asset) => assets.push(asset),
+                    Clip::Template(template) => assets.extend(self.numbered(&layer, &identifier, &template)?),
+                }
             }
             // A reference to another prim of the same stage names no file.
             for asset in assets.into_iter().filter(|asset| !asset.is_empty()) {
@@ -109,10 +116,7 @@ impl<'py> Walk<'_, 'py> {
                     let path = self.path.to_owned();
                     return Err(UsdError::MissingAsset { path, layer: layer_name, asset });
                 }
-                let inside = Path::new(outer(&resolved))
-                    .canonicalize()
-                    .is_ok_and(|file| file.starts_with(&self.folder));
-                if !inside && !self.follow_external {
+                if !self.is_allowed(Path::new(outer(&resolved))) {
                     let path = self.path.to_owned();
                     return Err(UsdError::ExternalAsset { path, layer: layer_name, asset });
                 }
@@ -122,11 +126,96 @@ impl<'py> Walk<'_, 'py> {
         Ok(())
     }
 
+    fn is_allowed(&self, file: &Path) -> bool {
+        self.follow_external || file.canonicalize().is_ok_and(|file| file.starts_with(&self.folder))
+    }
+
+    /// Files that a template of value clips, `./clip.###.usdc`, stands for; none where its folder has none.
+    fn numbered(
+        &self,
+        layer: &Bound<'py, PyAny>,
+        layer_name: &str,
+        template: &str,
+    ) -> Result<Vec<String>, UsdError> {
+        let anchored = self
+            .pxr
+            .sdf
+            .getattr("ComputeAssetPathRelativeToLayer")
+            .and_then(|anchor| anchor.call1((layer, template))?.extract::<String>())
+            .map_err(|error| self.unreadable(&error))?;
+        let anchored = Path::new(&anchored);
+        let (Some(folder), Some(name)) = (anchored.parent(), anchored.file_name()) else {
+            return Ok(Vec::new());
+        };
+        let folder = if folder.as_os_str().is_empty() { Path::new(".") } else { folder };
+        if folder.is_dir() && !self.is_allowed(folder) {
+            let (path, layer) = (self.path.to_owned(), layer_name.to_owned());
+            return Err(UsdError::ExternalAsset { path, layer, asset: template.to_owned() });
+        }
+        let name = name.to_string_lossy();
+        let before = name.split('#').next().unwrap_or_default();
+        let after = name.rsplit('#').next().unwrap_or_default();
+        let entries = std::fs::read_dir(folder).into_iter().flatten().filter_map(Result::ok);
+        let mut files: Vec<String> = entries
+            .map(|entry| (entry.file_name().to_string_lossy().into_owned(), entry.path()))
+            .filter(|(file, _)| {
+                let middle = file.strip_prefix(before).and_then(|rest| rest.strip_suffix(after));
+                middle.is_some_and(|number| {
+                    number.bytes().any(|byte| byte.is_ascii_digit())
+                        && number.bytes().all(|byte| byte.is_ascii_digit() || b".-".contains(&byte))
+                })
+            })
+            .map(|(_, path)| path.to_string_lossy().into_owned())
+            .collect();
+        files.sort();
+        Ok(files)
+    }
+
     fn resolve(&self, layer: &Bound<'py, PyAny>, asset: &str) -> PyResult<String> {
         let path = self.pxr.sdf.getattr("ComputeAssetPathRelativeToLayer")?.call1((layer, asset))?;
         let resolver = self.pxr.ar.call_method0("GetResolver")?;
         resolver.call_method1("Resolve", (path,))?.str()?.extract()
     }
+}
+
+/// What the value clips of a prim name.
+enum Clip {
+    Asset(String),
+    Template(String),
+}
+
+/// Files of the value clips of a layer: composition does not count them among what it needs.
+fn clips<'py>(pxr: &Pxr<'py>, layer: &Bound<'py, PyAny>) -> PyResult<Vec<Clip>> {
+    let mut clips = Vec::new();
+    let paths = PyList::empty(pxr.py);
+    let root = pxr.sdf.getattr("Path")?.getattr("absoluteRootPath")?;
+    layer.call_method1("Traverse", (root, paths.getattr("append")?))?;
+    for path in paths {
+        let is_prim = path.call_method0("IsPrimOrPrimVariantSelectionPath")?.is_truthy()?;
+        if !is_prim {
+            continue;
+        }
+        let spec = layer.call_method1("GetPrimAtPath", (&path,))?;
+        if spec.is_none() || !spec.call_method1("HasInfo", ("clips",))?.is_truthy()? {
+            continue;
+        }
+        let sets = spec.call_method1("GetInfo", ("clips",))?;
+        for set in sets.call_method0("values")?.try_iter()? {
+            let set = set?;
+            let get = |key: &str| set.call_method1("get", (key,));
+            let files = get("assetPaths")?;
+            let manifest = get("manifestAssetPath")?;
+            let files = if files.is_none() { Vec::new() } else { files.try_iter()?.collect::<PyResult<_>>()? };
+            for file in files.into_iter().chain((!manifest.is_none()).then_some(manifest)) {
+                clips.push(Clip::Asset(file.getattr("path")?.extract()?));
+            }
+            let template = get("templateAssetPath")?;
+            if !template.is_none() {
+                clips.push(Clip::Template(template.extract()?));
+            }
+        }
+    }
+    Ok(clips)
 }
 
 /// Identifier, file and needed assets of a layer.

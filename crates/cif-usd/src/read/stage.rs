@@ -281,13 +281,24 @@ fn survey<'py>(
     let pxr = reading.pxr;
     let predicate = pxr.usd.call_method1("TraverseInstanceProxies", ())?;
     let (mut found, mut cameras) = (Vec::new(), Vec::new());
+    // Prototypes below a point instancer are not drawn where they stand.
+    let mut instancer: Option<String> = None;
     for prim in stage.call_method1("Traverse", (predicate,))?.try_iter()? {
         let prim = prim?;
+        let path = values::path(&prim)?;
+        if instancer.as_ref().is_some_and(|above| path.starts_with(above.as_str())) {
+            continue;
+        }
         let type_name = text(&prim.call_method0("GetTypeName")?)?;
-        if type_name == "Camera" {
+        if type_name == "PointInstancer" {
+            reading.warn(format!(
+                "{path}: copies made by a point instancer are not read; turn them into prims with references"
+            ));
+            instancer = Some(format!("{path}/"));
+        } else if type_name == "Camera" {
             cameras.push(prim);
         } else if type_name == tokens::GAUSSIAN_SPLAT {
-            let splats = SplatPrim { path: values::path(&prim)?, prim };
+            let splats = SplatPrim { path, prim };
             if splats.has_positions()? {
                 found.push(splats);
             } else {

@@ -263,3 +263,88 @@ fn stages_of_one_name_keep_their_payloads_apart() {
     left.sort();
     assert_eq!(left, ["a.payloads", "a.usda", "a.usdc", "a.usdz"]);
 }
+
+/// Value clips on the object: its place at time codes 0 and 1 stands in another file.
+fn clips(asset: &str, file: &str) -> String {
+    format!(
+        "
+clip = Sdf.Layer.CreateNew(__import__('os').path.join(__import__('os').path.dirname(path), '{file}'))
+spec = Sdf.CreatePrimInLayer(clip, '/World/Thing')
+move = Sdf.AttributeSpec(spec, 'xformOp:translate', Sdf.ValueTypeNames.Double3)
+clip.SetTimeSample(move.path, 0.0, Gf.Vec3d(0, 0, 0))
+clip.SetTimeSample(move.path, 1.0, Gf.Vec3d(0, 5, 0))
+clip.Save()
+thing.AddTranslateOp()
+api = Usd.ClipsAPI(thing.GetPrim())
+api.SetClipPrimPath('/World/Thing')
+api.SetClipTimes([(0, 0), (1, 1)])
+{asset}
+"
+    )
+}
+
+#[test]
+fn value_clips_are_read_in_the_folder_and_refused_outside() {
+    let _session = session();
+    let named = |asset: &str| {
+        format!("api.SetClipAssetPaths([Sdf.AssetPath('{asset}')])\napi.SetClipActive([(0, 0)])")
+    };
+    let template = |asset: &str| {
+        format!(
+            "api.SetClipTemplateAssetPath('{asset}')\napi.SetClipTemplateStartTime(0)\n\
+             api.SetClipTemplateEndTime(0)\napi.SetClipTemplateStride(1)"
+        )
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let inner = folder.path().join("inner");
+    fs::create_dir(&inner).unwrap();
+    for (number, change) in
+        [clips(&named("./moves.usda"), "moves.usda"), clips(&template("./m.#.usda"), "m.0.usda")].iter().enumerate()
+    {
+        let inside = inner.join(format!("inside_{number}"));
+        fs::create_dir(&inside).unwrap();
+        let graph = read_scene(&stage_with(&inside, change)).unwrap();
+        let high = graph.nodes[0].world_transform(1.0).translation;
+        assert!((high - glam::DVec3::new(0.0, 5.0, 0.0)).length() < 1e-9, "{high} {:?}", graph.nodes[0].motion);
+    }
+    for (number, change) in
+        [clips(&named("../moves.usda"), "../moves.usda"), clips(&template("../m.#.usda"), "../m.0.usda")]
+            .iter()
+            .enumerate()
+    {
+        let outside = inner.join(format!("outside_{number}"));
+        fs::create_dir(&outside).unwrap();
+        let path = stage_with(&outside, change);
+        let error = read_scene(&path).unwrap_err();
+        assert!(matches!(&error, UsdError::ExternalAsset { asset, .. } if asset.contains("../m")), "{error}");
+        let read = read_scene_with(&path, ReadOptions { follow_external: true }).unwrap();
+        assert!((read.nodes[0].world_transform(1.0).translation.y - 5.0).abs() < 1e-9);
+    }
+    let gone = inner.join("gone");
+    fs::create_dir(&gone).unwrap();
+    let path = stage_with(&gone, &clips(&named("./moves.usda"), "moves.usda"));
+    fs::remove_file(gone.join("moves.usda")).unwrap();
+    let error = read_scene(&path).unwrap_err();
+    assert!(matches!(&error, UsdError::MissingAsset { .. }), "{error}");
+}
+
+#[test]
+fn copies_of_point_instancers_are_told() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = stage_with(
+        folder.path(),
+        "
+instancer = UsdGeom.PointInstancer.Define(stage, '/World/Copies')
+prototype = UsdVol.ParticleField3DGaussianSplat.Define(stage, '/World/Copies/One')
+prototype.CreatePositionsAttr([(0, 0, 0)])
+instancer.CreatePrototypesRel().SetTargets(['/World/Copies/One'])
+instancer.CreateProtoIndicesAttr([0, 0, 0])
+instancer.CreatePositionsAttr([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
+UsdGeom.Xform.Define(stage, '/World/CopiesNot')",
+    );
+    let graph = read_scene(&path).unwrap();
+    assert_eq!(graph.nodes.len(), 1, "prototypes are not drawn where they stand");
+    let told: Vec<&String> = graph.warnings.iter().filter(|text| text.contains("point instancer")).collect();
+    assert!(matches!(told[..], [text] if text.starts_with("/World/Copies:")), "{:?}", graph.warnings);
+}

@@ -42,6 +42,18 @@ pub(super) fn run(command: &Diff) -> Result<(), Error> {
 
 /// The differences as a table, one line each.
 pub(super) fn print_changes(changes: &SceneDiff) {
+    print_objects(changes);
+    if !changes.cameras.is_empty() {
+        println!("cameras that differ: {}", cameras(changes));
+    }
+}
+
+/// Cameras that differ, in words.
+pub(super) fn cameras(changes: &SceneDiff) -> String {
+    changes.cameras.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+}
+
+pub(super) fn print_objects(changes: &SceneDiff) {
     if changes.is_empty() {
         println!("no differences in {} objects", changes.unchanged);
         return;

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde_json::json;
 
-use super::diff::print_changes;
+use super::diff::{cameras, print_objects};
 use super::scene;
 use crate::error::Error;
 use crate::{graph_file, output};
@@ -19,6 +19,7 @@ file has it, cameras. It can be rendered, labelled, queried and exported, but no
 With --base, the scene that the file was exported from, only what was changed in the file is applied
 to it: objects moved (also over time), renamed, relabelled, hidden, deleted, duplicated or added, and
 splats recoloured, faded, resized, deleted or moved. Everything else keeps its learned motion.
+Cameras stay as they were recorded; edits of them are told.
 
   cif import fox.ply -o fox.cif
   cif export table.cif --usd table.usda        # then edit table.usda in any tool
@@ -70,7 +71,13 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
             if command.json {
                 println!("{:#}", json!(changes));
             } else {
-                print_changes(&changes);
+                print_objects(&changes);
+            }
+            if !changes.cameras.is_empty() {
+                eprintln!(
+                    "warning: cameras stay as they were recorded; not taken over: {}",
+                    cameras(&changes)
+                );
             }
             field
         }

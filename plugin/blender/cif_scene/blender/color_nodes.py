@@ -22,8 +22,8 @@ BAND_3 = (
 """Factors of real spherical harmonics with the Condon-Shortley sign, as 3D Gaussian splatting uses them."""
 
 
-def color(graph: Graph, camera: Camera, display: Value) -> bpy.types.NodeSocket:
-    """Colour seen from the camera: linear, or display-referred where that is wanted."""
+def color(graph: Graph, camera: Camera, tint: Value, display: Value) -> bpy.types.NodeSocket:
+    """Colour seen from the camera, tinted: linear, or display-referred where that is wanted."""
     plain = graph.attribute("colour", "FLOAT_VECTOR")[0]
     first, exists = graph.attribute("sh_0", "FLOAT_VECTOR")
     total = graph.vector("ADD", graph.scaled(first, BAND_0), (0.5, 0.5, 0.5))
@@ -33,8 +33,8 @@ def color(graph: Graph, camera: Camera, display: Value) -> bpy.types.NodeSocket:
         )
     total = graph.vector("MAXIMUM", total, (0.0, 0.0, 0.0))
     linear = graph.switch(exists, plain, _transfer(graph, total, decode=True), "VECTOR")
-    shown = graph.switch(exists, _transfer(graph, plain, decode=False), total, "VECTOR")
-    return graph.switch(display, linear, shown, "VECTOR")
+    linear = graph.vector("MULTIPLY", linear, tint)
+    return graph.switch(display, linear, _transfer(graph, linear, decode=False), "VECTOR")
 
 
 def _transfer(graph: Graph, color: Value, decode: bool) -> bpy.types.NodeSocket:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,15 +11,18 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ..io.color import BAND_0, display_from_linear, linear_from_display
 from ..io.scene import Instance, Scene, Visibility
 from ..io.tracks import Track, from_matrices
-from . import animation
+from . import animation, splats
 from .importer import IMPORTED, PART, PRIM, PRIMS, STAGE
 
 MOVED = 1e-5
 """Smallest change of place that counts, share of the distance from the origin plus one unit."""
 TURNED = 1e-4
 """Smallest change of an axis that counts; Blender keeps single precision."""
+RECOLOURED = 1e-4
+"""Smallest change of a linear colour or a tint that counts."""
 
 
 class EditError(RuntimeError):
@@ -57,6 +61,12 @@ def collect_edits(stage_path: str | Path) -> list:
             edit = _edit(instance, obj, root, codes, poses, copied=obj != kept)
             if edit is not None:
                 edits.append(edit)
+    recolored = {
+        instance.path: [obj for obj in objects.get(instance.path, []) if _is_recolored(obj)]
+        for instance in scene.instances
+    }
+    if any(recolored.values()):
+        return _with_colors(edits, stage_path, recolored, objects)
     return edits
 
 
@@ -127,36 +137,85 @@ def _sample(objects: list[bpy.types.Object], codes: np.ndarray) -> dict[bpy.type
 @contextlib.contextmanager
 def _all_evaluated(objects: list[bpy.types.Object]) -> Iterator[None]:
     """Blender does not move what is hidden; and it need not build splats to tell where they are."""
-    hidden = {
-        obj: (obj.hide_viewport, obj.name in bpy.context.view_layer.objects and obj.hide_get())
-        for obj in objects
-    }
-    modifiers = [modifier for obj in objects for modifier in obj.modifiers if modifier.show_viewport]
-    curves = [
-        curve
-        for obj in objects
-        for curve in animation.fcurves(obj)
-        if curve.data_path == "hide_viewport" and not curve.mute
-    ]
-    try:
-        for curve in curves:
-            curve.mute = True
-        for modifier in modifiers:
-            modifier.show_viewport = False
-        for obj, (_, eye) in hidden.items():
-            obj.hide_viewport = False
+    with contextlib.ExitStack() as restore:
+
+        def set_for_now(owner: object, name: str, value: bool) -> None:
+            restore.callback(setattr, owner, name, getattr(owner, name))
+            setattr(owner, name, value)
+
+        for obj in objects:
+            for curve in animation.fcurves(obj):
+                if curve.data_path == "hide_viewport" and not curve.mute:
+                    set_for_now(curve, "mute", True)
+            for modifier in obj.modifiers:
+                set_for_now(modifier, "show_viewport", False)
+            eye = obj.name in bpy.context.view_layer.objects and obj.hide_get()
+            set_for_now(obj, "hide_viewport", False)
             if eye:
+                restore.callback(obj.hide_set, True)
                 obj.hide_set(False)
         yield
-    finally:
-        for curve in curves:
-            curve.mute = False
-        for modifier in modifiers:
-            modifier.show_viewport = True
-        for obj, (viewport, eye) in hidden.items():
-            obj.hide_viewport = viewport
-            if eye:
-                obj.hide_set(True)
+
+
+def _is_recolored(obj: bpy.types.Object) -> bool:
+    """Whether colours of an object or its parts were tinted or painted over."""
+    meshes = [each for each in (obj, *obj.children) if each.type == "MESH" and splats.COLORS in each.data]
+    return any(
+        np.abs(splats.tint(each) - 1.0).max() > RECOLOURED
+        or splats.checksum(each.data) != each.data[splats.COLORS]
+        for each in meshes
+    )
+
+
+def _with_colors(
+    edits: list,
+    stage_path: str | Path,
+    recolored: dict[str, list[bpy.types.Object]],
+    objects: dict[str, list[bpy.types.Object]],
+) -> list:
+    """The edits, with the colours of what was recoloured."""
+    from ..io.edits import Edit
+    from ..io.read import read_scene
+
+    done = []
+    left = list(edits)
+    for instance in read_scene(stage_path, harmonics=False).instances:
+        kept = _original(objects.get(instance.path, []))
+        for obj in objects.get(instance.path, []):
+            name = None if obj == kept else obj.name
+            mine = [edit for edit in left if (edit.path, edit.copy_name) == (instance.path, name)]
+            left = [edit for edit in left if edit not in mine]
+            edit = mine[0] if mine else Edit(instance.path, copy_name=name)
+            if obj in recolored[instance.path]:
+                edit = dataclasses.replace(edit, colors=dict(_colors(instance, obj)))
+            if mine or edit.colors:
+                done.append(edit)
+        gone = [edit for edit in left if edit.path == instance.path]
+        left = [edit for edit in left if edit not in gone]
+        done += gone
+    return done + left
+
+
+def _colors(instance: Instance, obj: bpy.types.Object) -> Iterator[tuple[str, object]]:
+    """New display-referred colours by splat prim: which splats, and how they look."""
+    from ..io.edits import Colors
+
+    parts = {child[PART]: child for child in obj.children if PART in child}
+    for piece in instance.pieces:
+        each = parts.get(piece.path) if parts else obj
+        if each is None or each.type != "MESH" or splats.COLORS not in each.data:
+            continue
+        before = linear_from_display(0.5 + BAND_0 * piece.splats.harmonics[:, 0])
+        now = splats.colors(each.data)
+        if now is None or len(now) != len(before):
+            raise EditError(
+                f"{each.name}: its vertices or its attribute 'colour' are not those that were imported, "
+                "so that its colours cannot be told; undo that, or set the tint back to white"
+            )
+        now = now * splats.tint(each)
+        changed = np.flatnonzero(np.abs(now - before).max(1) > RECOLOURED)
+        if len(changed):
+            yield piece.path, Colors(changed, display_from_linear(now[changed]).astype(np.float32))
 
 
 def _edit(

@@ -6,8 +6,9 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper, ImportHelper
 
-from . import animation, importer
+from . import animation, importer, nodes
 from .importer import PRIM, STAGE
+from .splats import MODIFIER
 
 
 def instances(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -220,6 +221,11 @@ class CifPanel(bpy.types.Panel):
             for obj in members:
                 row = box.row(align=True)
                 row.prop(obj, '["display_name"]', text="")
+                modifier = obj.modifiers.get(MODIFIER)
+                if modifier is not None and modifier.node_group is not None:
+                    tint = row.row()
+                    tint.scale_x = 0.3
+                    tint.prop(modifier, f'["{nodes.input_of(modifier, nodes.TINT)}"]', text="")
                 self._buttons(row, is_hidden(obj), target=obj.name)
         layout.operator(ExportCifEdits.bl_idname, icon="EXPORT")
 

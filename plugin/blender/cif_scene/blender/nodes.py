@@ -28,6 +28,8 @@ NEAR = "Near"
 """Input with the depth below which a splat is not drawn, object units."""
 DISPLAY = "Display Blending"
 """Input that leaves colours display-referred, to be shown without a view transform."""
+TINT = "Tint"
+"""Input with a linear colour that all colours are multiplied with; white leaves them."""
 FACING = "Discs in Renders"
 """Input that draws discs that face the camera in renders; ellipsoids otherwise."""
 TRANSFORM = "splat_transform"
@@ -50,6 +52,7 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
         (BLUR, "NodeSocketFloat", 0.0),
         (VIEW, "NodeSocketVector", (1.0, 1.0, 0.0)),
         (NEAR, "NodeSocketFloat", 0.0),
+        (TINT, "NodeSocketColor", (1.0, 1.0, 1.0, 1.0)),
         (DISPLAY, "NodeSocketBool", False),
         (FACING, "NodeSocketBool", True),
     ):
@@ -70,9 +73,8 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
     ]
     transform = graph.switch(facing, shape.ellipsoid(), shape.disc(), "MATRIX")
     points = _store(graph, points, TRANSFORM, "FLOAT4X4", transform)
-    points = _store(
-        graph, points, material.COLOR, "FLOAT_VECTOR", color_nodes.color(graph, camera, given[DISPLAY])
-    )
+    color = color_nodes.color(graph, camera, given[TINT], given[DISPLAY])
+    points = _store(graph, points, material.COLOR, "FLOAT_VECTOR", color)
     points = _store(graph, points, material.OPACITY, "FLOAT", graph.attribute("opacity", "FLOAT")[0])
     # The shader looks up two attributes of an instance; thousands of copies of the others would be waste.
     for name in ("rot", "scale", "opacity", "colour", "occupancy", "sh_*"):
@@ -91,10 +93,15 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
 
 def set_input(modifier: bpy.types.NodesModifier, name: str, value: float | bool | tuple[float, ...]) -> str:
     """Set an input of the modifier by name; its data path in the object, to be animated."""
-    items = modifier.node_group.interface.items_tree
-    identifier = next(item.identifier for item in items if item.name == name and item.in_out == "INPUT")
+    identifier = input_of(modifier, name)
     modifier[identifier] = value
     return f'modifiers["{modifier.name}"]["{identifier}"]'
+
+
+def input_of(modifier: bpy.types.NodesModifier, name: str) -> str:
+    """Key of an input in the modifier."""
+    items = modifier.node_group.interface.items_tree
+    return next(item.identifier for item in items if item.name == name and item.in_out == "INPUT")
 
 
 def _body(graph: Graph, facing: Value) -> bpy.types.NodeSocket:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 
 import bpy
@@ -12,6 +13,8 @@ from ..io.scene import Splats
 from . import animation, nodes
 
 MODIFIER = "Splats"
+COLORS = "cif_colours"
+"""Custom property of a mesh: checksum of its colours as imported, to tell whether they were painted over."""
 
 
 def splat_mesh(name: str, splats: Splats, harmonics: bool) -> bpy.types.Mesh:
@@ -24,6 +27,7 @@ def splat_mesh(name: str, splats: Splats, harmonics: bool) -> bpy.types.Mesh:
     store(mesh, "opacity", "FLOAT", splats.opacities)
     display = np.clip(0.5 + BAND_0 * splats.harmonics[:, 0], 0.0, None)
     store(mesh, "colour", "FLOAT_COLOR", np.c_[linear_from_display(display), np.ones(splats.count)])
+    mesh[COLORS] = checksum(mesh)
     if splats.occupancies is not None:
         store(mesh, "occupancy", "FLOAT", splats.occupancies)
     if harmonics:
@@ -55,6 +59,31 @@ def add_modifier(
         if np.allclose(steps, steps[0]):
             numbers = numbers[[0, -1]]
         animation.curve(obj, path, 0, samples.codes[numbers.astype(int)], numbers)
+
+
+def colors(mesh: bpy.types.Mesh) -> np.ndarray | None:
+    """Linear colours of the vertices, [N, 3] float32; `None` where the attribute is gone or is another."""
+    attribute = mesh.attributes.get("colour")
+    if attribute is None or attribute.data_type != "FLOAT_COLOR" or attribute.domain != "POINT":
+        return None
+    flat = np.empty(4 * len(attribute.data), np.float32)
+    attribute.data.foreach_get("color", flat)
+    return flat.reshape(-1, 4)[:, :3]
+
+
+def checksum(mesh: bpy.types.Mesh) -> str:
+    """Checksum of the colours."""
+    values = colors(mesh)
+    return "" if values is None else f"{zlib.crc32(np.ascontiguousarray(values).tobytes()):08x}"
+
+
+def tint(obj: bpy.types.Object) -> np.ndarray:
+    """Linear colour that the colours of an object are multiplied with, [3]."""
+    modifier = obj.modifiers.get(MODIFIER)
+    if modifier is None or modifier.node_group is None or modifier.node_group.name != nodes.NAME:
+        return np.ones(3)
+    value = modifier.get(nodes.input_of(modifier, nodes.TINT))
+    return np.ones(3) if value is None else np.array(value[:3], np.float64)
 
 
 def store(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:

@@ -15,15 +15,27 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
-from .read import CLASS_LABELS, INSTANCE_LABELS, USER_LABEL, StageError, open_stage
+from .color import BAND_0
+from .read import CLASS_LABELS, COEFFICIENTS, INSTANCE_LABELS, USER_LABEL, StageError, open_stage
 from .scene import Visibility
 from .tracks import Track, from_matrices, thinned
 
+DISPLAY_COLOR = "primvars:displayColor"
 MARK = "cifEdits"
 """Key in `customLayerData` that marks a layer as one of edits, which may be replaced by newer ones."""
 TRANSFORM_OPS = ("xformOp:translate", "xformOp:orient", "xformOp:scale")
+
+
+@dataclass(frozen=True)
+class Colors:
+    """New colours of some splats of a prim."""
+
+    splats: np.ndarray
+    """Which ones, [N] int."""
+    display: np.ndarray
+    """Their display-referred colours, [N, 3] float32."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +56,8 @@ class Edit:
     visibility: Visibility | None = None
     parts: list[Edit] = field(default_factory=list)
     """Edits of prims below; their `path` is that in the stage, also in a copy."""
+    colors: dict[str, Colors] = field(default_factory=dict)
+    """New colours by splat prim of the stage."""
 
 
 def write_edits(
@@ -155,6 +169,12 @@ def _apply(layer: Sdf.Layer, stage: Usd.Stage, edit: Edit, names: _NewNames) -> 
             part_spec.SetInfo("active", False)
         if part.track is not None:
             _transform(part_spec, part_prim, part.track, relative_to=prim)
+    for path, colors in edit.colors.items():
+        below = Sdf.Path(path)
+        splats = stage.GetPrimAtPath(below)
+        if not splats:
+            raise StageError(f"{path}: is not in the stage")
+        _recolor(Sdf.CreatePrimInLayer(layer, below.ReplacePrefix(source, target)), splats, colors)
 
 
 def _set(
@@ -193,6 +213,21 @@ def _rename(spec: Sdf.PrimSpec, prim: Usd.Prim, edit: Edit) -> None:
         listed.prependedItems = ["SemanticsLabelsAPI:class"]
         spec.SetInfo("apiSchemas", listed)
     _set(spec, CLASS_LABELS, Sdf.ValueTypeNames.TokenArray, classes)
+
+
+def _recolor(spec: Sdf.PrimSpec, splats: Usd.Prim, colors: Colors) -> None:
+    """Display colours: cif takes those that differ from what it wrote as the colour of the splats."""
+    primvar = UsdGeom.Primvar(splats.GetAttribute(DISPLAY_COLOR))
+    values = np.array(primvar.ComputeFlattened() if primvar else [], np.float32).reshape(-1, 3)
+    count = len(splats.GetAttribute("positions").Get() or [])
+    if len(values) != count:  # by others, who need not write it
+        first = np.array(splats.GetAttribute(COEFFICIENTS).Get(), np.float32).reshape(count, -1, 3)[:, 0]
+        values = np.clip(0.5 + BAND_0 * first, 0.0, None).astype(np.float32)
+    values[colors.splats] = colors.display
+    _set(spec, DISPLAY_COLOR, Sdf.ValueTypeNames.Color3fArray, Vt.Vec3fArray.FromNumpy(values))
+    spec.properties[DISPLAY_COLOR].SetInfo("interpolation", "vertex")
+    indices = Sdf.AttributeSpec(spec, f"{DISPLAY_COLOR}:indices", Sdf.ValueTypeNames.IntArray)
+    indices.default = Sdf.ValueBlock()
 
 
 def _transform(spec: Sdf.PrimSpec, prim: Usd.Prim, track: Track, relative_to: Usd.Prim | None = None) -> None:
