@@ -1,14 +1,15 @@
 //! A file that left comes home: as a scene of its own, and with its edits onto the scene that it came from.
 #![allow(clippy::unwrap_used)] // Helpers of tests.
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
 use cif_field::{Field, Heads, Identities, Instance, RecordedCamera};
 use cif_render::synthetic::{SyntheticConfig, generate};
-use cif_scene::{MotionModel, SceneGraph, SceneOptions};
+use cif_scene::{Motion, MotionModel, PoseSample, SceneGraph, SceneOptions};
 use cif_test::command::{Run, run};
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use serde_json::{Value, json};
 
 const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
@@ -210,4 +211,100 @@ fn mistakes_are_explained_and_nothing_is_overwritten() {
     graph.origin = cif_scene::Origin::default();
     write_glb(&graph, &path.join("theirs.glb"));
     cif(path, "import theirs.glb --base base.cif -o newer.cif").fails(1, &["theirs.glb does not say"]);
+}
+
+/// Size and channels of an EXR file.
+fn channels(path: &Path) -> (usize, usize, BTreeMap<String, Vec<f32>>) {
+    let image = exr::prelude::read_first_flat_layer_from_file(path).unwrap();
+    let size = image.layer_data.size;
+    let list = image.layer_data.channel_data.list.iter();
+    let channels = list.map(|c| (c.name.to_string(), c.sample_data.values_as_f32().collect())).collect();
+    (size.width(), size.height(), channels)
+}
+
+/// PSNR between the first picture and the second one fetched along `factor` times the motion vectors of the
+/// first, over the pixels that move.
+fn fetched(folder: &Path, views: &str, factor: f64) -> f64 {
+    let (width, height, first) = channels(&folder.join(views).join("exr/a.exr"));
+    let (_, _, second) = channels(&folder.join(views).join("exr/b.exr"));
+    let (mut squares, mut count) = (0.0, 0_usize);
+    for y in 0..height {
+        for x in 0..width {
+            let at = y * width + x;
+            // u to the right, v up.
+            let (u, v) = (f64::from(first["forward.u"][at]), -f64::from(first["forward.v"][at]));
+            if u.hypot(v) < 0.5 {
+                continue;
+            }
+            let (u, v) = (x as f64 + factor * u, y as f64 + factor * v);
+            let inside = u >= 0.0 && v >= 0.0 && u < (width - 1) as f64 && v < (height - 1) as f64;
+            if !inside {
+                continue;
+            }
+            let (left, top) = (u.floor() as usize, v.floor() as usize);
+            let (right_share, low_share) = (u.fract(), v.fract());
+            for name in ["R", "G", "B"] {
+                let pixel = |x: usize, y: usize| f64::from(second[name][y * width + x]);
+                let row = |y: usize| pixel(left, y) * (1.0 - right_share) + pixel(left + 1, y) * right_share;
+                let color = row(top) * (1.0 - low_share) + row(top + 1) * low_share;
+                squares += (color - f64::from(first[name][at])).powi(2);
+                count += 1;
+            }
+        }
+    }
+    assert!(count > 300, "{views}: {count} values move");
+    -10.0 * (squares / count as f64).log10()
+}
+
+#[test]
+fn motion_vectors_lead_from_one_frame_to_the_next() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let (_, mut graph) = setting(path);
+    // The mug drives to the side, in front of everything else; the rest stands still.
+    let still = graph.time_codes.start();
+    let end = graph.time_codes.end();
+    graph.nodes.retain(|node| node.label == "red mug");
+    for node in &mut graph.nodes {
+        let sample = |time_code: f64, shift: DVec3| PoseSample {
+            time_code,
+            translation: node.pivot + shift,
+            rotation: DQuat::from_rotation_z(0.2 * shift.length()),
+        };
+        node.motion = Motion::Rigid(vec![sample(still, DVec3::ZERO), sample(end, DVec3::new(0.6, 0.2, 0.1))]);
+    }
+    let field = cif_scene::field_from_graph(&graph, "a test").unwrap();
+    field.save(path.join("driven.cif")).unwrap();
+
+    let view: Value = parsed(&fs::read_to_string(path.join("left.json")).unwrap());
+    let views = |first: (&str, f64, f64), second: (&str, f64, f64)| {
+        let one = |(name, time, aside): (&str, f64, f64)| {
+            let mut view = view[0].clone();
+            view["name"] = name.into();
+            view["time"] = time.into();
+            let x = view["world_from_camera"][0][3].as_f64().unwrap();
+            view["world_from_camera"][0][3] = (x + aside).into();
+            view
+        };
+        json!([one(first), one(second)]).to_string()
+    };
+    for (name, what) in [
+        ("object", views(("a", 0.2, 0.0), ("b", 0.5, 0.0))),
+        ("camera", views(("a", 0.2, 0.0), ("b", 0.2, 0.15))),
+        ("both", views(("a", 0.2, 0.0), ("b", 0.5, 0.15))),
+    ] {
+        fs::write(path.join(format!("{name}.json")), what).unwrap();
+        let line = format!("render driven.cif --camera {name}.json -o {name} --exr --exr-color display");
+        cif(path, &line).succeeds();
+        let [against, none, along] = [-1.0, 0.0, 1.0].map(|factor| fetched(path, name, factor));
+        assert!(along > none + 6.0, "{name}: {along} dB along the vectors, {none} dB without");
+        assert!(none > against + 1.0, "{name}: {none} dB without, {against} dB the other way");
+    }
+    // Nothing moves between two pictures of the same moment.
+    fs::write(path.join("same.json"), views(("a", 0.2, 0.0), ("b", 0.2, 0.0))).unwrap();
+    cif(path, "render driven.cif --camera same.json -o same --exr").succeeds();
+    let (_, _, first) = channels(&path.join("same/exr/a.exr"));
+    for name in ["forward.u", "forward.v"] {
+        assert!(first[name].iter().all(|value| value.abs() < 1e-3), "{name}");
+    }
 }

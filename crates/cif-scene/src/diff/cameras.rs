@@ -56,9 +56,7 @@ pub(super) fn changes(before: &SceneGraph, after: &SceneGraph) -> Vec<CameraChan
     let named = |tracks: &'_ [CameraTrack], name: &str| tracks.iter().position(|track| track.name == name);
     let change = |track: &CameraTrack, kind| CameraChange { name: track.name.clone(), kind };
     let kept = before.cameras.iter().filter_map(|first| match named(&after.cameras, &first.name) {
-        Some(second) => {
-            compare(first, &after.cameras[second]).map(|kind| change(first, kind))
-        }
+        Some(second) => compare(first, &after.cameras[second]).map(|kind| change(first, kind)),
         None => Some(change(first, CameraChangeKind::Removed)),
     });
     let added = after

@@ -49,9 +49,11 @@ fn cameras_that_differ_are_told_and_are_no_edit() {
     let mut field = learned_field(2, 7);
     let first = field.cameras[0].clone();
     for (name, times) in [("left", 0..2), ("right", 0..1), ("gone", 0..1), ("zoomed", 0..1)] {
-        field.cameras.extend(
-            times.map(|time_index| cif_field::RecordedCamera { name: name.into(), time_index, ..first.clone() }),
-        );
+        field.cameras.extend(times.map(|time_index| cif_field::RecordedCamera {
+            name: name.into(),
+            time_index,
+            ..first.clone()
+        }));
     }
     let before = build(&field, &SceneOptions::default()).unwrap();
     let mut after = before.clone();

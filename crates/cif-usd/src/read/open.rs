@@ -93,7 +93,8 @@ impl<'py> Walk<'_, 'py> {
     fn visit(&mut self, root: &Bound<'py, PyAny>) -> Result<(), UsdError> {
         let mut open = vec![root.clone()];
         while let Some(layer) = open.pop() {
-            let (identifier, real, mut assets) = described(&layer).map_err(|error| self.unreadable(&error))?;
+            let (identifier, real, mut assets) =
+                described(&layer).map_err(|error| self.unreadable(&error))?;
             if !self.seen.insert(identifier.clone()) {
                 continue;
             }
@@ -105,7 +106,9 @@ impl<'py> Walk<'_, 'py> {
             for clip in clips(self.pxr, &layer).map_err(|error| self.unreadable(&error))? {
                 match clip {
                     Clip::Asset(asset) => assets.push(asset),
-                    Clip::Template(template) => assets.extend(self.numbered(&layer, &identifier, &template)?),
+                    Clip::Template(template) => {
+                        assets.extend(self.numbered(&layer, &identifier, &template)?)
+                    }
                 }
             }
             // A reference to another prim of the same stage names no file.
@@ -205,7 +208,8 @@ fn clips<'py>(pxr: &Pxr<'py>, layer: &Bound<'py, PyAny>) -> PyResult<Vec<Clip>> 
             let get = |key: &str| set.call_method1("get", (key,));
             let files = get("assetPaths")?;
             let manifest = get("manifestAssetPath")?;
-            let files = if files.is_none() { Vec::new() } else { files.try_iter()?.collect::<PyResult<_>>()? };
+            let files =
+                if files.is_none() { Vec::new() } else { files.try_iter()?.collect::<PyResult<_>>()? };
             for file in files.into_iter().chain((!manifest.is_none()).then_some(manifest)) {
                 clips.push(Clip::Asset(file.getattr("path")?.extract()?));
             }

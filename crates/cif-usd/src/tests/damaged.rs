@@ -299,13 +299,19 @@ fn value_clips_are_read_in_the_folder_and_refused_outside() {
     let inner = folder.path().join("inner");
     fs::create_dir(&inner).unwrap();
     for (number, change) in
-        [clips(&named("./moves.usda"), "moves.usda"), clips(&template("./m.#.usda"), "m.0.usda")].iter().enumerate()
+        [clips(&named("./moves.usda"), "moves.usda"), clips(&template("./m.#.usda"), "m.0.usda")]
+            .iter()
+            .enumerate()
     {
         let inside = inner.join(format!("inside_{number}"));
         fs::create_dir(&inside).unwrap();
         let graph = read_scene(&stage_with(&inside, change)).unwrap();
         let high = graph.nodes[0].world_transform(1.0).translation;
-        assert!((high - glam::DVec3::new(0.0, 5.0, 0.0)).length() < 1e-9, "{high} {:?}", graph.nodes[0].motion);
+        assert!(
+            (high - glam::DVec3::new(0.0, 5.0, 0.0)).length() < 1e-9,
+            "{high} {:?}",
+            graph.nodes[0].motion
+        );
     }
     for (number, change) in
         [clips(&named("../moves.usda"), "../moves.usda"), clips(&template("../m.#.usda"), "../m.0.usda")]
