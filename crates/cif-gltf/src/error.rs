@@ -2,34 +2,25 @@
 
 use std::path::PathBuf;
 
+use cif_scene::files::FileError;
+
 /// Why a glTF file cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum GltfError {
+    /// Reading or writing failed, as it can with any format.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Not a file name of glTF.
     #[error("{path}: the ending decides the kind of file; use .glb (one file) or .gltf (text beside a .bin)")]
     Extension {
         /// Given path.
         path: PathBuf,
     },
-    /// The folder of the output is missing.
-    #[error("{folder}: no such folder; create it first (for {path})")]
-    NoFolder {
-        /// Missing folder.
-        folder: PathBuf,
-        /// Output in it.
-        path: PathBuf,
-    },
     /// A folder is in the way.
     #[error("{path} is a folder; give a file name")]
     IsFolder {
         /// The folder.
-        path: PathBuf,
-    },
-    /// A file that cif did not write is in the way.
-    #[error("{path} exists and was not written by cif; choose another name, or replace it with --force")]
-    Foreign {
-        /// The file.
         path: PathBuf,
     },
     /// Motion that glTF cannot hold.
@@ -55,22 +46,6 @@ pub enum GltfError {
         path: PathBuf,
         /// Its size.
         bytes: u64,
-    },
-    /// Writing failed.
-    #[error("{path} could not be written: {source}")]
-    Write {
-        /// Output.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
-    /// Reading failed.
-    #[error("{path} cannot be read: {source}")]
-    Read {
-        /// Given path.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
     },
     /// The file is no glTF, or damaged.
     #[error("{path} is not readable as glTF: {reason}")]

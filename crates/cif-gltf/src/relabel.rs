@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
+use cif_scene::files::{FileError, folder_of};
 use serde_json::{Value, json};
 
 use crate::GltfError;
@@ -39,7 +40,7 @@ pub fn relabel(
     label: &str,
     category: Option<&str>,
 ) -> Result<Relabelled, GltfError> {
-    let read = |source| GltfError::Read { path: path.to_owned(), source };
+    let read = |source| FileError::Read { path: path.to_owned(), source };
     let unreadable = |reason: String| GltfError::Unreadable { path: path.to_owned(), reason };
     let invalid = |what: String| GltfError::Invalid {
         path: path.to_owned(),
@@ -70,7 +71,7 @@ pub fn relabel(
     }
     let mut document: Value = serde_json::from_slice(&text)
         .map_err(|error| unreadable(format!("its JSON is damaged ({error}); export it again")))?;
-    let folder = |path: &Path| std::fs::canonicalize(crate::write::folder_of(path)).ok();
+    let folder = |path: &Path| std::fs::canonicalize(folder_of(path)).ok();
     if folder(path) != folder(output) && names_files(&document) {
         return Err(invalid(format!(
             "the file names others beside it, which {} would not find; write into the same folder",
@@ -100,7 +101,7 @@ pub fn relabel(
         }
         Ok(())
     });
-    let unwritable = |source| GltfError::Write { path: output.to_owned(), source };
+    let unwritable = |source| FileError::Write { path: output.to_owned(), source };
     crate::write::persist(written.map_err(unwritable)?, output).map_err(unwritable)?;
     Ok(done)
 }

@@ -8,6 +8,7 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use cif_scene::SceneGraph;
+use cif_scene::files::{FileError, existing_folder, folder_of};
 use serde::Deserialize;
 use tempfile::NamedTempFile;
 
@@ -31,14 +32,6 @@ fn kind_of(path: &Path) -> Result<Kind, GltfError> {
     }
 }
 
-/// Folder of an output; `.` for a bare name.
-pub(crate) fn folder_of(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-        _ => PathBuf::from("."),
-    }
-}
-
 /// The file with the buffer of a `.gltf`.
 fn buffer_path(path: &Path) -> PathBuf {
     path.with_extension("bin")
@@ -50,16 +43,13 @@ pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), Gl
 
 fn checked_kind(path: &Path, options: ExportOptions) -> Result<Kind, GltfError> {
     let kind = kind_of(path)?;
-    let folder = folder_of(path);
-    if !folder.is_dir() {
-        return Err(GltfError::NoFolder { folder, path: path.to_owned() });
-    }
+    existing_folder(path)?;
     let ours = is_ours(path);
     if path.is_dir() {
         return Err(GltfError::IsFolder { path: path.to_owned() });
     }
     if path.exists() && !options.force && !ours {
-        return Err(GltfError::Foreign { path: path.to_owned() });
+        return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
     if kind == Kind::Text {
         let buffer = buffer_path(path);
@@ -68,7 +58,7 @@ fn checked_kind(path: &Path, options: ExportOptions) -> Result<Kind, GltfError> 
         }
         // A buffer is ours where a .gltf of ours stands beside it.
         if buffer.exists() && !options.force && !ours {
-            return Err(GltfError::Foreign { path: buffer });
+            return Err(FileError::Foreign { path: buffer }.into());
         }
     }
     Ok(kind)
@@ -109,7 +99,7 @@ pub(crate) fn export(
 ) -> Result<ExportSummary, GltfError> {
     let kind = checked_kind(path, options)?;
     let mut authored = author(graph)?;
-    let failed = |source: io::Error| GltfError::Write { path: path.to_owned(), source };
+    let failed = |source: io::Error| FileError::Write { path: path.to_owned(), source };
     let mut paths = vec![path.to_owned()];
     let bytes = match kind {
         Kind::Binary => {

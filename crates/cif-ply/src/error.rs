@@ -2,24 +2,21 @@
 
 use std::path::PathBuf;
 
+use cif_scene::files::FileError;
+
 /// Why a PLY file cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum PlyError {
+    /// Reading or writing failed, as it can with any format.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// Not a file name of PLY.
     #[error(
         "{path}: one file of splats ends in .ply; several files go into a folder (split by object, or a sequence)"
     )]
     Extension {
         /// Given path.
-        path: PathBuf,
-    },
-    /// The folder of the output is missing.
-    #[error("{folder}: no such folder; create it first (for {path})")]
-    NoFolder {
-        /// Missing folder.
-        folder: PathBuf,
-        /// Output in it.
         path: PathBuf,
     },
     /// A folder is where a file is wanted, or the other way round.
@@ -32,12 +29,6 @@ pub enum PlyError {
         /// What is to be written.
         wanted: &'static str,
     },
-    /// A file that cif did not write is in the way.
-    #[error("{path} exists and was not written by cif; choose another name, or replace it with --force")]
-    Foreign {
-        /// The file.
-        path: PathBuf,
-    },
     /// Nothing can be seen at that time.
     #[error(
         "no object can be seen at time code {time_code}, so that {path} would be empty; choose another time"
@@ -47,22 +38,6 @@ pub enum PlyError {
         path: PathBuf,
         /// When.
         time_code: f64,
-    },
-    /// Writing failed.
-    #[error("{path} could not be written: {source}")]
-    Write {
-        /// Output.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
-    },
-    /// Reading failed.
-    #[error("{path} cannot be read: {source}")]
-    Read {
-        /// Given path.
-        path: PathBuf,
-        /// What the system says.
-        source: std::io::Error,
     },
     /// The file is no PLY of splats, or damaged.
     #[error("{path}: {what}")]

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_geometry::{RigidTransform, quaternion};
+use cif_scene::files::FileError;
 use cif_scene::{
     Motion, MotionReport, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes, UpAxis, extent, naming,
 };
@@ -43,7 +44,7 @@ impl PropertyAccess for Ignored {
 }
 
 pub(crate) fn read(path: &Path) -> Result<SceneGraph, PlyError> {
-    let failed = |source| PlyError::Read { path: path.to_owned(), source };
+    let failed = |source| FileError::Read { path: path.to_owned(), source };
     let invalid = |what: String| PlyError::Invalid { path: path.to_owned(), what };
     let file = File::open(path).map_err(failed)?;
     let metadata = file.metadata().map_err(failed)?;

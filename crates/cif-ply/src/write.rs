@@ -8,6 +8,7 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use cif_geometry::spherical_harmonics::coefficient_count;
+use cif_scene::files::{FileError, existing_folder, folder_of};
 use cif_scene::{Node, SceneGraph, Splats};
 use tempfile::NamedTempFile;
 
@@ -17,14 +18,6 @@ use crate::{ExportOptions, ExportSummary, PlyError};
 /// First comment of our files; tells what may be replaced.
 const MARK: &str = concat!("comment cif ", env!("CARGO_PKG_VERSION"));
 const MARK_PREFIX: &[u8] = b"ply\nformat binary_little_endian 1.0\ncomment cif ";
-
-/// Folder of an output; `.` for a bare name.
-fn folder_of(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-        _ => PathBuf::from("."),
-    }
-}
 
 fn is_ply(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"))
@@ -41,10 +34,7 @@ pub(crate) fn check_target(path: &Path, options: &ExportOptions) -> Result<(), P
     if path.exists() && !path.is_dir() {
         return Err(PlyError::InTheWay { path: path.to_owned(), found: "a file", wanted: "a folder" });
     }
-    let folder = folder_of(path);
-    if !folder.is_dir() {
-        return Err(PlyError::NoFolder { folder, path: path.to_owned() });
-    }
+    existing_folder(path)?;
     Ok(())
 }
 
@@ -56,12 +46,9 @@ fn check_file(path: &Path, force: bool) -> Result<(), PlyError> {
     if path.is_dir() {
         return Err(PlyError::InTheWay { path: path.to_owned(), found: "a folder", wanted: "a file" });
     }
-    let folder = folder_of(path);
-    if !folder.is_dir() {
-        return Err(PlyError::NoFolder { folder, path: path.to_owned() });
-    }
+    existing_folder(path)?;
     if path.exists() && !force && !is_ours(path) {
-        return Err(PlyError::Foreign { path: path.to_owned() });
+        return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
     Ok(())
 }
@@ -100,7 +87,7 @@ pub(crate) fn export(
             }
             return Err(PlyError::NothingVisible { path: job.path, time_code: job.time_code });
         }
-        let failed = |source| PlyError::Write { path: job.path.clone(), source };
+        let failed = |source| FileError::Write { path: job.path.clone(), source };
         fs::create_dir_all(folder_of(&job.path)).map_err(failed)?;
         summary.bytes += write(&job).map_err(failed)?;
         summary.splats += job.nodes.iter().map(|node| node.splats.len()).sum::<usize>();

@@ -43,6 +43,7 @@ pub mod edits;
 pub mod error;
 pub mod extent;
 pub mod field_from_graph;
+pub mod files;
 pub mod frames;
 pub mod graph;
 pub mod keys;

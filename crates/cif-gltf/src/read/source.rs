@@ -8,6 +8,7 @@ use std::path::{Component, Path, PathBuf};
 use std::rc::Rc;
 
 use base64::Engine;
+use cif_scene::files::FileError;
 use gltf::json;
 use serde_json::Value;
 
@@ -36,7 +37,7 @@ struct Buffer {
 impl Source {
     /// Reads a file and everything it refers to.
     pub(crate) fn open(path: &Path) -> Result<Self, GltfError> {
-        let failed = |source| GltfError::Read { path: path.to_owned(), source };
+        let failed = |source| FileError::Read { path: path.to_owned(), source };
         if !fs::metadata(path).map_err(failed)?.is_file() {
             return Err(unreadable(path, "it is not a file"));
         }
