@@ -13,7 +13,7 @@ import cif
 import numpy as np
 import pytest
 from conftest import camera_at
-from pxr import Gf, Sdf, Usd, UsdGeom
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdSemantics, UsdVol
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 NAMES = ["mug", "bowl", "box", "vase", "spoon", "ball", "book"]
@@ -163,6 +163,89 @@ def test_cameras_and_instancers_are_told(base: Path, tmp_path: Path, capfd: pyte
     assert found["objects"] == [] and [change["kind"] for change in found["cameras"]] == ["lens"]
     assert "cameras stay as they were recorded" in err and "another lens" in err
     assert "/World/Copies: copies made by a point instancer are not read" in err
+
+
+def stage_with_clips(folder: Path, asset: str, template: bool) -> Path:
+    """Two splats whose prim is moved by a value clip: 3 up at time code 0, 5 up at 1."""
+    folder.mkdir()
+    clip = Sdf.Layer.CreateNew(str(folder / asset.replace("#", "0")))
+    moved = Sdf.AttributeSpec(
+        Sdf.CreatePrimInLayer(clip, "/World/Thing"), "xformOp:translate", Sdf.ValueTypeNames.Double3
+    )
+    clip.SetTimeSample(moved.path, 0.0, Gf.Vec3d(0, 0, 3))
+    clip.SetTimeSample(moved.path, 1.0, Gf.Vec3d(0, 0, 5))
+    clip.Save()
+    stage = Usd.Stage.CreateNew(str(folder / "thing.usda"))
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    UsdGeom.SetStageMetersPerUnit(stage, 1)
+    thing = UsdGeom.Xform.Define(stage, "/World/Thing")
+    UsdSemantics.LabelsAPI.Apply(thing.GetPrim(), "class").CreateLabelsAttr().Set(["thing"])
+    thing.AddTranslateOp()
+    splats = UsdVol.ParticleField3DGaussianSplat.Define(stage, "/World/Thing/Cloud")
+    splats.CreatePositionsAttr([(0, 0, 0), (0.1, 0, 0)])
+    splats.CreateOrientationsAttr([Gf.Quatf(1)] * 2)
+    splats.CreateScalesAttr([(0.01, 0.01, 0.01)] * 2)
+    splats.CreateOpacitiesAttr([1, 1])
+    splats.CreateRadianceSphericalHarmonicsDegreeAttr(0)
+    splats.CreateRadianceSphericalHarmonicsCoefficientsAttr([(1, 0, 0), (0, 1, 0)])
+    clips = Usd.ClipsAPI(thing.GetPrim())
+    clips.SetClipPrimPath("/World/Thing")
+    if template:
+        clips.SetClipTemplateAssetPath(asset)
+        clips.SetClipTemplateStartTime(0)
+        clips.SetClipTemplateEndTime(0)
+        clips.SetClipTemplateStride(1)
+    else:
+        clips.SetClipAssetPaths([Sdf.AssetPath(asset)])
+        clips.SetClipActive([(0, 0)])
+        clips.SetClipTimes([(0, 0), (1, 1)])
+    stage.GetRootLayer().Save()
+    return folder / "thing.usda"
+
+
+@pytest.mark.filterwarnings("default")
+@pytest.mark.parametrize(
+    ("asset", "template", "height"), [("moves.usda", False, 5.0), ("moves.#.usda", True, 3.0)]
+)
+def test_value_clips_stay_in_the_folder(
+    tmp_path: Path, asset: str, template: bool, height: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    def height_of(path: Path, *words: str) -> float:
+        home = path.with_suffix(".cif")
+        assert cif.run(["import", str(path), "-o", str(home), *words]) == 0
+        (found,) = told(capfd, "query", home, "--label", "thing", "--time", 1)
+        return (found["low"][2] + found["high"][2]) / 2
+
+    assert height_of(stage_with_clips(tmp_path / "inside", f"./{asset}", template)) == pytest.approx(height)
+    outside = stage_with_clips(tmp_path / "outside", f"../{asset}", template)
+    capfd.readouterr()
+    assert cif.run(["import", str(outside), "-o", str(outside.with_suffix(".cif"))]) == 1
+    said = capfd.readouterr().err
+    assert "outside the folder" in said and "--follow-external" in said and "../moves." in said, said
+    assert not outside.with_suffix(".cif").exists()
+    assert height_of(outside, "--follow-external") == pytest.approx(height)
+
+
+def test_missing_value_clips_are_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = stage_with_clips(tmp_path / "gone", "./moves.usda", template=False)
+    (path.parent / "moves.usda").unlink()
+    assert cif.run(["import", str(path), "-o", str(tmp_path / "home.cif")]) == 1
+    assert "moves.usda, which does not exist" in capfd.readouterr().err
+
+
+def test_prototypes_are_not_objects(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    path = stage_with_clips(tmp_path / "copies", "./moves.usda", template=False)
+    stage = Usd.Stage.Open(str(path))
+    copies = UsdGeom.PointInstancer.Define(stage, "/World/Copies")
+    Sdf.CopySpec(stage.GetRootLayer(), "/World/Thing/Cloud", stage.GetRootLayer(), "/World/Copies/One")
+    copies.CreatePrototypesRel().SetTargets(["/World/Copies/One"])
+    copies.CreateProtoIndicesAttr([0, 0])
+    copies.CreatePositionsAttr([(0, 0, 1), (0, 0, 2)])
+    stage.Save()
+    home = tmp_path / "home.cif"
+    assert cif.run(["import", str(path), "-o", str(home)]) == 0
+    assert "/World/Copies: copies made by a point instancer are not read" in capfd.readouterr().err
+    assert len(cif.Field.load(home).means) == 2, "prototypes are not drawn where they stand"
 
 
 def run_with(pxr: dict[str, str], folder: Path, *words: object) -> subprocess.CompletedProcess[str]:

@@ -194,7 +194,8 @@ fn clips<'py>(pxr: &Pxr<'py>, layer: &Bound<'py, PyAny>) -> PyResult<Vec<Clip>> 
     let root = pxr.sdf.getattr("Path")?.getattr("absoluteRootPath")?;
     layer.call_method1("Traverse", (root, paths.getattr("append")?))?;
     for path in paths {
-        let is_prim = path.call_method0("IsPrimOrPrimVariantSelectionPath")?.is_truthy()?;
+        let is_prim = path.call_method0("IsPrimPath")?.is_truthy()?
+            || path.call_method0("IsPrimVariantSelectionPath")?.is_truthy()?;
         if !is_prim {
             continue;
         }
