@@ -17,6 +17,7 @@
 //! | [`resample`] | instance-guided resampling with volume conservation |
 //! | [`tracks`] | where objects travel, from masks alone |
 //! | [`metrics`] | how good a field is |
+//! | `wgpu` | losses and optimiser on the GPU, behind the feature of that name |
 //!
 //! ```no_run
 //! use cif_train::{Control, Preset, TrainConfig, Trainer};
@@ -53,6 +54,8 @@ pub mod resample;
 pub mod schedule;
 pub mod tracks;
 pub mod trainer;
+#[cfg(feature = "wgpu")]
+pub mod wgpu;
 
 pub use clock::{Clock, Seconds, SystemClock};
 pub use config::{Ablation, Preset, TrainConfig};

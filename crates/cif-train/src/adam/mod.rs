@@ -9,6 +9,8 @@ mod regularizer;
 
 use rayon::prelude::*;
 
+#[cfg(feature = "wgpu")]
+pub(crate) use planes::factors;
 pub use planes::{PlaneWeights, step_planes};
 pub use regularizer::plane_penalty;
 
@@ -69,15 +71,15 @@ const MAX_SPLIT_WIDTH: usize = 48;
 
 /// What is the same for all floats of a step.
 #[derive(Clone, Copy, Debug)]
-struct BiasCorrection {
+pub(crate) struct BiasCorrection {
     /// `1 / (1 - beta_1^t)`.
-    first: f32,
+    pub(crate) first: f32,
     /// `1 / sqrt(1 - beta_2^t)`.
-    second: f32,
+    pub(crate) second: f32,
 }
 
 impl BiasCorrection {
-    fn after(steps: u32) -> Self {
+    pub(crate) fn after(steps: u32) -> Self {
         let power = |beta: f32| f64::from(beta).powf(f64::from(steps));
         Self {
             first: (1.0 / (1.0 - power(BETA_1))) as f32,

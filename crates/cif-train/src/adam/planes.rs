@@ -24,7 +24,7 @@ const BAND_ROWS: usize = 16;
 const HALO_ROWS: usize = 4;
 
 /// Gradient factors of one plane: of the second difference, and of the distance from 1.
-pub(super) fn factors(
+pub(crate) fn factors(
     layout: &PlaneLayout,
     plane: usize,
     channels: usize,

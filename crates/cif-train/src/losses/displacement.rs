@@ -107,7 +107,7 @@ pub fn rotations(
 }
 
 /// Towards no rotation, relative to the size of the correlation.
-const NO_ROTATION: f64 = 0.02;
+pub(crate) const NO_ROTATION: f64 = 0.02;
 
 /// Newton's iteration for the orthogonal factor of the polar decomposition; none where a reflection is nearer.
 fn nearest_rotation(correlation: DMat3) -> DMat3 {

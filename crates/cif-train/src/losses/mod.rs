@@ -1,7 +1,7 @@
 //! Losses and their gradients: of the colours of a view (methods reference 1.4), and of motion that is known.
 
 pub mod displacement;
-mod ssim;
+pub(crate) mod ssim;
 
 use cif_geometry::PixelGrid;
 use rayon::prelude::*;

@@ -6,14 +6,14 @@ use rayon::prelude::*;
 use super::unit;
 
 /// Half the window: 11 taps.
-const RADIUS: usize = 5;
+pub(crate) const RADIUS: usize = 5;
 
 /// Standard deviation of the window, pixels.
 const SIGMA: f64 = 1.5;
 
 /// `(0.01)^2` and `(0.03)^2` for colours in [0, 1].
-const C1: f32 = 1e-4;
-const C2: f32 = 9e-4;
+pub(crate) const C1: f32 = 1e-4;
+pub(crate) const C2: f32 = 9e-4;
 
 /// Memory kept between calls.
 #[derive(Clone, Debug, Default)]
@@ -27,7 +27,7 @@ pub struct SsimScratch {
 }
 
 /// Normalised taps from the centre outwards.
-fn window() -> [f32; RADIUS + 1] {
+pub(crate) fn window() -> [f32; RADIUS + 1] {
     let tap = |k: usize| (-(k as f64 * k as f64) / (2.0 * SIGMA * SIGMA)).exp();
     let sum = tap(0) + 2.0 * (1..=RADIUS).map(tap).sum::<f64>();
     std::array::from_fn(|k| (tap(k) / sum) as f32)

@@ -119,6 +119,7 @@ impl Trainer {
         if count == 0 || !due || curve.holds(stage, step) {
             return Ok(None);
         }
+        self.fetch_from_gpu()?;
         let start = self.clock.now();
         let frames = match self.yardstick.frames.take() {
             Some(frames) => frames,

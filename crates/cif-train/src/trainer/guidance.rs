@@ -355,6 +355,42 @@ impl Trainer {
         [motion.guidance * motion.guidance_end.powf(done), motion.stillness]
     }
 
+    /// What pulls at a time, for the GPU: how far each object is from its canonical place, and the two pulls; `None`
+    /// when nothing pulls.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn pulls(
+        &self,
+        time: f64,
+        [guidance, stillness]: [f32; 2],
+    ) -> Option<(Vec<DVec3>, [Pull; 2])> {
+        if (guidance, stillness) == (0.0, 0.0) || self.guidance.guide_of.len() != self.field.gaussians.len() {
+            return None;
+        }
+        let shift = |guide: &Guide| guide.track.at(&self.dataset.times, time) - guide.reference;
+        let shifts = self.guidance.guides.iter().map(shift).collect();
+        Some((shifts, self.pull_strengths([guidance, stillness])))
+    }
+
+    /// Guide + 1 of every Gaussian; empty without guidance.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn guide_of(&self) -> &[u16] {
+        &self.guidance.guide_of
+    }
+
+    /// Labels (dense index + 1) of travelling objects, where there are any.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn travelling_labels(&self) -> Option<&[bool]> {
+        let travelling = &self.guidance.travelling[..];
+        travelling.contains(&true).then_some(travelling)
+    }
+
+    /// The pulls to paths and to places.
+    fn pull_strengths(&self, [guidance, stillness]: [f32; 2]) -> [Pull; 2] {
+        let extent = f64::from(self.field.extent);
+        let pull = |weight: f32, reach: f64| Pull { weight: f64::from(weight), reach: reach * extent };
+        [pull(guidance, PATH_REACH), pull(stillness, PLACE_REACH)]
+    }
+
     /// Gradients by what the deformation adds to every centre at the renderer's present time; empty when
     /// nothing pulls.
     pub(super) fn displacement_gradients(&self, time: f64, [guidance, stillness]: [f32; 2]) -> Vec<[f32; 3]> {
@@ -374,8 +410,7 @@ impl Trainer {
             })
             .collect();
         let extent = f64::from(self.field.extent);
-        let pull = |weight: f32, reach: f64| Pull { weight: f64::from(weight), reach: reach * extent };
-        let pulls = [pull(guidance, PATH_REACH), pull(stillness, PLACE_REACH)];
+        let pulls = self.pull_strengths([guidance, stillness]);
         displacement_loss(displaced, canonical, pose_of, &poses, pulls, extent).1
     }
 }

@@ -16,11 +16,14 @@
 //! | `evaluate` | what a run has reached, on a few frames |
 //! | `pacing` | when stages end by time, or by what was reached |
 //! | `times`, `measure` | where the time of a step goes |
+//! | `device` | how steps run on a GPU, behind the feature `wgpu` |
 //!
 //! Random choices depend on the seed and the step alone (see `random`), and all sums have a fixed order: a
 //! run that was interrupted and resumed ends bit for bit where an uninterrupted one ends, on any number of
 //! threads.
 
+#[cfg(feature = "wgpu")]
+mod device;
 mod earned;
 mod evaluate;
 mod frames;
@@ -106,6 +109,14 @@ pub struct Trainer {
     pacing: Option<Pacing>,
     /// Warnings not sent yet.
     warnings: Vec<String>,
+    /// The GPU that steps run on.
+    #[cfg(feature = "wgpu")]
+    device: Option<Box<device::DeviceTraining>>,
+    /// Loss of the last step that has arrived from the GPU, and of the one that is arriving.
+    #[cfg(feature = "wgpu")]
+    last_loss: StepLoss,
+    #[cfg(feature = "wgpu")]
+    arriving_loss: StepLoss,
 }
 
 /// What the observer asked for since it was last obeyed.
@@ -178,6 +189,12 @@ impl Trainer {
             yardstick,
             pacing: None,
             warnings: Vec::new(),
+            #[cfg(feature = "wgpu")]
+            device: None,
+            #[cfg(feature = "wgpu")]
+            last_loss: StepLoss::default(),
+            #[cfg(feature = "wgpu")]
+            arriving_loss: StepLoss::default(),
             dataset,
             config,
             field,
@@ -359,8 +376,14 @@ impl Trainer {
                     );
                     requests.add(self.emit(observer, &TrainEvent::Warning { message }));
                 }
-            } else if self.run_steps(stage, observer, &mut requests)? == Outcome::Interrupted {
-                return Ok(Outcome::Interrupted);
+            } else {
+                let outcome = self.run_steps(stage, observer, &mut requests);
+                // Whatever ended the steps, the field is whole again.
+                let fetched = self.fetch_from_gpu();
+                if outcome? == Outcome::Interrupted {
+                    return fetched.map(|()| Outcome::Interrupted);
+                }
+                fetched?;
             }
             let next = self.plan.after(&self.config, stage);
             let ends = stage == Stage::Identity || next == Stage::Done || self.progress.iteration >= MIN_GAP;
@@ -407,6 +430,9 @@ impl Trainer {
             let spent = self.clock.now() - start;
             self.progress.add_time(stage, spent);
             (lap, lap_steps) = (lap + spent.wall_s, lap_steps + 1);
+            for message in std::mem::take(&mut self.warnings) {
+                events.push(TrainEvent::Warning { message });
+            }
             for event in events.drain(..) {
                 requests.add(self.emit(observer, &event));
             }
@@ -433,11 +459,13 @@ impl Trainer {
             self.follow_budget(stage);
             let total = (self.progress.total_steps % u64::from(u32::MAX)) as u32;
             if falls_on(total, self.config.report.evaluate_every) {
+                self.fetch_from_gpu()?;
                 let event = self.evaluate(stage)?;
                 requests.add(self.emit(observer, &event));
             }
             if falls_on(total, self.config.report.checkpoint_every) || requests.save {
                 requests.save = false;
+                self.fetch_from_gpu()?;
                 requests.add(self.emit(observer, &TrainEvent::CheckpointDue { stage, iteration }));
             }
         }
@@ -482,6 +510,13 @@ impl Trainer {
         observer(event, &TrainerView { trainer: self })
     }
 
+    /// Brings the field and the optimiser up to date where steps run on a GPU.
+    fn fetch_from_gpu(&mut self) -> Result<(), TrainError> {
+        #[cfg(feature = "wgpu")]
+        self.fetch_from_device()?;
+        Ok(())
+    }
+
     /// Begins a stage: the fine stage gets its deformation and a new optimiser (methods reference 1.3).
     fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
         if stage == Stage::Fine {
@@ -503,5 +538,7 @@ impl Trainer {
         self.progress.sh_start = self.field.sh_degree;
         self.progress.opacities_were_reset = false;
         self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
+        #[cfg(feature = "wgpu")]
+        self.everything_changed();
     }
 }

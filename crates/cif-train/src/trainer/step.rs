@@ -22,7 +22,7 @@ use crate::resample::{ResampleContext, apply, plan};
 use crate::schedule::{falls_on, sh_degree};
 
 /// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
-const RENORMALISE_EVERY: u64 = 1_000;
+pub(super) const RENORMALISE_EVERY: u64 = 1_000;
 
 /// Memory kept between steps.
 pub(super) struct Scratch {
@@ -75,7 +75,7 @@ impl Trainer {
     }
 
     /// Training view `position` of a stage: every epoch visits all views, in its own order.
-    fn view_at(&mut self, stage: Stage, position: u64) -> usize {
+    pub(super) fn view_at(&mut self, stage: Stage, position: u64) -> usize {
         let count = self.frames.len() as u64;
         let key = (stage, position / count);
         if self.scratch.order.as_ref().is_none_or(|(at, _)| *at != key) {
@@ -90,6 +90,10 @@ impl Trainer {
 
     /// Renders the step's views forward and backward, then moves the parameters.
     pub(super) fn step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
+        #[cfg(feature = "wgpu")]
+        if self.device.is_some() {
+            return self.device_step(events);
+        }
         let start = Instant::now();
         let stage = self.progress.stage;
         let iteration = self.progress.iteration + 1;
@@ -255,7 +259,7 @@ impl Trainer {
     }
 
     /// Pruning, additions and opacity resets that fall on this step.
-    fn densify(
+    pub(super) fn densify(
         &mut self,
         stage: Stage,
         iteration: u32,
@@ -309,7 +313,11 @@ impl Trainer {
     }
 
     /// Refreshed estimates and relocations that fall on this step.
-    fn instance_events(&mut self, iteration: u32, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
+    pub(super) fn instance_events(
+        &mut self,
+        iteration: u32,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
         let last = self.plan.iterations(&self.config, Stage::Instance);
         if falls_on(iteration, self.config.identity.refresh_every) && iteration < last {
             let event = self.estimate_identities(false)?;

@@ -32,7 +32,8 @@ const MOMENT: Snippet = Snippet { name: "moment", text: || structures(&[Moment::
 const LAYERS: Snippet = Snippet { name: "layers", text: || structures(&[Layers::layout()]) };
 const HEXPLANE: Snippet = Snippet { name: "hexplane", text: || include_str!("hexplane.wgsl").to_owned() };
 const NETWORK: Snippet = Snippet { name: "network", text: || include_str!("network.wgsl").to_owned() };
-const FIXED_POINT: Snippet =
+/// Sums in 64-bit fixed point, for kernels that add to or take those of [`DeformationGradients`].
+pub const FIXED_POINT: Snippet =
     Snippet { name: "fixed_point", text: || include_str!("fixed_point.wgsl").to_owned() };
 
 const PREPARE: Module = Module {

@@ -1,0 +1,264 @@
+//! Steps on a GPU: parameters, moments and gradients stay there from step to step.
+//!
+//! The host's field and optimiser are what every other part of the trainer works on: rare events (densification,
+//! resampling, identities, evaluation, saving) fetch them from the device, and what they change is sent again before
+//! the next step. Losses and counts of a step are read when they arrive, some steps later.
+//!
+//! A gradient that is not finite moves nothing. Unlike on the processor such a step is not rolled back: the run
+//! stops once the fault has arrived.
+//!
+//! | file | holds |
+//! |---|---|
+//! | `resident` | what lies on the device, fetching and sending |
+//! | `step` | one step |
+//! | `arriving` | what is read of steps, later |
+
+mod arriving;
+mod resident;
+mod step;
+
+use std::collections::BTreeMap;
+
+use cif_field::gaussians::SH_FLOATS;
+use cif_render::wgpu::deform::Shape;
+use cif_render::wgpu::{Gpu, GpuError, GpuVec, Rasterizer, Timestamps};
+
+use self::arriving::Arrivals;
+use self::resident::{Resident, Stale};
+use super::progress::Progress;
+use super::{Trainer, initialize};
+use crate::densify::DensifyStatistics;
+use crate::error::TrainError;
+use crate::wgpu::losses::{GpuLosses, GpuTarget};
+use crate::wgpu::motion::GpuMotion;
+use crate::wgpu::optimiser::GpuOptimiser;
+
+/// Steps after which the host's state is fetched at the latest, so that a lost device costs no more.
+const FETCH_EVERY: u32 = 500;
+
+/// Pairs and label slots that there is room for from the start, so that small scenes never meet the limit.
+const SMALLEST_ROOM: usize = 1 << 17;
+
+/// What a step on a GPU needs.
+pub(super) struct DeviceTraining {
+    gpu: Gpu,
+    rasterizer: Rasterizer,
+    losses: GpuLosses,
+    optimiser: GpuOptimiser,
+    motion: GpuMotion,
+    /// Training frames on the device, by position, and their bytes.
+    targets: BTreeMap<usize, GpuTarget>,
+    target_bytes: u64,
+    /// `None` until the first step.
+    resident: Option<Resident>,
+    stale: Stale,
+    /// Bits of gradients that were not finite.
+    faults: GpuVec<u32>,
+    arrivals: Arrivals,
+    /// Views whose pairs have been counted.
+    counted: Vec<bool>,
+    /// Most pairs and label slots that a view wanted so far, and of how many Gaussians.
+    wanted: [usize; 2],
+    wanted_of: usize,
+    /// Whether the device is ahead of the host.
+    ahead: bool,
+    /// Steps since the host's state was fetched.
+    since_fetch: u32,
+    /// Counters of the run when the host's state was right last.
+    fetched: Option<Fetched>,
+    /// Slot of the next view's losses.
+    slot: usize,
+    /// Every step waits for the device; for measuring alone.
+    waits: bool,
+    /// Times every stage, where the device can.
+    timestamps: Option<Timestamps>,
+}
+
+/// Counters that belong to the host's field and moments.
+struct Fetched {
+    progress: Progress,
+    sh_degree: u8,
+    adam_steps: Vec<u32>,
+    statistics: DensifyStatistics,
+}
+
+impl Trainer {
+    /// Makes the steps of this run run on a GPU. May be called before or between runs.
+    ///
+    /// # Errors
+    /// When a setting is on that the GPU does not support, named; when the scene may grow beyond what the device
+    /// holds, with the arithmetic; when the driver rejects a kernel.
+    pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
+        self.refuse_unsupported()?;
+        self.refuse_too_large(gpu)?;
+        let views = self.frames.len();
+        self.device = Some(Box::new(DeviceTraining {
+            rasterizer: Rasterizer::new(gpu)?,
+            losses: GpuLosses::new(gpu)?,
+            optimiser: GpuOptimiser::new(gpu)?,
+            motion: GpuMotion::new(gpu)?,
+            targets: BTreeMap::new(),
+            target_bytes: 0,
+            resident: None,
+            stale: Stale::default(),
+            faults: GpuVec::zeros(gpu, "faults", 4)?,
+            arrivals: Arrivals::default(),
+            counted: vec![false; views],
+            wanted: [SMALLEST_ROOM; 2],
+            wanted_of: 0,
+            ahead: false,
+            since_fetch: 0,
+            fetched: None,
+            slot: 0,
+            waits: false,
+            timestamps: None,
+            gpu: gpu.clone(),
+        }));
+        Ok(())
+    }
+
+    /// What steps run on: the GPU's name, or `None` for the processor.
+    #[must_use]
+    pub fn gpu_name(&self) -> Option<&str> {
+        self.device.as_ref().map(|device| device.gpu.facts().name.as_str())
+    }
+
+    /// Times the stages of every step on the device, where it has timestamps; steps then wait for it.
+    pub fn time_gpu_stages(&mut self) {
+        if let Some(device) = &mut self.device {
+            device.waits = true;
+            device.timestamps = Timestamps::new(&device.gpu);
+        }
+    }
+
+    /// Names every setting that is on and not supported.
+    fn refuse_unsupported(&self) -> Result<(), TrainError> {
+        let (effects, adam) = (&self.config.effects, &self.config.adam);
+        let settings: Vec<&str> = [
+            ("adam.fresh_row_bias_correction", adam.fresh_row_bias_correction),
+            ("effects.still_every", effects.still_every > 0),
+            ("effects.sh_gain", effects.sh_gain > 0.0),
+            ("effects.head_gain", effects.head_gain > 0.0),
+            ("--debug-validation", self.debug_validation),
+        ]
+        .into_iter()
+        .filter_map(|(name, is_on)| is_on.then_some(name))
+        .collect();
+        if settings.is_empty() { Ok(()) } else { Err(TrainError::NotOnGpu { settings: settings.join(", ") }) }
+    }
+
+    /// Refuses a scene that may not fit, before any time is spent on it.
+    fn refuse_too_large(&self, gpu: &Gpu) -> Result<(), TrainError> {
+        let limit = gpu.largest_binding();
+        let check = |what: &str, count: u64, item_bytes: u64, advice: &str| {
+            let bytes = u128::from(count) * u128::from(item_bytes);
+            if bytes <= u128::from(limit) {
+                return Ok(());
+            }
+            Err(TrainError::from(GpuError::TooLarge {
+                what: what.to_owned(),
+                count,
+                item_bytes,
+                bytes,
+                limit,
+                advice: advice.to_owned(),
+            }))
+        };
+        let most = self.field.gaussians.len().max(self.config.densify.max_gaussians as usize) as u64;
+        let sh_bytes = (SH_FLOATS * size_of::<f32>()) as u64;
+        check("spherical harmonics", most, sh_bytes, "a lower densify.max_gaussians")?;
+        let pixels =
+            self.dataset.frames.iter().map(|f| u64::from(f.camera.width) * u64::from(f.camera.height));
+        // The similarity keeps five images of 16 bytes per pixel, the backward pass two.
+        let per_pixel = if self.config.loss.lambda_dssim > 0.0 { 80 } else { 32 };
+        check("images of a view", pixels.max().unwrap_or(0), per_pixel, "a larger downscale")?;
+        if self.plan.is_dynamic {
+            let fresh;
+            let deformation = match &self.field.deformation {
+                Some(deformation) => deformation,
+                None => {
+                    fresh = initialize::initial_deformation(&self.dataset, &self.config)?;
+                    &fresh
+                }
+            };
+            let shape = Shape::new(deformation, limit)?;
+            let sums = deformation.planes.len() + shape.line_sources.len();
+            check("gradients of the hexplanes", sums as u64, 8, "a smaller spatial_resolution")?;
+        }
+        Ok(())
+    }
+
+    /// Brings the host's field, moments and statistics up to date, reading every loss that is under way.
+    pub(super) fn fetch_from_device(&mut self) -> Result<(), TrainError> {
+        let Some(mut device) = self.device.take() else { return Ok(()) };
+        let fetched = self.fetch(&mut device);
+        self.device = Some(device);
+        fetched.map_err(|error| self.device_failed(error))
+    }
+
+    fn fetch(&mut self, device: &mut DeviceTraining) -> Result<(), TrainError> {
+        let received = self.receive(device, true);
+        if matches!(received, Err(TrainError::Gpu(_))) {
+            return received;
+        }
+        device.faults.write(&device.gpu, 0, &[0; 4]);
+        if let Some(resident) = &device.resident
+            && device.ahead
+        {
+            resident.fetch(&device.gpu, &mut self.field, &mut self.optimiser, &mut self.statistics)?;
+        }
+        device.ahead = false;
+        device.since_fetch = 0;
+        // Numbers that are not finite moved nothing, so the field is good.
+        received
+    }
+
+    /// Counters that belong to the host's present field and moments.
+    fn counters(&self) -> Fetched {
+        Fetched {
+            progress: self.progress.clone(),
+            sh_degree: self.field.sh_degree,
+            adam_steps: self.optimiser.groups().map(|(_, moments)| moments.steps).into(),
+            statistics: self.statistics.clone(),
+        }
+    }
+
+    /// Says that the host has changed its Gaussians, with their moments and statistics.
+    pub(super) fn gaussians_changed(&mut self) {
+        if let Some(device) = &mut self.device {
+            device.stale.gaussians = true;
+        }
+    }
+
+    /// Says that the host has changed its identities, too.
+    pub(super) fn identities_changed(&mut self) {
+        if let Some(device) = &mut self.device {
+            device.stale = Stale { gaussians: true, identities: true, ..device.stale };
+        }
+    }
+
+    /// Says that the host has changed everything.
+    pub(super) fn everything_changed(&mut self) {
+        if let Some(device) = &mut self.device {
+            device.stale = Stale { gaussians: true, identities: true, deformation: true };
+            // A stage may draw more: labels need room from the instance stage on.
+            device.counted.fill(false);
+        }
+    }
+
+    /// After a fault of the device the host stands where its state was fetched last.
+    fn device_failed(&mut self, error: TrainError) -> TrainError {
+        if !matches!(error, TrainError::Gpu(_)) {
+            return error;
+        }
+        if let Some(fetched) = self.device.take().and_then(|device| device.fetched) {
+            self.progress = fetched.progress;
+            self.field.sh_degree = fetched.sh_degree;
+            self.statistics = fetched.statistics;
+            for ((_, moments), steps) in self.optimiser.groups_mut().into_iter().zip(fetched.adam_steps) {
+                moments.steps = steps;
+            }
+        }
+        error
+    }
+}

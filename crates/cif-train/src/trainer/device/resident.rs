@@ -1,0 +1,230 @@
+//! What lies on the device: the field, its moments and gradients.
+
+use cif_field::{Field, Identities};
+use cif_render::wgpu::deform::DeformationGradients;
+use cif_render::wgpu::gaussians::{gaussians, geometry};
+use cif_render::wgpu::{DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuVec};
+
+use super::super::optimiser::Optimiser;
+use crate::densify::DensifyStatistics;
+use crate::error::TrainError;
+use crate::wgpu::optimiser::GpuMoments;
+
+/// What the host has changed since it was sent.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Stale {
+    pub(super) gaussians: bool,
+    pub(super) identities: bool,
+    pub(super) deformation: bool,
+}
+
+/// The deformation with its moments (planes, network) and gradients.
+pub(super) struct ResidentDeformation {
+    pub(super) parameters: GpuDeformation,
+    pub(super) gradients: DeformationGradients,
+    pub(super) moments: [GpuMoments; 2],
+}
+
+/// Identity rows with their calibrations.
+pub(super) struct ResidentIdentities {
+    pub(super) rows: DeviceIdentities,
+    pub(super) log_estimates: GpuVec<f32>,
+    pub(super) log_calibrations: GpuVec<f32>,
+    pub(super) gradients: GpuVec<f32>,
+    pub(super) moments: GpuMoments,
+}
+
+/// Everything of a run that stays on the device.
+pub(super) struct Resident {
+    pub(super) canonical: GpuGaussians,
+    /// First and second moments, in the layout of the parameters.
+    pub(super) moments: [GpuGaussians; 2],
+    pub(super) gradients: GpuGaussians,
+    /// At the time of a view.
+    pub(super) posed: GpuGaussians,
+    /// Screen gradients of the step, `[N]`: along x and y, radius, whether visible.
+    pub(super) screen: GpuVec<[f32; 4]>,
+    /// Summed norms, steps and largest radius since the last densification, `[N]`.
+    pub(super) statistics: GpuVec<[f32; 4]>,
+    pub(super) deformation: Option<ResidentDeformation>,
+    pub(super) identities: Option<ResidentIdentities>,
+}
+
+/// Moments of the Gaussians in the layout of the device: first or second.
+fn moment_rows(optimiser: &Optimiser, second: bool) -> cif_field::Gaussians {
+    let of = |moments: &crate::adam::Moments| {
+        if second { moments.second.clone() } else { moments.first.clone() }
+    };
+    fn rows<const W: usize>(values: &[f32]) -> Vec<[f32; W]> {
+        values.as_chunks::<W>().0.to_vec()
+    }
+    cif_field::Gaussians {
+        means: rows(&of(&optimiser.means)),
+        log_scales: rows(&of(&optimiser.log_scales)),
+        quaternions: rows(&of(&optimiser.quaternions)),
+        opacity_logits: of(&optimiser.opacity),
+        occupancy_logits: of(&optimiser.occupancy),
+        sh_coefficients: rows(&of(&optimiser.sh)),
+    }
+}
+
+/// The other way.
+fn set_moment_rows(optimiser: &mut Optimiser, second: bool, rows: cif_field::Gaussians) {
+    let set = |moments: &mut crate::adam::Moments, values: Vec<f32>| {
+        *(if second { &mut moments.second } else { &mut moments.first }) = values;
+    };
+    set(&mut optimiser.means, rows.means.into_flattened());
+    set(&mut optimiser.log_scales, rows.log_scales.into_flattened());
+    set(&mut optimiser.quaternions, rows.quaternions.into_flattened());
+    set(&mut optimiser.opacity, rows.opacity_logits);
+    set(&mut optimiser.occupancy, rows.occupancy_logits);
+    set(&mut optimiser.sh, rows.sh_coefficients.into_flattened());
+}
+
+/// Statistics in the layout of the device.
+fn statistic_rows(statistics: &DensifyStatistics) -> Vec<[f32; 4]> {
+    let (gradient, count, radius) = (&statistics.gradient, &statistics.count, &statistics.radius);
+    (0..gradient.len()).map(|row| [gradient[row], count[row] as f32, radius[row], 0.0]).collect()
+}
+
+impl ResidentIdentities {
+    fn send(gpu: &Gpu, rows: &Identities, instances: usize, optimiser: &Optimiser) -> Result<Self, GpuError> {
+        let moments = &optimiser.calibration;
+        Ok(Self {
+            rows: DeviceIdentities::from_identities(gpu, rows, instances)?,
+            log_estimates: GpuVec::from_slice(gpu, "identity estimates", &rows.log_estimates)?,
+            log_calibrations: GpuVec::from_slice(gpu, "calibrations", &rows.log_calibrations)?,
+            gradients: GpuVec::zeros(gpu, "gradients of the calibrations", rows.labels.len())?,
+            moments: GpuMoments::upload(gpu, "moments of the calibrations", &moments.first, &moments.second)?,
+        })
+    }
+}
+
+impl Resident {
+    /// Nothing yet.
+    pub(super) fn new(gpu: &Gpu) -> Result<Self, GpuError> {
+        let none = || GpuGaussians::zeros(gpu, 0);
+        Ok(Self {
+            canonical: none()?,
+            moments: [none()?, none()?],
+            gradients: none()?,
+            posed: none()?,
+            screen: GpuVec::zeros(gpu, "screen gradients", 0)?,
+            statistics: GpuVec::zeros(gpu, "statistics of densification", 0)?,
+            deformation: None,
+            identities: None,
+        })
+    }
+
+    /// Sends what is stale.
+    pub(super) fn send(
+        &mut self,
+        gpu: &Gpu,
+        stale: Stale,
+        field: &Field,
+        optimiser: &Optimiser,
+        statistics: &DensifyStatistics,
+    ) -> Result<(), GpuError> {
+        if stale.gaussians {
+            let n = field.gaussians.len();
+            self.canonical.replace(gpu, &field.gaussians)?;
+            for (second, moments) in [false, true].into_iter().zip(&mut self.moments) {
+                moments.replace(gpu, &moment_rows(optimiser, second))?;
+            }
+            self.gradients = GpuGaussians::zeros(gpu, n)?;
+            self.posed.geometry.resize(gpu, n)?;
+            let moves_sh = field.deformation.as_ref().is_some_and(|d| d.config.heads.sh);
+            self.posed.sh.resize(gpu, if moves_sh { n } else { 0 })?;
+            self.screen = GpuVec::zeros(gpu, "screen gradients", n)?;
+            self.statistics.replace(gpu, &statistic_rows(statistics))?;
+        }
+        if stale.deformation {
+            self.deformation = match &field.deformation {
+                None => None,
+                Some(deformation) => {
+                    let parameters = GpuDeformation::new(gpu, deformation)?;
+                    let (planes, mlp) = (&optimiser.planes, &optimiser.mlp);
+                    Some(ResidentDeformation {
+                        gradients: DeformationGradients::zeros(gpu, &parameters)?,
+                        moments: [
+                            GpuMoments::upload(
+                                gpu,
+                                "moments of the hexplanes",
+                                &planes.first,
+                                &planes.second,
+                            )?,
+                            GpuMoments::upload(gpu, "moments of the network", &mlp.first, &mlp.second)?,
+                        ],
+                        parameters,
+                    })
+                }
+            };
+        }
+        if stale.identities {
+            self.identities = match &field.identities {
+                None => None,
+                Some(rows) => Some(ResidentIdentities::send(gpu, rows, field.instances.len(), optimiser)?),
+            };
+        }
+        Ok(())
+    }
+
+    /// Reads everything that steps change, waiting for the device.
+    pub(super) fn fetch(
+        &self,
+        gpu: &Gpu,
+        field: &mut Field,
+        optimiser: &mut Optimiser,
+        statistics: &mut DensifyStatistics,
+    ) -> Result<(), TrainError> {
+        // Everything is read before anything is changed, so that a device lost on the way leaves the host whole.
+        let parameters = (self.canonical.geometry.read(gpu)?, self.canonical.sh.read(gpu)?);
+        let mut moments = Vec::new();
+        for of in &self.moments {
+            moments.push(gaussians(&of.geometry.read(gpu)?, of.sh.read(gpu)?));
+        }
+        let rows = self.statistics.read(gpu)?;
+        let deformation = match &self.deformation {
+            None => None,
+            Some(resident) => {
+                let [planes, mlp] = &resident.moments;
+                Some((
+                    [
+                        resident.parameters.planes.read(gpu)?,
+                        planes.first.read(gpu)?,
+                        planes.second.read(gpu)?,
+                    ],
+                    [resident.parameters.mlp.read(gpu)?, mlp.first.read(gpu)?, mlp.second.read(gpu)?],
+                ))
+            }
+        };
+        let calibrations = match &self.identities {
+            None => None,
+            Some(resident) => Some([
+                resident.log_calibrations.read(gpu)?,
+                resident.moments.first.read(gpu)?,
+                resident.moments.second.read(gpu)?,
+            ]),
+        };
+        debug_assert_eq!(geometry(&field.gaussians).len(), parameters.0.len(), "the set changes on the host");
+        field.gaussians = gaussians(&parameters.0, parameters.1);
+        for (second, rows) in [false, true].into_iter().zip(moments) {
+            set_moment_rows(optimiser, second, rows);
+        }
+        statistics.gradient = rows.iter().map(|row| row[0]).collect();
+        statistics.count = rows.iter().map(|row| row[1] as u32).collect();
+        statistics.radius = rows.iter().map(|row| row[2]).collect();
+        if let (Some(target), Some(([planes, first, second], [mlp, mlp_first, mlp_second]))) =
+            (&mut field.deformation, deformation)
+        {
+            (target.planes, target.mlp) = (planes, mlp);
+            (optimiser.planes.first, optimiser.planes.second) = (first, second);
+            (optimiser.mlp.first, optimiser.mlp.second) = (mlp_first, mlp_second);
+        }
+        if let (Some(target), Some([values, first, second])) = (&mut field.identities, calibrations) {
+            target.log_calibrations = values;
+            (optimiser.calibration.first, optimiser.calibration.second) = (first, second);
+        }
+        Ok(())
+    }
+}

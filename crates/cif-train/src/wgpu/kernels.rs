@@ -1,0 +1,299 @@
+//! The WGSL files of training: their bindings and entry points, and what they share with Rust.
+
+use cif_field::gaussians::SH_FLOATS;
+use cif_geometry::quaternion::MIN_NORM;
+use cif_render::constants::MIN_LABEL_PROBABILITY;
+use cif_render::wgpu::Access::{Read, ReadWrite, Uniform};
+use cif_render::wgpu::deform::{FIXED_POINT, PLANES_FAULT};
+use cif_render::wgpu::{
+    Constant, Gpu, GpuError, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet, constants, structures,
+};
+
+use crate::adam::{BETA_1, BETA_2, EPSILON};
+use crate::losses::displacement::NO_ROTATION;
+use crate::losses::ssim::{C1, C2};
+
+cif_render::shared_struct! {
+    /// What the losses of a view depend on.
+    pub struct LossSettings {
+        /// Pixels of the view.
+        pub pixels: u32,
+        /// Pixels of a row.
+        pub width: u32,
+        /// Where the results go.
+        pub slot: u32,
+        /// 1 when the view was drawn with labels.
+        pub with_instances: u32,
+        /// 1 under coverage normalisation.
+        pub by_coverage: u32,
+        /// Gradient of an absolute difference.
+        pub absolute_weight: f32,
+        /// Gradient of a pixel's similarity.
+        pub similarity_weight: f32,
+        /// Pads to 16 bytes.
+        pub unused: f32,
+        /// Taps of the window of the similarity, from the centre outwards.
+        pub window: [[f32; 4]; 2],
+    }
+}
+
+cif_render::shared_struct! {
+    /// What the optimiser's step of the Gaussians depends on.
+    pub struct GaussianRates {
+        /// Rates of the geometry with the correction of the first moment; 0 keeps still.
+        pub geometry: [[f32; 4]; 3],
+        /// Correction of the second moment.
+        pub geometry_second: [[f32; 4]; 3],
+        /// Fault bits of the geometry.
+        pub faults: [[u32; 4]; 3],
+        /// Gaussians N.
+        pub gaussians: u32,
+        /// 1 when only visible rows move.
+        pub visible_only: u32,
+        /// 1 when raw quaternions become unit ones.
+        pub renormalise: u32,
+        /// Coefficients that move.
+        pub sh_active: u32,
+        /// Rate of the first three coefficients, corrected.
+        pub sh_base: f32,
+        /// Rate of the others, corrected.
+        pub sh_rest: f32,
+        /// Correction of the second moment of the coefficients.
+        pub sh_second: f32,
+        /// Limits of the occupancy logit.
+        pub lowest_occupancy: f32,
+        /// As above.
+        pub highest_occupancy: f32,
+        /// Pads to 16 bytes.
+        pub unused_0: f32,
+        /// As above.
+        pub unused_1: f32,
+        /// As above.
+        pub unused_2: f32,
+    }
+}
+
+cif_render::shared_struct! {
+    /// What the optimiser's step of a flat group depends on.
+    pub struct GroupRates {
+        /// Floats.
+        pub floats: u32,
+        /// Parts that the gradient comes in.
+        pub parts: u32,
+        /// Bit of the fault word.
+        pub fault: u32,
+        /// Rate with the correction of the first moment; 0 keeps still.
+        pub rate: f32,
+        /// Correction of the second moment.
+        pub second: f32,
+        /// Parameters stay within plus and minus this.
+        pub limit: f32,
+        /// Pads to 16 bytes.
+        pub unused: [f32; 2],
+    }
+}
+
+cif_render::shared_struct! {
+    /// What the optimiser's step of the planes depends on.
+    pub struct PlaneRates {
+        /// Planes.
+        pub planes: u32,
+        /// Columns of all planes.
+        pub columns: u32,
+        /// Rate with the correction of the first moment; 0 keeps still.
+        pub rate: f32,
+        /// Correction of the second moment.
+        pub second: f32,
+    }
+}
+
+cif_render::shared_struct! {
+    /// How much is added.
+    pub struct Accumulation {
+        /// Floats, or rows.
+        pub count: u32,
+        /// Pads to 16 bytes.
+        pub unused_0: u32,
+        /// As above.
+        pub unused_1: u32,
+        /// As above.
+        pub unused_2: u32,
+    }
+}
+
+cif_render::shared_struct! {
+    /// How Gaussians are held to known motion.
+    pub struct Motion {
+        /// Weight and reach (metres) of the pull to a path.
+        pub path: [f32; 2],
+        /// Of the pull to the own place.
+        pub place: [f32; 2],
+        /// Factor of all gradients.
+        pub scale: f32,
+        /// Gaussians N.
+        pub gaussians: u32,
+        /// Pads to 16 bytes.
+        pub unused: [f32; 2],
+    }
+}
+
+/// Bits of the fault word; that of the planes is [`PLANES_FAULT`].
+pub mod fault {
+    /// Gradient of centres.
+    pub const MEANS: u32 = 2;
+    /// Gradient of log-scales.
+    pub const LOG_SCALES: u32 = 4;
+    /// Gradient of quaternions.
+    pub const QUATERNIONS: u32 = 8;
+    /// Gradient of opacity logits.
+    pub const OPACITY: u32 = 16;
+    /// Gradient of occupancy logits.
+    pub const OCCUPANCY: u32 = 32;
+    /// Gradient of spherical harmonics.
+    pub const SH: u32 = 64;
+    /// Gradient of calibrations.
+    pub const CALIBRATIONS: u32 = 128;
+    /// Gradient of the network.
+    pub const MLP: u32 = 256;
+}
+
+/// What the lowest bit of a fault word stands for; the same words as on the CPU.
+#[must_use]
+pub fn fault_name(faults: u32) -> &'static str {
+    match 1 << faults.trailing_zeros().min(31) {
+        PLANES_FAULT => "the gradient of planes",
+        fault::MEANS => "the gradient of means",
+        fault::LOG_SCALES => "the gradient of log_scales",
+        fault::QUATERNIONS => "the gradient of quaternions",
+        fault::OPACITY => "the gradient of opacity_logits",
+        fault::OCCUPANCY => "the gradient of occupancy_logits",
+        fault::SH => "the gradient of sh_coefficients",
+        fault::CALIBRATIONS => "the gradient of log_calibrations",
+        fault::MLP => "the gradient of mlp",
+        _ => "a gradient",
+    }
+}
+
+const CONSTANTS: Snippet = Snippet {
+    name: "constants",
+    text: || {
+        constants(&[
+            ("BETA_1", Constant::Float(BETA_1)),
+            ("BETA_2", Constant::Float(BETA_2)),
+            ("EPSILON", Constant::Float(EPSILON)),
+            ("SMALLEST_SECOND", Constant::Float(f32::MIN_POSITIVE)),
+            ("MIN_NORM", Constant::Float(MIN_NORM as f32)),
+            ("MIN_LABEL_PROBABILITY", Constant::Float(MIN_LABEL_PROBABILITY)),
+            ("SSIM_C1", Constant::Float(C1)),
+            ("SSIM_C2", Constant::Float(C2)),
+            ("NO_ROTATION", Constant::Float(NO_ROTATION as f32)),
+            ("SH_FLOATS", Constant::Unsigned(SH_FLOATS as u32)),
+            ("SH_FAULT", Constant::Unsigned(fault::SH)),
+            ("PLANES_FAULT", Constant::Unsigned(PLANES_FAULT)),
+            ("MAX_WORKGROUPS", Constant::Unsigned(MAX_WORKGROUPS)),
+        ])
+    },
+};
+
+const LOSS_SETTINGS: Snippet =
+    Snippet { name: "loss_settings", text: || structures(&[LossSettings::layout()]) };
+const GAUSSIAN_RATES: Snippet =
+    Snippet { name: "gaussian_rates", text: || structures(&[GaussianRates::layout()]) };
+const GROUP_RATES: Snippet = Snippet { name: "group_rates", text: || structures(&[GroupRates::layout()]) };
+const PLANE_RATES: Snippet = Snippet { name: "plane_rates", text: || structures(&[PlaneRates::layout()]) };
+const ACCUMULATION: Snippet =
+    Snippet { name: "accumulation", text: || structures(&[Accumulation::layout()]) };
+const MOTION: Snippet = Snippet { name: "motion", text: || structures(&[Motion::layout()]) };
+const ADAM: Snippet = Snippet { name: "adam", text: || include_str!("adam.wgsl").to_owned() };
+
+/// Colour loss, and the value of the instance loss.
+pub const LOSSES: Module = Module {
+    name: "losses",
+    text: include_str!("losses.wgsl"),
+    imports: &[CONSTANTS, LOSS_SETTINGS],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
+    entries: &["losses", "total", "leave_out"],
+};
+
+/// Structural similarity.
+pub const SSIM: Module = Module {
+    name: "ssim",
+    text: include_str!("ssim.wgsl"),
+    imports: &[CONSTANTS, LOSS_SETTINGS],
+    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["blur_rows", "compare", "blur_maps", "add_gradient"],
+};
+
+/// Optimiser of what Gaussians have.
+pub const ADAM_GAUSSIANS: Module = Module {
+    name: "adam_gaussians",
+    text: include_str!("adam_gaussians.wgsl"),
+    imports: &[CONSTANTS, GAUSSIAN_RATES, ADAM],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, ReadWrite],
+    entries: &["adam_geometry", "adam_sh"],
+};
+
+/// Optimiser of the network and of calibrations.
+pub const ADAM_NETWORK: Module = Module {
+    name: "adam_network",
+    text: include_str!("adam_network.wgsl"),
+    imports: &[CONSTANTS, GROUP_RATES, ADAM],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["adam_network"],
+};
+
+/// Optimiser of the planes, with their regularisers.
+pub const ADAM_PLANES: Module = Module {
+    name: "adam_planes",
+    text: include_str!("adam_planes.wgsl"),
+    imports: &[CONSTANTS, PLANE_RATES, FIXED_POINT, ADAM],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read],
+    entries: &["adam_planes"],
+};
+
+/// Sums over the views of a step, and statistics.
+pub const ACCUMULATE: Module = Module {
+    name: "accumulate",
+    text: include_str!("accumulate.wgsl"),
+    imports: &[CONSTANTS, ACCUMULATION],
+    bindings: &[Uniform, Read, ReadWrite],
+    entries: &["add", "add_screen", "add_statistics"],
+};
+
+/// Probabilities of identities.
+pub const IDENTITY: Module = Module {
+    name: "identity",
+    text: include_str!("identity.wgsl"),
+    imports: &[CONSTANTS, ACCUMULATION],
+    bindings: &[Uniform, Read, Read, Read, ReadWrite],
+    entries: &["identity"],
+};
+
+/// Known motion.
+pub const DISPLACEMENT: Module = Module {
+    name: "displacement",
+    text: include_str!("displacement.wgsl"),
+    imports: &[CONSTANTS, MOTION],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["follow", "displace"],
+};
+
+/// Every WGSL file of this crate.
+pub const MODULES: &[&Module] =
+    &[&LOSSES, &SSIM, &ADAM_GAUSSIANS, &ADAM_NETWORK, &ADAM_PLANES, &ACCUMULATE, &IDENTITY, &DISPLACEMENT];
+
+/// Every structure that Rust and WGSL share.
+pub const LAYOUTS: &[fn() -> Layout] = &[
+    LossSettings::layout,
+    GaussianRates::layout,
+    GroupRates::layout,
+    PlaneRates::layout,
+    Accumulation::layout,
+    Motion::layout,
+];
+
+/// The kernels of a module, as many as it has entry points.
+pub(crate) fn entries<const N: usize>(gpu: &Gpu, module: &Module) -> Result<[Kernel; N], GpuError> {
+    let kernels = Kernel::compile(gpu, module)?;
+    Ok(<[Kernel; N]>::try_from(kernels).expect("as many kernels as entry points, and the module lists those"))
+}

@@ -1,0 +1,95 @@
+// Colour loss of a view and its gradient, and the value of the instance loss from the pass that drew it. Sums per
+// workgroup are added in a fixed order by `total`. Rust twins: losses/mod.rs `color_loss`, cpu/renderer/mod.rs
+// `instance_loss`. Source: methods reference 1.4 and 4.3.
+
+#import constants
+#import loss_settings
+
+@group(0) @binding(0) var<uniform> settings: LossSettings;
+// Colour and transmittance.
+@group(0) @binding(1) var<storage, read> colors: array<vec4f>;
+// Depth, probability of the label, instance transmittance.
+@group(0) @binding(2) var<storage, read> blended: array<vec4f>;
+// Red, green and blue bytes from the lowest.
+@group(0) @binding(3) var<storage, read> targets: array<u32>;
+// Dense instance index + 1, or 0.
+@group(0) @binding(4) var<storage, read> labels: array<u32>;
+@group(0) @binding(5) var<storage, read_write> v_colors: array<vec4f>;
+// Absolute and squared differences, instance loss, unsupported pixels; two per workgroup: the second has the structural
+// similarity.
+@group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
+// As a workgroup's sums, for the view.
+@group(0) @binding(7) var<storage, read_write> results: array<vec4f>;
+// Per label, whether its pixels train nothing.
+@group(0) @binding(8) var<storage, read> left_out: array<u32>;
+
+var<workgroup> shared_sums: array<vec4f, 256>;
+
+// Sum over the workgroup, in the first element.
+fn reduce(local: u32, value: vec4f) {
+    shared_sums[local] = value;
+    workgroupBarrier();
+    for (var half = 128u; half > 0u; half /= 2u) {
+        if local < half {
+            shared_sums[local] += shared_sums[local + half];
+        }
+        workgroupBarrier();
+    }
+}
+
+@compute @workgroup_size(256)
+fn losses(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
+    let workgroup = group.y * MAX_WORKGROUPS + group.x;
+    let pixel = workgroup * 256u + local;
+    var sums = vec4f(0.0);
+    if pixel < settings.pixels {
+        let difference = colors[pixel].xyz - unpack4x8unorm(targets[pixel]).xyz;
+        v_colors[pixel] = vec4f(settings.absolute_weight * sign(difference), 0.0);
+        let absolute = abs(difference);
+        sums = vec4f(absolute.x + absolute.y + absolute.z, dot(difference, difference), 0.0, 0.0);
+        if settings.with_instances != 0u {
+            if labels[pixel] != 0u {
+                let probability = blended[pixel].y;
+                sums.z = -log(max(probability, MIN_LABEL_PROBABILITY));
+                if probability < MIN_LABEL_PROBABILITY {
+                    sums.w = 1.0;
+                } else if settings.by_coverage != 0u {
+                    sums.z += log(1.0 - blended[pixel].z);
+                }
+            }
+        }
+    }
+    reduce(local, sums);
+    if local == 0u {
+        partial_sums[2u * workgroup] = shared_sums[0];
+        partial_sums[2u * workgroup + 1u] = vec4f(0.0);
+    }
+}
+
+// Adds the workgroups' sums; one workgroup.
+@compute @workgroup_size(256)
+fn total(@builtin(local_invocation_index) local: u32) {
+    let workgroups = (settings.pixels + 255u) / 256u;
+    for (var part = 0u; part < 2u; part++) {
+        var sums = vec4f(0.0);
+        for (var k = local; k < workgroups; k += 256u) {
+            sums += partial_sums[2u * k + part];
+        }
+        reduce(local, sums);
+        if local == 0u {
+            results[2u * settings.slot + part] = shared_sums[0];
+        }
+        workgroupBarrier();
+    }
+}
+
+// Takes the gradient from pixels of labels that are left out.
+@compute @workgroup_size(256)
+fn leave_out(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
+    let pixel = (group.y * MAX_WORKGROUPS + group.x) * 256u + local;
+    if pixel < settings.pixels {
+        if left_out[labels[pixel]] != 0u {
+            v_colors[pixel] = vec4f(0.0);
+        }
+    }
+}

@@ -1,0 +1,245 @@
+//! Runs on a GPU beside the same runs on the processor. `CIF_TEST_GPU=off|auto|require` says whether they run.
+#![cfg(feature = "wgpu")]
+#![allow(clippy::unwrap_used)] // Helpers of tests.
+
+mod support;
+
+use cif_dataset::Dataset;
+use cif_field::{Checkpoint, Field};
+use cif_render::wgpu::{Gpu, testing};
+use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
+use cif_train::{Control, Outcome, TrainConfig, TrainError, TrainEvent, Trainer};
+use support::{Scene, capture, small_config};
+
+/// A run, on the GPU where one is given; stops after so many steps of all stages.
+fn run(dataset: &Dataset, config: &TrainConfig, gpu: Option<&Gpu>, stop_at: u64) -> Trainer {
+    let mut config = config.clone();
+    config.report.step_every = 1;
+    let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
+    if let Some(gpu) = gpu {
+        trainer.use_gpu(gpu).unwrap();
+        assert_eq!(trainer.gpu_name(), Some(gpu.facts().name.as_str()));
+    }
+    go_on(&mut trainer, stop_at);
+    trainer
+}
+
+fn go_on(trainer: &mut Trainer, stop_at: u64) -> Outcome {
+    let mut left = stop_at;
+    trainer
+        .run(&mut |event, _| {
+            if let TrainEvent::Step { loss, .. } = event {
+                assert!(loss.is_finite());
+                left = left.saturating_sub(1);
+            }
+            if left == 0 { Control::Stop } else { Control::Continue }
+        })
+        .unwrap()
+}
+
+/// Root mean square of the differences of two fields' parameters, relative to how far a run has moved them.
+fn differences(a: &Field, b: &Field, start: &Field) -> Vec<(&'static str, f64)> {
+    fn rms<'a>(a: impl Iterator<Item = &'a f32>, b: impl Iterator<Item = &'a f32>) -> f64 {
+        let (sum, count) =
+            a.zip(b).fold((0.0, 0.0_f64), |(s, n), (a, b)| (s + f64::from(a - b).powi(2), n + 1.0));
+        (sum / count.max(1.0)).sqrt()
+    }
+    let parts: [(&str, fn(&Field) -> Vec<f32>); 6] = [
+        ("means", |f| f.gaussians.means.as_flattened().to_vec()),
+        ("log_scales", |f| f.gaussians.log_scales.as_flattened().to_vec()),
+        ("quaternions", |f| f.gaussians.quaternions.as_flattened().to_vec()),
+        ("opacity", |f| f.gaussians.opacity_logits.clone()),
+        ("sh", |f| f.gaussians.sh_coefficients.as_flattened().to_vec()),
+        ("planes", |f| f.deformation.as_ref().map_or_else(Vec::new, |d| d.planes.clone())),
+    ];
+    parts
+        .into_iter()
+        .map(|(name, part)| {
+            let (a, b, start) = (part(a), part(b), part(start));
+            if start.is_empty() {
+                // A deformation that has just begun.
+                return (name, 0.0);
+            }
+            let moved = rms(a.iter(), start.iter()).max(1e-12);
+            (name, rms(a.iter(), b.iter()) / moved)
+        })
+        .collect()
+}
+
+#[test]
+fn steps_move_parameters_as_on_the_processor() {
+    let Some(gpu) = testing::gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (6, 8, 0);
+    config.stages.batch = 2;
+    config.loss.lambda_dssim = 0.2;
+    // Paths are rehearsed before the first fine step, and end elsewhere for the least difference.
+    config.motion.guidance = 0.0;
+    let start = run(&dataset, &config, None, 6).field().clone();
+    for stop_at in [6, 14] {
+        let cpu = run(&dataset, &config, None, stop_at);
+        let on_gpu = run(&dataset, &config, Some(&gpu), stop_at);
+        assert_eq!(on_gpu.steps_done(), cpu.steps_done());
+        let before = if stop_at == 6 {
+            Trainer::new(dataset.clone(), config.clone()).unwrap().into_field()
+        } else {
+            start.clone()
+        };
+        for (name, difference) in differences(on_gpu.field(), cpu.field(), &before) {
+            eprintln!("{name} after {stop_at} steps: {difference:.1e} of the way");
+            // Adam's first steps turn the rounding of vanishing gradients into whole steps, so a few floats differ;
+            // of round Gaussians, which all are at first, every gradient of a rotation vanishes.
+            assert!(difference < 0.1 || name == "quaternions", "{name} after {stop_at} steps: {difference}");
+        }
+    }
+}
+
+#[test]
+fn a_run_is_as_good_as_on_the_processor() {
+    let Some(gpu) = testing::gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 240, 80);
+    let scores = |gpu: Option<&Gpu>, seed: u64| {
+        let config = TrainConfig { seed, ..config.clone() };
+        let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
+        if let Some(gpu) = gpu {
+            trainer.use_gpu(gpu).unwrap();
+        }
+        let mut names = std::collections::BTreeSet::new();
+        let outcome = trainer.run(&mut |event, _| {
+            names.insert(serde_json::to_value(event).unwrap()["event"].as_str().unwrap().to_owned());
+            Control::Continue
+        });
+        assert_eq!(outcome.unwrap(), Outcome::Finished);
+        for name in ["step", "densified", "resampled", "identity_estimated", "finished"] {
+            assert!(names.contains(name), "{name} missing in {names:?}");
+        }
+        let field = trainer.into_field();
+        field.validate().unwrap();
+        let options = EvaluationOptions::held_out(&field);
+        let overall = evaluate::<EvaluationError>(&field, &dataset, &options, |_| Ok(())).unwrap().overall;
+        (overall.psnr.unwrap(), overall.instance.miou.unwrap())
+    };
+    // One run of so small a capture varies by a point of mIoU from seed to seed; means of three vary less.
+    let mean = |gpu: Option<&Gpu>| {
+        let all: Vec<(f64, f64)> = [3, 4, 5].map(|seed| scores(gpu, seed)).into();
+        (all.iter().map(|s| s.0).sum::<f64>() / 3.0, all.iter().map(|s| s.1).sum::<f64>() / 3.0)
+    };
+    let (cpu, on_gpu) = (mean(None), mean(Some(&gpu)));
+    eprintln!("PSNR {:.2} and {:.2} dB, mIoU {:.1} and {:.1} %", cpu.0, on_gpu.0, cpu.1, on_gpu.1);
+    assert!(on_gpu.0 > cpu.0 - 0.2, "PSNR {} and {} dB", cpu.0, on_gpu.0);
+    assert!(on_gpu.1 > cpu.1 - 1.0, "mIoU {} and {} %", cpu.1, on_gpu.1);
+}
+
+#[test]
+fn a_run_goes_on_on_either_backend() {
+    let Some(gpu) = testing::gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 40, 30);
+    (config.densify.from, config.densify.every) = (5, 10);
+    for (first, second) in [(Some(&gpu), None), (None, Some(&gpu)), (Some(&gpu), Some(&gpu))] {
+        for stop_at in [13_u64, 35, 75] {
+            let trainer = run(&dataset, &config, first, stop_at);
+            assert_eq!(trainer.steps_done(), stop_at);
+            let path = folder.path().join("stopped.cif");
+            trainer.checkpoint(true).save(&path).unwrap();
+            let mut resumed = Trainer::resume(dataset.clone(), Checkpoint::load(&path).unwrap()).unwrap();
+            if let Some(gpu) = second {
+                resumed.use_gpu(gpu).unwrap();
+            }
+            assert_eq!(go_on(&mut resumed, u64::MAX), Outcome::Finished);
+            assert_eq!(resumed.steps_done(), 90);
+            resumed.field().validate().unwrap();
+        }
+    }
+}
+
+#[test]
+fn interrupted_runs_on_a_gpu_end_where_uninterrupted_ones_end() {
+    let Some(gpu) = testing::gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (15, 25, 15);
+    (config.densify.from, config.densify.every) = (5, 10);
+    let whole = run(&dataset, &config, Some(&gpu), u64::MAX);
+    let same = |other: &Trainer, what: &str| {
+        for (name, difference) in differences(whole.field(), other.field(), whole.field()) {
+            assert!(difference == 0.0, "{what}: {name} differ");
+        }
+        let plain =
+            |trainer: &Trainer| Field { provenance: serde_json::Value::Null, ..trainer.field().clone() };
+        assert!(plain(&whole) == plain(other), "{what}: the fields differ");
+    };
+    same(&run(&dataset, &config, Some(&gpu), u64::MAX), "the same run again");
+    let path = folder.path().join("stopped.cif");
+    for stop_at in [7, 23, 44] {
+        run(&dataset, &config, Some(&gpu), stop_at).checkpoint(true).save(&path).unwrap();
+        let mut resumed = Trainer::resume(dataset.clone(), Checkpoint::load(&path).unwrap()).unwrap();
+        resumed.use_gpu(&gpu).unwrap();
+        go_on(&mut resumed, u64::MAX);
+        same(&resumed, &format!("stopped after {stop_at}"));
+    }
+}
+
+#[test]
+fn a_lost_device_leaves_what_was_fetched_last() {
+    let Some(_) = testing::gpu() else { return };
+    // A device of its own, for it ends here.
+    let gpu = Gpu::open().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (15, 40, 0);
+    (config.densify.from, config.densify.every, config.densify.prune_every) = (5, 10, 0);
+    config.report.step_every = 1;
+    let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
+    trainer.use_gpu(&gpu).unwrap();
+    let mut steps = 0;
+    let error = trainer
+        .run(&mut |event, _| {
+            steps += u64::from(matches!(event, TrainEvent::Step { .. }));
+            if steps == 15 + 27 {
+                gpu.device().destroy();
+            }
+            Control::Continue
+        })
+        .unwrap_err();
+    assert!(matches!(error, TrainError::Gpu(_)), "{error}");
+    assert!(trainer.gpu_name().is_none());
+    // The last densification was after 20 fine steps; what came after it is gone.
+    assert_eq!(trainer.steps_done(), 15 + 20, "{error}");
+    trainer.field().validate().unwrap();
+    let path = folder.path().join("saved.cif");
+    trainer.checkpoint(true).save(&path).unwrap();
+    let mut resumed = Trainer::resume(dataset, Checkpoint::load(&path).unwrap()).unwrap();
+    assert_eq!(go_on(&mut resumed, u64::MAX), Outcome::Finished);
+    assert_eq!(resumed.steps_done(), 55);
+}
+
+#[test]
+fn what_is_not_supported_or_does_not_fit_is_refused_by_name() {
+    let Some(gpu) = testing::gpu() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let refusal = |edit: fn(&mut TrainConfig)| {
+        let mut config = small_config();
+        edit(&mut config);
+        Trainer::new(dataset.clone(), config).unwrap().use_gpu(&gpu).unwrap_err().to_string()
+    };
+    let text = refusal(|config| {
+        config.adam.fresh_row_bias_correction = true;
+        config.effects.still_every = 100;
+    });
+    assert!(text.contains("adam.fresh_row_bias_correction, effects.still_every"), "{text}");
+    let text = refusal(|config| config.densify.max_gaussians = u32::MAX);
+    assert!(text.contains("4294967295 x 192 bytes = 824633720640 bytes"), "{text}");
+    let text = refusal(|config| config.model.width = 512);
+    assert!(text.contains("width 512"), "{text}");
+}
