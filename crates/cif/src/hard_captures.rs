@@ -58,7 +58,8 @@ pub const HARD_CAPTURES: [HardCapture; 22] = [
     same("scaled-down", "lengths times 1e-3", true, |d, _| move_world(d, 1e-3, DMat3::IDENTITY, 0.0)),
     same("scaled-up", "lengths times 1e3", false, |d, _| move_world(d, 1e3, DMat3::IDENTITY, 0.0)),
     same("moved", "moved by 1e4 scene sizes", true, |d, _| move_world(d, 1.0, DMat3::IDENTITY, 1e4)),
-    same("axes-swapped", "x, y, z become y, z, x", false, |d, _| {
+    // The planes of the deformation and their smoothness know the axes, so that this is told and not held to 0.
+    finite("axes-swapped", "x, y, z become y, z, x", false, |d, _| {
         move_world(d, 1.0, DMat3::from_cols(DVec3::Y, DVec3::Z, DVec3::X), 0.0)
     }),
     finite("times-reversed", "time runs backwards", false, |d, _| retime(d, |t| 1.0 - t)),
@@ -84,12 +85,14 @@ pub const HARD_CAPTURES: [HardCapture; 22] = [
         edit_masks(d, f, |_, mask, _| mask.pixels.fill(0))
     }),
     finite("swapped-ids", "ids of two instances swapped in a tenth of the masks", false, |d, f| {
-        edit_masks(d, f, swap_ids)
+        edit_masks(d, f, |position, mask, labels| swap_ids(position, mask, labels))
     }),
     finite("shifted-masks", "masks two pixels off", false, |d, f| {
         edit_masks(d, f, |_, mask, _| shift(mask, 2))
     }),
-    finite("lost-masks", "an instance lost in a third of the masks", false, |d, f| edit_masks(d, f, lose)),
+    finite("lost-masks", "an instance lost in a third of the masks", false, |d, f| {
+        edit_masks(d, f, |position, mask, labels| lose(position, mask, labels))
+    }),
 ];
 
 const fn same(
@@ -280,8 +283,8 @@ fn one_pixel(_: usize, mask: &mut PixelGrid<u16>, labels: &mut Vec<InstanceLabel
     mask.pixels[middle] = id;
 }
 
-fn swap_ids(position: usize, mask: &mut PixelGrid<u16>, labels: &mut Vec<InstanceLabel>) {
-    if let ([a, b, ..], 0) = (&labels[..], position % 10) {
+fn swap_ids(position: usize, mask: &mut PixelGrid<u16>, labels: &[InstanceLabel]) {
+    if let ([a, b, ..], 0) = (labels, position % 10) {
         let (a, b) = (a.id, b.id);
         for pixel in &mut mask.pixels {
             *pixel = match *pixel {
@@ -293,8 +296,8 @@ fn swap_ids(position: usize, mask: &mut PixelGrid<u16>, labels: &mut Vec<Instanc
     }
 }
 
-fn lose(position: usize, mask: &mut PixelGrid<u16>, labels: &mut Vec<InstanceLabel>) {
-    if position % 3 == 0
+fn lose(position: usize, mask: &mut PixelGrid<u16>, labels: &[InstanceLabel]) {
+    if position.is_multiple_of(3)
         && let Some(label) = labels.get(position / 3 % labels.len().max(1))
     {
         replace(mask, label.id, 0);

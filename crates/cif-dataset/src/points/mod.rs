@@ -68,7 +68,40 @@ impl RawPoints {
     }
 }
 
+/// Side of a cloud's box, in sides of the box of its middle half, from which the points far outside are outliers.
+/// A uniform cube has 2, a normal distribution of a million points about 7.
+const MOST_SPREAD: f64 = 30.0;
+
+/// Half side of the box that is kept then, in sides of the box of the middle half.
+const KEPT_SPREAD: f64 = 10.0;
+
 impl PointCloud {
+    /// Box of the cloud. Where some points lie far outside what holds the middle half of them (wrong matches, a sky
+    /// dome), the box of the others: what is measured in sizes of the box, such as voxels and planes, would hold
+    /// everything else in one cell.
+    #[must_use]
+    pub fn core_bounds(&self) -> Bounds {
+        let place = |p: &[f32; 3]| DVec3::from_array(p.map(f64::from));
+        let whole = Bounds::around(self.positions.iter().map(place));
+        let n = self.positions.len();
+        if n < 8 {
+            return whole;
+        }
+        let quartiles = [0, 1, 2].map(|axis| {
+            let mut along: Vec<f32> = self.positions.iter().map(|p| p[axis]).collect();
+            along.sort_unstable_by(f32::total_cmp);
+            [along[n / 4], along[3 * n / 4]].map(f64::from)
+        });
+        let side = quartiles.iter().map(|[low, high]| high - low).fold(0.0, f64::max);
+        // A cloud of one place has no scale of its own.
+        if side <= 0.0 || side.is_nan() || whole.size().max_element() <= MOST_SPREAD * side {
+            return whole;
+        }
+        let middle = DVec3::from_array(quartiles.map(|[low, high]| f64::midpoint(low, high)));
+        let is_near = |p: &DVec3| (*p - middle).abs().max_element() <= KEPT_SPREAD * side;
+        Bounds::around(self.positions.iter().map(place).filter(is_near))
+    }
+
     /// The cloud with at most `limit` points, at least one: where there are more, the points inside one voxel
     /// become their mean, in the order of their first points. Voxels start small for the cloud's box and grow by a
     /// fifth until few enough are occupied, so that the unit of length does not matter.
@@ -78,7 +111,7 @@ impl PointCloud {
         if self.positions.len() <= limit {
             return self.clone();
         }
-        let bounds = Bounds::around(self.positions.iter().map(|p| DVec3::from_array(p.map(f64::from))));
+        let bounds = self.core_bounds();
         // Of N points on a surface, a voxel of 1 / sqrt(N) of the box holds about one; start well below.
         let mut voxel =
             (bounds.size().max_element() / (limit as f64).sqrt() / VOXELS_PER_POINT).max(SMALLEST_VOXEL);
@@ -167,6 +200,24 @@ mod tests {
             }
             assert!((position[2] - 1.0).abs() < 1e-6 && color[2] == 128);
         }
+    }
+
+    #[test]
+    fn outliers_neither_stretch_the_box_nor_swallow_the_scene() {
+        let grid = |outliers: usize| {
+            let mut positions: Vec<[f32; 3]> =
+                (0..10_000).map(|k| [(k % 100) as f32 * 0.01, (k / 100) as f32 * 0.01, 0.3]).collect();
+            positions.extend((0..outliers).map(|k| [(k as f32 - 1000.0) * 3.0, 900.0, -(k as f32)]));
+            PointCloud { colors: vec![[9; 3]; positions.len()], positions, source: PointSource::Random }
+        };
+        let bounds = grid(2000).core_bounds();
+        assert_eq!(bounds, grid(0).core_bounds());
+        assert!((bounds.size() - DVec3::new(0.99, 0.99, 0.0)).length() < 1e-6, "{bounds:?}");
+        // A fifth of the points lies far away; what is left of them still leaves room for the scene.
+        let thinned = grid(2000).thinned(4000);
+        let inside = thinned.positions.iter().filter(|p| p[1] < 1.0).count();
+        assert!(inside > 1000, "{inside} of {} points are the scene's", thinned.positions.len());
+        assert!(thinned.positions.len() <= 4000);
     }
 
     #[test]

@@ -116,7 +116,7 @@ pub(super) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option
         ("mlp", &gradients.mlp, rates.mlp),
     ];
     groups.into_iter().filter(|(_, _, rate)| *rate != 0.0).find_map(|(tensor, values, rate)| {
-        if !(rate.abs() <= MAX_RATE) {
+        if rate.is_nan() || rate.abs() > MAX_RATE {
             return Some(Fault {
                 part: "optimiser",
                 tensor: rate_name(tensor),

@@ -2,9 +2,7 @@
 
 use cif_dataset::{Dataset, Split};
 use cif_field::{Deformation, DeformationConfig, Field, Gaussians, Instance, RecordedCamera, Timeline};
-use cif_geometry::Bounds;
 use cif_geometry::scalar::logit;
-use glam::DVec3;
 
 use crate::config::TrainConfig;
 use crate::error::TrainError;
@@ -79,8 +77,8 @@ pub(super) fn initial_deformation(
         heads: model.heads,
         time_encoding: model.time_encoding,
     };
-    let (positions, _) = initial_points(dataset, config);
-    let bounds = Bounds::around(positions.iter().map(|p| DVec3::from_array(p.map(f64::from))));
+    // Outliers are moved as the nearest face of the box is; a box around them would leave the planes no resolution.
+    let bounds = dataset.points.thinned(config.model.max_initial_points as usize).core_bounds();
     let seed = derive(config.seed, Purpose::Deformation, 0);
     Ok(Deformation::new(shape, bounds, dataset.extent(), seed, model.zero_initial_heads)?)
 }

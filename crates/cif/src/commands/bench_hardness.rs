@@ -17,18 +17,18 @@ use crate::hard_captures::{Demand, HARD_CAPTURES, HardCapture, Unfit};
 use crate::settings::Layers;
 use crate::{interrupt, output};
 
-/// What scale, place and axes may cost, dB.
+/// What scale and place may cost, dB.
 const MAX_PSNR_LOSS: f64 = 0.3;
 
-/// What scale, place and axes may cost, percent of mIoU.
+/// What scale and place may cost, percent of mIoU.
 const MAX_MIOU_LOSS: f64 = 1.0;
 
 /// Train hard variants of a capture and compare them with the capture itself
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Every variant is trained with the same settings and seed, and scored on the same held-out frames.
-Scaling, moving and turning the capture must not change PSNR by 0.3 dB or mIoU by 1 point; every
-variant must end with a finite scene. Exit code 1 when one does not.
+Scaling and moving the capture must not change PSNR by 0.3 dB or mIoU by 1 point; every variant must
+end with a finite scene. Exit code 1 when one does not.
 
   cif bench hardness captures/table -o hardness
   cif bench hardness captures/table -o hardness --quick --only moved,wrong-camera

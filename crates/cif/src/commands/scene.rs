@@ -69,6 +69,21 @@ pub(super) fn render_settings(field: &Field) -> RenderSettings {
     cif_train::metrics::trained_settings(field)
 }
 
+/// Says where a scene lies in the coordinates of its capture, where those are not its own.
+pub(super) fn note_frame(field: &Field) {
+    let recorded = field.provenance.get("dataset").and_then(|dataset| dataset.get("frame"));
+    let frame =
+        recorded.and_then(|frame| serde_json::from_value::<cif_dataset::CaptureFrame>(frame.clone()).ok());
+    if let Some(frame) = frame {
+        let [x, y, z] = frame.offset;
+        eprintln!(
+            "note: the capture was read in a frame of its own, which the files have: a place in the capture is that in \
+             the files / {} + ({x}, {y}, {z})",
+            frame.scale
+        );
+    }
+}
+
 /// Image reduction that a scene was trained with.
 pub(super) fn trained_downscale(field: &Field) -> Option<u32> {
     cif_train::metrics::training_config(field)?.downscale
