@@ -2,6 +2,8 @@
 
 use cif_scene::Tolerance;
 
+use crate::quality::DRAFT;
+
 /// What a rung does.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Work {
@@ -109,6 +111,8 @@ pub struct Base {
     pub until: [u32; 2],
     /// Most Gaussians.
     pub gaussians: u32,
+    /// Most initial points.
+    pub points: u32,
     /// Nodes of the planes along x.
     pub nodes: u32,
     /// Network width.
@@ -190,12 +194,15 @@ fn ladder(name: &'static str, base: &Base) -> Ladder {
         ),
         "gaussians" => (
             "Gaussians",
-            "The most Gaussians that densification may add up to.",
+            "The most Gaussians that densification may add up to, and no more points to begin with.",
             factors(&[0.25, 0.5, 1.0, 2.0], &[0.5, 1.0, 2.0])
                 .into_iter()
                 .map(|factor| {
                     let most = scaled(base.gaussians, factor);
-                    let settings = [format!("densify.max_gaussians={most}")];
+                    let settings = [
+                        format!("densify.max_gaussians={most}"),
+                        format!("model.max_initial_points={}", base.points.min(most)),
+                    ];
                     let settings = if factor == 1.0 { &[][..] } else { &settings };
                     train(&format!("gaussians-{factor}"), most.to_string(), settings)
                 })
@@ -324,19 +331,19 @@ fn ladder(name: &'static str, base: &Base) -> Ladder {
              colour to the final quality; seconds are those of a frame.",
             vec![
                 rung(
-                    "render-draft",
-                    "half size, degree 1, opacity from 0.05",
-                    Work::Render { reduction: 2, sh_degree: Some(1), min_opacity: 0.05 },
-                ),
-                rung(
                     "render-half",
                     "half size",
                     Work::Render { reduction: 2, sh_degree: None, min_opacity: 0.0 },
                 ),
                 rung(
+                    "render-draft",
+                    "draft: opacity from 0.3",
+                    Work::Render { reduction: 1, sh_degree: None, min_opacity: DRAFT.min_opacity },
+                ),
+                rung(
                     "render-opaque",
-                    "opacity from 0.05",
-                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.05 },
+                    "opacity from 0.1",
+                    Work::Render { reduction: 1, sh_degree: None, min_opacity: 0.1 },
                 ),
                 rung(
                     "render-degree",
@@ -382,6 +389,7 @@ mod tests {
             steps: [300, 7_000, 1_500],
             until: [4_000, 1_250],
             gaussians: 12_000,
+            points: 20_000,
             nodes: 64,
             width: 64,
             sh_degree: 3,

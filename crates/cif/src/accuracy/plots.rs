@@ -180,7 +180,7 @@ fn draw<'a>(
                 // Beside the mark, towards the middle of the plot.
                 let right = place(*x) < middle;
                 let width = 6 * name.chars().count() as i32;
-                let offset = if right { (8, -6) } else { (-8 - width, -6) };
+                let offset = if right { (10, -6) } else { (-10 - width, -6) };
                 EmptyElement::at((place(*x), *y))
                     + Text::new(name.clone(), offset, ("sans-serif", 11).into_font().color(&INK.mix(0.85)))
             },

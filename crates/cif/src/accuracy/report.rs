@@ -394,9 +394,9 @@ fn summary(rows: &[Row<'_>]) -> Vec<String> {
             let value = value(row.record).unwrap_or(f64::NAN);
             let what = match row.id {
                 BASE => "the base".to_owned(),
-                _ => format!("{} {}", row.ladder.title.to_lowercase(), row.label),
+                _ => format!("{}: {}", row.ladder.title.to_lowercase(), row.label),
             };
-            format!("{what} {value:.2} {unit} in {}", amount(row.record.cpu_s, "s"))
+            format!("{value:.2} {unit} in {} ({what})", amount(row.record.cpu_s, "s"))
         };
         if !on_front.is_empty() {
             let steps: Vec<String> = on_front.iter().map(describe).collect();
@@ -540,6 +540,7 @@ mod tests {
             steps: [60, 600, 200],
             until: [400, 160],
             gaussians: 3_000,
+            points: 1_500,
             nodes: 32,
             width: 64,
             sh_degree: 3,

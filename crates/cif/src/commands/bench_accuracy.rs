@@ -86,6 +86,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         steps: [config.stages.coarse, config.fine_iterations(), config.stages.instance],
         until: [config.densify.until, config.resample.until],
         gaussians: config.densify.max_gaussians,
+        points: config.model.max_initial_points,
         nodes: config.model.spatial_resolution[0],
         width: config.model.width,
         sh_degree: config.model.sh_degree,
