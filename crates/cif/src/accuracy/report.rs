@@ -410,7 +410,7 @@ fn figures(page: &mut String, plots: &[(String, String, String)], prefix: &str) 
     for (name, caption, text) in plots.iter().filter(|(name, ..)| name.starts_with(prefix)) {
         let whole = name == prefix || prefix.ends_with('-');
         if whole {
-            let _ = write!(page, "<figure>{text}<figcaption>{}</figcaption></figure>\n", escape(caption));
+            let _ = writeln!(page, "<figure>{text}<figcaption>{}</figcaption></figure>", escape(caption));
         }
     }
 }
@@ -521,9 +521,9 @@ fn pictures(page: &mut String, rungs: &Folder, rows: &[&Row<'_>]) -> Result<(), 
 fn picture(page: &mut String, path: &Path, caption: &str) -> Result<(), Error> {
     let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
     let caption = escape(caption);
-    let _ = write!(
+    let _ = writeln!(
         page,
-        "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>{caption}</figcaption></figure>\n",
+        "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>{caption}</figcaption></figure>",
         STANDARD.encode(bytes)
     );
     Ok(())

@@ -277,7 +277,7 @@ impl Bench {
             if self.record(&base, "first the base")?.is_none() {
                 return Ok(None);
             }
-            self.base = Some(Field::load(&self.base_file()).map_err(Error::plain)?);
+            self.base = Some(Field::load(self.base_file()).map_err(Error::plain)?);
         }
         let Some(field) = &self.base else { return Ok(None) };
         let mut record = Record { gaussians: Some(field.len()), ..Record::default() };
@@ -339,7 +339,7 @@ impl Bench {
         measure::score(&field, &scored, &self.dataset, &rung.id, &self.rungs, &mut record)?;
         record.settings = settings;
         if rung.id == BASE {
-            field.save(&self.base_file()).map_err(Error::plain)?;
+            field.save(self.base_file()).map_err(Error::plain)?;
             (self.base, self.exact) = (Some(field), None);
         }
         Ok(Some(record))
