@@ -258,7 +258,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
     let (moves, why) = motion(found);
     let full_motion = if found.times > 1 { Extent::Full } else { Extent::Off };
     let cost = if found.times > 1 {
-        format!("more than half of a step, {deformation_mb:.0} MB; a tenth of that where little moves")
+        format!("more than half of a step, {deformation_mb:.0} MB; in time only for what moves")
     } else {
         "none".to_owned()
     };
@@ -293,7 +293,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
             Extent::Full,
             &format!("{} while they help", optional.join(", ")),
             "judged in training, on pixels that are held out".to_owned(),
-            "a twentieth to a tenth of a step each".to_owned(),
+            "two layers of the network each".to_owned(),
         ));
     }
     if moves_now {
@@ -327,7 +327,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
                     found.view_angle
                 )
             },
-            "a twentieth of a step, 540 bytes per Gaussian and moment at degree 3".to_owned(),
+            "720 bytes per Gaussian at degree 3, with gradients and moments".to_owned(),
         ));
     }
 
@@ -346,7 +346,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
         } else {
             "no masks".to_owned()
         },
-        format!("{} steps, each a tenth to a fifth longer", config.stages.instance),
+        format!("{} steps, each about an eighth longer than without", config.stages.instance),
     );
     if !has_masks {
         // Nothing can be switched on.

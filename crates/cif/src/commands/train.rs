@@ -20,8 +20,7 @@ use crate::{interrupt, output};
 /// Train a scene on a capture
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Settings come from the preset, then from what the capture calls for (`cif plan`), then the --config file,
-then what is typed here; the result is
+Settings come from the preset, then from --effects, then the --config file, then what is typed here; the result is
 written beside the scene as SCENE.train.toml, which --config accepts again.
 
   cif train captures/table -o table.cif --preset draft
