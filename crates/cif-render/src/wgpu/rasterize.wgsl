@@ -4,6 +4,7 @@
 // Source: methods reference 3.1 (pixel loop) and 4.2.
 
 #import constants
+#import variant
 #import view
 #import splat
 @group(0) @binding(0) var<uniform> view: View;
@@ -27,7 +28,7 @@ fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
     let position = pixel.y * view.size.x + pixel.x;
     let centre = vec2f(pixel) + 0.5;
     var label = 0u;
-    if (inside && view.label_pixels != 0u) {
+    if (WITH_INSTANCES && inside && view.label_pixels != 0u) {
         label = labels[position];
     }
     // Passes that still let light through here.
@@ -39,7 +40,7 @@ fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
     var instance_transmittance = 1.0;
 
     let range = tile_ranges[tile.y * view.tiles.x + tile.x];
-    let wanted = COLOR_PASS | select(0u, INSTANCE_PASS, view.label_pixels != 0u);
+    let wanted = COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES && view.label_pixels != 0u);
     for (var first = range.x; first < range.y; first += 64u) {
         if (!any_live(open != 0u, local)) {
             break;
@@ -66,7 +67,7 @@ fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
                     }
                 }
             }
-            if ((passes & INSTANCE_PASS) != 0u) {
+            if (WITH_INSTANCES && (passes & INSTANCE_PASS) != 0u) {
                 let alpha = min(MAX_ALPHA, staged[k].color.w * peak);
                 if (alpha >= MIN_ALPHA) {
                     let weight = instance_transmittance * alpha;

@@ -7,6 +7,7 @@
 // weighted q. And per entry of its identity row the weighted responsibility for that label.
 
 #import constants
+#import variant
 #import view
 #import splat
 @group(0) @binding(0) var<uniform> view: View;
@@ -90,7 +91,7 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
         p.inverse = instance.x;
         p.ratio = instance.y;
         p.label = u32(instance.z);
-        p.open = COLOR_PASS | select(0u, INSTANCE_PASS, p.inverse > 0.0);
+        p.open = COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES && p.inverse > 0.0);
     }
     return p;
 }
@@ -123,7 +124,7 @@ fn replay(splat: Staged, passes: u32, p: ptr<function, Pixel>) -> vec4f {
             }
         }
     }
-    if ((open & INSTANCE_PASS) != 0u) {
+    if (WITH_INSTANCES && (open & INSTANCE_PASS) != 0u) {
         let unclamped = splat.color.w * peak;
         let alpha = min(MAX_ALPHA, unclamped);
         if (alpha >= MIN_ALPHA) {
@@ -198,7 +199,7 @@ fn visit(
                 (*sums).second += vec4f(v_conic * dy * dy, share.x * pixels[at].xyz);
                 (*sums).third += share.yz;
             }
-            if ((passes & INSTANCE_PASS) != 0u) {
+            if (WITH_INSTANCES && (passes & INSTANCE_PASS) != 0u) {
                 for (var entry = part; splat.row_first + entry < splat.row_end; entry += 8u) {
                     let label = f32(identities[splat.row_first + entry].x + 1u);
                     var mass = 0.0;
@@ -220,7 +221,7 @@ fn visit(
 }
 
 fn has_row(splat: Staged) -> bool {
-    return view.label_slots != 0u && splat.row_first < splat.row_end;
+    return WITH_INSTANCES && splat.row_first < splat.row_end;
 }
 
 @compute @workgroup_size(64)
@@ -247,12 +248,12 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
             item.conic = splat.conic;
             item.color = splat.color;
             item.slot = entry.z;
-            let drawn = (entry.y >> PASS_SHIFT) & (COLOR_PASS | select(0u, INSTANCE_PASS, view.label_slots != 0u));
+            let drawn = (entry.y >> PASS_SHIFT) & (COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES));
             for (var quadrant = 0u; quadrant < 4u; quadrant += 1u) {
                 let passes = drawn & passes_in_quadrant(splat, quadrant_origin(tile, quadrant));
                 item.passes |= passes << (2u * quadrant);
             }
-            if (view.label_slots != 0u) {
+            if (WITH_INSTANCES) {
                 item.row_first = row_offsets[row];
                 item.row_end = row_offsets[row + 1u];
                 // Longer rows than there are eighths are summed in place.

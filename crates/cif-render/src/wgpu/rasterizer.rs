@@ -445,10 +445,14 @@ impl Rasterizer {
             stage.dispatch_indirect(&kernels.ranges, &ranges, &arrays.work, work::BY_PAIR);
         });
         let label_map = labels.map_or(&arrays.no_labels, |labels| labels.labels);
+        let (variant, kernel) = match view.label_pixels {
+            0 => (0, &kernels.rasterize_color),
+            _ => (1, &kernels.rasterize),
+        };
         let rasterize = self.cache.get(
             gpu,
-            ("rasterize", 0),
-            &kernels.rasterize,
+            ("rasterize", variant),
+            kernel,
             &[
                 uniform,
                 arrays.splats.buffer(),
@@ -462,7 +466,7 @@ impl Rasterizer {
             ],
         );
         commands.stage("rasterize", |stage| {
-            stage.dispatch(&kernels.rasterize, &rasterize, [2 * view.tiles[0], 2 * view.tiles[1], 1]);
+            stage.dispatch(kernel, &rasterize, [2 * view.tiles[0], 2 * view.tiles[1], 1]);
         });
         Ok(())
     }
@@ -557,10 +561,14 @@ impl Rasterizer {
         commands.stage("cotangents", |stage| {
             stage.dispatch(&kernels.cotangents, &cotangents, workgroups(view.pixels(), 64));
         });
+        let (variant, kernel) = match view.label_slots {
+            0 => (0, &kernels.rasterize_backward_color),
+            _ => (1, &kernels.rasterize_backward),
+        };
         let backward = self.cache.get(
             gpu,
-            ("rasterize_backward", 0),
-            &kernels.rasterize_backward,
+            ("rasterize_backward", variant),
+            kernel,
             &[
                 uniform,
                 arrays.splats.buffer(),
@@ -574,7 +582,7 @@ impl Rasterizer {
             ],
         );
         commands.stage("rasterize backward", |stage| {
-            stage.dispatch(&kernels.rasterize_backward, &backward, [view.tiles[0], view.tiles[1], 1]);
+            stage.dispatch(kernel, &backward, [view.tiles[0], view.tiles[1], 1]);
         });
         let gather = self.cache.get(
             gpu,

@@ -5,8 +5,8 @@ use super::error::GpuError;
 use super::kernel::Access::{Read, ReadWrite, Uniform};
 use super::kernel::{Kernel, Module};
 use super::view::{
-    CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, STAGING,
-    TILES, VIEW,
+    COLOR_ONLY, CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT,
+    STAGING, TILES, VIEW, WITH_INSTANCES,
 };
 
 /// Projection.
@@ -67,10 +67,14 @@ pub const RANGES: Module = Module {
 pub const RASTERIZE: Module = Module {
     name: "rasterize",
     text: include_str!("rasterize.wgsl"),
-    imports: &[CONSTANTS, VIEW, SPLAT, STAGING, IDENTITY],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, STAGING, IDENTITY],
     bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize"],
 };
+
+/// Blending of colour alone.
+pub const RASTERIZE_COLOR: Module =
+    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, STAGING, IDENTITY], ..RASTERIZE };
 
 /// Instance images.
 pub const DENSE: Module = Module {
@@ -94,10 +98,14 @@ pub const COTANGENTS: Module = Module {
 pub const RASTERIZE_BACKWARD: Module = Module {
     name: "rasterize_backward",
     text: include_str!("rasterize_backward.wgsl"),
-    imports: &[CONSTANTS, VIEW, SPLAT, IDENTITY],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, IDENTITY],
     bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize_backward"],
 };
+
+/// Gradients of pairs from colour alone.
+pub const RASTERIZE_BACKWARD_COLOR: Module =
+    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, IDENTITY], ..RASTERIZE_BACKWARD };
 
 /// Gradients of splats.
 pub const GATHER_GRADIENTS: Module = Module {
@@ -136,9 +144,11 @@ pub(crate) struct Kernels {
     pub(crate) emit: Kernel,
     pub(crate) ranges: Kernel,
     pub(crate) rasterize: Kernel,
+    pub(crate) rasterize_color: Kernel,
     pub(crate) dense: Kernel,
     pub(crate) cotangents: Kernel,
     pub(crate) rasterize_backward: Kernel,
+    pub(crate) rasterize_backward_color: Kernel,
     pub(crate) gather_gradients: Kernel,
     pub(crate) identity_backward: Kernel,
     pub(crate) project_backward: Kernel,
@@ -156,9 +166,11 @@ impl Kernels {
             emit: one(&EMIT)?,
             ranges: one(&RANGES)?,
             rasterize: one(&RASTERIZE)?,
+            rasterize_color: one(&RASTERIZE_COLOR)?,
             dense: one(&DENSE)?,
             cotangents: one(&COTANGENTS)?,
             rasterize_backward: one(&RASTERIZE_BACKWARD)?,
+            rasterize_backward_color: one(&RASTERIZE_BACKWARD_COLOR)?,
             gather_gradients: one(&GATHER_GRADIENTS)?,
             identity_backward: one(&IDENTITY_BACKWARD)?,
             project_backward: one(&PROJECT_BACKWARD)?,

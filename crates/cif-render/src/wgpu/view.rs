@@ -282,6 +282,12 @@ pub(crate) const STAGING: Snippet =
     Snippet { name: "staging", text: || include_str!("shared/staging.wgsl").to_owned() };
 pub(crate) const IDENTITY: Snippet =
     Snippet { name: "identity", text: || include_str!("shared/identity.wgsl").to_owned() };
+/// Declares that the instance pass is drawn, or is not: what a kernel does not do costs nothing then.
+pub(crate) const WITH_INSTANCES: Snippet =
+    Snippet { name: "variant", text: || "const WITH_INSTANCES: bool = true;\n".to_owned() };
+/// As above.
+pub(crate) const COLOR_ONLY: Snippet =
+    Snippet { name: "variant", text: || "const WITH_INSTANCES: bool = false;\n".to_owned() };
 pub(crate) const SCAN_PARAMETERS: Snippet =
     Snippet { name: "scan_parameters", text: || structures(&[ScanParameters::layout()]) };
 pub(crate) const SORT_PARAMETERS: Snippet =
