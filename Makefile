@@ -58,6 +58,8 @@ demo: build
 plugin:
 	$(PYTHON) plugin/blender/build.py out
 
+# CIF_TEST_GPU says what tests do with a GPU: auto (the default) takes what Vulkan, Metal or Direct3D 12 offers, software
+# such as Mesa's lavapipe too, off skips them, require fails without one.
 test: test-rust test-python test-usd
 
 test-rust:

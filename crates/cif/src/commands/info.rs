@@ -1,4 +1,4 @@
-//! `cif info`: what is in a capture or a scene.
+//! `cif info`: what is in a capture or a scene, and what GPUs there are.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
@@ -14,12 +14,19 @@ use serde_json::{Value, json};
 use super::{CaptureOptions, scene};
 use crate::error::Error;
 
-/// Tell what is in a capture or a trained scene
+/// Tell what is in a capture or a trained scene, or what GPUs there are
 #[derive(Debug, Args)]
 pub(super) struct Info {
     /// Folder of a capture, or a .cif file
     #[arg(value_name = "CAPTURE|SCENE.cif")]
-    path: PathBuf,
+    #[cfg_attr(feature = "wgpu", arg(required_unless_present = "gpu"))]
+    #[cfg_attr(not(feature = "wgpu"), arg(required = true))]
+    path: Option<PathBuf>,
+    /// Tell which GPUs Vulkan, Metal and Direct3D 12 offer, their features and limits, and what of them is used.
+    /// The first is taken; WGPU_ADAPTER_NAME=PART takes the first whose name contains PART
+    #[cfg(feature = "wgpu")]
+    #[arg(long, conflicts_with = "path")]
+    gpu: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -28,13 +35,20 @@ pub(super) struct Info {
 }
 
 pub(super) fn run(command: &Info) -> Result<(), Error> {
-    let facts = if command.path.is_file() {
-        let checkpoint = Checkpoint::load(&command.path).map_err(Error::plain)?;
+    #[cfg(feature = "wgpu")]
+    if command.gpu {
+        return super::info_gpu::run(command.json);
+    }
+    let Some(path) = &command.path else {
+        return Err(Error::usage("nothing to tell of", "name a capture or a scene"));
+    };
+    let facts = if path.is_file() {
+        let checkpoint = Checkpoint::load(path).map_err(Error::plain)?;
         scene_facts(&checkpoint)
-    } else if scene::is_scene(&command.path) {
-        return scene::load(&command.path).map(drop);
+    } else if scene::is_scene(path) {
+        return scene::load(path).map(drop);
     } else {
-        capture_facts(&command.capture_options.open(&command.path)?)?
+        capture_facts(&command.capture_options.open(path)?)?
     };
     if command.json {
         println!("{:#}", Value::Object(facts.into_iter().collect()));

@@ -1,5 +1,7 @@
 //! The subcommands, one file each.
 
+#[cfg(feature = "wgpu")]
+mod backend;
 mod bench;
 mod bench_accuracy;
 mod bench_export;
@@ -12,10 +14,13 @@ mod export_gltf;
 mod export_ply;
 mod import;
 mod info;
+#[cfg(feature = "wgpu")]
+mod info_gpu;
 mod label;
 mod masks;
 mod model_options;
 mod motion_table;
+mod painter;
 mod plan;
 mod query;
 mod render;

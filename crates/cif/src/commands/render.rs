@@ -17,6 +17,9 @@ use cif_train::{Clock, SystemClock};
 use clap::{ArgGroup, Args, ValueEnum};
 
 use super::eval::SplitName;
+use super::painter::Painter;
+#[cfg(feature = "wgpu")]
+use super::painter::Sample;
 use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
@@ -69,6 +72,11 @@ pub(super) struct Render {
     /// Vector instructions: `auto` takes the widest that the processor has
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
+    /// What renders: `auto` measures the first view where there is a GPU, and tells what is faster. EXR files and
+    /// draft quality need the processor
+    #[cfg(feature = "wgpu")]
+    #[arg(long, value_name = "BACKEND", default_value = "auto")]
+    backend: super::backend::Backend,
 }
 
 /// Layers that can be written.
@@ -176,35 +184,40 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let depth = command.exr || what.contains(&What::Depth) || what.contains(&What::DepthColor);
     let instances = wanted || (command.exr && field.identities.is_some());
     let settings = scene::render_settings(&field);
-    let mut renderer = Renderer::new(command.simd.into());
     let quality = match command.quality {
         QualityName::Draft => quality::DRAFT,
         QualityName::Final => quality::FINAL,
     };
     if command.quality == QualityName::Draft {
+        let mut renderer = Renderer::new(command.simd.into());
         tell_draft(&mut renderer, &field, &views, &settings, command.time);
     }
     let field = quality.thin(&field);
+    let channels = Channels { depth, instances };
+    let mut painter = painter(command, &field, &views, &settings, channels)?;
     interrupt::watch();
     for (index, Shot { view, .. }) in views.iter().enumerate() {
         if interrupt::requested() {
             return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
         }
         let time = command.time.or(view.time).unwrap_or(0.0);
-        let image = quality.render(
-            &mut renderer,
-            &field,
-            &view.camera,
-            time,
-            &settings,
-            Channels { depth, instances },
-        );
+        let image = match &mut painter {
+            Painter::Cpu(renderer) => {
+                quality.render(renderer, &field, &view.camera, time, &settings, channels)
+            }
+            #[cfg(feature = "wgpu")]
+            Painter::Gpu(renderer) => {
+                renderer.render(&field, &view.camera, time, &settings, channels).map_err(Error::plain)?
+            }
+        };
         for what in &what {
             write(*what, &field, &image, &command.output, &view.name)?;
         }
-        if command.exr {
+        if command.exr
+            && let Painter::Cpu(renderer) = &mut painter
+        {
             let place = Place { field: &field, views: &views, index, time: command.time };
-            write_exr(&mut renderer, &image, &settings, &place, command)?;
+            write_exr(renderer, &image, &settings, &place, command)?;
         }
     }
     eprintln!("rendered {} views into {}", views.len(), command.output.display());
@@ -252,6 +265,49 @@ fn tell_draft(
         field.len(),
         seconds[0] / seconds[1].max(1e-9)
     );
+}
+
+/// The processor or a GPU, as asked.
+#[cfg(feature = "wgpu")]
+fn painter(
+    command: &Render,
+    field: &Field,
+    views: &[Shot],
+    settings: &RenderSettings,
+    channels: Channels,
+) -> Result<Painter, Error> {
+    use super::backend::Backend;
+    if command.exr && command.backend == Backend::Wgpu {
+        return Err(Error::usage(
+            "EXR files hold several objects per pixel and motion, which only the processor renders",
+            "leave --backend wgpu or --exr out",
+        ));
+    }
+    let draft = command.quality == QualityName::Draft;
+    if draft && command.backend == Backend::Wgpu {
+        return Err(Error::usage(
+            "--quality draft is what the processor leaves out, a GPU leaves nothing out",
+            "leave --backend wgpu or --quality draft out",
+        ));
+    }
+    let (false, Some(Shot { view, .. })) = (command.exr || draft, views.first()) else {
+        return Ok(Painter::cpu(command.simd.into()));
+    };
+    let time = command.time.or(view.time).unwrap_or(0.0);
+    let sample = Sample { field, camera: &view.camera, time, settings, channels };
+    Painter::choose(command.backend, command.simd.into(), &sample)
+}
+
+/// The processor.
+#[cfg(not(feature = "wgpu"))]
+fn painter(
+    command: &Render,
+    _: &Field,
+    _: &[Shot],
+    _: &RenderSettings,
+    _: Channels,
+) -> Result<Painter, Error> {
+    Ok(Painter::cpu(command.simd.into()))
 }
 
 /// A view, and the camera that it belongs to.

@@ -1,0 +1,87 @@
+//! Pictures of a scene by the processor or by a GPU.
+
+#[cfg(feature = "wgpu")]
+use cif_field::Field;
+#[cfg(feature = "wgpu")]
+use cif_geometry::PinholeCamera;
+use cif_render::cpu::{Renderer, SimdLevel};
+#[cfg(feature = "wgpu")]
+use cif_render::wgpu::{Gpu, GpuError, GpuRenderer};
+#[cfg(feature = "wgpu")]
+use cif_render::{Channels, RenderSettings};
+
+#[cfg(feature = "wgpu")]
+use super::backend::Backend;
+#[cfg(feature = "wgpu")]
+use crate::error::Error;
+
+/// What renders.
+pub(super) enum Painter {
+    /// The processor.
+    Cpu(Renderer),
+    /// A GPU.
+    #[cfg(feature = "wgpu")]
+    Gpu(Box<GpuRenderer>),
+}
+
+/// What is rendered first, to tell which is faster.
+#[cfg(feature = "wgpu")]
+pub(super) struct Sample<'a> {
+    pub(super) field: &'a Field,
+    pub(super) camera: &'a PinholeCamera,
+    pub(super) time: f64,
+    pub(super) settings: &'a RenderSettings,
+    pub(super) channels: Channels,
+}
+
+impl Painter {
+    /// The processor.
+    pub(super) fn cpu(simd: SimdLevel) -> Self {
+        Self::Cpu(Renderer::new(simd))
+    }
+
+    /// What was asked for; `auto` renders `sample` both ways where there is a GPU, and tells what is faster.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn choose(backend: Backend, simd: SimdLevel, sample: &Sample<'_>) -> Result<Self, Error> {
+        let Some(gpu) = backend.open()? else { return Ok(Self::cpu(simd)) };
+        let facts = gpu.facts();
+        let name = format!("{} ({})", facts.name, facts.interface);
+        if backend == Backend::Wgpu {
+            eprintln!("rendering on {name}");
+            return GpuRenderer::new(&gpu, sample.field)
+                .map(|renderer| Self::Gpu(Box::new(renderer)))
+                .map_err(Error::plain);
+        }
+        let mut processor = Renderer::new(simd);
+        let start = std::time::Instant::now();
+        processor.render(sample.field, sample.camera, sample.time, sample.settings, sample.channels);
+        let on_processor = start.elapsed();
+        match probe(&gpu, sample) {
+            Ok((renderer, on_gpu)) if on_gpu < on_processor => {
+                eprintln!("rendering on {name}: {on_gpu:.1?} a view, {on_processor:.1?} on the processor");
+                Ok(Self::Gpu(Box::new(renderer)))
+            }
+            Ok((_, on_gpu)) => {
+                eprintln!("rendering on the processor: {on_processor:.1?} a view, {on_gpu:.1?} on {name}");
+                Ok(Self::Cpu(processor))
+            }
+            Err(error) => {
+                eprintln!("note: rendering on the processor, because {name} does not do it: {error}");
+                Ok(Self::Cpu(processor))
+            }
+        }
+    }
+}
+
+/// A renderer on the GPU, and the time of a view once everything is warm.
+#[cfg(feature = "wgpu")]
+fn probe(gpu: &Gpu, sample: &Sample<'_>) -> Result<(GpuRenderer, std::time::Duration), GpuError> {
+    let mut renderer = GpuRenderer::new(gpu, sample.field)?;
+    let view = |renderer: &mut GpuRenderer| {
+        renderer.render(sample.field, sample.camera, sample.time, sample.settings, sample.channels)
+    };
+    view(&mut renderer)?;
+    let start = std::time::Instant::now();
+    view(&mut renderer)?;
+    Ok((renderer, start.elapsed()))
+}

@@ -1,0 +1,124 @@
+//! The command on a GPU (or lavapipe): `CIF_TEST_GPU=off|auto|require` says whether one is used.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
+
+use std::fs;
+use std::path::Path;
+
+use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, generate};
+use cif_test::command::{Run, run};
+use serde_json::{Value, json};
+
+const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
+
+fn cif(folder: &Path, line: &str) -> Run {
+    run(CIF, folder, line.split_whitespace())
+}
+
+/// What `cif info --gpu` says, when a GPU is to be used here.
+fn gpu(folder: &Path) -> Option<Value> {
+    let wish = std::env::var("CIF_TEST_GPU").unwrap_or_else(|_| "auto".to_owned());
+    assert!(["off", "auto", "require"].contains(&wish.as_str()), "CIF_TEST_GPU is {wish}");
+    if wish == "off" {
+        eprintln!("skipped: CIF_TEST_GPU=off");
+        return None;
+    }
+    let facts: Value =
+        serde_json::from_str(&cif(folder, "info --gpu --json").succeeds().stdout).expect("JSON on stdout");
+    if facts["used"].is_null() {
+        assert!(wish == "auto", "CIF_TEST_GPU=require: {}", facts["fault"]);
+        eprintln!("skipped: {}", facts["fault"]);
+        return None;
+    }
+    Some(facts)
+}
+
+/// A moving scene with instances, and a camera file.
+fn write_scene(folder: &Path) {
+    let config = SyntheticConfig {
+        seed: 5,
+        gaussians: 400,
+        instances: 5,
+        width: 90,
+        height: 70,
+        heads: Some(ALL_HEADS),
+        screen_size: (0.01, 0.08),
+    };
+    let scene = generate(&config);
+    let pose = scene.camera.camera_from_world.inverse();
+    let row = |k: usize| {
+        let r = pose.rotation.row(k);
+        json!([r.x, r.y, r.z, pose.translation[k]])
+    };
+    let view = json!([{
+        "name": "a", "width": 90, "height": 70, "time": 0.4,
+        "focal_px": scene.camera.focal_px.to_array(), "principal_px": scene.camera.principal_px.to_array(),
+        "world_from_camera": [row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]],
+    }]);
+    fs::write(folder.join("views.json"), view.to_string()).unwrap();
+    scene.field.save(folder.join("scene.cif")).unwrap();
+}
+
+#[test]
+fn info_tells_of_gpus_without_a_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(facts) = gpu(folder.path()) else { return };
+    let first = &facts["adapters"][0];
+    for key in ["name", "interface", "kind", "driver", "software", "timestamps", "limits", "used"] {
+        assert!(!first[key].is_null(), "{key} in {first}");
+    }
+    assert!(first["limits"]["bytes_per_binding"].as_u64().unwrap() >= 128 << 20);
+    let text = cif(folder.path(), "info --gpu").succeeds().stdout;
+    assert!(text.contains(first["name"].as_str().unwrap()) && text.contains("bytes per binding"), "{text}");
+    cif(folder.path(), "info").fails(2, &["--gpu"]);
+    cif(folder.path(), "info table --gpu").fails(2, &["--gpu"]);
+}
+
+#[test]
+fn a_gpu_renders_what_the_processor_renders() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let Some(facts) = gpu(path) else { return };
+    write_scene(path);
+    let what = "rgb,depth,alpha,instance,probability,foreground,coverage,entropy";
+    for backend in ["cpu", "wgpu"] {
+        cif(
+            path,
+            &format!("render scene.cif --camera views.json --what {what} --backend {backend} -o {backend}"),
+        )
+        .succeeds();
+    }
+    for layer in what.split(',') {
+        let [a, b] = ["cpu", "wgpu"].map(|backend| {
+            image::open(path.join(backend).join(layer).join("a.png")).unwrap().into_rgb16().into_raw()
+        });
+        // A step of 8 or 16 bits, and a few pixels where the two round to other sides of a threshold.
+        let step = if layer == "rgb" { 257 } else { 20 };
+        let far = a.iter().zip(&b).filter(|(a, b)| a.abs_diff(**b) > step).count();
+        assert!(far * 50 < a.len(), "{layer}: {far} of {} values differ", a.len());
+        assert!(a.iter().any(|value| *value > 0), "{layer} shows something");
+    }
+    let software = facts["adapters"][0]["software"].as_bool().unwrap();
+    let told = cif(path, "render scene.cif --camera views.json -o auto").succeeds().stderr;
+    assert!(told.contains(if software { "software" } else { "a view" }), "{told}");
+    cif(path, "render scene.cif --camera views.json --exr --backend wgpu -o exr").fails(2, &["EXR"]);
+}
+
+#[test]
+fn a_gpu_that_is_not_there_is_said_clearly() {
+    let folder = tempfile::tempdir().unwrap();
+    write_scene(folder.path());
+    let line = "render scene.cif --camera views.json -o out --backend";
+    let with = |backend: &str| {
+        let mut command = std::process::Command::new(CIF);
+        command.args(line.split_whitespace()).arg(backend).current_dir(folder.path());
+        command.env("WGPU_ADAPTER_NAME", "no such GPU").env("NO_COLOR", "1");
+        command.output().unwrap()
+    };
+    let refused = with("wgpu");
+    let text = String::from_utf8_lossy(&refused.stderr).replace('\n', " ");
+    assert_eq!(refused.status.code(), Some(1), "{text}");
+    assert!(text.contains("no GPU was found") && text.contains("--backend cpu"), "{text}");
+    assert!(!folder.path().join("out/rgb").exists(), "nothing is written");
+    let fine = with("auto");
+    assert!(fine.status.success() && folder.path().join("out/rgb/a.png").exists());
+}
