@@ -344,4 +344,16 @@ mod tests {
         assert!(text.contains("134217728"), "{text}");
         assert!(checked_product("x", u64::MAX, u64::MAX, u64::MAX).is_err());
     }
+
+    #[test]
+    fn a_lost_device_is_an_error_and_nothing_hangs() {
+        let Some(gpu) = crate::wgpu::testing::gpu() else { return };
+        let values = GpuVec::from_slice(&gpu, "values", &[1_u32, 2, 3]).unwrap();
+        assert_eq!(values.read(&gpu).unwrap(), [1, 2, 3]);
+        gpu.device().destroy();
+        let _ = gpu.wait();
+        let error = values.read(&gpu).unwrap_err();
+        assert!(error.to_string().contains("GPU"), "{error}");
+        assert!(gpu.check().is_err(), "the fault stays");
+    }
 }

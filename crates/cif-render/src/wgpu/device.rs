@@ -181,11 +181,7 @@ impl Gpu {
             );
         }));
         let kept = Arc::clone(&fault);
-        device.set_device_lost_callback(move |reason, message| {
-            if reason != wgpu::DeviceLostReason::Destroyed {
-                keep(&kept, GpuError::Lost(message));
-            }
-        });
+        device.set_device_lost_callback(move |_, message| keep(&kept, GpuError::Lost(message)));
         Ok(Self { device, queue, facts: Arc::new(facts), fault })
     }
 

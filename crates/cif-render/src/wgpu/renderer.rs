@@ -1,4 +1,5 @@
-//! Renders fields on a GPU. Gaussians are posed on the device; those of fields with recorded motion by the processor.
+//! Renders fields on a GPU. Gaussians are posed on the device; those of fields with recorded motion, or with Gaussians
+//! that stand still, by the processor.
 
 use cif_field::Field;
 use cif_geometry::{PinholeCamera, PixelGrid};
@@ -39,16 +40,17 @@ impl GpuRenderer {
             .as_ref()
             .map(|identities| DeviceIdentities::from_identities(gpu, identities, field.instances.len()))
             .transpose()?;
+        let learned = field.deformation.as_ref().filter(|_| field.tracks.is_none());
+        let deformation = match learned.map(|deformation| GpuDeformation::new(gpu, deformation)) {
+            // What the device cannot move, the processor does.
+            Some(Err(GpuError::StandStill { .. })) => None,
+            deformation => deformation.transpose()?,
+        };
         Ok(Self {
             rasterizer: Rasterizer::new(gpu)?,
             poser: Renderer::new(SimdLevel::Auto),
             canonical: GpuGaussians::upload(gpu, &field.gaussians)?,
-            deformation: field
-                .deformation
-                .as_ref()
-                .filter(|_| field.tracks.is_none())
-                .map(|deformation| GpuDeformation::new(gpu, deformation))
-                .transpose()?,
+            deformation,
             posed: GpuGaussians::zeros(gpu, 0)?,
             identities,
             gpu: gpu.clone(),
@@ -77,7 +79,8 @@ impl GpuRenderer {
         let input = ViewInput { camera, settings: &settings, labels: None };
         let identities = self.identities.as_ref().filter(|_| wants_instances);
         let mut commands = Commands::new(&self.gpu, None);
-        let posed = if field.tracks.is_some() {
+        let learned = settings.deform && field.deformation.is_some();
+        let posed = if field.tracks.is_some() || (learned && self.deformation.is_none()) {
             let poser = &mut self.poser;
             let moved = if settings.deform || field.deformation.is_none() {
                 poser.deform(field, time)
