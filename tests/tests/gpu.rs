@@ -69,7 +69,7 @@ fn info_tells_of_gpus_without_a_scene() {
     assert!(first["limits"]["bytes_per_binding"].as_u64().unwrap() >= 128 << 20);
     let text = cif(folder.path(), "info --gpu").succeeds().stdout;
     assert!(text.contains(first["name"].as_str().unwrap()) && text.contains("bytes per binding"), "{text}");
-    cif(folder.path(), "info").fails(2, &["--gpu"]);
+    cif(folder.path(), "info").fails(2, &["CAPTURE"]);
     cif(folder.path(), "info table --gpu").fails(2, &["--gpu"]);
 }
 
@@ -115,9 +115,9 @@ fn a_gpu_that_is_not_there_is_said_clearly() {
         command.output().unwrap()
     };
     let refused = with("wgpu");
-    let text = String::from_utf8_lossy(&refused.stderr).replace('\n', " ");
+    let text = String::from_utf8_lossy(&refused.stderr);
     assert_eq!(refused.status.code(), Some(1), "{text}");
-    assert!(text.contains("no GPU was found") && text.contains("--backend cpu"), "{text}");
+    assert!(text.contains("WGPU_ADAPTER_NAME") && text.contains("--backend"), "{text}");
     assert!(!folder.path().join("out/rgb").exists(), "nothing is written");
     let fine = with("auto");
     assert!(fine.status.success() && folder.path().join("out/rgb/a.png").exists());
