@@ -18,7 +18,7 @@ use crate::error::Error;
 /// What renders.
 pub(super) enum Painter {
     /// The processor.
-    Cpu(Renderer),
+    Cpu(Box<Renderer>),
     /// A GPU.
     #[cfg(feature = "wgpu")]
     Gpu(Box<GpuRenderer>),
@@ -37,7 +37,7 @@ pub(super) struct Sample<'a> {
 impl Painter {
     /// The processor.
     pub(super) fn cpu(simd: SimdLevel) -> Self {
-        Self::Cpu(Renderer::new(simd))
+        Self::Cpu(Box::new(Renderer::new(simd)))
     }
 
     /// What was asked for; `auto` renders `sample` both ways where there is a GPU, and tells what is faster.
@@ -63,11 +63,11 @@ impl Painter {
             }
             Ok((_, on_gpu)) => {
                 eprintln!("rendering on the processor: {on_processor:.1?} a view, {on_gpu:.1?} on {name}");
-                Ok(Self::Cpu(processor))
+                Ok(Self::Cpu(Box::new(processor)))
             }
             Err(error) => {
                 eprintln!("note: rendering on the processor, because {name} does not do it: {error}");
-                Ok(Self::Cpu(processor))
+                Ok(Self::Cpu(Box::new(processor)))
             }
         }
     }
