@@ -1,6 +1,7 @@
 //! `--backend`: whether the processor or a GPU does the work.
 
 use cif_render::wgpu::Gpu;
+use cif_train::{TrainError, Trainer};
 use clap::ValueEnum;
 
 use crate::error::Error;
@@ -18,6 +19,15 @@ pub(super) enum Backend {
 }
 
 impl Backend {
+    /// As it is typed.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Cpu => "cpu",
+            Self::Wgpu => "wgpu",
+        }
+    }
+
     /// The GPU to use, if any; `auto` takes no software rasteriser for one.
     pub(super) fn open(self) -> Result<Option<Gpu>, Error> {
         match self {
@@ -38,5 +48,19 @@ impl Backend {
                 }
             }),
         }
+    }
+
+    /// Makes a trainer's steps run on the GPU, and says so; `auto` stays on the processor where the GPU does not
+    /// support what is asked.
+    pub(super) fn apply(self, gpu: Option<&Gpu>, trainer: &mut Trainer) -> Result<(), Error> {
+        let Some(gpu) = gpu else { return Ok(()) };
+        match trainer.use_gpu(gpu) {
+            Ok(()) => eprintln!("training on {} ({})", gpu.facts().name, gpu.facts().interface),
+            Err(error @ (TrainError::NotOnGpu { .. } | TrainError::Gpu(_))) if self == Self::Auto => {
+                eprintln!("note: {error}; using --backend cpu");
+            }
+            Err(error) => return Err(Error::plain(error)),
+        }
+        Ok(())
     }
 }

@@ -81,6 +81,11 @@ struct Step {
     /// Vector instructions: `auto` takes the widest that the processor has
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
+    /// What does the steps. On a GPU that has timestamps the parts are timed there, one step at a time; counts
+    /// of what it does not count are 0
+    #[cfg(feature = "wgpu")]
+    #[arg(long, value_name = "BACKEND", default_value = "cpu")]
+    backend: super::backend::Backend,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -196,6 +201,8 @@ fn measure(
     // Every series starts from the same state, because training changes what a step costs.
     let mut series = Vec::new();
     let mut simd = String::new();
+    #[cfg(feature = "wgpu")]
+    let gpu = command.backend.open()?;
     for table in std::iter::once(None).chain(tables.into_iter().map(Some)) {
         let (dataset, config, field) = (dataset.clone(), config.clone(), field.clone());
         let mut trainer =
@@ -205,6 +212,12 @@ fn measure(
             trainer.spread_instances(usize::from(count));
         }
         simd = trainer.simd_name();
+        #[cfg(feature = "wgpu")]
+        {
+            command.backend.apply(gpu.as_ref(), &mut trainer)?;
+            trainer.time_gpu_stages();
+            simd = trainer.gpu_name().map_or(simd, str::to_owned);
+        }
         series.push(Series::measure(&mut trainer, command)?);
     }
     Ok(Report { stage, warm_up: command.warm_up, simd, series })

@@ -98,6 +98,11 @@ pub(super) struct Train {
     /// rounding
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
+    /// What does the steps; results of the processor and of a GPU differ by rounding, and --resume goes on
+    /// with either
+    #[cfg(feature = "wgpu")]
+    #[arg(long, value_name = "BACKEND", default_value = "cpu")]
+    backend: super::backend::Backend,
     #[command(flatten)]
     goals: Goals,
     #[command(flatten)]
@@ -178,6 +183,9 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         resolve(command, base.as_ref(), Layout::HyperNerf, None)?;
     }
 
+    #[cfg(feature = "wgpu")]
+    let gpu = command.backend.open()?;
+
     let mut capture = command.capture_options.clone();
     let wanted = match &checkpoint {
         Some(checkpoint) => scene::trained_downscale(&checkpoint.field),
@@ -227,6 +235,8 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     trainer.set_simd(command.simd.into());
     trainer.set_debug_validation(command.debug_validation);
     command.goals.apply(&timing, &mut trainer)?;
+    #[cfg(feature = "wgpu")]
+    command.backend.apply(gpu.as_ref(), &mut trainer)?;
 
     let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
     interrupt::watch();
@@ -350,6 +360,10 @@ fn resume_command(command: &Train) -> String {
     }
     if command.simd != Simd::Auto {
         line += &format!(" --simd {}", command.simd.name());
+    }
+    #[cfg(feature = "wgpu")]
+    if command.backend != super::backend::Backend::Cpu {
+        line += &format!(" --backend {}", command.backend.name());
     }
     line + " --resume"
 }
