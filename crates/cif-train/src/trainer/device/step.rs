@@ -245,6 +245,9 @@ impl Trainer {
             // The first visit makes room; later ones see in time that more is needed.
             rasterizer.measure(gpu, commands)?;
             counted[view.view] = true;
+            if let Some(timestamps) = timestamps.as_ref() {
+                add_stage_times(&mut self.times, &timestamps.read(gpu)?);
+            }
             commands = Commands::new(gpu, timestamps.as_mut());
         }
         rasterizer.rasterize(gpu, &mut commands, rows, labels)?;
