@@ -1,4 +1,5 @@
 //! Effects that a capture does not call for are not run, and what is left out costs no quality.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod support;
 

@@ -37,6 +37,9 @@ fn go_on(trainer: &mut Trainer, stop_at: u64) -> Outcome {
         .unwrap()
 }
 
+/// A name, and what it names of a field.
+type Part = (&'static str, fn(&Field) -> Vec<f32>);
+
 /// Root mean square of the differences of two fields' parameters, relative to how far a run has moved them.
 fn differences(a: &Field, b: &Field, start: &Field) -> Vec<(&'static str, f64)> {
     fn rms<'a>(a: impl Iterator<Item = &'a f32>, b: impl Iterator<Item = &'a f32>) -> f64 {
@@ -44,7 +47,7 @@ fn differences(a: &Field, b: &Field, start: &Field) -> Vec<(&'static str, f64)> 
             a.zip(b).fold((0.0, 0.0_f64), |(s, n), (a, b)| (s + f64::from(a - b).powi(2), n + 1.0));
         (sum / count.max(1.0)).sqrt()
     }
-    let parts: [(&str, fn(&Field) -> Vec<f32>); 6] = [
+    let parts: [Part; 6] = [
         ("means", |f| f.gaussians.means.as_flattened().to_vec()),
         ("log_scales", |f| f.gaussians.log_scales.as_flattened().to_vec()),
         ("quaternions", |f| f.gaussians.quaternions.as_flattened().to_vec()),
