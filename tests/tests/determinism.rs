@@ -39,7 +39,9 @@ fn bytes(trainer: &Trainer) -> Vec<u8> {
     let mut checkpoint = trainer.checkpoint(true);
     checkpoint.field.provenance = serde_json::Value::Null;
     let state = checkpoint.training.as_mut().unwrap();
-    state.json["progress"]["wall_s"] = serde_json::Value::Null;
+    for key in ["wall_s", "cpu_s", "curve"] {
+        state.json["progress"][key] = serde_json::Value::Null;
+    }
     let mut bytes = Vec::new();
     checkpoint.write(&mut bytes, Path::new("memory")).unwrap();
     bytes

@@ -35,11 +35,13 @@ impl Trainer {
     /// be read.
     pub fn from_scene(
         mut dataset: Dataset,
-        config: TrainConfig,
+        mut config: TrainConfig,
         scene: Checkpoint,
         name: &str,
     ) -> Result<Self, TrainError> {
         config.validate()?;
+        // Settings of a scene without instances say that there shall be none; here they are all there is to train.
+        config.effects.instances = true;
         let yardstick = Yardstick::withhold(&mut dataset, &config);
         let Checkpoint { mut field, training } = scene;
         check_capture(&field, &dataset)?;
