@@ -218,7 +218,7 @@ fn set(kind: EffectKind, extent: Extent, config: &mut TrainConfig) {
         EffectKind::Guidance => {
             if extent == Extent::Off {
                 (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
-            } else if config.motion.guidance == 0.0 {
+            } else if (config.motion.guidance, config.motion.stillness) == (0.0, 0.0) {
                 (config.motion.guidance, config.motion.stillness) = (GUIDANCE, STILLNESS);
             }
         }
@@ -356,7 +356,8 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
     effects.push(instances);
 
     if moves_now && has_masks {
-        let preset = if config.motion.guidance > 0.0 { Extent::Full } else { Extent::Off };
+        let holds = config.motion.guidance > 0.0 || config.motion.stillness > 0.0;
+        let preset = if holds { Extent::Full } else { Extent::Off };
         effects.push(effect(
             EffectKind::Guidance,
             preset,
