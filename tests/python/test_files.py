@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cif
@@ -84,3 +88,15 @@ def test_motion_errors_stop_an_export(field: cif.Field, tmp_path: Path) -> None:
     with pytest.raises(cif.CifError, match="tolerance"):
         field.export(tmp_path / "scene.usda", tolerance="much")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGPIPE"), reason="no pipes that break")
+def test_a_reader_that_leaves_is_no_fault() -> None:
+    capture = Path(__file__).parents[2] / "examples" / "tabletop-mini"
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "cif", "info", str(capture)]
+    ended = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert ended.returncode == -signal.SIGPIPE, ended.stderr
+    assert b"panicked" not in ended.stderr

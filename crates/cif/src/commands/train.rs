@@ -29,8 +29,8 @@ written beside the scene as SCENE.train.toml, which --config accepts again.
 
 Measured: draft on examples/tabletop-mini (60 frames of 128 x 96) takes 106 s of processor time and reaches
 28.5 dB PSNR and 96 % mIoU on held-out frames (cif bench accuracy examples/tabletop-mini -o report --quick);
-standard on a capture of 256 x 192 took four minutes on two cores and reached 27.8 dB and 94 %; paper is
-not measured. `cif bench accuracy` measures this on your capture and machine.
+standard on a capture of 256 x 192 took under five minutes on two cores and reached 29.1 dB and 97 %; paper
+is not measured. `cif bench accuracy` measures this on your capture and machine.
 
 Other masks or variants on one reconstruction, without training it again (settings that are not typed
 are those of the scene it comes from):
