@@ -2,6 +2,8 @@
 
 use cif_field::SortMetric;
 
+use crate::Channels;
+
 /// Where the blending weight of the instance pass comes from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum OccupancySource {
@@ -79,6 +81,13 @@ impl Default for RenderSettings {
 }
 
 impl RenderSettings {
+    /// With the instance pass where the outputs need it and the field has identities, and only there.
+    #[must_use]
+    pub(crate) fn for_outputs(&self, field: &cif_field::Field, channels: Channels) -> Self {
+        let wanted = channels.instances && field.identities.is_some();
+        Self { instances: wanted.then(|| self.instances.unwrap_or_default()), ..*self }
+    }
+
     /// The settings a field was trained with.
     #[must_use]
     pub fn of_field(field: &cif_field::Field) -> Self {

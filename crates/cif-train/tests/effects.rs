@@ -3,11 +3,10 @@
 
 mod support;
 
-use cif_field::Field;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::plan::EffectKind;
 use cif_train::{Control, EffectChoice, EffectPlan, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
-use support::{Scene, capture, small_config, train};
+use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 /// The settings with what a capture calls for.
 fn planned(dataset: &cif_dataset::Dataset, config: &TrainConfig, choice: &str) -> TrainConfig {
@@ -125,11 +124,6 @@ fn what_stands_still_skips_the_network_and_what_moves_does_not() {
     assert!(with > without - 0.5, "{with} dB against {without} dB");
 }
 
-/// Everything but times and sizes of the run.
-fn without_record(field: &Field) -> Field {
-    Field { provenance: serde_json::Value::Null, ..field.clone() }
-}
-
 #[test]
 fn a_resumed_run_keeps_what_stands_still_and_what_was_judged() {
     let folder = tempfile::tempdir().unwrap();
@@ -158,13 +152,7 @@ fn a_resumed_run_keeps_what_stands_still_and_what_was_judged() {
     assert!(deformation.still.contains(&true) && !deformation.config.heads.rotation);
     assert_eq!(whole.field().sh_degree, 0);
     for stop_at in [72_u64, 73, 95, 131, 175] {
-        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
-        let mut steps = 0;
-        let outcome = trainer.run(&mut |event, _| {
-            steps += u64::from(matches!(event, TrainEvent::Step { .. }));
-            if steps >= stop_at { Control::Stop } else { Control::Continue }
-        });
-        assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+        let trainer = stopped_after(&dataset, &config, stop_at);
         let path = folder.path().join("stopped.cif");
         trainer.checkpoint(true).save(&path).unwrap();
         let loaded = cif_field::Checkpoint::load(&path).unwrap();

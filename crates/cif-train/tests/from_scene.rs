@@ -6,7 +6,7 @@ mod support;
 use cif_dataset::{Dataset, InstanceLabel, Split};
 use cif_field::{Checkpoint, Field, Gaussians};
 use cif_train::{Control, Outcome, Stage, TrainConfig, TrainError, TrainEvent, Trainer};
-use support::{Scene, capture, small_config, train};
+use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 fn short() -> TrainConfig {
     let mut config = small_config();
@@ -18,10 +18,6 @@ fn short() -> TrainConfig {
     config
 }
 
-fn without_record(field: &Field) -> Field {
-    Field { provenance: serde_json::Value::Null, ..field.clone() }
-}
-
 fn without_occupancy(gaussians: &Gaussians) -> Gaussians {
     Gaussians { occupancy_logits: Vec::new(), ..gaussians.clone() }
 }
@@ -31,18 +27,6 @@ fn without_masks(dataset: &Dataset) -> Dataset {
     bare.instances.clear();
     bare.frames.iter_mut().for_each(|frame| frame.mask = None);
     bare
-}
-
-/// The state where the run has done `steps` steps.
-fn stopped_after(dataset: &Dataset, config: &TrainConfig, steps: u64) -> Trainer {
-    let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
-    let mut done = 0;
-    let outcome = trainer.run(&mut |event, _| {
-        done += u64::from(matches!(event, TrainEvent::Step { .. }));
-        if done >= steps { Control::Stop } else { Control::Continue }
-    });
-    assert_eq!((outcome.unwrap(), trainer.steps_done()), (Outcome::Interrupted, steps));
-    trainer
 }
 
 fn finish(mut trainer: Trainer) -> Field {

@@ -7,7 +7,7 @@ use cif_dataset::Dataset;
 use cif_field::{Checkpoint, Field};
 use cif_train::{Control, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
 use glam::DVec3;
-use support::{Scene, capture, small_config, train};
+use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 const TRAVEL: f64 = 0.9;
 
@@ -27,10 +27,6 @@ fn guided() -> TrainConfig {
     config.motion.gaussians = 100;
     config.densify.max_gaussians = 1_500;
     config
-}
-
-fn without_record(field: &Field) -> Field {
-    Field { provenance: serde_json::Value::Null, ..field.clone() }
 }
 
 /// How far the opaque Gaussians of an instance move until half-time, on average.
@@ -93,15 +89,8 @@ fn neither_threads_nor_interruptions_change_the_result() {
     };
     let whole = on(1);
     assert!(without_record(&on(2)) == without_record(&whole));
-    config.report.step_every = 1;
     for stop_at in [11, 30, 60, 80, 95] {
-        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
-        let mut steps = 0;
-        let outcome = trainer.run(&mut |event, _| {
-            steps += u64::from(matches!(event, TrainEvent::Step { .. }));
-            if steps >= stop_at { Control::Stop } else { Control::Continue }
-        });
-        assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+        let trainer = stopped_after(&dataset, &config, stop_at);
         let file = folder.path().join("stopped.cif");
         trainer.checkpoint(true).save(&file).unwrap();
         let finish = |mut trainer: Trainer| {

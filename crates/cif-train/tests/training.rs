@@ -6,12 +6,7 @@ mod support;
 use cif_field::Field;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::{Control, Outcome, Stage, TrainError, TrainEvent, Trainer};
-use support::{Scene, capture, small_config, train};
-
-/// A field without its record, which holds wall times.
-fn without_record(field: &Field) -> Field {
-    Field { provenance: serde_json::Value::Null, ..field.clone() }
-}
+use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 fn assert_equal(a: &Field, b: &Field) {
     assert_eq!(a.gaussians.len(), b.gaussians.len());
@@ -72,11 +67,11 @@ fn a_resumed_run_ends_where_the_uninterrupted_one_ends() {
     (config.densify.from, config.densify.every, config.stages.batch) = (10, 20, 2);
     config.densify.opacity_reset_every = 35;
     let whole = train(dataset.clone(), config.clone());
+    let total = Trainer::new(dataset.clone(), config.clone()).unwrap().steps_left();
     // Interruptions inside every stage, and on both sides of a densification.
     for stop_at in [7_u64, 59, 61, 139, 165] {
-        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
-        let total = trainer.steps_left();
-        trainer_stop_after(&mut trainer, total, stop_at);
+        let trainer = stopped_after(&dataset, &config, stop_at);
+        assert_eq!(trainer.steps_left(), total - stop_at);
         let path = folder.path().join("stopped.cif");
         trainer.checkpoint(true).save(&path).unwrap();
         let loaded = cif_field::Checkpoint::load(&path).unwrap();
@@ -85,23 +80,6 @@ fn a_resumed_run_ends_where_the_uninterrupted_one_ends() {
         assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         assert_equal(resumed.field(), whole.field());
     }
-}
-
-/// Stops after `stop_at` steps of all stages.
-fn trainer_stop_after(trainer: &mut Trainer, total: u64, stop_at: u64) {
-    let mut config = trainer.config().clone();
-    config.report.step_every = 1;
-    let mut steps = 0;
-    let mut fresh = Trainer::new(trainer.dataset().clone(), config).unwrap();
-    let outcome = fresh.run(&mut |event, _| {
-        if matches!(event, TrainEvent::Step { .. }) {
-            steps += 1;
-        }
-        if steps >= stop_at { Control::Stop } else { Control::Continue }
-    });
-    assert_eq!(outcome.unwrap(), Outcome::Interrupted);
-    assert_eq!(fresh.steps_left(), total - stop_at);
-    *trainer = fresh;
 }
 
 #[test]

@@ -2,10 +2,15 @@
 
 use std::path::PathBuf;
 
+use cif_scene::files::FileError;
+
 /// Why a stage cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum UsdError {
+    /// Something with the file itself.
+    #[error(transparent)]
+    File(#[from] FileError),
     /// The crate was built without the feature `python`.
     #[error(
         "this build of cif has no USD: install the Python wheel (`make build`, then .venv/bin/cif), which brings usd-core with it"
@@ -34,20 +39,6 @@ pub enum UsdError {
     )]
     Extension {
         /// Given path.
-        path: PathBuf,
-    },
-    /// The folder of the output is missing.
-    #[error("{folder}: no such folder; create it first (for {path})")]
-    NoFolder {
-        /// Missing folder.
-        folder: PathBuf,
-        /// Output in it.
-        path: PathBuf,
-    },
-    /// A file that cif did not write is in the way.
-    #[error("{path} exists and was not written by cif; choose another name, or replace it with --force")]
-    Foreign {
-        /// The file.
         path: PathBuf,
     },
     /// A folder is in the way.

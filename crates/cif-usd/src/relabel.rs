@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use cif_scene::files::folder_of;
 use pyo3::BoundObject;
 use pyo3::prelude::*;
 
@@ -37,10 +38,6 @@ pub(crate) fn relabel(
     if output.extension() != path.extension() {
         return Err(refused(format!("{} has another ending; keep .{extension}", output.display())));
     }
-    let folder_of = |path: &Path| match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-        _ => Path::new(".").to_owned(),
-    };
     let folder = folder_of(output);
     let moved = std::fs::canonicalize(&folder).ok() != std::fs::canonicalize(folder_of(path)).ok();
     let unwritable =

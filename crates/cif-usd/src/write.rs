@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use cif_scene::SceneGraph;
+use cif_scene::files::{FileError, existing_folder, folder_of};
 use pyo3::prelude::*;
 
 use crate::author::{self, Scene, Storage};
@@ -25,14 +26,6 @@ fn kind_of(path: &Path) -> Result<Kind, UsdError> {
         Some("usdc") => Ok(Kind::Binary),
         Some("usdz") => Ok(Kind::Package),
         _ => Err(UsdError::Extension { path: path.to_owned() }),
-    }
-}
-
-/// Folder of an output; `.` for a bare name.
-fn folder_of(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-        _ => PathBuf::from("."),
     }
 }
 
@@ -92,19 +85,16 @@ fn checked(pxr: &Pxr<'_>, path: &Path, options: ExportOptions) -> Result<Target,
         (Payloads::Separate, _) | (Payloads::ByKind, Kind::Text) => true,
         (Payloads::SingleFile, _) | (Payloads::ByKind, _) => false,
     };
-    let folder = folder_of(path);
-    if !folder.is_dir() {
-        return Err(UsdError::NoFolder { folder, path: path.to_owned() });
-    }
+    existing_folder(path)?;
     if path.is_dir() {
         return Err(UsdError::IsFolder { path: path.to_owned() });
     }
     if path.exists() && !options.force && !is_ours(pxr, path) {
-        return Err(UsdError::Foreign { path: path.to_owned() });
+        return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
     let payloads = payloads_of(path);
     if split && payloads.exists() && !options.force && !is_folder_of_ours(pxr, &payloads) {
-        return Err(UsdError::Foreign { path: payloads });
+        return Err(FileError::Foreign { path: payloads }.into());
     }
     Ok(Target { kind, split })
 }

@@ -2,8 +2,9 @@
 
 use std::fs;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use cif_scene::files::folder_of;
 use tempfile::NamedTempFile;
 
 use crate::error::Error;
@@ -66,15 +67,6 @@ pub fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
     file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(Error::io("write", path))?;
     file.persist(path).map_err(|error| Error::io("replace", path)(error.error))?;
     Ok(())
-}
-
-/// The folder that a file lies in; `.` for a bare name.
-#[must_use]
-pub fn folder_of(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-        _ => PathBuf::from("."),
-    }
 }
 
 fn probe(folder: &Path) -> Result<(), Error> {

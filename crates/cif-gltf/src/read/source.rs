@@ -8,7 +8,7 @@ use std::path::{Component, Path, PathBuf};
 use std::rc::Rc;
 
 use base64::Engine;
-use cif_scene::files::FileError;
+use cif_scene::files::{FileError, folder_of};
 use gltf::json;
 use serde_json::Value;
 
@@ -121,13 +121,9 @@ impl Source {
         if !inside || name.contains('\\') || name.is_empty() {
             return Err(outside());
         }
-        let folder = match self.path.parent() {
-            Some(parent) if !parent.as_os_str().is_empty() => parent,
-            _ => Path::new("."),
-        };
         let missing =
             |error: std::io::Error| format!("{uri} cannot be read ({error}); put it beside the file");
-        let folder = folder.canonicalize().map_err(missing)?;
+        let folder = folder_of(&self.path).canonicalize().map_err(missing)?;
         // Links may lead out as well.
         let path = folder.join(relative).canonicalize().map_err(missing)?;
         if path.starts_with(&folder) { Ok(path) } else { Err(outside()) }

@@ -69,15 +69,11 @@ impl GpuRenderer {
         settings: &RenderSettings,
         channels: Channels,
     ) -> Result<RenderedImage, GpuError> {
-        let wants_instances = channels.instances && field.identities.is_some();
-        let settings = RenderSettings {
-            instances: if wants_instances { settings.instances.or(Some(Default::default())) } else { None },
-            ..*settings
-        };
+        let settings = settings.for_outputs(field, channels);
         let (width, height) = (camera.width, camera.height);
         let pixels = width as usize * height as usize;
         let input = ViewInput { camera, settings: &settings, labels: None };
-        let identities = self.identities.as_ref().filter(|_| wants_instances);
+        let identities = self.identities.as_ref().filter(|_| settings.instances.is_some());
         let mut commands = Commands::new(&self.gpu, None);
         let learned = settings.deform && field.deformation.is_some();
         let posed = if field.tracks.is_some() || (learned && self.deformation.is_none()) {

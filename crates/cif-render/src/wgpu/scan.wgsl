@@ -39,10 +39,8 @@ fn before(local: u32, value: u32) -> u32 {
     return select(0u, partial[max(local, 1u) - 1u], local > 0u);
 }
 
-@compute @workgroup_size(256)
-fn reduce(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    let block = item_of(workgroup, 0u, 1u);
-    let total = count();
+// Sum of the four values of an invocation.
+fn own_sum(block: u32, local: u32, total: u32) -> u32 {
     var sum = 0u;
     for (var k = 0u; k < 4u; k += 1u) {
         let index = block * SCAN_BLOCK + local * 4u + k;
@@ -50,6 +48,14 @@ fn reduce(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_ind
             sum = saturating(sum, values[index]);
         }
     }
+    return sum;
+}
+
+@compute @workgroup_size(256)
+fn reduce(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
+    let block = item_of(workgroup, 0u, 1u);
+    let total = count();
+    let sum = own_sum(block, local, total);
     let left = before(local, sum);
     if (local == 255u && block * SCAN_BLOCK < total) {
         sums[block] = saturating(left, sum);
@@ -79,13 +85,7 @@ fn spine(@builtin(local_invocation_index) local: u32) {
 fn spread(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
     let block = item_of(workgroup, 0u, 1u);
     let total = count();
-    var sum = 0u;
-    for (var k = 0u; k < 4u; k += 1u) {
-        let index = block * SCAN_BLOCK + local * 4u + k;
-        if (index < total) {
-            sum = saturating(sum, values[index]);
-        }
-    }
+    let sum = own_sum(block, local, total);
     var running = before(local, sum);
     if (block * SCAN_BLOCK < total) {
         running = saturating(running, sums[block]);

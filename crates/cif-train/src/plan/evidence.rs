@@ -3,10 +3,10 @@
 use std::collections::BTreeMap;
 
 use cif_dataset::{Dataset, Frame, Split};
-use glam::{DVec2, DVec3};
+use glam::DVec3;
 
 use crate::error::TrainError;
-use crate::tracks::{Observation, travels};
+use crate::tracks::{Observation, observe, travels};
 
 /// Masks that are looked at, spread evenly over the training frames.
 const MASKS: usize = 64;
@@ -19,9 +19,6 @@ const CAMERAS: usize = 4;
 
 /// Difference of a channel from which a pixel counts as changed; above the noise of cameras and codecs.
 const CHANGE: u8 = 24;
-
-/// Fewest pixels of a mask that say where an object is.
-const FEWEST_PIXELS: usize = 12;
 
 /// Initial points that distances are measured with.
 const POINTS: usize = 500;
@@ -128,23 +125,8 @@ fn travelling(dataset: &Dataset, masked: &[(usize, &Frame)]) -> Result<Vec<Strin
     let mut seen: BTreeMap<u16, Vec<Observation>> = BTreeMap::new();
     for (index, frame) in spread(masked, MASKS) {
         let Some(mask) = dataset.load_mask(index)? else { continue };
-        let mut sums: BTreeMap<u16, (DVec2, usize, bool)> = BTreeMap::new();
-        for (pixel, id) in mask.pixels.iter().enumerate().filter(|(_, id)| **id != 0) {
-            let (x, y) = (pixel as u32 % mask.width, pixel as u32 / mask.width);
-            let sum = sums.entry(*id).or_insert((DVec2::ZERO, 0, false));
-            sum.0 += DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-            sum.1 += 1;
-            sum.2 |= x == 0 || y == 0 || x + 1 == mask.width || y + 1 == mask.height;
-        }
-        for (id, (sum, pixels, cut)) in sums.into_iter().filter(|(_, sum)| sum.1 >= FEWEST_PIXELS) {
-            seen.entry(id).or_default().push(Observation {
-                time_index: frame.time_index,
-                camera: frame.camera,
-                centroid_px: sum / pixels as f64,
-                area_px: pixels as f64,
-                cut,
-                contact_depth: None,
-            });
+        for (id, observation) in observe(&mask, &frame.camera, frame.time_index) {
+            seen.entry(id).or_default().push(observation);
         }
     }
     Ok(dataset

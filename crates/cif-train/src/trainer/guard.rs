@@ -103,59 +103,40 @@ fn fault(part: &'static str, tensor: &'static str, values: &[f32], limit: f32) -
 
 /// The first gradient that a group which moves cannot take, or rate that would leave the finite numbers.
 pub(super) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option<Fault> {
+    struct Group<'a> {
+        gradient: &'static str,
+        rate: &'static str,
+        values: &'a [f32],
+        at: f32,
+    }
+    macro_rules! group {
+        ($name:literal, $values:expr, $at:expr) => {
+            Group {
+                gradient: concat!("gradient of ", $name),
+                rate: concat!("learning rate of ", $name),
+                values: $values,
+                at: $at,
+            }
+        };
+    }
     let g = &gradients.gaussians;
-    let groups: [(&'static str, &[f32], f32); 9] = [
-        ("means", g.means.as_flattened(), rates.means),
-        ("log_scales", g.log_scales.as_flattened(), rates.log_scales),
-        ("quaternions", g.quaternions.as_flattened(), rates.quaternions),
-        ("opacity_logits", &g.opacity_logits, rates.opacity),
-        ("occupancy_logits", &g.occupancy_logits, rates.occupancy),
-        ("sh_coefficients", g.sh_coefficients.as_flattened(), rates.sh_base.max(rates.sh_rest)),
-        ("log_calibrations", &gradients.log_calibrations, rates.calibration),
-        ("planes", &gradients.planes, rates.planes),
-        ("mlp", &gradients.mlp, rates.mlp),
+    let groups = [
+        group!("means", g.means.as_flattened(), rates.means),
+        group!("log_scales", g.log_scales.as_flattened(), rates.log_scales),
+        group!("quaternions", g.quaternions.as_flattened(), rates.quaternions),
+        group!("opacity_logits", &g.opacity_logits, rates.opacity),
+        group!("occupancy_logits", &g.occupancy_logits, rates.occupancy),
+        group!("sh_coefficients", g.sh_coefficients.as_flattened(), rates.sh_base.max(rates.sh_rest)),
+        group!("log_calibrations", &gradients.log_calibrations, rates.calibration),
+        group!("planes", &gradients.planes, rates.planes),
+        group!("mlp", &gradients.mlp, rates.mlp),
     ];
-    groups.into_iter().filter(|(_, _, rate)| *rate != 0.0).find_map(|(tensor, values, rate)| {
-        if rate.is_nan() || rate.abs() > MAX_RATE {
-            return Some(Fault {
-                part: "optimiser",
-                tensor: rate_name(tensor),
-                index: 0,
-                value: rate.to_string(),
-            });
+    groups.into_iter().filter(|group| group.at != 0.0).find_map(|Group { gradient, rate, values, at }| {
+        if at.is_nan() || at.abs() > MAX_RATE {
+            return Some(Fault { part: "optimiser", tensor: rate, index: 0, value: at.to_string() });
         }
-        fault("gradients", gradient_name(tensor), values, MAX_GRADIENT)
+        fault("gradients", gradient, values, MAX_GRADIENT)
     })
-}
-
-/// `gradient of ...` without allocation.
-fn gradient_name(tensor: &str) -> &'static str {
-    match tensor {
-        "means" => "gradient of means",
-        "log_scales" => "gradient of log_scales",
-        "quaternions" => "gradient of quaternions",
-        "opacity_logits" => "gradient of opacity_logits",
-        "occupancy_logits" => "gradient of occupancy_logits",
-        "sh_coefficients" => "gradient of sh_coefficients",
-        "log_calibrations" => "gradient of log_calibrations",
-        "planes" => "gradient of planes",
-        _ => "gradient of mlp",
-    }
-}
-
-/// `learning rate of ...` without allocation.
-fn rate_name(tensor: &str) -> &'static str {
-    match tensor {
-        "means" => "learning rate of means",
-        "log_scales" => "learning rate of log_scales",
-        "quaternions" => "learning rate of quaternions",
-        "opacity_logits" => "learning rate of opacity_logits",
-        "occupancy_logits" => "learning rate of occupancy_logits",
-        "sh_coefficients" => "learning rate of sh_coefficients",
-        "log_calibrations" => "learning rate of log_calibrations",
-        "planes" => "learning rate of planes",
-        _ => "learning rate of mlp",
-    }
 }
 
 /// The first parameter that is not finite.

@@ -4,9 +4,10 @@ use std::collections::BTreeMap;
 
 use cif_field::Gaussians;
 use cif_field::checkpoint::StateTensor;
+use cif_geometry::PixelGrid;
 use cif_geometry::scalar::logit;
-use cif_render::{Channels, Gradients, RenderSettings, UNLABELLED};
-use glam::{DVec2, DVec3};
+use cif_render::{Channels, Gradients, RenderSettings, RenderedImage, UNLABELLED};
+use glam::DVec3;
 use rand::RngExt;
 
 use super::Trainer;
@@ -17,10 +18,8 @@ use crate::error::TrainError;
 use crate::events::Stage;
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
 use crate::random::{Purpose, stream};
-use crate::tracks::{Observation, Track, fit, travels};
+use crate::tracks::{Observation, Track, fit, observe, travels};
 
-/// Fewest pixels of a mask that say where an object is.
-const FEWEST_PIXELS: f64 = 12.0;
 /// Share of the nearest depths around a mask that is taken for noise.
 const CONTACT_SHARE: f64 = 0.08;
 /// Distance from the path beyond which the pull no longer grows, relative to the extent.
@@ -160,54 +159,15 @@ impl Trainer {
             let Some(labels) = &data.labels else { continue };
             let settings = RenderSettings { deform: false, ..self.color_settings() };
             let frame = &self.dataset.frames[self.frames.index(view)];
-            let depth = with_contacts.then(|| {
+            let contacts = with_contacts.then(|| {
                 let channels = Channels { depth: true, instances: false };
-                self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels)
+                let seen = self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels);
+                contact_depths(labels, &seen, k)
             });
-            let (mut sums, mut areas) = (vec![DVec2::ZERO; k], vec![0.0; k]);
-            let mut cut = vec![false; k];
-            let mut ring: Vec<Vec<f64>> = vec![Vec::new(); k];
-            let (width, height) = (labels.width, labels.height);
-            for y in 0..height {
-                for x in 0..width {
-                    let label = *labels.at(x, y);
-                    if label != UNLABELLED {
-                        let of = usize::from(label) - 1;
-                        sums[of] += DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5);
-                        areas[of] += 1.0;
-                        cut[of] |= x == 0 || y == 0 || x + 1 == width || y + 1 == height;
-                        continue;
-                    }
-                    let Some(depth) = &depth else { continue };
-                    let seen = depth.depth.as_ref().map_or(0.0, |depth| *depth.at(x, y));
-                    if seen <= 0.0 || *depth.alpha.at(x, y) < 0.5 {
-                        continue;
-                    }
-                    let mut beside = [x.wrapping_sub(1), x + 1, x, x]
-                        .into_iter()
-                        .zip([y, y, y.wrapping_sub(1), y + 1])
-                        .filter(|(x, y)| *x < width && *y < height)
-                        .map(|(x, y)| *labels.at(x, y))
-                        .filter(|label| *label != UNLABELLED)
-                        .collect::<Vec<_>>();
-                    beside.sort_unstable();
-                    beside.dedup();
-                    for label in beside {
-                        ring[usize::from(label) - 1].push(f64::from(seen));
-                    }
-                }
-            }
-            for of in (0..k).filter(|of| areas[*of] >= FEWEST_PIXELS) {
-                ring[of].sort_by(f64::total_cmp);
-                let nearest = (ring[of].len() as f64 * CONTACT_SHARE) as usize;
-                observations[of].push(Observation {
-                    time_index: frame.time_index,
-                    camera: frame.camera,
-                    centroid_px: sums[of] / areas[of],
-                    area_px: areas[of],
-                    cut: cut[of],
-                    contact_depth: ring[of].get(nearest).copied(),
-                });
+            for (label, observation) in observe(labels, &frame.camera, frame.time_index) {
+                let of = usize::from(label) - 1;
+                let contact_depth = contacts.as_ref().and_then(|contacts| contacts[of]);
+                observations[of].push(Observation { contact_depth, ..observation });
             }
         }
         for observations in &mut observations {
@@ -413,4 +373,41 @@ impl Trainer {
         let pulls = self.pull_strengths([guidance, stillness]);
         displacement_loss(displaced, canonical, pose_of, &poses, pulls, extent).1
     }
+}
+
+/// Per instance, the depth of what is seen just outside its mask where that is nearest.
+fn contact_depths(labels: &PixelGrid<u16>, seen: &RenderedImage, instances: usize) -> Vec<Option<f64>> {
+    let (width, height) = (labels.width, labels.height);
+    let mut rings: Vec<Vec<f64>> = vec![Vec::new(); instances];
+    for y in 0..height {
+        for x in 0..width {
+            if *labels.at(x, y) != UNLABELLED {
+                continue;
+            }
+            let depth = seen.depth.as_ref().map_or(0.0, |depth| *depth.at(x, y));
+            if depth <= 0.0 || *seen.alpha.at(x, y) < 0.5 {
+                continue;
+            }
+            let mut beside = [x.wrapping_sub(1), x + 1, x, x]
+                .into_iter()
+                .zip([y, y, y.wrapping_sub(1), y + 1])
+                .filter(|(x, y)| *x < width && *y < height)
+                .map(|(x, y)| *labels.at(x, y))
+                .filter(|label| *label != UNLABELLED)
+                .collect::<Vec<_>>();
+            beside.sort_unstable();
+            beside.dedup();
+            for label in beside {
+                rings[usize::from(label) - 1].push(f64::from(depth));
+            }
+        }
+    }
+    rings
+        .into_iter()
+        .map(|mut ring| {
+            ring.sort_by(f64::total_cmp);
+            let nearest = (ring.len() as f64 * CONTACT_SHARE) as usize;
+            ring.get(nearest).copied()
+        })
+        .collect()
 }

@@ -5,8 +5,9 @@
 use std::path::Path;
 
 use cif_dataset::{Dataset, Frame, InstanceLabel, Layout, PointCloud, PointSource, Split};
+use cif_field::Field;
 use cif_geometry::{LensDistortion, PinholeCamera, RigidTransform};
-use cif_train::{Control, Outcome, TrainConfig, Trainer};
+use cif_train::{Control, Outcome, TrainConfig, TrainEvent, Trainer};
 use glam::{DMat3, DVec2, DVec3};
 
 /// Size of the images.
@@ -195,4 +196,23 @@ pub(crate) fn train(dataset: Dataset, config: TrainConfig) -> Trainer {
     let mut trainer = Trainer::new(dataset, config).unwrap();
     assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
     trainer
+}
+
+/// The state of a run that is interrupted after so many steps of all stages.
+pub(crate) fn stopped_after(dataset: &Dataset, config: &TrainConfig, steps: u64) -> Trainer {
+    let mut config = config.clone();
+    config.report.step_every = 1;
+    let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
+    let mut done = 0;
+    let outcome = trainer.run(&mut |event, _| {
+        done += u64::from(matches!(event, TrainEvent::Step { .. }));
+        if done >= steps { Control::Stop } else { Control::Continue }
+    });
+    assert_eq!((outcome.unwrap(), trainer.steps_done()), (Outcome::Interrupted, steps));
+    trainer
+}
+
+/// A field without its record, which holds wall times.
+pub(crate) fn without_record(field: &Field) -> Field {
+    Field { provenance: serde_json::Value::Null, ..field.clone() }
 }

@@ -3,6 +3,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use cif_scene::files::FileError;
+
 use super::{python, scenes::Maker, session};
 use crate::{ExportOptions, ReadOptions, UsdError, export, read_scene, read_scene_with};
 
@@ -225,7 +227,10 @@ fn what_is_not_ours_is_kept() {
     fs::create_dir(&payloads).unwrap();
     fs::write(payloads.join("precious.txt"), "keep").unwrap();
     let error = export(&scene, &path, ExportOptions::default()).unwrap_err();
-    assert!(matches!(&error, UsdError::Foreign { path } if path.ends_with("a.payloads")), "{error}");
+    assert!(
+        matches!(&error, UsdError::File(FileError::Foreign { path }) if path.ends_with("a.payloads")),
+        "{error}"
+    );
     let single = ExportOptions { payloads: crate::Payloads::SingleFile, ..ExportOptions::default() };
     export(&scene, &path, single).unwrap();
     assert!(payloads.join("precious.txt").exists(), "not needed, not ours, not touched");

@@ -10,6 +10,7 @@ use cif_geometry::PixelGrid;
 use cif_render::constants::MIN_COVERAGE;
 use cif_render::cpu::Renderer;
 use cif_render::{BlendingWeights, Channels, RenderSettings, RenderedImage, screen_motion};
+use cif_scene::files::folder_of;
 use cif_scene::naming::instance_name;
 use cif_train::metrics::image::psnr;
 use cif_train::metrics::mask_ids;
@@ -384,7 +385,7 @@ fn write_exr(
         .map(|identities| renderer.instance_ranks(identities, cif_exr::cryptomatte::RANKS));
     let motion = motion(renderer, image, place);
     let path = command.output.join("exr").join(format!("{}.exr", view.name));
-    let folder = output::folder_of(&path);
+    let folder = folder_of(&path);
     std::fs::create_dir_all(&folder).map_err(Error::io("create the folder", &folder))?;
     let frame = cif_exr::Frame {
         name: &view.name,

@@ -27,11 +27,7 @@ impl Renderer {
         settings: &RenderSettings,
         channels: Channels,
     ) -> RenderedImage {
-        let wants_instances = channels.instances && field.identities.is_some();
-        let settings = RenderSettings {
-            instances: if wants_instances { settings.instances.or(Some(Default::default())) } else { None },
-            ..*settings
-        };
+        let settings = settings.for_outputs(field, channels);
         self.prepare(field, camera, time, &settings);
         self.rasterize(None, channels.depth);
         let (width, height) = (camera.width, camera.height);
@@ -43,7 +39,7 @@ impl Renderer {
                 if coverage > MIN_COVERAGE { tile.depth[group][lane] / coverage } else { 0.0 }
             })
         });
-        let instances = match (&field.identities, wants_instances) {
+        let instances = match (&field.identities, settings.instances.is_some()) {
             (Some(identities), true) => Some(self.render_instances(identities, width, height)),
             _ => None,
         };

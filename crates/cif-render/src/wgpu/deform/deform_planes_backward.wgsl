@@ -49,28 +49,8 @@ fn spread_line(first: u32, tap: AxisTap, v: f32) -> f32 {
 }
 
 fn feature_backward(position: vec3<f32>, feature: u32, v_feature: f32) -> vec3<f32> {
-    let level = feature / CHANNELS;
-    let channel = feature % CHANNELS;
-    let x = axis_tap(level, 0u, position.x);
-    let y = axis_tap(level, 1u, position.y);
-    let z = axis_tap(level, 2u, position.z);
-    let columns_x = u32(deformation.last[level].x) + 1u;
-    let columns_y = u32(deformation.last[level].y) + 1u;
-    let starts = deformation.planes[level];
-    let line_starts = deformation.lines[level];
-    let first_xy = first_node(starts.x, columns_x, x, y) + channel;
-    let first_xz = first_node(starts.y, columns_x, x, z) + channel;
-    let first_yz = first_node(starts.z, columns_y, y, z) + channel;
-    let first_x = line_starts.x + x.node * CHANNELS + channel;
-    let first_y = line_starts.y + y.node * CHANNELS + channel;
-    let first_z = line_starts.z + z.node * CHANNELS + channel;
-    var values: array<f32, 6>;
-    values[0] = bilinear(first_xy, columns_x, x, y);
-    values[1] = bilinear(first_xz, columns_x, x, z);
-    values[2] = bilinear(first_yz, columns_y, y, z);
-    values[3] = linear(first_x, x);
-    values[4] = linear(first_y, y);
-    values[5] = linear(first_z, z);
+    let taps = feature_taps(position, feature);
+    var values = plane_values(taps);
     var v: array<f32, 6>;
     var running = v_feature;
     for (var k = 0u; k < 6u; k++) {
@@ -82,13 +62,13 @@ fn feature_backward(position: vec3<f32>, feature: u32, v_feature: f32) -> vec3<f
         v[5u - k] *= running;
         running *= values[5u - k];
     }
-    let xy = spread(first_xy, columns_x, x, y, v[0]);
-    let xz = spread(first_xz, columns_x, x, z, v[1]);
-    let yz = spread(first_yz, columns_y, y, z, v[2]);
-    let along_x = xy.x + xz.x + spread_line(first_x, x, v[3]);
-    let along_y = xy.y + yz.x + spread_line(first_y, y, v[4]);
-    let along_z = xz.y + yz.y + spread_line(first_z, z, v[5]);
-    return vec3<f32>(along_x * x.slope, along_y * y.slope, along_z * z.slope);
+    let xy = spread(taps.planes.x, taps.columns_x, taps.x, taps.y, v[0]);
+    let xz = spread(taps.planes.y, taps.columns_x, taps.x, taps.z, v[1]);
+    let yz = spread(taps.planes.z, taps.columns_y, taps.y, taps.z, v[2]);
+    let along_x = xy.x + xz.x + spread_line(taps.lines.x, taps.x, v[3]);
+    let along_y = xy.y + yz.x + spread_line(taps.lines.y, taps.y, v[4]);
+    let along_z = xz.y + yz.y + spread_line(taps.lines.z, taps.z, v[5]);
+    return vec3<f32>(along_x * taps.x.slope, along_y * taps.y.slope, along_z * taps.z.slope);
 }
 
 @compute @workgroup_size(64)

@@ -39,8 +39,20 @@ fn linear(first: u32, tap: AxisTap) -> f32 {
     return (1.0 - tap.fraction) * lines[first] + tap.fraction * lines[first + CHANNELS];
 }
 
-// Feature `level * CHANNELS + channel` at a canonical position: the product of the six plane values.
-fn look_up(position: vec3<f32>, feature: u32) -> f32 {
+// Where feature `level * CHANNELS + channel` is read at a canonical position: a bilinear tap in each spatial plane, a
+// linear one in each line.
+struct FeatureTaps {
+    x: AxisTap,
+    y: AxisTap,
+    z: AxisTap,
+    columns_x: u32,
+    columns_y: u32,
+    // First floats of the taps of xy, xz, yz, and of the lines of x, y, z.
+    planes: vec3<u32>,
+    lines: vec3<u32>,
+}
+
+fn feature_taps(position: vec3<f32>, feature: u32) -> FeatureTaps {
     let level = feature / CHANNELS;
     let channel = feature % CHANNELS;
     let x = axis_tap(level, 0u, position.x);
@@ -50,10 +62,29 @@ fn look_up(position: vec3<f32>, feature: u32) -> f32 {
     let columns_y = u32(deformation.last[level].y) + 1u;
     let starts = deformation.planes[level];
     let line_starts = deformation.lines[level];
-    return bilinear(first_node(starts.x, columns_x, x, y) + channel, columns_x, x, y)
-        * bilinear(first_node(starts.y, columns_x, x, z) + channel, columns_x, x, z)
-        * bilinear(first_node(starts.z, columns_y, y, z) + channel, columns_y, y, z)
-        * linear(line_starts.x + x.node * CHANNELS + channel, x)
-        * linear(line_starts.y + y.node * CHANNELS + channel, y)
-        * linear(line_starts.z + z.node * CHANNELS + channel, z);
+    let planes = vec3<u32>(
+        first_node(starts.x, columns_x, x, y) + channel,
+        first_node(starts.y, columns_x, x, z) + channel,
+        first_node(starts.z, columns_y, y, z) + channel,
+    );
+    let nodes = vec3<u32>(x.node, y.node, z.node);
+    let lines = line_starts.xyz + nodes * CHANNELS + channel;
+    return FeatureTaps(x, y, z, columns_x, columns_y, planes, lines);
+}
+
+// Values of xy, xz, yz and of the lines of x, y, z; the feature is their product.
+fn plane_values(taps: FeatureTaps) -> array<f32, 6> {
+    return array<f32, 6>(
+        bilinear(taps.planes.x, taps.columns_x, taps.x, taps.y),
+        bilinear(taps.planes.y, taps.columns_x, taps.x, taps.z),
+        bilinear(taps.planes.z, taps.columns_y, taps.y, taps.z),
+        linear(taps.lines.x, taps.x),
+        linear(taps.lines.y, taps.y),
+        linear(taps.lines.z, taps.z),
+    );
+}
+
+fn look_up(position: vec3<f32>, feature: u32) -> f32 {
+    let values = plane_values(feature_taps(position, feature));
+    return values[0] * values[1] * values[2] * values[3] * values[4] * values[5];
 }
