@@ -7,6 +7,7 @@
 //! | `record` | what is kept of a rung, so that a report can be interrupted |
 //! | `pareto` | which rungs nothing else beats, and what the next dB costs |
 //! | `plots` | pictures of it |
+//! | `time_limit` | what still fits into a quick report |
 //! | `report` | the page, the table and the JSON |
 
 pub mod ladders;
@@ -15,6 +16,7 @@ mod pareto;
 mod plots;
 pub mod record;
 pub mod report;
+pub mod time_limit;
 
 pub use ladders::{Ladder, Rung, Work, ladders};
 pub use record::Record;

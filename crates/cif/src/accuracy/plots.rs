@@ -177,10 +177,10 @@ fn draw<'a>(
             .legend(move |(x, y)| Circle::new((x + 8, y), 5, color.filled()));
         chart.draw_series(series.points.iter().filter(|(.., name)| !name.is_empty()).map(
             |(x, y, name)| {
-                // Beside the mark, towards the middle of the plot.
+                // Towards the middle of the plot, and off the front, which rises to the right.
                 let right = place(*x) < middle;
                 let width = 6 * name.chars().count() as i32;
-                let offset = if right { (10, -6) } else { (-10 - width, -6) };
+                let offset = if right { (8, 6) } else { (-8 - width, -18) };
                 EmptyElement::at((place(*x), *y))
                     + Text::new(name.clone(), offset, ("sans-serif", 11).into_font().color(&INK.mix(0.85)))
             },

@@ -1,14 +1,15 @@
 //! `cif bench accuracy`: what accuracy costs, measured on a capture of one's own.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
+use cif_geometry::PinholeCamera;
 use cif_render::RenderedImage;
 use cif_train::metrics::trained_settings;
-use cif_train::{Preset, TrainConfig, Trainer};
+use cif_train::{Preset, SystemClock, TrainConfig, Trainer};
 use clap::Args;
 use serde_json::{Value, json};
 
@@ -17,6 +18,7 @@ use crate::accuracy::ladders::{BASE, Base, NAMES, QUICK_BASE};
 use crate::accuracy::measure::{self, Training};
 use crate::accuracy::record::{Folder, Record};
 use crate::accuracy::report::{self, Measured, Subject};
+use crate::accuracy::time_limit::{QUICK_SECONDS, TimeLimit};
 use crate::accuracy::{Rung, Work, ladders};
 use crate::error::Error;
 use crate::quality::{FINAL, Quality};
@@ -36,8 +38,9 @@ the scene that the base trains. Every rung is scored on the held-out frames.
 
 DIR holds report.html (needs no network), report.json, rungs.csv, the plots as SVG, and the rungs:
 finished ones are not measured again, and Ctrl-C keeps the one under way, so that the same command goes
-on where it stopped. --quick trains small scenes in a few minutes: it shows how costs and scores move,
-not how good a scene can get. Without it, a capture takes about thirty times a training run.
+on where it stopped. --quick trains small scenes on reduced images and ends within five minutes: it shows
+how costs and scores move, not how good a scene can get. Rungs that do not fit are named; the same command
+once more goes on with them. Without --quick, a capture takes about thirty times a training run.
 
 Processor time counts all threads together, so that other work on the machine disturbs it little.")]
 pub(super) struct BenchAccuracy {
@@ -46,7 +49,7 @@ pub(super) struct BenchAccuracy {
     /// Folder to write into
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Small scenes and fewer rungs
+    /// Small scenes, reduced images and fewer rungs, in five minutes
     #[arg(long, conflicts_with = "preset")]
     quick: bool,
     /// Ladders to measure, comma separated [default: all that say something of the capture]
@@ -71,7 +74,11 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     output::check_folder(&command.output, command.force || goes_on)?;
     let mut options = command.capture_options.clone();
     options.downscale = options.downscale.or(base_config(command, cif_dataset::Layout::HyperNerf)?.downscale);
-    let dataset = options.open(&command.capture)?;
+    let mut dataset = options.open(&command.capture)?;
+    if command.quick && options.downscale.is_none() {
+        options.downscale = reduction(&dataset);
+        dataset = options.open(&command.capture)?;
+    }
     print_warnings(&dataset);
     if !dataset.frames.iter().any(|frame| frame.split == Split::Val) {
         return Err(Error::failed(
@@ -114,25 +121,38 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         is_terminal: std::io::stderr().is_terminal(),
     };
     interrupt::watch();
-    let whole: BTreeMap<&str, &Rung> =
-        all.iter().flat_map(|ladder| &ladder.rungs).map(|rung| (rung.id.as_str(), rung)).collect();
-    let mut records: BTreeMap<String, Record> = BTreeMap::new();
-    let mut stopped = false;
-    let mut number = 0;
-    'all: for ladder in &all {
-        for rung in &ladder.rungs {
-            if records.contains_key(&rung.id) {
-                continue;
-            }
-            number += 1;
-            let heading = format!("[{number}/{}] {}: {}", whole.len(), ladder.name, rung.label);
-            let Some(record) = bench.record(rung, &heading)? else {
-                stopped = true;
-                break 'all;
-            };
-            records.insert(rung.id.clone(), record);
-        }
+    let mut seen = BTreeSet::new();
+    let mut order: Vec<(&str, &Rung)> = all
+        .iter()
+        .flat_map(|ladder| ladder.rungs.iter().map(|rung| (ladder.name, rung)))
+        .filter(|(_, rung)| seen.insert(&rung.id))
+        .collect();
+    if command.quick {
+        // What costs least comes first, so that the time suffices for as many as can be.
+        order.sort_by_key(|(_, rung)| (rung.id != BASE, bench.expected_steps(rung)));
     }
+    let mut limit = command.quick.then(|| TimeLimit::start(SystemClock::start(), QUICK_SECONDS));
+    let mut records: BTreeMap<String, Record> = BTreeMap::new();
+    let mut left_out = Vec::new();
+    let mut stopped = false;
+    for (number, (ladder, rung)) in order.iter().enumerate() {
+        let steps = bench.expected_steps(rung);
+        if !bench.is_kept(rung) && limit.as_ref().is_some_and(|limit| !limit.has_time_for(steps)) {
+            left_out.push(format!("{ladder}: {}", rung.label));
+            continue;
+        }
+        let begin_s = limit.as_ref().map_or(0.0, TimeLimit::elapsed_s);
+        let heading = format!("[{}/{}] {ladder}: {}", number + 1, order.len(), rung.label);
+        let Some(record) = bench.record(rung, &heading)? else {
+            stopped = true;
+            break;
+        };
+        if let Some(limit) = &mut limit {
+            limit.learn(steps, begin_s);
+        }
+        records.insert(rung.id.clone(), record);
+    }
+    drop(order);
     let measured: Measured = all
         .into_iter()
         .map(|ladder| {
@@ -150,8 +170,27 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
             help: Some("the same command goes on".to_owned()),
         });
     }
+    if !left_out.is_empty() {
+        eprintln!(
+            "left out, for they do not fit into five minutes: {}; the same command goes on with them",
+            left_out.join("; ")
+        );
+    }
     eprintln!("wrote {}", page.display());
     Ok(())
+}
+
+/// Pixels that training images of a quick report have at the most.
+const QUICK_PIXELS: u64 = 160 * 120;
+/// Reduction of the images of a capture for a quick report; none where they are small already.
+fn reduction(dataset: &Dataset) -> Option<u32> {
+    let pixels = |factor: u32| {
+        let size =
+            |camera: &PinholeCamera| u64::from(camera.width / factor) * u64::from(camera.height / factor);
+        dataset.frames.iter().map(|frame| size(&frame.camera)).max().unwrap_or(0)
+    };
+    let factor = (0..5).map(|power| 1 << power).find(|factor| pixels(*factor) <= QUICK_PIXELS).unwrap_or(32);
+    (factor > 1).then_some(factor)
 }
 
 /// Settings that all ladders start from.
@@ -238,6 +277,20 @@ impl Bench {
             "masks": self.dataset.frames.iter().filter_map(|frame| frame.mask.as_ref()).next(),
             "work": format!("{:?}", rung.work),
             "settings": training,
+        })
+    }
+
+    fn is_kept(&self, rung: &Rung) -> bool {
+        self.rungs.find(&rung.id, &self.fingerprint(rung)).is_some()
+    }
+
+    /// Steps that a rung trains; none where it uses the scene of the base.
+    fn expected_steps(&self, rung: &Rung) -> u64 {
+        let trains = matches!(rung.work, Work::Train(_) | Work::Preset(_));
+        let config = self.settings(rung).ok().filter(|_| trains);
+        config.map_or(0, |config| {
+            let stages = [config.stages.coarse, config.fine_iterations(), config.stages.instance];
+            stages.into_iter().map(u64::from).sum()
         })
     }
 
