@@ -3,6 +3,8 @@
 //! The hulls come from parry; here stand what it does not do: flat and thin sets are thickened, the number of
 //! corners is bounded, and no set of points makes it stop.
 
+use std::collections::BTreeSet;
+
 use glam::DVec3;
 use nalgebra::Matrix3;
 use parry3d_f64::math::Vector;
@@ -14,6 +16,12 @@ pub const MAX_CORNERS: usize = 64;
 const MIN_THICKNESS: f64 = 0.01;
 /// Points are moved by up to this share of the extent: exact hulls of points on common planes are ill-posed.
 const JITTER: f64 = 1e-6;
+/// Points that are nearer to each other, relative to the extent, count once: jitter would make needles of them.
+const SAME: f64 = 1e-5;
+/// Largest distance from a hull, relative to the extent, at which a point counts as held.
+const MISSED: f64 = 1e-3;
+/// Times that a hull which misses points is tried again, with ten times the jitter each.
+const TRIES: i32 = 3;
 
 /// A closed convex mesh in double precision.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -106,7 +114,13 @@ fn furthest_outside(planes: &[Plane], point: DVec3) -> f64 {
 #[must_use]
 pub fn convex_hull(points: &[DVec3]) -> Option<HullMesh> {
     let (normalized, middle, size) = normalize(points)?;
-    let all = exact(&normalized)?;
+    // Now and then parry loses a corner of points on common lines; others are in the way after another jitter.
+    let all = (0..TRIES)
+        .filter_map(|attempt| exact(&jittered(&normalized, JITTER * 10.0_f64.powi(attempt))))
+        .find(|mesh| {
+            let planes = mesh.planes();
+            normalized.iter().all(|point| furthest_outside(&planes, *point) < MISSED)
+        })?;
     let mut mesh = if all.points.len() > MAX_CORNERS { few_corners(&all.points)? } else { all };
     for point in &mut mesh.points {
         *point = middle + *point * size;
@@ -114,7 +128,7 @@ pub fn convex_hull(points: &[DVec3]) -> Option<HullMesh> {
     Some(mesh)
 }
 
-/// Points about the origin with a largest extent of 1, thick in all directions and in general position.
+/// Points about the origin with a largest extent of 1, thick in all directions, each once.
 fn normalize(points: &[DVec3]) -> Option<(Vec<DVec3>, DVec3, f64)> {
     let low = points.iter().copied().reduce(DVec3::min)?;
     let high = points.iter().copied().reduce(DVec3::max)?;
@@ -124,13 +138,18 @@ fn normalize(points: &[DVec3]) -> Option<(Vec<DVec3>, DVec3, f64)> {
         return None;
     }
     let mut normalized: Vec<DVec3> = points.iter().map(|point| (*point - middle) / size).collect();
+    let mut seen = BTreeSet::new();
+    normalized.retain(|point| seen.insert((*point / SAME).round().as_i64vec3().to_array()));
     thicken(&mut normalized);
-    for (index, point) in normalized.iter_mut().enumerate() {
-        // Kronecker sequence: spread out, and the same every time.
-        let step = DVec3::new(0.819_172_513_396_164, 0.671_043_606_703_789, 0.549_700_477_901_970);
-        *point += JITTER * ((step * (index + 1) as f64).fract() - 0.5);
-    }
     Some((normalized, middle, size))
+}
+
+/// Points in general position.
+fn jittered(points: &[DVec3], most: f64) -> Vec<DVec3> {
+    // Kronecker sequence: spread out, and the same every time.
+    let step = DVec3::new(0.819_172_513_396_164, 0.671_043_606_703_789, 0.549_700_477_901_970);
+    let noise = |index: usize| most * ((step * (index + 1) as f64).fract() - 0.5);
+    points.iter().enumerate().map(|(index, point)| *point + noise(index)).collect()
 }
 
 /// Doubles points along the axes in which the set is thinner than [`MIN_THICKNESS`].
@@ -158,6 +177,7 @@ fn thicken(points: &mut Vec<DVec3>) {
     }
 }
 
+/// Hull of points; `None` where parry finds none.
 fn exact(points: &[DVec3]) -> Option<HullMesh> {
     let input: Vec<Vector> = points.iter().map(|point| Vector::from_array(point.to_array())).collect();
     let (points, triangles) = try_convex_hull(&input).ok()?;
@@ -261,6 +281,17 @@ mod tests {
         let mut doubled = cloud(30);
         doubled.extend(cloud(30));
         assert_closed(&convex_hull(&doubled).unwrap());
+    }
+
+    #[test]
+    fn many_points_in_few_places_of_a_line_do_not_lose_its_ends() {
+        // Ninety doubled points in some order, of which parry lost an end.
+        let places = [0, 0, 4, 1, 0, 1, 1, 0, 0, 0, 1, 0, 0, 1, 0, 2, 2, 0, 0, 0, 3, 2, 4, 1, 2, 4, 3, 3, 4, 1];
+        let points: Vec<DVec3> =
+            (0..200).map(|k| DVec3::new(3.0, f64::from(places[k * 7 % 30]), 3.0)).collect();
+        let mesh = convex_hull(&points).unwrap();
+        assert_closed(&mesh);
+        assert!(points.iter().all(|point| mesh.outside(*point) < 1e-2));
     }
 
     #[test]
