@@ -1,28 +1,41 @@
-//! Fills the last column of the table in `tests/README.md` from what the tests of hard cases print (on stdin).
+//! Fills the last columns of the table in `tests/README.md` from what the tests of hard cases print (on stdin).
 
 use std::collections::BTreeMap;
 use std::io::BufRead;
 use std::path::Path;
 
+/// Columns of the table that are filled, by what was measured.
+const PATHS: [&str; 3] = ["f64", "f32", "fast"];
+
+/// Largest errors of a cell: of a number on its own, forward, backward.
+type Cell = [Option<f64>; 3];
+
+fn shown(cell: &Cell) -> String {
+    let number = |error: f64| if error == 0.0 { "0".to_owned() } else { format!("{error:.1e}") };
+    let half = |error: Option<f64>| error.map_or("–".to_owned(), number);
+    match cell {
+        [None, None, None] => "–".to_owned(),
+        [Some(alone), None, None] => number(*alone),
+        [_, forward, backward] => format!("{} / {}", half(*forward), half(*backward)),
+    }
+}
+
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    // Row: largest error, its limit.
-    let mut worst: BTreeMap<u32, (f64, f64)> = BTreeMap::new();
+    let mut worst: BTreeMap<u32, [Cell; 3]> = BTreeMap::new();
     for line in std::io::stdin().lock().lines() {
         let line = line?;
         // Tests print side by side with others, so that a line may begin with something else.
         let Some((_, told)) = line.split_once("hard case ") else { continue };
         let cells: Vec<&str> = told.split(" | ").collect();
-        let [row, _, error, limit] = cells[..] else { continue };
-        let (Ok(row), Ok(error), Ok(limit)) =
-            (row.parse(), error.parse::<f64>(), limit.trim().parse::<f64>())
+        let [row, path, way, _, error, _] = cells[..] else { continue };
+        let path = PATHS.iter().position(|known| *known == path);
+        let way = ["alone", "forward", "backward"].iter().position(|known| *known == way);
+        let (Ok(row), Some(path), Some(way), Ok(error)) = (row.parse(), path, way, error.parse::<f64>())
         else {
             continue;
         };
-        let seen = worst.entry(row).or_insert((0.0, limit));
-        // Several limits in one row: the one that is nearest to being reached.
-        if error / limit >= seen.0 / seen.1 {
-            *seen = (error, limit);
-        }
+        let seen = &mut worst.entry(row).or_default()[path][way];
+        *seen = Some(seen.map_or(error, |seen| seen.max(error)));
     }
     if worst.is_empty() {
         return Err("stdin holds no line of a hard case: run the tests with --nocapture".into());
@@ -32,10 +45,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for line in std::fs::read_to_string(&path)?.lines() {
         let number = line.split('|').nth(1).and_then(|cell| cell.trim().parse::<u32>().ok());
         match number.and_then(|number| worst.get(&number)) {
-            Some((error, limit)) if line.starts_with("| ") => {
-                let kept =
-                    line.trim_end().trim_end_matches('|').rsplit_once('|').map_or(line, |(kept, _)| kept);
-                text += &format!("{kept}| {error:.1e} of {limit:.0e} |\n");
+            Some(cells) if line.starts_with("| ") => {
+                let kept: Vec<&str> = line.split('|').skip(1).take(4).map(str::trim).collect();
+                let filled = cells.each_ref().map(shown);
+                text += &format!("| {} | {} |\n", kept.join(" | "), filled.join(" | "));
             }
             _ => text += &format!("{line}\n"),
         }

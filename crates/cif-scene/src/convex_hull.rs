@@ -286,7 +286,8 @@ mod tests {
     #[test]
     fn many_points_in_few_places_of_a_line_do_not_lose_its_ends() {
         // Ninety doubled points in some order, of which parry lost an end.
-        let places = [0, 0, 4, 1, 0, 1, 1, 0, 0, 0, 1, 0, 0, 1, 0, 2, 2, 0, 0, 0, 3, 2, 4, 1, 2, 4, 3, 3, 4, 1];
+        let places =
+            [0, 0, 4, 1, 0, 1, 1, 0, 0, 0, 1, 0, 0, 1, 0, 2, 2, 0, 0, 0, 3, 2, 4, 1, 2, 4, 3, 3, 4, 1];
         let points: Vec<DVec3> =
             (0..200).map(|k| DVec3::new(3.0, f64::from(places[k * 7 % 30]), 3.0)).collect();
         let mesh = convex_hull(&points).unwrap();

@@ -47,11 +47,14 @@ pub mod error;
 pub mod estimate;
 pub mod events;
 pub mod losses;
+#[cfg(test)]
+mod measured;
 pub mod metrics;
 pub mod plan;
 mod random;
 pub mod resample;
 pub mod schedule;
+pub mod tiles;
 pub mod tracks;
 pub mod trainer;
 #[cfg(feature = "wgpu")]

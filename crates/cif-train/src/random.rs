@@ -17,6 +17,8 @@ pub(crate) enum Purpose {
     Deformation = 4,
     /// Points inside travelling objects.
     Guidance = 5,
+    /// Tiles that a step learns from.
+    Tiles = 6,
 }
 
 /// The stream of a purpose; `counter` tells its uses apart.

@@ -11,6 +11,10 @@ use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::UNLABELLED;
 use glam::{DMat3, DVec2, DVec3};
 
+mod misfits;
+
+pub use misfits::misfits;
+
 /// An instance as one frame shows it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Observation {
@@ -96,7 +100,7 @@ const ROUNDS: usize = 16;
 const TOLERANT: i32 = 4;
 const LATE: usize = 8;
 /// Observations that a path needs.
-const FEWEST: usize = 5;
+pub(crate) const FEWEST: usize = 5;
 
 /// Whether an instance travels: no fixed point explains the directions that its mask is seen in. The median
 /// distance of that point from the mask's centre is compared with the mask's radius.

@@ -132,3 +132,69 @@ fn without_masks_nothing_is_held() {
     (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
     assert!(without_record(&train(moving, config).into_field()) == without_record(&held));
 }
+
+#[test]
+fn far_points_lead_no_path_astray() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut dataset = dataset(folder.path(), 12);
+    for k in 1..=300_u32 {
+        // Evenly in a box of 1000 extents.
+        let place = [0.819_172_5, 0.671_043_6, 0.549_700_5].map(|step: f64| (step * f64::from(k)).fract());
+        dataset.points.positions.push(place.map(|u| ((u - 0.5) * 1000.0 * dataset.extent()) as f32));
+        dataset.points.colors.push([128; 3]);
+    }
+    let followed = path(&train(dataset, guided()).into_field(), 2);
+    assert!((followed - DVec3::new(TRAVEL, 0.0, 0.0)).length() < 0.15, "{followed}");
+}
+
+/// What a run warns of before its first step.
+fn warnings(dataset: &Dataset, config: &TrainConfig) -> Vec<String> {
+    let mut messages = Vec::new();
+    let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+    let outcome = trainer.run(&mut |event, _| match event {
+        TrainEvent::Warning { message } => {
+            messages.push(message.clone());
+            Control::Continue
+        }
+        _ => Control::Stop,
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+    messages
+}
+
+#[test]
+fn a_wrong_camera_is_named_and_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let sound = dataset(folder.path(), 12);
+    let mut config = guided();
+    assert!(!warnings(&sound, &config).iter().any(|message| message.contains("left out")));
+    let mut wrong = sound.clone();
+    let frame = wrong.frames.iter_mut().find(|frame| frame.time_index == 5).unwrap();
+    let pose = &mut frame.camera.camera_from_world;
+    let centre = pose.inverse().translation;
+    pose.rotation = glam::DMat3::from_rotation_y(std::f64::consts::FRAC_PI_2) * pose.rotation;
+    pose.translation = -(pose.rotation * centre);
+    let told = warnings(&wrong, &config);
+    assert!(told.iter().any(|message| message.starts_with("left out of training: 5_5:")), "{told:?}");
+    assert!(told.iter().any(|message| message.ends_with("masks: ball 9")), "{told:?}");
+    // With the frame, everything seems to travel.
+    config.motion.misfit = 0.0;
+    let told = warnings(&wrong, &config);
+    assert!(told.iter().any(|message| message.ends_with("masks: ball 4, ball 7, ball 9")), "{told:?}");
+}
+
+#[test]
+fn masks_at_a_few_times_hold_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut few = dataset(folder.path(), 12);
+    for frame in few.frames.iter_mut().filter(|frame| frame.time_index % 5 != 1) {
+        frame.mask = None;
+    }
+    let mut config = guided();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (30, 50, 30);
+    let told = warnings(&few, &config);
+    assert!(told.iter().any(|message| message.starts_with("masks at 3 of 12 times")), "{told:?}");
+    let held = train(few.clone(), config.clone()).into_field();
+    (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
+    assert!(without_record(&train(few, config).into_field()) == without_record(&held));
+}

@@ -238,3 +238,74 @@ fn a_scene_with_recorded_motion_is_refused() {
     let error = Trainer::resume(dataset, checkpoint).err().unwrap();
     assert!(matches!(error, TrainError::RecordedMotion { groups: 1 }), "{error}");
 }
+
+#[test]
+fn far_points_do_not_fill_the_images() {
+    let folder = tempfile::tempdir().unwrap();
+    let near = capture(folder.path(), Scene { times: 1, views: 8, ..Scene::default() });
+    let mut far = near.clone();
+    for k in 1..=200_u32 {
+        // Evenly in a box of 1000 extents.
+        let place =
+            [0.819_172_5, 0.671_043_6, 0.549_700_5].map(|step: f64| (0.5 + step * f64::from(k)).fract());
+        far.points.positions.push(place.map(|u| ((u - 0.5) * 1000.0 * near.extent()) as f32));
+        far.points.colors.push([128; 3]);
+    }
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (0, 300, 0);
+    config.densify.max_gaussians = 3_000;
+    let n = near.points.positions.len();
+    let [alone, together] =
+        [&near, &far].map(|dataset| Trainer::new(dataset.clone(), config.clone()).unwrap());
+    let fresh = &together.field().gaussians;
+    assert_eq!(
+        fresh.log_scales[..n],
+        alone.field().gaussians.log_scales,
+        "the scene starts as it would alone"
+    );
+    let nearest = |mean: [f32; 3]| {
+        let centres = near.frames.iter().map(|frame| frame.camera.centre());
+        centres.map(|c| c.distance(mean.map(f64::from).into())).fold(f64::INFINITY, f64::min)
+    };
+    for (mean, log_scale) in fresh.means[n..].iter().zip(&fresh.log_scales[n..]) {
+        let angle = f64::from(log_scale[0]).exp() / nearest(*mean);
+        assert!(angle < 0.04, "{mean:?} is seen under {angle} radians");
+    }
+    let psnr = |dataset: &cif_dataset::Dataset| {
+        let field = train(dataset.clone(), config.clone()).into_field();
+        let options = EvaluationOptions::held_out(&field);
+        evaluate::<EvaluationError>(&field, dataset, &options, |_| Ok(())).unwrap().overall.psnr.unwrap()
+    };
+    let (alone, together) = (psnr(&near), psnr(&far));
+    assert!(together > alone - 0.5, "{together} dB beside {alone} dB without far points");
+}
+
+#[test]
+fn some_tiles_of_every_view_are_enough_and_depend_on_the_seed_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.tile_share, config.stages.batch, config.loss.lambda_dssim) = (0.4, 2, 0.2);
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 150, 60);
+    let on = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| train(dataset.clone(), config.clone()).into_field())
+    };
+    let whole = on(1);
+    assert_equal(&on(2), &whole);
+    let trainer = stopped_after(&dataset, &config, 101);
+    let path = folder.path().join("stopped.cif");
+    trainer.checkpoint(true).save(&path).unwrap();
+    let mut resumed = Trainer::resume(dataset.clone(), cif_field::Checkpoint::load(&path).unwrap()).unwrap();
+    assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+    assert_equal(resumed.field(), &whole);
+    let psnr = |field: &Field| {
+        let options = EvaluationOptions::held_out(field);
+        let scores = evaluate::<EvaluationError>(field, &dataset, &options, |_| Ok(())).unwrap();
+        scores.overall.psnr.unwrap()
+    };
+    config.stages.tile_share = 1.0;
+    let all = train(dataset.clone(), config.clone()).into_field();
+    let (some, all) = (psnr(&whole), psnr(&all));
+    assert!(some > all - 1.5 && some > 17.0, "{some} dB with some tiles, {all} dB with all");
+}

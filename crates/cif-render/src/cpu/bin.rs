@@ -96,8 +96,15 @@ fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
     smallest
 }
 
-/// Calls `visit` with every tile the splat reaches, in row order, and the passes that reach it, a bit each.
-fn visit_tiles(splat: &Splat, columns: u32, rows: u32, mut visit: impl FnMut(u32, u8)) {
+/// Calls `visit` with every tile of `drawn` (all without) that the splat reaches, in row order, and the passes
+/// that reach it, a bit each.
+fn visit_tiles(
+    splat: &Splat,
+    columns: u32,
+    rows: u32,
+    drawn: Option<&[bool]>,
+    mut visit: impl FnMut(u32, u8),
+) {
     let tile = TILE as f32;
     // Pixel centres lie half a pixel inside the tile.
     let range = |axis: usize, count: u32| {
@@ -111,12 +118,16 @@ fn visit_tiles(splat: &Splat, columns: u32, rows: u32, mut visit: impl FnMut(u32
     let reaches = splat.reach.map(|reach| reach * 1.000_01 + 1e-5);
     for row in i64::from(first_row)..=last_row {
         for column in i64::from(first_column)..=last_column {
+            let tile_index = (row as u32) * columns + column as u32;
+            if drawn.is_some_and(|drawn| !drawn[tile_index as usize]) {
+                continue;
+            }
             let low = [column as f32 * tile + 0.5, row as f32 * tile + 0.5];
             let high = [low[0] + tile - 1.0, low[1] + tile - 1.0];
             let sigma = smallest_sigma(splat, low, high);
             let passes = u8::from(sigma <= reaches[0]) | u8::from(sigma <= reaches[1]) << 1;
             if passes != 0 {
-                visit((row as u32) * columns + column as u32, passes);
+                visit(tile_index, passes);
             }
         }
     }
@@ -131,15 +142,22 @@ struct ReachedTiles {
 }
 
 impl TileLists {
-    /// Builds the lists for depth-sorted splats of an image.
+    /// Builds the lists for depth-sorted splats of an image; tiles that are not `drawn` stay empty.
     ///
     /// # Panics
     /// When there are too many pairs, before memory is.
-    pub(super) fn build(&mut self, splats: &[Splat], width: u32, height: u32) {
-        self.build_within(MAX_PAIRS, splats, width, height);
+    pub(super) fn build(&mut self, splats: &[Splat], width: u32, height: u32, drawn: Option<&[bool]>) {
+        self.build_within(MAX_PAIRS, splats, width, height, drawn);
     }
 
-    fn build_within(&mut self, limit: u64, splats: &[Splat], width: u32, height: u32) {
+    fn build_within(
+        &mut self,
+        limit: u64,
+        splats: &[Splat],
+        width: u32,
+        height: u32,
+        drawn: Option<&[bool]>,
+    ) {
         self.columns = width.div_ceil(TILE);
         self.rows = height.div_ceil(TILE);
         let (columns, rows) = (self.columns, self.rows);
@@ -157,7 +175,7 @@ impl TileLists {
                     (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
                 for splat in chunk {
                     let before = reached.len();
-                    visit_tiles(splat, columns, rows, |tile, passes| reached.push((tile, passes)));
+                    visit_tiles(splat, columns, rows, drawn, |tile, passes| reached.push((tile, passes)));
                     counts.push((reached.len() - before) as u32);
                 }
                 if pairs.fetch_add(reached.len() as u64, Ordering::Relaxed) + reached.len() as u64 > limit {
@@ -267,10 +285,10 @@ mod tests {
         let splats: Vec<Splat> = (0..3000).map(filling).collect();
         let mut lists = TileLists::default();
         // 5 x 5 tiles.
-        lists.build_within(75_000, &splats, 80, 80);
+        lists.build_within(75_000, &splats, 80, 80, None);
         assert_eq!(lists.entries.len(), 75_000);
         let refused = std::panic::catch_unwind(|| {
-            TileLists::default().build_within(74_999, &splats, 80, 80);
+            TileLists::default().build_within(74_999, &splats, 80, 80, None);
         });
         let message = *refused.unwrap_err().downcast::<String>().unwrap();
         assert!(

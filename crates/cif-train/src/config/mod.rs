@@ -80,6 +80,9 @@ pub struct StagesConfig {
     pub instance: u32,
     /// Views per step, default 1 (A27: all stages alike).
     pub batch: u32,
+    /// Share of a view's tiles of 16 x 16 pixels, drawn anew for every view, that a step renders and learns from;
+    /// (0, 1], default 1: all. Fewer make steps faster and noisier; the gradient stays right on average.
+    pub tile_share: f32,
 }
 
 /// Initial Gaussians and the deformation network.
@@ -193,6 +196,10 @@ pub struct MotionConfig {
     pub rehearsal: u32,
     /// Gaussians that a travelling object starts with, default 300.
     pub gaussians: u32,
+    /// Training frames in which more than half of the instances, two or more, are this many times farther than
+    /// usual from where the other frames see them have a wrong camera or wrong masks: they are named and left out.
+    /// Default 20; 0 keeps every frame, as in `paper`.
+    pub misfit: f32,
 }
 
 /// Cloning, splitting and pruning (methods reference 1.5). Steps count from the start of each stage.

@@ -33,8 +33,14 @@ fn draft() -> TrainConfig {
 
 fn paper(layout: Layout) -> TrainConfig {
     let mut config = TrainConfig { preset: Preset::Paper, ..TrainConfig::default() };
-    config.stages =
-        StagesConfig { coarse: 3_000, fine: 10_000, fine_includes_coarse: false, instance: 3_000, batch: 1 };
+    config.stages = StagesConfig {
+        coarse: 3_000,
+        fine: 10_000,
+        fine_includes_coarse: false,
+        instance: 3_000,
+        batch: 1,
+        tile_share: 1.0,
+    };
     config.model = ModelConfig {
         max_initial_points: 40_000,
         spatial_resolution: [64; 3],
@@ -66,7 +72,7 @@ fn paper(layout: Layout) -> TrainConfig {
     };
     config.resample = ResampleConfig { from: 100, until: 2_500, every: 100, ..config.resample };
     // The published method has no such losses.
-    config.motion = MotionConfig { guidance: 0.0, stillness: 0.0, ..config.motion };
+    config.motion = MotionConfig { guidance: 0.0, stillness: 0.0, misfit: 0.0, ..config.motion };
     match layout {
         Layout::DNerf => {
             config.model.multipliers = vec![1, 2];
@@ -135,7 +141,14 @@ impl Default for TrainConfig {
 
 impl Default for StagesConfig {
     fn default() -> Self {
-        Self { coarse: 300, fine: 7_000, fine_includes_coarse: false, instance: 1_500, batch: 1 }
+        Self {
+            coarse: 300,
+            fine: 7_000,
+            fine_includes_coarse: false,
+            instance: 1_500,
+            batch: 1,
+            tile_share: 1.0,
+        }
     }
 }
 
@@ -192,7 +205,14 @@ impl Default for LossConfig {
 
 impl Default for MotionConfig {
     fn default() -> Self {
-        Self { guidance: 10.0, guidance_end: 0.1, stillness: 1.0, rehearsal: 300, gaussians: 300 }
+        Self {
+            guidance: 10.0,
+            guidance_end: 0.1,
+            stillness: 1.0,
+            rehearsal: 300,
+            gaussians: 300,
+            misfit: 20.0,
+        }
     }
 }
 

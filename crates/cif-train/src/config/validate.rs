@@ -36,6 +36,12 @@ impl TrainConfig {
         }
         at_least("stages.batch", stages.batch, 1, "expected at least 1 view per step")?;
         check(
+            stages.tile_share > 0.0 && stages.tile_share <= 1.0,
+            "stages.tile_share",
+            stages.tile_share,
+            "expected a number in (0, 1]",
+        )?;
+        check(
             stages.fine > 0 || stages.coarse > 0,
             "stages.fine",
             stages.fine,
@@ -98,6 +104,7 @@ impl TrainConfig {
             ("loss.time_sparsity", self.loss.time_sparsity),
             ("motion.guidance", self.motion.guidance),
             ("motion.stillness", self.motion.stillness),
+            ("motion.misfit", self.motion.misfit),
             ("densify.gradient_threshold", densify.gradient_threshold),
             ("densify.split_scale", densify.split_scale),
             ("densify.prune_radius_px", densify.prune_radius_px),

@@ -5,8 +5,9 @@ use std::collections::BTreeMap;
 use cif_dataset::{Dataset, Frame, Split};
 use glam::DVec3;
 
+use crate::config::MotionConfig;
 use crate::error::TrainError;
-use crate::tracks::{Observation, observe, travels};
+use crate::tracks::{Observation, misfits, observe, travels};
 
 /// Masks that are looked at, spread evenly over the training frames.
 const MASKS: usize = 64;
@@ -122,12 +123,18 @@ fn largest_change(dataset: &Dataset, cameras: &[&Vec<(usize, &Frame)>]) -> Resul
 
 /// Labels of the instances that travel, by the centres of their masks.
 fn travelling(dataset: &Dataset, masked: &[(usize, &Frame)]) -> Result<Vec<String>, TrainError> {
-    let mut seen: BTreeMap<u16, Vec<Observation>> = BTreeMap::new();
+    let mut frames = Vec::new();
     for (index, frame) in spread(masked, MASKS) {
         let Some(mask) = dataset.load_mask(index)? else { continue };
-        for (id, observation) in observe(&mask, &frame.camera, frame.time_index) {
-            seen.entry(id).or_default().push(observation);
-        }
+        frames.push(observe(&mask, &frame.camera, frame.time_index));
+    }
+    // A wrong camera shows everything somewhere else, as if it travelled.
+    for frame in misfits(&frames, f64::from(MotionConfig::default().misfit)).into_iter().rev() {
+        frames.remove(frame);
+    }
+    let mut seen: BTreeMap<u16, Vec<Observation>> = BTreeMap::new();
+    for (id, observation) in frames.into_iter().flatten() {
+        seen.entry(id).or_default().push(observation);
     }
     Ok(dataset
         .instances

@@ -63,6 +63,26 @@ mod tests {
     }
 
     #[test]
+    fn row_1_and_2_coverage_is_conserved_at_both_ends() {
+        // `1 - (1 - x')^(n + 1)` against x, from logits in double precision and rounded to single.
+        let mut of_path = [("f64", 0.0_f64, 1e-9), ("f32", 0.0_f64, 2e-5)];
+        for (row, logits) in [(1, [-30.0, -14.0, -9.0, -4.0]), (2, [4.0, 9.0, 14.0, 16.0])] {
+            of_path.iter_mut().for_each(|(_, worst, _)| *worst = 0.0);
+            for (r, n) in logits.into_iter().flat_map(|r| [1_u32, 3, 50].map(|n| (r, n))) {
+                let after = |logit: f64| f64::from(n + 1) * softplus(logit);
+                let new = conserved_logit(r, n);
+                for ((_, worst, _), logit) in of_path.iter_mut().zip([new, f64::from(new as f32)]) {
+                    // Both sides as -log(1 - x): near 1 nothing else has digits left.
+                    *worst = worst.max((after(logit) / softplus(r) - 1.0).abs());
+                }
+            }
+            for (path, worst, limit) in of_path {
+                crate::measured::worst(row, path, "coverage", worst, limit);
+            }
+        }
+    }
+
+    #[test]
     fn nothing_changes_without_replicas() {
         // Row 3: bit for bit.
         for r in [-30.0, -3.3, 0.1, 12.7, 80.0] {
@@ -98,7 +118,7 @@ mod tests {
     }
 
     #[test]
-    fn integral_equals_the_alternating_sum() {
+    fn row_32_the_integral_equals_the_alternating_sum() {
         let (o, n) = (0.3_f64, 12_u32);
         let (mut sum, mut binomial) = (0.0, 1.0);
         for m in 1..=n {
@@ -106,6 +126,6 @@ mod tests {
             let sign = if m % 2 == 1 { 1.0 } else { -1.0 };
             sum += sign * binomial * o.powi(m as i32) / f64::from(m).sqrt();
         }
-        assert!((footprint_integral(o, n) - sum).abs() < 1e-7);
+        crate::measured::worst(32, "f64", "integral", (footprint_integral(o, n) - sum).abs(), 1e-7);
     }
 }

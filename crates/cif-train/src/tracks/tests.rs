@@ -3,7 +3,7 @@ use cif_geometry::RigidTransform;
 use super::*;
 
 /// A camera 1 m above the ground and 2 m away that looks at the origin from an angle.
-fn camera(angle: f64) -> PinholeCamera {
+pub(super) fn camera(angle: f64) -> PinholeCamera {
     let centre = DVec3::new(2.0 * angle.sin(), -2.0 * angle.cos(), 1.0);
     let forward = (-centre).normalize();
     let right = forward.cross(DVec3::Z).normalize();

@@ -1,5 +1,6 @@
 //! Training frames in memory: decoded once, as bytes, up to a budget.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use cif_dataset::{Dataset, Split};
@@ -8,6 +9,7 @@ use cif_render::UNLABELLED;
 use rayon::prelude::*;
 
 use crate::error::TrainError;
+use crate::tracks::{misfits, observe};
 
 /// A decoded frame.
 pub(super) struct TrainFrame {
@@ -86,10 +88,42 @@ impl FrameStore {
 
     /// Whether any frame has a labelled pixel; frames not kept count by having a mask.
     pub(super) fn has_labels(&self, dataset: &Dataset) -> bool {
-        self.frames.iter().any(|(index, frame)| match frame {
+        self.labelled_times(dataset) > 0
+    }
+
+    /// Distinct times of the training frames.
+    pub(super) fn times(&self, dataset: &Dataset) -> usize {
+        distinct_times(dataset, self.frames.iter().map(|(index, _)| *index))
+    }
+
+    /// Those of frames with a labelled pixel; frames not kept count by having a mask.
+    pub(super) fn labelled_times(&self, dataset: &Dataset) -> usize {
+        let labelled = self.frames.iter().filter(|(index, frame)| match frame {
             Some(frame) => frame.labelled > 0,
             None => dataset.frames[*index].mask.is_some(),
-        })
+        });
+        distinct_times(dataset, labelled.map(|(index, _)| *index))
+    }
+
+    /// Leaves out the training frames whose masks contradict the others (see [`misfits`]); their indices in the
+    /// capture.
+    pub(super) fn leave_out_misfits(
+        &mut self,
+        dataset: &Dataset,
+        limit: f64,
+    ) -> Result<Vec<usize>, TrainError> {
+        let mut masked = Vec::new();
+        let mut seen = Vec::new();
+        for k in 0..self.len() {
+            if let Some(labels) = &self.get(dataset, k)?.labels {
+                let frame = &dataset.frames[self.index(k)];
+                masked.push(k);
+                seen.push(observe(labels, &frame.camera, frame.time_index));
+            }
+        }
+        let left_out: Vec<usize> = misfits(&seen, limit).into_iter().map(|k| self.index(masked[k])).collect();
+        self.frames.retain(|(index, _)| !left_out.contains(index));
+        Ok(left_out)
     }
 
     /// Renames dense labels, in frames kept and in those decoded later.
@@ -112,6 +146,10 @@ impl FrameStore {
             labels.as_ref().map_or(0, |grid| grid.pixels.iter().filter(|l| **l != UNLABELLED).count());
         Ok(TrainFrame { image: data.image, labels, labelled })
     }
+}
+
+fn distinct_times(dataset: &Dataset, frames: impl Iterator<Item = usize>) -> usize {
+    frames.map(|index| dataset.frames[index].time_index).collect::<BTreeSet<_>>().len()
 }
 
 impl TrainFrame {

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use cif_field::Gaussians;
 use cif_field::checkpoint::StateTensor;
+use cif_field::{Field, Gaussians};
 use cif_geometry::PixelGrid;
 use cif_geometry::scalar::logit;
 use cif_render::{Channels, Gradients, RenderSettings, RenderedImage, UNLABELLED};
@@ -18,7 +18,7 @@ use crate::error::TrainError;
 use crate::events::Stage;
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
 use crate::random::{Purpose, stream};
-use crate::tracks::{Observation, Track, fit, observe, travels};
+use crate::tracks::{FEWEST, Observation, Track, fit, observe, travels};
 
 /// Share of the nearest depths around a mask that is taken for noise.
 const CONTACT_SHARE: f64 = 0.08;
@@ -128,11 +128,26 @@ impl Trainer {
     fn is_guided(&self) -> bool {
         // Without masks nobody knows what may be held in place.
         let is_asked = self.config.motion.guidance > 0.0 || self.config.motion.stillness > 0.0;
-        is_asked && self.plan.is_dynamic && self.plan.has_instances
+        is_asked && self.plan.is_dynamic && self.plan.has_instances && !self.has_few_masks()
+    }
+
+    /// Whether too few times have masks to tell what moves: what looks still could then be held against the images.
+    fn has_few_masks(&self) -> bool {
+        let masked = self.frames.labelled_times(&self.dataset);
+        masked < FEWEST && masked < self.frames.times(&self.dataset)
     }
 
     /// Finds out which instances travel.
     pub(super) fn find_travelling(&mut self) -> Result<(), TrainError> {
+        let motion = &self.config.motion;
+        let is_asked = (motion.guidance > 0.0 || motion.stillness > 0.0) && self.plan.is_dynamic;
+        if is_asked && self.plan.has_instances && self.has_few_masks() {
+            self.warnings.push(format!(
+                "masks at {} of {} times do not tell what moves: objects are neither guided nor held in place",
+                self.frames.labelled_times(&self.dataset),
+                self.frames.times(&self.dataset)
+            ));
+        }
         if self.config.motion.guidance <= 0.0 || !self.is_guided() {
             return Ok(());
         }
@@ -154,14 +169,16 @@ impl Trainer {
     fn observe(&mut self, with_contacts: bool) -> Result<Vec<Vec<Observation>>, TrainError> {
         let k = self.field.instances.len();
         let mut observations = vec![Vec::new(); k];
+        let scene = with_contacts.then(|| self.without_outliers()).flatten();
         for view in 0..self.frames.len() {
             let data = self.frames.get(&self.dataset, view)?;
             let Some(labels) = &data.labels else { continue };
             let settings = RenderSettings { deform: false, ..self.color_settings() };
             let frame = &self.dataset.frames[self.frames.index(view)];
             let contacts = with_contacts.then(|| {
+                let scene = scene.as_ref().unwrap_or(&self.field);
                 let channels = Channels { depth: true, instances: false };
-                let seen = self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels);
+                let seen = self.renderer.render(scene, &frame.camera, frame.time, &settings, channels);
                 contact_depths(labels, &seen, k)
             });
             for (label, observation) in observe(labels, &frame.camera, frame.time_index) {
@@ -174,6 +191,26 @@ impl Trainer {
             observations.sort_by_key(|o| o.time_index);
         }
         Ok(observations)
+    }
+
+    /// The field without what lies far outside the scene: depths are means, and a trace of something a thousand
+    /// times as far behind a surface would move it. `None` where nothing does.
+    fn without_outliers(&self) -> Option<Field> {
+        let points = &self.dataset.points;
+        let core = points.core_bounds();
+        if core == self.dataset.point_bounds() {
+            return None;
+        }
+        let (low, high) = (core.low - core.size(), core.high + core.size());
+        let is_near = |mean: &[f32; 3]| {
+            let mean = DVec3::from(mean.map(f64::from));
+            mean.cmpge(low).all() && mean.cmple(high).all()
+        };
+        let near: Vec<bool> = self.field.gaussians.means.iter().map(is_near).collect();
+        let mut field = self.field.clone();
+        field.gaussians.retain(&near);
+        (field.deformation, field.identities) = (None, None);
+        Some(field)
     }
 
     /// Keeps travelling objects out of the static set.

@@ -3,6 +3,7 @@
 use cif_dataset::{Dataset, Split};
 use cif_field::{Deformation, DeformationConfig, Field, Gaussians, Instance, RecordedCamera, Timeline};
 use cif_geometry::scalar::logit;
+use glam::DVec3;
 
 use crate::config::TrainConfig;
 use crate::error::TrainError;
@@ -10,6 +11,10 @@ use crate::random::{Purpose, derive};
 
 /// Frames per second where the capture does not say.
 const DEFAULT_FRAMES_PER_SECOND: f64 = 24.0;
+
+/// Largest angle that a fresh Gaussian far outside the scene is seen under by the nearest camera, standard
+/// deviation, radians: some pixels of a small image.
+const OUTLIER_ANGLE: f64 = 0.03;
 
 /// Fewest and most time nodes chosen automatically.
 const TIME_NODES: (usize, usize) = (8, 150);
@@ -21,6 +26,7 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
         return Err(TrainError::NoPoints { root: dataset.root.clone() });
     }
     let mut gaussians = Gaussians::from_points(&positions, &colors)?;
+    shrink_outliers(&mut gaussians, dataset);
     gaussians.opacity_logits.fill(logit(config.model.initial_opacity));
     gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
     let camera = |frame: &cif_dataset::Frame| RecordedCamera {
@@ -46,6 +52,23 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
         extent: dataset.extent() as f32,
         provenance: serde_json::json!({}),
     })
+}
+
+/// Bounds the fresh scales of Gaussians outside the box that holds the scene. What lies that far has neighbours
+/// as far again, so that each would fill every image, and what densification may add.
+fn shrink_outliers(gaussians: &mut Gaussians, dataset: &Dataset) {
+    let core = dataset.points.core_bounds();
+    let centres: Vec<DVec3> =
+        dataset.train_frames().into_iter().map(|index| dataset.frames[index].camera.centre()).collect();
+    for (mean, log_scale) in gaussians.means.iter().zip(&mut gaussians.log_scales) {
+        let mean = DVec3::from(mean.map(f64::from));
+        let is_inside = mean.cmpge(core.low).all() && mean.cmple(core.high).all();
+        let distance = centres.iter().map(|centre| centre.distance(mean)).fold(f64::INFINITY, f64::min);
+        if !is_inside && distance.is_finite() {
+            let largest = (OUTLIER_ANGLE * distance).ln() as f32;
+            *log_scale = log_scale.map(|s| s.min(largest));
+        }
+    }
 }
 
 /// The table of instances of a capture.

@@ -76,6 +76,24 @@ type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
 /// Share of unsupported pixels from which the user is told (methods reference 4.4).
 const MANY_UNSUPPORTED: f64 = 0.01;
 
+/// Names that a warning lists at most.
+const MOST_NAMES: usize = 8;
+
+/// What is told of frames that were left out.
+fn misfit_warning(dataset: &Dataset, left_out: &[usize]) -> Option<String> {
+    let names: Vec<&str> =
+        left_out.iter().take(MOST_NAMES).map(|index| dataset.frames[*index].name.as_str()).collect();
+    let more = left_out.len() - names.len();
+    let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+    (!names.is_empty()).then(|| {
+        format!(
+            "left out of training: {}{more}: they show most instances far from where all other frames see them; \
+             check their cameras and masks (motion.misfit = 0 keeps such frames)",
+            names.join(", ")
+        )
+    })
+}
+
 /// Trains one field on one capture.
 pub struct Trainer {
     dataset: Dataset,
@@ -167,9 +185,14 @@ impl Trainer {
             return Err(TrainError::RecordedMotion { groups: tracks.groups.len() });
         }
         let budget = u64::from(config.frame_memory_mib) << 20;
-        let frames = FrameStore::open(&dataset, config.background, budget)?;
+        let mut frames = FrameStore::open(&dataset, config.background, budget)?;
         let has_instances =
             config.effects.instances && !dataset.instances.is_empty() && frames.has_labels(&dataset);
+        let mut warnings = Vec::new();
+        if has_instances && config.motion.misfit > 0.0 {
+            let left_out = frames.leave_out_misfits(&dataset, f64::from(config.motion.misfit))?;
+            warnings.extend(misfit_warning(&dataset, &left_out));
+        }
         let n = field.gaussians.len();
         Ok(Self {
             plan: Plan { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
@@ -188,7 +211,7 @@ impl Trainer {
             clock: Arc::new(SystemClock::start()),
             yardstick,
             pacing: None,
-            warnings: Vec::new(),
+            warnings,
             #[cfg(feature = "wgpu")]
             device: None,
             #[cfg(feature = "wgpu")]

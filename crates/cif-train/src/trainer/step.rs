@@ -7,6 +7,7 @@ use cif_geometry::{PixelGrid, quaternion};
 use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
 use rand::seq::SliceRandom;
 
+use super::frames::TrainFrame;
 use super::guard::gradient_fault;
 use super::optimiser::StepRates;
 use super::times::lap;
@@ -16,10 +17,11 @@ use crate::config::Ablation;
 use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, reset_opacities};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
-use crate::losses::{SsimScratch, color_loss};
+use crate::losses::{SsimScratch, color_loss_of_tiles};
 use crate::random::{Purpose, stream};
 use crate::resample::{ResampleContext, apply, plan};
 use crate::schedule::{falls_on, sh_degree};
+use crate::tiles::TileSample;
 
 /// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
 pub(super) const RENORMALISE_EVERY: u64 = 1_000;
@@ -118,11 +120,11 @@ impl Trainer {
         let labelled: usize = views.iter().map(|(_, frame)| frame.labelled).sum();
         let weight = 1.0 / batch as f32;
         let mut loss = StepLoss::default();
-        let (mut instance_loss, mut unsupported) = (0.0, 0);
+        let (mut instance_loss, mut unsupported) = (0.0, 0.0);
         let pull = self.guidance_weight(stage, iteration);
         let (psnr_before, snapshot) = (self.progress.psnr, self.snapshot());
         let mut fault = self.fault_before_step();
-        for (index, data) in &views {
+        for (position, (index, data)) in views.iter().enumerate() {
             if fault.is_some() {
                 break;
             }
@@ -133,13 +135,17 @@ impl Trainer {
             let settings =
                 RenderSettings { instances: settings.instances.filter(|_| with_instances), ..settings };
             let labels = labels.filter(|_| with_instances);
-            let pass = self.renderer.forward(&self.field, &frame.camera, time, &settings, labels);
+            let tiles = self.tiles_of_view(stage, iteration, position, data);
+            let choice = tiles.as_ref().map(TileSample::choice);
+            let pass =
+                self.renderer.forward_tiles(&self.field, &frame.camera, time, &settings, labels, choice);
             let mut since = Instant::now();
-            let color = color_loss(
+            let color = color_loss_of_tiles(
                 &pass.color,
                 &data.image,
                 self.config.loss.lambda_dssim,
                 weight,
+                tiles.as_ref(),
                 &mut self.scratch.v_color,
                 &mut self.scratch.ssim,
             );
@@ -155,8 +161,10 @@ impl Trainer {
             self.leave_out_judged();
             // The mean is over the labelled pixels of all views of the step (A4).
             let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
+            let of_pixel = tiles.as_ref().map_or(1.0, TileSample::weight);
+            let share = of_pixel * share;
             instance_loss += share * pass.instance_loss;
-            unsupported += pass.unsupported_pixels;
+            unsupported += of_pixel * pass.unsupported_pixels as f64;
             fault = self.fault_of_view(color.loss, pass.instance_loss);
             if fault.is_some() {
                 break;
@@ -177,7 +185,7 @@ impl Trainer {
         loss.total = loss.color;
         if stage == Stage::Instance && labelled > 0 {
             loss.instance = Some(instance_loss);
-            loss.unsupported = Some(unsupported as f64 / labelled as f64);
+            loss.unsupported = Some(unsupported / labelled as f64);
             loss.total += f64::from(self.config.loss.lambda_instance) * instance_loss;
         }
         let rates = StepRates::at(&self.config, stage, iteration, self.field.extent);
@@ -225,6 +233,24 @@ impl Trainer {
         self.times.total += start.elapsed();
         self.times.steps += 1;
         Ok(loss)
+    }
+
+    /// Tiles that a view of a step is learnt from; `None` for all.
+    fn tiles_of_view(
+        &self,
+        stage: Stage,
+        iteration: u32,
+        position: usize,
+        data: &TrainFrame,
+    ) -> Option<TileSample> {
+        let share = self.config.stages.tile_share;
+        if share >= 1.0 {
+            return None;
+        }
+        let step = u64::from(iteration) * u64::from(self.config.stages.batch) + position as u64;
+        let mut rng = stream(self.config.seed, Purpose::Tiles, (stage as u64) << 48 | step);
+        let windows = self.config.loss.lambda_dssim > 0.0;
+        TileSample::draw(data.image.width, data.image.height, share, windows, &mut rng)
     }
 
     fn not_finite(&mut self, tensor: &'static str) -> TrainError {

@@ -28,8 +28,8 @@ impl Renderer {
         assert_eq!((labels.width, labels.height), (camera.width, camera.height), "label map size");
         assert_eq!(counts.gaussians(), field.gaussians.len(), "counts of other Gaussians");
         let settings = RenderSettings { instances: None, ..*settings };
-        self.prepare(field, camera, time, &settings);
-        self.rasterize(None, false);
+        self.prepare(field, camera, time, &settings, None);
+        self.rasterize(None, None, false);
         let (tape, level) = (&self.tape, self.level);
         let lists = &tape.lists;
         let tiles: Vec<(Vec<u16>, Vec<f32>)> = (0..lists.tiles())

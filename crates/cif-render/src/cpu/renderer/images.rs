@@ -28,8 +28,8 @@ impl Renderer {
         channels: Channels,
     ) -> RenderedImage {
         let settings = settings.for_outputs(field, channels);
-        self.prepare(field, camera, time, &settings);
-        self.rasterize(None, channels.depth);
+        self.prepare(field, camera, time, &settings, None);
+        self.rasterize(None, None, channels.depth);
         let (width, height) = (camera.width, camera.height);
         let alpha =
             self.gather_image(width, height, |tile, group, lane| 1.0 - tile.transmittance[group][lane]);

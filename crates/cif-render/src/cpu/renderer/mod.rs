@@ -32,7 +32,7 @@ use super::project::{Splat, ViewConstants, project};
 use super::rasterize::{TileImage, rasterize_tile};
 use super::tile::{GROUPS, TilePlace};
 use super::timing::{StageTimes, timed};
-use crate::constants::MIN_LABEL_PROBABILITY;
+use crate::constants::{MIN_LABEL_PROBABILITY, TILE};
 use crate::{InstanceNormalisation, RenderSettings};
 
 /// Gaussians handled by one task.
@@ -76,6 +76,15 @@ pub struct ForwardPass {
     pub unsupported_pixels: usize,
     /// Counts.
     pub statistics: ViewStatistics,
+}
+
+/// Tiles of a view that a forward pass takes part in, row by row, [`TILE`] pixels wide and high.
+#[derive(Clone, Copy, Debug)]
+pub struct TileChoice<'a> {
+    /// Drawn and differentiated.
+    pub drawn: &'a [bool],
+    /// Those whose labels count.
+    pub labelled: &'a [bool],
 }
 
 /// State of the last forward pass that the backward pass needs.
@@ -163,15 +172,36 @@ impl Renderer {
         settings: &RenderSettings,
         labels: Option<&PixelGrid<u16>>,
     ) -> ForwardPass {
+        self.forward_tiles(field, camera, time, settings, labels, None)
+    }
+
+    /// [`Self::forward`] of some tiles only: what is not drawn has the colour of the background and no gradient,
+    /// and the sums over labelled pixels are those of the labelled tiles (their means still count all pixels).
+    ///
+    /// # Panics
+    /// As [`Self::forward`], and when a choice has another number of tiles than the view.
+    pub fn forward_tiles(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        labels: Option<&PixelGrid<u16>>,
+        tiles: Option<TileChoice<'_>>,
+    ) -> ForwardPass {
         let labels = labels.filter(|_| settings.instances.is_some());
         if let Some(labels) = labels {
             assert_eq!((labels.width, labels.height), (camera.width, camera.height), "label map size");
         }
-        self.prepare(field, camera, time, settings);
+        if let Some(TileChoice { drawn, labelled }) = tiles {
+            let count = (camera.width.div_ceil(TILE) * camera.height.div_ceil(TILE)) as usize;
+            assert_eq!([drawn.len(), labelled.len()], [count; 2], "tiles of the view");
+        }
+        self.prepare(field, camera, time, settings, tiles.map(|tiles| tiles.drawn));
         let identities = labels.map(|labels| {
             (labels, field.identities.as_ref().expect("the instance pass needs estimated identities"))
         });
-        self.rasterize(identities, false);
+        self.rasterize(identities, tiles.map(|tiles| tiles.labelled), false);
         let (instance_loss, unsupported_pixels) = self.instance_loss(settings);
         ForwardPass {
             color: PixelGrid::from_pixels(camera.width, camera.height, self.tape.color.clone()),
@@ -183,7 +213,14 @@ impl Renderer {
     }
 
     /// Deformation, projection, sorting and tile lists of a view.
-    fn prepare(&mut self, field: &Field, camera: &PinholeCamera, time: f64, settings: &RenderSettings) {
+    fn prepare(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        drawn: Option<&[bool]>,
+    ) {
         let mut times = self.times;
         let level = self.level;
         let tape = &mut self.tape;
@@ -215,7 +252,7 @@ impl Renderer {
         });
         timed(&mut times.bin, || {
             sort_by_depth(&mut tape.splats);
-            tape.lists.build(&tape.splats, camera.width, camera.height);
+            tape.lists.build(&tape.splats, camera.width, camera.height, drawn);
         });
         self.statistics = ViewStatistics {
             visible: tape.splats.len(),
@@ -243,8 +280,13 @@ impl Renderer {
         rank_of
     }
 
-    /// Blends all tiles into the tape.
-    fn rasterize(&mut self, labels: Option<(&PixelGrid<u16>, &Identities)>, depth: bool) {
+    /// Blends all tiles into the tape, with instances in those that are `labelled` (all without).
+    fn rasterize(
+        &mut self,
+        labels: Option<(&PixelGrid<u16>, &Identities)>,
+        labelled: Option<&[bool]>,
+        depth: bool,
+    ) {
         let mut times = self.times;
         timed(&mut times.rasterize, || {
             let level = self.level;
@@ -260,9 +302,13 @@ impl Renderer {
                 self.statistics.identity_rows = self.tape.splats.len();
             }
             self.tape.labels = match labels {
-                Some((map, _)) => {
-                    (0..tiles).into_par_iter().map(|tile| TileLabels::new(map, &self.place(tile))).collect()
-                }
+                Some((map, _)) => (0..tiles)
+                    .into_par_iter()
+                    .map(|tile| {
+                        let is_asked = labelled.is_none_or(|labelled| labelled[tile]);
+                        if is_asked { TileLabels::new(map, &self.place(tile)) } else { None }
+                    })
+                    .collect(),
                 None => vec![None; tiles],
             };
             self.tape.labelled_pixels =

@@ -135,6 +135,7 @@ impl Trainer {
     fn refuse_unsupported(&self) -> Result<(), TrainError> {
         let (effects, adam) = (&self.config.effects, &self.config.adam);
         let settings: Vec<&str> = [
+            ("stages.tile_share", self.config.stages.tile_share < 1.0),
             ("adam.fresh_row_bias_correction", adam.fresh_row_bias_correction),
             ("effects.still_every", effects.still_every > 0),
             ("effects.sh_gain", effects.sh_gain > 0.0),
