@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::Trainer;
-use crate::trainer::Fault;
+use crate::trainer::{Fault, Work};
 
 /// Parts of a run, in order (methods reference 1.3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -220,6 +220,8 @@ pub enum TrainEvent {
         peak_rss_mb: Option<f64>,
         /// Steps that were rolled back.
         rolled_back: u64,
+        /// What the steps worked on.
+        work: Work,
     },
 }
 

@@ -46,6 +46,7 @@ pub mod densify;
 pub mod error;
 pub mod estimate;
 pub mod events;
+pub mod exposure;
 pub mod losses;
 #[cfg(test)]
 mod measured;
@@ -66,4 +67,4 @@ pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
 pub use plan::{EffectChoice, EffectPlan};
-pub use trainer::{Fault, InstancePass, StepTimes, Trainer};
+pub use trainer::{Fault, InstancePass, StepTimes, Trainer, Work};

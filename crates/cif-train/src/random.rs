@@ -19,6 +19,8 @@ pub(crate) enum Purpose {
     Guidance = 5,
     /// Tiles that a step learns from.
     Tiles = 6,
+    /// Gaussians that stand still and are looked at again.
+    Still = 7,
 }
 
 /// The stream of a purpose; `counter` tells its uses apart.

@@ -3,13 +3,17 @@
 
 mod support;
 
+use cif_dataset::Dataset;
+use cif_train::exposure::{Exposure, trained_exposures};
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::plan::EffectKind;
 use cif_train::{Control, EffectChoice, EffectPlan, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
-use support::{Scene, capture, small_config, stopped_after, train, without_record};
+use support::{
+    Scene, capture, relative_gain, small_config, stopped_after, train, with_known_points, without_record,
+};
 
 /// The settings with what a capture calls for.
-fn planned(dataset: &cif_dataset::Dataset, config: &TrainConfig, choice: &str) -> TrainConfig {
+fn planned(dataset: &Dataset, config: &TrainConfig, choice: &str) -> TrainConfig {
     let choice: EffectChoice = choice.parse().unwrap();
     let mut config = config.clone();
     EffectPlan::new(dataset, &config, &choice).unwrap().apply(&mut config);
@@ -22,6 +26,7 @@ fn still_config() -> TrainConfig {
     config.effects.still_every = 40;
     config.effects.still_from = 0.3;
     config.effects.still_loss = 0.1;
+    (config.effects.still_displacement, config.effects.still_shape) = (0.03, 0.5);
     config
 }
 
@@ -36,6 +41,12 @@ fn a_static_capture_without_masks_trains_plain_splats_only() {
     assert_eq!((times.deformed, times.deformed_backward), (0, 0));
     assert_eq!((times.labelled_tiles, times.identity_rows, times.instance_pairs), (0, 0, 0));
     assert!(trainer.field().deformation.is_none() && trainer.field().identities.is_none());
+    // The scene records as much.
+    let work = trainer.field().provenance["train"]["work"].clone();
+    assert_eq!(work, serde_json::json!(trainer.work()));
+    let nothing = ["deformed", "deformed_backward", "labelled_tiles", "identity_rows", "instance_pairs"];
+    assert!(nothing.iter().all(|name| work[name] == 0), "{work}");
+    assert_eq!(work["views"], trainer.steps_done());
 }
 
 #[test]
@@ -63,8 +74,7 @@ fn the_plan_of_a_capture_follows_what_is_in_it() {
     let folder = tempfile::tempdir().unwrap();
     let moving = capture(folder.path(), Scene { times: 6, views: 3, ..Scene::default() });
     let config = small_config();
-    let plan =
-        |dataset: &cif_dataset::Dataset| EffectPlan::new(dataset, &config, &EffectChoice::default()).unwrap();
+    let plan = |dataset: &Dataset| EffectPlan::new(dataset, &config, &EffectChoice::default()).unwrap();
     let words = |plan: &EffectPlan, kind| plan.decision(kind).map(ToString::to_string);
     let found = plan(&moving);
     assert_eq!(words(&found, EffectKind::Motion).unwrap(), "where it is");
@@ -88,15 +98,6 @@ fn the_plan_of_a_capture_follows_what_is_in_it() {
 fn what_stands_still_skips_the_network_and_what_moves_does_not() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene::default());
-    let score = |trainer: &Trainer| {
-        let field = trainer.field();
-        let options = EvaluationOptions::held_out(field);
-        evaluate::<EvaluationError>(field, trainer.dataset(), &options, |_| Ok(()))
-            .unwrap()
-            .overall
-            .psnr
-            .unwrap()
-    };
     let mut settled = Vec::new();
     let mut trainer = Trainer::new(dataset.clone(), still_config()).unwrap();
     let outcome = trainer.run(&mut |event, _| {
@@ -146,8 +147,10 @@ fn a_resumed_run_keeps_what_stands_still_and_what_was_judged() {
             Control::Continue
         })
         .unwrap();
-    assert!(judged.iter().all(|(_, kept)| !kept), "{judged:?}");
-    assert_eq!(judged.len(), 3, "degree 1, scales and rotations: {judged:?}");
+    for what in ["view-dependent colour of degree 1", "motion of scales", "motion of rotations"] {
+        let last = judged.iter().rfind(|(name, _)| name == what);
+        assert!(last.is_some_and(|(_, kept)| !kept), "{what}: {judged:?}");
+    }
     let deformation = whole.field().deformation.as_ref().unwrap();
     assert!(deformation.still.contains(&true) && !deformation.config.heads.rotation);
     assert_eq!(whole.field().sh_degree, 0);
@@ -176,4 +179,93 @@ fn threads_do_not_change_what_stands_still() {
         pool.install(|| without_record(train(dataset.clone(), config.clone()).field()))
     };
     assert_eq!(on(1), on(3));
+}
+
+/// Mean PSNR on the held-out frames, dB.
+fn score(trainer: &Trainer) -> f64 {
+    let field = trainer.field();
+    let options = EvaluationOptions::held_out(field);
+    let scores = evaluate::<EvaluationError>(field, trainer.dataset(), &options, |_| Ok(())).unwrap();
+    scores.overall.psnr.unwrap()
+}
+
+#[test]
+fn exposures_are_learnt_where_cameras_disagree() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = Scene { times: 2, disagree: true, ..Scene::default() };
+    let dataset = with_known_points(capture(folder.path(), scene));
+    let dark = TrainConfig { background: [0.0; 3], ..small_config() };
+    let config = planned(&dataset, &dark, "auto");
+    assert!(config.effects.exposure);
+    let (with, without) = (
+        train(dataset.clone(), config.clone()),
+        train(dataset.clone(), planned(&dataset, &config, "auto,-exposure")),
+    );
+    let (gained, plain) = (score(&with), score(&without));
+    println!("cameras disagree: {gained:.2} dB with exposures, {plain:.2} dB without");
+    assert!(gained > plain + 0.2, "{gained} dB with exposures, {plain} dB without");
+    // What was learnt is what was put in, relative to the average camera.
+    let learnt = trained_exposures(with.field());
+    assert_eq!(learnt.len(), 4);
+    for view in 0..4 {
+        let Exposure { gain, offset } = learnt[&format!("cam{view}")];
+        for (channel, truth) in relative_gain(view).into_iter().enumerate() {
+            let of_grey = f64::from(gain[channel] + offset[channel] / 0.5);
+            assert!((of_grey / truth - 1.0).abs() < 0.12, "{view} {channel}: {of_grey} for {truth}");
+        }
+    }
+    assert!(trained_exposures(without.field()).is_empty());
+
+    let folder = tempfile::tempdir().unwrap();
+    let agree = with_known_points(capture(folder.path(), Scene { times: 2, ..Scene::default() }));
+    let config = planned(&agree, &small_config(), "auto");
+    assert!(!config.effects.exposure);
+    let forced = planned(&agree, &config, "auto,+exposure");
+    assert!(forced.effects.exposure);
+    let (without, with) = (score(&train(agree.clone(), config)), score(&train(agree, forced)));
+    println!("cameras agree: {with:.2} dB with exposures, {without:.2} dB without");
+    assert!(without > with - 0.3, "{with} dB with exposures, {without} dB without");
+}
+
+#[test]
+fn a_resumed_run_goes_on_with_its_exposures() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, disagree: true, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 30, 20);
+    (config.densify.from, config.densify.every, config.resample.every) = (10, 20, 10);
+    config.effects.exposure = true;
+    config.report.step_every = 1;
+    let whole = train(dataset.clone(), config.clone());
+    let (expected, work) = (trained_exposures(whole.field()), whole.work());
+    assert!(expected.values().any(|exposure| *exposure != Exposure::NEUTRAL));
+    for stop_at in [11_u64, 35, 60] {
+        let path = folder.path().join("stopped.cif");
+        stopped_after(&dataset, &config, stop_at).checkpoint(true).save(&path).unwrap();
+        let loaded = cif_field::Checkpoint::load(&path).unwrap();
+        let mut resumed = Trainer::resume(dataset.clone(), loaded).unwrap();
+        assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+        assert_eq!(without_record(resumed.field()), without_record(whole.field()), "stopped after {stop_at}");
+        assert_eq!((trained_exposures(resumed.field()), resumed.work()), (expected.clone(), work));
+    }
+}
+
+#[test]
+fn instances_that_appear_are_found() {
+    let evidence = |scene: Scene| {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), scene);
+        let plan = EffectPlan::new(&dataset, &small_config(), &EffectChoice::default()).unwrap();
+        let row = plan.effects.into_iter().find(|effect| effect.effect == EffectKind::Appearing).unwrap();
+        (row.evidence, planned(&dataset, &small_config(), "auto,+appearing").model.heads.opacity)
+    };
+    let (found, switched) = evidence(Scene { times: 6, appears: true, ..Scene::default() });
+    assert!(found.contains("ball 9") && switched, "{found}");
+    // Balls that are always there, one of which rolls, hidden at times.
+    for scene in [
+        Scene { times: 6, ..Scene::default() },
+        Scene { times: 12, views: 12, rolls: Some(1.5), one_camera: true, ..Scene::default() },
+    ] {
+        assert!(evidence(scene).0.contains("none appears"), "{}", evidence(scene).0);
+    }
 }

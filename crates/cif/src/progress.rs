@@ -112,7 +112,9 @@ impl Progress {
             }
             TrainEvent::Measured { point, .. } => self.miou = point.miou.or(self.miou),
             TrainEvent::Warning { message } => self.line(&format!("warning: {message}")),
-            TrainEvent::Finished { wall_s, iterations, gaussians, psnr, peak_rss_mb, rolled_back } => {
+            TrainEvent::Finished {
+                wall_s, iterations, gaussians, psnr, peak_rss_mb, rolled_back, ..
+            } => {
                 self.clear();
                 let memory = peak_rss_mb.map_or(String::new(), |mb| format!(", peak memory {mb:.0} MB"));
                 if *rolled_back > 0 {

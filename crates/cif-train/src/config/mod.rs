@@ -314,23 +314,31 @@ pub struct EffectsConfig {
     /// Steps between tests for Gaussians that stand still, which then skip the deformation network; default 0:
     /// every Gaussian goes through it.
     pub still_every: u32,
-    /// Share of the fine steps before the first test, default 0.25.
+    /// Share of the fine steps before the first test, default 0.15.
     pub still_from: f32,
     /// Displacement from its mean, as a fraction of the extent, up to which a Gaussian may be taken to stand
-    /// still, default 0.03. Less counts, down to 0.001, where that much shows.
+    /// still, default 0.002. Less counts, down to a quarter, where that much shows.
     pub still_displacement: f32,
     /// Change of log-scales, of the unit quaternion, of the opacity logit and of the colour coefficients up to
-    /// which, likewise, a Gaussian may be taken to stand still, default 0.5.
+    /// which, likewise, a Gaussian may be taken to stand still, default 0.2.
     pub still_shape: f32,
+    /// Share of the Gaussians that stand still which go through the network all the same from one test to the
+    /// next, others each time: what they learn shows where more must move. Default 0.03.
+    pub still_awake: f32,
     /// Loss, dB on held-out pixels of training views, up to which a test takes Gaussians to stand still, default
     /// 0.02.
     pub still_loss: f32,
-    /// Gain, dB on held-out pixels of training views, that a degree of spherical harmonics must bring before the
-    /// next one comes; else it is taken back. Default 0: degrees come by steps alone.
+    /// Gain, dB on held-out pixels of training views, that a degree of spherical harmonics must bring at half of
+    /// the fine stage; else it is taken back. Until then the next degree waits while the last one brings no gain
+    /// at all. Default 0: degrees come by steps alone, and stay.
     pub sh_gain: f32,
-    /// Gain, likewise, that the motion of scales, rotations, opacities and colours must each bring at the first
-    /// test for Gaussians that stand still; else it is removed. Default 0: all stay.
+    /// Gain, likewise, that the motion of scales, rotations, opacities and colours must each bring at half of the
+    /// fine stage; else it is removed. Default 0: all stay.
     pub head_gain: f32,
+    /// Whether exports hold hulls of instances for simulators unless told otherwise, default yes.
+    pub physics: bool,
+    /// Whether an exposure and a white balance are learnt for every camera, default no.
+    pub exposure: bool,
 }
 
 /// What is reported, evaluated and saved on the way.

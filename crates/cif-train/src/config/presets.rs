@@ -287,12 +287,15 @@ impl Default for EffectsConfig {
             motion: true,
             instances: true,
             still_every: 0,
-            still_from: 0.25,
-            still_displacement: 0.03,
-            still_shape: 0.5,
+            still_from: 0.15,
+            still_displacement: 0.002,
+            still_shape: 0.2,
+            still_awake: 0.03,
             still_loss: 0.02,
             sh_gain: 0.0,
             head_gain: 0.0,
+            physics: true,
+            exposure: false,
         }
     }
 }

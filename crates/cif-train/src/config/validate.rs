@@ -126,6 +126,7 @@ impl TrainConfig {
         at_least("motion.gaussians", self.motion.gaussians, 4, "expected at least 4")?;
 
         within("effects.still_from", self.effects.still_from, 0.0..=1.0, "expected a number in [0, 1]")?;
+        within("effects.still_awake", self.effects.still_awake, 0.0..=1.0, "expected a number in [0, 1]")?;
 
         at_least("densify.every", densify.every, 1, "expected at least 1")?;
         at_least("densify.max_gaussians", densify.max_gaussians, 1, "expected at least 1")?;

@@ -12,6 +12,7 @@ use cif_render::{Channels, OccupancySource, RenderSettings, RenderedImage};
 use serde::Serialize;
 
 use crate::config::{Ablation, TrainConfig};
+use crate::exposure::trained_exposures;
 
 use super::image::{psnr, ssim, unit_color};
 use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
@@ -117,6 +118,9 @@ pub struct Evaluation {
     pub gaussians: usize,
     /// Mean wall time of a render, milliseconds.
     pub render_ms_per_frame: f64,
+    /// Frames that were compared as their camera was learnt to expose; `None` where no exposures were learnt. The
+    /// other frames are compared with what the average camera sees.
+    pub exposed_frames: Option<usize>,
 }
 
 /// Renders and scores every frame of a split; `observe` sees each one.
@@ -130,6 +134,8 @@ pub fn evaluate<E: From<EvaluationError>>(
     mut observe: impl FnMut(FrameView<'_>) -> Result<(), E>,
 ) -> Result<Evaluation, E> {
     let mut renderer = Renderer::new(options.simd);
+    let exposures = trained_exposures(field);
+    let mut exposed_frames = 0;
     let channels = Channels { depth: options.depth, instances: options.settings.instances.is_some() };
     let mut frames: Vec<FrameScores> = Vec::new();
     let mut confusions: Vec<Option<FrameConfusion>> = Vec::new();
@@ -137,8 +143,12 @@ pub fn evaluate<E: From<EvaluationError>>(
         let truth =
             dataset.load_frame(index, options.settings.background).map_err(EvaluationError::Dataset)?;
         let start = Instant::now();
-        let rendered = renderer.render(field, &frame.camera, frame.time, &options.settings, channels);
+        let mut rendered = renderer.render(field, &frame.camera, frame.time, &options.settings, channels);
         let render_ms = start.elapsed().as_secs_f64() * 1e3;
+        if let Some(exposure) = exposures.get(&frame.camera_name) {
+            exposure.apply(&mut rendered.color);
+            exposed_frames += 1;
+        }
         let predicted = rendered.instances.as_ref().map(|instances| mask_ids(field, &instances.label));
         let confusion = match (&truth.mask, &predicted) {
             (Some(mask), Some(predicted)) => {
@@ -187,7 +197,14 @@ pub fn evaluate<E: From<EvaluationError>>(
     let groups = names.into_iter().map(|name| (name.to_owned(), select(Some(name)))).collect();
     let overall = select(None);
     let render_ms_per_frame = frames.iter().map(|f| f.render_ms).sum::<f64>() / frames.len() as f64;
-    Ok(Evaluation { overall, groups, gaussians: field.gaussians.len(), render_ms_per_frame, frames })
+    Ok(Evaluation {
+        overall,
+        groups,
+        gaussians: field.gaussians.len(),
+        render_ms_per_frame,
+        frames,
+        exposed_frames: (!exposures.is_empty()).then_some(exposed_frames),
+    })
 }
 
 /// The settings that a field was trained with; `None` for a field of other origin.

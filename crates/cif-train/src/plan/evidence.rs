@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use cif_dataset::{Dataset, Frame, Split};
+use cif_dataset::{Dataset, Frame, PointSource, Split};
 use glam::DVec3;
 
 use crate::config::MotionConfig;
@@ -24,6 +24,20 @@ const CHANGE: u8 = 24;
 /// Initial points that distances are measured with.
 const POINTS: usize = 500;
 
+/// Share of its usual area from which an instance counts as seen whole.
+const WHOLE: f64 = 0.5;
+
+/// Points, cameras, and images of each that brightness is compared with.
+const COLORED_POINTS: usize = 4_000;
+const EXPOSED_CAMERAS: usize = 24;
+const EXPOSED_IMAGES: usize = 3;
+
+/// Values that cameras record in proportion to the light.
+const PROPORTIONAL: std::ops::RangeInclusive<u8> = 24..=232;
+
+/// Points with such values, per channel, that a camera is judged by.
+const SAMPLES: usize = 60;
+
 /// What was found.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Evidence {
@@ -41,6 +55,11 @@ pub(super) struct Evidence {
     /// Instances, and the labels of those that travel.
     pub instances: usize,
     pub travelling: Vec<String>,
+    /// Labels of the instances that appear or vanish inside the view, by their masks.
+    pub appearing: Vec<String>,
+    /// Training cameras that were compared, and the largest factor between two of them in how bright they record
+    /// the same points, by channel; `None` with fewer than two cameras, or points without colours.
+    pub exposures: Option<(usize, f64)>,
     /// Largest over smallest number of pixels per metre at the points that frames see, by frame.
     pub footprint_ratio: f64,
     /// Largest angle between directions from which training cameras see the middle of the points, degrees.
@@ -73,6 +92,7 @@ impl Evidence {
         };
         let masked: Vec<(usize, &Frame)> =
             training.iter().filter(|(_, frame)| frame.mask.is_some()).copied().collect();
+        let sightings = Sightings::of(dataset, &masked)?;
         Ok(Self {
             times: dataset.times.len(),
             frames: training.len(),
@@ -81,7 +101,9 @@ impl Evidence {
             change,
             masked: masked.len(),
             instances: dataset.instances.len(),
-            travelling: if dataset.times.len() > 1 { travelling(dataset, &masked)? } else { Vec::new() },
+            travelling: sightings.travelling(dataset),
+            appearing: sightings.appearing(dataset),
+            exposures: exposures(dataset, &cameras)?,
             footprint_ratio: footprint_ratio(dataset, &training),
             view_angle: view_angle(dataset, &training),
             lenses: training.iter().filter(|(_, frame)| !frame.lens.is_identity()).count(),
@@ -121,27 +143,139 @@ fn largest_change(dataset: &Dataset, cameras: &[&Vec<(usize, &Frame)>]) -> Resul
     Ok(largest)
 }
 
-/// Labels of the instances that travel, by the centres of their masks.
-fn travelling(dataset: &Dataset, masked: &[(usize, &Frame)]) -> Result<Vec<String>, TrainError> {
-    let mut frames = Vec::new();
-    for (index, frame) in spread(masked, MASKS) {
-        let Some(mask) = dataset.load_mask(index)? else { continue };
-        frames.push(observe(&mask, &frame.camera, frame.time_index));
+/// Where masks show instances, in a sample of the frames; empty for a single time.
+struct Sightings<'a> {
+    /// Frames looked at, by camera, in the order of time.
+    times: BTreeMap<&'a str, Vec<usize>>,
+    /// Per instance id, camera by camera.
+    of: BTreeMap<u16, BTreeMap<&'a str, Vec<Observation>>>,
+}
+
+impl<'a> Sightings<'a> {
+    fn of(dataset: &Dataset, masked: &[(usize, &'a Frame)]) -> Result<Self, TrainError> {
+        let mut found = Self { times: BTreeMap::new(), of: BTreeMap::new() };
+        if dataset.times.len() < 2 {
+            return Ok(found);
+        }
+        let mut masked = masked.to_vec();
+        masked.sort_by_key(|(_, frame)| frame.time_index);
+        let (mut frames, mut seen) = (Vec::new(), Vec::new());
+        for (index, frame) in spread(&masked, MASKS) {
+            let Some(mask) = dataset.load_mask(index)? else { continue };
+            frames.push(frame);
+            seen.push(observe(&mask, &frame.camera, frame.time_index));
+        }
+        // A wrong camera shows everything somewhere else, as if it travelled.
+        for wrong in misfits(&seen, f64::from(MotionConfig::default().misfit)).into_iter().rev() {
+            frames.remove(wrong);
+            seen.remove(wrong);
+        }
+        for (frame, seen) in frames.into_iter().zip(seen) {
+            let camera = frame.camera_name.as_str();
+            found.times.entry(camera).or_default().push(frame.time_index);
+            for (id, observation) in seen {
+                found.of.entry(id).or_default().entry(camera).or_default().push(observation);
+            }
+        }
+        Ok(found)
     }
-    // A wrong camera shows everything somewhere else, as if it travelled.
-    for frame in misfits(&frames, f64::from(MotionConfig::default().misfit)).into_iter().rev() {
-        frames.remove(frame);
+
+    fn labels(
+        &self,
+        dataset: &Dataset,
+        wanted: impl Fn(&BTreeMap<&str, Vec<Observation>>) -> bool,
+    ) -> Vec<String> {
+        let instances = dataset.instances.iter();
+        instances
+            .filter(|instance| self.of.get(&instance.id).is_some_and(&wanted))
+            .map(|instance| instance.label.clone())
+            .collect()
     }
-    let mut seen: BTreeMap<u16, Vec<Observation>> = BTreeMap::new();
-    for (id, observation) in frames.into_iter().flatten() {
-        seen.entry(id).or_default().push(observation);
+
+    /// Labels of the instances that travel, by the centres of their masks.
+    fn travelling(&self, dataset: &Dataset) -> Vec<String> {
+        self.labels(dataset, |cameras| {
+            let mut all: Vec<Observation> = cameras.values().flatten().copied().collect();
+            all.sort_by_key(|observation| observation.time_index);
+            travels(&all)
+        })
     }
-    Ok(dataset
-        .instances
-        .iter()
-        .filter(|instance| seen.get(&instance.id).is_some_and(|observations| travels(observations)))
-        .map(|instance| instance.label.clone())
-        .collect())
+
+    /// Labels of the instances that every camera which sees them sees appear, or vanish, inside its image and at
+    /// full size: what comes in from the side is cut first, what comes from behind something starts small.
+    fn appearing(&self, dataset: &Dataset) -> Vec<String> {
+        self.labels(dataset, |cameras| {
+            let all = |pops: &dyn Fn(&[usize], &[Observation]) -> bool| {
+                cameras.iter().all(|(camera, seen)| pops(&self.times[camera], seen))
+            };
+            all(&|times, seen| {
+                let (Some(first), Some(start)) = (seen.first(), times.first()) else { return false };
+                first.time_index > *start && is_whole(first, &seen[1..])
+            }) || all(&|times, seen| {
+                let (Some(last), Some(end)) = (seen.last(), times.last()) else { return false };
+                last.time_index < *end && is_whole(last, &seen[..seen.len() - 1])
+            })
+        })
+    }
+}
+
+/// Whether an instance is seen as large as in the other frames, away from the border.
+fn is_whole(observation: &Observation, others: &[Observation]) -> bool {
+    let mut areas: Vec<f64> = others.iter().map(|other| other.area_px).collect();
+    areas.sort_by(f64::total_cmp);
+    let Some(median) = areas.get(areas.len() / 2) else { return false };
+    !observation.cut && observation.area_px >= WHOLE * median
+}
+
+/// How many training cameras could be compared, and the largest factor between two of them in how bright they
+/// record the same points.
+fn exposures(
+    dataset: &Dataset,
+    cameras: &BTreeMap<&str, Vec<(usize, &Frame)>>,
+) -> Result<Option<(usize, f64)>, TrainError> {
+    if cameras.len() < 2 || matches!(dataset.points.source, PointSource::Random) {
+        return Ok(None);
+    }
+    let points: Vec<([f32; 3], [u8; 3])> =
+        dataset.points.positions.iter().copied().zip(dataset.points.colors.iter().copied()).collect();
+    let points = spread(&points, COLORED_POINTS);
+    let (mut low, mut high, mut compared) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3], 0);
+    for frames in spread(&cameras.values().collect::<Vec<_>>(), EXPOSED_CAMERAS) {
+        let mut ratios: [Vec<f64>; 3] = Default::default();
+        for (index, frame) in spread(frames, EXPOSED_IMAGES) {
+            let image = dataset.load_image(index, [1.0; 3])?;
+            for (position, color) in &points {
+                let Some((pixel, _)) = frame.camera.project(DVec3::from(position.map(f64::from))) else {
+                    continue;
+                };
+                let (x, y) = (pixel.x.floor(), pixel.y.floor());
+                if x < 0.0 || y < 0.0 || x >= f64::from(image.width) || y >= f64::from(image.height) {
+                    continue;
+                }
+                let seen = image.at(x as u32, y as u32);
+                for channel in 0..3 {
+                    let pair = [seen[channel], color[channel]];
+                    // Near black and white, cameras do not record in proportion.
+                    if pair.iter().all(|value| PROPORTIONAL.contains(value)) {
+                        let [seen, known] = pair.map(f64::from);
+                        ratios[channel].push((seen / known).ln());
+                    }
+                }
+            }
+        }
+        if ratios.iter().any(|of| of.len() < SAMPLES) {
+            continue;
+        }
+        compared += 1;
+        for (channel, of) in ratios.iter_mut().enumerate() {
+            // Half of the points may be hidden, shiny or misplaced.
+            of.sort_by(f64::total_cmp);
+            let median = of[of.len() / 2];
+            (low[channel], high[channel]) = (low[channel].min(median), high[channel].max(median));
+        }
+    }
+    let widest = (0..3).map(|channel| high[channel] - low[channel]).fold(0.0, f64::max);
+    Ok((compared >= 2).then(|| (compared, widest.exp())))
 }
 
 /// Largest over smallest median of pixels per metre at what a frame sees; 1 with nothing to compare.

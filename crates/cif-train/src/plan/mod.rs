@@ -27,10 +27,11 @@ use crate::trainer::automatic_time_nodes;
 const STILL_EVERY: u32 = 500;
 
 /// Gain that a degree of spherical harmonics must bring, dB.
-const SH_GAIN: f32 = 0.02;
+const SH_GAIN: f32 = 0.01;
 
-/// Gain that an optional output of the deformation must bring, dB.
-const HEAD_GAIN: f32 = 0.02;
+/// Gain that an optional output of the deformation must bring, dB. Little, as it costs little where most stands
+/// still, and what moves covers few pixels.
+const HEAD_GAIN: f32 = 0.005;
 
 /// Share of changed pixels up to which a fixed camera sees nothing move.
 const STATIC_CHANGE: f64 = 5e-4;
@@ -41,6 +42,9 @@ const FEW_DIRECTIONS: f64 = 4.0;
 /// Ratio of footprints from which the low-pass filter of the nearest views would hide detail, or that of the
 /// farthest would thicken it.
 const FOOTPRINTS: f64 = 4.0;
+
+/// Factor between cameras in how bright they record the same points from which they disagree.
+const DISAGREEMENT: f64 = 1.1;
 
 /// Weights of motion guidance where it is switched on.
 const GUIDANCE: f32 = 10.0;
@@ -59,25 +63,34 @@ pub enum EffectKind {
     ViewDependence,
     /// Identities, occupancy, calibration, resampling.
     Instances,
+    /// Instances that are not there all the time: opacities that change.
+    Appearing,
     /// Paths of travelling objects from their masks.
     Guidance,
+    /// Exposure and white balance per camera.
+    Exposure,
     /// Compensation of opacity for the low-pass filter.
     Antialiasing,
     /// Removal of lens distortion.
     Lens,
     /// Colour behind everything.
     Background,
+    /// Hulls of instances for simulators, in exports.
+    Physics,
 }
 
 impl EffectKind {
     /// Those that `--effects` switches.
-    pub const SWITCHED: [Self; 6] = [
+    pub const SWITCHED: [Self; 9] = [
         Self::Motion,
         Self::Shape,
         Self::ViewDependence,
         Self::Instances,
+        Self::Appearing,
         Self::Guidance,
+        Self::Exposure,
         Self::Antialiasing,
+        Self::Physics,
     ];
 
     /// Name, as in `--effects` and in JSON.
@@ -89,10 +102,13 @@ impl EffectKind {
             Self::TimePlanes => "time-planes",
             Self::ViewDependence => "view-dependence",
             Self::Instances => "instances",
+            Self::Appearing => "appearing",
             Self::Guidance => "guidance",
+            Self::Exposure => "exposure",
             Self::Antialiasing => "antialiasing",
             Self::Lens => "lens",
             Self::Background => "background",
+            Self::Physics => "physics",
         }
     }
 }
@@ -222,6 +238,10 @@ fn set(kind: EffectKind, extent: Extent, config: &mut TrainConfig) {
                 (config.motion.guidance, config.motion.stillness) = (GUIDANCE, STILLNESS);
             }
         }
+        // Off, it leaves a preset that moves opacities as it is; `shape` judges these.
+        EffectKind::Appearing => config.model.heads.opacity |= extent != Extent::Off,
+        EffectKind::Exposure => config.effects.exposure = extent != Extent::Off,
+        EffectKind::Physics => config.effects.physics = extent != Extent::Off,
         EffectKind::Antialiasing => config.antialiased = extent != Extent::Off,
         // Told, and set elsewhere: by the number of times, by the capture, by the background.
         EffectKind::TimePlanes | EffectKind::Lens | EffectKind::Background => {}
@@ -356,6 +376,23 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
     effects.push(instances);
 
     if moves_now && has_masks {
+        let preset = if heads.opacity { Extent::Full } else { Extent::Off };
+        effects.push(effect(
+            EffectKind::Appearing,
+            preset,
+            preset,
+            "",
+            if found.appearing.is_empty() {
+                "by their masks, none appears or vanishes inside the view".to_owned()
+            } else {
+                format!(
+                    "these appear or vanish inside the view: {}; moving them out of sight did as well as opacities \
+                     that change",
+                    found.appearing.join(", ")
+                )
+            },
+            "opacities that change: two layers of the network".to_owned(),
+        ));
         let holds = config.motion.guidance > 0.0 || config.motion.stillness > 0.0;
         let preset = if holds { Extent::Full } else { Extent::Off };
         effects.push(effect(
@@ -371,6 +408,21 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
                 (labels, _) => format!("several cameras see what travels: {}", labels.join(", ")),
             },
             format!("{} steps before the fine stage", config.motion.rehearsal),
+        ));
+    }
+
+    if let Some((cameras, factor)) = found.exposures {
+        let preset = if config.effects.exposure { Extent::Full } else { Extent::Off };
+        effects.push(effect(
+            EffectKind::Exposure,
+            if factor >= DISAGREEMENT { Extent::Full } else { preset },
+            preset,
+            "",
+            format!(
+                "of {cameras} cameras, two differ by {:.0} % in how bright they record the same points",
+                100.0 * (factor - 1.0)
+            ),
+            "6 numbers per camera".to_owned(),
         ));
     }
 
@@ -404,6 +456,20 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
         cost: "none".to_owned(),
         flag: "--set background=[R,G,B]".to_owned(),
     });
+    if has_masks && effects.iter().any(|e| e.effect == EffectKind::Instances && e.decision != Decision::Off) {
+        effects.push(effect(
+            EffectKind::Physics,
+            if moves_now { Extent::Full } else { Extent::Off },
+            Extent::Full,
+            "",
+            match &found.travelling[..] {
+                _ if !moves_now => "nothing moves, so that there is nothing to simulate".to_owned(),
+                [] => "instances may move, though none travels by its masks".to_owned(),
+                labels => format!("these travel: {}", labels.join(", ")),
+            },
+            "none in training; in exports one hull per instance".to_owned(),
+        ));
+    }
     effects
 }
 

@@ -10,6 +10,8 @@ fn found() -> Evidence {
         masked: 60,
         instances: 5,
         travelling: vec!["ball".to_owned()],
+        appearing: Vec::new(),
+        exposures: None,
         footprint_ratio: 1.3,
         view_angle: 50.0,
         lenses: 0,
@@ -92,7 +94,7 @@ fn few_directions_and_many_footprints_count() {
 
 #[test]
 fn every_effect_says_why_and_what_decides_otherwise() {
-    let lens = Evidence { lenses: 3, has_alpha: true, ..found() };
+    let lens = Evidence { lenses: 3, has_alpha: true, exposures: Some((3, 1.02)), ..found() };
     let (plan, _) = plan(&lens, "auto");
     for effect in &plan.effects {
         assert!(!effect.evidence.is_empty() && !effect.cost.is_empty(), "{effect:?}");
@@ -109,11 +111,48 @@ fn every_effect_says_why_and_what_decides_otherwise() {
             "time-planes",
             "view-dependence",
             "instances",
+            "appearing",
             "guidance",
+            "exposure",
             "antialiasing",
             "lens",
-            "background"
+            "background",
+            "physics"
         ]
     );
     assert_eq!(json["effects"][4]["decision"], "on");
+}
+
+#[test]
+fn cameras_that_disagree_and_instances_that_appear_count() {
+    let calm = Evidence { exposures: Some((8, 1.04)), ..found() };
+    let (plan, config) = plan(&calm, "auto");
+    assert_eq!(plan.decision(EffectKind::Exposure), Some(&Decision::Off));
+    assert_eq!(plan.decision(EffectKind::Appearing), Some(&Decision::Off));
+    assert!(!config.effects.exposure && !config.model.heads.opacity);
+    let found = Evidence { exposures: Some((8, 1.3)), appearing: vec!["kite".to_owned()], ..found() };
+    let (plan, config) = self::plan(&found, "auto");
+    // Opacities that change were not worth it where it was measured.
+    assert!(config.effects.exposure && !config.model.heads.opacity);
+    assert!(self::plan(&found, "auto,+appearing").1.model.heads.opacity);
+    let why = |kind| plan.effects.iter().find(|effect| effect.effect == kind).unwrap().evidence.clone();
+    assert!(why(EffectKind::Exposure).contains("30 %") && why(EffectKind::Appearing).contains("kite"));
+    assert_eq!(self::plan(&found, "all").1, TrainConfig::default(), "all takes no evidence");
+    let (_, config) = self::plan(&found, "auto,-exposure,-appearing");
+    assert!(!config.effects.exposure && !config.model.heads.opacity);
+    assert!(self::plan(&calm, "all,+exposure").1.effects.exposure);
+    assert!(self::plan(&self::found(), "+exposure").0.decision(EffectKind::Exposure).is_none(), "one camera");
+}
+
+#[test]
+fn hulls_are_for_what_moves() {
+    assert!(plan(&found(), "auto").1.effects.physics);
+    for (still, choice) in [
+        (Evidence { times: 1, ..found() }, "auto"),
+        (Evidence { moving_cameras: 0, fixed_cameras: 3, change: Some(0.0), ..found() }, "auto"),
+        (found(), "auto,-physics"),
+    ] {
+        assert!(!plan(&still, choice).1.effects.physics, "{choice}");
+    }
+    assert!(plan(&Evidence { times: 1, ..found() }, "auto,+physics").1.effects.physics);
 }

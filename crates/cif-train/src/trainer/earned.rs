@@ -1,6 +1,6 @@
-//! What has to show that it helps: a degree of spherical harmonics before the next one comes, and the optional
-//! outputs of the deformation once it has learnt for a while. Both are judged on pixels of training views that
-//! the colour loss leaves out.
+//! What has to show that it helps: degrees of spherical harmonics and the optional outputs of the deformation. They
+//! are judged on pixels of training views that the colour loss leaves out, at half of the fine stage: sooner they
+//! have not learnt what they are worth, and later nothing is left to make good for what is taken back.
 
 use cif_dataset::Dataset;
 use cif_field::deformation::HeadKind;
@@ -11,10 +11,11 @@ use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
 use super::frames::FrameStore;
-use super::still::{first_test, probe, probe_times};
+use super::still::{probe, probe_times};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
-use crate::schedule::falls_on;
+use crate::exposure::Exposures;
+use crate::schedule::{falls_on, sh_degree};
 
 /// Every so many columns and rows there is a pixel that the colour loss leaves out.
 const SPACING: u32 = 8;
@@ -37,15 +38,18 @@ fn held_out(width: u32, height: u32) -> impl Iterator<Item = usize> {
 }
 
 impl Trainer {
-    /// Whether pixels are held out to judge by.
-    fn judges(&self) -> bool {
+    /// Whether anything is still to be judged by pixels that are held out; then all pixels train.
+    fn judges(&self, stage: Stage, iteration: u32) -> bool {
         let effects = &self.config.effects;
-        effects.sh_gain > 0.0 || effects.head_gain > 0.0 || effects.still_every > 0
+        let half = self.plan.iterations(&self.config, Stage::Fine) / 2;
+        let earns = effects.sh_gain > 0.0 || effects.head_gain > 0.0;
+        (earns && (stage == Stage::Coarse || (stage == Stage::Fine && iteration <= half)))
+            || self.tests_to_come(stage, iteration)
     }
 
     /// Keeps the pixels that are judged by out of the colour gradient.
-    pub(super) fn leave_out_judged(&mut self) {
-        if self.judges() {
+    pub(super) fn leave_out_judged(&mut self, stage: Stage, iteration: u32) {
+        if self.judges(stage, iteration) {
             let grid = &mut self.scratch.v_color;
             for pixel in held_out(grid.width, grid.height) {
                 grid.pixels[pixel] = [0.0; 3];
@@ -53,65 +57,95 @@ impl Trainer {
         }
     }
 
-    /// Judges the present degree of spherical harmonics where the next one is due, and lowers it for good when
-    /// it does not help.
+    /// Degree of spherical harmonics at a step: as the schedule says, but not two above one that helps, and not
+    /// above what was taken back.
+    pub(super) fn degree_at(&self, iteration: u32) -> u8 {
+        let scheduled = sh_degree(&self.config, self.progress.sh_start, iteration);
+        if self.config.effects.sh_gain <= 0.0 {
+            return scheduled;
+        }
+        scheduled.min(self.progress.sh_judged + 1).min(self.progress.sh_cap.unwrap_or(u8::MAX))
+    }
+
+    /// Looks whether the present degree of spherical harmonics helps where the next one is due, and at half of the
+    /// fine stage takes back, for good, those that do not help enough.
     pub(super) fn judge_sh(
         &mut self,
         stage: Stage,
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let degree = self.field.sh_degree;
-        let due = matches!(stage, Stage::Coarse | Stage::Fine)
-            && self.config.effects.sh_gain > 0.0
-            && falls_on(iteration, self.config.model.sh_interval)
-            && self.progress.sh_cap.is_none()
-            && degree > self.progress.sh_judged;
-        if !due {
+        if self.config.effects.sh_gain <= 0.0 || !matches!(stage, Stage::Coarse | Stage::Fine) {
             return Ok(());
         }
-        let settings = self.color_settings();
-        let lower = RenderSettings { sh_degree: degree - 1, ..settings };
-        let views = (&self.frames, &self.dataset);
-        let with = judged_error(&mut self.renderer, views, &self.field, &settings)?;
-        let without = judged_error(&mut self.renderer, views, &self.field, &lower)?;
-        let gain_db = gain(without, with);
-        let kept = gain_db >= f64::from(self.config.effects.sh_gain);
-        self.progress.sh_judged = degree;
-        if !kept {
-            self.progress.sh_cap = Some(degree - 1);
-            let first = 3 * coefficient_count(degree - 1);
-            for coefficients in &mut self.field.gaussians.sh_coefficients {
-                coefficients[first..].fill(0.0);
+        let is_last = self.is_half_way(stage, iteration);
+        let is_next_due = falls_on(iteration, self.config.model.sh_interval)
+            && self.progress.sh_cap.is_none()
+            && self.field.sh_degree > self.progress.sh_judged;
+        if is_last {
+            while self.field.sh_degree > 0 {
+                let gain_wanted = f64::from(self.config.effects.sh_gain);
+                let degree = self.field.sh_degree;
+                if self.degree_gains(stage, iteration, gain_wanted, events)? {
+                    break;
+                }
+                let first = 3 * coefficient_count(degree - 1);
+                for coefficients in &mut self.field.gaussians.sh_coefficients {
+                    coefficients[first..].fill(0.0);
+                }
+                self.field.sh_degree = degree - 1;
+                self.progress.sh_cap = Some(degree - 1);
             }
-            self.field.sh_degree = degree - 1;
+        } else if is_next_due && self.degree_gains(stage, iteration, 0.0, events)? {
+            self.progress.sh_judged = self.field.sh_degree;
         }
-        let what = format!("view-dependent colour of degree {degree}");
-        events.push(TrainEvent::Judged { stage, iteration, what, gain_db, kept });
         Ok(())
     }
 
-    /// Judges the optional outputs of the deformation, once, when the first test for Gaussians that stand still
-    /// falls due, and removes those that do not help.
+    /// Whether the highest degree of spherical harmonics gains as much on the held-out pixels.
+    fn degree_gains(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        gain_wanted: f64,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<bool, TrainError> {
+        let degree = self.field.sh_degree;
+        let settings = self.color_settings();
+        let lower = RenderSettings { sh_degree: degree - 1, ..settings };
+        let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
+        let with = judged_error(&mut self.renderer, views, &self.field, &settings)?;
+        let without = judged_error(&mut self.renderer, views, &self.field, &lower)?;
+        let gain_db = gain(without, with);
+        let kept = gain_db >= gain_wanted;
+        let what = format!("view-dependent colour of degree {degree}");
+        events.push(TrainEvent::Judged { stage, iteration, what, gain_db, kept });
+        Ok(kept)
+    }
+
+    /// Whether a step is the one on which what has not earned its place is taken back.
+    fn is_half_way(&self, stage: Stage, iteration: u32) -> bool {
+        let last = self.plan.iterations(&self.config, Stage::Fine);
+        stage == Stage::Fine && iteration == (last / 2).max(1)
+    }
+
+    /// Judges the optional outputs of the deformation, once, at half of the fine stage, and removes those that do
+    /// not help.
     pub(super) fn judge_heads(
         &mut self,
         stage: Stage,
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let effects = &self.config.effects;
-        let gain_wanted = f64::from(effects.head_gain);
-        let due = stage == Stage::Fine
-            && gain_wanted > 0.0
-            && iteration == first_test(effects.still_from, self.plan.iterations(&self.config, stage));
-        if !due || self.field.deformation.is_none() {
+        let gain_wanted = f64::from(self.config.effects.head_gain);
+        if gain_wanted <= 0.0 || !self.is_half_way(stage, iteration) || self.field.deformation.is_none() {
             return Ok(());
         }
         let settings = self.color_settings();
         let times = probe_times(&self.dataset.times);
         for kind in OPTIONAL {
             let Some(trial) = without_output(&self.field, kind, &times) else { continue };
-            let views = (&self.frames, &self.dataset);
+            let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
             let with = judged_error(&mut self.renderer, views, &self.field, &settings)?;
             let without = judged_error(&mut self.renderer, views, &trial.field, &settings)?;
             let gain_db = gain(without, with);
@@ -133,7 +167,7 @@ impl Trainer {
 /// Mean squared colour error of a field over the held-out pixels of evenly spread training views.
 pub(super) fn judged_error(
     renderer: &mut Renderer,
-    (frames, dataset): (&FrameStore, &Dataset),
+    (frames, dataset, exposures): (&FrameStore, &Dataset, Option<&Exposures>),
     field: &Field,
     settings: &RenderSettings,
 ) -> Result<f64, TrainError> {
@@ -144,7 +178,10 @@ pub(super) fn judged_error(
         let data = frames.get(dataset, view)?;
         let frame = &dataset.frames[frames.index(view)];
         let channels = Channels { depth: false, instances: false };
-        let rendered = renderer.render(field, &frame.camera, frame.time, settings, channels);
+        let mut rendered = renderer.render(field, &frame.camera, frame.time, settings, channels);
+        if let Some(exposures) = exposures {
+            exposures.at(&frame.camera_name).apply(&mut rendered.color);
+        }
         for pixel in held_out(data.image.width, data.image.height) {
             for channel in 0..3 {
                 let target = f64::from(data.image.pixels[pixel][channel]) / 255.0;

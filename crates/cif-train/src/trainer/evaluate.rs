@@ -162,7 +162,11 @@ impl Trainer {
         let (mut psnrs, mut ssims, mut confusions) = (Vec::new(), Vec::new(), Vec::new());
         for (index, truth) in frames {
             let frame = &self.dataset.frames[*index];
-            let rendered = self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels);
+            let mut rendered =
+                self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels);
+            if let Some(exposures) = &self.progress.exposures {
+                exposures.at(&frame.camera_name).apply(&mut rendered.color);
+            }
             let target = unit_color(&truth.image);
             psnrs.push(psnr(&rendered.color, &target).min(MAX_PSNR));
             ssims.push(ssim(&rendered.color, &target));

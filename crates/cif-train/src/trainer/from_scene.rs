@@ -13,6 +13,7 @@ use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::events::Stage;
+use crate::exposure::trained_exposures;
 
 /// Times that differ by less are the same.
 const SAME_TIME: f64 = 1e-9;
@@ -83,6 +84,10 @@ impl Trainer {
         let mut trainer = Self::assemble(dataset, yardstick, config, field, Some(progress))?;
         if !trainer.plan.has_instances {
             return Err(TrainError::NoLabels { root: trainer.dataset.root });
+        }
+        let known = trained_exposures(&trainer.field);
+        if !trainer.config.effects.exposure || trainer.progress.exposures.is_none() {
+            trainer.progress.exposures = trainer.exposures().map(|fresh| fresh.start_with(&known));
         }
         if let Some((mut tensors, steps)) = state {
             restore(&mut trainer.optimiser, &mut tensors, &steps)?;

@@ -61,13 +61,14 @@ use self::optimiser::Optimiser;
 use self::pacing::Pacing;
 use self::progress::{Plan, Progress};
 use self::step::{Scratch, StepLoss};
-pub use self::times::StepTimes;
+pub use self::times::{StepTimes, Work};
 use crate::clock::{Clock, SystemClock};
 use crate::config::TrainConfig;
 use crate::curve::{Curve, MIN_GAP};
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent, TrainerView};
+use crate::exposure::Exposures;
 use crate::schedule::falls_on;
 
 /// Observer of a run.
@@ -169,6 +170,7 @@ impl Trainer {
         trainer.find_travelling()?;
         let first = trainer.plan.from(&trainer.config, Stage::Coarse);
         trainer.progress = Progress::at(first);
+        trainer.progress.exposures = trainer.exposures();
         trainer.enter(first)?;
         Ok(trainer)
     }
@@ -223,6 +225,11 @@ impl Trainer {
             field,
             frames,
         })
+    }
+
+    /// Neutral exposures of the cameras, where they are to be learnt.
+    fn exposures(&self) -> Option<Exposures> {
+        self.config.effects.exposure.then(|| Exposures::of(&self.dataset)).flatten()
     }
 
     fn warn_of_capture(&mut self) {
@@ -348,6 +355,12 @@ impl Trainer {
         self.times
     }
 
+    /// What the steps of the whole run worked on, over interruptions.
+    #[must_use]
+    pub fn work(&self) -> Work {
+        self.progress.work
+    }
+
     /// Sets times and counts to zero.
     pub fn reset_times(&mut self) {
         self.times = StepTimes::default();
@@ -428,6 +441,7 @@ impl Trainer {
             psnr: self.progress.psnr.unwrap_or(0.0),
             peak_rss_mb: provenance::peak_rss_mb(),
             rolled_back: self.progress.rollbacks.total,
+            work: self.progress.work,
         };
         self.emit(observer, &finished);
         Ok(Outcome::Finished)

@@ -6,10 +6,12 @@ use serde::{Deserialize, Serialize};
 
 use super::guard::Rollbacks;
 use super::pacing::Goals;
+use super::times::Work;
 use crate::clock::Seconds;
 use crate::config::TrainConfig;
 use crate::curve::Curve;
 use crate::events::Stage;
+use crate::exposure::Exposures;
 
 /// Counters of a run; saved with its state.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -36,7 +38,7 @@ pub(super) struct Progress {
     pub goals: Goals,
     /// Spherical-harmonics degree at the start of the stage.
     pub sh_start: u8,
-    /// Highest degree of spherical harmonics that was judged.
+    /// Highest degree of spherical harmonics that was seen to help.
     #[serde(default)]
     pub sh_judged: u8,
     /// Highest degree that is left, once one did not help.
@@ -45,6 +47,12 @@ pub(super) struct Progress {
     /// Rung of the ladder of limits that held at the last test for Gaussians that stand still.
     #[serde(default)]
     pub still_rung: u32,
+    /// What the steps worked on.
+    #[serde(default)]
+    pub work: Work,
+    /// What each camera makes of colours, where cameras disagree.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub exposures: Option<Exposures>,
     /// What was planned for the capture, as recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effects: Option<serde_json::Value>,
@@ -95,6 +103,8 @@ impl Progress {
             sh_judged: 0,
             sh_cap: None,
             still_rung: 0,
+            work: Work::default(),
+            exposures: None,
             effects: None,
             opacities_were_reset: false,
             psnr: None,

@@ -38,6 +38,7 @@ impl Trainer {
                 "simd": self.simd_name(),
                 "gaussians": self.field.gaussians.len(),
                 "psnr_training_views": self.progress.psnr,
+                "work": (self.progress.work.views > 0).then_some(self.progress.work),
             },
             "config": self.config,
         });
@@ -50,6 +51,9 @@ impl Trainer {
         }
         if let Some(effects) = &self.progress.effects {
             record["train"]["effects"] = effects.clone();
+        }
+        if let Some(exposures) = &self.progress.exposures {
+            record["train"]["exposures"] = json!(exposures.by_camera());
         }
         if !self.progress.curve.points.is_empty() {
             record["curve"] = json!(self.progress.curve);

@@ -17,10 +17,11 @@ use crate::config::Ablation;
 use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, reset_opacities};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
+use crate::exposure::RATES;
 use crate::losses::{SsimScratch, color_loss_of_tiles};
 use crate::random::{Purpose, stream};
 use crate::resample::{ResampleContext, apply, plan};
-use crate::schedule::{falls_on, sh_degree};
+use crate::schedule::{falls_on, log_linear, schedule_steps};
 use crate::tiles::TileSample;
 
 /// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
@@ -102,8 +103,7 @@ impl Trainer {
         let batch = self.config.stages.batch;
         if matches!(stage, Stage::Coarse | Stage::Fine) {
             self.judge_sh(stage, iteration, events)?;
-            let degree = sh_degree(&self.config, self.progress.sh_start, iteration);
-            self.field.sh_degree = self.progress.sh_cap.map_or(degree, |cap| degree.min(cap));
+            self.field.sh_degree = self.degree_at(iteration);
         }
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
@@ -140,8 +140,14 @@ impl Trainer {
             let pass =
                 self.renderer.forward_tiles(&self.field, &frame.camera, time, &settings, labels, choice);
             let mut since = Instant::now();
+            let exposure = self.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name));
+            let recorded = exposure.map(|exposure| {
+                let mut recorded = pass.color.clone();
+                exposure.apply(&mut recorded);
+                recorded
+            });
             let color = color_loss_of_tiles(
-                &pass.color,
+                recorded.as_ref().unwrap_or(&pass.color),
                 &data.image,
                 self.config.loss.lambda_dssim,
                 weight,
@@ -158,7 +164,11 @@ impl Trainer {
             if stage == Stage::Coarse {
                 self.leave_out_travelling(data);
             }
-            self.leave_out_judged();
+            self.leave_out_judged(stage, iteration);
+            if let (Some(exposure), Some(all)) = (exposure, &mut self.progress.exposures) {
+                let gradient = exposure.pull_back(&pass.color, &mut self.scratch.v_color);
+                all.add(&self.dataset.frames[*index].camera_name, &gradient);
+            }
             // The mean is over the labelled pixels of all views of the step (A4).
             let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
             let of_pixel = tiles.as_ref().map_or(1.0, TileSample::weight);
@@ -179,7 +189,9 @@ impl Trainer {
                 &mut self.gradients,
             );
             fault = self.fault_of_backward();
-            self.times.add_view(self.field.gaussians.len(), &self.renderer.statistics());
+            let statistics = self.renderer.statistics();
+            self.times.add_view(self.field.gaussians.len(), &statistics);
+            self.progress.work.add_view(self.field.gaussians.len(), &statistics);
         }
         self.times.add_render(&self.renderer.times());
         loss.total = loss.color;
@@ -210,6 +222,14 @@ impl Trainer {
                 )
                 .map_err(|tensor| self.not_finite(tensor))?;
             fault = self.fault_after_step();
+        }
+        if let Some(exposures) = &mut self.progress.exposures {
+            if fault.is_none() {
+                let done = u32::try_from(self.progress.total_steps).unwrap_or(u32::MAX);
+                exposures.step(log_linear(RATES, done, schedule_steps(&self.config)));
+            } else {
+                exposures.reset();
+            }
         }
         match fault {
             Some(fault) => self.roll_back(fault, snapshot, psnr_before, events)?,

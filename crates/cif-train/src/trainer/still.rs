@@ -2,18 +2,23 @@
 //! reference 11 (idea 5).
 //!
 //! A Gaussian that stands still keeps the mean of what the network did to it: that is added to its canonical
-//! parameters once, and the network then leaves it alone, forward and backward. A Gaussian that the network,
-//! trained by its neighbours, would move again is handed back the same way.
+//! parameters once, and the network then leaves it alone, forward and backward. What has not learnt to move yet
+//! looks like what never will: so nothing settles among others that move, and a changing few of those that stand
+//! still go through the network all the same. Where these learn to move, their neighbours are handed back.
+
+use std::collections::BTreeMap;
 
 use cif_field::deformation::Deformation;
 use cif_field::deformation::evaluate::Deltas;
 use cif_field::{Field, Gaussians};
+use rand::RngExt;
 
 use super::Trainer;
 use super::earned::{gain, judged_error};
 use crate::config::EffectsConfig;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
+use crate::random::{Purpose, stream};
 use crate::schedule::falls_on;
 
 /// Times at which the network is probed.
@@ -22,12 +27,19 @@ const PROBES: usize = 8;
 /// Gaussians probed together, which bounds the memory.
 const CHUNK: usize = 4_096;
 
-/// Motion, in highest limits, from which a Gaussian that stands still is handed back; more than 1, so that none
-/// goes back and forth.
+/// Motion, in limits, from which a Gaussian that stands still is handed back; more than 1, so that none goes back
+/// and forth.
 const RELEASE: f32 = 2.0;
 
+/// Side of the cells in which Gaussians have neighbours, relative to the extent.
+const AROUND: f32 = 0.02;
+
+/// Share of its neighbours that must move for a Gaussian to be kept awake, and fewest of them.
+const RESTLESS: f64 = 0.2;
+const FEWEST_MOVING: u32 = 3;
+
 /// Rungs of the ladder of limits, each half of the one above.
-pub(super) const RUNGS: u32 = 6;
+pub(super) const RUNGS: u32 = 3;
 
 /// What the network does to a Gaussian over the probe times.
 #[derive(Clone, Debug, PartialEq)]
@@ -42,7 +54,8 @@ pub(super) struct Motion {
 
 impl Trainer {
     /// The test for Gaussians that stand still, where it falls on this step: of a ladder of limits, the highest
-    /// one counts that does not show in the held-out pixels.
+    /// one counts that does not show in the held-out pixels. What the network moves again is handed back unless
+    /// that shows.
     pub(super) fn settle(
         &mut self,
         stage: Stage,
@@ -60,31 +73,75 @@ impl Trainer {
         let rows: Vec<u32> = (0..self.field.len() as u32).collect();
         let motions = probe(deformation, &self.field.gaussians, &rows, &probe_times(&self.dataset.times));
         let settings = self.color_settings();
-        let views = (&self.frames, &self.dataset);
+        let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
         let before = judged_error(&mut self.renderer, views, &self.field, &settings)?;
+        let watched = self.draw_watched(stage);
+        let restless = restless(&self.field, &motions, highest);
+        let awake: Vec<bool> = watched.iter().zip(&restless).map(|(a, b)| *a || *b).collect();
+        let allowed = f64::from(effects.still_loss);
         // Not far above the rung that held last time, so that few are tried in vain.
-        let (mut rung, mut settled, mut released) = (self.progress.still_rung.saturating_sub(1), 0, 0);
+        let mut rung = self.progress.still_rung.saturating_sub(1);
+        let (mut settled, mut error) = (0, before);
         while rung < RUNGS {
             let limits = highest.scaled(0.5_f32.powi(rung as i32));
             let mut trial = self.field.clone();
-            let counts = rest(&mut trial, &motions, limits, highest.scaled(RELEASE));
-            if counts == (0, 0) {
+            let (found, _) = rest(&mut trial, &motions, limits, Limits::NEVER, &awake);
+            if found == 0 {
                 break;
             }
-            let views = (&self.frames, &self.dataset);
+            let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
             let after = judged_error(&mut self.renderer, views, &trial, &settings)?;
-            if gain(after, before) <= f64::from(effects.still_loss) {
-                self.field = trial;
-                (settled, released) = counts;
+            if gain(after, before) <= allowed {
+                (self.field, settled, error) = (trial, found, after);
                 break;
             }
             rung += 1;
         }
         self.progress.still_rung = rung.min(RUNGS - 1);
+        // Where nothing is trained, the network may do anything: what it says must fit the pictures.
+        let mut trial = self.field.clone();
+        let (_, mut released) = rest(&mut trial, &motions, Limits::NONE, highest.scaled(RELEASE), &awake);
+        let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
+        if trial != self.field
+            && gain(judged_error(&mut self.renderer, views, &trial, &settings)?, error) > allowed
+        {
+            (trial, released) = (self.field.clone(), 0);
+            rest(&mut trial, &motions, Limits::NONE, Limits::NEVER, &watched);
+        }
+        self.field = trial;
         let still = self.field.deformation.as_ref().map_or(0, |d| d.still.iter().filter(|s| **s).count());
         let gaussians = self.field.len();
         events.push(TrainEvent::Settled { stage, iteration, still, settled, released, gaussians });
         Ok(())
+    }
+
+    /// Whether Gaussians will be tested on this step or a later one.
+    pub(super) fn tests_to_come(&self, stage: Stage, iteration: u32) -> bool {
+        let every = self.config.effects.still_every;
+        if every == 0 || !self.plan.is_dynamic {
+            return false;
+        }
+        let last = self.plan.iterations(&self.config, Stage::Fine);
+        match stage {
+            Stage::Coarse => true,
+            // The instance stage begins with a test; else the last one is in this stage.
+            Stage::Fine => {
+                self.plan.has_instances
+                    || (iteration..last)
+                        .take(every as usize)
+                        .any(|later| falls_due(&self.config.effects, stage, later, last))
+                    || iteration < first_test(self.config.effects.still_from, last)
+            }
+            _ => iteration <= 1,
+        }
+    }
+
+    /// Which Gaussians go through the network until the next test though they could stand still. None in the
+    /// instance stage, where nothing learns to move any more.
+    fn draw_watched(&self, stage: Stage) -> Vec<bool> {
+        let share = if stage == Stage::Fine { self.config.effects.still_awake } else { 0.0 };
+        let mut rng = stream(self.config.seed, Purpose::Still, self.progress.total_steps);
+        (0..self.field.len()).map(|_| rng.random::<f32>() < share).collect()
     }
 
     /// Follows a change of the set of Gaussians: copies and children of what stands still stand still.
@@ -104,8 +161,8 @@ impl Trainer {
     }
 }
 
-/// Whether a test falls on a step: at a share of the fine stage, then every so many steps, never at the end of a
-/// stage, where nothing is left to make good for it.
+/// Whether a test falls on a step: at a share of the fine stage, then every so many steps, never at its end, where
+/// nothing is left to make good for it; and once more when the instance stage begins.
 fn falls_due(effects: &EffectsConfig, stage: Stage, iteration: u32, last: u32) -> bool {
     if effects.still_every == 0 || iteration >= last {
         return false;
@@ -115,13 +172,13 @@ fn falls_due(effects: &EffectsConfig, stage: Stage, iteration: u32, last: u32) -
             let from = first_test(effects.still_from, last);
             iteration == from || (iteration > from && falls_on(iteration - from, effects.still_every))
         }
-        Stage::Instance => falls_on(iteration, effects.still_every),
+        Stage::Instance => iteration == 1,
         _ => false,
     }
 }
 
 /// Step of the fine stage on which the first test falls.
-pub(super) fn first_test(share: f32, fine_steps: u32) -> u32 {
+fn first_test(share: f32, fine_steps: u32) -> u32 {
     ((f64::from(share) * f64::from(fine_steps)).round() as u32).max(1)
 }
 
@@ -142,6 +199,11 @@ struct Limits {
 }
 
 impl Limits {
+    /// What everything keeps to.
+    const NEVER: Self = Self { displacement: f32::INFINITY, shape: f32::INFINITY };
+    /// What nothing keeps to.
+    const NONE: Self = Self { displacement: -1.0, shape: -1.0 };
+
     fn scaled(self, factor: f32) -> Self {
         Self { displacement: factor * self.displacement, shape: factor * self.shape }
     }
@@ -151,20 +213,63 @@ impl Limits {
     }
 }
 
-/// Settles what moves inside one limit and releases what moves beyond another; returns their numbers. A field
-/// without a deformation stays as it is.
-fn rest(field: &mut Field, motions: &[Motion], settle: Limits, release: Limits) -> (usize, usize) {
+/// Gaussians among others that move: of those that go through the network around them, a share moves more than the
+/// limits. Things move as wholes, and what moves little learns it late.
+fn restless(field: &Field, motions: &[Motion], limits: Limits) -> Vec<bool> {
+    let Some(deformation) = &field.deformation else { return vec![false; motions.len()] };
+    let cell_of = |row: usize, motion: &Motion| -> [i64; 3] {
+        let moved = if deformation.is_still(row) { [0.0; 3] } else { motion.mean.position };
+        std::array::from_fn(|axis| {
+            let place = field.gaussians.means[row][axis] + moved[axis];
+            (f64::from(place) / f64::from(AROUND * field.extent)).floor() as i64
+        })
+    };
+    // Rows that go through the network, and of these those that move, by cell.
+    let mut cells: BTreeMap<[i64; 3], [u32; 2]> = BTreeMap::new();
+    for (row, motion) in motions.iter().enumerate().filter(|(row, _)| !deformation.is_still(*row)) {
+        let counts = cells.entry(cell_of(row, motion)).or_default();
+        counts[0] += 1;
+        counts[1] += u32::from(!limits.hold(motion));
+    }
+    let mut known: BTreeMap<[i64; 3], bool> = BTreeMap::new();
+    let around = |[x, y, z]: [i64; 3]| {
+        let (mut all, mut moving) = (0, 0);
+        for (near_x, near_y) in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (x + dx, y + dy))) {
+            for (_, counts) in cells.range([near_x, near_y, z - 1]..=[near_x, near_y, z + 1]) {
+                (all, moving) = (all + counts[0], moving + counts[1]);
+            }
+        }
+        moving >= FEWEST_MOVING && f64::from(moving) >= RESTLESS * f64::from(all)
+    };
+    let of_row = |(row, motion)| {
+        let cell = cell_of(row, motion);
+        *known.entry(cell).or_insert_with(|| around(cell))
+    };
+    motions.iter().enumerate().map(of_row).collect()
+}
+
+/// Settles what moves inside one limit and releases what moves beyond another; returns their numbers. What is to be
+/// `awake` goes through the network either way. A field without a deformation stays as it is.
+fn rest(
+    field: &mut Field,
+    motions: &[Motion],
+    settle: Limits,
+    release: Limits,
+    awake: &[bool],
+) -> (usize, usize) {
     let Some(deformation) = &mut field.deformation else { return (0, 0) };
     deformation.still.resize(motions.len(), false);
     let (mut settled, mut released) = (0, 0);
     for (row, motion) in motions.iter().enumerate() {
         let still = &mut deformation.still[row];
-        if !*still && settle.hold(motion) {
+        let moves = !release.hold(motion);
+        if !*still && !awake[row] && settle.hold(motion) {
             add(&mut field.gaussians, row, &motion.mean, 1.0);
             (*still, settled) = (true, settled + 1);
-        } else if *still && !release.hold(motion) {
+        } else if *still && (moves || awake[row]) {
             add(&mut field.gaussians, row, &motion.mean, -1.0);
-            (*still, released) = (false, released + 1);
+            *still = false;
+            released += usize::from(moves);
         }
     }
     if !deformation.still.contains(&true) {
@@ -246,7 +351,10 @@ mod tests {
 
     use super::*;
 
-    const ALL: Limits = Limits { displacement: f32::INFINITY, shape: f32::INFINITY };
+    const ALL: Limits = Limits::NEVER;
+
+    /// Nobody is kept awake.
+    const NOBODY: [bool; 60] = [false; 60];
 
     fn field() -> Field {
         let mut field = synthetic::generate(&synthetic::SyntheticConfig {
@@ -267,7 +375,7 @@ mod tests {
         };
         assert_eq!(due(Stage::Fine, 200), [50, 100, 150]);
         assert_eq!(due(Stage::Fine, 170), [43, 93, 143]);
-        assert_eq!(due(Stage::Instance, 101), [50, 100]);
+        assert_eq!(due(Stage::Instance, 101), [1]);
         assert!(due(Stage::Coarse, 200).is_empty());
         let never = EffectsConfig { still_every: 0, ..effects };
         assert!(!falls_due(&never, Stage::Fine, 50, 200));
@@ -294,7 +402,7 @@ mod tests {
         sizes.sort_by(f32::total_cmp);
         let limit = sizes[30];
         let limits = Limits { displacement: limit, shape: f32::INFINITY };
-        assert_eq!(rest(&mut field, &motions, limits, limits), (31, 0));
+        assert_eq!(rest(&mut field, &motions, limits, limits, &NOBODY), (31, 0));
         for (row, motion) in motions.iter().enumerate() {
             let is_still = motion.displacement <= limit;
             assert_eq!(field.deformation.as_ref().unwrap().is_still(row), is_still);
@@ -320,11 +428,11 @@ mod tests {
         };
         let (none, all) = (Limits { displacement: 0.0, shape: 0.0 }, ALL);
         let first = motions(&field);
-        assert_eq!(rest(&mut field, &first, all, all), (60, 0));
+        assert_eq!(rest(&mut field, &first, all, all, &NOBODY), (60, 0));
         let still = field.deformed(0.4);
         assert_eq!(still, field.gaussians, "nothing goes through the network");
         let second = motions(&field);
-        assert_eq!(rest(&mut field, &second, none, none), (0, 60));
+        assert_eq!(rest(&mut field, &second, none, none, &NOBODY), (0, 60));
         assert!(field.deformation.as_ref().unwrap().still.is_empty());
         let mut farthest = 0.0_f32;
         let largest = motions(&field).iter().map(|motion| motion.displacement).fold(0.0, f32::max);
@@ -338,13 +446,70 @@ mod tests {
     }
 
     #[test]
+    fn those_kept_awake_go_through_the_network_from_where_they_stood() {
+        let mut field = field();
+        let times = [0.0, 0.5, 1.0];
+        let rows: Vec<u32> = (0..60).collect();
+        let motions =
+            |field: &Field| probe(field.deformation.as_ref().unwrap(), &field.gaussians, &rows, &times);
+        let awake: Vec<bool> = (0..60).map(|row| row % 4 == 0).collect();
+        let first = motions(&field);
+        assert_eq!(rest(&mut field, &first, ALL, ALL, &awake), (45, 0));
+        let others: Vec<bool> = awake.iter().map(|awake| !awake).collect();
+        assert_eq!(field.deformation.as_ref().unwrap().still, others);
+        let (before, second) = (field.clone(), motions(&field));
+        // Those that stood still wake, the others settle.
+        assert_eq!(rest(&mut field, &second, ALL, ALL, &others), (15, 0));
+        assert_eq!(field.deformation.as_ref().unwrap().still, awake);
+        let farthest = second.iter().map(|motion| motion.displacement).fold(0.0, f32::max);
+        for time in times {
+            let (now, then) = (field.deformed(time), before.deformed(time));
+            for row in 0..60 {
+                let moved = distance(&now.means[row], &then.means[row]);
+                assert!(moved <= 3.0 * farthest, "{row}: {moved} against a motion of {farthest}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_among_others_that_move_stays_awake() {
+        let mut field = field();
+        // One crowd at the origin, one far away; a third of the first moves.
+        for (row, place) in field.gaussians.means.iter_mut().enumerate() {
+            let side = if row < 30 { 0.0 } else { 0.5 };
+            *place = [side + 0.001 * (row % 5) as f32, 0.0, 0.0];
+        }
+        let still =
+            Deltas { position: [0.0; 3], scale: [0.0; 3], rotation: [0.0; 4], opacity: 0.0, sh: [0.0; 48] };
+        let mut motions: Vec<Motion> = (0..60)
+            .map(|row| Motion {
+                mean: still.clone(),
+                displacement: if row < 30 && row % 3 == 0 { 0.1 } else { 0.0 },
+                shape: 0.0,
+            })
+            .collect();
+        let limits = Limits { displacement: 0.01, shape: 1.0 };
+        let first_crowd: Vec<bool> = (0..60).map(|row| row < 30).collect();
+        assert_eq!(restless(&field, &motions, limits), first_crowd);
+        // Only those that are looked at count: where few of many are awake, these tell for all.
+        field.deformation.as_mut().unwrap().still = (0..60).map(|row| row % 3 != 0).collect();
+        assert_eq!(restless(&field, &motions, limits), first_crowd);
+        field.deformation.as_mut().unwrap().still = (0..60).map(|row| row % 3 == 0).collect();
+        assert_eq!(restless(&field, &motions, limits), [false; 60]);
+        // Two are too few to tell.
+        field.deformation.as_mut().unwrap().still.clear();
+        motions.iter_mut().skip(4).for_each(|motion| motion.displacement = 0.0);
+        assert_eq!(restless(&field, &motions, limits), [false; 60]);
+    }
+
+    #[test]
     fn shape_counts_like_displacement() {
         let mut field = field();
         let rows: Vec<u32> = (0..60).collect();
         let motions = probe(field.deformation.as_ref().unwrap(), &field.gaussians, &rows, &[0.0, 0.5, 1.0]);
         let only = Limits { displacement: f32::INFINITY, shape: 0.0 };
-        assert_eq!(rest(&mut field, &motions, only, ALL), (0, 0));
+        assert_eq!(rest(&mut field, &motions, only, ALL, &NOBODY), (0, 0));
         field.deformation = None;
-        assert_eq!(rest(&mut field, &motions, ALL, ALL), (0, 0));
+        assert_eq!(rest(&mut field, &motions, ALL, ALL, &NOBODY), (0, 0));
     }
 }

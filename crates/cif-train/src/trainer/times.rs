@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use cif_render::cpu::{StageTimes, ViewStatistics};
+use serde::{Deserialize, Serialize};
 
 /// Wall time of training steps by part, and counts of their work, summed over steps and views since
 /// [`Trainer::reset_times`](super::Trainer::reset_times).
@@ -44,6 +45,39 @@ pub struct StepTimes {
     pub identity_rows: u64,
     /// (pixel, Gaussian) pairs evaluated for identities in the forward pass.
     pub instance_pairs: u64,
+}
+
+/// What the steps of a run worked on, summed over their views: zeros prove what did not run. Steps on a GPU are
+/// not counted.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Work {
+    /// Views rendered forward and backward.
+    pub views: u64,
+    /// Gaussians, visible or not.
+    pub gaussians: u64,
+    /// Gaussians that went through the deformation network.
+    pub deformed: u64,
+    /// Gaussians whose deformation was differentiated.
+    pub deformed_backward: u64,
+    /// Tiles that blended identities.
+    pub labelled_tiles: u64,
+    /// Gaussians whose identity row was evaluated.
+    pub identity_rows: u64,
+    /// (pixel, Gaussian) pairs evaluated for identities.
+    pub instance_pairs: u64,
+}
+
+impl Work {
+    pub(super) fn add_view(&mut self, gaussians: usize, view: &ViewStatistics) {
+        self.views += 1;
+        self.gaussians += gaussians as u64;
+        self.deformed += view.deformed as u64;
+        self.deformed_backward += view.deformed_backward as u64;
+        self.labelled_tiles += view.labelled_tiles as u64;
+        self.identity_rows += view.identity_rows as u64;
+        self.instance_pairs += view.instance_pairs;
+    }
 }
 
 impl StepTimes {

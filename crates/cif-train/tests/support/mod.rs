@@ -30,12 +30,40 @@ pub(crate) struct Scene {
     pub(crate) rolls: Option<f64>,
     /// A single camera that is somewhere else at each time; there must be as many views as times.
     pub(crate) one_camera: bool,
+    /// The third ball is there only in the second half of the times.
+    pub(crate) appears: bool,
+    /// Cameras disagree in exposure and white balance, before black; the one held out sees what they see on
+    /// average.
+    pub(crate) disagree: bool,
+    /// Balls have highlights.
+    pub(crate) shiny: bool,
+    /// The third ball stays where it is first.
+    pub(crate) frozen: bool,
 }
 
 impl Default for Scene {
     fn default() -> Self {
-        Self { times: 5, views: 4, masks: true, empty_masks: false, rolls: None, one_camera: false }
+        Self {
+            times: 5,
+            views: 4,
+            masks: true,
+            empty_masks: false,
+            rolls: None,
+            one_camera: false,
+            appears: false,
+            disagree: false,
+            shiny: false,
+            frozen: false,
+        }
     }
+}
+
+/// Points per ball.
+const POINTS: usize = 150;
+
+/// Where light comes from.
+fn sun() -> DVec3 {
+    DVec3::new(0.3, -0.8, -0.5).normalize()
 }
 
 /// Height of the floor; y points down.
@@ -69,8 +97,26 @@ fn camera(angle: f64) -> PinholeCamera {
     }
 }
 
-fn write_frame(camera: &PinholeCamera, scene: Scene, time: f64, image: &Path, mask: Option<&Path>) {
-    let mut rgb = image::RgbImage::from_pixel(WIDTH, HEIGHT, image::Rgb([255; 3]));
+/// Factors per channel of training cameras that disagree; the one held out sees their geometric mean.
+const GAINS: [[f64; 3]; 4] = [[0.95, 0.95, 0.95], [0.6, 0.65, 0.75], [0.9, 0.75, 0.6], [0.7, 0.9, 0.9]];
+
+/// What cameras that disagree make of a picture, relative to their mean.
+pub(crate) fn relative_gain(view: usize) -> [f64; 3] {
+    std::array::from_fn(|channel| {
+        let mean = GAINS.iter().map(|gain| gain[channel]).product::<f64>().powf(0.25);
+        GAINS[view % GAINS.len()][channel] / mean
+    })
+}
+
+fn write_frame(
+    camera: &PinholeCamera,
+    scene: Scene,
+    (time, gain): (f64, [f64; 3]),
+    image: &Path,
+    mask: Option<&Path>,
+) {
+    let empty = if scene.disagree { 0 } else { 255 };
+    let mut rgb = image::RgbImage::from_pixel(WIDTH, HEIGHT, image::Rgb([empty; 3]));
     let mut ids = image::GrayImage::new(WIDTH, HEIGHT);
     let world_from_camera = camera.camera_from_world.inverse();
     for y in 0..HEIGHT {
@@ -86,19 +132,28 @@ fn write_frame(camera: &PinholeCamera, scene: Scene, time: f64, image: &Path, ma
                 let light = 0.6 + 0.15 * (5.0 * floor.x).sin() + 0.15 * (4.0 * floor.z).cos();
                 rgb.put_pixel(x, y, image::Rgb([light * 200.0, light * 230.0, 160.0].map(|c| c as u8)));
             }
-            for (centre, radius, color, id) in balls(time, scene.rolls) {
+            let there = if scene.appears && time < 0.5 { 2 } else { 3 };
+            let when = if scene.frozen { 0.0 } else { time };
+            for (centre, radius, color, id) in balls(when, scene.rolls).into_iter().take(there) {
                 let to = centre - origin;
                 let along = to.dot(direction);
                 let squared = radius * radius - (to.length_squared() - along * along);
                 if squared > 0.0 && along - squared.sqrt() < nearest {
                     nearest = along - squared.sqrt();
                     let normal = (origin + direction * nearest - centre) / radius;
-                    let light = 0.6 + 0.4 * normal.dot(DVec3::new(0.3, -0.8, -0.5).normalize()).max(0.0);
-                    rgb.put_pixel(x, y, image::Rgb(color.map(|c| (c * light * 255.0) as u8)));
+                    let light = 0.6 + 0.4 * normal.dot(sun()).max(0.0);
+                    let mirrored = direction - 2.0 * direction.dot(normal) * normal;
+                    let highlight =
+                        if scene.shiny { 0.6 * mirrored.dot(sun()).max(0.0).powi(6) } else { 0.0 };
+                    let seen = color.map(|c| ((c * light + highlight).min(1.0) * 255.0) as u8);
+                    rgb.put_pixel(x, y, image::Rgb(seen));
                     ids.put_pixel(x, y, image::Luma([id]));
                 }
             }
         }
+    }
+    for pixel in rgb.pixels_mut() {
+        pixel.0 = std::array::from_fn(|channel| (f64::from(pixel.0[channel]) * gain[channel]).round() as u8);
     }
     rgb.save(image).unwrap();
     if let Some(mask) = mask {
@@ -122,7 +177,13 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
             let name = format!("{view}_{time_index}");
             let image = folder.join(format!("{name}.png"));
             let mask = scene.masks.then(|| folder.join(format!("{name}_mask.png")));
-            write_frame(&camera, scene, *time, &image, mask.as_deref());
+            let gain = match (scene.disagree, held_out) {
+                (false, _) => [1.0; 3],
+                // Dimmed, so that the brightest camera is not saturated.
+                (true, true) => [0.8; 3],
+                (true, false) => relative_gain(view).map(|gain| 0.8 * gain),
+            };
+            write_frame(&camera, scene, (*time, gain), &image, mask.as_deref());
             if let Some(mask) = mask.as_ref().filter(|_| scene.empty_masks) {
                 image::GrayImage::new(WIDTH, HEIGHT).save(mask).unwrap();
             }
@@ -143,9 +204,9 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
     let label = |id| InstanceLabel { id, label: format!("ball {id}"), category: "ball".into() };
     let (mut positions, mut colors) = (Vec::new(), Vec::new());
     for (centre, radius, color, _) in balls(0.0, scene.rolls) {
-        for k in 0..150 {
-            let z = 1.0 - (2.0 * f64::from(k) + 1.0) / 150.0;
-            let (s, c) = (f64::from(k) * 2.399_963).sin_cos();
+        for k in 0..POINTS {
+            let z = 1.0 - (2.0 * k as f64 + 1.0) / POINTS as f64;
+            let (s, c) = (k as f64 * 2.399_963).sin_cos();
             let r = (1.0 - z * z).sqrt();
             positions.push((centre + radius * DVec3::new(r * c, r * s, z)).as_vec3().to_array());
             colors.push(color.map(|c| (c * 200.0) as u8));
@@ -168,6 +229,21 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
         warnings: Vec::new(),
         frame: Default::default(),
     }
+}
+
+/// Points of the balls as a reconstruction gives them, with the light that falls on them.
+pub(crate) fn with_known_points(mut dataset: Dataset) -> Dataset {
+    dataset.points.source = PointSource::File(dataset.root.join("points.ply"));
+    let points = &mut dataset.points;
+    for (of_ball, colors) in points.positions.chunks(POINTS).zip(points.colors.chunks_mut(POINTS)).take(3) {
+        let places: Vec<DVec3> = of_ball.iter().map(|p| DVec3::from(p.map(f64::from))).collect();
+        let centre = places.iter().sum::<DVec3>() / POINTS as f64;
+        for (place, color) in places.iter().zip(colors) {
+            let light = 0.6 + 0.4 * (*place - centre).normalize().dot(sun()).max(0.0);
+            *color = color.map(|c| (f64::from(c) * 255.0 / 200.0 * light) as u8);
+        }
+    }
+    dataset
 }
 
 /// Settings that train the capture in seconds.

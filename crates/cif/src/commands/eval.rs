@@ -139,6 +139,7 @@ fn to_json(evaluation: &Evaluation, field: &Field) -> Value {
     report["groups"] = Value::Object(groups);
     report["per_frame"] = json!(evaluation.frames);
     report["gaussians"] = json!(evaluation.gaussians);
+    report["frames_with_exposure"] = json!(evaluation.exposed_frames);
     report["render_ms_per_frame"] = json!(evaluation.render_ms_per_frame);
     report["train"] = json!({
         "wall_s": key("wall_s"),
@@ -219,6 +220,13 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
             ]);
         }
         println!("{table}");
+    }
+    if let Some(exposed) = evaluation.exposed_frames {
+        let all = evaluation.frames.len();
+        println!(
+            "{exposed} of {all} frames compared as their camera was learnt to expose, the others as the average \
+             camera sees"
+        );
     }
     println!("{} Gaussians, {:.1} ms per frame", evaluation.gaussians, evaluation.render_ms_per_frame);
 }

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use cif_field::Field;
 use cif_scene::{FrameRange, SceneGraph, SceneOptions, Tolerance, UpAxis};
 use clap::{ArgGroup, Args};
 use serde_json::json;
@@ -110,7 +111,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
     let field = scene::load(&command.scene)?;
     scene::note_frame(&field);
-    let options = options(command);
+    let options = options(command, &field);
     let only_gltf = command.gltf.gltf.is_some() && command.usd.is_none() && command.ply.ply.is_none();
     let options = if only_gltf { Gltf::options(&options) } else { options };
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
@@ -165,19 +166,22 @@ fn writing(command: &Export) -> cif_usd::ExportOptions {
     cif_usd::ExportOptions { force: command.force, payloads, levels_of_detail: !command.no_lod }
 }
 
-fn options(command: &Export) -> SceneOptions {
+fn options(command: &Export, field: &Field) -> SceneOptions {
     let defaults = SceneOptions::default();
-    command.models.apply(SceneOptions {
-        tolerance: command.tolerance,
-        frames: command.frames,
-        frame_step: command.frame_step,
-        up_axis: command.up_axis,
-        meters_per_unit: command.meters_per_unit,
-        min_opacity: command.min_opacity.unwrap_or(defaults.min_opacity),
-        background_threshold: command.background_threshold.unwrap_or(defaults.background_threshold),
-        proxy_points: command.proxy_points.unwrap_or(defaults.proxy_points),
-        ..defaults
-    })
+    command.models.apply(
+        field,
+        SceneOptions {
+            tolerance: command.tolerance,
+            frames: command.frames,
+            frame_step: command.frame_step,
+            up_axis: command.up_axis,
+            meters_per_unit: command.meters_per_unit,
+            min_opacity: command.min_opacity.unwrap_or(defaults.min_opacity),
+            background_threshold: command.background_threshold.unwrap_or(defaults.background_threshold),
+            proxy_points: command.proxy_points.unwrap_or(defaults.proxy_points),
+            ..defaults
+        },
+    )
 }
 
 fn check_stage_name(path: &Path) -> Result<(), Error> {

@@ -139,6 +139,7 @@ fn scene_facts(checkpoint: &Checkpoint) -> Facts {
         ("extent".to_owned(), json!(field.extent)),
         ("instances".to_owned(), json!(instances)),
         ("resumable".to_owned(), json!(checkpoint.training.is_some())),
+        ("work".to_owned(), field.provenance.pointer("/train/work").cloned().unwrap_or_default()),
         ("curve".to_owned(), field.provenance.get("curve").cloned().unwrap_or_default()),
         ("provenance".to_owned(), field.provenance.clone()),
     ]
@@ -176,10 +177,19 @@ fn print(facts: &Facts) {
             Value::Object(items) if name == "provenance" => {
                 println!("{name:>28}  {}", items.keys().cloned().collect::<Vec<_>>().join(", "));
             }
-            Value::Null if name == "curve" => {}
+            Value::Null if name == "curve" || name == "work" => {}
+            Value::Object(items) if name == "work" => print_work(items),
             value if name == "curve" => print_curve(value),
             value => println!("{name:>28}  {}", one_line(value)),
         }
+    }
+}
+
+/// What the steps of the run worked on.
+fn print_work(counts: &serde_json::Map<String, Value>) {
+    for (row, (name, count)) in counts.iter().enumerate() {
+        let heading = if row == 0 { "work of training" } else { "" };
+        println!("{heading:>28}  {}  {}", count, name.replace('_', " "));
     }
 }
 

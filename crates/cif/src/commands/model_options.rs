@@ -1,6 +1,8 @@
 //! Options of motion models and colliders that `cif export` and `cif bench export` share.
 
+use cif_field::Field;
 use cif_scene::{MotionModel, SceneOptions};
+use cif_train::metrics::training_config;
 use clap::{Args, ValueEnum};
 
 /// How motion is simplified and what simulators get.
@@ -16,9 +18,10 @@ pub(super) struct ModelOptions {
     /// Write a sample at every frame, also where interpolation would do
     #[arg(long)]
     no_reduce_keys: bool,
-    /// Most convex hulls of an object, 0 for no colliders; more than one pay for concave objects
-    #[arg(long, default_value_t = 1, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
-    hulls: u16,
+    /// Most convex hulls of an object, 0 for no colliders; more than one pay for concave objects [default: 1, or 0
+    /// where the plan that the scene was trained with leaves physics out, see `cif plan`]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
+    hulls: Option<u16>,
     /// Most convex hulls of the background, for simulators in which objects fall on it; 16 to 64 do
     #[arg(long, default_value_t = 0, value_name = "N", value_parser = clap::value_parser!(u16).range(0..=1024))]
     background_hulls: u16,
@@ -33,8 +36,9 @@ enum Motion {
 }
 
 impl ModelOptions {
-    /// Options of the scene graph with these.
-    pub(super) fn apply(&self, options: SceneOptions) -> SceneOptions {
+    /// Options of the scene graph of a field with these.
+    pub(super) fn apply(&self, field: &Field, options: SceneOptions) -> SceneOptions {
+        let has_physics = training_config(field).is_none_or(|config| config.effects.physics);
         SceneOptions {
             most_expensive_motion: match self.motion {
                 Motion::Static => MotionModel::Static,
@@ -44,7 +48,7 @@ impl ModelOptions {
             },
             max_parts: usize::from(self.max_parts),
             reduce_keys: !self.no_reduce_keys,
-            hulls_per_instance: usize::from(self.hulls),
+            hulls_per_instance: self.hulls.map_or(usize::from(has_physics), usize::from),
             background_hulls: usize::from(self.background_hulls),
             ..options
         }

@@ -140,6 +140,7 @@ impl Trainer {
             ("effects.still_every", effects.still_every > 0),
             ("effects.sh_gain", effects.sh_gain > 0.0),
             ("effects.head_gain", effects.head_gain > 0.0),
+            ("effects.exposure", effects.exposure),
             ("--debug-validation", self.debug_validation),
         ]
         .into_iter()

@@ -20,7 +20,7 @@ use crate::adam::{Moments, PlaneWeights};
 use crate::config::Ablation;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
-use crate::schedule::{falls_on, sh_degree};
+use crate::schedule::falls_on;
 use crate::wgpu::kernels::fault_name;
 use crate::wgpu::losses::{GpuTarget, LossWeights, SLOTS};
 use crate::wgpu::optimiser::{GaussianStep, GroupStep};
@@ -75,8 +75,7 @@ impl Trainer {
         let iteration = self.progress.iteration + 1;
         let batch = self.config.stages.batch;
         if matches!(stage, Stage::Coarse | Stage::Fine) {
-            let degree = sh_degree(&self.config, self.progress.sh_start, iteration);
-            self.field.sh_degree = self.progress.sh_cap.map_or(degree, |cap| degree.min(cap));
+            self.field.sh_degree = self.degree_at(iteration);
         }
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
