@@ -255,3 +255,20 @@ fn masks_go_through_a_tracker_and_come_back() {
     cif(path, "masks zigzag table -o sequence").fails(1, &["sequence"]);
     cif(path, "masks split tracked tracked -o other").fails(1, &["cif masks zigzag"]);
 }
+
+#[cfg(unix)]
+#[test]
+fn a_reader_that_leaves_is_no_fault() {
+    use std::os::unix::process::ExitStatusExt;
+
+    let folder = with_capture();
+    let (reader, writer) = std::io::pipe().expect("a pipe");
+    drop(reader);
+    let mut command = std::process::Command::new(CIF);
+    command.args(["info", "table"]).current_dir(folder.path()).stdout(writer);
+    let ended = command.output().expect("the command starts");
+    let stderr = String::from_utf8_lossy(&ended.stderr);
+    assert!(!stderr.contains("panicked"), "{stderr}");
+    // SIGPIPE
+    assert_eq!(ended.status.signal(), Some(13), "{stderr}");
+}

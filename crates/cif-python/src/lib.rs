@@ -32,6 +32,12 @@ fn run(py: Python<'_>, arguments: Vec<OsString>) -> i32 {
     py.detach(|| cif::run(arguments))
 }
 
+/// Ends this process without a word when whatever reads its output has seen enough.
+#[pyfunction]
+fn end_with_reader() {
+    cif::end_with_reader();
+}
+
 #[pymodule]
 fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add("__version__", env!("CARGO_PKG_VERSION"))?;
@@ -40,6 +46,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<dataset::Dataset>()?;
     module.add_class::<field::Field>()?;
     module.add_function(wrap_pyfunction!(run, module)?)?;
+    module.add_function(wrap_pyfunction!(end_with_reader, module)?)?;
     module.add_function(wrap_pyfunction!(dataset::open_dataset, module)?)?;
     module.add_function(wrap_pyfunction!(export::query_stage, module)?)?;
     module.add_function(wrap_pyfunction!(import::import_scene, module)?)?;

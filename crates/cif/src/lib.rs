@@ -1,4 +1,5 @@
-//! The `cif` command as a library: [`run`] is what both the binary and the Python package call.
+//! The `cif` command as a library: [`run`] is what both the binary and the Python package call, each after
+//! [`end_with_reader`] where the process is theirs.
 //!
 //! | module | answers |
 //! |---|---|
@@ -41,6 +42,12 @@ use clap::Parser;
 use miette::{GraphicalReportHandler, GraphicalTheme};
 
 pub use error::Error;
+
+/// From here on the process ends without a word when whatever reads its output has seen enough, as in
+/// `cif eval ... | head`. For processes that are nothing but the command: others would end with it.
+pub fn end_with_reader() {
+    sigpipe::reset();
+}
 
 /// Runs a command line, the first argument being the name of the program, and returns the exit code:
 /// 0 done, 1 failed, 2 not understood, 130 interrupted. Errors are written to stderr.

@@ -190,6 +190,9 @@ class Field:
         replaced with force.
         """
 
+def end_with_reader() -> None:
+    """End this process without a word when whatever reads its output has seen enough."""
+
 def run(arguments: Sequence[str | os.PathLike[str]]) -> int:
     """Run the command line; the first argument is the name of the program."""
 
