@@ -100,7 +100,7 @@ const ROUNDS: usize = 16;
 const TOLERANT: i32 = 4;
 const LATE: usize = 8;
 /// Observations that a path needs.
-pub(crate) const FEWEST: usize = 5;
+const FEWEST: usize = 5;
 
 /// Whether an instance travels: no fixed point explains the directions that its mask is seen in. The median
 /// distance of that point from the mask's centre is compared with the mask's radius.

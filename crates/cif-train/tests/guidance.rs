@@ -182,19 +182,3 @@ fn a_wrong_camera_is_named_and_left_out() {
     let told = warnings(&wrong, &config);
     assert!(told.iter().any(|message| message.ends_with("masks: ball 4, ball 7, ball 9")), "{told:?}");
 }
-
-#[test]
-fn masks_at_a_few_times_hold_nothing() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut few = dataset(folder.path(), 12);
-    for frame in few.frames.iter_mut().filter(|frame| frame.time_index % 5 != 1) {
-        frame.mask = None;
-    }
-    let mut config = guided();
-    (config.stages.coarse, config.stages.fine, config.stages.instance) = (30, 50, 30);
-    let told = warnings(&few, &config);
-    assert!(told.iter().any(|message| message.starts_with("masks at 3 of 12 times")), "{told:?}");
-    let held = train(few.clone(), config.clone()).into_field();
-    (config.motion.guidance, config.motion.stillness) = (0.0, 0.0);
-    assert!(without_record(&train(few, config).into_field()) == without_record(&held));
-}

@@ -1,6 +1,5 @@
 //! Training frames in memory: decoded once, as bytes, up to a budget.
 
-use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use cif_dataset::{Dataset, Split};
@@ -88,21 +87,10 @@ impl FrameStore {
 
     /// Whether any frame has a labelled pixel; frames not kept count by having a mask.
     pub(super) fn has_labels(&self, dataset: &Dataset) -> bool {
-        self.labelled_times(dataset) > 0
-    }
-
-    /// Distinct times of the training frames.
-    pub(super) fn times(&self, dataset: &Dataset) -> usize {
-        distinct_times(dataset, self.frames.iter().map(|(index, _)| *index))
-    }
-
-    /// Those of frames with a labelled pixel; frames not kept count by having a mask.
-    pub(super) fn labelled_times(&self, dataset: &Dataset) -> usize {
-        let labelled = self.frames.iter().filter(|(index, frame)| match frame {
+        self.frames.iter().any(|(index, frame)| match frame {
             Some(frame) => frame.labelled > 0,
             None => dataset.frames[*index].mask.is_some(),
-        });
-        distinct_times(dataset, labelled.map(|(index, _)| *index))
+        })
     }
 
     /// Leaves out the training frames whose masks contradict the others (see [`misfits`]); their indices in the
@@ -146,10 +134,6 @@ impl FrameStore {
             labels.as_ref().map_or(0, |grid| grid.pixels.iter().filter(|l| **l != UNLABELLED).count());
         Ok(TrainFrame { image: data.image, labels, labelled })
     }
-}
-
-fn distinct_times(dataset: &Dataset, frames: impl Iterator<Item = usize>) -> usize {
-    frames.map(|index| dataset.frames[index].time_index).collect::<BTreeSet<_>>().len()
 }
 
 impl TrainFrame {

@@ -18,7 +18,7 @@ use crate::error::TrainError;
 use crate::events::Stage;
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
 use crate::random::{Purpose, stream};
-use crate::tracks::{FEWEST, Observation, Track, fit, observe, travels};
+use crate::tracks::{Observation, Track, fit, observe, travels};
 
 /// Share of the nearest depths around a mask that is taken for noise.
 const CONTACT_SHARE: f64 = 0.08;
@@ -128,26 +128,11 @@ impl Trainer {
     fn is_guided(&self) -> bool {
         // Without masks nobody knows what may be held in place.
         let is_asked = self.config.motion.guidance > 0.0 || self.config.motion.stillness > 0.0;
-        is_asked && self.plan.is_dynamic && self.plan.has_instances && !self.has_few_masks()
-    }
-
-    /// Whether too few times have masks to tell what moves: what looks still could then be held against the images.
-    fn has_few_masks(&self) -> bool {
-        let masked = self.frames.labelled_times(&self.dataset);
-        masked < FEWEST && masked < self.frames.times(&self.dataset)
+        is_asked && self.plan.is_dynamic && self.plan.has_instances
     }
 
     /// Finds out which instances travel.
     pub(super) fn find_travelling(&mut self) -> Result<(), TrainError> {
-        let motion = &self.config.motion;
-        let is_asked = (motion.guidance > 0.0 || motion.stillness > 0.0) && self.plan.is_dynamic;
-        if is_asked && self.plan.has_instances && self.has_few_masks() {
-            self.warnings.push(format!(
-                "masks at {} of {} times do not tell what moves: objects are neither guided nor held in place",
-                self.frames.labelled_times(&self.dataset),
-                self.frames.times(&self.dataset)
-            ));
-        }
         if self.config.motion.guidance <= 0.0 || !self.is_guided() {
             return Ok(());
         }
