@@ -37,6 +37,12 @@ fn held_out(width: u32, height: u32) -> impl Iterator<Item = usize> {
     })
 }
 
+/// Training views that are judged by, evenly spread.
+fn judged_views(views: usize) -> impl Iterator<Item = usize> {
+    let count = views.min(VIEWS);
+    (0..count).map(move |k| k * views / count)
+}
+
 impl Trainer {
     /// Whether anything is still to be judged by pixels that are held out; then all pixels train.
     fn judges(&self, stage: Stage, iteration: u32) -> bool {
@@ -47,9 +53,11 @@ impl Trainer {
             || self.tests_to_come(stage, iteration)
     }
 
-    /// Keeps the pixels that are judged by out of the colour gradient.
-    pub(super) fn leave_out_judged(&mut self, stage: Stage, iteration: u32) {
-        if self.judges(stage, iteration) {
+    /// Keeps the pixels that are judged by out of the colour gradient of a frame of the capture, where it is one of
+    /// those that are judged by.
+    pub(super) fn leave_out_judged(&mut self, stage: Stage, iteration: u32, frame: usize) {
+        let is_judged = judged_views(self.frames.len()).any(|view| self.frames.index(view) == frame);
+        if is_judged && self.judges(stage, iteration) {
             let grid = &mut self.scratch.v_color;
             for pixel in held_out(grid.width, grid.height) {
                 grid.pixels[pixel] = [0.0; 3];
@@ -171,10 +179,8 @@ pub(super) fn judged_error(
     field: &Field,
     settings: &RenderSettings,
 ) -> Result<f64, TrainError> {
-    let count = frames.len().min(VIEWS);
     let (mut squares, mut values) = (0.0, 0_u64);
-    for k in 0..count {
-        let view = k * frames.len() / count;
+    for view in judged_views(frames.len()) {
         let data = frames.get(dataset, view)?;
         let frame = &dataset.frames[frames.index(view)];
         let channels = Channels { depth: false, instances: false };
@@ -268,6 +274,13 @@ mod tests {
         assert_eq!(pixels.len(), 64 * 48 / 64);
         assert_eq!(pixels[0], 5 * 64 + 3);
         assert!(held_out(3, 5).next().is_none(), "tiny images have none");
+    }
+
+    #[test]
+    fn few_of_many_views_are_judged_by() {
+        assert_eq!(judged_views(3).collect::<Vec<_>>(), [0, 1, 2]);
+        assert_eq!(judged_views(80).collect::<Vec<_>>(), [0, 10, 20, 30, 40, 50, 60, 70]);
+        assert_eq!(judged_views(0).count(), 0);
     }
 
     #[test]

@@ -164,7 +164,7 @@ impl Trainer {
             if stage == Stage::Coarse {
                 self.leave_out_travelling(data);
             }
-            self.leave_out_judged(stage, iteration);
+            self.leave_out_judged(stage, iteration, *index);
             if let (Some(exposure), Some(all)) = (exposure, &mut self.progress.exposures) {
                 let gradient = exposure.pull_back(&pass.color, &mut self.scratch.v_color);
                 all.add(&self.dataset.frames[*index].camera_name, &gradient);
