@@ -67,4 +67,6 @@ pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
 pub use plan::{EffectChoice, EffectPlan};
+#[cfg(feature = "wgpu")]
+pub use trainer::Probe;
 pub use trainer::{Fault, InstancePass, StepTimes, Trainer, Work};

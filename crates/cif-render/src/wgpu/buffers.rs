@@ -38,6 +38,14 @@ impl<T: Pod> GpuVec<T> {
         Ok(Self { label, buffer: allocate(gpu, label, bytes), len, generation: 0, marker: PhantomData })
     }
 
+    /// Zeros of the same kind and name.
+    ///
+    /// # Errors
+    /// As [`Self::zeros`].
+    pub fn like(&self, gpu: &Gpu, len: usize) -> Result<Self, GpuError> {
+        Self::zeros(gpu, self.label, len)
+    }
+
     /// A copy of values.
     ///
     /// # Errors
@@ -260,6 +268,76 @@ impl<T: Pod> Arriving<T> {
     }
 }
 
+/// Small read-backs of equal size, again and again: their memory is used anew once they have been read.
+#[derive(Debug)]
+pub struct Mailbox {
+    words: usize,
+    free: Vec<wgpu::Buffer>,
+}
+
+/// Words on their way to the host.
+#[derive(Debug)]
+#[must_use = "open it, or wait for its submission"]
+pub struct Letter(Arriving<u32>);
+
+impl Mailbox {
+    /// For letters of so many words of 4 bytes.
+    #[must_use]
+    pub fn new(words: usize) -> Self {
+        Self { words, free: Vec::new() }
+    }
+
+    /// Records copies of words, (array, first byte, words) each, into one letter, in their order.
+    ///
+    /// # Panics
+    /// When they are more words than a letter has.
+    pub fn record(
+        &mut self,
+        gpu: &Gpu,
+        encoder: &mut wgpu::CommandEncoder,
+        parts: &[(&wgpu::Buffer, u64, usize)],
+    ) -> Recorded<u32> {
+        let staging = self.free.pop().unwrap_or_else(|| {
+            gpu.device().create_buffer(&wgpu::BufferDescriptor {
+                label: Some("letter"),
+                size: 4 * self.words as u64,
+                usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
+                mapped_at_creation: false,
+            })
+        });
+        let mut at = 0;
+        for (array, first_byte, words) in parts {
+            assert!(at + words <= self.words, "a letter has {} words", self.words);
+            encoder.copy_buffer_to_buffer(array, *first_byte, &staging, 4 * at as u64, 4 * *words as u64);
+            at += words;
+        }
+        Recorded { staging, count: at, marker: PhantomData }
+    }
+
+    /// What has arrived, or the letter itself when it is still under way; never waits.
+    ///
+    /// # Errors
+    /// When the device is lost or a command was rejected.
+    pub fn open(&mut self, gpu: &Gpu, letter: Letter) -> Result<Result<Vec<u32>, Letter>, GpuError> {
+        let staging = letter.0.staging.clone();
+        Ok(match letter.0.take(gpu)? {
+            Ok(words) => {
+                staging.unmap();
+                self.free.push(staging);
+                Ok(words)
+            }
+            Err(arriving) => Err(Letter(arriving)),
+        })
+    }
+}
+
+impl Recorded<u32> {
+    /// As [`Self::start`], for a letter.
+    pub fn send(self) -> Letter {
+        Letter(self.start())
+    }
+}
+
 /// A small block of constants that kernels read as a uniform.
 #[derive(Debug)]
 pub struct Uniform<T> {
@@ -343,6 +421,37 @@ mod tests {
         assert!(text.contains("tile pairs: 8589934592 x 8 bytes = 68719476736 bytes"), "{text}");
         assert!(text.contains("134217728"), "{text}");
         assert!(checked_product("x", u64::MAX, u64::MAX, u64::MAX).is_err());
+    }
+
+    #[test]
+    fn letters_arrive_in_order_and_their_memory_is_used_again() {
+        let Some(gpu) = crate::wgpu::testing::gpu() else { return };
+        let a = GpuVec::from_slice(&gpu, "a", &[1_u32, 2, 3]).unwrap();
+        let b = GpuVec::from_slice(&gpu, "b", &[[4.0_f32; 4]; 2]).unwrap();
+        let mut mailbox = Mailbox::new(6);
+        for round in 0..3_u32 {
+            a.write(&gpu, 0, &[round]);
+            let mut encoder = gpu.device().create_command_encoder(&Default::default());
+            let parts = [(a.buffer(), 0, 2), (b.buffer(), 16, 4)];
+            let recorded = mailbox.record(&gpu, &mut encoder, &parts);
+            let submission = gpu.queue().submit([encoder.finish()]);
+            let letter = recorded.send();
+            gpu.wait_for(submission).unwrap();
+            let words = mailbox.open(&gpu, letter).unwrap().unwrap();
+            assert_eq!(
+                words,
+                [round, 2, 4.0_f32.to_bits(), 4.0_f32.to_bits(), 4.0_f32.to_bits(), 4.0_f32.to_bits()]
+            );
+            assert_eq!(mailbox.free.len(), 1, "one after the other needs one");
+        }
+    }
+
+    #[test]
+    fn the_first_fault_that_is_told_stays() {
+        let Some(gpu) = crate::wgpu::testing::gpu() else { return };
+        gpu.tell(GpuError::OutOfMemory("no room".to_owned()));
+        gpu.tell(GpuError::Lost("later".to_owned()));
+        assert_eq!(gpu.check(), Err(GpuError::OutOfMemory("no room".to_owned())));
     }
 
     #[test]

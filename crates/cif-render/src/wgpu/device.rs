@@ -238,6 +238,22 @@ impl Gpu {
         self.check()
     }
 
+    /// Waits until a submission is done, and those before it; later ones go on.
+    ///
+    /// # Errors
+    /// When the device is lost or a command was rejected.
+    pub fn wait_for(&self, submission: wgpu::SubmissionIndex) -> Result<(), GpuError> {
+        self.device
+            .poll(wgpu::PollType::Wait { submission_index: Some(submission), timeout: None })
+            .map_err(|error| GpuError::Lost(error.to_string()))?;
+        self.check()
+    }
+
+    /// Tells a fault that was found elsewhere, as the driver would; the first one stays.
+    pub fn tell(&self, fault: GpuError) {
+        self.fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(fault);
+    }
+
     /// Lets finished read-backs arrive, without waiting.
     ///
     /// # Errors

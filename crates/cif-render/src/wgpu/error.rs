@@ -33,15 +33,6 @@ pub enum GpuError {
         /// What the driver says.
         message: String,
     },
-    /// Gaussians that skip the deformation network, which the kernels do not know.
-    #[error(
-        "{still} Gaussians of this scene stand still and skip its deformation network, which the GPU cannot do yet; \
-         use the CPU with --backend cpu, or train with --effects +motion"
-    )]
-    StandStill {
-        /// Their number.
-        still: usize,
-    },
     /// Something does not fit the limits of the device.
     #[error(
         "{what}: {count} x {item_bytes} bytes = {bytes} bytes, but this GPU binds at most {limit} bytes at a time; \

@@ -262,6 +262,24 @@ impl<'a> Commands<'a> {
         }
     }
 
+    /// Copies as many elements as the source has.
+    ///
+    /// # Panics
+    /// When the target has fewer.
+    pub fn copy<T: bytemuck::Pod>(&mut self, source: &GpuVec<T>, target: &GpuVec<T>) {
+        assert!(source.len() <= target.len(), "{} elements do not fit {}", source.len(), target.len());
+        let bytes = ((source.len() * size_of::<T>()) as u64).next_multiple_of(4);
+        if bytes > 0 {
+            self.encoder.copy_buffer_to_buffer(source.buffer(), 0, target.buffer(), 0, bytes);
+        }
+    }
+
+    /// Sets some elements to zero bytes.
+    pub fn clear_range<T: bytemuck::Pod>(&mut self, array: &GpuVec<T>, first: usize, count: usize) {
+        let size = size_of::<T>() as u64;
+        self.encoder.clear_buffer(array.buffer(), first as u64 * size, Some(count as u64 * size));
+    }
+
     /// Records the dispatches of a stage.
     pub fn stage(&mut self, name: &'static str, record: impl FnOnce(&mut Stage<'_>)) {
         let timestamp_writes = self.timestamps.as_mut().and_then(|timestamps| timestamps.next(name));

@@ -5,6 +5,8 @@
 //! | [`device`] | which GPU, what it can do, what went wrong on it |
 //! | [`kernel`] | kernels from WGSL files, recorded commands, times on the device |
 //! | [`gaussians`], [`identities`] | Gaussians and their gradients, and identities, on the device |
+//! | [`faults`] | what no optimiser may take |
+//! | [`counts`] | label mass of Gaussians |
 //! | [`deform`] | canonical Gaussians to the time of a view, and back |
 //! | [`buffers`] | typed arrays that grow, uploads and read-backs |
 //! | [`layout`] | structures that Rust and WGSL share |
@@ -22,9 +24,11 @@
 
 pub mod buffers;
 pub mod cache;
+pub mod counts;
 pub mod deform;
 pub mod device;
 pub mod error;
+pub mod faults;
 pub mod gaussians;
 pub mod identities;
 pub mod kernel;
@@ -37,8 +41,10 @@ pub mod testing;
 pub mod validation;
 pub mod view;
 
-pub use buffers::{Arriving, GpuVec, Recorded, Uniform};
+pub use ::wgpu::SubmissionIndex as Submission;
+pub use buffers::{Arriving, GpuVec, Letter, Mailbox, Recorded, Uniform};
 pub use cache::{BindCache, Place, UniformCache};
+pub use counts::GpuIdentityCounts;
 pub use deform::{DeformationGradients, GpuDeformation};
 pub use device::{AdapterFacts, Gpu};
 pub use error::GpuError;
@@ -71,8 +77,15 @@ pub const MODULES: &[&Module] = &[
     &stages::GATHER_GRADIENTS,
     &stages::IDENTITY_BACKWARD,
     &stages::PROJECT_BACKWARD,
+    &counts::COUNT_LABELS,
+    &counts::GATHER_COUNTS,
 ];
 
 /// Every structure that Rust and WGSL share.
-pub const LAYOUTS: &[fn() -> Layout] =
-    &[View::layout, Splat::layout, view::ScanParameters::layout, view::SortParameters::layout];
+pub const LAYOUTS: &[fn() -> Layout] = &[
+    View::layout,
+    Splat::layout,
+    view::ScanParameters::layout,
+    view::SortParameters::layout,
+    counts::LabelChunk::layout,
+];

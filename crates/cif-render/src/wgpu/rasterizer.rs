@@ -2,8 +2,8 @@
 //!
 //! A view goes through [`Rasterizer::project`] and [`Rasterizer::rasterize`], then
 //! [`Rasterizer::render_instances`] or [`Rasterizer::backward`]. Each records commands; nothing waits but
-//! [`Rasterizer::measure`], which makes room for the pairs of a view. A trainer calls it for the first views, and
-//! afterwards reads [`Rasterizer::read_statistics`] when it arrives: a view whose pairs did not fit drew nothing.
+//! [`Rasterizer::measure`], which makes room for the pairs of a view. A trainer does not wait: it reads
+//! [`Rasterizer::counts`] when they arrive, and draws a view again whose pairs did not fit, for it drew nothing.
 //!
 //! Memory grows with need: per Gaussian 64 + 4 x 9 bytes for a view and 48 + 48 + 192 + 16 for gradients, per pair 40
 //! and 48, per label slot 4, per pixel 32 and 48.
@@ -74,6 +74,13 @@ pub struct GpuStatistics {
 }
 
 impl GpuStatistics {
+    /// Words of the counts.
+    pub const WORDS: usize = work::LEN;
+    /// Word of the pairs that there are.
+    pub const WANTED_PAIRS: usize = work::WANTED_PAIRS;
+    /// Word of those that were drawn.
+    pub const PAIRS: usize = work::PAIRS;
+
     /// From the first elements of the work counts.
     #[must_use]
     pub fn of(counts: &[u32]) -> Self {
@@ -157,6 +164,20 @@ impl Arrays {
             no_entries: GpuVec::zeros(gpu, "no identities", 1)?,
         })
     }
+}
+
+/// Arrays of a rasterized view.
+pub(crate) struct CountingArrays<'a> {
+    pub(crate) view: &'a wgpu::Buffer,
+    pub(crate) splats: &'a wgpu::Buffer,
+    pub(crate) depth_order: &'a wgpu::Buffer,
+    pub(crate) pair_offsets: &'a wgpu::Buffer,
+    pub(crate) pairs: &'a wgpu::Buffer,
+    pub(crate) entries: &'a wgpu::Buffer,
+    pub(crate) tile_ranges: &'a wgpu::Buffer,
+    pub(crate) colors: &'a wgpu::Buffer,
+    pub(crate) work: &'a wgpu::Buffer,
+    pub(crate) pair_sums: &'a wgpu::Buffer,
 }
 
 /// Renders posed Gaussians on a device; keeps memory between views.
@@ -330,6 +351,12 @@ impl Rasterizer {
         self.reserve(gpu, pairs as usize, slots as usize)
     }
 
+    /// Most pairs of a view that the device holds.
+    #[must_use]
+    pub fn most_pairs(gpu: &Gpu) -> usize {
+        (gpu.largest_binding() / (PAIR_SUMS * size_of::<f32>()) as u64) as usize
+    }
+
     /// Makes room for pairs and label slots; more room than asked stays.
     ///
     /// # Errors
@@ -338,7 +365,11 @@ impl Rasterizer {
         let arrays = &mut self.arrays;
         if pairs > arrays.entries.len() {
             // Half as much room on top, where the device allows, so that the next views fit too.
-            let largest = (gpu.largest_binding() / (PAIR_SUMS * size_of::<f32>()) as u64) as usize;
+            let largest = Self::most_pairs(gpu);
+            if pairs > largest {
+                let per_pair = (PAIR_SUMS * size_of::<f32>()) as u64;
+                return Err(too_many_pairs(pairs as u64, per_pair, gpu.largest_binding()));
+            }
             let roomy = (pairs + pairs / 2).min(largest).max(pairs);
             arrays.entries.resize(gpu, roomy)?;
             arrays.pairs.resize(gpu, roomy)?;
@@ -646,6 +677,35 @@ impl Rasterizer {
     /// Records a read-back of the counts of the view, for [`GpuStatistics::of`].
     pub fn read_statistics(&self, gpu: &Gpu, commands: &mut Commands<'_>) -> Recorded<u32> {
         self.arrays.work.read_later(gpu, commands.encoder(), 0, work::LEN)
+    }
+
+    /// Counts of the view, for [`GpuStatistics::of`].
+    #[must_use]
+    pub fn counts(&self) -> &GpuVec<u32> {
+        &self.arrays.work
+    }
+
+    /// Constants of the view, its splats, tile lists and pairs, as [`super::GpuIdentityCounts`] reads them.
+    pub(crate) fn for_counting(&self) -> CountingArrays<'_> {
+        let arrays = &self.arrays;
+        CountingArrays {
+            view: self.uniform.buffer(),
+            splats: arrays.splats.buffer(),
+            depth_order: arrays.depth.values[self.depth_result].buffer(),
+            pair_offsets: arrays.pair_offsets.buffer(),
+            pairs: arrays.pairs.buffer(),
+            entries: arrays.entries.buffer(),
+            tile_ranges: arrays.tile_ranges.buffer(),
+            colors: arrays.colors.buffer(),
+            work: arrays.work.buffer(),
+            pair_sums: arrays.pair_sums.buffer(),
+        }
+    }
+
+    /// Makes room for the sums of pairs.
+    pub(crate) fn reserve_sums(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
+        self.arrays.pair_sums.resize(gpu, PAIR_SUMS * self.arrays.entries.len())?;
+        Ok(())
     }
 
     /// Constants of the view.

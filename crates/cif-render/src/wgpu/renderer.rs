@@ -1,5 +1,4 @@
-//! Renders fields on a GPU. Gaussians are posed on the device; those of fields with recorded motion, or with Gaussians
-//! that stand still, by the processor.
+//! Renders fields on a GPU. Gaussians are posed on the device; those of fields with recorded motion by the processor.
 
 use cif_field::Field;
 use cif_geometry::{PinholeCamera, PixelGrid};
@@ -41,11 +40,7 @@ impl GpuRenderer {
             .map(|identities| DeviceIdentities::from_identities(gpu, identities, field.instances.len()))
             .transpose()?;
         let learned = field.deformation.as_ref().filter(|_| field.tracks.is_none());
-        let deformation = match learned.map(|deformation| GpuDeformation::new(gpu, deformation)) {
-            // What the device cannot move, the processor does.
-            Some(Err(GpuError::StandStill { .. })) => None,
-            deformation => deformation.transpose()?,
-        };
+        let deformation = learned.map(|deformation| GpuDeformation::new(gpu, deformation)).transpose()?;
         Ok(Self {
             rasterizer: Rasterizer::new(gpu)?,
             poser: Renderer::new(SimdLevel::Auto),
@@ -75,8 +70,7 @@ impl GpuRenderer {
         let input = ViewInput { camera, settings: &settings, labels: None };
         let identities = self.identities.as_ref().filter(|_| settings.instances.is_some());
         let mut commands = Commands::new(&self.gpu, None);
-        let learned = settings.deform && field.deformation.is_some();
-        let posed = if field.tracks.is_some() || (learned && self.deformation.is_none()) {
+        let posed = if field.tracks.is_some() {
             let poser = &mut self.poser;
             let moved = if settings.deform || field.deformation.is_none() {
                 poser.deform(field, time)

@@ -9,7 +9,7 @@ use super::kernel::{Constant, MAX_WORKGROUPS, Snippet, constants, structures};
 use super::layout::Shared;
 use crate::constants::{
     JACOBIAN_MARGIN, LOG_SCALE_RANGE, LOW_PASS, MAX_ALPHA, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
-    MIN_ANTIALIASING, MIN_LABEL_PROBABILITY, MIN_TRANSMITTANCE, TILE,
+    MIN_ANTIALIASING, MIN_COVERAGE, MIN_LABEL_PROBABILITY, MIN_TRANSMITTANCE, TILE,
 };
 use crate::{GeometryPath, InstanceNormalisation, OccupancySource, RenderSettings};
 
@@ -225,6 +225,7 @@ fn shared_constants() -> String {
         ("LOG_SCALE_HIGH", Float(LOG_SCALE_RANGE.1)),
         ("MAX_COVARIANCE", Float(MAX_COVARIANCE)),
         ("MIN_LABEL_PROBABILITY", Float(MIN_LABEL_PROBABILITY)),
+        ("MIN_COVERAGE", Float(MIN_COVERAGE)),
         ("MAX_POSITION_GRADIENT", Float(MAX_POSITION_GRADIENT)),
         ("MIN_QUATERNION_NORM", single(quaternion::MIN_NORM)),
         ("SETTLED", Float(SETTLED)),

@@ -18,10 +18,10 @@ use crate::exposure::Exposures;
 use crate::schedule::{falls_on, sh_degree};
 
 /// Every so many columns and rows there is a pixel that the colour loss leaves out.
-const SPACING: u32 = 8;
+pub(crate) const JUDGED_SPACING: u32 = 8;
 
-/// Where the first of them is.
-const FIRST: (u32, u32) = (3, 5);
+/// Column and row of the first of them.
+pub(crate) const FIRST_JUDGED: (u32, u32) = (3, 5);
 
 /// Views that are compared.
 const VIEWS: usize = 8;
@@ -31,9 +31,10 @@ const OPTIONAL: [HeadKind; 4] = [HeadKind::Sh, HeadKind::Opacity, HeadKind::Scal
 
 /// Positions in an image of the pixels that are left out of the colour loss.
 fn held_out(width: u32, height: u32) -> impl Iterator<Item = usize> {
-    let rows = (FIRST.1..height).step_by(SPACING as usize);
+    let spacing = JUDGED_SPACING as usize;
+    let rows = (FIRST_JUDGED.1..height).step_by(spacing);
     rows.flat_map(move |y| {
-        (FIRST.0..width).step_by(SPACING as usize).map(move |x| y as usize * width as usize + x as usize)
+        (FIRST_JUDGED.0..width).step_by(spacing).map(move |x| y as usize * width as usize + x as usize)
     })
 }
 
@@ -149,6 +150,7 @@ impl Trainer {
         if gain_wanted <= 0.0 || !self.is_half_way(stage, iteration) || self.field.deformation.is_none() {
             return Ok(());
         }
+        let gain_wanted = f64::from(self.config.effects.head_gain);
         let settings = self.color_settings();
         let times = probe_times(&self.dataset.times);
         for kind in OPTIONAL {

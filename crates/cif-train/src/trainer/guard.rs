@@ -16,17 +16,17 @@ use serde::{Deserialize, Serialize};
 use super::Trainer;
 use super::optimiser::{Optimiser, StepRates};
 use crate::error::TrainError;
-use crate::events::TrainEvent;
+use crate::events::{Stage, TrainEvent};
 
 /// Bad steps in a row after which a run stops.
 pub const MAX_ROLLBACKS_IN_A_ROW: u32 = 10;
 
 /// Largest gradient whose square is finite in single precision, with a margin; what is larger counts as not
 /// finite, because it would make a moment infinite for ever.
-const MAX_GRADIENT: f32 = 1e18;
+pub(crate) const MAX_GRADIENT: f32 = 1e18;
 
 /// Largest learning rate: a step moves by a few times the rate, so that parameters below stay finite.
-const MAX_RATE: f32 = 1e30;
+pub(super) const MAX_RATE: f32 = 1e30;
 
 /// Floats that one task looks at.
 const CHUNK: usize = 1 << 14;
@@ -237,6 +237,17 @@ impl Trainer {
         self.gradients.reset();
         self.progress.psnr = psnr_before;
         let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
+        events.push(self.count_bad_step(stage, iteration, fault)?);
+        Ok(())
+    }
+
+    /// Counts a step that was undone; too many in a row end the run.
+    pub(super) fn count_bad_step(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        fault: Fault,
+    ) -> Result<TrainEvent, TrainError> {
         let rollbacks = &mut self.progress.rollbacks;
         rollbacks.total += 1;
         rollbacks.in_a_row += 1;
@@ -248,8 +259,7 @@ impl Trainer {
             let hint = if self.debug_validation { Hint::Rates } else { Hint::Validate };
             return Err(TrainError::Diverged { stage, iteration, in_a_row, fault, hint });
         }
-        events.push(TrainEvent::RolledBack { stage, iteration, fault, in_a_row, total });
-        Ok(())
+        Ok(TrainEvent::RolledBack { stage, iteration, fault, in_a_row, total })
     }
 }
 

@@ -32,6 +32,7 @@ const OPACITY: f32 = 0.4;
 const OUTSIDE: f64 = 0.15;
 
 /// A travelling object.
+#[derive(Clone)]
 pub(super) struct Guide {
     track: Track,
     /// Where its centre is in the canonical set.
@@ -39,7 +40,7 @@ pub(super) struct Guide {
 }
 
 /// Everything that keeps objects on their paths; empty without guidance.
-#[derive(Default)]
+#[derive(Clone, Default)]
 pub(super) struct Guidance {
     /// Per label (dense index + 1), whether the instance travels.
     travelling: Vec<bool>,

@@ -1,5 +1,6 @@
 //! The identity stage: counts label mass over the training frames and makes identity rows of it.
 
+use cif_geometry::PixelGrid;
 use cif_geometry::scalar::{logit, sigmoid};
 use cif_render::cpu::IdentityCounts;
 use cif_render::{Gradients, UNLABELLED};
@@ -13,28 +14,9 @@ use crate::events::TrainEvent;
 impl Trainer {
     /// Estimates the rows of all Gaussians; `starts` also sets occupancy to where the instance stage begins.
     pub(super) fn estimate_identities(&mut self, starts: bool) -> Result<TrainEvent, TrainError> {
-        let settings = self.color_settings();
         let k = self.field.instances.len();
-        let mut counts = IdentityCounts::zeros(self.field.gaussians.len(), k);
-        let mut frames = 0;
         self.label_pixels = vec![0.0; k];
-        for view in (0..self.frames.len()).step_by(self.config.identity.stride as usize) {
-            let data = self.frames.get(&self.dataset, view)?;
-            let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
-            let frame = &self.dataset.frames[self.frames.index(view)];
-            self.renderer.count_identities(
-                &self.field,
-                &frame.camera,
-                frame.time,
-                &settings,
-                labels,
-                &mut counts,
-            );
-            for label in labels.pixels.iter().filter(|label| **label != UNLABELLED) {
-                self.label_pixels[usize::from(*label) - 1] += 1.0;
-            }
-            frames += 1;
-        }
+        let (counts, frames) = self.count_labels()?;
         let extent = f64::from(self.field.extent);
         let estimated = estimate(&counts, &self.field.gaussians, extent, &self.config.identity);
         if starts {
@@ -56,6 +38,40 @@ impl Trainer {
         self.optimiser.start_identities(&self.field, self.config.adam.fresh_row_bias_correction);
         self.gradients = Gradients::zeros(&self.field);
         Ok(event)
+    }
+
+    /// Label mass of the frames that identities are estimated from, and how many there are.
+    fn count_labels(&mut self) -> Result<(IdentityCounts, usize), TrainError> {
+        #[cfg(feature = "wgpu")]
+        if let Some(counted) = self.count_on_device()? {
+            return Ok(counted);
+        }
+        let settings = self.color_settings();
+        let mut counts = IdentityCounts::zeros(self.field.gaussians.len(), self.field.instances.len());
+        let mut frames = 0;
+        for view in (0..self.frames.len()).step_by(self.config.identity.stride as usize) {
+            let data = self.frames.get(&self.dataset, view)?;
+            let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
+            let frame = &self.dataset.frames[self.frames.index(view)];
+            self.renderer.count_identities(
+                &self.field,
+                &frame.camera,
+                frame.time,
+                &settings,
+                labels,
+                &mut counts,
+            );
+            self.add_label_pixels(labels);
+            frames += 1;
+        }
+        Ok((counts, frames))
+    }
+
+    /// Adds the labelled pixels of a frame that identities are estimated from.
+    pub(super) fn add_label_pixels(&mut self, labels: &PixelGrid<u16>) {
+        for label in labels.pixels.iter().filter(|label| **label != UNLABELLED) {
+            self.label_pixels[usize::from(*label) - 1] += 1.0;
+        }
     }
 
     /// Occupancy at the start of the instance stage (A5); Gaussians that nothing is known of start lower.

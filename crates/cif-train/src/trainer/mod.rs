@@ -51,8 +51,14 @@ use cif_field::Field;
 use cif_render::Gradients;
 use cif_render::cpu::{Renderer, SimdLevel};
 
+#[cfg(feature = "wgpu")]
+pub use self::device::Probe;
+#[cfg(feature = "wgpu")]
+pub(crate) use self::earned::{FIRST_JUDGED, JUDGED_SPACING};
 use self::evaluate::Yardstick;
 use self::frames::FrameStore;
+#[cfg(all(test, feature = "wgpu"))]
+pub(crate) use self::guard::MAX_GRADIENT;
 pub use self::guard::{Fault, Hint, MAX_ROLLBACKS_IN_A_ROW};
 use self::guidance::Guidance;
 pub(crate) use self::initialize::automatic_time_nodes;
@@ -131,11 +137,12 @@ pub struct Trainer {
     /// The GPU that steps run on.
     #[cfg(feature = "wgpu")]
     device: Option<Box<device::DeviceTraining>>,
-    /// Loss of the last step that has arrived from the GPU, and of the one that is arriving.
+    /// Loss of the last step that has arrived from the GPU.
     #[cfg(feature = "wgpu")]
     last_loss: StepLoss,
+    /// Events of steps that have arrived from it, not sent yet.
     #[cfg(feature = "wgpu")]
-    arriving_loss: StepLoss,
+    arrived: Vec<TrainEvent>,
 }
 
 /// What the observer asked for since it was last obeyed.
@@ -219,7 +226,7 @@ impl Trainer {
             #[cfg(feature = "wgpu")]
             last_loss: StepLoss::default(),
             #[cfg(feature = "wgpu")]
-            arriving_loss: StepLoss::default(),
+            arrived: Vec::new(),
             dataset,
             config,
             field,
@@ -416,6 +423,10 @@ impl Trainer {
                 let outcome = self.run_steps(stage, observer, &mut requests);
                 // Whatever ended the steps, the field is whole again.
                 let fetched = self.fetch_from_gpu();
+                #[cfg(feature = "wgpu")]
+                for event in self.arrived_events() {
+                    requests.add(self.emit(observer, &event));
+                }
                 if outcome? == Outcome::Interrupted {
                     return fetched.map(|()| Outcome::Interrupted);
                 }

@@ -270,6 +270,14 @@ impl Optimiser {
         }
     }
 
+    /// Zero moments for another number of Gaussians; steps stay counted.
+    pub(super) fn resize_rows(&mut self, n: usize) {
+        for moments in self.gaussian_groups_mut() {
+            moments.first = vec![0.0; n * moments.width];
+            moments.second = vec![0.0; n * moments.width];
+        }
+    }
+
     /// Follows a relocation: fresh moments for relocated rows, and for opacity and occupancy of sources.
     pub(super) fn relocate(&mut self, weak: &[u32], sources: &[u32], entry_origins: &[Option<u32>]) {
         for moments in self.gaussian_groups_mut() {

@@ -350,7 +350,15 @@ impl Trainer {
 
     /// Replaces the set of Gaussians, and everything that has a row per Gaussian.
     fn rearrange(&mut self, change: Rearrangement) {
-        self.optimiser.gather(&change.origins);
+        #[cfg(feature = "wgpu")]
+        let follows = self.follows_on_device(&change);
+        #[cfg(not(feature = "wgpu"))]
+        let follows = false;
+        if follows {
+            self.optimiser.resize_rows(change.gaussians.len());
+        } else {
+            self.optimiser.gather(&change.origins);
+        }
         self.statistics.gather(&change.origins);
         self.guidance.gather(&change.parents);
         self.gather_still(&change.parents);

@@ -12,24 +12,21 @@
 @group(0) @binding(4) var<storage, read_write> second_moments: array<f32>;
 // Screen gradient, radius and whether visible.
 @group(0) @binding(5) var<storage, read> screen: array<vec4f>;
+// The second is not 0 while steps wait for the host.
 @group(0) @binding(6) var<storage, read_write> faults: array<atomic<u32>>;
 
 #import adam
 
 // Whether a Gaussian takes part at all.
 fn takes_part(row: u32) -> bool {
-    return rates.visible_only == 0u || screen[row].w > 0.0;
+    return atomicLoad(&faults[1]) == 0u && (rates.visible_only == 0u || screen[row].w > 0.0);
 }
 
-// Moves a float; a gradient that is not finite is told and moves nothing.
-fn step(at: u32, rate: f32, second_bias: f32, fault: u32) {
+// Moves a float.
+fn step(at: u32, rate: f32, second_bias: f32) {
     let g = gradients[at];
     gradients[at] = 0.0;
     if rate <= 0.0 {
-        return;
-    }
-    if !is_finite(g) {
-        atomicOr(&faults[0], fault);
         return;
     }
     let moved = move_by(parameters[at], g, first_moments[at], second_moments[at], rate, second_bias);
@@ -48,13 +45,14 @@ fn adam_geometry(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_
     let base = row * 12u;
     let taking_part = takes_part(row);
     for (var k = 0u; k < 12u; k++) {
-        let fault = rates.faults[k / 4u][k % 4u];
         step(
             base + k,
             select(0.0, rates.geometry[k / 4u][k % 4u], taking_part),
             rates.geometry_second[k / 4u][k % 4u],
-            fault,
         );
+    }
+    if atomicLoad(&faults[1]) != 0u {
+        return;
     }
     parameters[base + 7u] = clamp(parameters[base + 7u], rates.lowest_occupancy, rates.highest_occupancy);
     if rates.renormalise != 0u {
@@ -78,5 +76,5 @@ fn adam_sh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     let k = at % SH_FLOATS;
     let rate = select(rates.sh_rest, rates.sh_base, k < 3u);
     let moves = k < rates.sh_active && takes_part(at / SH_FLOATS);
-    step(at, select(0.0, rate, moves), rates.sh_second, SH_FAULT);
+    step(at, select(0.0, rate, moves), rates.sh_second);
 }

@@ -11,6 +11,7 @@
 @group(0) @binding(2) var<storage, read_write> gradients: array<f32>;
 @group(0) @binding(3) var<storage, read_write> first_moments: array<f32>;
 @group(0) @binding(4) var<storage, read_write> second_moments: array<f32>;
+// The second is not 0 while steps wait for the host.
 @group(0) @binding(5) var<storage, read_write> faults: array<atomic<u32>>;
 
 #import adam
@@ -26,11 +27,7 @@ fn adam_network(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_i
         g += gradients[part * rates.floats + at];
         gradients[part * rates.floats + at] = 0.0;
     }
-    if rates.rate <= 0.0 {
-        return;
-    }
-    if !is_finite(g) {
-        atomicOr(&faults[0], rates.fault);
+    if rates.rate <= 0.0 || atomicLoad(&faults[1]) != 0u {
         return;
     }
     let moved = move_by(parameters[at], g, first_moments[at], second_moments[at], rates.rate, rates.second);

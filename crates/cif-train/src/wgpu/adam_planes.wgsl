@@ -10,6 +10,7 @@
 @group(0) @binding(2) var<storage, read_write> sums: array<atomic<u32>>;
 @group(0) @binding(3) var<storage, read_write> first_moments: array<f32>;
 @group(0) @binding(4) var<storage, read_write> second_moments: array<f32>;
+// The second is not 0 while steps wait for the host.
 @group(0) @binding(5) var<storage, read_write> faults: array<atomic<u32>>;
 
 // Two per plane: first float, rows, floats per row and first column; bits of the gradient factors of the second
@@ -38,6 +39,7 @@ fn adam_planes(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
     var above_1 = 0.0;
     var current = planes[first];
     var below_1 = planes[first + min(1u, place.y - 1u) * row_len];
+    let moves = rates.rate > 0.0 && atomicLoad(&faults[1]) == 0u;
     for (var row = 0u; row < place.y; row++) {
         let at = first + row * row_len;
         let below_2 = planes[first + min(row + 2u, place.y - 1u) * row_len];
@@ -53,15 +55,11 @@ fn adam_planes(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_in
             g += smooth_factor * (current - 2.0 * above_1 + above_2);
         }
         g += sparse_factor * (select(0.0, 1.0, current > 1.0) - select(0.0, 1.0, current < 1.0));
-        if rates.rate > 0.0 {
-            if is_finite(g) {
-                let moved = move_by(current, g, first_moments[at], second_moments[at], rates.rate, rates.second);
-                planes[at] = moved.parameter;
-                first_moments[at] = moved.first;
-                second_moments[at] = moved.second;
-            } else {
-                atomicOr(&faults[0], PLANES_FAULT);
-            }
+        if moves {
+            let moved = move_by(current, g, first_moments[at], second_moments[at], rates.rate, rates.second);
+            planes[at] = moved.parameter;
+            first_moments[at] = moved.first;
+            second_moments[at] = moved.second;
         }
         above_2 = above_1;
         above_1 = current;

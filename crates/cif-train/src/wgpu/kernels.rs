@@ -5,13 +5,18 @@ use cif_geometry::quaternion::MIN_NORM;
 use cif_render::constants::MIN_LABEL_PROBABILITY;
 use cif_render::wgpu::Access::{Read, ReadWrite, Uniform};
 use cif_render::wgpu::deform::{FIXED_POINT, PLANES_FAULT};
+use cif_render::wgpu::faults::FAULTS;
 use cif_render::wgpu::{
-    Constant, Gpu, GpuError, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet, constants, structures,
+    Constant, Gpu, GpuError, GpuStatistics, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet,
+    constants, structures,
 };
+
+pub use cif_render::wgpu::faults as fault;
 
 use crate::adam::{BETA_1, BETA_2, EPSILON};
 use crate::losses::displacement::NO_ROTATION;
 use crate::losses::ssim::{C1, C2};
+use crate::trainer::{FIRST_JUDGED, JUDGED_SPACING};
 
 cif_render::shared_struct! {
     /// What the losses of a view depend on.
@@ -30,8 +35,8 @@ cif_render::shared_struct! {
         pub absolute_weight: f32,
         /// Gradient of a pixel's similarity.
         pub similarity_weight: f32,
-        /// Pads to 16 bytes.
-        pub unused: f32,
+        /// 1 when pixels of some labels train nothing, 2 when the pixels that are judged by train nothing.
+        pub leaves_out: u32,
         /// Taps of the window of the similarity, from the centre outwards.
         pub window: [[f32; 4]; 2],
     }
@@ -44,8 +49,6 @@ cif_render::shared_struct! {
         pub geometry: [[f32; 4]; 3],
         /// Correction of the second moment.
         pub geometry_second: [[f32; 4]; 3],
-        /// Fault bits of the geometry.
-        pub faults: [[u32; 4]; 3],
         /// Gaussians N.
         pub gaussians: u32,
         /// 1 when only visible rows move.
@@ -80,8 +83,6 @@ cif_render::shared_struct! {
         pub floats: u32,
         /// Parts that the gradient comes in.
         pub parts: u32,
-        /// Bit of the fault word.
-        pub fault: u32,
         /// Rate with the correction of the first moment; 0 keeps still.
         pub rate: f32,
         /// Correction of the second moment.
@@ -89,7 +90,11 @@ cif_render::shared_struct! {
         /// Parameters stay within plus and minus this.
         pub limit: f32,
         /// Pads to 16 bytes.
-        pub unused: [f32; 2],
+        pub unused_0: f32,
+        /// As above.
+        pub unused_1: f32,
+        /// As above.
+        pub unused_2: f32,
     }
 }
 
@@ -112,12 +117,43 @@ cif_render::shared_struct! {
     pub struct Accumulation {
         /// Floats, or rows.
         pub count: u32,
+        /// Bit of the fault word for what no optimiser may take.
+        pub fault: u32,
+        /// 1 when the floats are geometry of Gaussians, whose bits differ.
+        pub is_geometry: u32,
         /// Pads to 16 bytes.
-        pub unused_0: u32,
-        /// As above.
-        pub unused_1: u32,
-        /// As above.
-        pub unused_2: u32,
+        pub unused: u32,
+    }
+}
+
+cif_render::shared_struct! {
+    /// How rows are rearranged.
+    pub struct Rearrangement {
+        /// New rows.
+        pub rows: u32,
+        /// Floats of a row.
+        pub width: u32,
+        /// 1 when fresh rows are zeros.
+        pub fresh_are_zero: u32,
+        /// A float of every row that becomes zero; beyond the row for none.
+        pub zero_column: u32,
+    }
+}
+
+/// Bit of an origin that marks a fresh row.
+pub const FRESH: u32 = 1 << 31;
+
+cif_render::shared_struct! {
+    /// How a step is judged.
+    pub struct Judgement {
+        /// Slot of the view's losses.
+        pub slot: u32,
+        /// Fault bits that make steps wait.
+        pub counts: u32,
+        /// Fault bits that the host knows of.
+        pub known: u32,
+        /// 1 after the last view of a step.
+        pub is_last: u32,
     }
 }
 
@@ -137,41 +173,24 @@ cif_render::shared_struct! {
     }
 }
 
-/// Bits of the fault word; that of the planes is [`PLANES_FAULT`].
-pub mod fault {
-    /// Gradient of centres.
-    pub const MEANS: u32 = 2;
-    /// Gradient of log-scales.
-    pub const LOG_SCALES: u32 = 4;
-    /// Gradient of quaternions.
-    pub const QUATERNIONS: u32 = 8;
-    /// Gradient of opacity logits.
-    pub const OPACITY: u32 = 16;
-    /// Gradient of occupancy logits.
-    pub const OCCUPANCY: u32 = 32;
-    /// Gradient of spherical harmonics.
-    pub const SH: u32 = 64;
-    /// Gradient of calibrations.
-    pub const CALIBRATIONS: u32 = 128;
-    /// Gradient of the network.
-    pub const MLP: u32 = 256;
-}
-
-/// What the lowest bit of a fault word stands for; the same words as on the CPU.
+/// What the lowest bit of a fault word stands for: the part of the step and the name that the CPU has for it.
 #[must_use]
-pub fn fault_name(faults: u32) -> &'static str {
-    match 1 << faults.trailing_zeros().min(31) {
-        PLANES_FAULT => "the gradient of planes",
-        fault::MEANS => "the gradient of means",
-        fault::LOG_SCALES => "the gradient of log_scales",
-        fault::QUATERNIONS => "the gradient of quaternions",
-        fault::OPACITY => "the gradient of opacity_logits",
-        fault::OCCUPANCY => "the gradient of occupancy_logits",
-        fault::SH => "the gradient of sh_coefficients",
-        fault::CALIBRATIONS => "the gradient of log_calibrations",
-        fault::MLP => "the gradient of mlp",
-        _ => "a gradient",
-    }
+pub fn fault_name(found: u32) -> (&'static str, &'static str) {
+    let tensor = match 1 << found.trailing_zeros().min(31) {
+        fault::PLANES => "gradient of planes",
+        fault::MEANS => "gradient of means",
+        fault::LOG_SCALES => "gradient of log_scales",
+        fault::QUATERNIONS => "gradient of quaternions",
+        fault::OPACITY => "gradient of opacity_logits",
+        fault::OCCUPANCY => "gradient of occupancy_logits",
+        fault::SH => "gradient of sh_coefficients",
+        fault::CALIBRATIONS => "gradient of log_calibrations",
+        fault::MLP => "gradient of mlp",
+        fault::COLOR_LOSS => return ("losses", "colour loss"),
+        fault::INSTANCE_LOSS => return ("losses", "instance loss"),
+        _ => return ("optimiser", "learning rate"),
+    };
+    ("gradients", tensor)
 }
 
 const CONSTANTS: Snippet = Snippet {
@@ -188,7 +207,12 @@ const CONSTANTS: Snippet = Snippet {
             ("SSIM_C2", Constant::Float(C2)),
             ("NO_ROTATION", Constant::Float(NO_ROTATION as f32)),
             ("SH_FLOATS", Constant::Unsigned(SH_FLOATS as u32)),
-            ("SH_FAULT", Constant::Unsigned(fault::SH)),
+            ("FRESH", Constant::Unsigned(FRESH)),
+            ("PAIRS_WORD", Constant::Unsigned(GpuStatistics::PAIRS as u32)),
+            ("WANTED_PAIRS_WORD", Constant::Unsigned(GpuStatistics::WANTED_PAIRS as u32)),
+            ("JUDGED_SPACING", Constant::Unsigned(JUDGED_SPACING)),
+            ("JUDGED_COLUMN", Constant::Unsigned(FIRST_JUDGED.0)),
+            ("JUDGED_ROW", Constant::Unsigned(FIRST_JUDGED.1)),
             ("PLANES_FAULT", Constant::Unsigned(PLANES_FAULT)),
             ("MAX_WORKGROUPS", Constant::Unsigned(MAX_WORKGROUPS)),
         ])
@@ -203,6 +227,9 @@ const GROUP_RATES: Snippet = Snippet { name: "group_rates", text: || structures(
 const PLANE_RATES: Snippet = Snippet { name: "plane_rates", text: || structures(&[PlaneRates::layout()]) };
 const ACCUMULATION: Snippet =
     Snippet { name: "accumulation", text: || structures(&[Accumulation::layout()]) };
+const REARRANGEMENT: Snippet =
+    Snippet { name: "rearrangement", text: || structures(&[Rearrangement::layout()]) };
+const JUDGEMENT: Snippet = Snippet { name: "judgement", text: || structures(&[Judgement::layout()]) };
 const MOTION: Snippet = Snippet { name: "motion", text: || structures(&[Motion::layout()]) };
 const ADAM: Snippet = Snippet { name: "adam", text: || include_str!("adam.wgsl").to_owned() };
 
@@ -255,9 +282,27 @@ pub const ADAM_PLANES: Module = Module {
 pub const ACCUMULATE: Module = Module {
     name: "accumulate",
     text: include_str!("accumulate.wgsl"),
-    imports: &[CONSTANTS, ACCUMULATION],
-    bindings: &[Uniform, Read, ReadWrite],
+    imports: &[CONSTANTS, ACCUMULATION, FAULTS],
+    bindings: &[Uniform, Read, ReadWrite, ReadWrite],
     entries: &["add", "add_screen", "add_statistics"],
+};
+
+/// Changes of the set of Gaussians.
+pub const REARRANGE: Module = Module {
+    name: "rearrange",
+    text: include_str!("rearrange.wgsl"),
+    imports: &[CONSTANTS, REARRANGEMENT],
+    bindings: &[Uniform, Read, Read, ReadWrite],
+    entries: &["rearrange"],
+};
+
+/// Judgement of steps.
+pub const JUDGE: Module = Module {
+    name: "judge",
+    text: include_str!("judge.wgsl"),
+    imports: &[CONSTANTS, FAULTS, JUDGEMENT],
+    bindings: &[Uniform, Read, Read, ReadWrite],
+    entries: &["judge"],
 };
 
 /// Probabilities of identities.
@@ -279,8 +324,18 @@ pub const DISPLACEMENT: Module = Module {
 };
 
 /// Every WGSL file of this crate.
-pub const MODULES: &[&Module] =
-    &[&LOSSES, &SSIM, &ADAM_GAUSSIANS, &ADAM_NETWORK, &ADAM_PLANES, &ACCUMULATE, &IDENTITY, &DISPLACEMENT];
+pub const MODULES: &[&Module] = &[
+    &LOSSES,
+    &SSIM,
+    &ADAM_GAUSSIANS,
+    &ADAM_NETWORK,
+    &ADAM_PLANES,
+    &ACCUMULATE,
+    &JUDGE,
+    &REARRANGE,
+    &IDENTITY,
+    &DISPLACEMENT,
+];
 
 /// Every structure that Rust and WGSL share.
 pub const LAYOUTS: &[fn() -> Layout] = &[
@@ -289,6 +344,8 @@ pub const LAYOUTS: &[fn() -> Layout] = &[
     GroupRates::layout,
     PlaneRates::layout,
     Accumulation::layout,
+    Judgement::layout,
+    Rearrangement::layout,
     Motion::layout,
 ];
 

@@ -65,6 +65,8 @@ pub struct LossWeights {
     pub by_coverage: bool,
     /// Whether labels are left out, see [`GpuLosses::leave_out`].
     pub leaves_out: bool,
+    /// Whether the pixels that effects are judged by are left out of the gradient.
+    pub leaves_judged: bool,
 }
 
 /// Losses on the device.
@@ -145,6 +147,8 @@ impl GpuLosses {
         let pixels = width as usize * height as usize;
         let groups = pixels.div_ceil(WORKGROUP);
         let with_similarity = weights.lambda_dssim > 0.0;
+        let leaves_labels = weights.leaves_out && !target.labels.is_empty();
+        let leaves_out = u32::from(leaves_labels) | u32::from(weights.leaves_judged) << 1;
         self.v_colors.resize(gpu, pixels)?;
         self.partial_sums.resize(gpu, 2 * groups)?;
         self.rows.resize(gpu, if with_similarity { 5 * pixels } else { 0 })?;
@@ -163,7 +167,7 @@ impl GpuLosses {
                 by_coverage: u32::from(weights.by_coverage),
                 absolute_weight: share(f64::from(1.0 - weights.lambda_dssim)),
                 similarity_weight: share(-f64::from(weights.lambda_dssim)),
-                unused: 0.0,
+                leaves_out,
                 window: [[taps[0], taps[1], taps[2], taps[3]], [taps[4], taps[5], 0.0, 0.0]],
             },
         );
@@ -202,7 +206,7 @@ impl GpuLosses {
                     stage.dispatch(kernel, bind_group, workgroups(pixels, WORKGROUP));
                 }
             }
-            if weights.leaves_out && !target.labels.is_empty() {
+            if leaves_out != 0 {
                 stage.dispatch(&self.leave_out, &leave_out, workgroups(pixels, WORKGROUP));
             }
             stage.dispatch(&self.total, &total, [1, 1, 1]);

@@ -83,13 +83,24 @@ fn total(@builtin(local_invocation_index) local: u32) {
     }
 }
 
-// Takes the gradient from pixels of labels that are left out.
+// Takes the gradient from pixels of labels that are left out, and from those that are judged by.
 @compute @workgroup_size(256)
 fn leave_out(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
     let pixel = (group.y * MAX_WORKGROUPS + group.x) * 256u + local;
-    if pixel < settings.pixels {
-        if left_out[labels[pixel]] != 0u {
-            v_colors[pixel] = vec4f(0.0);
-        }
+    if pixel >= settings.pixels {
+        return;
+    }
+    var leaves_out = false;
+    if (settings.leaves_out & 1u) != 0u {
+        leaves_out = left_out[labels[pixel]] != 0u;
+    }
+    if (settings.leaves_out & 2u) != 0u {
+        let column = pixel % settings.width;
+        let row = pixel / settings.width;
+        leaves_out = leaves_out
+            || (column % JUDGED_SPACING == JUDGED_COLUMN && row % JUDGED_SPACING == JUDGED_ROW);
+    }
+    if leaves_out {
+        v_colors[pixel] = vec4f(0.0);
     }
 }

@@ -4,17 +4,21 @@
 //! | file | stage |
 //! |---|---|
 //! | `losses.wgsl`, `ssim.wgsl` | colour loss with its gradient, value of the instance loss |
+//! | `judge.wgsl` | whether a step may move anything |
+//! | `rearrange.wgsl` | rows after a change of the set of Gaussians |
 //! | `identity.wgsl` | probabilities of the identity rows |
 //! | `accumulate.wgsl` | sums over the views of a step, statistics of densification |
 //! | `adam_gaussians.wgsl`, `adam_planes.wgsl`, `adam_network.wgsl` | the optimiser |
 //! | `displacement.wgsl` | holds travelling objects to their paths, everything else to its place |
 //! | `kernels` | the files, and what they share with Rust |
-//! | `losses`, `motion`, `optimiser` | recording them |
+//! | `losses`, `judge`, `motion`, `optimiser`, `rearrange` | recording them |
 
+pub mod judge;
 pub mod kernels;
 pub mod losses;
 pub mod motion;
 pub mod optimiser;
+pub mod rearrange;
 
 #[cfg(test)]
 mod tests;

@@ -60,19 +60,18 @@ pub struct GaussianStep {
 impl GaussianStep {
     fn rates(&self, gaussians: usize) -> GaussianRates {
         let groups = [
-            (self.means, fault::MEANS, 0..3),
-            (self.opacity, fault::OPACITY, 3..4),
-            (self.log_scales, fault::LOG_SCALES, 4..7),
-            (self.occupancy, fault::OCCUPANCY, 7..8),
-            (self.quaternions, fault::QUATERNIONS, 8..12),
+            (self.means, 0..3),
+            (self.opacity, 3..4),
+            (self.log_scales, 4..7),
+            (self.occupancy, 7..8),
+            (self.quaternions, 8..12),
         ];
         let mut rates = GaussianRates::default();
-        for (group, fault, components) in groups {
+        for (group, components) in groups {
             let (rate, second) = group.corrected();
             for k in components {
                 rates.geometry[k / 4][k % 4] = rate;
                 rates.geometry_second[k / 4][k % 4] = second;
-                rates.faults[k / 4][k % 4] = fault;
             }
         }
         let (sh_base, sh_second) = self.sh.corrected();
@@ -173,11 +172,18 @@ impl GpuOptimiser {
 
     fn count(&self, gpu: &Gpu, count: Count, value: usize) -> &Uniform<Accumulation> {
         let uniform = &self.counts[count as usize];
-        uniform.write(gpu, &Accumulation { count: value as u32, ..Default::default() });
+        let fault = match count {
+            Count::Sh => fault::SH,
+            Count::Calibrations => fault::CALIBRATIONS,
+            _ => 0,
+        };
+        let is_geometry = u32::from(matches!(count, Count::Geometry));
+        uniform.write(gpu, &Accumulation { count: value as u32, fault, is_geometry, unused: 0 });
         uniform
     }
 
-    /// Records `total += view` for gradients of Gaussians: the geometry, the spherical harmonics, or both.
+    /// Records `total += view` for gradients of Gaussians: the spherical harmonics, and the geometry too where asked.
+    /// Sums that no optimiser may take are bits of the first word of `faults`.
     pub fn add_gaussians(
         &self,
         gpu: &Gpu,
@@ -185,17 +191,20 @@ impl GpuOptimiser {
         view: &GpuGaussians,
         total: &GpuGaussians,
         with_geometry: bool,
+        faults: &GpuVec<u32>,
     ) {
         if with_geometry {
             let floats = view.geometry.len() * 12;
             let count = self.count(gpu, Count::Geometry, floats);
-            let bindings = [count.binding(), view.geometry.binding(), total.geometry.binding()];
+            let bindings =
+                [count.binding(), view.geometry.binding(), total.geometry.binding(), faults.binding()];
             let group = self.add.bind(gpu, &bindings);
             commands.stage("accumulate", |s| s.dispatch(&self.add, &group, workgroups(floats, 256)));
         }
         let floats = view.sh.len() * SH_FLOATS;
         let count = self.count(gpu, Count::Sh, floats);
-        let group = self.add.bind(gpu, &[count.binding(), view.sh.binding(), total.sh.binding()]);
+        let bindings = [count.binding(), view.sh.binding(), total.sh.binding(), faults.binding()];
+        let group = self.add.bind(gpu, &bindings);
         commands.stage("accumulate", |s| s.dispatch(&self.add, &group, workgroups(floats, 256)));
     }
 
@@ -204,11 +213,12 @@ impl GpuOptimiser {
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        view: &GpuVec<f32>,
-        total: &GpuVec<f32>,
+        (view, total): (&GpuVec<f32>, &GpuVec<f32>),
+        faults: &GpuVec<u32>,
     ) {
         let count = self.count(gpu, Count::Calibrations, total.len());
-        let group = self.add.bind(gpu, &[count.binding(), view.binding(), total.binding()]);
+        let bindings = [count.binding(), view.binding(), total.binding(), faults.binding()];
+        let group = self.add.bind(gpu, &bindings);
         commands.stage("accumulate", |s| s.dispatch(&self.add, &group, workgroups(total.len(), 256)));
     }
 
@@ -217,24 +227,26 @@ impl GpuOptimiser {
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        view: &GpuVec<[f32; 4]>,
-        total: &GpuVec<[f32; 4]>,
+        (view, total): (&GpuVec<[f32; 4]>, &GpuVec<[f32; 4]>),
+        faults: &GpuVec<u32>,
     ) {
         let count = self.count(gpu, Count::Screen, 4 * total.len());
-        let group = self.add_screen.bind(gpu, &[count.binding(), view.binding(), total.binding()]);
+        let bindings = [count.binding(), view.binding(), total.binding(), faults.binding()];
+        let group = self.add_screen.bind(gpu, &bindings);
         commands.stage("accumulate", |s| s.dispatch(&self.add_screen, &group, workgroups(total.len(), 256)));
     }
 
-    /// Records the step's share of the statistics: summed norms, steps, largest radius.
+    /// Records the step's share of the statistics: summed norms, steps, largest radius. Nothing while steps wait.
     pub fn add_statistics(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        screen: &GpuVec<[f32; 4]>,
-        statistics: &GpuVec<[f32; 4]>,
+        (screen, statistics): (&GpuVec<[f32; 4]>, &GpuVec<[f32; 4]>),
+        faults: &GpuVec<u32>,
     ) {
         let count = self.count(gpu, Count::Statistics, 4 * statistics.len());
-        let group = self.add_statistics.bind(gpu, &[count.binding(), screen.binding(), statistics.binding()]);
+        let bindings = [count.binding(), screen.binding(), statistics.binding(), faults.binding()];
+        let group = self.add_statistics.bind(gpu, &bindings);
         commands.stage("accumulate", |s| {
             s.dispatch(&self.add_statistics, &group, workgroups(statistics.len(), 256));
         });
@@ -264,7 +276,8 @@ impl GpuOptimiser {
         commands.stage("identity", |s| s.dispatch(&self.identity, &group, workgroups(rows, 64)));
     }
 
-    /// Records the step of all Gaussians; gradients become zero. `moments` are the first and the second.
+    /// Records the step of all Gaussians; gradients become zero. While the second word of `faults` makes steps wait,
+    /// nothing moves here and in the steps of the other groups. `moments` are the first and the second.
     pub fn step_gaussians(
         &self,
         gpu: &Gpu,
@@ -322,15 +335,7 @@ impl GpuOptimiser {
         let floats = parameters.len();
         self.calibration_rates.write(
             gpu,
-            &GroupRates {
-                floats: floats as u32,
-                parts: 1,
-                fault: fault::CALIBRATIONS,
-                rate,
-                second,
-                limit,
-                unused: [0.0; 2],
-            },
+            &GroupRates { floats: floats as u32, parts: 1, rate, second, limit, ..GroupRates::default() },
         );
         let group = self.network.bind(
             gpu,
@@ -370,11 +375,10 @@ impl GpuOptimiser {
             &GroupRates {
                 floats: floats as u32,
                 parts: SPLITS,
-                fault: fault::MLP,
                 rate,
                 second,
                 limit: f32::MAX,
-                unused: [0.0; 2],
+                ..GroupRates::default()
             },
         );
         let [of_planes, of_network] = moments;

@@ -7,9 +7,10 @@ use cif_render::Gradients;
 use cif_render::wgpu::deform::{DeformationGradients, FIXED_UNITS, SPLITS, ZERO_SUM};
 use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::validation::validate;
-use cif_render::wgpu::{Commands, GpuDeformation, GpuGaussians, GpuVec, Layout, testing};
+use cif_render::wgpu::{Commands, GpuDeformation, GpuGaussians, GpuStatistics, GpuVec, Layout, testing};
 
-use super::kernels::{LAYOUTS, MODULES, fault, fault_name};
+use super::judge::GpuJudge;
+use super::kernels::{Judgement, LAYOUTS, MODULES, fault, fault_name};
 use super::losses::{GpuLosses, GpuTarget, LossWeights, ViewLoss};
 use super::motion::GpuMotion;
 use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep};
@@ -46,9 +47,10 @@ fn every_file_is_valid_and_lies_as_in_rust() {
 
 #[test]
 fn faults_have_the_names_of_the_cpu() {
-    assert_eq!(fault_name(fault::SH | fault::MLP), "the gradient of sh_coefficients");
-    assert_eq!(fault_name(1), "the gradient of planes");
-    assert_eq!(fault_name(0), "a gradient");
+    assert_eq!(fault_name(fault::SH | fault::MLP), ("gradients", "gradient of sh_coefficients"));
+    assert_eq!(fault_name(1), ("gradients", "gradient of planes"));
+    assert_eq!(fault_name(fault::INSTANCE_LOSS), ("losses", "instance loss"));
+    assert_eq!(fault::MAX_GRADIENT, crate::trainer::MAX_GRADIENT, "both backends refuse the same gradients");
 }
 
 /// A view larger than a few workgroups, with partial windows at every border.
@@ -232,7 +234,7 @@ fn gaussians_move_as_on_the_cpu() {
 }
 
 #[test]
-fn limits_unit_quaternions_and_faults() {
+fn limits_and_unit_quaternions() {
     let Some(gpu) = testing::gpu() else { return };
     let mut start = some_gaussians(3, 0.31, 1.0);
     start.occupancy_logits = vec![-9.0, 0.5, 9.0];
@@ -242,10 +244,7 @@ fn limits_unit_quaternions_and_faults() {
     let screen = GpuVec::<[f32; 4]>::zeros(&gpu, "screen", 3).unwrap();
     let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
     let optimiser = GpuOptimiser::new(&gpu).unwrap();
-    let mut bad = some_gaussians(3, 0.2, 1e-3);
-    bad.log_scales[1][2] = f32::NAN;
-    bad.sh_coefficients[2][1] = f32::INFINITY;
-    let gradients = GpuGaussians::upload(&gpu, &bad).unwrap();
+    let gradients = GpuGaussians::upload(&gpu, &some_gaussians(3, 0.2, 1e-3)).unwrap();
     let step = GaussianStep {
         log_scales: step_of(1e-2, 1),
         sh: step_of(1e-2, 1),
@@ -270,11 +269,95 @@ fn limits_unit_quaternions_and_faults() {
     assert_eq!(found.occupancy_logits, [-5.0, 0.5, 5.0]);
     assert_eq!(found.quaternions[0], [0.0; 4]);
     compare("unit quaternion", &found.quaternions[1], &[0.6, 0.0, 0.8, 0.0], 1e-6);
-    assert_eq!(faults.read(&gpu).unwrap()[0], fault::LOG_SCALES | fault::SH);
-    assert_eq!(found.log_scales[1][2], start.log_scales[1][2], "a bad gradient moves nothing");
     assert!(found.log_scales[1][0] != start.log_scales[1][0]);
     assert_eq!(found.means, start.means, "a rate of 0 keeps still");
-    assert!(found.sh_coefficients.as_flattened().iter().all(|v| v.is_finite()));
+
+    // While steps wait for the host nothing moves, and gradients are taken all the same.
+    faults.write(&gpu, 1, &[1]);
+    gradients.geometry.write(&gpu, 0, &[[f32::NAN; 12]; 3]);
+    let mut commands = Commands::new(&gpu, None);
+    optimiser.step_gaussians(
+        &gpu,
+        &mut commands,
+        &step,
+        (&parameters, &gradients),
+        &moments,
+        &screen,
+        &faults,
+    );
+    commands.submit();
+    assert_eq!(parameters.download(&gpu).unwrap(), found);
+    assert_eq!(gradients.download(&gpu).unwrap().log_scales, vec![[0.0; 3]; 3]);
+}
+
+#[test]
+fn sums_that_no_optimiser_may_take_are_told_by_group() {
+    let Some(gpu) = testing::gpu() else { return };
+    let optimiser = GpuOptimiser::new(&gpu).unwrap();
+    let n = 5;
+    let mut bad: Vec<(u32, cif_field::Gaussians)> = vec![(0, some_gaussians(n, 0.3, 1.0))];
+    let mut with = |bit: u32, damage: fn(&mut cif_field::Gaussians)| {
+        let mut gaussians = some_gaussians(n, 0.3, 1.0);
+        damage(&mut gaussians);
+        bad.push((bit, gaussians));
+    };
+    with(fault::MEANS, |g| g.means[3][2] = f32::NAN);
+    with(fault::OPACITY, |g| g.opacity_logits[0] = f32::INFINITY);
+    with(fault::LOG_SCALES, |g| g.log_scales[4][0] = -2e18);
+    with(fault::OCCUPANCY, |g| g.occupancy_logits[2] = f32::NEG_INFINITY);
+    with(fault::QUATERNIONS, |g| g.quaternions[1][3] = 1.5e18);
+    with(fault::SH, |g| g.sh_coefficients[4][47] = f32::NAN);
+    with(fault::SH | fault::MEANS, |g| (g.sh_coefficients[0][0], g.means[0][0]) = (f32::NAN, f32::NAN));
+    with(0, |g| g.quaternions[1][3] = 0.9e18);
+    for (bits, view) in bad {
+        let faults = GpuVec::<u32>::zeros(&gpu, "faults", fault::WORDS).unwrap();
+        let view = GpuGaussians::upload(&gpu, &view).unwrap();
+        let total = GpuGaussians::zeros(&gpu, n).unwrap();
+        let mut commands = Commands::new(&gpu, None);
+        optimiser.add_gaussians(&gpu, &mut commands, &view, &total, true, &faults);
+        commands.submit();
+        assert_eq!(faults.read(&gpu).unwrap()[..2], [bits, 0]);
+    }
+    let faults = GpuVec::<u32>::zeros(&gpu, "faults", fault::WORDS).unwrap();
+    let view = GpuVec::from_slice(&gpu, "view", &[0.0, f32::NAN]).unwrap();
+    let total = GpuVec::from_slice(&gpu, "total", &[1.0_f32, 2.0]).unwrap();
+    let mut commands = Commands::new(&gpu, None);
+    optimiser.add_calibrations(&gpu, &mut commands, (&view, &total), &faults);
+    commands.submit();
+    assert_eq!(faults.read(&gpu).unwrap()[0], fault::CALIBRATIONS);
+}
+
+#[test]
+fn steps_wait_after_what_counts_and_only_then() {
+    let Some(gpu) = testing::gpu() else { return };
+    let judge = GpuJudge::new(&gpu).unwrap();
+    let good = ([1.0, 2.0, 3.0, 4.0], [0.5, 0.0, 0.0, 0.0]);
+    let fits = [7, 7];
+    // Losses, pairs that there are and that were drawn, bits before, bits that count, whether last; bits, and waits.
+    let cases = [
+        (good, fits, 0, u32::MAX, 1, 0, 0),
+        (([f32::NAN, 0.0, 0.0, 0.0], [0.0; 4]), fits, 0, u32::MAX, 1, fault::COLOR_LOSS, 1),
+        (([0.0; 4], [f32::INFINITY, 0.0, 0.0, 0.0]), fits, 0, u32::MAX, 1, fault::COLOR_LOSS, 1),
+        (([0.0, 0.0, f32::NAN, 0.0], [0.0; 4]), fits, 0, u32::MAX, 1, fault::INSTANCE_LOSS, 1),
+        (good, [7, 0], 0, fault::NO_ROOM, 1, fault::NO_ROOM, 1),
+        (good, [7, 0], 0, fault::NO_ROOM, 0, fault::NO_ROOM, 0),
+        (good, fits, fault::MEANS, fault::MEANS | fault::SH, 1, fault::MEANS, 1),
+        (good, fits, fault::MEANS, fault::SH, 1, fault::MEANS, 0),
+    ];
+    for (at, ((sums, similarity), [wanted, drawn], before, counts, is_last, bits, waits)) in
+        cases.into_iter().enumerate()
+    {
+        let results = GpuVec::from_slice(&gpu, "results", &[[9.0; 4], [9.0; 4], sums, similarity]).unwrap();
+        let mut words = vec![0; GpuStatistics::WORDS];
+        (words[GpuStatistics::WANTED_PAIRS], words[GpuStatistics::PAIRS]) = (wanted, drawn);
+        let words = GpuVec::from_slice(&gpu, "counts", &words).unwrap();
+        let faults = GpuVec::from_slice(&gpu, "faults", &[before, 0_u32, 0, 0]).unwrap();
+        let mut commands = Commands::new(&gpu, None);
+        let judgement = Judgement { slot: 1, counts, known: 0, is_last };
+        judge.record(&gpu, &mut commands, judgement, (&results, &words), &faults);
+        commands.submit();
+        assert_eq!(faults.read(&gpu).unwrap()[..2], [bits, waits], "case {at}");
+    }
 }
 
 #[test]
@@ -369,6 +452,7 @@ fn statistics_and_sums_are_those_of_the_cpu() {
     let optimiser = GpuOptimiser::new(&gpu).unwrap();
     let total = GpuVec::<[f32; 4]>::zeros(&gpu, "screen", n).unwrap();
     let statistics = GpuVec::<[f32; 4]>::zeros(&gpu, "statistics", n).unwrap();
+    let faults = GpuVec::<u32>::zeros(&gpu, "faults", fault::WORDS).unwrap();
     let mut expected = DensifyStatistics::zeros(n);
     let field = cif_render::synthetic::generate(&cif_render::synthetic::SyntheticConfig {
         gaussians: n,
@@ -396,12 +480,12 @@ fn statistics_and_sums_are_those_of_the_cpu() {
             }
             let of_view = GpuVec::from_slice(&gpu, "view", &rows).unwrap();
             let mut commands = Commands::new(&gpu, None);
-            optimiser.add_screen(&gpu, &mut commands, &of_view, &total);
+            optimiser.add_screen(&gpu, &mut commands, (&of_view, &total), &faults);
             commands.submit();
         }
         expected.add(&gradients);
         let mut commands = Commands::new(&gpu, None);
-        optimiser.add_statistics(&gpu, &mut commands, &total, &statistics);
+        optimiser.add_statistics(&gpu, &mut commands, (&total, &statistics), &faults);
         commands.submit();
     }
     let found = statistics.read(&gpu).unwrap();
@@ -413,10 +497,10 @@ fn statistics_and_sums_are_those_of_the_cpu() {
     let (a, b) = (some_gaussians(n, 0.3, 1.0), some_gaussians(n, 0.4, 1.0));
     let (view, sum) = (GpuGaussians::upload(&gpu, &a).unwrap(), GpuGaussians::upload(&gpu, &b).unwrap());
     let mut commands = Commands::new(&gpu, None);
-    optimiser.add_gaussians(&gpu, &mut commands, &view, &sum, true);
+    optimiser.add_gaussians(&gpu, &mut commands, &view, &sum, true, &faults);
     let of_view = GpuVec::from_slice(&gpu, "view", &[1.0_f32, 2.0, 3.0]).unwrap();
     let calibrations = GpuVec::from_slice(&gpu, "total", &[10.0_f32, 20.0, 30.0]).unwrap();
-    optimiser.add_calibrations(&gpu, &mut commands, &of_view, &calibrations);
+    optimiser.add_calibrations(&gpu, &mut commands, (&of_view, &calibrations), &faults);
     commands.submit();
     let found = sum.download(&gpu).unwrap();
     assert_eq!(found.means[7], [0, 1, 2].map(|k| a.means[7][k] + b.means[7][k]));
@@ -488,6 +572,25 @@ fn pulls_are_those_of_the_cpu_and_leave_the_direct_path_alone() {
         assert_eq!(*found, -*taken);
     }
     assert!(found.opacity_logits.iter().all(|v| *v == 0.0));
+}
+
+#[test]
+fn pixels_that_are_judged_by_have_no_gradient() {
+    let Some(gpu) = testing::gpu() else { return };
+    let (rendered, target) = images();
+    let mut losses = GpuLosses::new(&gpu).unwrap();
+    let on_device = GpuTarget::new(&gpu, &target, None).unwrap();
+    let colors = GpuVec::from_slice(&gpu, "colors", &four(&rendered.pixels)).unwrap();
+    let blended = GpuVec::<[f32; 4]>::zeros(&gpu, "blended", rendered.pixels.len()).unwrap();
+    let weights = LossWeights { view: 1.0, leaves_judged: true, ..LossWeights::default() };
+    let mut commands = Commands::new(&gpu, None);
+    losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, 0).unwrap();
+    commands.submit();
+    let width = target.width as usize;
+    for (k, v) in losses.v_colors.read(&gpu).unwrap().iter().enumerate() {
+        let is_judged = k % width % 8 == 3 && k / width % 8 == 5;
+        assert_eq!(*v == [0.0; 4], is_judged, "pixel {k}: {v:?}");
+    }
 }
 
 #[test]

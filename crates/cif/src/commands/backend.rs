@@ -9,7 +9,8 @@ use crate::error::Error;
 /// What does the work.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub(super) enum Backend {
-    /// A GPU where there is one that supports everything that is asked, else the processor
+    /// A GPU where there is one that supports everything that is asked and is faster, which is measured for a
+    /// second, else the processor
     Auto,
     /// The processor
     #[default]
@@ -50,13 +51,20 @@ impl Backend {
         }
     }
 
-    /// Makes a trainer's steps run on the GPU, and says so; `auto` stays on the processor where the GPU does not
-    /// support what is asked.
+    /// Makes a trainer's steps run on the GPU, and says so; `auto` tries steps on both for a second, takes what is
+    /// faster, and stays on the processor where the GPU does not support what is asked.
     pub(super) fn apply(self, gpu: Option<&Gpu>, trainer: &mut Trainer) -> Result<(), Error> {
         let Some(gpu) = gpu else { return Ok(()) };
-        match trainer.use_gpu(gpu) {
-            Ok(()) => eprintln!("training on {} ({})", gpu.facts().name, gpu.facts().interface),
-            Err(error @ (TrainError::NotOnGpu { .. } | TrainError::Gpu(_))) if self == Self::Auto => {
+        let name = format!("{} ({})", gpu.facts().name, gpu.facts().interface);
+        if self != Self::Auto {
+            trainer.use_gpu(gpu).map_err(Error::plain)?;
+            eprintln!("training on {name}");
+            return Ok(());
+        }
+        match trainer.use_faster(gpu) {
+            Ok(probe) if probe.gpu_is_faster() => eprintln!("training on {name}: {probe}"),
+            Ok(probe) => eprintln!("training on the processor, not on {name}: {probe}"),
+            Err(error @ (TrainError::NotOnGpu { .. } | TrainError::Gpu(_))) => {
                 eprintln!("note: {error}; using --backend cpu");
             }
             Err(error) => return Err(Error::plain(error)),

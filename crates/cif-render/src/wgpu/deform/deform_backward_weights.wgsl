@@ -4,12 +4,21 @@
 
 #import layers
 #import moment
+#import faults
 
 @group(0) @binding(0) var<uniform> layers: Layers;
 @group(0) @binding(1) var<uniform> moment: Moment;
 @group(0) @binding(2) var<storage, read> scratch: array<vec4<f32>>;
 // `[SPLITS, MLP_FLOATS]`.
 @group(0) @binding(3) var<storage, read_write> partial_sums: array<f32>;
+@group(0) @binding(4) var<storage, read_write> faults: array<atomic<u32>>;
+
+// Adds to a part; says whether it is one that no optimiser may take.
+fn add(at: u32, value: f32) -> bool {
+    let total = partial_sums[at] + value;
+    partial_sums[at] = total;
+    return is_beyond(total);
+}
 
 @compute @workgroup_size(64)
 fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) thread: u32) {
@@ -53,18 +62,22 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
         }
     }
     let part = group.y * MLP_FLOATS;
+    var beyond = false;
     for (var k = 0u; k < 4u; k++) {
         let output = first_output + k;
         if output < shape.z {
             for (var j = 0u; j < 4u; j++) {
                 let input = first_input + j;
                 if input < shape.w {
-                    partial_sums[part + place.x + output * shape.w + input] += sums[k][j];
+                    beyond = add(part + place.x + output * shape.w + input, sums[k][j]) || beyond;
                 }
             }
             if first_input == 0u {
-                partial_sums[part + place.y + output] += biases[k];
+                beyond = add(part + place.y + output, biases[k]) || beyond;
             }
         }
+    }
+    if beyond {
+        atomicOr(&faults[0], MLP_FAULT);
     }
 }

@@ -19,6 +19,7 @@
 
 #import hexplane
 #import fixed_point
+#import faults
 
 // Threads per Gaussian, and Gaussians per workgroup of 64.
 const LANES: u32 = 16u;
@@ -103,9 +104,17 @@ fn main(
         for (var lane = 0u; lane < LANES; lane++) {
             total += slopes[thread + lane];
         }
-        let at = row * 3u;
-        v_canonical[at] += v_posed[at] + vec4<f32>(total, 0.0);
-        v_canonical[at + 1u] += v_posed[at + 1u];
-        v_canonical[at + 2u] += v_posed[at + 2u];
+        var found = 0u;
+        for (var k = 0u; k < 3u; k++) {
+            let at = row * 3u + k;
+            let sum = v_canonical[at] + v_posed[at] + select(vec4<f32>(0.0), vec4<f32>(total, 0.0), k == 0u);
+            v_canonical[at] = sum;
+            for (var lane = 0u; lane < 4u; lane++) {
+                found |= select(0u, geometry_fault(4u * k + lane), is_beyond(sum[lane]));
+            }
+        }
+        if found != 0u {
+            atomicOr(&faults[0], found);
+        }
     }
 }

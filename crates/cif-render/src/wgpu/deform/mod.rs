@@ -8,27 +8,33 @@
 //! | `deform_backward_weights.wgsl` | gradients of its weights and biases |
 //! | `deform_planes_backward.wgsl` | gradients of planes, lines and canonical centres |
 //! | `deform_lines_backward.wgsl` | gradients of lines to the time planes |
+//! | `deform_moving.wgsl`, `moving` | Gaussians that stand still, which the network leaves alone |
 //! | `hexplane.wgsl`, `network.wgsl`, `fixed_point.wgsl` | what they share |
 //! | `shape` | constants and tables that follow from a configuration |
 //!
 //! Results are the same on every run: weights are summed in fixed parts and order, planes in 64-bit fixed point.
 
+mod moving;
 mod shape;
 
 use cif_field::Deformation as FieldDeformation;
 
+use self::moving::MovingRows;
+use super::faults::{self, FAULTS};
 use super::gaussians::GpuGaussians;
 use super::{
     Access, Commands, Gpu, GpuError, GpuVec, Kernel, Layout, Module, Shared, Snippet, Uniform, structures,
     workgroups,
 };
+pub use moving::Moving;
 pub use shape::{Deformation, Layers, Moment, SPLITS, Shape};
 
 /// Bit of the fault word: a gradient of the planes is not finite, or beyond what fixed point holds.
-pub const PLANES_FAULT: u32 = 1;
+pub const PLANES_FAULT: u32 = faults::PLANES;
 
 const DEFORMATION: Snippet = Snippet { name: "deformation", text: || structures(&[Deformation::layout()]) };
 const MOMENT: Snippet = Snippet { name: "moment", text: || structures(&[Moment::layout()]) };
+const MOVING: Snippet = Snippet { name: "moving", text: || structures(&[Moving::layout()]) };
 const LAYERS: Snippet = Snippet { name: "layers", text: || structures(&[Layers::layout()]) };
 const HEXPLANE: Snippet = Snippet { name: "hexplane", text: || include_str!("hexplane.wgsl").to_owned() };
 const NETWORK: Snippet = Snippet { name: "network", text: || include_str!("network.wgsl").to_owned() };
@@ -91,15 +97,15 @@ const BACKWARD: Module = Module {
 const BACKWARD_WEIGHTS: Module = Module {
     name: "deform_backward_weights",
     text: include_str!("deform_backward_weights.wgsl"),
-    imports: &[LAYERS, MOMENT],
-    bindings: &[Access::Uniform, Access::Uniform, Access::Read, Access::ReadWrite],
+    imports: &[LAYERS, MOMENT, FAULTS],
+    bindings: &[Access::Uniform, Access::Uniform, Access::Read, Access::ReadWrite, Access::ReadWrite],
     entries: &["main"],
 };
 
 const PLANES_BACKWARD: Module = Module {
     name: "deform_planes_backward",
     text: include_str!("deform_planes_backward.wgsl"),
-    imports: &[DEFORMATION, MOMENT, HEXPLANE, FIXED_POINT],
+    imports: &[DEFORMATION, MOMENT, HEXPLANE, FIXED_POINT, FAULTS],
     bindings: &[
         Access::Uniform,
         Access::Uniform,
@@ -123,12 +129,28 @@ const LINES_BACKWARD: Module = Module {
     entries: &["main"],
 };
 
+const MOVING_ROWS: Module = Module {
+    name: "deform_moving",
+    text: include_str!("deform_moving.wgsl"),
+    imports: &[MOVING, FAULTS],
+    bindings: &[
+        Access::Uniform,
+        Access::Read,
+        Access::Read,
+        Access::Read,
+        Access::ReadWrite,
+        Access::Read,
+        Access::ReadWrite,
+    ],
+    entries: &["take", "put", "put_gradients"],
+};
+
 /// Files of this stage; they are compiled with the declarations of [`Shape`] before them.
 pub const MODULES: &[&Module] =
-    &[&PREPARE, &FORWARD, &BACKWARD, &BACKWARD_WEIGHTS, &PLANES_BACKWARD, &LINES_BACKWARD];
+    &[&PREPARE, &FORWARD, &BACKWARD, &BACKWARD_WEIGHTS, &PLANES_BACKWARD, &LINES_BACKWARD, &MOVING_ROWS];
 
 /// Structures of this stage.
-pub const LAYOUTS: &[fn() -> Layout] = &[Deformation::layout, Moment::layout, Layers::layout];
+pub const LAYOUTS: &[fn() -> Layout] = &[Deformation::layout, Moment::layout, Layers::layout, Moving::layout];
 
 /// A deformation on the device.
 #[derive(Debug)]
@@ -147,6 +169,10 @@ pub struct GpuDeformation {
     weights: GpuVec<u32>,
     prepare: Kernel,
     forward: Kernel,
+    /// Where some Gaussians stand still.
+    moving: Option<MovingRows>,
+    /// Compiled when the first of them does.
+    moving_kernels: Option<[Kernel; 3]>,
 }
 
 /// The one entry point of a module.
@@ -159,16 +185,11 @@ impl GpuDeformation {
     /// A copy of a deformation, ready to move Gaussians.
     ///
     /// # Errors
-    /// When it does not fit the device, with the arithmetic; when Gaussians stand still, which the kernels do not
-    /// know.
+    /// When it does not fit the device, with the arithmetic.
     pub fn new(gpu: &Gpu, deformation: &FieldDeformation) -> Result<Self, GpuError> {
-        let still = deformation.still.iter().filter(|still| **still).count();
-        if still > 0 {
-            return Err(GpuError::StandStill { still });
-        }
         let shape = Shape::new(deformation, gpu.largest_binding())?;
         let declarations = shape.forward_declarations();
-        Ok(Self {
+        let mut deformed = Self {
             planes: GpuVec::from_slice(gpu, "nodes of the hexplanes", &deformation.planes)?,
             mlp: GpuVec::from_slice(gpu, "weights of the deformation network", &deformation.mlp)?,
             config: deformation.config.clone(),
@@ -181,7 +202,28 @@ impl GpuDeformation {
             prepare: compile(gpu, &PREPARE, &declarations)?,
             forward: compile(gpu, &FORWARD, &declarations)?,
             shape,
-        })
+            moving: None,
+            moving_kernels: None,
+        };
+        deformed.set_still(gpu, &deformation.still)?;
+        Ok(deformed)
+    }
+
+    /// Says which Gaussians stand still, `[N]`, or none at all when empty.
+    ///
+    /// # Errors
+    /// When the arrays of those that move do not fit the device.
+    pub fn set_still(&mut self, gpu: &Gpu, still: &[bool]) -> Result<(), GpuError> {
+        self.moving = if still.contains(&true) {
+            let kernels = match &self.moving_kernels {
+                Some(kernels) => kernels.clone(),
+                None => self.moving_kernels.insert(super::stages::entries(gpu, &MOVING_ROWS)?).clone(),
+            };
+            Some(MovingRows::new(gpu, kernels, still, self.shape.moves_sh)?)
+        } else {
+            None
+        };
+        Ok(())
     }
 
     /// Constants and tables.
@@ -212,6 +254,23 @@ impl GpuDeformation {
     /// Records the moving of `canonical` to `time` in [0, 1] into `posed`, which has as many rows; only a head that
     /// moves them writes the spherical harmonics of `posed`. One time per submission: the time is written at once.
     pub fn forward(
+        &self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        time: f64,
+        canonical: &GpuGaussians,
+        posed: &GpuGaussians,
+    ) {
+        let Some(moving) = &self.moving else {
+            self.forward_all(gpu, commands, time, canonical, posed);
+            return;
+        };
+        moving.take_canonical(gpu, commands, canonical);
+        self.forward_all(gpu, commands, time, &moving.canonical, &moving.posed);
+        moving.put_posed(gpu, commands, canonical, posed);
+    }
+
+    fn forward_all(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
@@ -325,6 +384,26 @@ impl DeformationGradients {
         v_canonical: &GpuGaussians,
         faults: &GpuVec<u32>,
     ) {
+        let Some(moving) = &deformation.moving else {
+            self.backward_all(gpu, commands, (deformation, time), canonical, v_posed, v_canonical, faults);
+            return;
+        };
+        moving.take_gradients(gpu, commands, v_posed, v_canonical);
+        let (v_moving, v_places) = (&moving.v_posed, &moving.v_canonical);
+        self.backward_all(gpu, commands, (deformation, time), &moving.canonical, v_moving, v_places, faults);
+        moving.put_gradients(gpu, commands, v_posed, v_canonical, faults);
+    }
+
+    fn backward_all(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        (deformation, time): (&GpuDeformation, f64),
+        canonical: &GpuGaussians,
+        v_posed: &GpuGaussians,
+        v_canonical: &GpuGaussians,
+        faults: &GpuVec<u32>,
+    ) {
         let shape = &deformation.shape;
         let n = canonical.len();
         let chunks = n.div_ceil(shape.chunk_rows as usize);
@@ -353,7 +432,13 @@ impl DeformationGradients {
             );
             let weights = self.backward_weights.bind(
                 gpu,
-                &[self.layers.binding(), uniform.binding(), self.scratch.binding(), self.parts.binding()],
+                &[
+                    self.layers.binding(),
+                    uniform.binding(),
+                    self.scratch.binding(),
+                    self.parts.binding(),
+                    faults.binding(),
+                ],
             );
             let planes = self.planes_backward.bind(
                 gpu,

@@ -2,36 +2,52 @@
 //!
 //! The host's field and optimiser are what every other part of the trainer works on: rare events (densification,
 //! resampling, identities, evaluation, saving) fetch them from the device, and what they change is sent again before
-//! the next step. Losses and counts of a step are read when they arrive, some steps later.
-//!
-//! A gradient that is not finite moves nothing. Unlike on the processor such a step is not rolled back: the run
-//! stops once the fault has arrived.
+//! the next step. Losses and counts of a step are read when they arrive, some steps later; no step waits for them.
 //!
 //! | file | holds |
 //! |---|---|
 //! | `resident` | what lies on the device, fetching and sending |
-//! | `step` | one step |
-//! | `arriving` | what is read of steps, later |
+//! | `step`, `view` | one step, and one view of it |
+//! | `flight` | steps on their way: what is read of them later, room for pairs, bad steps |
+//! | `validation` | where a bad step went wrong, and every array of a step looked at |
+//! | `events` | what happens between steps |
+//! | `probe`, `kept` | whether the GPU is faster: trial steps, and undoing them |
+//! | `rearrange` | changes of the set of Gaussians, with their rows staying there |
+//! | `identities` | label mass for the identity stage |
 
-mod arriving;
+mod events;
+mod flight;
+mod identities;
+mod kept;
+mod probe;
+mod rearrange;
 mod resident;
 mod step;
+#[cfg(test)]
+mod tests;
+mod validation;
+mod view;
 
 use std::collections::BTreeMap;
 
 use cif_field::gaussians::SH_FLOATS;
 use cif_render::wgpu::deform::Shape;
-use cif_render::wgpu::{Gpu, GpuError, GpuVec, Rasterizer, Timestamps};
+use cif_render::wgpu::{Gpu, GpuError, GpuVec, Mailbox, Rasterizer, Timestamps, faults};
 
-use self::arriving::Arrivals;
+use self::flight::{Flights, LETTER_WORDS};
+use self::kept::Kept;
+pub use self::probe::Probe;
 use self::resident::{Resident, Stale};
 use super::progress::Progress;
 use super::{Trainer, initialize};
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
+use crate::events::TrainEvent;
+use crate::wgpu::judge::GpuJudge;
 use crate::wgpu::losses::{GpuLosses, GpuTarget};
 use crate::wgpu::motion::GpuMotion;
 use crate::wgpu::optimiser::GpuOptimiser;
+use crate::wgpu::rearrange::GpuRearranger;
 
 /// Steps after which the host's state is fetched at the latest, so that a lost device costs no more.
 const FETCH_EVERY: u32 = 500;
@@ -46,17 +62,20 @@ pub(super) struct DeviceTraining {
     losses: GpuLosses,
     optimiser: GpuOptimiser,
     motion: GpuMotion,
+    judge: GpuJudge,
+    rearranger: GpuRearranger,
+    /// Where the rows of a set that is changing come from.
+    origins: Option<Vec<u32>>,
     /// Training frames on the device, by position, and their bytes.
     targets: BTreeMap<usize, GpuTarget>,
     target_bytes: u64,
     /// `None` until the first step.
     resident: Option<Resident>,
     stale: Stale,
-    /// Bits of gradients that were not finite.
+    /// See [`cif_render::wgpu::faults`].
     faults: GpuVec<u32>,
-    arrivals: Arrivals,
-    /// Views whose pairs have been counted.
-    counted: Vec<bool>,
+    mailbox: Mailbox,
+    flights: Flights,
     /// Most pairs and label slots that a view wanted so far, and of how many Gaussians.
     wanted: [usize; 2],
     wanted_of: usize,
@@ -80,6 +99,8 @@ struct Fetched {
     sh_degree: u8,
     adam_steps: Vec<u32>,
     statistics: DensifyStatistics,
+    /// The host's side, where it no longer is what was fetched.
+    kept: Option<Kept>,
 }
 
 impl Trainer {
@@ -91,19 +112,21 @@ impl Trainer {
     pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
         self.refuse_unsupported()?;
         self.refuse_too_large(gpu)?;
-        let views = self.frames.len();
         self.device = Some(Box::new(DeviceTraining {
             rasterizer: Rasterizer::new(gpu)?,
             losses: GpuLosses::new(gpu)?,
             optimiser: GpuOptimiser::new(gpu)?,
             motion: GpuMotion::new(gpu)?,
+            judge: GpuJudge::new(gpu)?,
+            rearranger: GpuRearranger::new(gpu)?,
+            origins: None,
             targets: BTreeMap::new(),
             target_bytes: 0,
             resident: None,
             stale: Stale::default(),
-            faults: GpuVec::zeros(gpu, "faults", 4)?,
-            arrivals: Arrivals::default(),
-            counted: vec![false; views],
+            faults: GpuVec::zeros(gpu, "faults", faults::WORDS)?,
+            mailbox: Mailbox::new(LETTER_WORDS),
+            flights: Flights::default(),
             wanted: [SMALLEST_ROOM; 2],
             wanted_of: 0,
             ahead: false,
@@ -141,7 +164,6 @@ impl Trainer {
             ("effects.sh_gain", effects.sh_gain > 0.0),
             ("effects.head_gain", effects.head_gain > 0.0),
             ("effects.exposure", effects.exposure),
-            ("--debug-validation", self.debug_validation),
         ]
         .into_iter()
         .filter_map(|(name, is_on)| is_on.then_some(name))
@@ -203,7 +225,6 @@ impl Trainer {
         if matches!(received, Err(TrainError::Gpu(_))) {
             return received;
         }
-        device.faults.write(&device.gpu, 0, &[0; 4]);
         if let Some(resident) = &device.resident
             && device.ahead
         {
@@ -211,8 +232,13 @@ impl Trainer {
         }
         device.ahead = false;
         device.since_fetch = 0;
-        // Numbers that are not finite moved nothing, so the field is good.
+        // A bad step moved nothing, so the field is good.
         received
+    }
+
+    /// What steps told that have arrived since they were last asked.
+    pub(super) fn arrived_events(&mut self) -> Vec<TrainEvent> {
+        std::mem::take(&mut self.arrived)
     }
 
     /// Counters that belong to the host's present field and moments.
@@ -222,6 +248,7 @@ impl Trainer {
             sh_degree: self.field.sh_degree,
             adam_steps: self.optimiser.groups().map(|(_, moments)| moments.steps).into(),
             statistics: self.statistics.clone(),
+            kept: None,
         }
     }
 
@@ -243,8 +270,6 @@ impl Trainer {
     pub(super) fn everything_changed(&mut self) {
         if let Some(device) = &mut self.device {
             device.stale = Stale { gaussians: true, identities: true, deformation: true };
-            // A stage may draw more: labels need room from the instance stage on.
-            device.counted.fill(false);
         }
     }
 
@@ -254,6 +279,9 @@ impl Trainer {
             return error;
         }
         if let Some(fetched) = self.device.take().and_then(|device| device.fetched) {
+            if let Some(kept) = fetched.kept {
+                self.put_back(kept);
+            }
             self.progress = fetched.progress;
             self.field.sh_degree = fetched.sh_degree;
             self.statistics = fetched.statistics;

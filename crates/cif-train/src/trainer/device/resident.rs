@@ -82,9 +82,18 @@ fn set_moment_rows(optimiser: &mut Optimiser, second: bool, rows: cif_field::Gau
 }
 
 /// Statistics in the layout of the device.
-fn statistic_rows(statistics: &DensifyStatistics) -> Vec<[f32; 4]> {
+pub(super) fn statistic_rows(statistics: &DensifyStatistics) -> Vec<[f32; 4]> {
     let (gradient, count, radius) = (&statistics.gradient, &statistics.count, &statistics.radius);
     (0..gradient.len()).map(|row| [gradient[row], count[row] as f32, radius[row], 0.0]).collect()
+}
+
+/// The other way.
+pub(super) fn statistics_of(rows: &[[f32; 4]]) -> DensifyStatistics {
+    DensifyStatistics {
+        gradient: rows.iter().map(|row| row[0]).collect(),
+        count: rows.iter().map(|row| row[1] as u32).collect(),
+        radius: rows.iter().map(|row| row[2]).collect(),
+    }
 }
 
 impl ResidentIdentities {
@@ -137,6 +146,11 @@ impl Resident {
             self.posed.sh.resize(gpu, if moves_sh { n } else { 0 })?;
             self.screen = GpuVec::zeros(gpu, "screen gradients", n)?;
             self.statistics.replace(gpu, &statistic_rows(statistics))?;
+        }
+        if let (true, Some(deformation), Some(resident)) =
+            (stale.gaussians && !stale.deformation, &field.deformation, &mut self.deformation)
+        {
+            resident.parameters.set_still(gpu, &deformation.still)?;
         }
         if stale.deformation {
             self.deformation = match &field.deformation {
@@ -211,9 +225,7 @@ impl Resident {
         for (second, rows) in [false, true].into_iter().zip(moments) {
             set_moment_rows(optimiser, second, rows);
         }
-        statistics.gradient = rows.iter().map(|row| row[0]).collect();
-        statistics.count = rows.iter().map(|row| row[1] as u32).collect();
-        statistics.radius = rows.iter().map(|row| row[2]).collect();
+        *statistics = statistics_of(&rows);
         if let (Some(target), Some(([planes, first, second], [mlp, mlp_first, mlp_second]))) =
             (&mut field.deformation, deformation)
         {

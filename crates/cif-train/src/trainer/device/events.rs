@@ -1,0 +1,79 @@
+//! Rare events of a run on the device. Most run on the host, which is brought up to date first; what they change is
+//! sent before the next step. Changes of the set of Gaussians alone leave the rows where they are.
+
+use std::time::Instant;
+
+use super::super::Trainer;
+use super::FETCH_EVERY;
+use crate::error::TrainError;
+use crate::events::{Stage, TrainEvent};
+use crate::schedule::falls_on;
+
+impl Trainer {
+    /// Judges the present degree of spherical harmonics, where that falls before a step.
+    pub(super) fn events_before(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        if self.sh_is_due(stage, iteration) {
+            self.fetch_from_device()?;
+            self.judge_sh(stage, iteration, events)?;
+            self.gaussians_changed();
+        }
+        Ok(())
+    }
+
+    /// Events that fall on the step just done.
+    pub(super) fn rare_events(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
+        let (stage, iteration) = (self.progress.stage, self.progress.iteration);
+        let rearranges = match stage {
+            Stage::Instance => {
+                let resample = &self.config.resample;
+                falls_on(iteration, self.config.identity.refresh_every)
+                    || falls_on(iteration, resample.every)
+                        && (resample.from..=resample.until).contains(&iteration)
+            }
+            _ => {
+                let densify = &self.config.densify;
+                iteration < densify.until
+                    && (iteration > densify.from
+                        && (falls_on(iteration, densify.prune_every) || falls_on(iteration, densify.every))
+                        || falls_on(iteration, densify.opacity_reset_every))
+            }
+        };
+        let heads = self.heads_are_due(stage, iteration);
+        let still = self.still_is_due(stage, iteration);
+        let is_late = self.device.as_ref().is_some_and(|device| device.since_fetch >= FETCH_EVERY);
+        if !(rearranges || heads || still || is_late) {
+            return Ok(());
+        }
+        let start = Instant::now();
+        if rearranges && stage != Stage::Instance && !(heads || still || is_late) {
+            self.densify_on_device(stage, iteration, events)?;
+            self.times.rearrange += start.elapsed();
+            self.times.total += start.elapsed();
+            return Ok(());
+        }
+        self.fetch_from_device()?;
+        if rearranges && stage == Stage::Instance {
+            self.instance_events(iteration, events)?;
+            self.identities_changed();
+        } else if rearranges {
+            self.densify(stage, iteration, events)?;
+            self.gaussians_changed();
+        }
+        if heads {
+            self.judge_heads(stage, iteration, events)?;
+            self.everything_changed();
+        }
+        if still {
+            self.settle(stage, iteration, events)?;
+            self.gaussians_changed();
+        }
+        self.times.rearrange += start.elapsed();
+        self.times.total += start.elapsed();
+        Ok(())
+    }
+}

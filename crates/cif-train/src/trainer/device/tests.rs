@@ -1,0 +1,395 @@
+//! Steps on a GPU that go wrong, or that have no room, on a real capture. `CIF_TEST_GPU=off|auto|require`.
+
+#[path = "../../../tests/support/mod.rs"]
+mod support;
+
+use cif_field::Field;
+use cif_render::wgpu::{Gpu, GpuError, testing};
+use tempfile::TempDir;
+
+use self::support::{Scene, capture, small_config};
+use super::super::optimiser::Optimiser;
+use super::Trainer;
+use crate::clock::{Clock, Seconds};
+use crate::densify::DensifyStatistics;
+use crate::error::TrainError;
+use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::trainer::MAX_ROLLBACKS_IN_A_ROW;
+
+fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (6, 12, 6);
+    config.stages.batch = 2;
+    config.report.step_every = 1;
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    if let Some(gpu) = gpu {
+        trainer.use_gpu(gpu).unwrap();
+    }
+    (trainer, folder)
+}
+
+/// What steps change, brought to the host.
+fn state(trainer: &mut Trainer) -> (Field, Optimiser, DensifyStatistics) {
+    trainer.fetch_from_device().unwrap();
+    (trainer.field.clone(), trainer.optimiser.clone(), trainer.statistics.clone())
+}
+
+/// One step, and what it told.
+fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
+    let mut events = Vec::new();
+    let result = trainer.step(&mut events).map(drop);
+    (result, events)
+}
+
+/// Puts a value into the gradients of the next step, behind the back of everything.
+fn damage(trainer: &mut Trainer, geometry: [f32; 12]) {
+    let device = trainer.device.as_mut().unwrap();
+    let resident = device.resident.as_ref().unwrap();
+    resident.gradients.geometry.write(&device.gpu, 3, &[geometry]);
+}
+
+fn only(column: usize, value: f32) -> [f32; 12] {
+    let mut row = [0.0; 12];
+    row[column] = value;
+    row
+}
+
+#[test]
+fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_not_been() {
+    let Some(gpu) = testing::gpu() else { return };
+    for (geometry, tensor) in [
+        (only(1, f32::NAN), "gradient of means"),
+        (only(3, 1e25), "gradient of opacity_logits"),
+        (only(9, f32::INFINITY), "gradient of quaternions"),
+    ] {
+        let (mut trainer, _folder) = trainer(Some(&gpu));
+        step(&mut trainer).0.unwrap();
+        let before = state(&mut trainer);
+        let (iteration, counters) = (trainer.iteration(), before.1.groups().map(|(_, m)| m.steps));
+        damage(&mut trainer, geometry);
+        let mut told = Vec::new();
+        for _ in 0..4 {
+            let (result, events) = step(&mut trainer);
+            result.unwrap();
+            told.extend(events);
+        }
+        state(&mut trainer);
+        told.extend(trainer.arrived_events());
+        let [TrainEvent::RolledBack { stage: Stage::Coarse, iteration: at, fault, in_a_row: 1, total: 1 }] =
+            &told[..]
+        else {
+            panic!("{told:?}")
+        };
+        assert_eq!((*at, fault.part, fault.tensor), (iteration + 1, "gradients", tensor));
+        assert!(fault.value.contains("on the GPU alone"), "{fault}");
+        assert_eq!((trainer.iteration(), trainer.rolled_back()), (iteration + 4, 1));
+        assert_eq!(trainer.progress.rollbacks.in_a_row, 0);
+        let steps = trainer.optimiser.groups().map(|(_, moments)| moments.steps);
+        for (name, ((now, then), (_, moments))) in ["means", "log_scales", "quaternions", "opacity"]
+            .iter()
+            .zip(steps.iter().zip(&counters).zip(trainer.optimiser.groups()))
+        {
+            assert_eq!(*now, then + 3, "{name}");
+            assert!(moments.first.iter().all(|v| v.is_finite()));
+        }
+        // The same steps without the bad one.
+        let (mut other, _folder) = self::trainer(Some(&gpu));
+        step(&mut other).0.unwrap();
+        other.progress.iteration += 1;
+        other.progress.total_steps += 1;
+        for _ in 0..3 {
+            step(&mut other).0.unwrap();
+        }
+        assert!(state(&mut trainer) == state(&mut other), "{tensor}");
+    }
+}
+
+#[test]
+fn what_the_processor_would_refuse_too_is_told_in_its_words() {
+    let Some(gpu) = testing::gpu() else { return };
+    let fault_on = |gpu: Option<&Gpu>| {
+        let (mut trainer, _folder) = trainer(gpu);
+        trainer.set_debug_validation(gpu.is_none());
+        for row in &mut trainer.field.gaussians.sh_coefficients {
+            row[0] = 3e38;
+        }
+        let (result, mut events) = step(&mut trainer);
+        result.unwrap();
+        trainer.fetch_from_device().unwrap();
+        events.extend(trainer.arrived_events());
+        match events.into_iter().next() {
+            Some(TrainEvent::RolledBack { fault, .. }) => fault.to_string(),
+            other => panic!("{other:?}"),
+        }
+    };
+    assert_eq!(fault_on(Some(&gpu)), fault_on(None));
+}
+
+#[test]
+fn too_many_bad_steps_in_a_row_stop_the_run_where_the_first_of_them_was() {
+    let Some(gpu) = testing::gpu() else { return };
+    let (mut trainer, folder) = trainer(Some(&gpu));
+    // A colour that overflows in every view.
+    let sound = trainer.field.gaussians.sh_coefficients[0];
+    for row in &mut trainer.field.gaussians.sh_coefficients {
+        row[0] = 3e38;
+    }
+    let before = trainer.field.clone();
+    let mut told = 0;
+    let error = trainer
+        .run(&mut |event, _| {
+            told += u32::from(matches!(event, TrainEvent::RolledBack { .. }));
+            Control::Continue
+        })
+        .unwrap_err();
+    let TrainError::Diverged { in_a_row, iteration, stage, .. } = error else { panic!("{error}") };
+    assert_eq!(in_a_row, MAX_ROLLBACKS_IN_A_ROW);
+    assert_eq!(told, MAX_ROLLBACKS_IN_A_ROW - 1);
+    assert_eq!((trainer.stage(), trainer.iteration() + 1), (stage, iteration));
+    assert_eq!(trainer.steps_done(), trainer.progress.steps.values().sum::<u64>());
+    assert!(trainer.field.gaussians.sh_coefficients == before.gaussians.sh_coefficients);
+    // What is saved goes on once the cause is gone.
+    let path = folder.path().join("stopped.cif");
+    trainer.checkpoint(true).save(&path).unwrap();
+    let mut checkpoint = cif_field::Checkpoint::load(&path).unwrap();
+    checkpoint.field.gaussians.sh_coefficients.fill(sound);
+    let mut resumed = Trainer::resume(trainer.dataset().clone(), checkpoint).unwrap();
+    resumed.use_gpu(&gpu).unwrap();
+    assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+    assert_eq!(resumed.steps_done(), 24);
+    assert_eq!(resumed.rolled_back(), u64::from(MAX_ROLLBACKS_IN_A_ROW));
+}
+
+#[test]
+fn views_without_room_are_drawn_again_and_no_bit_differs() {
+    let Some(gpu) = testing::gpu() else { return };
+    let run = |room: usize| {
+        let (mut trainer, _folder) = trainer(Some(&gpu));
+        trainer.device.as_mut().unwrap().wanted = [room; 2];
+        let mut losses = Vec::new();
+        let outcome = trainer.run(&mut |event, _| {
+            if let TrainEvent::Finished { rolled_back, .. } = event {
+                losses.push(*rolled_back);
+            }
+            Control::Continue
+        });
+        assert_eq!(outcome.unwrap(), Outcome::Finished);
+        assert_eq!(losses, [0], "room is no fault");
+        let wanted = trainer.device.as_ref().unwrap().wanted;
+        let mut state = state(&mut trainer);
+        state.0.provenance = serde_json::Value::Null;
+        (state, wanted)
+    };
+    let (roomy, _) = run(1 << 17);
+    let (tight, wanted) = run(1);
+    assert!(wanted[0] > 1 && wanted[1] > 1, "views wanted room: {wanted:?}");
+    assert!(roomy == tight);
+}
+
+#[test]
+fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
+    let Some(gpu) = testing::gpu() else { return };
+    let run = |fetches: bool| {
+        let (mut trainer, _folder) = trainer(Some(&gpu));
+        let densify = &mut trainer.config.densify;
+        (densify.from, densify.every, densify.prune_every, densify.opacity_reset_every) = (1, 3, 2, 4);
+        (densify.gradient_threshold, densify.prune_min_n, densify.until) = (1e-7, 1, 100);
+        densify.split_scale = 0.02;
+        let mut kinds = [0; 3];
+        let mut result = Vec::new();
+        while trainer.stage() != Stage::Instance && result.len() < 40 {
+            let stage = trainer.stage();
+            if trainer.iteration() == trainer.plan.iterations(&trainer.config, stage) {
+                break;
+            }
+            if fetches && let Some(device) = &mut trainer.device {
+                // As late as can be: everything goes through the host.
+                device.since_fetch = super::FETCH_EVERY;
+            }
+            let (stepped, events) = step(&mut trainer);
+            stepped.unwrap();
+            for event in events {
+                if let TrainEvent::Densified { cloned, split, pruned, .. } = event {
+                    kinds = [kinds[0] + cloned, kinds[1] + split, kinds[2] + pruned];
+                }
+            }
+            result.push(trainer.field.gaussians.len());
+        }
+        (state(&mut trainer), result, kinds)
+    };
+    let (on_device, on_host) = (run(false), run(true));
+    assert!(on_device.2.iter().all(|count| *count > 0), "cloned, split, pruned: {:?}", on_device.2);
+    assert_eq!(on_device.1, on_host.1, "Gaussians after every step");
+    assert!(on_device.0.0.gaussians == on_host.0.0.gaussians, "parameters");
+    assert!(on_device.0.1 == on_host.0.1, "moments");
+    assert!(on_device.0.2 == on_host.0.2, "statistics");
+}
+
+#[test]
+fn a_device_lost_after_a_change_of_the_set_leaves_what_was_fetched_before_it() {
+    let Some(_) = testing::gpu() else { return };
+    let gpu = Gpu::open().unwrap();
+    let (mut trainer, _folder) = trainer(Some(&gpu));
+    let densify = &mut trainer.config.densify;
+    (densify.from, densify.every, densify.gradient_threshold, densify.until) = (1, 3, 1e-7, 100);
+    step(&mut trainer).0.unwrap();
+    let before = state(&mut trainer);
+    for _ in 0..3 {
+        step(&mut trainer).0.unwrap();
+    }
+    assert!(trainer.field.gaussians.len() > before.0.gaussians.len(), "the set has changed");
+    gpu.device().destroy();
+    let error = (0..20).find_map(|_| step(&mut trainer).0.err()).expect("the device is lost");
+    assert!(matches!(error, TrainError::Gpu(_)), "{error}");
+    assert_eq!((trainer.iteration(), trainer.steps_done()), (1, 1));
+    assert!((trainer.field.clone(), trainer.optimiser.clone(), trainer.statistics.clone()) == before);
+}
+
+#[test]
+fn debug_validation_names_the_part_and_changes_no_bit() {
+    let Some(gpu) = testing::gpu() else { return };
+    let (mut plain, _one) = trainer(Some(&gpu));
+    let (mut looked_at, _two) = trainer(Some(&gpu));
+    looked_at.set_debug_validation(true);
+    for trainer in [&mut plain, &mut looked_at] {
+        assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+    }
+    let (mut a, mut b) = (state(&mut plain), state(&mut looked_at));
+    (a.0.provenance, b.0.provenance) = Default::default();
+    assert!(a == b);
+
+    let fault_of = |damage: &dyn Fn(&mut Trainer)| {
+        let (mut trainer, _folder) = trainer(Some(&gpu));
+        trainer.set_debug_validation(true);
+        damage(&mut trainer);
+        let before = trainer.field.clone();
+        let iteration = trainer.iteration();
+        let (result, events) = step(&mut trainer);
+        result.unwrap();
+        assert_eq!((trainer.iteration(), trainer.rolled_back()), (iteration + 1, 1));
+        assert_eq!(format!("{:?}", trainer.field.gaussians), format!("{:?}", before.gaussians));
+        match events.into_iter().next() {
+            Some(TrainEvent::RolledBack { fault, .. }) => fault.to_string(),
+            other => panic!("{other:?}"),
+        }
+    };
+    let parameters = fault_of(&|trainer| trainer.field.gaussians.means[1][2] = f32::NAN);
+    assert_eq!(parameters, "parameters: means[5] is NaN");
+    let moments = fault_of(&|trainer| trainer.optimiser.opacity.second[1] = f32::INFINITY);
+    assert_eq!(moments, "optimiser: second moments[1] is inf");
+}
+
+/// A clock whose readings are given.
+struct Readings(std::sync::Mutex<std::collections::VecDeque<f64>>);
+
+impl Clock for Readings {
+    fn now(&self) -> Seconds {
+        let wall_s = self.0.lock().unwrap().pop_front().expect("a reading is left");
+        Seconds { wall_s, cpu_s: 0.0 }
+    }
+}
+
+#[test]
+fn the_faster_of_both_is_taken_and_the_trial_leaves_no_trace() {
+    let Some(gpu) = testing::gpu() else { return };
+    // Two steps on the processor in a second; then one on the GPU that takes 0.9 or 0.2 seconds: start, after every
+    // step, and once all is done.
+    for (on_gpu, taken) in [(0.9, false), (0.2, true)] {
+        let (mut trainer, _folder) = trainer(None);
+        let before = state(&mut trainer);
+        let progress = trainer.progress.clone();
+        let gpu_steps = if taken { vec![10.2, 10.4, 10.6, 10.6] } else { vec![10.9, 10.9] };
+        let mut readings = vec![5.0, 5.4, 6.0, 6.0, 10.0];
+        readings.extend(&gpu_steps);
+        trainer.set_clock(std::sync::Arc::new(Readings(std::sync::Mutex::new(readings.into()))));
+        let probe = trainer.use_faster(&gpu).unwrap();
+        assert!((probe.processor_s - 0.5).abs() < 1e-9 && (probe.gpu_s - on_gpu).abs() < 1e-9, "{probe}");
+        assert_eq!((probe.gpu_is_faster(), probe.stage), (taken, Stage::Coarse));
+        assert!(probe.to_string().contains("500.0 ms on the processor"), "{probe}");
+        assert_eq!(trainer.gpu_name().is_some(), taken);
+        assert!(state(&mut trainer) == before && trainer.progress == progress);
+        trainer.set_clock(std::sync::Arc::new(crate::clock::SystemClock::start()));
+        assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+        // As good as a run that nothing was tried in.
+        let (mut other, _folder) = self::trainer(taken.then_some(&gpu));
+        assert_eq!(other.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+        let (mut a, mut b) = (state(&mut trainer), state(&mut other));
+        (a.0.provenance, b.0.provenance) = Default::default();
+        assert!(a == b, "the trial left a trace");
+    }
+}
+
+#[test]
+fn a_fault_of_the_device_leaves_a_run_that_goes_on_on_the_processor() {
+    let Some(_) = testing::gpu() else { return };
+    for fault in [GpuError::OutOfMemory("full".to_owned()), GpuError::Lost("unplugged".to_owned())] {
+        // A device of its own, for the fault stays.
+        let gpu = Gpu::open().unwrap();
+        let (mut trainer, folder) = trainer(Some(&gpu));
+        let (expected, kind) = (fault.to_string(), fault.clone());
+        let mut steps = 0;
+        let error = trainer
+            .run(&mut |event, _| {
+                steps += u32::from(matches!(event, TrainEvent::Step { .. }));
+                if steps == 9 {
+                    gpu.tell(kind.clone());
+                }
+                Control::Continue
+            })
+            .unwrap_err();
+        assert_eq!(error.to_string(), expected);
+        assert!(trainer.gpu_name().is_none());
+        assert!(trainer.steps_done() >= 6, "what was fetched at the end of the coarse stage is there");
+        assert_eq!(trainer.steps_done(), trainer.progress.steps.values().sum::<u64>());
+        trainer.field.validate().unwrap();
+        let path = folder.path().join("saved.cif");
+        trainer.checkpoint(true).save(&path).unwrap();
+        let checkpoint = cif_field::Checkpoint::load(&path).unwrap();
+        let mut resumed = Trainer::resume(trainer.dataset().clone(), checkpoint).unwrap();
+        assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+        assert_eq!(resumed.steps_done(), 24);
+    }
+}
+
+#[test]
+fn effects_that_have_to_earn_their_keep_run_on_a_gpu() {
+    let Some(gpu) = testing::gpu() else { return };
+    let run = |gpu: Option<&Gpu>| {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 3, views: 3, ..Scene::default() });
+        let mut config = small_config();
+        (config.stages.coarse, config.stages.fine, config.stages.instance) = (12, 40, 20);
+        config.model.sh_interval = 5;
+        let effects = &mut config.effects;
+        (effects.still_every, effects.still_from, effects.still_loss) = (10, 0.25, 5.0);
+        (effects.sh_gain, effects.head_gain) = (50.0, 50.0);
+        let mut trainer = Trainer::new(dataset, config).unwrap();
+        if let Some(gpu) = gpu {
+            trainer.use_gpu(gpu).unwrap();
+        }
+        let (mut judged, mut still) = (Vec::new(), 0);
+        let outcome = trainer.run(&mut |event, _| {
+            match event {
+                TrainEvent::Judged { iteration, what, kept, .. } => {
+                    judged.push((*iteration, what.clone(), *kept));
+                }
+                TrainEvent::Settled { still: count, .. } => still = *count,
+                _ => {}
+            }
+            Control::Continue
+        });
+        assert_eq!(outcome.unwrap(), Outcome::Finished);
+        let field = trainer.into_field();
+        field.validate().unwrap();
+        let deformation = field.deformation.as_ref().unwrap();
+        assert_eq!(deformation.still.iter().filter(|still| **still).count(), still);
+        assert!(deformation.config.heads.position && !deformation.config.heads.scale);
+        assert_eq!(field.sh_degree, 0);
+        (judged, still)
+    };
+    let (on_cpu, on_gpu) = (run(None), run(Some(&gpu)));
+    assert_eq!(on_cpu.0, on_gpu.0, "the same judgements at the same steps");
+    assert!(on_gpu.1 > 0 && on_cpu.1 > 0, "{} and {} stand still", on_cpu.1, on_gpu.1);
+}

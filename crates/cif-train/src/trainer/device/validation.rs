@@ -1,0 +1,86 @@
+//! Bad steps on a GPU: where they went wrong, and every array of a step looked at.
+
+use super::super::Trainer;
+use super::super::guard::Fault;
+use super::DeviceTraining;
+use super::step::StepPlan;
+use crate::error::TrainError;
+use crate::events::TrainEvent;
+use crate::wgpu::kernels::fault_name;
+
+impl Trainer {
+    /// Where a step that the device refused went wrong: it is repeated on the processor, with every array looked at.
+    /// What goes wrong on the device alone is told by the group whose gradient it was.
+    pub(super) fn diagnose(
+        &mut self,
+        device: &DeviceTraining,
+        plan: &StepPlan,
+        found: u32,
+    ) -> Result<Fault, TrainError> {
+        let (part, tensor) = fault_name(found);
+        let unknown = Fault { part, tensor, index: 0, value: "not finite, on the GPU alone".to_owned() };
+        let Some(resident) = &device.resident else { return Ok(unknown) };
+        // The trial may change anything: all of it is put back.
+        let kept = self.keep();
+        let fetched = resident.fetch(&device.gpu, &mut self.field, &mut self.optimiser, &mut self.statistics);
+        let mut events = Vec::new();
+        let result = fetched.and_then(|()| {
+            self.uncount(plan.moving);
+            self.gradients = cif_render::Gradients::zeros(&self.field);
+            self.progress.iteration = plan.iteration - 1;
+            self.progress.rollbacks.in_a_row = 0;
+            self.set_debug_validation(true);
+            // There is no device at hand here, so this is the processor's step.
+            self.step(&mut events)
+        });
+        self.put_back(kept);
+        let told = events.into_iter().find_map(|event| match event {
+            TrainEvent::RolledBack { fault, .. } => Some(fault),
+            _ => None,
+        });
+        match (told, result) {
+            (Some(fault), _) => Ok(fault),
+            // A lost device, say.
+            (None, Err(error @ TrainError::Gpu(_))) => Err(error),
+            (None, _) => Ok(unknown),
+        }
+    }
+
+    /// A step under debug validation: the host looks at every parameter before it and at every parameter and moment
+    /// after it; what is between is looked at by [`Self::diagnose`] where the device refuses the step.
+    pub(super) fn validated_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
+        self.fetch_from_device()?;
+        let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
+        self.events_before(stage, iteration, events)?;
+        let (snapshot, statistics) = (self.snapshot(), self.statistics.clone());
+        let psnr_before = self.progress.psnr;
+        let fault = match self.fault_before_step() {
+            Some(fault) => {
+                self.progress.iteration = iteration;
+                self.progress.total_steps += 1;
+                *self.progress.steps.entry(stage.name().to_owned()).or_default() += 1;
+                Some(fault)
+            }
+            None => {
+                self.unwatched_step()?;
+                self.fetch_from_device()?;
+                self.fault_after_step()
+            }
+        };
+        let Some(fault) = fault else { return Ok(()) };
+        // As before the step, but that it counts as done.
+        self.progress.iteration -= 1;
+        let undone = self.roll_back(fault, snapshot, psnr_before, events);
+        self.statistics = statistics;
+        self.everything_changed();
+        if undone.is_err() {
+            self.progress.total_steps -= 1;
+            if let Some(of_stage) = self.progress.steps.get_mut(stage.name()) {
+                *of_stage -= 1;
+            }
+        } else {
+            self.progress.iteration += 1;
+        }
+        undone
+    }
+}

@@ -1,0 +1,270 @@
+//! One view of a step, recorded.
+
+use std::time::Duration;
+
+use cif_render::wgpu::{
+    Commands, GpuError, GpuStatistics, LabelInput, PosedInput, Submission, ViewInput, faults,
+};
+use cif_render::{InstanceNormalisation, RenderSettings};
+
+use super::super::Trainer;
+use super::super::times::StepTimes;
+use super::DeviceTraining;
+use super::flight::{AboutView, LOSS_WORDS, ViewRead};
+use super::resident::Resident;
+use super::step::{StepPlan, StepView};
+use crate::error::TrainError;
+use crate::events::Stage;
+use crate::wgpu::kernels::{Judgement, fault};
+use crate::wgpu::losses::{GpuTarget, LossWeights, SLOTS};
+
+/// What stops a step whatever moves.
+const ALWAYS: u32 = fault::NO_ROOM | fault::COLOR_LOSS | fault::INSTANCE_LOSS;
+
+impl Trainer {
+    /// One view, forward and backward; after the last one of a step, the optimiser.
+    pub(super) fn view_on(
+        &mut self,
+        device: &mut DeviceTraining,
+        resident: &mut Resident,
+        plan: &StepPlan,
+        position: usize,
+    ) -> Result<(ViewRead, Submission), TrainError> {
+        let view = &plan.views[position];
+        let (first, last) = (position == 0, position + 1 == plan.views.len());
+        device.keep_target(view, u64::from(self.config.frame_memory_mib) << 20)?;
+        let DeviceTraining {
+            gpu,
+            rasterizer,
+            losses,
+            optimiser,
+            motion,
+            targets,
+            judge,
+            mailbox,
+            faults,
+            slot,
+            timestamps,
+            ..
+        } = device;
+        let fresh;
+        let target = match targets.get(&view.view) {
+            Some(target) => target,
+            None => {
+                fresh = GpuTarget::new(gpu, &view.frame.image, view.frame.labels.as_ref())?;
+                &fresh
+            }
+        };
+        let frame = &self.dataset.frames[view.index];
+        let with_instances =
+            plan.settings.instances.is_some() && view.frame.labelled > 0 && resident.identities.is_some();
+        let settings =
+            RenderSettings { instances: plan.settings.instances.filter(|_| with_instances), ..plan.settings };
+        let weight = 1.0 / self.config.stages.batch as f32;
+        let share = view.frame.labelled as f64 / plan.labelled.max(1) as f64;
+        let labels = with_instances.then(|| LabelInput {
+            labels: &target.labels,
+            labelled_pixels: view.frame.labelled,
+            weight: (share * f64::from(self.config.loss.lambda_instance)) as f32,
+        });
+        let input = ViewInput { camera: &frame.camera, settings: &settings, labels };
+
+        let mut commands = Commands::new(gpu, timestamps.as_mut());
+        if let Some(identities) = resident.identities.as_ref().filter(|_| first && with_instances) {
+            optimiser.identities(
+                gpu,
+                &mut commands,
+                &identities.rows.row_offsets,
+                (&identities.log_estimates, &identities.log_calibrations),
+                &identities.rows.entries,
+            );
+        }
+        let posed = match &resident.deformation {
+            Some(deformation) => {
+                let moving = &deformation.parameters;
+                moving.forward(gpu, &mut commands, frame.time, &resident.canonical, &resident.posed);
+                let sh = if moving.moves_sh() { &resident.posed.sh } else { &resident.canonical.sh };
+                PosedInput { geometry: &resident.posed.geometry, sh }
+            }
+            None => (&resident.canonical).into(),
+        };
+        let rows = resident.identities.as_ref().filter(|_| with_instances).map(|identities| &identities.rows);
+        rasterizer.project(gpu, &mut commands, posed, rows, &input)?;
+        rasterizer.rasterize(gpu, &mut commands, rows, labels)?;
+        let weights = LossWeights {
+            lambda_dssim: self.config.loss.lambda_dssim,
+            view: weight,
+            with_instances,
+            by_coverage: settings
+                .instances
+                .is_some_and(|instances| instances.normalisation == InstanceNormalisation::Coverage),
+            leaves_out: plan.stage == Stage::Coarse && self.travelling_labels().is_some(),
+            leaves_judged: false,
+        };
+        let images = (rasterizer.colors(), rasterizer.blended());
+        losses.record(gpu, &mut commands, images, target, &weights, *slot)?;
+        if plan.stage == Stage::Instance && !self.config.instance.color_loss {
+            commands.clear(&losses.v_colors);
+        }
+        rasterizer.backward(gpu, &mut commands, posed, rows, labels, &losses.v_colors)?;
+
+        let gradients = rasterizer.gradients();
+        if let Some(deformation) = &mut resident.deformation {
+            optimiser.add_gaussians(
+                gpu,
+                &mut commands,
+                &gradients.gaussians,
+                &resident.gradients,
+                false,
+                faults,
+            );
+            let strengths = self.guidance_weight(plan.stage, plan.iteration);
+            if let Some((shifts, pulls)) = self.pulls(frame.time, strengths) {
+                motion.record(
+                    gpu,
+                    &mut commands,
+                    (&shifts, pulls, f64::from(self.field.extent)),
+                    (&resident.posed, &resident.canonical),
+                    (&gradients.gaussians, &resident.gradients),
+                )?;
+            }
+            deformation.gradients.backward(
+                gpu,
+                &mut commands,
+                (&deformation.parameters, frame.time),
+                &resident.canonical,
+                &gradients.gaussians,
+                &resident.gradients,
+                faults,
+            );
+        } else {
+            optimiser.add_gaussians(
+                gpu,
+                &mut commands,
+                &gradients.gaussians,
+                &resident.gradients,
+                true,
+                faults,
+            );
+        }
+        optimiser.add_screen(gpu, &mut commands, (&gradients.screen, &resident.screen), faults);
+        if let (Some(identities), true) =
+            (&resident.identities, labels.is_some_and(|labels| labels.weight != 0.0))
+        {
+            let sums = (&gradients.calibrations, &identities.gradients);
+            optimiser.add_calibrations(gpu, &mut commands, sums, faults);
+        }
+        let judgement = Judgement {
+            slot: *slot as u32,
+            counts: plan.moving | ALWAYS,
+            known: plan.known,
+            is_last: u32::from(last),
+        };
+        let losses_and_counts = (losses.results(), rasterizer.counts());
+        judge.record(gpu, &mut commands, judgement, losses_and_counts, faults);
+
+        if last {
+            if matches!(plan.stage, Stage::Coarse | Stage::Fine) && plan.iteration < self.config.densify.until
+            {
+                let rows = (&resident.screen, &resident.statistics);
+                optimiser.add_statistics(gpu, &mut commands, rows, faults);
+            }
+            optimiser.step_gaussians(
+                gpu,
+                &mut commands,
+                &plan.step,
+                (&resident.canonical, &resident.gradients),
+                &resident.moments,
+                &resident.screen,
+                faults,
+            );
+            commands.clear(&resident.screen);
+            if let Some(identities) = &resident.identities {
+                optimiser.step_calibrations(
+                    gpu,
+                    &mut commands,
+                    (plan.calibration, self.config.instance.calibration_limit),
+                    (&identities.log_calibrations, &identities.gradients),
+                    &identities.moments,
+                    faults,
+                );
+            }
+            if let Some(deformation) = &resident.deformation {
+                optimiser.step_deformation(
+                    gpu,
+                    &mut commands,
+                    (plan.planes, plan.mlp),
+                    &plan.weights,
+                    (&deformation.parameters, &deformation.gradients),
+                    &deformation.moments,
+                    faults,
+                )?;
+            }
+        }
+
+        let parts = [
+            (losses.results().buffer(), 32 * *slot as u64, LOSS_WORDS),
+            (rasterizer.counts().buffer(), 0, GpuStatistics::WORDS),
+            (faults.buffer(), 0, faults::WORDS),
+        ];
+        let letter = mailbox.record(gpu, commands.encoder(), &parts);
+        *slot = (*slot + 1) % SLOTS;
+        if last {
+            // Whether steps wait stays.
+            commands.clear_range(faults, 0, 1);
+        }
+        let submission = commands.submit();
+        let letter = letter.send();
+        if let Some(timestamps) = timestamps {
+            add_stage_times(&mut self.times, &timestamps.read(gpu)?);
+        }
+        let pixels = target.size[0] as usize * target.size[1] as usize;
+        let about = AboutView {
+            pixels,
+            weight: f64::from(weight),
+            labelled: if with_instances { view.frame.labelled } else { 0 },
+            lambda_dssim: weights.lambda_dssim,
+            gaussians: resident.canonical.len(),
+        };
+        Ok((ViewRead::new(letter, about), submission))
+    }
+}
+
+impl DeviceTraining {
+    /// Keeps a frame on the device, while `budget` bytes hold them.
+    pub(super) fn keep_target(&mut self, view: &StepView, budget: u64) -> Result<(), GpuError> {
+        if !self.targets.contains_key(&view.view) && self.target_bytes < budget {
+            let target = GpuTarget::new(&self.gpu, &view.frame.image, view.frame.labels.as_ref())?;
+            self.target_bytes += target.bytes();
+            self.targets.insert(view.view, target);
+        }
+        Ok(())
+    }
+}
+
+/// Adds the times of a submission to the parts of a step.
+fn add_stage_times(times: &mut StepTimes, stages: &[(&'static str, Duration)]) {
+    let render = &mut times.render;
+    for (name, duration) in stages {
+        let part = match *name {
+            "deform" => &mut render.deform,
+            "project" => &mut render.project,
+            "sort by depth" | "bin" | "emit" | "sort by tile" | "ranges" => &mut render.bin,
+            "rasterize" => &mut render.rasterize,
+            "losses" => &mut times.losses,
+            "cotangents" | "rasterize backward" => &mut render.rasterize_backward,
+            "gather gradients" | "project backward" | "identity backward" | "guidance" => {
+                &mut render.project_backward
+            }
+            "deform backward: network" | "deform backward: planes" | "deform backward: lines" => {
+                &mut render.deform_backward
+            }
+            "optimiser: planes" => &mut times.optimiser_planes,
+            "optimiser: network" => &mut times.optimiser_mlp,
+            "optimiser: Gaussians" | "accumulate" | "identity" | "judge" => &mut times.optimiser_gaussians,
+            // Counted as other.
+            _ => continue,
+        };
+        *part += *duration;
+    }
+}
