@@ -216,8 +216,8 @@ fn a_lost_device_leaves_what_was_fetched_last() {
         .unwrap_err();
     assert!(matches!(error, TrainError::Gpu(_)), "{error}");
     assert!(trainer.gpu_name().is_none());
-    // The last densification was after 20 fine steps; what came after it is gone.
-    assert_eq!(trainer.steps_done(), 15 + 20, "{error}");
+    // The state was fetched when the fine stage began; densification leaves it on the device. What came after is gone.
+    assert_eq!(trainer.steps_done(), 15, "{error}");
     trainer.field().validate().unwrap();
     let path = folder.path().join("saved.cif");
     trainer.checkpoint(true).save(&path).unwrap();

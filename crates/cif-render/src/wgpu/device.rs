@@ -181,7 +181,13 @@ impl Gpu {
             );
         }));
         let kept = Arc::clone(&fault);
-        device.set_device_lost_callback(move |_, message| keep(&kept, GpuError::Lost(message)));
+        device.set_device_lost_callback(move |_, message| {
+            let mut fault = kept.lock().unwrap_or_else(PoisonError::into_inner);
+            // What a lost device rejects is told first, and is a consequence.
+            if matches!(*fault, None | Some(GpuError::Rejected(_))) {
+                *fault = Some(GpuError::Lost(message));
+            }
+        });
         Ok(Self { device, queue, facts: Arc::new(facts), fault })
     }
 
@@ -221,9 +227,15 @@ impl Gpu {
     /// # Errors
     /// That fault.
     pub fn check(&self) -> Result<(), GpuError> {
-        match &*self.fault.lock().unwrap_or_else(PoisonError::into_inner) {
-            Some(fault) => Err(fault.clone()),
+        let fault = || self.fault.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        match fault() {
             None => Ok(()),
+            Some(GpuError::Rejected(message)) => {
+                // Whether the device is lost is told when it is asked; that it is, is then the fault.
+                let _ = self.device.poll(wgpu::PollType::Poll);
+                Err(fault().unwrap_or(GpuError::Rejected(message)))
+            }
+            Some(fault) => Err(fault),
         }
     }
 
