@@ -10,21 +10,6 @@ use crate::events::{Stage, TrainEvent};
 use crate::schedule::falls_on;
 
 impl Trainer {
-    /// Judges the present degree of spherical harmonics, where that falls before a step.
-    pub(super) fn events_before(
-        &mut self,
-        stage: Stage,
-        iteration: u32,
-        events: &mut Vec<TrainEvent>,
-    ) -> Result<(), TrainError> {
-        if self.sh_is_due(stage, iteration) {
-            self.fetch_from_device()?;
-            self.judge_sh(stage, iteration, events)?;
-            self.gaussians_changed();
-        }
-        Ok(())
-    }
-
     /// Events that fall on the step just done.
     pub(super) fn rare_events(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
         let (stage, iteration) = (self.progress.stage, self.progress.iteration);
@@ -43,14 +28,12 @@ impl Trainer {
                         || falls_on(iteration, densify.opacity_reset_every))
             }
         };
-        let heads = self.heads_are_due(stage, iteration);
-        let still = self.still_is_due(stage, iteration);
         let is_late = self.device.as_ref().is_some_and(|device| device.since_fetch >= FETCH_EVERY);
-        if !(rearranges || heads || still || is_late) {
+        if !(rearranges || is_late) {
             return Ok(());
         }
         let start = Instant::now();
-        if rearranges && stage != Stage::Instance && !(heads || still || is_late) {
+        if rearranges && stage != Stage::Instance && !is_late {
             self.densify_on_device(stage, iteration, events)?;
             self.times.rearrange += start.elapsed();
             self.times.total += start.elapsed();
@@ -62,14 +45,6 @@ impl Trainer {
             self.identities_changed();
         } else if rearranges {
             self.densify(stage, iteration, events)?;
-            self.gaussians_changed();
-        }
-        if heads {
-            self.judge_heads(stage, iteration, events)?;
-            self.everything_changed();
-        }
-        if still {
-            self.settle(stage, iteration, events)?;
             self.gaussians_changed();
         }
         self.times.rearrange += start.elapsed();

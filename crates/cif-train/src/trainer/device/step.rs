@@ -91,12 +91,7 @@ impl Trainer {
         &mut self,
         events: &mut Vec<TrainEvent>,
     ) -> Result<StepLoss, TrainError> {
-        let result = if self.debug_validation {
-            self.validated_step(events)
-        } else {
-            let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
-            self.events_before(stage, iteration, events).and_then(|()| self.unwatched_step())
-        };
+        let result = if self.debug_validation { self.validated_step(events) } else { self.unwatched_step() };
         let result = result.and_then(|()| self.rare_events(events));
         events.append(&mut self.arrived);
         result.map_err(|error| self.device_failed(error))?;

@@ -51,7 +51,6 @@ impl Trainer {
     pub(super) fn validated_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
         self.fetch_from_device()?;
         let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
-        self.events_before(stage, iteration, events)?;
         let (snapshot, statistics) = (self.snapshot(), self.statistics.clone());
         let psnr_before = self.progress.psnr;
         let fault = match self.fault_before_step() {
