@@ -150,7 +150,6 @@ impl Trainer {
         if gain_wanted <= 0.0 || !self.is_half_way(stage, iteration) || self.field.deformation.is_none() {
             return Ok(());
         }
-        let gain_wanted = f64::from(self.config.effects.head_gain);
         let settings = self.color_settings();
         let times = probe_times(&self.dataset.times);
         for kind in OPTIONAL {
