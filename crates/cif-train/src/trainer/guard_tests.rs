@@ -1,7 +1,7 @@
 //! Steps that go wrong, on a real capture.
 
 #[path = "../../tests/support/mod.rs"]
-mod support;
+pub(super) mod support;
 
 use cif_field::Field;
 use tempfile::TempDir;

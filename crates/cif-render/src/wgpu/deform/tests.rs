@@ -18,6 +18,9 @@ const BACKWARD: f64 = 2e-5;
 
 const SOME_HEADS: Heads = Heads { position: true, scale: false, rotation: true, opacity: false, sh: false };
 
+/// Whether a row stands still.
+type Still = fn(usize) -> bool;
+
 fn scene(heads: Heads, gaussians: usize) -> SyntheticScene {
     let config = SyntheticConfig { seed: 5, gaussians, heads: Some(heads), ..SyntheticConfig::default() };
     let mut scene = generate(&config);
@@ -163,7 +166,7 @@ fn gradients_agree_with_the_reference_and_repeat_to_the_bit() {
     let Some(gpu) = testing::gpu() else { return };
     // Of some Gaussians that stand still, and of all of them.
     let some = |row: usize| row % 3 == 1 || (40..75).contains(&row);
-    let cases: [(Heads, usize, Option<fn(usize) -> bool>); 5] = [
+    let cases: [(Heads, usize, Option<Still>); 5] = [
         (ALL_HEADS, 150, None),
         (SOME_HEADS, 77, None),
         (ALL_HEADS, 150, Some(some)),

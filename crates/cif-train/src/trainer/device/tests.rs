@@ -1,13 +1,10 @@
 //! Steps on a GPU that go wrong, or that have no room, on a real capture. `CIF_TEST_GPU=off|auto|require`.
 
-#[path = "../../../tests/support/mod.rs"]
-mod support;
-
 use cif_field::Field;
 use cif_render::wgpu::{Gpu, GpuError, testing};
 use tempfile::TempDir;
 
-use self::support::{Scene, capture, small_config};
+use super::super::guard_tests::support::{Scene, capture, small_config};
 use super::super::optimiser::Optimiser;
 use super::Trainer;
 use crate::clock::{Clock, Seconds};
