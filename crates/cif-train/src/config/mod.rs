@@ -81,7 +81,8 @@ pub struct StagesConfig {
     /// Views per step, default 1 (A27: all stages alike).
     pub batch: u32,
     /// Share of a view's tiles of 16 x 16 pixels, drawn anew for every view, that a step renders and learns from;
-    /// (0, 1], default 1: all. Fewer make steps faster and noisier; the gradient stays right on average.
+    /// (0, 1], default 1: all. The gradient stays right on average, with more noise; only what pixels cost is saved,
+    /// little in small images: on the example capture half of the tiles take 6 % less time for 0.5 dB and 1.1 mIoU.
     pub tile_share: f32,
 }
 
