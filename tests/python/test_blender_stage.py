@@ -338,3 +338,42 @@ def test_extension_is_whole(tmp_path: Path) -> None:
     assert all(len(reason) <= 64 and not reason.endswith(".") for reason in values["permissions"].values())
     assert values["maintainer"]
     assert values["name"]
+
+
+def test_far_scenes_are_worked_on_in_their_own_frame(path: Path, small: scene.Scene, tmp_path: Path) -> None:
+    from pxr import Gf, Sdf, Usd, UsdGeom
+
+    # As `cif export` writes captures far from their origin and in other units.
+    far = tmp_path / "far.usda"
+    layer = Sdf.Layer.FindOrOpen(str(path))
+    layer.Export(str(far))
+    layer = Sdf.Layer.FindOrOpen(str(far))
+    layer.customLayerData = {"cif": {"captureOffset": Gf.Vec3d(3e6, -2e5, 40), "captureScale": 0.01}}
+    stage = Usd.Stage.Open(layer)
+    root = UsdGeom.Xformable(stage.GetPrimAtPath("/World"))
+    root.AddTranslateOp().Set(Gf.Vec3d(3e6, -2e5, 40))
+    root.AddScaleOp(UsdGeom.XformOp.PrecisionDouble).Set(Gf.Vec3d(100, 100, 100))
+    layer.Save()
+
+    read_far = read.read_scene(far)
+    for near, other in zip(small.instances, read_far.instances, strict=True):
+        np.testing.assert_allclose(other.track.translations, near.track.translations, atol=1e-8)
+        np.testing.assert_allclose(other.track.scales, near.track.scales, atol=1e-8)
+    for near, other in zip(small.cameras, read_far.cameras, strict=True):
+        np.testing.assert_allclose(other.track.translations, near.track.translations, atol=1e-8)
+
+    # What is moved there moves in the frame of the root, which stays.
+    mug = by_name(read_far)["red_mug_001"]
+    lifted = mug.track.matrices(np.zeros(1))
+    lifted[:, :3, 3] += [0, 0, 0.25]
+    edit = Edit(path=mug.path, track=tracks.from_matrices(np.zeros(1), lifted))
+    out = edits.write_edits(far, tmp_path / "edits.usda", [edit])
+    moved = by_name(read.read_scene(out))["red_mug_001"].track
+    np.testing.assert_allclose(moved.translations[0], mug.track.translations[0] + [0, 0, 0.25], atol=1e-8)
+    opened = Usd.Stage.Open(str(out))
+    world = UsdGeom.XformCache().GetLocalToWorldTransform(opened.GetPrimAtPath(mug.path))
+    np.testing.assert_allclose(
+        np.array(world.ExtractTranslation()),
+        np.array([3e6, -2e5, 40]) + 100 * (mug.track.translations[0] + [0, 0, 0.25]),
+        atol=1e-6,
+    )

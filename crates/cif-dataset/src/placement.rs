@@ -42,6 +42,12 @@ impl CaptureFrame {
         *self == Self::default()
     }
 
+    /// Whether the frame can be used: finite numbers, a scale above 0.
+    #[must_use]
+    pub fn is_valid(&self) -> bool {
+        self.offset.iter().all(|value| value.is_finite()) && self.scale.is_normal() && self.scale > 0.0
+    }
+
     /// A point of the capture in the dataset.
     #[must_use]
     pub fn dataset_from_capture(&self, point: DVec3) -> DVec3 {
@@ -115,7 +121,7 @@ impl Dataset {
             what.push(format!("lengths times {}, since the scene is {size:.1e} units large", frame.scale));
         }
         self.warnings.push(format!(
-            "{}: read in a frame of its own: {}; scenes and exports have these coordinates",
+            "{}: read in a frame of its own: {}; scenes have these coordinates, exports those of the capture",
             self.root.display(),
             what.join(", and ")
         ));

@@ -38,6 +38,8 @@ pub struct Frame<'a> {
     pub time: f64,
     /// The picture.
     pub image: &'a RenderedImage,
+    /// World units per unit of the picture's depths: 1 but for captures in units far from metres.
+    pub world_per_unit: f64,
     /// Colour that the picture lies on, display-referred.
     pub background: [f32; 3],
     /// Instances of the scene.
@@ -70,7 +72,8 @@ pub(crate) fn channels(frame: &Frame<'_>) -> Vec<Channel> {
     }
     channels.push(float("A", image.alpha.pixels.clone()));
     if let Some(depth) = &image.depth {
-        let depth = depth.pixels.iter().map(|depth| if *depth > 0.0 { *depth } else { NO_DEPTH });
+        let world = |depth: f32| (f64::from(depth) * frame.world_per_unit) as f32;
+        let depth = depth.pixels.iter().map(|depth| if *depth > 0.0 { world(*depth) } else { NO_DEPTH });
         channels.push(float("Z", depth.collect()));
     }
     if let Some(motion) = frame.motion {

@@ -9,6 +9,9 @@ use exr::prelude::*;
 
 use super::*;
 
+/// As of a scene in units 2.5 times those of its capture.
+const WORLD_PER_UNIT: f64 = 2.5;
+
 struct Rendered {
     image: RenderedImage,
     ranks: InstanceRanks,
@@ -39,6 +42,7 @@ impl Rendered {
             name: "000000",
             time: 0.25,
             image: &self.image,
+            world_per_unit: WORLD_PER_UNIT,
             background: self.settings.background,
             objects: &self.objects,
             ranks: Some(&self.ranks),
@@ -79,7 +83,11 @@ fn every_layer_comes_back() {
     }
     let depth = rendered.image.depth.as_ref().unwrap();
     for (value, depth) in floats("Z").iter().zip(&depth.pixels) {
-        assert_eq!(*value, if *depth > 0.0 { *depth } else { layers::NO_DEPTH });
+        assert_eq!(
+            *value,
+            if *depth > 0.0 { 2.5 * *depth } else { layers::NO_DEPTH },
+            "in the capture's units"
+        );
     }
     assert!(floats("forward.u").iter().all(|u| *u == 1.5) && floats("forward.v").iter().all(|v| *v == -2.0));
     let instances = rendered.image.instances.as_ref().unwrap();

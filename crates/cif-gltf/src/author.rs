@@ -8,7 +8,7 @@ use cif_scene::{
     CameraTrack, Motion, MotionModel, Node, NodeKind, PoseSample, SceneGraph, Splats, VisibilitySample,
     naming,
 };
-use glam::{DQuat, DVec2};
+use glam::{DQuat, DVec2, DVec3};
 use serde_json::{Value, json};
 
 use crate::arrays::Array;
@@ -107,7 +107,7 @@ impl<'a> Author<'a> {
         let hidden = node.visibility.first().is_some_and(|sample| !sample.visible);
         let index = self.push(document::Node {
             name: name.clone(),
-            translation: Some(first.translation.as_vec3().to_array()),
+            translation: Some(single(first.translation)),
             rotation: Some(conventions::gltf_quaternion(first.rotation)),
             scale: hidden.then_some([conventions::HIDDEN_SCALE; 3]),
             extras: Some(Extras { cif: object_extras(node) }),
@@ -129,7 +129,7 @@ impl<'a> Author<'a> {
                     let child = self.push(document::Node {
                         name,
                         mesh,
-                        translation: Some(first.translation.as_vec3().to_array()),
+                        translation: Some(single(first.translation)),
                         rotation: Some(conventions::gltf_quaternion(first.rotation)),
                         extras: Some(Extras {
                             cif: Cif::Part(extras::Part {
@@ -240,7 +240,7 @@ impl<'a> Author<'a> {
         let node = self.push(document::Node {
             name,
             camera: Some(camera),
-            translation: Some(pose.translation.as_vec3().to_array()),
+            translation: Some(single(pose.translation)),
             rotation: Some(conventions::gltf_quaternion(pose.rotation)),
             extras: Some(Extras {
                 cif: Cif::Camera(extras::Camera {
@@ -399,10 +399,10 @@ impl<'a> Author<'a> {
                 samplers: self.samplers,
             }];
         }
-        let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
+        let finite = |values: &[f32; 4]| values.iter().all(|value| value.is_finite());
         for node in &self.document.nodes {
-            let translation = node.translation.as_ref().is_none_or(|values| finite(values));
-            if !translation || !node.rotation.as_ref().is_none_or(|values| finite(values)) {
+            let translation = node.translation.as_ref().is_none_or(document::Translation::is_finite);
+            if !translation || !node.rotation.as_ref().is_none_or(finite) {
                 return Err(GltfError::Inconsistent {
                     node: node.name.clone(),
                     what: "its pose is not finite".to_owned(),
@@ -415,12 +415,14 @@ impl<'a> Author<'a> {
     fn world(&mut self, children: Vec<usize>) -> usize {
         let graph = self.graph;
         let codes = &graph.time_codes;
-        let scale = graph.meters_per_unit as f32;
+        let placed = conventions::gltf_from_scene(graph.up_axis, graph.meters_per_unit, &graph.frame);
+        let scale = placed.scale as f32;
         let cif = Cif::World(Box::new(extras::World {
             generator: GENERATOR.to_owned(),
             layout: extras::LAYOUT,
             up_axis: graph.up_axis,
             meters_per_unit: graph.meters_per_unit,
+            frame: graph.frame,
             frames_per_second: codes.frames_per_second,
             first_time_code: self.first_time_code,
             time_codes: codes.samples.clone(),
@@ -436,12 +438,18 @@ impl<'a> Author<'a> {
         self.push(document::Node {
             name: conventions::WORLD.to_owned(),
             children,
+            translation: (placed.translation != DVec3::ZERO)
+                .then_some(document::Translation::Double(placed.translation.to_array())),
             rotation: (rotation != [0.0, 0.0, 0.0, 1.0]).then_some(rotation),
             scale: (scale != 1.0).then_some([scale; 3]),
             extras: Some(Extras { cif }),
             ..document::Node::default()
         })
     }
+}
+
+fn single(translation: DVec3) -> document::Translation {
+    document::Translation::Single(translation.as_vec3().to_array())
 }
 
 /// The earliest time code of anything: it is at 0 seconds.

@@ -2,7 +2,7 @@
 //!
 //! | quantity | ours | glTF |
 //! |---|---|---|
-//! | world | up axis declared, `meters_per_unit` | +y up, metres: the node [`WORLD`] turns and scales what is below it |
+//! | world | up axis declared, `meters_per_unit`, `frame` | +y up, metres: the node [`WORLD`] turns, scales and places what is below it |
 //! | quaternions | (w, x, y, z) | (x, y, z, w) |
 //! | time | time codes | seconds since the first time code |
 //! | cameras | x right, y down, z forward; pixels | x right, y up, -z forward; vertical angle and aspect |
@@ -13,7 +13,7 @@
 //! spherical harmonics are touched on the way out.
 
 use cif_geometry::{PinholeCamera, RigidTransform};
-use cif_scene::UpAxis;
+use cif_scene::{CaptureFrame, UpAxis};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
 /// Name of the node that everything hangs from.
@@ -34,6 +34,28 @@ pub fn world_rotation(up_axis: UpAxis) -> [f32; 4] {
     match up_axis {
         UpAxis::Y => [0.0, 0.0, 0.0, 1.0],
         UpAxis::Z => [-std::f32::consts::FRAC_1_SQRT_2, 0.0, 0.0, std::f32::consts::FRAC_1_SQRT_2],
+    }
+}
+
+/// Pose of the root node: what brings the frame of a scene into glTF's world (metres, +y up).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RootPose {
+    /// Metres.
+    pub translation: DVec3,
+    /// As [`world_rotation`].
+    pub rotation: DQuat,
+    /// Metres per unit of the scene.
+    pub scale: f64,
+}
+
+/// The pose of the root node of a scene that lies so in the world of its capture.
+#[must_use]
+pub fn gltf_from_scene(up_axis: UpAxis, meters_per_unit: f64, frame: &CaptureFrame) -> RootPose {
+    let rotation = DQuat::from_array(world_rotation(up_axis).map(f64::from)).normalize();
+    RootPose {
+        translation: rotation * (meters_per_unit * DVec3::from(frame.offset)),
+        rotation,
+        scale: meters_per_unit / frame.scale,
     }
 }
 

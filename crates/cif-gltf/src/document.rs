@@ -59,13 +59,31 @@ pub(crate) struct Node {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) camera: Option<usize>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub(crate) translation: Option<[f32; 3]>,
+    pub(crate) translation: Option<Translation>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) rotation: Option<[f32; 4]>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) scale: Option<[f32; 3]>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) extras: Option<Extras>,
+}
+
+/// Numbers as short as their precision.
+#[derive(Clone, Copy, Serialize)]
+#[serde(untagged)]
+pub(crate) enum Translation {
+    Single([f32; 3]),
+    /// Of the root of a scene far from the origin.
+    Double([f64; 3]),
+}
+
+impl Translation {
+    pub(crate) fn is_finite(&self) -> bool {
+        match self {
+            Self::Single(values) => values.iter().all(|value| value.is_finite()),
+            Self::Double(values) => values.iter().all(|value| value.is_finite()),
+        }
+    }
 }
 
 #[derive(Serialize)]

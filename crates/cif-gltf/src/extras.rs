@@ -4,7 +4,7 @@
 //! ones they are. Whatever glTF itself holds (transforms, keys, splats) is read from there, so that edits count.
 
 use cif_field::SortMetric;
-use cif_scene::{MotionReport, SceneOptions, UpAxis};
+use cif_scene::{CaptureFrame, MotionReport, SceneOptions, UpAxis};
 use serde::{Deserialize, Serialize};
 
 /// Version of what stands here.
@@ -34,6 +34,9 @@ pub(crate) struct World {
     pub(crate) layout: u32,
     pub(crate) up_axis: UpAxis,
     pub(crate) meters_per_unit: f64,
+    /// Where the scene lies in the world of its capture; the root node is there.
+    #[serde(default, skip_serializing_if = "CaptureFrame::is_identity")]
+    pub(crate) frame: CaptureFrame,
     pub(crate) frames_per_second: f64,
     /// Time code at 0 seconds.
     pub(crate) first_time_code: f64,

@@ -578,6 +578,7 @@ fn damaged_containers_are_refused() {
         first_frame: 0,
         up_axis: cif_scene::UpAxis::Z,
         meters_per_unit: 1.0,
+        frame: cif_scene::CaptureFrame::default(),
     };
     crate::export(&crate::testing::scene(recipe), path, crate::ExportOptions::default()).unwrap();
     let whole = std::fs::read(path).unwrap();

@@ -3,9 +3,9 @@
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use cif_scene::{
-    CameraSample, CameraTrack, Motion, MotionModel, MotionReport, Node, NodeKind, Origin, Part, PartsMotion,
-    PoseSample, ResidualStatistics, SceneGraph, SceneOptions, Splats, TimeCodes, UpAxis, VisibilitySample,
-    extent,
+    CameraSample, CameraTrack, CaptureFrame, Motion, MotionModel, MotionReport, Node, NodeKind, Origin, Part,
+    PartsMotion, PoseSample, ResidualStatistics, SceneGraph, SceneOptions, Splats, TimeCodes, UpAxis,
+    VisibilitySample, extent,
 };
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use proptest::prelude::*;
@@ -85,13 +85,19 @@ pub(crate) struct Recipe {
     pub(crate) first_frame: usize,
     pub(crate) up_axis: UpAxis,
     pub(crate) meters_per_unit: f64,
+    pub(crate) frame: CaptureFrame,
 }
 
 pub(crate) fn recipes() -> impl Strategy<Value = Recipe> {
     let axes = prop_oneof![Just(UpAxis::Y), Just(UpAxis::Z)];
     let units = prop_oneof![Just(1.0), Just(0.01), 0.1..10.0_f64];
-    (any::<u64>(), 1..6_usize, 1..9_usize, 0..=3_u8, 1..12_usize, 0..40_usize, axes, units).prop_map(
-        |(seed, nodes, splats, sh_degree, frames, first_frame, up_axis, meters_per_unit)| Recipe {
+    let frames = prop_oneof![
+        Just(CaptureFrame::default()),
+        Just(CaptureFrame { offset: [3.1e6, -2.7e5, 41.25], scale: 1.0 }),
+        Just(CaptureFrame { offset: [-4.4e7, 1.3e8, 0.1], scale: 1e-3 }),
+    ];
+    (any::<u64>(), 1..6_usize, 1..9_usize, 0..=3_u8, 1..12_usize, 0..40_usize, axes, units, frames).prop_map(
+        |(seed, nodes, splats, sh_degree, frames, first_frame, up_axis, meters_per_unit, frame)| Recipe {
             seed,
             nodes,
             splats,
@@ -100,6 +106,7 @@ pub(crate) fn recipes() -> impl Strategy<Value = Recipe> {
             first_frame,
             up_axis,
             meters_per_unit,
+            frame,
         },
     )
 }
@@ -122,6 +129,7 @@ pub(crate) fn scene(recipe: Recipe) -> SceneGraph {
     SceneGraph {
         up_axis: recipe.up_axis,
         meters_per_unit: recipe.meters_per_unit,
+        frame: recipe.frame,
         time_codes: TimeCodes { samples: codes.clone(), times, frames_per_second: 30.0 },
         nodes,
         cameras: vec![

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use cif_scene::{Motion, NodeKind, PoseSample, SceneGraph, UpAxis};
+use cif_scene::{CaptureFrame, Motion, NodeKind, PoseSample, SceneGraph, UpAxis};
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -20,6 +20,7 @@ fn recipe() -> Recipe {
         first_frame: 10,
         up_axis: UpAxis::Z,
         meters_per_unit: 1.0,
+        frame: CaptureFrame::default(),
     }
 }
 
@@ -107,6 +108,49 @@ fn edit_file(path: &Path, edit: impl FnOnce(&mut Value)) {
 
 fn node_index(json: &Value, name: &str) -> usize {
     json["nodes"].as_array().unwrap().iter().position(|node| node["name"] == name).unwrap()
+}
+
+#[test]
+fn a_far_scene_stands_in_the_world_of_its_capture() {
+    let frame = CaptureFrame { offset: [3e6, -2e5, 40.0], scale: 0.1 };
+    let graph = scene(Recipe { frame, meters_per_unit: 0.5, ..recipe() });
+    let mut root = Value::Null;
+    let read = edited(&graph, |json| root = json["nodes"][node_index(json, "World")].clone()).unwrap();
+    assert_same(&graph, &read);
+    // Metres, +y up: half of the offset, turned; a unit of the scene is ten of the capture's half metres.
+    assert!(root["translation"].to_string().len() > 20, "double precision: {root}");
+    for (value, expected) in root["translation"].as_array().unwrap().iter().zip([1.5e6, 20.0, 1e5]) {
+        assert!((value.as_f64().unwrap() - expected).abs() < 1e-6, "{root}");
+    }
+    assert_eq!(root["scale"], json!([5.0, 5.0, 5.0]));
+    assert_eq!(root["extras"]["cif"]["frame"], json!(frame));
+    // A root that is moved takes everything along, in units of the scene.
+    let moved = edited(&graph, |json| {
+        let root = node_index(json, "World");
+        json["nodes"][root]["translation"][0] = json!(1.5e6 + 10.0);
+    })
+    .unwrap();
+    assert!(
+        moved.warnings.iter().any(|warning| warning.contains("\"World\" was moved")),
+        "{:?}",
+        moved.warnings
+    );
+    for (a, b) in graph.nodes.iter().zip(&moved.nodes) {
+        let code = graph.time_codes.start();
+        let way = b.world_transform(code).translation - a.world_transform(code).translation;
+        assert!((way - 2.0 * DVec3::X).length() < 0.05, "{way}");
+    }
+    let nowhere = edited(&graph, |json| {
+        let root = node_index(json, "World");
+        json["nodes"][root]["extras"]["cif"]["frame"]["scale"] = json!(0.0);
+    });
+    assert!(nowhere.unwrap_err().to_string().contains("places the scene nowhere"));
+    // Ordinary scenes say nothing of it.
+    edited(&scene(recipe()), |json| {
+        let root = &json["nodes"][node_index(json, "World")];
+        assert!(root.get("translation").is_none() && root["extras"]["cif"].get("frame").is_none(), "{root}");
+    })
+    .unwrap();
 }
 
 #[test]

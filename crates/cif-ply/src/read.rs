@@ -8,7 +8,8 @@ use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_geometry::{RigidTransform, quaternion};
 use cif_scene::files::FileError;
 use cif_scene::{
-    Motion, MotionReport, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes, UpAxis, extent, naming,
+    CaptureFrame, Motion, MotionReport, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes, UpAxis,
+    extent, naming,
 };
 use glam::DVec3;
 use ply_rs_bw::parser::{ParseError, Parser, Reader};
@@ -17,6 +18,7 @@ use ply_rs_bw::ply::{
 };
 
 use crate::PlyError;
+use crate::write::{WORLD_OFFSET, WORLD_SCALE};
 
 /// Positions of what is read in a row.
 const POSITION: usize = 0;
@@ -59,6 +61,7 @@ pub(crate) fn read(path: &Path) -> Result<SceneGraph, PlyError> {
         invalid(format!("not a readable PLY file ({})", text.lines().next().unwrap_or_default()))
     };
     let header = parser.read_header(&mut reader).map_err(damaged)?;
+    let frame = frame(&header.comments).map_err(invalid)?;
     for (name, element) in &header.elements {
         let ascii = header.encoding == Encoding::Ascii;
         let least = smallest_size(element, ascii);
@@ -80,9 +83,36 @@ pub(crate) fn read(path: &Path) -> Result<SceneGraph, PlyError> {
         if splats.is_empty() {
             return Err(invalid(format!("none of its {} splats can be drawn", element.count)));
         }
-        return Ok(scene(path, splats, left_out));
+        return Ok(SceneGraph { frame, ..scene(path, splats, left_out) });
     }
     Err(invalid("it has no element `vertex`; splats are expected".to_owned()))
+}
+
+/// Where our comments place the scene in the world of its capture.
+fn frame(comments: &[String]) -> Result<CaptureFrame, String> {
+    let mut frame = CaptureFrame::default();
+    if !comments.first().is_some_and(|comment| comment.trim_start().starts_with("cif ")) {
+        return Ok(frame);
+    }
+    let numbers = |comment: &str, name: &str| -> Option<Option<Vec<f64>>> {
+        let words = comment.trim().strip_prefix(name)?.split_ascii_whitespace();
+        Some(words.map(|word| word.parse().ok()).collect())
+    };
+    for comment in comments {
+        let wrong = || format!("its comment '{}' tells no place; remove it", comment.trim());
+        if let Some(offset) = numbers(comment, WORLD_OFFSET) {
+            frame.offset = offset.and_then(|offset| offset.try_into().ok()).ok_or_else(wrong)?;
+        } else if let Some(scale) = numbers(comment, WORLD_SCALE) {
+            let [scale] = scale.and_then(|scale| scale.try_into().ok()).ok_or_else(wrong)?;
+            frame.scale = scale;
+        } else {
+            continue;
+        }
+        if !frame.is_valid() {
+            return Err(wrong());
+        }
+    }
+    Ok(frame)
 }
 
 /// Where in an element the values of a splat stand.
@@ -332,6 +362,7 @@ fn scene(path: &Path, splats: Splats, left_out: usize) -> SceneGraph {
     SceneGraph {
         up_axis: UpAxis::default(),
         meters_per_unit: 1.0,
+        frame: CaptureFrame::default(),
         time_codes: TimeCodes { samples: vec![0.0], times: vec![0.0], frames_per_second: 24.0 },
         nodes: vec![node],
         cameras: Vec::new(),

@@ -1,7 +1,7 @@
 use std::io::Write;
 
 use cif_geometry::spherical_harmonics::{basis, coefficient_count};
-use cif_scene::{Motion, PoseSample, Splats};
+use cif_scene::{CaptureFrame, Motion, PoseSample, Splats};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::*;
@@ -273,4 +273,37 @@ fn splats_without_a_rotation_or_number_are_left_out_and_counted() {
     let graph = read(&path).unwrap();
     assert_eq!(graph.nodes[0].splats.rows, [0, 3]);
     assert!(graph.warnings[0].starts_with("2 splats"), "{:?}", graph.warnings);
+}
+
+#[test]
+fn far_scenes_stay_precise_and_say_where_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("far.ply");
+    let frame = CaptureFrame { offset: [3.1e6, -2.7e5, 0.1], scale: 1e-3 };
+    let near = scene(&[splats(5, 1)]);
+    for (frame, told) in [(frame, true), (CaptureFrame::default(), false)] {
+        let graph = SceneGraph { frame, ..near.clone() };
+        export(&graph, &path, ExportOptions { force: true, ..ExportOptions::default() }).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        let text = String::from_utf8_lossy(&bytes);
+        assert_eq!(
+            text.contains("comment world offset 3100000 -270000 0.1\ncomment world scale 0.001\n"),
+            told
+        );
+        let back = read(&path).unwrap();
+        assert_eq!(back.frame, frame);
+        assert_eq!(back.nodes[0].splats.means, near.nodes[0].splats.means, "as precise as at the origin");
+    }
+    let head = "ply\nformat ascii 1.0\n";
+    let whole = String::from_utf8(ascii(&splats(2, 0), &[])).unwrap();
+    let with = |comments: &str| {
+        std::fs::write(&path, whole.replacen(head, &format!("{head}{comments}"), 1)).unwrap();
+        read(&path)
+    };
+    for wrong in ["world offset 1 2", "world offset 1 2 x", "world scale 0", "world offset 1 2 nan"] {
+        let told = with(&format!("comment cif 1\ncomment {wrong}\n")).unwrap_err().to_string();
+        assert!(told.contains(wrong) && told.contains("remove it"), "{told}");
+    }
+    // Others may write what they like.
+    assert!(with("comment made elsewhere\ncomment world offset 1 2\n").unwrap().frame.is_identity());
 }

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_scene::files::{FileError, existing_folder, folder_of};
-use cif_scene::{Node, SceneGraph, Splats};
+use cif_scene::{CaptureFrame, Node, SceneGraph, Splats};
 use tempfile::NamedTempFile;
 
 use crate::pose::world_splats;
@@ -17,6 +17,11 @@ use crate::{ExportOptions, ExportSummary, PlyError};
 
 /// First comment of our files; tells what may be replaced.
 const MARK: &str = concat!("comment cif ", env!("CARGO_PKG_VERSION"));
+/// Comments of files whose scene lies elsewhere in the world of its capture: `world = file / scale + offset`. Splats
+/// are kept in the scene's own frame, as far from the world's origin single precision would not hold them.
+pub(crate) const WORLD_OFFSET: &str = "world offset";
+/// See [`WORLD_OFFSET`].
+pub(crate) const WORLD_SCALE: &str = "world scale";
 const MARK_PREFIX: &[u8] = b"ply\nformat binary_little_endian 1.0\ncomment cif ";
 
 fn is_ply(path: &Path) -> bool {
@@ -63,6 +68,7 @@ fn is_ours(path: &Path) -> bool {
 struct Job<'a> {
     path: PathBuf,
     time_code: f64,
+    frame: CaptureFrame,
     nodes: Vec<&'a Node>,
 }
 
@@ -114,12 +120,12 @@ fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> Vec<
                 } else {
                     path.join(format!("{}.ply", node.name))
                 };
-                jobs.push(Job { path, time_code: code, nodes: vec![node] });
+                jobs.push(Job { path, time_code: code, frame: graph.frame, nodes: vec![node] });
             }
         } else {
             let path = if options.sequence { path.join(&number) } else { path.to_owned() };
             let nodes = graph.nodes.iter().filter(visible(code)).collect();
-            jobs.push(Job { path, time_code: code, nodes });
+            jobs.push(Job { path, time_code: code, frame: graph.frame, nodes });
         }
     }
     jobs
@@ -136,7 +142,7 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     let mut out = BufWriter::with_capacity(1 << 16, &mut file);
     let degree = job.nodes.iter().map(|node| node.splats.sh_degree).max().unwrap_or(0);
     let count = job.nodes.iter().map(|node| node.splats.len()).sum();
-    out.write_all(header(count, degree, job.time_code).as_bytes())?;
+    out.write_all(header(count, degree, job.time_code, &job.frame).as_bytes())?;
     for node in &job.nodes {
         rows(&mut out, &world_splats(node, job.time_code), degree)?;
     }
@@ -148,10 +154,17 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     Ok(bytes)
 }
 
-fn header(count: usize, degree: u8, time_code: f64) -> String {
-    let mut header = format!(
-        "ply\nformat binary_little_endian 1.0\n{MARK}\ncomment time code {time_code}\nelement vertex {count}\n"
-    );
+fn header(count: usize, degree: u8, time_code: f64, frame: &CaptureFrame) -> String {
+    let mut header = format!("ply\nformat binary_little_endian 1.0\n{MARK}\ncomment time code {time_code}\n");
+    if !frame.is_identity() {
+        // The shortest texts that are read back as the same numbers.
+        let [x, y, z] = frame.offset;
+        header.push_str(&format!(
+            "comment {WORLD_OFFSET} {x} {y} {z}\ncomment {WORLD_SCALE} {}\n",
+            frame.scale
+        ));
+    }
+    header.push_str(&format!("element vertex {count}\n"));
     let rest = 3 * (coefficient_count(degree) - 1);
     let names = ["x", "y", "z", "nx", "ny", "nz"].map(str::to_owned).into_iter();
     let numbered = |name: &'static str, count: usize| (0..count).map(move |k| format!("{name}_{k}"));

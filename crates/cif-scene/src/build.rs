@@ -13,6 +13,7 @@ use crate::opacities::{self, Opacities};
 use crate::source::FieldMotion;
 use crate::{
     MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, proxy, visibility,
+    world,
 };
 
 /// Share of an instance's weight that may be outliers when a motion model is chosen.
@@ -104,6 +105,7 @@ pub fn build_from(
     Ok(SceneGraph {
         up_axis: options.up_axis,
         meters_per_unit: options.meters_per_unit,
+        frame: world::frame_of(field)?,
         cameras: camera_tracks::camera_tracks(&field.cameras, code_of),
         time_codes,
         nodes,

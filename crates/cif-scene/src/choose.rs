@@ -21,6 +21,11 @@ const TRIED_PARTITIONS: usize = 3;
 const PROMISING: f64 = 1.2;
 /// Residual of parts over that of one rigid body above which parts are not worth having.
 const WORTH: f64 = 0.98;
+/// Where the best parts miss the tolerance, those that move by less than this share of it rest: beside what the
+/// model misses, such motion would be made up.
+const UNSHOWN: f64 = 0.5;
+/// Share of the tolerance within which rounding alone moves a part.
+const ROUNDING: f64 = 1e-6;
 /// Bytes of a pose: three doubles and a quaternion of floats.
 pub(crate) const POSE_BYTES: usize = 3 * 8 + 4 * 4;
 /// Bytes of a splat at one dense sample: centre and orientation as floats.
@@ -274,18 +279,24 @@ fn leading_track(
     let shape: Vec<DVec3> = leader.rigid_shape.means.iter().map(|mean| *mean - offset).collect();
     let moments = Moments::of(&shape, &leader.weights);
     let allowed = keys::allowances(&parts.residual.times, group.tolerance);
-    reduced_or_resting(&full, &allowed, &moments, &group.rest_pose())
+    reduced_or_resting(&full, &allowed, &moments, &group.rest_pose(), unshown(group, &parts.residual))
 }
 
-/// A reduced track, or none where resting is inside the allowances too.
+/// RMS deviation by which a part may always rest.
+fn unshown(group: &MovingGroup, residual: &ResidualSum) -> f64 {
+    group.tolerance * if inside(group, residual) { ROUNDING } else { UNSHOWN }
+}
+
+/// A reduced track, or none where resting is inside the allowances, or inside `unshown`, too.
 fn reduced_or_resting(
     full: &[PoseSample],
     allowed: &[f64],
     moments: &Moments,
     rest: &RigidTransform,
+    unshown: f64,
 ) -> Vec<PoseSample> {
     let deviation = |sample: usize, pose: &RigidTransform| moments.deviation(&full[sample].transform(), pose);
-    if (0..full.len()).all(|sample| deviation(sample, rest) <= allowed[sample]) {
+    if (0..full.len()).all(|sample| deviation(sample, rest) <= allowed[sample].max(unshown)) {
         return Vec::new();
     }
     keys::reduce(full, allowed, deviation)
@@ -298,7 +309,7 @@ fn bulk_track(group: &MovingGroup, full: Vec<PoseSample>, options: &SceneOptions
         return full;
     }
     let moments = Moments::of(&group.rigid_shape.means, &group.weights);
-    reduced_or_resting(&full, &vec![group.tolerance; full.len()], &moments, &group.rest_pose())
+    reduced_or_resting(&full, &vec![group.tolerance; full.len()], &moments, &group.rest_pose(), 0.0)
 }
 
 /// Poses `node_from_part`, reduced; empty where the part stays at its pivot inside the bound.
@@ -325,7 +336,7 @@ fn part_track(
     let moments = Moments::of(&part.rigid_shape.means, &part.weights);
     let allowed = keys::allowances(&residual.times, group.tolerance);
     let rest = RigidTransform { translation: part.pivot - group.pivot, ..RigidTransform::IDENTITY };
-    reduced_or_resting(&full, &allowed, &moments, &rest)
+    reduced_or_resting(&full, &allowed, &moments, &rest, unshown(group, residual))
 }
 
 /// The splats of dense groups at every time, relative to their tracks.

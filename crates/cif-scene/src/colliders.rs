@@ -1,8 +1,13 @@
 //! Convex colliders of nodes.
 //!
-//! A collider is the hull of the opaque splats: of their centres and the points one standard deviation along
-//! their axes, without what sticks out of the bulk. A concave node can have several hulls: its splats are cut
-//! by planes, each time where that takes most off the summed volume.
+//! Colliders enclose their splats: those of a node (of every part, where it has some) hold at least [`ENCLOSED`] of
+//! the opacity of its splats, and of what is seen of them (see [`Splats::importance`]), counted by their centres. The
+//! two measures differ where many small or faint splats lie around few broad ones; a simulation that shows an object
+//! outside its collider is wrong by either. What sticks out of the bulk is left out as far as that allows.
+//!
+//! A collider is the hull of these centres and of the points one standard deviation along the axes of the opaque
+//! ones, as far as those stay in the bulk. A concave node can have several hulls: its splats are cut by planes, each
+//! time where that takes most off the summed volume.
 
 use cif_geometry::quaternion;
 use glam::DVec3;
@@ -12,16 +17,21 @@ use crate::convex_hull::{self, HullMesh};
 use crate::procrustes::weighted_quantile;
 use crate::{ConvexHull, Motion, Node, Splats};
 
-/// Splats of less opacity carry no collider, unless the node has little else.
+/// Share of the opacity, and of what is seen, that colliders hold at least: what strays and what few corners cut off
+/// share the rest.
+pub const ENCLOSED: f64 = (1.0 - STRAYS) * HELD;
+/// Share of the opacity, and of what is seen, that may be left out as straying.
+const STRAYS: f64 = 0.04;
+/// Share of the rest that every hull holds.
+const HELD: f64 = 0.99;
+/// Fainter splats count with their centres only, unless the node has little else.
 const OPAQUE: f32 = 0.5;
 /// Standard deviations that a hull reaches around a centre.
 const SIGMAS: f64 = 1.0;
 /// Weight that may stick out of the bulk in every direction.
 const TRIM: f64 = 0.01;
-/// What sticks out further than this share of the bulk's width is trimmed.
+/// What sticks out further than this share of the bulk's width strays.
 const TRIM_MARGIN: f64 = 0.1;
-/// Share of the kept centres that the hull holds.
-const HELD: f64 = 0.995;
 /// Splats at most that cuts are judged by.
 const JUDGED: usize = 400;
 /// A cut that takes less than this share off a piece's volume is not made: cutting a cloud in two always
@@ -30,12 +40,13 @@ const MIN_GAIN: f64 = 0.15;
 /// Places where a cut is tried: quantiles of the weight along each principal axis.
 const CUTS: [f64; 7] = [0.1, 0.25, 0.4, 0.5, 0.6, 0.75, 0.9];
 
-/// An opaque splat: its centre, the ends of its axes, and its importance.
+/// A splat: its centre, the ends of its axes where it is opaque, its opacity, and how much it is seen.
 #[derive(Clone, Debug)]
 struct Blob {
     centre: DVec3,
-    ends: [DVec3; 6],
-    weight: f64,
+    ends: Vec<DVec3>,
+    opacity: f64,
+    seen: f64,
 }
 
 /// Hulls of a node, `hulls` at most (every part has one at least), in its local frame or its parts' frames.
@@ -55,7 +66,7 @@ pub fn colliders(node: &Node, hulls: usize) -> Vec<ConvexHull> {
     ranges
         .into_iter()
         .flat_map(|(part, range)| {
-            let blobs = trimmed(opaque(&node.splats, &importance, range));
+            let blobs = enclosed(blobs(&node.splats, &importance, range));
             decompose(blobs, each).into_iter().filter_map(move |blobs| {
                 let mesh = hull(&blobs)?;
                 Some(ConvexHull {
@@ -68,58 +79,104 @@ pub fn colliders(node: &Node, hulls: usize) -> Vec<ConvexHull> {
         .collect()
 }
 
-/// The opaque splats of a range.
-fn opaque(splats: &Splats, importance: &[f64], range: std::ops::Range<usize>) -> Vec<Blob> {
+/// The splats of a range.
+fn blobs(splats: &Splats, importance: &[f64], range: std::ops::Range<usize>) -> Vec<Blob> {
     let opacities: Vec<f64> = splats.opacities[range.clone()].iter().map(|o| f64::from(*o)).collect();
     // A glass has no opaque splats: then those of the better half are its body.
     let half = weighted_quantile(&opacities, &importance[range.clone()], 0.5) as f32;
     let opaque = OPAQUE.min(half);
     range
-        .filter(|&index| splats.opacities[index] >= opaque)
         .map(|index| {
             let centre = DVec3::from_array(splats.means[index].map(f64::from));
-            let rotation = quaternion::to_rotation(splats.orientations[index].map(f64::from));
-            let ends = std::array::from_fn(|end| {
+            let end = |end: usize, rotation: &[[f64; 3]; 3]| {
                 let axis = end / 2;
                 let length = SIGMAS * f64::from(splats.scales[index][axis]);
                 let direction = DVec3::new(rotation[0][axis], rotation[1][axis], rotation[2][axis]);
                 centre + if end % 2 == 0 { length } else { -length } * direction
-            });
-            Blob { centre, ends, weight: importance[index] }
+            };
+            let ends = if splats.opacities[index] >= opaque {
+                let rotation = quaternion::to_rotation(splats.orientations[index].map(f64::from));
+                (0..6).map(|k| end(k, &rotation)).collect()
+            } else {
+                Vec::new()
+            };
+            Blob { centre, ends, opacity: f64::from(splats.opacities[index]), seen: importance[index] }
         })
         .collect()
 }
 
-/// Drops splats whose centres stick out of the bulk, and pulls in ends that do.
-fn trimmed(mut blobs: Vec<Blob>) -> Vec<Blob> {
-    let weights: Vec<f64> = blobs.iter().map(|blob| blob.weight).collect();
-    // The bulk between two planes along each of 13 axes: faces, edges and corners of a cube.
-    let mut slabs = Vec::with_capacity(13);
-    for code in 14..27 {
-        let axis = DVec3::new(f64::from(code % 3 - 1), f64::from(code / 3 % 3 - 1), f64::from(code / 9 - 1));
-        let axis = axis.normalize();
-        let along: Vec<f64> = blobs.iter().map(|blob| axis.dot(blob.centre)).collect();
-        let low = weighted_quantile(&along, &weights, TRIM);
-        let high = weighted_quantile(&along, &weights, 1.0 - TRIM);
-        let sigma: Vec<f64> = blobs
-            .iter()
-            .map(|blob| blob.ends.iter().map(|end| axis.dot(*end - blob.centre)).fold(0.0, f64::max))
-            .collect();
-        let reach = weighted_quantile(&sigma, &weights, 0.5);
-        let margin = TRIM_MARGIN * (high - low) + reach;
-        slabs.push((axis, low - margin, high + margin));
+/// A pair of planes that the bulk lies between.
+struct Slab {
+    axis: DVec3,
+    low: f64,
+    high: f64,
+}
+
+impl Slab {
+    /// How far a point is outside; 0 or less inside.
+    fn excess(&self, point: DVec3) -> f64 {
+        let along = self.axis.dot(point);
+        (self.low - along).max(along - self.high)
     }
-    let inside =
-        |point: DVec3| slabs.iter().all(|(axis, low, high)| (*low..=*high).contains(&axis.dot(point)));
-    blobs.retain(|blob| inside(blob.centre));
+}
+
+/// The bulk between two planes along each of 13 axes: faces, edges and corners of a cube.
+fn bulk(blobs: &[Blob]) -> Vec<Slab> {
+    let seen: Vec<f64> = blobs.iter().map(|blob| blob.seen).collect();
+    (14..27)
+        .map(|code| {
+            let axis =
+                DVec3::new(f64::from(code % 3 - 1), f64::from(code / 3 % 3 - 1), f64::from(code / 9 - 1))
+                    .normalize();
+            let along: Vec<f64> = blobs.iter().map(|blob| axis.dot(blob.centre)).collect();
+            let low = weighted_quantile(&along, &seen, TRIM);
+            let high = weighted_quantile(&along, &seen, 1.0 - TRIM);
+            let sigmas: Vec<f64> = blobs
+                .iter()
+                .map(|blob| blob.ends.iter().map(|end| axis.dot(*end - blob.centre)).fold(0.0, f64::max))
+                .collect();
+            let reach = weighted_quantile(&sigmas, &seen, 0.5);
+            let margin = TRIM_MARGIN * (high - low) + reach;
+            Slab { axis, low: low - margin, high: high + margin }
+        })
+        .collect()
+}
+
+/// What a collider is to enclose: leaves out the splats that stick out of the bulk, the furthest first, as far as
+/// [`STRAYS`] allows, and pulls in ends that do.
+fn enclosed(mut blobs: Vec<Blob>) -> Vec<Blob> {
+    let slabs = bulk(&blobs);
+    let excess = |point: DVec3| slabs.iter().map(|slab| slab.excess(point)).fold(f64::NEG_INFINITY, f64::max);
+    let mut straying: Vec<(usize, f64)> = blobs
+        .iter()
+        .enumerate()
+        .map(|(index, blob)| (index, excess(blob.centre)))
+        .filter(|(_, excess)| *excess > 0.0)
+        .collect();
+    straying.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
+    let sum = |weight: fn(&Blob) -> f64| blobs.iter().map(weight).sum::<f64>();
+    let (mut opacity, mut seen) = (STRAYS * sum(|blob| blob.opacity), STRAYS * sum(|blob| blob.seen));
+    let mut keep = vec![true; blobs.len()];
+    for (index, _) in straying {
+        let blob = &blobs[index];
+        if blob.opacity <= opacity && blob.seen <= seen {
+            opacity -= blob.opacity;
+            seen -= blob.seen;
+            keep[index] = false;
+        }
+    }
+    let mut kept = keep.into_iter();
+    blobs.retain(|_| kept.next().unwrap_or(true));
     for blob in &mut blobs {
-        for end in &mut blob.ends {
+        let centre = blob.centre;
+        blob.ends.retain_mut(|end| {
             let mut shorter = 1.0;
-            while shorter > 0.1 && !inside(blob.centre + shorter * (*end - blob.centre)) {
+            while shorter > 0.1 && excess(centre + shorter * (*end - centre)) > 0.0 {
                 shorter *= 0.7;
             }
-            *end = if shorter > 0.1 { blob.centre + shorter * (*end - blob.centre) } else { blob.centre };
-        }
+            *end = centre + shorter * (*end - centre);
+            shorter > 0.1
+        });
     }
     blobs
 }
@@ -129,7 +186,10 @@ fn hull(blobs: &[Blob]) -> Option<HullMesh> {
         blobs.iter().flat_map(|blob| blob.ends.iter().copied().chain([blob.centre])).collect();
     let mut mesh = convex_hull::convex_hull(&points)?;
     let centres: Vec<DVec3> = blobs.iter().map(|blob| blob.centre).collect();
-    mesh.grow_to_hold(&centres, HELD);
+    for weight in [|blob: &Blob| blob.opacity, |blob: &Blob| blob.seen] {
+        let weights: Vec<f64> = blobs.iter().map(weight).collect();
+        mesh.grow_to_hold(&centres, &weights, HELD);
+    }
     Some(mesh)
 }
 
@@ -178,7 +238,7 @@ fn piece(blobs: Vec<Blob>) -> Piece {
         convex_hull::convex_hull(&points).map_or(0.0, |mesh| mesh.volume())
     };
     let volume = volume_of(&mut judged.iter());
-    let weights: Vec<f64> = judged.iter().map(|blob| blob.weight).collect();
+    let weights: Vec<f64> = judged.iter().map(|blob| blob.seen).collect();
     let mut cut: Option<Cut> = None;
     for axis in principal_axes(&judged) {
         let along: Vec<f64> = judged.iter().map(|blob| axis.dot(blob.centre)).collect();
@@ -200,12 +260,12 @@ fn piece(blobs: Vec<Blob>) -> Piece {
 }
 
 fn principal_axes(blobs: &[&Blob]) -> [DVec3; 3] {
-    let total: f64 = blobs.iter().map(|blob| blob.weight).sum();
-    let mean = blobs.iter().map(|blob| blob.weight * blob.centre).sum::<DVec3>() / total;
+    let total: f64 = blobs.iter().map(|blob| blob.seen).sum();
+    let mean = blobs.iter().map(|blob| blob.seen * blob.centre).sum::<DVec3>() / total;
     let mut covariance = Matrix3::zeros();
     for blob in blobs {
         let d = nalgebra::Vector3::from((blob.centre - mean).to_array());
-        covariance += d * d.transpose() * (blob.weight / total);
+        covariance += d * d.transpose() * (blob.seen / total);
     }
     if !covariance.iter().all(|value| value.is_finite()) {
         return [DVec3::X, DVec3::Y, DVec3::Z];

@@ -10,6 +10,8 @@ use nalgebra::Matrix3;
 use parry3d_f64::math::Vector;
 use parry3d_f64::transformation::try_convex_hull;
 
+use crate::procrustes::weighted_quantile;
+
 /// Most corners of a hull; what simulators and USD physics accept.
 pub const MAX_CORNERS: usize = 64;
 /// Thickness of a flat set of points, over its largest extent.
@@ -71,12 +73,12 @@ impl HullMesh {
             .collect()
     }
 
-    /// Grows the hull about its middle until at least `share` of the points are inside.
-    pub fn grow_to_hold(&mut self, points: &[DVec3], share: f64) {
+    /// Grows the hull about its middle until points with at least `share` of the weight are inside.
+    pub fn grow_to_hold(&mut self, points: &[DVec3], weights: &[f64], share: f64) {
         let middle = self.middle();
         let planes = self.planes();
         // Factor at which a point would lie on the surface.
-        let mut factors: Vec<f64> = points
+        let factors: Vec<f64> = points
             .iter()
             .map(|point| {
                 planes
@@ -88,13 +90,9 @@ impl HullMesh {
                     .fold(0.0, f64::max)
             })
             .collect();
-        if factors.is_empty() {
-            return;
-        }
-        factors.sort_unstable_by(f64::total_cmp);
-        let last_inside = ((share * factors.len() as f64).ceil() as usize).clamp(1, factors.len()) - 1;
-        if factors[last_inside] > 1.0 {
-            let factor = factors[last_inside] * (1.0 + 1e-6);
+        let wanted = weighted_quantile(&factors, weights, share);
+        if wanted > 1.0 {
+            let factor = wanted * (1.0 + 1e-6);
             for point in &mut self.points {
                 *point = middle + factor * (*point - middle);
             }
@@ -309,9 +307,15 @@ mod tests {
         let mut mesh = convex_hull(&points[..40]).unwrap();
         let inside = |mesh: &HullMesh| points.iter().filter(|point| mesh.outside(**point) <= 1e-9).count();
         assert!(inside(&mesh) < 900);
-        mesh.grow_to_hold(&points, 0.99);
+        mesh.grow_to_hold(&points, &[1.0; 1000], 0.99);
         assert!((990..1000).contains(&inside(&mesh)), "{}", inside(&mesh));
         assert_closed(&mesh);
+        // What weighs nothing stays out.
+        let mut mesh = convex_hull(&points[..40]).unwrap();
+        let weights: Vec<f64> = points.iter().map(|point| f64::from(mesh.outside(*point) <= 1e-9)).collect();
+        let before = mesh.clone();
+        mesh.grow_to_hold(&points, &weights, 1.0);
+        assert_eq!(mesh, before);
     }
 
     proptest! {

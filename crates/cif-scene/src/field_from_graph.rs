@@ -79,6 +79,7 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
                 "file": source,
                 "up_axis": graph.up_axis,
                 "meters_per_unit": graph.meters_per_unit,
+                "frame": (!graph.frame.is_identity()).then_some(graph.frame),
                 "first_time_code": reference,
                 "exported_from": graph.origin.field_fingerprint,
                 "cif": env!("CARGO_PKG_VERSION"),

@@ -1,5 +1,6 @@
 //! What a scene is made of.
 
+use cif_dataset::CaptureFrame;
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
@@ -14,6 +15,10 @@ pub struct SceneGraph {
     pub up_axis: UpAxis,
     /// Metres per world unit.
     pub meters_per_unit: f64,
+    /// Where the coordinates of the graph lie in the world: that of the capture. What is called *world* in a graph
+    /// is its own frame; writers place it in the world, and readers take it from there. The identity for ordinary
+    /// captures; see [`crate::world`].
+    pub frame: CaptureFrame,
     /// When the samples are.
     pub time_codes: TimeCodes,
     /// One node per instance in the order of the field's instance table, then the background where there is one.

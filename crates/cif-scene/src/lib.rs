@@ -15,6 +15,7 @@
 //! | [`extent`] | boxes that hold the 3-sigma ellipsoids |
 //! | [`convex_hull`] | convex hulls with few corners |
 //! | [`colliders`] | one or several hulls around a node's opaque splats |
+//! | [`world`] | where a graph lies in the world of its capture |
 //! | [`level_of_detail`] | the most important splats of a node |
 //! | [`velocity`] | how fast a node moves |
 //! | [`opacities`] | opacities that change over time, and when a node is hidden by them |
@@ -27,7 +28,7 @@
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
 //! | [`field_from_graph`] | the way back: Gaussians, recorded motion and instances of a graph |
 //!
-//! Frames: world as captured (right-handed, metres). A node's splats live in its local frame, whose axes are the
+//! Frames: world as captured (right-handed, metres), or a frame of the scene's own in it (see [`world`]). A node's splats live in its local frame, whose axes are the
 //! world's and whose origin is the node's pivot at the reference time, so that no rotation is baked into splats
 //! and their spherical harmonics are stored as trained.
 
@@ -68,6 +69,7 @@ mod tests;
 mod time_map;
 pub mod velocity;
 mod visibility;
+pub mod world;
 
 pub use build::{build, build_from};
 pub use diff::{ChangeKind, ObjectChange, SceneDiff};
@@ -86,3 +88,7 @@ pub use report::{MotionReport, ResidualStatistics};
 pub use search::{ObjectMatch, ObjectQuery, VolumeOf, When, search};
 pub use source::MotionSource;
 pub use velocity::Velocity;
+pub use world::frame_of;
+
+/// Where coordinates lie in the world of the capture; see [`world`].
+pub use cif_dataset::CaptureFrame;

@@ -1,11 +1,10 @@
 //! Nodes by label.
 
 use cif_geometry::Bounds;
-use glam::DMat4;
 use globset::{GlobBuilder, GlobMatcher};
 use serde::Serialize;
 
-use crate::SceneGraph;
+use crate::{SceneGraph, world};
 
 /// What to look for, and when.
 #[derive(Clone, Debug, PartialEq)]
@@ -108,11 +107,8 @@ pub fn query(graph: &SceneGraph, query: &LabelQuery, place: &str) -> Result<Vec<
     for node in &graph.nodes {
         let names = [&node.label, &node.category, &node.name];
         if names.iter().any(|name| matcher.is_match(name.as_str())) {
-            let world_from_local = node.world_transform(time_code);
-            let matrix =
-                DMat4::from_mat3_translation(world_from_local.rotation, world_from_local.translation);
-            let rows = matrix.transpose().to_cols_array_2d();
-            let (low, high) = corners(&node.bounds(time_code));
+            let rows = world::world_matrix(&graph.frame, &node.world_transform(time_code));
+            let (low, high) = corners(&world::world_bounds(&graph.frame, node.bounds(time_code)));
             found.push(LabelMatch {
                 path: format!("/World/{}", node.name),
                 class: node.category.clone(),

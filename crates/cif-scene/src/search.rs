@@ -1,10 +1,10 @@
 //! Objects by label, time and place.
 
 use cif_geometry::Bounds;
-use glam::{DMat4, DVec3};
+use glam::DVec3;
 use serde::Serialize;
 
-use crate::{ConvexHull, LabelMatch, LabelQuery, Node, QueryError, SceneGraph, query};
+use crate::{ConvexHull, LabelMatch, LabelQuery, Node, QueryError, SceneGraph, query, world};
 
 /// When something is looked for, in time codes.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -192,8 +192,7 @@ pub fn search(
             names.iter().any(|name| matcher.as_ref().is_none_or(|glob| glob.is_match(name.as_str())));
         known.extend(names.into_iter().cloned());
         labelled |= carries;
-        if carries && let Some(object) = describe(node, wanted, at, &sampled, codes.frames_per_second, &path)
-        {
+        if carries && let Some(object) = describe(graph, node, wanted, at, &sampled, &path) {
             found.push(object);
         }
     }
@@ -204,11 +203,11 @@ pub fn search(
 }
 
 fn describe(
+    graph: &SceneGraph,
     node: &Node,
     wanted: &ObjectQuery,
     at: f64,
     sampled: &[f64],
-    codes_per_second: f64,
     path: impl Fn(&str) -> String,
 ) -> Option<ObjectMatch> {
     let over = matches!(wanted.when, When::Over(..));
@@ -217,13 +216,13 @@ fn describe(
         .filter(|code| node.is_visible(*code))
         .collect();
     let bounds = visible.iter().fold(Bounds::EMPTY, |all, code| all.union(node.bounds(*code)));
+    let bounds = world::world_bounds(&graph.frame, bounds);
     if visible.is_empty() || !wanted.is_at(&bounds) {
         return None;
     }
-    let transform = node.world_transform(at);
-    let matrix = DMat4::from_mat3_translation(transform.rotation, transform.translation);
+    let world_per_unit = 1.0 / graph.frame.scale;
     let way: Vec<DVec3> = sampled.iter().map(|code| node.world_transform(*code).translation).collect();
-    let (volume, volume_of) = volume(hull_volume(&node.colliders), &bounds);
+    let (volume, volume_of) = volume(hull_volume(&node.colliders) * world_per_unit.powi(3), &bounds);
     let (low, high) = query::corners(&bounds);
     Some(ObjectMatch {
         found: LabelMatch {
@@ -231,13 +230,13 @@ fn describe(
             class: node.category.clone(),
             instance: node.name.clone(),
             label: node.label.clone(),
-            transform: matrix.transpose().to_cols_array_2d(),
+            transform: world::world_matrix(&graph.frame, &node.world_transform(at)),
             low,
             high,
         },
         volume,
         volume_of,
-        speed: speed(sampled, &way, codes_per_second),
+        speed: speed(sampled, &way, graph.time_codes.frames_per_second) * world_per_unit,
     })
 }
 

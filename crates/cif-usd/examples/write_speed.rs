@@ -92,6 +92,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
     SceneGraph {
         up_axis: UpAxis::Z,
         meters_per_unit: 1.0,
+        frame: cif_scene::CaptureFrame::default(),
         time_codes: TimeCodes {
             times: codes.iter().map(|code| code / (samples.max(2) - 1) as f64).collect(),
             samples: codes,

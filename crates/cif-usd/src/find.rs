@@ -256,8 +256,9 @@ impl<'a, 'py> Search<'a, 'py> {
             let points = points
                 .iter()
                 .map(|p| {
-                    let world = world.transform_point3(DVec3::from_array(*p));
-                    world.to_array().map(|v| v as f32)
+                    // Volumes do not depend on the place, which may be far from the origin.
+                    let turned = world.transform_vector3(DVec3::from_array(*p));
+                    turned.to_array().map(|v| v as f32)
                 })
                 .collect();
             hulls.push(ConvexHull { points, triangles: fans(&counts, &indices), part: None });

@@ -25,6 +25,10 @@ pub const SAMPLE_CODES: &str = "sampleCodes";
 pub const BACKGROUND_COLOR: &str = "backgroundColor";
 /// Labels of instances without a prim, in `customLayerData`.
 pub const OMITTED: &str = "omitted";
+/// Origin of the scene in the world of its capture as exported, in `customLayerData`; the prim [`WORLD`] is there.
+pub const CAPTURE_OFFSET: &str = "captureOffset";
+/// Units of the scene per unit of the capture, in `customLayerData`.
+pub const CAPTURE_SCALE: &str = "captureScale";
 /// What the user was told, in `customLayerData`.
 pub const WARNINGS: &str = "warnings";
 /// Fingerprint of the exported field, in `customLayerData`.

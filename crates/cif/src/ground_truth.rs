@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_geometry::RigidTransform;
-use cif_scene::{MotionModel, NodeKind, SceneGraph};
+use cif_scene::{CaptureFrame, MotionModel, NodeKind, SceneGraph};
 use glam::{DMat3, DVec3};
 use serde::{Deserialize, Serialize};
 
@@ -91,6 +91,11 @@ pub fn read(path: &Path) -> Result<GroundTruth, Error> {
     Ok(truth)
 }
 
+/// A pose of the scene where it is in the world of the capture, in which motion is known.
+fn in_world(frame: &CaptureFrame, pose: &RigidTransform) -> RigidTransform {
+    RigidTransform { translation: frame.capture_from_dataset(pose.translation), ..*pose }
+}
+
 /// Compares every exported instance that is static or rigid in truth, in the order of the scene.
 ///
 /// `meters_per_unit` of the scene turns world units into millimetres.
@@ -114,7 +119,9 @@ pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
                 .iter()
                 .zip(&step_of)
                 .filter(|(code, _)| (first as f64..=last as f64).contains(*code))
-                .filter_map(|(code, step)| Some((node.world_transform(*code), (*step)?)))
+                .filter_map(|(code, step)| {
+                    Some((in_world(&graph.frame, &node.world_transform(*code)), (*step)?))
+                })
                 .collect();
             let mut error = MotionError {
                 id,
@@ -238,6 +245,7 @@ mod tests {
         SceneGraph {
             up_axis: UpAxis::Z,
             meters_per_unit: 1.0,
+            frame: cif_scene::CaptureFrame::default(),
             time_codes: TimeCodes {
                 samples: (0..count).map(|frame| frame as f64).collect(),
                 times: (0..count).map(|frame| frame as f64 / (count - 1) as f64).collect(),
@@ -314,6 +322,22 @@ mod tests {
         assert_eq!((errors.len(), errors[0].samples), (1, 3));
         assert!(errors[0].translation_max_mm < 1e-9, "{errors:?}");
         assert!(errors[0].rotation_max_deg < 1e-6, "{errors:?}");
+    }
+
+    #[test]
+    fn motion_is_compared_in_the_world_of_the_capture() {
+        // The scene lies around (2e5, 0, -30), in units of 100 of the capture's.
+        let frame = CaptureFrame { offset: [2e5, 0.0, -30.0], scale: 0.01 };
+        let mut graph = exported(DVec3::new(0.0, 0.0, 0.003), 0.0);
+        graph.frame = frame;
+        if let Motion::Rigid(track) = &mut graph.nodes[0].motion {
+            for pose in track {
+                pose.translation = frame.dataset_from_capture(pose.translation);
+            }
+        }
+        let error = &compare(&graph, &truth("rigid"))[0];
+        assert!((error.translation_max_mm - 3.0).abs() < 1e-6, "{error:?}");
+        assert!(error.rotation_max_deg < 1e-6, "{error:?}");
     }
 
     #[test]

@@ -16,8 +16,8 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use cif_field::SortMetric;
-use cif_scene::{Motion, NodeKind, Origin, SceneGraph, TimeCodes, UpAxis};
-use glam::{DAffine3, DQuat, DVec3};
+use cif_scene::{CaptureFrame, Motion, NodeKind, Origin, SceneGraph, TimeCodes, UpAxis};
+use glam::{DAffine3, DVec3};
 
 use self::animation::Curves;
 use self::hierarchy::{Hierarchy, Placed};
@@ -99,6 +99,7 @@ pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
     Ok(SceneGraph {
         up_axis: world.as_ref().map_or(UpAxis::Y, |world| world.up_axis),
         meters_per_unit: world.as_ref().map_or(1.0, |world| world.meters_per_unit),
+        frame: world.as_ref().map_or_else(CaptureFrame::default, |world| world.frame),
         time_codes,
         nodes,
         cameras,
@@ -129,6 +130,9 @@ fn check_world(world: &World) -> Result<(), String> {
         || !world.first_time_code.is_finite()
     {
         return Err("frame rate or unit of its extras.cif is not above 0; export the scene again".to_owned());
+    }
+    if !world.frame.is_valid() {
+        return Err("frame of its extras.cif places the scene nowhere; export the scene again".to_owned());
     }
     Ok(())
 }
@@ -162,15 +166,17 @@ fn moved_world(
     world: &World,
     warnings: &mut Vec<String>,
 ) -> Option<DAffine3> {
-    let scale = DVec3::splat(f64::from(world.meters_per_unit as f32));
-    let rotation = DQuat::from_array(conventions::world_rotation(world.up_axis).map(f64::from)).normalize();
-    let written = DAffine3::from_scale_rotation_translation(scale, rotation, DVec3::ZERO);
+    let root = conventions::gltf_from_scene(world.up_axis, world.meters_per_unit, &world.frame);
+    let scale = DVec3::splat(f64::from(root.scale as f32));
+    let written = DAffine3::from_scale_rotation_translation(scale, root.rotation, root.translation);
     let chain = placed.chain.iter();
     let now = chain.clone().fold(DAffine3::IDENTITY, |all, &node| all * stage.locals[node].affine());
     let animated = chain.clone().any(|&node| stage.curves.of(node).is_some());
     let difference = (now.matrix3 - written.matrix3).to_cols_array();
     let turned = difference.iter().any(|value| value.abs() > 1e-6 * scale.x);
-    if !animated && !turned && now.translation.length() < 1e-9 {
+    // Readers hold single precision.
+    let rounding = 1e-9 + f64::from(f32::EPSILON) * written.translation.abs().max_element();
+    if !animated && !turned && (now.translation - written.translation).abs().max_element() < rounding {
         return None;
     }
     warnings.push(format!("{} was moved: all objects move with it", stage.source.node_name(placed.index)));

@@ -59,6 +59,15 @@ pub fn import_edits(
         });
     }
     let exported = build(base, options)?;
+    if edited.frame != exported.frame {
+        return Err(SceneError::Import {
+            object: source.to_owned(),
+            what: format!(
+                "it lies at {:?} of the capture's world, the base at {:?}; export the base again and edit that",
+                edited.frame.offset, exported.frame.offset
+            ),
+        });
+    }
     if *fingerprint == found {
         return apply(base, &exported, edited, source);
     }

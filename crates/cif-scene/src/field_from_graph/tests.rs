@@ -64,6 +64,24 @@ fn assert_same(a: &SceneGraph, b: &SceneGraph) {
 }
 
 #[test]
+fn a_graph_keeps_its_place_in_the_world() {
+    let mut field = recorded_field(2, 5);
+    let frame = crate::CaptureFrame { offset: [3e6, -2e5, 40.0], scale: 0.01 };
+    field.provenance = serde_json::json!({ "dataset": { "frame": frame } });
+    let graph = build(&field, &options()).unwrap();
+    assert_eq!(graph.frame, frame);
+    let back = field_from_graph(&graph, "far.usda").unwrap();
+    assert_eq!(build(&back, &options()).unwrap().frame, frame);
+    // Edits of a file that lies elsewhere are not taken for edits of this scene.
+    let mut edited = graph.clone();
+    edited.frame.offset[0] += 1.0;
+    let told = crate::import_edits(&field, &edited, "moved.usda", false).unwrap_err().to_string();
+    assert!(told.contains("moved.usda") && told.contains("export the base again"), "{told}");
+    edited.frame = frame;
+    assert!(crate::import_edits(&field, &edited, "same.usda", false).unwrap().1.is_empty());
+}
+
+#[test]
 fn a_graph_comes_back_as_the_graph_it_was() {
     for seed in 0..6 {
         let field = recorded_field(1 + seed as usize, seed);

@@ -176,6 +176,61 @@ fn without_dense_motion_the_best_parts_leave_and_the_loss_is_told() {
 }
 
 #[test]
+fn parts_that_hardly_move_rest_where_the_model_misses_the_tolerance() {
+    // The base drifts by `drift` in all; lid and drawer bend, so that no rigid part follows them inside the tolerance.
+    let field = cabinet_field();
+    let source = |drift: f64| {
+        let base = move |time: f64| RigidTransform {
+            translation: DVec3::new(drift * time, 0.0, 0.0),
+            ..RigidTransform::IDENTITY
+        };
+        let cabinet = cabinet(&field, base);
+        let field = &field;
+        move |time: f64| {
+            let mut gaussians = cabinet(time);
+            for row in 30..60 {
+                gaussians.means[row][2] += (time as f32) * 6.0 * field.gaussians.means[row][0].powi(2);
+            }
+            gaussians
+        }
+    };
+    let parts_of = |drift: f64| {
+        let source = source(drift);
+        let options = SceneOptions {
+            most_expensive_motion: MotionModel::Parts,
+            max_parts: 3,
+            ..SceneOptions::default()
+        };
+        let graph = build_from(&field, &mut { &source }, &options).unwrap();
+        assert_consistent(&graph);
+        let node = &graph.nodes[0];
+        assert!(node.report.residual.decisive > node.report.tolerance, "{:?}", node.report);
+        let found = decisive(&graph, node, &source);
+        assert!((found - node.report.residual.decisive).abs() < 0.1 * found, "what resting costs is told");
+        let Motion::Parts(motion) = &node.motion else { panic!("{:?}", node.report) };
+        for part in &motion.parts {
+            let still = part.track.iter().all(|pose| {
+                (pose.translation - part.pivot).length() < 1e-9 && pose.rotation.xyz().length() < 1e-9
+            });
+            assert!(part.track.is_empty() || !still, "{} has keys, but does not move", part.name);
+        }
+        (
+            motion.track.len(),
+            motion.parts[0].track.len(),
+            node.report.residual.decisive,
+            node.report.tolerance,
+        )
+    };
+    let (track, leader, still, tolerance) = parts_of(0.0);
+    assert_eq!((track, leader), (0, 0));
+    let (track, leader, resting, _) = parts_of(0.3 * tolerance);
+    assert_eq!((track, leader), (0, 0), "less than the model misses shows nothing");
+    assert!(resting < still + 0.5 * tolerance, "{resting} {still}");
+    let (track, leader, ..) = parts_of(5.0 * tolerance);
+    assert!(track >= 2 && leader == 0, "{track}");
+}
+
+#[test]
 fn rigid_keys_are_few_and_inside_the_tolerance() {
     let field = field(1);
     let source = |time: f64| moved(&field, 0..60, &pose(time * 0.3));

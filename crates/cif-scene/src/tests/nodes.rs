@@ -60,6 +60,64 @@ fn a_collider_holds_its_splats_and_no_stragglers() {
     assert!((0.4 * 0.2 * 0.1..0.5 * 0.3 * 0.2).contains(&mesh.volume()), "{}", mesh.volume());
 }
 
+/// Shares of the opacity, and of what is seen, whose centres lie in the hulls.
+fn shares_held(hulls: &[ConvexHull], node: &Node) -> [f64; 2] {
+    let hulls: Vec<HullMesh> = hulls.iter().map(mesh).collect();
+    let opacities: Vec<f64> = node.splats.opacities.iter().map(|opacity| f64::from(*opacity)).collect();
+    [opacities, node.splats.importance()].map(|weights| {
+        let inside = (0..node.splats.len()).filter(|k| {
+            let centre = motion::vector(node.splats.means[*k]);
+            hulls.iter().any(|hull| hull.outside(centre) < 1e-6)
+        });
+        inside.map(|k| weights[k]).sum::<f64>() / weights.iter().sum::<f64>()
+    })
+}
+
+#[test]
+fn colliders_enclose_their_splats_by_opacity_and_by_sight() {
+    let enclosed = |node: &Node, hulls: usize| {
+        let hulls = colliders::colliders(node, hulls);
+        let shares = shares_held(&hulls, node);
+        assert!(shares.iter().all(|share| *share >= colliders::ENCLOSED - 1e-9), "{shares:?}");
+        hulls.iter().map(|hull| mesh(hull).volume()).sum::<f64>()
+    };
+    let ball = |count: usize, radius: f64| {
+        let points = cloud(count, DVec3::ONE).into_iter().filter_map(DVec3::try_normalize);
+        points.map(move |point| radius * point)
+    };
+    // A bright core in a faint shell that holds a quarter of the opacity.
+    let mut shell = node(&ball(300, 0.1).chain(ball(300, 0.12)).collect::<Vec<_>>());
+    shell.splats.opacities[300..].fill(0.3);
+    assert!(enclosed(&shell, 1) < 1.3 * 4.19 * 0.12_f64.powi(3));
+    // Broad splats, and many small opaque ones beside them: 12 % of the opacity, next to nothing of what is seen.
+    let mut specks: Vec<DVec3> = ball(300, 0.1).collect();
+    specks.extend(ball(42, 0.02).map(|point| point + 0.2 * DVec3::X));
+    let mut specks = node(&specks);
+    specks.splats.scales[300..].fill([1e-3; 3]);
+    enclosed(&specks, 1);
+    enclosed(&specks, 4);
+    // The other way round: one broad faint splat out of 200 is most of what is seen.
+    let mut broad: Vec<DVec3> = ball(199, 0.1).collect();
+    broad.push(DVec3::new(0.0, 0.15, 0.0));
+    let mut broad = node(&broad);
+    broad.splats.scales[199] = [0.2; 3];
+    broad.splats.opacities[199] = 0.2;
+    enclosed(&broad, 1);
+    // Parts enclose theirs.
+    let mut jointed = node(&ball(200, 0.1).chain(ball(100, 0.05)).collect::<Vec<_>>());
+    jointed.splats.opacities[200..].fill(0.2);
+    let part = |splats: std::ops::Range<usize>| Part {
+        name: format!("part_{}", splats.start),
+        splats,
+        pivot: DVec3::ZERO,
+        track: Vec::new(),
+        extent: cif_geometry::Bounds::EMPTY,
+    };
+    jointed.motion =
+        Motion::Parts(PartsMotion { track: Vec::new(), parts: vec![part(0..200), part(200..300)] });
+    enclosed(&jointed, 2);
+}
+
 #[test]
 fn concave_nodes_fall_into_hulls() {
     // An L of two bars.

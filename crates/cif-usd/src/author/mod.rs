@@ -41,6 +41,7 @@ pub(crate) fn author(scene: &Scene<'_, '_>, root: &Path) -> PyResult<()> {
     metadata(scene, &layer, tokens::ROLE_ROOT, tokens::WORLD)?;
     let world = layer.define(tokens::WORLD, "Xform")?;
     world.info("kind", tokens::KIND_ASSEMBLY)?;
+    transforms::world(scene.pxr, &world, &graph.frame)?;
     for node in &graph.nodes {
         instance::author(scene, &layer, node)?;
     }
@@ -81,6 +82,10 @@ fn metadata(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, role: &str, default_pr
             ours.set_item(key, pxr.vt.call_method1("StringArray", (values.clone(),))?)?;
         }
         ours.set_item(tokens::SORT, splats::sorting(graph.sort_metric))?;
+        if !graph.frame.is_identity() {
+            ours.set_item(tokens::CAPTURE_OFFSET, pxr.vec3d(graph.frame.offset.into())?)?;
+            ours.set_item(tokens::CAPTURE_SCALE, graph.frame.scale)?;
+        }
         if let Some(fingerprint) = &graph.origin.field_fingerprint {
             ours.set_item(tokens::FIELD_FINGERPRINT, fingerprint)?;
         }

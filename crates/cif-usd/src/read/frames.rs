@@ -3,20 +3,25 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
-use cif_scene::PoseSample;
+use cif_scene::{CaptureFrame, PoseSample, world};
 use glam::{DAffine3, DQuat, DVec3};
 use pyo3::prelude::*;
 
 use super::bake::{self, Split};
 use super::values;
 use crate::pxr::Pxr;
+use crate::tokens;
 
 /// Most time codes that a track is sampled at between its keys.
 const MOST_FRAMES: f64 = 10_000.0;
 
-/// Transforms of a stage.
+/// Transforms of a stage: from prims to the scene's own frame, which is the world unless the export placed it there.
 pub(super) struct Frames<'a, 'py> {
     pxr: &'a Pxr<'py>,
+    /// What brings the world into the scene's frame; `None` where they are one.
+    scene_from_world: Option<DAffine3>,
+    /// The prim that places the scene, while it does so as exported.
+    root: Option<Bound<'py, PyAny>>,
     caches: RefCell<BTreeMap<u64, Bound<'py, PyAny>>>,
 }
 
@@ -84,11 +89,31 @@ fn usable(affine: &DAffine3) -> bool {
 }
 
 impl<'a, 'py> Frames<'a, 'py> {
-    pub(super) fn new(pxr: &'a Pxr<'py>) -> Self {
-        Self { pxr, caches: RefCell::default() }
+    /// `frame` is where the export placed the scene.
+    pub(super) fn new(pxr: &'a Pxr<'py>, stage: &Bound<'py, PyAny>, frame: &CaptureFrame) -> PyResult<Self> {
+        let mut frames = Self { pxr, scene_from_world: None, root: None, caches: RefCell::default() };
+        if frame.is_identity() {
+            return Ok(frames);
+        }
+        let placed = world::world_from_graph(frame);
+        let root = stage.call_method1("GetPrimAtPath", (tokens::WORLD,))?;
+        if root.is_truthy()? && frames.keys(&root)?.is_empty() && frames.world(&root, None)? == placed {
+            frames.root = Some(root);
+        }
+        frames.scene_from_world = Some(placed.inverse());
+        frames.caches.take();
+        Ok(frames)
+    }
+
+    /// Whether a prim only places the scene in the world, as exported.
+    fn is_root(&self, prim: &Bound<'py, PyAny>) -> PyResult<bool> {
+        self.root.as_ref().map_or(Ok(false), |root| root.eq(prim))
     }
 
     fn operations(&self, prim: &Bound<'py, PyAny>) -> PyResult<Operations<'py>> {
+        if self.is_root(prim)? {
+            return Ok(Operations::None);
+        }
         let xformable = self.pxr.usd_geom.getattr("Xformable")?.call1((prim,))?;
         if !xformable.is_truthy()? {
             return Ok(Operations::None);
@@ -167,7 +192,7 @@ impl<'a, 'py> Frames<'a, 'py> {
         Ok(Some(Track { rest, samples }))
     }
 
-    /// `world_from_prim`; the earliest time for `None`.
+    /// `scene_from_prim`; the earliest time for `None`.
     pub(super) fn world(&self, prim: &Bound<'py, PyAny>, time: Option<f64>) -> PyResult<DAffine3> {
         let key = time.map_or(u64::MAX, f64::to_bits);
         let known = self.caches.borrow().get(&key).cloned();
@@ -184,7 +209,8 @@ impl<'a, 'py> Frames<'a, 'py> {
             }
         };
         let matrix = values::matrix(&cache.call_method1("GetLocalToWorldTransform", (prim,))?)?;
-        Ok(DAffine3::from_mat4(matrix))
+        let world = DAffine3::from_mat4(matrix);
+        Ok(self.scene_from_world.map_or(world, |scene_from_world| scene_from_world * world))
     }
 
     /// Prims from `prim` up to, but without, `end` or the root.
@@ -208,15 +234,23 @@ impl<'a, 'py> Frames<'a, 'py> {
         }
     }
 
-    /// Exact track of `prim` in the frame of `end` (the world for `None`), where only one prim between them has
+    /// Exact track of `prim` in the frame of `end` (that of the scene for `None`), where only one prim between them has
     /// operations, and those are ours.
     fn exact_between(
         &self,
         prim: &Bound<'py, PyAny>,
         end: Option<&Bound<'py, PyAny>>,
     ) -> PyResult<Option<Track>> {
+        let chain = self.chain(prim, end)?;
+        if end.is_none() && self.scene_from_world.is_some() {
+            // What stands beside our root, or below it where it was moved, is seen from the world.
+            let top = chain.last().map_or(Ok(false), |top| self.is_root(top))?;
+            if !top {
+                return Ok(None);
+            }
+        }
         let mut found = None;
-        for prim in self.chain(prim, end)? {
+        for prim in chain {
             let operations = self.operations(&prim)?;
             match operations {
                 Operations::None => {}
@@ -258,7 +292,7 @@ impl<'a, 'py> Frames<'a, 'py> {
         Ok(times)
     }
 
-    /// Track of a prim's frame in the world, without what is not rigid in it; `None` where it collapses.
+    /// Track of a prim's frame in that of the scene, without what is not rigid in it; `None` where it collapses.
     pub(super) fn node(&self, prim: &Bound<'py, PyAny>) -> PyResult<Option<(Track, bool)>> {
         if let Some(track) = self.exact_between(prim, None)? {
             return Ok(Some((track, true)));

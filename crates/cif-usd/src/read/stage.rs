@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_field::SortMetric;
-use cif_scene::{Node, NodeKind, Origin, SceneGraph, SceneOptions, TimeCodes, UpAxis};
+use cif_scene::{CaptureFrame, Node, NodeKind, Origin, SceneGraph, SceneOptions, TimeCodes, UpAxis};
 use pyo3::prelude::*;
 
 use super::arrays::Arrays;
@@ -62,6 +62,7 @@ struct Mark {
     omitted: Vec<String>,
     warnings: Vec<String>,
     sort: Option<String>,
+    frame: CaptureFrame,
     origin: Origin,
 }
 
@@ -74,6 +75,13 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
         if mark.ours && mark.layout != expected {
             let (path, generator, found) = (path.to_owned(), mark.generator, mark.layout);
             return Err(UsdError::Layout { path, generator, found, expected });
+        }
+        if !mark.frame.is_valid() {
+            let problem = format!("its layer places the scene nowhere ({:?})", mark.frame);
+            let (path, prim) = (path.to_owned(), tokens::WORLD.to_owned());
+            let fix =
+                "put captureOffset and captureScale of its customLayerData right, or export the scene again";
+            return Err(UsdError::Prim { path, prim, problem, fix });
         }
         // A layer of edits that names no rate means ours; USD would take 24 for it and stretch what is below.
         let root = stage.call_method0("GetRootLayer").map_err(failed)?;
@@ -95,7 +103,7 @@ pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, Usd
             pxr,
             path,
             arrays: Arrays::new(pxr, bytes).map_err(failed)?,
-            frames: Frames::new(pxr),
+            frames: Frames::new(pxr, &stage, &mark.frame).map_err(failed)?,
             start: mark.codes.first().copied().unwrap_or(start),
             source_frames: (
                 mark.codes.first().copied().unwrap_or(start).max(0.0) as usize,
@@ -153,6 +161,7 @@ fn read<'py>(
     Ok(SceneGraph {
         up_axis,
         meters_per_unit,
+        frame: mark.frame,
         time_codes,
         nodes,
         cameras,
@@ -224,6 +233,13 @@ fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
             None => [0.0; 3],
         };
         let options = string(tokens::OPTIONS)?;
+        let mut frame = CaptureFrame::default();
+        if let Some(offset) = get(tokens::CAPTURE_OFFSET)? {
+            frame.offset = values::vector(&offset)?;
+        }
+        if let Some(scale) = get(tokens::CAPTURE_SCALE)? {
+            frame.scale = scale.extract()?;
+        }
         return Ok(Mark {
             ours: true,
             rate: rate(&layer)?,
@@ -235,6 +251,7 @@ fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
             omitted: strings(tokens::OMITTED)?,
             warnings: strings(tokens::WARNINGS)?,
             sort: string(tokens::SORT)?,
+            frame,
             origin: Origin {
                 field_fingerprint: string(tokens::FIELD_FINGERPRINT)?,
                 options: options.and_then(|text| serde_json::from_str::<SceneOptions>(&text).ok()),

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use cif_scene::{Motion, Node, NodeKind, SceneGraph};
+use cif_scene::{CaptureFrame, Motion, Node, NodeKind, SceneGraph};
 use glam::DVec3;
 
 use super::{python, scenes::Maker, session};
@@ -10,9 +10,14 @@ use crate::{ExportOptions, export, read_scene};
 
 /// The scene before, and after `edits` in a layer over it, which see the composed stage as `stage`.
 fn edited(edits: &str) -> (SceneGraph, SceneGraph) {
+    edited_at(CaptureFrame::default(), edits)
+}
+
+/// As [`edited`], of a scene that lies elsewhere in the world.
+fn edited_at(frame: CaptureFrame, edits: &str) -> (SceneGraph, SceneGraph) {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("a.usda");
-    let before = Maker::new(21).scene();
+    let before = SceneGraph { frame, ..Maker::new(21).scene() };
     export(&before, &path, ExportOptions::default()).unwrap();
     let over = folder.path().join("over.usda");
     // As Blender leaves it: a layer of its own with no word on axis, unit and time.
@@ -48,6 +53,43 @@ fn an_empty_layer_changes_nothing() {
     assert_eq!((after.up_axis, after.meters_per_unit), (before.up_axis, before.meters_per_unit));
     assert_eq!(after.time_codes, before.time_codes);
     assert_eq!(after.origin, before.origin);
+}
+
+#[test]
+fn edits_of_a_far_scene_are_seen_from_its_own_frame() {
+    let _session = session();
+    let frame = CaptureFrame { offset: [3.1e6, -2.7e5, 41.25], scale: 0.01 };
+    // The root moves by 2 in the world, which is 0.02 of the scene.
+    let (before, after) = edited_at(
+        frame,
+        "
+op = UsdGeom.Xformable(stage.GetPrimAtPath('/World')).GetOrderedXformOps()[0]
+op.Set(op.Get() + Gf.Vec3d(2, 0, 0))
+",
+    );
+    assert_eq!(after.frame, frame);
+    for (a, b) in before.nodes.iter().zip(&after.nodes) {
+        let (a, b) = (a.world_transform(0.0), b.world_transform(0.0));
+        assert!((b.translation - a.translation - DVec3::X * 0.02).length() < 1e-9, "{a:?} {b:?}");
+        assert!((b.rotation - a.rotation).to_cols_array().iter().all(|v| v.abs() < 1e-6));
+    }
+    // What is added beside the root is placed in the world.
+    let (before, after) = edited_at(
+        frame,
+        "
+prim = stage.DefinePrim('/Visitor', 'ParticleField3DGaussianSplat')
+prim.CreateAttribute('positions', Sdf.ValueTypeNames.Point3fArray).Set(Vt.Vec3fArray([(0, 0, 0)]))
+prim.CreateAttribute('scales', Sdf.ValueTypeNames.Float3Array).Set(Vt.Vec3fArray([(1, 1, 1)]))
+prim.CreateAttribute('orientations', Sdf.ValueTypeNames.QuatfArray).Set(Vt.QuatfArray([Gf.Quatf(1, 0, 0, 0)]))
+prim.CreateAttribute('opacities', Sdf.ValueTypeNames.FloatArray).Set(Vt.FloatArray([0.5]))
+UsdGeom.Xformable(prim).AddTranslateOp().Set(Gf.Vec3d(3.1e6 + 100, -2.7e5, 41.25))
+",
+    );
+    assert_eq!(after.nodes.len(), before.nodes.len() + 1);
+    assert_eq!(after.nodes[..before.nodes.len()], before.nodes);
+    let visitor = after.nodes.last().unwrap();
+    assert!((visitor.pivot - DVec3::X).length() < 1e-9, "{:?}", visitor.pivot);
+    assert!(visitor.splats.scales[0].iter().all(|scale| (scale - 0.01).abs() < 1e-7));
 }
 
 #[test]

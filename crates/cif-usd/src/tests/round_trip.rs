@@ -1,11 +1,20 @@
 //! Our own export comes back as it was.
 
-use cif_scene::{Motion, SceneGraph};
+use cif_scene::{CaptureFrame, LabelQuery, Motion, ObjectQuery, SceneGraph, VolumeOf};
+use glam::DVec3;
 use proptest::prelude::*;
 
 use super::scenes::Maker;
 use super::session;
 use crate::{ExportOptions, Payloads, export, read_scene};
+
+/// Where scenes lie: at the origin, far from it, in other units, or both.
+const FRAMES: [CaptureFrame; 4] = [
+    CaptureFrame { offset: [0.0; 3], scale: 1.0 },
+    CaptureFrame { offset: [3.1e6, -2.7e5, 41.25], scale: 1.0 },
+    CaptureFrame { offset: [0.0; 3], scale: 10.0 },
+    CaptureFrame { offset: [-4.4e7, 1.3e8, 0.1], scale: 1e-3 },
+];
 
 /// Cameras to the precision of USD's lenses, everything else exactly.
 fn assert_same(read: &SceneGraph, written: &SceneGraph) {
@@ -43,9 +52,9 @@ proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
 
     #[test]
-    fn scenes_come_back_exactly(seed: u64, kind in 0..6_usize, levels_of_detail: bool) {
+    fn scenes_come_back_exactly(seed: u64, kind in 0..6_usize, levels_of_detail: bool, frame in 0..4_usize) {
         let _session = session();
-        let written = Maker::new(seed).scene();
+        let written = SceneGraph { frame: FRAMES[frame], ..Maker::new(seed).scene() };
         let (name, payloads) = [
             ("a.usda", Payloads::ByKind),
             ("a.usda", Payloads::SingleFile),
@@ -119,4 +128,69 @@ stage.Save()
         (track.len(), track[0].translation, track[0].rotation),
         (1, start.translation, start.rotation)
     );
+}
+
+#[test]
+fn a_far_scene_stands_in_the_world_of_its_capture() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    for (number, frame) in FRAMES.into_iter().enumerate() {
+        let graph = SceneGraph { frame, ..Maker::new(5).scene() };
+        let path = folder.path().join(format!("{number}.usda"));
+        export(&graph, &path, ExportOptions { payloads: Payloads::SingleFile, ..ExportOptions::default() })
+            .unwrap();
+        let text = std::fs::read_to_string(&path).unwrap();
+        let head = text.split("def Xform \"red_mug_001\"").next().unwrap();
+        assert_eq!(head.contains("double3 xformOp:translate"), !frame.is_identity(), "{head}");
+        assert_eq!(head.contains("double3 xformOp:scale"), frame.scale != 1.0, "{head}");
+        // Queries of the stage and of the graph tell the same places, in the world.
+        let wanted = LabelQuery { pattern: "*".into(), time_code: Some(graph.time_codes.start()) };
+        let (stage, scene) =
+            (crate::query(&path, &wanted).unwrap(), cif_scene::query(&graph, &wanted, "graph").unwrap());
+        assert_eq!(stage.len(), scene.len());
+        for (a, b) in stage.iter().zip(&scene) {
+            let scale = 1.0 / frame.scale;
+            for (row, other) in a.transform.iter().flatten().zip(b.transform.iter().flatten()) {
+                assert!((row - other).abs() < 2e-6 * scale + 1e-15 * row.abs(), "{a:?} {b:?}");
+            }
+            // Boxes of stages hold turned boxes, so that they are a little wider.
+            if let (Some(low), Some(high), Some(inner), Some(outer)) = (a.low, a.high, b.low, b.high) {
+                let size = DVec3::from(outer).distance(inner.into());
+                for axis in 0..3 {
+                    let (below, above) = (inner[axis] - low[axis], high[axis] - outer[axis]);
+                    let allowed = -1e-4 * scale..=2.0 * size;
+                    assert!(allowed.contains(&below) && allowed.contains(&above), "{}: {a:?} {b:?}", b.path);
+                }
+            }
+        }
+        let everything = ObjectQuery { label: Some("*".into()), ..ObjectQuery::default() };
+        let (stage, scene) = (
+            crate::search(&path, &everything).unwrap(),
+            cif_scene::search(&graph, &everything, "graph", str::to_owned).unwrap(),
+        );
+        for a in &stage {
+            let Some(b) = scene.iter().find(|b| a.found.path.ends_with(&b.found.path)) else { continue };
+            let same = |a: f64, b: f64| (a - b).abs() <= 1e-3 * a.abs().max(b.abs()) + 1e-6 / frame.scale;
+            if let (Some(VolumeOf::Hull), Some(VolumeOf::Hull)) = (a.volume_of, b.volume_of) {
+                let (a, b) = (a.volume.unwrap(), b.volume.unwrap());
+                assert!((a / b - 1.0).abs() < 1e-3, "{a} {b} {frame:?}");
+            }
+            assert!(same(a.speed, b.speed), "{a:?} {b:?}");
+        }
+    }
+}
+
+#[test]
+fn a_stage_that_is_placed_nowhere_is_refused() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.usda");
+    let graph = SceneGraph { frame: FRAMES[3], ..Maker::new(5).scene() };
+    export(&graph, &path, ExportOptions::default()).unwrap();
+    let text = std::fs::read_to_string(&path).unwrap();
+    let scale = "double captureScale = 0.001";
+    assert!(text.contains(scale));
+    std::fs::write(&path, text.replace(scale, "double captureScale = -1")).unwrap();
+    let told = read_scene(&path).unwrap_err().to_string();
+    assert!(told.contains("/World") && told.contains("captureScale"), "{told}");
 }

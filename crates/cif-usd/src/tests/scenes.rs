@@ -2,9 +2,9 @@
 
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform, spherical_harmonics};
 use cif_scene::{
-    CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, MotionReport, Node,
-    NodeKind, Origin, Part, PartsMotion, PointProxy, PoseSample, ResidualStatistics, SceneGraph,
-    SceneOptions, Splats, TimeCodes, UpAxis, VisibilitySample, extent,
+    CameraSample, CameraTrack, CaptureFrame, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel,
+    MotionReport, Node, NodeKind, Origin, Part, PartsMotion, PointProxy, PoseSample, ResidualStatistics,
+    SceneGraph, SceneOptions, Splats, TimeCodes, UpAxis, VisibilitySample, extent,
 };
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -276,6 +276,7 @@ impl Maker {
         SceneGraph {
             up_axis: if self.chance.random_bool(0.5) { UpAxis::Y } else { UpAxis::Z },
             meters_per_unit: if self.chance.random_bool(0.5) { 1.0 } else { 0.1 },
+            frame: CaptureFrame::default(),
             time_codes: TimeCodes {
                 times: codes.iter().map(|code| code / last).collect(),
                 samples: codes,

@@ -110,7 +110,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     command.ply.check(command.force)?;
     let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
     let field = scene::load(&command.scene)?;
-    scene::note_frame(&field);
+    scene::note_frame(&scene::frame(&field)?, command.ply.ply.is_some());
     let options = options(command, &field);
     let only_gltf = command.gltf.gltf.is_some() && command.usd.is_none() && command.ply.ply.is_none();
     let options = if only_gltf { Gltf::options(&options) } else { options };

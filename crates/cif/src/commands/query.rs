@@ -211,7 +211,7 @@ pub(super) fn code_at(times: &[f64], codes: &[f64], time: f64) -> f64 {
 fn at(command: &Query, place: DVec3) -> Result<(), Error> {
     let field: Field = scene::load(&command.path)?;
     let time = command.time.unwrap_or(0.0);
-    let answers = field.query(&[place], time);
+    let answers = field.query(&[scene::frame(&field)?.dataset_from_capture(place)], time);
     let answer = &answers[0];
     let named: Vec<_> = answer
         .identity

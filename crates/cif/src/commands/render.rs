@@ -319,7 +319,12 @@ struct Shot {
 
 fn views(command: &Render, field: &Field) -> Result<Vec<Shot>, Error> {
     if let Some(path) = &command.camera {
-        let views = camera_file::read(path)?;
+        let mut views = camera_file::read(path)?;
+        // Cameras are given in the world of the capture.
+        let frame = scene::frame(field)?;
+        if !frame.is_identity() {
+            views.iter_mut().for_each(|view| view.camera = frame.camera(&view.camera));
+        }
         return Ok(views.into_iter().map(|view| Shot { view, camera: String::new() }).collect());
     }
     let Some(capture) = &command.capture else {
@@ -391,6 +396,7 @@ fn write_exr(
         name: &view.name,
         time: place.time_of(view),
         image,
+        world_per_unit: 1.0 / scene::frame(field)?.scale,
         background: settings.background,
         objects: &objects(field),
         ranks: ranks.as_ref(),

@@ -4,6 +4,7 @@ use std::path::Path;
 
 use cif_field::Field;
 use cif_render::RenderSettings;
+use cif_scene::CaptureFrame;
 
 use crate::error::Error;
 
@@ -69,17 +70,30 @@ pub(super) fn render_settings(field: &Field) -> RenderSettings {
     cif_train::metrics::trained_settings(field)
 }
 
-/// Says where a scene lies in the coordinates of its capture, where those are not its own.
-pub(super) fn note_frame(field: &Field) {
-    let recorded = field.provenance.get("dataset").and_then(|dataset| dataset.get("frame"));
-    let frame =
-        recorded.and_then(|frame| serde_json::from_value::<cif_dataset::CaptureFrame>(frame.clone()).ok());
-    if let Some(frame) = frame {
-        let [x, y, z] = frame.offset;
+/// Where a scene lies in the world of its capture.
+///
+/// # Errors
+/// When what the scene records of it is no frame.
+pub(super) fn frame(field: &Field) -> Result<CaptureFrame, Error> {
+    cif_scene::frame_of(field).map_err(Error::plain)
+}
+
+/// Says where a scene lies in the world of its capture, where that is not at its origin. `relative`: whether a file
+/// that is written holds places relative to there.
+pub(super) fn note_frame(frame: &CaptureFrame, relative: bool) {
+    if frame.is_identity() {
+        return;
+    }
+    let [x, y, z] = frame.offset;
+    eprintln!(
+        "note: the capture was read in a frame of its own, around ({x}, {y}, {z}), lengths times {}; the root of a stage \
+         or glTF file places the scene there",
+        frame.scale
+    );
+    if relative {
         eprintln!(
-            "note: the capture was read in a frame of its own, which the files have: a place in the capture is that in \
-             the files / {} + ({x}, {y}, {z})",
-            frame.scale
+            "note: splats of PLY files, which are single precision, stay in that frame; the comments `world offset` and \
+             `world scale` tell it: a place in the world is that in the file / scale + offset"
         );
     }
 }

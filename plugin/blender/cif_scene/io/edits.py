@@ -18,7 +18,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
 from .color import BAND_0
-from .read import CLASS_LABELS, COEFFICIENTS, INSTANCE_LABELS, USER_LABEL, StageError, open_stage
+from .read import CLASS_LABELS, COEFFICIENTS, INSTANCE_LABELS, USER_LABEL, StageError, home, open_stage
 from .scene import Visibility
 from .tracks import Track, from_matrices, thinned
 
@@ -48,7 +48,7 @@ class Edit:
     """Wanted name of a copy beside that prim; the edit then describes the copy."""
     deleted: bool = False
     track: Track | None = None
-    """New poses in the world of the stage, or in the frame of the instance for a part."""
+    """New poses as `Instance` has them, or in the frame of the instance for a part."""
     label: str | None = None
     """New first class label."""
     display_name: str | None = None
@@ -156,7 +156,7 @@ def _apply(layer: Sdf.Layer, stage: Usd.Stage, edit: Edit, names: _NewNames) -> 
     if edit.label is not None or edit.display_name is not None:
         _rename(spec, prim, edit)
     if edit.track is not None:
-        _transform(spec, prim, edit.track)
+        _transform(spec, prim, edit.track, relative_to=home(stage))
     if edit.visibility is not None:
         _visibility(spec, edit.visibility)
     for part in edit.parts:

@@ -22,6 +22,10 @@ DEGREE = "radiance:sphericalHarmonicsDegree"
 CLASS_LABELS = "semantics:labels:class"
 INSTANCE_LABELS = "semantics:labels:instance"
 USER_LABEL = "userProperties:label"
+MARK = "cif"
+"""Key in `customLayerData` of layers that cif wrote."""
+ROOT = "/World"
+"""The prim that places such a scene in the world of its capture."""
 LEFT_OUT = ("cif:label", "cif:category", "cif:motion:report")
 """Properties of our schema that are found elsewhere, or are too long to show."""
 MAX_SHEAR = 1e-4
@@ -43,6 +47,20 @@ def open_stage(path: str | Path) -> Usd.Stage:
     return stage
 
 
+def home(stage: Usd.Stage) -> Usd.Prim | None:
+    """The prim whose frame is worked in; `None` is the world.
+
+    A scene that cif placed far from the origin is kept in the frame of its root: Blender's single precision would
+    not hold it where it stands.
+    """
+    for layer in stage.GetLayerStack(False):
+        mark = layer.customLayerData.get(MARK)
+        if mark is not None:
+            root = stage.GetPrimAtPath(ROOT) if "captureOffset" in mark else None
+            return root if root else None
+    return None
+
+
 def read_scene(path: str | Path, harmonics: bool = True, arrays: bool = True) -> Scene:
     """Read a stage; without `harmonics` only degree 0, without `arrays` no splats but poses and labels."""
     stage = open_stage(path)
@@ -53,11 +71,12 @@ def read_scene(path: str | Path, harmonics: bool = True, arrays: bool = True) ->
     owned: dict[Sdf.Path, list[Usd.Prim]] = {}
     for prim in splats:
         owned.setdefault(_owner(prim).GetPath(), []).append(prim)
+    root = home(stage)
     instances = [
-        _instance(stage.GetPrimAtPath(owner), prims, harmonics, arrays, warnings)
+        _instance(stage.GetPrimAtPath(owner), prims, root, harmonics, arrays, warnings)
         for owner, prims in owned.items()
     ]
-    cameras = [_camera(prim) for prim in stage.Traverse() if prim.GetTypeName() == "Camera"]
+    cameras = [_camera(prim, root) for prim in stage.Traverse() if prim.GetTypeName() == "Camera"]
     return Scene(
         path=str(path),
         up_axis=str(UsdGeom.GetStageUpAxis(stage)),
@@ -105,7 +124,12 @@ def _owner(splats: Usd.Prim) -> Usd.Prim:
 
 
 def _instance(
-    prim: Usd.Prim, splats: list[Usd.Prim], harmonics: bool, arrays: bool, warnings: list[str]
+    prim: Usd.Prim,
+    splats: list[Usd.Prim],
+    root: Usd.Prim | None,
+    harmonics: bool,
+    arrays: bool,
+    warnings: list[str],
 ) -> Instance:
     classes = _labels(prim, CLASS_LABELS)
     ancestor = prim
@@ -130,7 +154,7 @@ def _instance(
         label=classes[0] if classes else display_name,
         display_name=display_name,
         instance=instance[0] if instance else prim.GetName(),
-        track=_track(prim, None, warnings),
+        track=_track(prim, root, warnings),
         pieces=pieces,
         visibility=_visibility(splats[0] if len(splats) == 1 else prim),
         data=_data(prim),
@@ -329,7 +353,7 @@ EMPTY = Splats(
 """Stands for arrays that were not asked for."""
 
 
-def _camera(prim: Usd.Prim) -> Camera:
+def _camera(prim: Usd.Prim, root: Usd.Prim | None) -> Camera:
     camera = UsdGeom.Camera(prim)
     names = ("focalLength", "horizontalAperture", "horizontalApertureOffset", "verticalApertureOffset")
     codes = sorted({code for name in names for code in prim.GetAttribute(name).GetTimeSamples()})
@@ -347,7 +371,7 @@ def _camera(prim: Usd.Prim) -> Camera:
         path=str(prim.GetPath()),
         name=prim.GetName(),
         display_name=prim.GetDisplayName() or prim.GetName(),
-        track=_track(prim, None, []),
+        track=_track(prim, root, []),
         lens_codes=np.array(codes or [0.0]),
         focal=np.array([view.focalLength / w for view, w in zip(views, width, strict=True)]),
         shift=np.array(shift),

@@ -88,7 +88,7 @@ class Instance:
     instance: str
     """Label in the taxonomy `instance`, unique in the scene."""
     track: Track
-    """Poses in the world of the stage."""
+    """Poses in the world of the stage, or in the frame of its root where that is far (`read.home`)."""
     pieces: list[Piece]
     visibility: Visibility
     data: dict[str, float | int | str] = field(default_factory=dict)
