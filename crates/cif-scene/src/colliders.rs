@@ -92,7 +92,7 @@ fn blobs(splats: &Splats, importance: &[f64], range: std::ops::Range<usize>) -> 
                 let axis = end / 2;
                 let length = SIGMAS * f64::from(splats.scales[index][axis]);
                 let direction = DVec3::new(rotation[0][axis], rotation[1][axis], rotation[2][axis]);
-                centre + if end % 2 == 0 { length } else { -length } * direction
+                centre + if end.is_multiple_of(2) { length } else { -length } * direction
             };
             let ends = if splats.opacities[index] >= opaque {
                 let rotation = quaternion::to_rotation(splats.orientations[index].map(f64::from));

@@ -50,8 +50,8 @@ def open_stage(path: str | Path) -> Usd.Stage:
 def home(stage: Usd.Stage) -> Usd.Prim | None:
     """The prim whose frame is worked in; `None` is the world.
 
-    A scene that cif placed far from the origin is kept in the frame of its root: Blender's single precision would
-    not hold it where it stands.
+    A scene that cif placed far from the origin is kept in the frame of its root: Blender's single precision
+    would not hold it where it stands.
     """
     for layer in stage.GetLayerStack(False):
         mark = layer.customLayerData.get(MARK)
