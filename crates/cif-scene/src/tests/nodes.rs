@@ -74,6 +74,15 @@ fn shares_held(hulls: &[ConvexHull], node: &Node) -> [f64; 2] {
 }
 
 #[test]
+fn large_nodes_are_enclosed_by_what_a_sample_of_them_says() {
+    let node = node(&cloud(90_000, DVec3::new(0.4, 0.2, 0.1)));
+    let hulls = colliders::colliders(&node, 1);
+    let shares = shares_held(&hulls, &node);
+    assert!(shares.iter().all(|share| *share >= colliders::ENCLOSED - 5e-3), "{shares:?}");
+    assert!(mesh(&hulls[0]).volume() < 1.5 * 0.4 * 0.2 * 0.1);
+}
+
+#[test]
 fn colliders_enclose_their_splats_by_opacity_and_by_sight() {
     let enclosed = |node: &Node, hulls: usize| {
         let hulls = colliders::colliders(node, hulls);
