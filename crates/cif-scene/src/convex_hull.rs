@@ -283,7 +283,7 @@ mod tests {
 
     #[test]
     fn many_points_in_few_places_of_a_line_do_not_lose_its_ends() {
-        // Ninety doubled points in some order, of which parry lost an end.
+        // Few distinct places, each taken many times, in no order.
         let places =
             [0, 0, 4, 1, 0, 1, 1, 0, 0, 0, 1, 0, 0, 1, 0, 2, 2, 0, 0, 0, 3, 2, 4, 1, 2, 4, 3, 3, 4, 1];
         let points: Vec<DVec3> =

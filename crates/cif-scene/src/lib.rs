@@ -14,7 +14,7 @@
 //! | [`placement`] | where a node's splats are at any time |
 //! | [`extent`] | boxes that hold the 3-sigma ellipsoids |
 //! | [`convex_hull`] | convex hulls with few corners |
-//! | [`colliders`] | one or several hulls around a node's opaque splats |
+//! | [`colliders`] | one or several hulls around most of what a node shows |
 //! | [`world`] | where a graph lies in the world of its capture |
 //! | [`level_of_detail`] | the most important splats of a node |
 //! | [`velocity`] | how fast a node moves |
@@ -28,9 +28,9 @@
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
 //! | [`field_from_graph`] | the way back: Gaussians, recorded motion and instances of a graph |
 //!
-//! Frames: world as captured (right-handed, metres), or a frame of the scene's own in it (see [`world`]). A node's splats live in its local frame, whose axes are the
-//! world's and whose origin is the node's pivot at the reference time, so that no rotation is baked into splats
-//! and their spherical harmonics are stored as trained.
+//! Frames: world as captured (right-handed, metres), or a frame of the scene's own in it (see [`world`]). A node's
+//! splats live in its local frame, whose axes are the world's and whose origin is the node's pivot at the reference
+//! time, so that no rotation is baked into splats and their spherical harmonics are stored as trained.
 
 pub mod assignment;
 pub mod build;

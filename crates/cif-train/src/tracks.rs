@@ -32,6 +32,21 @@ pub struct Observation {
     pub contact_depth: Option<f64>,
 }
 
+impl Observation {
+    /// Radius of a disc as large as the mask, pixels.
+    fn radius_px(&self) -> f64 {
+        (self.area_px / std::f64::consts::PI).sqrt()
+    }
+
+    /// Projection onto the plane across the ray through the mask's centre.
+    fn across(&self) -> DMat3 {
+        let direction = self.camera.ray(self.centroid_px).normalize();
+        let along =
+            DMat3::from_cols(direction * direction.x, direction * direction.y, direction * direction.z);
+        DMat3::IDENTITY - along
+    }
+}
+
 /// What the mask of a frame shows of each label in it, without contacts; labels of a few pixels are left out.
 #[must_use]
 pub fn observe(
@@ -113,7 +128,7 @@ pub fn travels(observations: &[Observation]) -> bool {
     let mut misses: Vec<f64> = observations
         .iter()
         .map(|o| match o.camera.project(point) {
-            Some((pixel, _)) => (pixel - o.centroid_px).length() / (o.area_px / std::f64::consts::PI).sqrt(),
+            Some((pixel, _)) => (pixel - o.centroid_px).length() / o.radius_px(),
             None => f64::INFINITY,
         })
         .collect();
@@ -128,9 +143,7 @@ const TRAVEL: f64 = 0.3;
 fn fixed_point(observations: &[Observation]) -> DVec3 {
     let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
     for o in observations {
-        let direction = o.camera.ray(o.centroid_px).normalize();
-        let across = DMat3::IDENTITY
-            - DMat3::from_cols(direction * direction.x, direction * direction.y, direction * direction.z);
+        let across = o.across();
         normal += across;
         right += across * o.camera.centre();
     }

@@ -42,7 +42,7 @@ pub fn misfits(frames: &[BTreeMap<u16, Observation>], limit: f64) -> Vec<usize> 
         let usual = sorted[sorted.len() / 2];
         for ((frame, o), miss) in seen.iter().zip(misses) {
             let focal = o.camera.focal_px.min_element();
-            let radius = (o.area_px / std::f64::consts::PI).sqrt() / focal;
+            let radius = o.radius_px() / focal;
             let usual = usual.max(USUAL_RADII * radius).max(USUAL_PX / focal);
             excesses[*frame].push(if miss > radius { miss / usual } else { 0.0 });
         }
@@ -64,15 +64,7 @@ fn miss(o: &Observation, point: DVec3) -> f64 {
 /// The point with the least sum of distances from the rays through the masks' centres, as lines: some wrong rays
 /// do not move it. `None` where the rays are parallel.
 fn middle_point(observations: &[&Observation]) -> Option<DVec3> {
-    let lines: Vec<(DVec3, DMat3)> = observations
-        .iter()
-        .map(|o| {
-            let direction = o.camera.ray(o.centroid_px).normalize();
-            let along =
-                DMat3::from_cols(direction * direction.x, direction * direction.y, direction * direction.z);
-            (o.camera.centre(), DMat3::IDENTITY - along)
-        })
-        .collect();
+    let lines: Vec<(DVec3, DMat3)> = observations.iter().map(|o| (o.camera.centre(), o.across())).collect();
     let mut weights = vec![1.0; lines.len()];
     let mut point = DVec3::ZERO;
     for _ in 0..ROUNDS {

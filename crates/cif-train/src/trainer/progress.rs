@@ -89,6 +89,23 @@ const PSNR_SHARE: f64 = 0.02;
 const MAX_PSNR: f64 = 100.0;
 
 impl Progress {
+    /// A step of the current stage is done.
+    pub(super) fn count_step(&mut self) {
+        self.iteration += 1;
+        self.total_steps += 1;
+        *self.steps.entry(self.stage.name().to_owned()).or_default() += 1;
+    }
+
+    /// The last steps of the current stage are not done after all.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn uncount_steps(&mut self, steps: u32) {
+        self.iteration -= steps;
+        self.total_steps -= u64::from(steps);
+        if let Some(of_stage) = self.steps.get_mut(self.stage.name()) {
+            *of_stage -= u64::from(steps);
+        }
+    }
+
     pub(super) fn at(stage: Stage) -> Self {
         Self {
             stage,

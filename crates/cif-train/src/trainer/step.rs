@@ -238,9 +238,7 @@ impl Trainer {
         self.gradients.screen.fill([0.0; 2]);
         self.gradients.radii.fill(0.0);
 
-        self.progress.iteration = iteration;
-        self.progress.total_steps += 1;
-        *self.progress.steps.entry(stage.name().to_owned()).or_default() += 1;
+        self.progress.count_step();
         self.keep_in_range(stage);
         let mut since = Instant::now();
         match stage {

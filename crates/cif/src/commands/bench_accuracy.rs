@@ -75,8 +75,11 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     let mut options = command.capture_options.clone();
     options.downscale = options.downscale.or(base_config(command, cif_dataset::Layout::HyperNerf)?.downscale);
     let mut dataset = options.open(&command.capture)?;
-    if command.quick && options.downscale.is_none() {
-        options.downscale = reduction(&dataset);
+    if command.quick
+        && options.downscale.is_none()
+        && let Some(factor) = reduction(&dataset)
+    {
+        options.downscale = Some(factor);
         dataset = options.open(&command.capture)?;
     }
     print_warnings(&dataset);
@@ -137,7 +140,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     let mut stopped = false;
     for (number, (ladder, rung)) in order.iter().enumerate() {
         let steps = bench.expected_steps(rung);
-        if !bench.is_kept(rung) && limit.as_ref().is_some_and(|limit| !limit.has_time_for(steps)) {
+        if bench.kept(rung).is_none() && limit.as_ref().is_some_and(|limit| !limit.has_time_for(steps)) {
             left_out.push(format!("{ladder}: {}", rung.label));
             continue;
         }
@@ -182,6 +185,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
 
 /// Pixels that training images of a quick report have at the most.
 const QUICK_PIXELS: u64 = 160 * 120;
+
 /// Reduction of the images of a capture for a quick report; none where they are small already.
 fn reduction(dataset: &Dataset) -> Option<u32> {
     let pixels = |factor: u32| {
@@ -234,15 +238,12 @@ impl Bench {
         if interrupt::requested() {
             return Ok(None);
         }
-        let fingerprint = self.fingerprint(rung);
-        if let Some(record) = self.rungs.find(&rung.id, &fingerprint)
-            && (rung.id != BASE || self.base_file().is_file())
-        {
+        if let Some(record) = self.kept(rung) {
             eprintln!("{heading}: kept, {}", told(&record));
             return Ok(Some(record));
         }
         let Some(mut record) = self.measure(rung, heading)? else { return Ok(None) };
-        record.fingerprint = fingerprint;
+        record.fingerprint = self.fingerprint(rung);
         self.rungs.keep(&rung.id, &record)?;
         self.show(&format!("{heading}: {}", told(&record)), true);
         Ok(Some(record))
@@ -280,8 +281,11 @@ impl Bench {
         })
     }
 
-    fn is_kept(&self, rung: &Rung) -> bool {
-        self.rungs.find(&rung.id, &self.fingerprint(rung)).is_some()
+    /// What an earlier run kept of a rung; of the base, also the scene must be there.
+    fn kept(&self, rung: &Rung) -> Option<Record> {
+        self.rungs
+            .find(&rung.id, &self.fingerprint(rung))
+            .filter(|_| rung.id != BASE || self.base_file().is_file())
     }
 
     /// Steps that a rung trains; none where it uses the scene of the base.

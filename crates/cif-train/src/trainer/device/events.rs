@@ -35,17 +35,15 @@ impl Trainer {
         let start = Instant::now();
         if rearranges && stage != Stage::Instance && !is_late {
             self.densify_on_device(stage, iteration, events)?;
-            self.times.rearrange += start.elapsed();
-            self.times.total += start.elapsed();
-            return Ok(());
-        }
-        self.fetch_from_device()?;
-        if rearranges && stage == Stage::Instance {
-            self.instance_events(iteration, events)?;
-            self.identities_changed();
-        } else if rearranges {
-            self.densify(stage, iteration, events)?;
-            self.gaussians_changed();
+        } else {
+            self.fetch_from_device()?;
+            if rearranges && stage == Stage::Instance {
+                self.instance_events(iteration, events)?;
+                self.identities_changed();
+            } else if rearranges {
+                self.densify(stage, iteration, events)?;
+                self.gaussians_changed();
+            }
         }
         self.times.rearrange += start.elapsed();
         self.times.total += start.elapsed();

@@ -172,10 +172,10 @@ impl Trainer {
             for later in &mut again {
                 later.uncount(plan.moving);
             }
-            match self.count_bad_step(plan.stage(), plan.iteration(), fault) {
+            match self.count_bad_step(plan.stage, plan.iteration, fault) {
                 Ok(event) => self.arrived.push(event),
                 Err(error) => {
-                    self.forget(&plan, &again);
+                    self.forget(&again);
                     return Err(error);
                 }
             }
@@ -187,16 +187,11 @@ impl Trainer {
     }
 
     /// Stands before a step again that ended the run; those after it have moved nothing either.
-    fn forget(&mut self, plan: &StepPlan, later: &[StepPlan]) {
+    fn forget(&mut self, later: &[StepPlan]) {
         for step in later {
             self.uncount(step.moving);
         }
-        let steps = 1 + later.len() as u64;
-        self.progress.iteration = plan.iteration() - 1;
-        self.progress.total_steps -= steps;
-        if let Some(of_stage) = self.progress.steps.get_mut(plan.stage().name()) {
-            *of_stage -= steps;
-        }
+        self.progress.uncount_steps(1 + later.len() as u32);
     }
 
     /// Losses and counts of a step that was taken.
@@ -206,8 +201,8 @@ impl Trainer {
             let about = &view.about;
             self.progress.add_psnr(view.loss.color.psnr());
             loss.color += view.loss.color.loss * about.weight;
-            if plan.stage() == Stage::Instance && plan.labelled() > 0 {
-                let of_step = plan.labelled() as f64;
+            if plan.stage == Stage::Instance && plan.labelled > 0 {
+                let of_step = plan.labelled as f64;
                 // The mean over the labelled pixels of all views of the step (A4).
                 *loss.instance.get_or_insert(0.0) +=
                     if about.labelled > 0 { view.loss.instance_sum / of_step } else { 0.0 };

@@ -2,7 +2,7 @@
 
 use cif_render::UNLABELLED;
 use cif_render::cpu::IdentityCounts;
-use cif_render::wgpu::{Commands, GpuIdentityCounts, PosedInput, ViewInput};
+use cif_render::wgpu::{Commands, GpuIdentityCounts, ViewInput};
 
 use super::super::Trainer;
 use super::DeviceTraining;
@@ -52,15 +52,7 @@ impl Trainer {
             };
             let frame = &self.dataset.frames[self.frames.index(view)];
             let mut commands = Commands::new(gpu, None);
-            let posed = match &resident.deformation {
-                Some(deformation) => {
-                    let moving = &deformation.parameters;
-                    moving.forward(gpu, &mut commands, frame.time, &resident.canonical, &resident.posed);
-                    let sh = if moving.moves_sh() { &resident.posed.sh } else { &resident.canonical.sh };
-                    PosedInput { geometry: &resident.posed.geometry, sh }
-                }
-                None => (&resident.canonical).into(),
-            };
+            let posed = resident.pose(gpu, &mut commands, frame.time);
             let input = ViewInput { camera: &frame.camera, settings: &settings, labels: None };
             rasterizer.project(gpu, &mut commands, posed, None, &input)?;
             // Between steps the host may wait for the room that a view needs.

@@ -3,7 +3,9 @@
 use cif_field::{Field, Identities};
 use cif_render::wgpu::deform::DeformationGradients;
 use cif_render::wgpu::gaussians::{gaussians, geometry};
-use cif_render::wgpu::{DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuVec};
+use cif_render::wgpu::{
+    Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuVec, PosedInput,
+};
 
 use super::super::optimiser::Optimiser;
 use crate::densify::DensifyStatistics;
@@ -110,6 +112,15 @@ impl ResidentIdentities {
 }
 
 impl Resident {
+    /// The Gaussians at a time in 0..=1, deformed if the field moves.
+    pub(super) fn pose(&self, gpu: &Gpu, commands: &mut Commands<'_>, time: f64) -> PosedInput<'_> {
+        let Some(deformation) = &self.deformation else { return (&self.canonical).into() };
+        let moving = &deformation.parameters;
+        moving.forward(gpu, commands, time, &self.canonical, &self.posed);
+        let sh = if moving.moves_sh() { &self.posed.sh } else { &self.canonical.sh };
+        PosedInput { geometry: &self.posed.geometry, sh }
+    }
+
     /// Nothing yet.
     pub(super) fn new(gpu: &Gpu) -> Result<Self, GpuError> {
         let none = || GpuGaussians::zeros(gpu, 0);

@@ -52,18 +52,6 @@ pub(super) struct StepPlan {
 }
 
 impl StepPlan {
-    pub(super) fn stage(&self) -> Stage {
-        self.stage
-    }
-
-    pub(super) fn iteration(&self) -> u32 {
-        self.iteration
-    }
-
-    pub(super) fn labelled(&self) -> usize {
-        self.labelled
-    }
-
     /// One step less of some groups before this one.
     pub(super) fn uncount(&mut self, groups: u32) {
         let step = &mut self.step;
@@ -122,9 +110,7 @@ impl Trainer {
         self.record(device, plan)?;
         device.ahead = true;
         device.since_fetch += 1;
-        self.progress.iteration = iteration;
-        self.progress.total_steps += 1;
-        *self.progress.steps.entry(stage.name().to_owned()).or_default() += 1;
+        self.progress.count_step();
         self.times.total += start.elapsed();
         self.times.steps += 1;
         Ok(())

@@ -50,14 +50,11 @@ impl Trainer {
     /// after it; what is between is looked at by [`Self::diagnose`] where the device refuses the step.
     pub(super) fn validated_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
         self.fetch_from_device()?;
-        let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
         let (snapshot, statistics) = (self.snapshot(), self.statistics.clone());
         let psnr_before = self.progress.psnr;
         let fault = match self.fault_before_step() {
             Some(fault) => {
-                self.progress.iteration = iteration;
-                self.progress.total_steps += 1;
-                *self.progress.steps.entry(stage.name().to_owned()).or_default() += 1;
+                self.progress.count_step();
                 Some(fault)
             }
             None => {
@@ -72,13 +69,9 @@ impl Trainer {
         let undone = self.roll_back(fault, snapshot, psnr_before, events);
         self.statistics = statistics;
         self.everything_changed();
+        self.progress.iteration += 1;
         if undone.is_err() {
-            self.progress.total_steps -= 1;
-            if let Some(of_stage) = self.progress.steps.get_mut(stage.name()) {
-                *of_stage -= 1;
-            }
-        } else {
-            self.progress.iteration += 1;
+            self.progress.uncount_steps(1);
         }
         undone
     }

@@ -2,9 +2,7 @@
 
 use std::time::Duration;
 
-use cif_render::wgpu::{
-    Commands, GpuError, GpuStatistics, LabelInput, PosedInput, Submission, ViewInput, faults,
-};
+use cif_render::wgpu::{Commands, GpuError, GpuStatistics, LabelInput, Submission, ViewInput, faults};
 use cif_render::{InstanceNormalisation, RenderSettings};
 
 use super::super::Trainer;
@@ -79,15 +77,7 @@ impl Trainer {
                 &identities.rows.entries,
             );
         }
-        let posed = match &resident.deformation {
-            Some(deformation) => {
-                let moving = &deformation.parameters;
-                moving.forward(gpu, &mut commands, frame.time, &resident.canonical, &resident.posed);
-                let sh = if moving.moves_sh() { &resident.posed.sh } else { &resident.canonical.sh };
-                PosedInput { geometry: &resident.posed.geometry, sh }
-            }
-            None => (&resident.canonical).into(),
-        };
+        let posed = resident.pose(gpu, &mut commands, frame.time);
         let rows = resident.identities.as_ref().filter(|_| with_instances).map(|identities| &identities.rows);
         rasterizer.project(gpu, &mut commands, posed, rows, &input)?;
         rasterizer.rasterize(gpu, &mut commands, rows, labels)?;
