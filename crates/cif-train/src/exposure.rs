@@ -21,7 +21,7 @@ pub struct Exposure {
 }
 
 /// Floats of an exposure: logarithms of gains, then offsets.
-const WIDTH: usize = 6;
+pub(crate) const WIDTH: usize = 6;
 
 /// First and last learning rate of the logarithms of gains, and of offsets.
 pub(crate) const RATES: [f32; 2] = [1e-2, 5e-4];
@@ -81,15 +81,20 @@ impl Exposures {
         let mut cameras: Vec<String> = frames.map(|frame| frame.camera_name.clone()).collect();
         cameras.sort_unstable();
         cameras.dedup();
+        (cameras.len() > 1).then(|| Self::neutral(cameras))
+    }
+
+    /// Neutral exposures of cameras, by ascending names.
+    pub(crate) fn neutral(cameras: Vec<String>) -> Self {
         let zeros = vec![0.0; WIDTH * cameras.len()];
-        (cameras.len() > 1).then(|| Self {
+        Self {
             cameras,
             values: zeros.clone(),
             first: zeros.clone(),
             second: zeros.clone(),
             steps: 0,
             gradients: zeros,
-        })
+        }
     }
 
     /// The exposures that a scene was trained with, where they are of these cameras.
@@ -105,7 +110,38 @@ impl Exposures {
         self
     }
 
-    fn position(&self, camera: &str) -> Option<usize> {
+    /// Number of cameras.
+    #[cfg(feature = "wgpu")]
+    pub(crate) fn cameras(&self) -> usize {
+        self.cameras.len()
+    }
+
+    /// Values, first and second moments, `[cameras, WIDTH]`.
+    #[cfg(feature = "wgpu")]
+    pub(crate) fn arrays(&self) -> [&[f32]; 3] {
+        [&self.values, &self.first, &self.second]
+    }
+
+    /// What [`Self::arrays`] returns, from elsewhere.
+    #[cfg(feature = "wgpu")]
+    pub(crate) fn set_arrays(&mut self, [values, first, second]: [Vec<f32>; 3]) {
+        (self.values, self.first, self.second) = (values, first, second);
+    }
+
+    /// Steps done; counted by whoever does them elsewhere.
+    #[cfg(feature = "wgpu")]
+    pub(crate) fn steps_mut(&mut self) -> &mut u32 {
+        &mut self.steps
+    }
+
+    /// The first summed gradient beyond a limit or not a number.
+    pub(crate) fn gradient_beyond(&self, limit: f32) -> Option<(usize, f32)> {
+        let beyond = |value: &f32| value.is_nan() || value.abs() > limit;
+        self.gradients.iter().copied().enumerate().find(|(_, value)| beyond(value))
+    }
+
+    /// Number of a camera, where it is one of these.
+    pub(crate) fn position(&self, camera: &str) -> Option<usize> {
         self.cameras.binary_search_by(|name| name.as_str().cmp(camera)).ok()
     }
 

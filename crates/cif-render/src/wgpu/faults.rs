@@ -33,6 +33,8 @@ pub const NO_ROOM: u32 = 512;
 pub const COLOR_LOSS: u32 = 1024;
 /// The instance loss.
 pub const INSTANCE_LOSS: u32 = 2048;
+/// Gradient of exposures.
+pub const EXPOSURES: u32 = 4096;
 
 /// Largest gradient whose square is finite in single precision, with a margin: what is larger would make a moment
 /// infinite for ever.
@@ -52,6 +54,7 @@ pub const FAULTS: Snippet = Snippet {
             ("NO_ROOM_FAULT", Constant::Unsigned(NO_ROOM)),
             ("COLOR_LOSS_FAULT", Constant::Unsigned(COLOR_LOSS)),
             ("INSTANCE_LOSS_FAULT", Constant::Unsigned(INSTANCE_LOSS)),
+            ("EXPOSURES_FAULT", Constant::Unsigned(EXPOSURES)),
             ("LARGEST_GRADIENT", Constant::Unsigned(MAX_GRADIENT.to_bits())),
         ]);
         format!("{names}{}", include_str!("shared/faults.wgsl"))

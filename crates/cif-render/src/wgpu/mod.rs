@@ -41,7 +41,7 @@ pub mod testing;
 pub mod validation;
 pub mod view;
 
-pub use ::wgpu::SubmissionIndex as Submission;
+pub use ::wgpu::{BindGroup, SubmissionIndex as Submission};
 pub use buffers::{Arriving, GpuVec, Letter, Mailbox, Recorded, Uniform};
 pub use cache::{BindCache, Place, UniformCache};
 pub use counts::GpuIdentityCounts;

@@ -65,8 +65,6 @@ impl GpuRenderer {
         channels: Channels,
     ) -> Result<RenderedImage, GpuError> {
         let settings = settings.for_outputs(field, channels);
-        let (width, height) = (camera.width, camera.height);
-        let pixels = width as usize * height as usize;
         let input = ViewInput { camera, settings: &settings, labels: None };
         let identities = self.identities.as_ref().filter(|_| settings.instances.is_some());
         let mut commands = Commands::new(&self.gpu, None);
@@ -90,21 +88,40 @@ impl GpuRenderer {
         } else {
             (&self.canonical).into()
         };
-        self.rasterizer.project(&self.gpu, &mut commands, posed, identities, &input)?;
-        self.rasterizer.measure(&self.gpu, commands)?;
-        let mut commands = Commands::new(&self.gpu, None);
-        self.rasterizer.rasterize(&self.gpu, &mut commands, identities, None)?;
+        self.rasterizer.draw(&self.gpu, commands, posed, identities, &input, channels.depth)
+    }
+}
+
+impl Rasterizer {
+    /// Draws a view for looking at or measuring, after what `commands` hold, and reads it; instances where `identities`
+    /// are given. Waits for the device.
+    ///
+    /// # Errors
+    /// When the view exceeds what the device binds, with the arithmetic; when the device is out of memory or lost.
+    pub fn draw(
+        &mut self,
+        gpu: &Gpu,
+        mut commands: Commands<'_>,
+        posed: PosedInput<'_>,
+        identities: Option<&DeviceIdentities>,
+        input: &ViewInput<'_>,
+        with_depth: bool,
+    ) -> Result<RenderedImage, GpuError> {
+        let (width, height) = (input.camera.width, input.camera.height);
+        let pixels = width as usize * height as usize;
+        self.project(gpu, &mut commands, posed, identities, input)?;
+        self.measure(gpu, commands)?;
+        let mut commands = Commands::new(gpu, None);
+        self.rasterize(gpu, &mut commands, identities, None)?;
         if let Some(identities) = identities {
-            self.rasterizer.render_instances(&self.gpu, &mut commands, identities)?;
+            self.render_instances(gpu, &mut commands, identities)?;
         }
-        let rasterizer = &self.rasterizer;
-        let colors = rasterizer.colors().read_later(&self.gpu, commands.encoder(), 0, pixels);
-        let blended =
-            channels.depth.then(|| rasterizer.blended().read_later(&self.gpu, commands.encoder(), 0, pixels));
+        let colors = self.colors().read_later(gpu, commands.encoder(), 0, pixels);
+        let blended = with_depth.then(|| self.blended().read_later(gpu, commands.encoder(), 0, pixels));
         let instances = identities.map(|_| {
             (
-                rasterizer.instance_images().read_later(&self.gpu, commands.encoder(), 0, pixels),
-                rasterizer.foregrounds().read_later(&self.gpu, commands.encoder(), 0, pixels),
+                self.instance_images().read_later(gpu, commands.encoder(), 0, pixels),
+                self.foregrounds().read_later(gpu, commands.encoder(), 0, pixels),
             )
         });
         commands.submit();
@@ -112,11 +129,11 @@ impl GpuRenderer {
         let blended = blended.map(super::Recorded::start);
         let instances = instances.map(|(images, foregrounds)| (images.start(), foregrounds.start()));
 
-        let colors = colors.wait(&self.gpu)?;
+        let colors = colors.wait(gpu)?;
         let grid = |values: Vec<f32>| PixelGrid::from_pixels(width, height, values);
         let depth = match blended {
             Some(blended) => {
-                let blended = blended.wait(&self.gpu)?;
+                let blended = blended.wait(gpu)?;
                 let expected = colors.iter().zip(&blended).map(|(color, blended)| {
                     let coverage = 1.0 - color[3];
                     if coverage > MIN_COVERAGE { blended[0] / coverage } else { 0.0 }
@@ -127,14 +144,14 @@ impl GpuRenderer {
         };
         let instances = match instances {
             Some((images, foregrounds)) => {
-                let images = images.wait(&self.gpu)?;
+                let images = images.wait(gpu)?;
                 let part = |channel: usize| grid(images.iter().map(|image| image[channel]).collect());
                 Some(InstanceImage {
                     label: part(0).map(|label| *label as u16),
                     probability: part(1),
                     coverage: part(2),
                     entropy: part(3),
-                    foreground: grid(foregrounds.wait(&self.gpu)?),
+                    foreground: grid(foregrounds.wait(gpu)?),
                 })
             }
             None => None,

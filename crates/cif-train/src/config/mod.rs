@@ -83,6 +83,7 @@ pub struct StagesConfig {
     /// Share of a view's tiles of 16 x 16 pixels, drawn anew for every view, that a step renders and learns from;
     /// (0, 1], default 1: all. The gradient stays right on average, with more noise; only what pixels cost is saved,
     /// little in small images: on the example capture half of the tiles take 6 % less time for 0.5 dB and 1.1 mIoU.
+    /// Less than 1 runs on the processor alone.
     pub tile_share: f32,
 }
 
@@ -157,7 +158,8 @@ pub struct RatesConfig {
 #[serde(default, deny_unknown_fields)]
 pub struct AdamConfig {
     /// Rows made after the start correct their bias from their own first step, default off: they share the
-    /// group's step count, and their first step is 3.16 times the rate (methods reference 7, row 26).
+    /// group's step count, and their first step is 3.16 times the rate (methods reference 7, row 26). Runs on the
+    /// processor alone.
     pub fresh_row_bias_correction: bool,
     /// Rows not visible in any view of a step keep still instead of moving by their momentum, default off.
     pub visible_rows_only: bool,

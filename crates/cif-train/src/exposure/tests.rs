@@ -89,15 +89,7 @@ fn a_scene_begins_with_the_exposures_it_was_trained_with() {
 }
 
 fn two_cameras() -> Exposures {
-    let zeros = vec![0.0; 2 * WIDTH];
-    Exposures {
-        cameras: vec!["a".into(), "b".into()],
-        values: zeros.clone(),
-        first: zeros.clone(),
-        second: zeros.clone(),
-        steps: 0,
-        gradients: zeros,
-    }
+    Exposures::neutral(vec!["a".into(), "b".into()])
 }
 
 #[test]
@@ -119,7 +111,11 @@ fn what_all_cameras_have_in_common_stays_with_the_field() {
 #[test]
 fn gradients_that_are_not_finite_move_nothing() {
     let mut exposures = two_cameras();
-    exposures.add("a", &[f32::NAN; WIDTH]);
+    exposures.add("a", &[0.5; WIDTH]);
+    assert_eq!(exposures.gradient_beyond(1.0), None);
+    assert_eq!(exposures.gradient_beyond(0.1), Some((0, 0.5)));
+    exposures.add("b", &[f32::NAN; WIDTH]);
+    assert_eq!(exposures.gradient_beyond(1.0).map(|(index, _)| index), Some(WIDTH));
     exposures.step(RATES[0]);
     assert_eq!(exposures.values, two_cameras().values);
     exposures.add("b", &[1.0; WIDTH]);

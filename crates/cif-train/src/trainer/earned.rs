@@ -2,19 +2,17 @@
 //! are judged on pixels of training views that the colour loss leaves out, at half of the fine stage: sooner they
 //! have not learnt what they are worth, and later nothing is left to make good for what is taken back.
 
-use cif_dataset::Dataset;
 use cif_field::deformation::HeadKind;
 use cif_field::{Deformation, Field};
+use cif_geometry::PixelGrid;
 use cif_geometry::spherical_harmonics::coefficient_count;
-use cif_render::cpu::Renderer;
 use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
-use super::frames::FrameStore;
+use super::draw::Views;
 use super::still::{probe, probe_times};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
-use crate::exposure::Exposures;
 use crate::schedule::{falls_on, sh_degree};
 
 /// Every so many columns and rows there is a pixel that the colour loss leaves out.
@@ -38,6 +36,13 @@ fn held_out(width: u32, height: u32) -> impl Iterator<Item = usize> {
     })
 }
 
+/// Takes the gradient from the pixels that are judged by.
+pub(super) fn leave_out_held_out(v_color: &mut PixelGrid<[f32; 3]>) {
+    for pixel in held_out(v_color.width, v_color.height) {
+        v_color.pixels[pixel] = [0.0; 3];
+    }
+}
+
 /// Training views that are judged by, evenly spread.
 fn judged_views(views: usize) -> impl Iterator<Item = usize> {
     let count = views.min(VIEWS);
@@ -54,16 +59,11 @@ impl Trainer {
             || self.tests_to_come(stage, iteration)
     }
 
-    /// Keeps the pixels that are judged by out of the colour gradient of a frame of the capture, where it is one of
-    /// those that are judged by.
-    pub(super) fn leave_out_judged(&mut self, stage: Stage, iteration: u32, frame: usize) {
-        let is_judged = judged_views(self.frames.len()).any(|view| self.frames.index(view) == frame);
-        if is_judged && self.judges(stage, iteration) {
-            let grid = &mut self.scratch.v_color;
-            for pixel in held_out(grid.width, grid.height) {
-                grid.pixels[pixel] = [0.0; 3];
-            }
-        }
+    /// Whether a step keeps the pixels that are judged by out of the colour gradient of a frame of the capture: while
+    /// anything is still to be judged, and where the frame is one of those that are judged by.
+    pub(super) fn leaves_out_judged(&self, stage: Stage, iteration: u32, frame: usize) -> bool {
+        judged_views(self.frames.len()).any(|view| self.frames.index(view) == frame)
+            && self.judges(stage, iteration)
     }
 
     /// Degree of spherical harmonics at a step: as the schedule says, but not two above one that helps, and not
@@ -76,6 +76,17 @@ impl Trainer {
         scheduled.min(self.progress.sh_judged + 1).min(self.progress.sh_cap.unwrap_or(u8::MAX))
     }
 
+    /// Whether spherical harmonics are judged before a step.
+    pub(super) fn judges_sh(&self, stage: Stage, iteration: u32) -> bool {
+        if self.config.effects.sh_gain <= 0.0 || !matches!(stage, Stage::Coarse | Stage::Fine) {
+            return false;
+        }
+        let is_next_due = falls_on(iteration, self.config.model.sh_interval)
+            && self.progress.sh_cap.is_none()
+            && self.field.sh_degree > self.progress.sh_judged;
+        is_next_due || self.is_half_way(stage, iteration)
+    }
+
     /// Looks whether the present degree of spherical harmonics helps where the next one is due, and at half of the
     /// fine stage takes back, for good, those that do not help enough.
     pub(super) fn judge_sh(
@@ -84,14 +95,10 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        if self.config.effects.sh_gain <= 0.0 || !matches!(stage, Stage::Coarse | Stage::Fine) {
+        if !self.judges_sh(stage, iteration) {
             return Ok(());
         }
-        let is_last = self.is_half_way(stage, iteration);
-        let is_next_due = falls_on(iteration, self.config.model.sh_interval)
-            && self.progress.sh_cap.is_none()
-            && self.field.sh_degree > self.progress.sh_judged;
-        if is_last {
+        if self.is_half_way(stage, iteration) {
             while self.field.sh_degree > 0 {
                 let gain_wanted = f64::from(self.config.effects.sh_gain);
                 let degree = self.field.sh_degree;
@@ -102,10 +109,12 @@ impl Trainer {
                 for coefficients in &mut self.field.gaussians.sh_coefficients {
                     coefficients[first..].fill(0.0);
                 }
+                #[cfg(feature = "wgpu")]
+                self.gaussians_changed();
                 self.field.sh_degree = degree - 1;
                 self.progress.sh_cap = Some(degree - 1);
             }
-        } else if is_next_due && self.degree_gains(stage, iteration, 0.0, events)? {
+        } else if self.degree_gains(stage, iteration, 0.0, events)? {
             self.progress.sh_judged = self.field.sh_degree;
         }
         Ok(())
@@ -122,9 +131,8 @@ impl Trainer {
         let degree = self.field.sh_degree;
         let settings = self.color_settings();
         let lower = RenderSettings { sh_degree: degree - 1, ..settings };
-        let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
-        let with = judged_error(&mut self.renderer, views, &self.field, &settings)?;
-        let without = judged_error(&mut self.renderer, views, &self.field, &lower)?;
+        let with = self.judged_error(None, &settings)?;
+        let without = self.judged_error(None, &lower)?;
         let gain_db = gain(without, with);
         let kept = gain_db >= gain_wanted;
         let what = format!("view-dependent colour of degree {degree}");
@@ -138,6 +146,13 @@ impl Trainer {
         stage == Stage::Fine && iteration == (last / 2).max(1)
     }
 
+    /// Whether outputs of the deformation are judged after a step.
+    pub(super) fn judges_heads(&self, stage: Stage, iteration: u32) -> bool {
+        self.config.effects.head_gain > 0.0
+            && self.is_half_way(stage, iteration)
+            && self.field.deformation.is_some()
+    }
+
     /// Judges the optional outputs of the deformation, once, at half of the fine stage, and removes those that do
     /// not help.
     pub(super) fn judge_heads(
@@ -147,16 +162,15 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let gain_wanted = f64::from(self.config.effects.head_gain);
-        if gain_wanted <= 0.0 || !self.is_half_way(stage, iteration) || self.field.deformation.is_none() {
+        if !self.judges_heads(stage, iteration) {
             return Ok(());
         }
         let settings = self.color_settings();
         let times = probe_times(&self.dataset.times);
         for kind in OPTIONAL {
             let Some(trial) = without_output(&self.field, kind, &times) else { continue };
-            let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
-            let with = judged_error(&mut self.renderer, views, &self.field, &settings)?;
-            let without = judged_error(&mut self.renderer, views, &trial.field, &settings)?;
+            let with = self.judged_error(None, &settings)?;
+            let without = self.judged_error(Some(&trial.field), &settings)?;
             let gain_db = gain(without, with);
             let kept = gain_db >= gain_wanted;
             if !kept {
@@ -165,39 +179,43 @@ impl Trainer {
                 mlp.first.drain(trial.removed.clone());
                 mlp.second.drain(trial.removed.clone());
                 self.gradients.mlp.drain(trial.removed);
+                #[cfg(feature = "wgpu")]
+                self.everything_changed();
             }
             let what = format!("motion of {}", name(kind));
             events.push(TrainEvent::Judged { stage, iteration, what, gain_db, kept });
         }
         Ok(())
     }
-}
 
-/// Mean squared colour error of a field over the held-out pixels of evenly spread training views.
-pub(super) fn judged_error(
-    renderer: &mut Renderer,
-    (frames, dataset, exposures): (&FrameStore, &Dataset, Option<&Exposures>),
-    field: &Field,
-    settings: &RenderSettings,
-) -> Result<f64, TrainError> {
-    let (mut squares, mut values) = (0.0, 0_u64);
-    for view in judged_views(frames.len()) {
-        let data = frames.get(dataset, view)?;
-        let frame = &dataset.frames[frames.index(view)];
+    /// Mean squared colour error of the field, or of a `trial` in its stead, over the held-out pixels of evenly spread
+    /// training views.
+    pub(super) fn judged_error(
+        &mut self,
+        trial: Option<&Field>,
+        settings: &RenderSettings,
+    ) -> Result<f64, TrainError> {
+        let views: Vec<usize> = judged_views(self.frames.len()).collect();
+        let frames: Vec<usize> = views.iter().map(|view| self.frames.index(*view)).collect();
+        let mut truth = Vec::with_capacity(views.len());
+        for view in views {
+            truth.push(self.frames.get(&self.dataset, view)?);
+        }
+        let (mut squares, mut values) = (0.0, 0_u64);
         let channels = Channels { depth: false, instances: false };
-        let mut rendered = renderer.render(field, &frame.camera, frame.time, settings, channels);
-        if let Some(exposures) = exposures {
-            exposures.at(&frame.camera_name).apply(&mut rendered.color);
-        }
-        for pixel in held_out(data.image.width, data.image.height) {
-            for channel in 0..3 {
-                let target = f64::from(data.image.pixels[pixel][channel]) / 255.0;
-                squares += (f64::from(rendered.color.pixels[pixel][channel]) - target).powi(2);
+        let mut truth = truth.iter();
+        self.draw(trial, Views { frames: &frames, settings, channels }, &mut |rendered| {
+            let Some(data) = truth.next() else { return };
+            for pixel in held_out(data.image.width, data.image.height) {
+                for channel in 0..3 {
+                    let target = f64::from(data.image.pixels[pixel][channel]) / 255.0;
+                    squares += (f64::from(rendered.color.pixels[pixel][channel]) - target).powi(2);
+                }
+                values += 3;
             }
-            values += 3;
-        }
+        })?;
+        Ok(squares / values.max(1) as f64)
     }
-    Ok(squares / values.max(1) as f64)
 }
 
 /// A field without an output of its deformation.

@@ -4,6 +4,7 @@ use cif_dataset::{Dataset, FrameData, Split};
 use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
+use super::draw::Views;
 use crate::config::TrainConfig;
 use crate::curve::{CurveFrames, CurvePoint};
 use crate::error::TrainError;
@@ -94,7 +95,7 @@ impl Trainer {
                 Ok((index, self.dataset.load_frame(index, self.config.background)?))
             })
             .collect::<Result<Vec<_>, TrainError>>()?;
-        let scores = self.score(&frames);
+        let scores = self.score(&frames)?;
         Ok(TrainEvent::Evaluated {
             stage,
             iteration: self.progress.iteration,
@@ -132,7 +133,7 @@ impl Trainer {
                 indices.into_iter().map(load).collect::<Result<_, TrainError>>()?
             }
         };
-        let scores = self.score(&frames);
+        let scores = self.score(&frames)?;
         let point = CurvePoint {
             stage,
             iteration,
@@ -153,31 +154,39 @@ impl Trainer {
     }
 
     /// Renders frames of the capture and compares them.
-    fn score(&mut self, frames: &[(usize, FrameData)]) -> MeanScores {
+    fn score(&mut self, frames: &[(usize, FrameData)]) -> Result<MeanScores, TrainError> {
         let settings = RenderSettings {
             instances: self.field.identities.as_ref().map(|_| self.instance_settings()),
             ..self.color_settings()
         };
         let channels = Channels { depth: false, instances: settings.instances.is_some() };
-        let (mut psnrs, mut ssims, mut confusions) = (Vec::new(), Vec::new(), Vec::new());
-        for (index, truth) in frames {
-            let frame = &self.dataset.frames[*index];
-            let mut rendered =
-                self.renderer.render(&self.field, &frame.camera, frame.time, &settings, channels);
-            if let Some(exposures) = &self.progress.exposures {
-                exposures.at(&frame.camera_name).apply(&mut rendered.color);
-            }
+        let (mut psnrs, mut ssims, mut labels) = (Vec::new(), Vec::new(), Vec::new());
+        let indices: Vec<usize> = frames.iter().map(|(index, _)| *index).collect();
+        let views = Views { frames: &indices, settings: &settings, channels };
+        let mut truths = frames.iter();
+        self.draw(None, views, &mut |rendered| {
+            let Some((_, truth)) = truths.next() else { return };
             let target = unit_color(&truth.image);
             psnrs.push(psnr(&rendered.color, &target).min(MAX_PSNR));
             ssims.push(ssim(&rendered.color, &target));
-            if let (Some(mask), Some(instances)) = (&truth.mask, &rendered.instances) {
-                let predicted = mask_ids(&self.field, &instances.label);
+            labels.push(rendered.instances.map(|instances| instances.label));
+        })?;
+        let mut confusions = Vec::new();
+        for ((index, truth), labels) in frames.iter().zip(labels) {
+            if let (Some(mask), Some(labels)) = (&truth.mask, labels) {
+                let frame = &self.dataset.frames[*index];
+                let predicted = mask_ids(&self.field, &labels);
                 confusions.push(FrameConfusion::new(&frame.camera_name, frame.time_index, mask, &predicted));
             }
         }
         let mean =
             |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
         let scores = instance_metrics(&confusions);
-        MeanScores { psnr: mean(&psnrs), ssim: mean(&ssims), miou: scores.miou, macc_pix: scores.macc_pix }
+        Ok(MeanScores {
+            psnr: mean(&psnrs),
+            ssim: mean(&ssims),
+            miou: scores.miou,
+            macc_pix: scores.macc_pix,
+        })
     }
 }

@@ -17,6 +17,7 @@ use super::Trainer;
 use super::optimiser::{Optimiser, StepRates};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
+use crate::exposure::Exposures;
 
 /// Bad steps in a row after which a run stops.
 pub const MAX_ROLLBACKS_IN_A_ROW: u32 = 10;
@@ -137,6 +138,12 @@ pub(super) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option
         }
         fault("gradients", gradient, values, MAX_GRADIENT)
     })
+}
+
+/// The first gradient of an exposure that no optimiser may take.
+pub(super) fn exposure_fault(exposures: Option<&Exposures>) -> Option<Fault> {
+    let (index, value) = exposures?.gradient_beyond(MAX_GRADIENT)?;
+    Some(Fault { part: "gradients", tensor: "gradient of exposures", index, value: value.to_string() })
 }
 
 /// The first parameter that is not finite.

@@ -32,6 +32,29 @@ fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
 }
 
 #[test]
+fn a_bad_gradient_of_an_exposure_moves_neither_exposures_nor_field() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let mut config = small_config();
+    config.effects.exposure = true;
+    let mut trainer = Trainer::new(dataset, config).unwrap();
+    step(&mut trainer).0.unwrap();
+    let arrays = |trainer: &Trainer| {
+        let exposures = serde_json::to_value(trainer.progress.exposures.as_ref().unwrap()).unwrap();
+        (state(trainer), exposures)
+    };
+    let before = arrays(&trainer);
+    trainer.progress.exposures.as_mut().unwrap().add("cam1", &[0.0, 0.0, f32::INFINITY, 0.0, 0.0, 0.0]);
+    let (result, events) = step(&mut trainer);
+    result.unwrap();
+    let [TrainEvent::RolledBack { fault, .. }] = &events[..] else { panic!("{events:?}") };
+    assert_eq!((fault.part, fault.tensor, fault.index), ("gradients", "gradient of exposures", 8));
+    assert!(arrays(&trainer) == before);
+    step(&mut trainer).0.unwrap();
+    assert!(arrays(&trainer) != before, "the next step moves them");
+}
+
+#[test]
 fn a_bad_gradient_is_rolled_back_told_and_counted() {
     let (mut trainer, _folder) = trainer(3);
     for debug in [false, true] {

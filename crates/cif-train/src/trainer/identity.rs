@@ -37,6 +37,8 @@ impl Trainer {
         self.field.identities = Some(estimated.identities);
         self.optimiser.start_identities(&self.field, self.config.adam.fresh_row_bias_correction);
         self.gradients = Gradients::zeros(&self.field);
+        #[cfg(feature = "wgpu")]
+        self.identities_changed();
         Ok(event)
     }
 

@@ -13,6 +13,7 @@
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `state` | what is saved, and how a run resumes |
+//! | `draw` | how views are rendered between steps |
 //! | `evaluate` | what a run has reached, on a few frames |
 //! | `pacing` | when stages end by time, or by what was reached |
 //! | `times`, `measure` | where the time of a step goes |
@@ -24,6 +25,7 @@
 
 #[cfg(feature = "wgpu")]
 mod device;
+mod draw;
 mod earned;
 mod evaluate;
 mod frames;

@@ -7,13 +7,14 @@ use cif_geometry::{PixelGrid, quaternion};
 use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
 use rand::seq::SliceRandom;
 
+use super::earned::leave_out_held_out;
 use super::frames::TrainFrame;
-use super::guard::gradient_fault;
+use super::guard::{exposure_fault, gradient_fault};
 use super::optimiser::StepRates;
 use super::times::lap;
 use super::{InstancePass, Trainer};
 use crate::adam::PlaneWeights;
-use crate::config::Ablation;
+use crate::config::{Ablation, TrainConfig};
 use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, reset_opacities};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
@@ -26,6 +27,12 @@ use crate::tiles::TileSample;
 
 /// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
 pub(super) const RENORMALISE_EVERY: u64 = 1_000;
+
+/// Learning rate of exposures after so many steps of all stages.
+pub(super) fn exposure_rate(config: &TrainConfig, total_steps: u64) -> f32 {
+    let done = u32::try_from(total_steps).unwrap_or(u32::MAX);
+    log_linear(RATES, done, schedule_steps(config))
+}
 
 /// Memory kept between steps.
 pub(super) struct Scratch {
@@ -164,7 +171,9 @@ impl Trainer {
             if stage == Stage::Coarse {
                 self.leave_out_travelling(data);
             }
-            self.leave_out_judged(stage, iteration, *index);
+            if self.leaves_out_judged(stage, iteration, *index) {
+                leave_out_held_out(&mut self.scratch.v_color);
+            }
             if let (Some(exposure), Some(all)) = (exposure, &mut self.progress.exposures) {
                 let gradient = exposure.pull_back(&pass.color, &mut self.scratch.v_color);
                 all.add(&self.dataset.frames[*index].camera_name, &gradient);
@@ -206,7 +215,9 @@ impl Trainer {
             time_smoothness: self.config.loss.time_smoothness,
             time_sparsity: self.config.loss.time_sparsity,
         };
-        fault = fault.or_else(|| gradient_fault(&self.gradients, &rates));
+        fault = fault
+            .or_else(|| gradient_fault(&self.gradients, &rates))
+            .or_else(|| exposure_fault(self.progress.exposures.as_ref()));
         if fault.is_none() {
             if matches!(stage, Stage::Coarse | Stage::Fine) && iteration < self.config.densify.until {
                 self.statistics.add(&self.gradients);
@@ -225,8 +236,7 @@ impl Trainer {
         }
         if let Some(exposures) = &mut self.progress.exposures {
             if fault.is_none() {
-                let done = u32::try_from(self.progress.total_steps).unwrap_or(u32::MAX);
-                exposures.step(log_linear(RATES, done, schedule_steps(&self.config)));
+                exposures.step(exposure_rate(&self.config, self.progress.total_steps));
             } else {
                 exposures.reset();
             }

@@ -14,7 +14,7 @@ use cif_field::{Field, Gaussians};
 use rand::RngExt;
 
 use super::Trainer;
-use super::earned::{gain, judged_error};
+use super::earned::gain;
 use crate::config::EffectsConfig;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
@@ -53,6 +53,12 @@ pub(super) struct Motion {
 }
 
 impl Trainer {
+    /// Whether Gaussians are tested after a step.
+    pub(super) fn settles(&self, stage: Stage, iteration: u32) -> bool {
+        let last = self.plan.iterations(&self.config, stage);
+        self.field.deformation.is_some() && falls_due(&self.config.effects, stage, iteration, last)
+    }
+
     /// The test for Gaussians that stand still, where it falls on this step: of a ladder of limits, the highest
     /// one counts that does not show in the held-out pixels. What the network moves again is handed back unless
     /// that shows.
@@ -62,8 +68,7 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let last = self.plan.iterations(&self.config, stage);
-        let due = falls_due(&self.config.effects, stage, iteration, last);
+        let due = self.settles(stage, iteration);
         let Some(deformation) = self.field.deformation.as_ref().filter(|_| due) else { return Ok(()) };
         let effects = &self.config.effects;
         let highest = Limits {
@@ -73,12 +78,11 @@ impl Trainer {
         let rows: Vec<u32> = (0..self.field.len() as u32).collect();
         let motions = probe(deformation, &self.field.gaussians, &rows, &probe_times(&self.dataset.times));
         let settings = self.color_settings();
-        let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
-        let before = judged_error(&mut self.renderer, views, &self.field, &settings)?;
+        let allowed = f64::from(effects.still_loss);
+        let before = self.judged_error(None, &settings)?;
         let watched = self.draw_watched(stage);
         let restless = restless(&self.field, &motions, highest);
         let awake: Vec<bool> = watched.iter().zip(&restless).map(|(a, b)| *a || *b).collect();
-        let allowed = f64::from(effects.still_loss);
         // Not far above the rung that held last time, so that few are tried in vain.
         let mut rung = self.progress.still_rung.saturating_sub(1);
         let (mut settled, mut error) = (0, before);
@@ -89,8 +93,7 @@ impl Trainer {
             if found == 0 {
                 break;
             }
-            let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
-            let after = judged_error(&mut self.renderer, views, &trial, &settings)?;
+            let after = self.judged_error(Some(&trial), &settings)?;
             if gain(after, before) <= allowed {
                 (self.field, settled, error) = (trial, found, after);
                 break;
@@ -101,14 +104,13 @@ impl Trainer {
         // Where nothing is trained, the network may do anything: what it says must fit the pictures.
         let mut trial = self.field.clone();
         let (_, mut released) = rest(&mut trial, &motions, Limits::NONE, highest.scaled(RELEASE), &awake);
-        let views = (&self.frames, &self.dataset, self.progress.exposures.as_ref());
-        if trial != self.field
-            && gain(judged_error(&mut self.renderer, views, &trial, &settings)?, error) > allowed
-        {
+        if trial != self.field && gain(self.judged_error(Some(&trial), &settings)?, error) > allowed {
             (trial, released) = (self.field.clone(), 0);
             rest(&mut trial, &motions, Limits::NONE, Limits::NEVER, &watched);
         }
         self.field = trial;
+        #[cfg(feature = "wgpu")]
+        self.gaussians_changed();
         let still = self.field.deformation.as_ref().map_or(0, |d| d.still.iter().filter(|s| **s).count());
         let gaussians = self.field.len();
         events.push(TrainEvent::Settled { stage, iteration, still, settled, released, gaussians });

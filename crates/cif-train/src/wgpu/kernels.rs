@@ -14,6 +14,7 @@ use cif_render::wgpu::{
 pub use cif_render::wgpu::faults as fault;
 
 use crate::adam::{BETA_1, BETA_2, EPSILON};
+use crate::exposure::WIDTH as EXPOSURE_FLOATS;
 use crate::losses::displacement::NO_ROTATION;
 use crate::losses::ssim::{C1, C2};
 use crate::trainer::{FIRST_JUDGED, JUDGED_SPACING};
@@ -113,6 +114,34 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
+    /// Which camera a view is of.
+    pub struct ExposureSettings {
+        /// Pixels of the view.
+        pub pixels: u32,
+        /// Number of the camera.
+        pub camera: u32,
+        /// Pads to 16 bytes.
+        pub unused_0: u32,
+        /// As above.
+        pub unused_1: u32,
+    }
+}
+
+cif_render::shared_struct! {
+    /// What the optimiser's step of exposures depends on.
+    pub struct ExposureRates {
+        /// Cameras.
+        pub cameras: u32,
+        /// Rate with the correction of the first moment.
+        pub rate: f32,
+        /// Correction of the second moment.
+        pub second: f32,
+        /// Pads to 16 bytes.
+        pub unused: u32,
+    }
+}
+
+cif_render::shared_struct! {
     /// How much is added.
     pub struct Accumulation {
         /// Floats, or rows.
@@ -186,6 +215,7 @@ pub fn fault_name(found: u32) -> (&'static str, &'static str) {
         fault::SH => "gradient of sh_coefficients",
         fault::CALIBRATIONS => "gradient of log_calibrations",
         fault::MLP => "gradient of mlp",
+        fault::EXPOSURES => "gradient of exposures",
         fault::COLOR_LOSS => return ("losses", "colour loss"),
         fault::INSTANCE_LOSS => return ("losses", "instance loss"),
         _ => return ("optimiser", "learning rate"),
@@ -208,6 +238,7 @@ const CONSTANTS: Snippet = Snippet {
             ("NO_ROTATION", Constant::Float(NO_ROTATION as f32)),
             ("SH_FLOATS", Constant::Unsigned(SH_FLOATS as u32)),
             ("FRESH", Constant::Unsigned(FRESH)),
+            ("EXPOSURE_FLOATS", Constant::Unsigned(EXPOSURE_FLOATS as u32)),
             ("PAIRS_WORD", Constant::Unsigned(GpuStatistics::PAIRS as u32)),
             ("WANTED_PAIRS_WORD", Constant::Unsigned(GpuStatistics::WANTED_PAIRS as u32)),
             ("JUDGED_SPACING", Constant::Unsigned(JUDGED_SPACING)),
@@ -225,6 +256,10 @@ const GAUSSIAN_RATES: Snippet =
     Snippet { name: "gaussian_rates", text: || structures(&[GaussianRates::layout()]) };
 const GROUP_RATES: Snippet = Snippet { name: "group_rates", text: || structures(&[GroupRates::layout()]) };
 const PLANE_RATES: Snippet = Snippet { name: "plane_rates", text: || structures(&[PlaneRates::layout()]) };
+const EXPOSURE_SETTINGS: Snippet =
+    Snippet { name: "exposure_settings", text: || structures(&[ExposureSettings::layout()]) };
+const EXPOSURE_RATES: Snippet =
+    Snippet { name: "exposure_rates", text: || structures(&[ExposureRates::layout()]) };
 const ACCUMULATION: Snippet =
     Snippet { name: "accumulation", text: || structures(&[Accumulation::layout()]) };
 const REARRANGEMENT: Snippet =
@@ -249,6 +284,24 @@ pub const SSIM: Module = Module {
     imports: &[CONSTANTS, LOSS_SETTINGS],
     bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["blur_rows", "compare", "blur_maps", "add_gradient"],
+};
+
+/// What cameras make of colours, and the way back.
+pub const EXPOSURE: Module = Module {
+    name: "exposure",
+    text: include_str!("exposure.wgsl"),
+    imports: &[CONSTANTS, FAULTS, EXPOSURE_SETTINGS],
+    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["expose", "pull_back", "add_gradient"],
+};
+
+/// Optimiser of exposures.
+pub const ADAM_EXPOSURES: Module = Module {
+    name: "adam_exposures",
+    text: include_str!("adam_exposures.wgsl"),
+    imports: &[CONSTANTS, EXPOSURE_RATES, ADAM],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["adam_exposures"],
 };
 
 /// Optimiser of what Gaussians have.
@@ -327,6 +380,8 @@ pub const DISPLACEMENT: Module = Module {
 pub const MODULES: &[&Module] = &[
     &LOSSES,
     &SSIM,
+    &EXPOSURE,
+    &ADAM_EXPOSURES,
     &ADAM_GAUSSIANS,
     &ADAM_NETWORK,
     &ADAM_PLANES,
@@ -343,6 +398,8 @@ pub const LAYOUTS: &[fn() -> Layout] = &[
     GaussianRates::layout,
     GroupRates::layout,
     PlaneRates::layout,
+    ExposureSettings::layout,
+    ExposureRates::layout,
     Accumulation::layout,
     Judgement::layout,
     Rearrangement::layout,

@@ -4,15 +4,17 @@
 //! | file | stage |
 //! |---|---|
 //! | `losses.wgsl`, `ssim.wgsl` | colour loss with its gradient, value of the instance loss |
+//! | `exposure.wgsl` | what cameras make of colours, and its gradient |
 //! | `judge.wgsl` | whether a step may move anything |
 //! | `rearrange.wgsl` | rows after a change of the set of Gaussians |
 //! | `identity.wgsl` | probabilities of the identity rows |
 //! | `accumulate.wgsl` | sums over the views of a step, statistics of densification |
-//! | `adam_gaussians.wgsl`, `adam_planes.wgsl`, `adam_network.wgsl` | the optimiser |
+//! | `adam_gaussians.wgsl`, `adam_planes.wgsl`, `adam_network.wgsl`, `adam_exposures.wgsl` | the optimiser |
 //! | `displacement.wgsl` | holds travelling objects to their paths, everything else to its place |
 //! | `kernels` | the files, and what they share with Rust |
-//! | `losses`, `judge`, `motion`, `optimiser`, `rearrange` | recording them |
+//! | `losses`, `exposure`, `judge`, `motion`, `optimiser`, `rearrange` | recording them |
 
+pub(crate) mod exposure;
 pub mod judge;
 pub mod kernels;
 pub mod losses;

@@ -24,7 +24,7 @@ pub struct GroupStep {
 
 impl GroupStep {
     /// Rate and correction of the first moment together, and correction of the second.
-    fn corrected(self) -> (f32, f32) {
+    pub(super) fn corrected(self) -> (f32, f32) {
         let bias = BiasCorrection::after(self.steps.max(1));
         (self.rate * bias.first, bias.second)
     }

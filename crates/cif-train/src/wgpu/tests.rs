@@ -9,6 +9,7 @@ use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::validation::validate;
 use cif_render::wgpu::{Commands, GpuDeformation, GpuGaussians, GpuStatistics, GpuVec, Layout, testing};
 
+use super::exposure::{CameraExposures, GpuExposure};
 use super::judge::GpuJudge;
 use super::kernels::{Judgement, LAYOUTS, MODULES, fault, fault_name};
 use super::losses::{GpuLosses, GpuTarget, LossWeights, ViewLoss};
@@ -16,6 +17,7 @@ use super::motion::GpuMotion;
 use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep};
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
 use crate::densify::DensifyStatistics;
+use crate::exposure::{Exposures, RATES, WIDTH};
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
 use crate::losses::{SsimScratch, color_loss};
 
@@ -48,6 +50,7 @@ fn every_file_is_valid_and_lies_as_in_rust() {
 #[test]
 fn faults_have_the_names_of_the_cpu() {
     assert_eq!(fault_name(fault::SH | fault::MLP), ("gradients", "gradient of sh_coefficients"));
+    assert_eq!(fault_name(fault::EXPOSURES), ("gradients", "gradient of exposures"));
     assert_eq!(fault_name(1), ("gradients", "gradient of planes"));
     assert_eq!(fault_name(fault::INSTANCE_LOSS), ("losses", "instance loss"));
     assert_eq!(fault::MAX_GRADIENT, crate::trainer::MAX_GRADIENT, "both backends refuse the same gradients");
@@ -71,6 +74,10 @@ fn four(pixels: &[[f32; 3]]) -> Vec<[f32; 4]> {
     pixels.iter().map(|[r, g, b]| [*r, *g, *b, 0.5]).collect()
 }
 
+fn flat(pixels: &[[f32; 4]]) -> Vec<f32> {
+    pixels.iter().flat_map(|v| [v[0], v[1], v[2]]).collect()
+}
+
 #[test]
 fn colour_losses_and_gradients_are_those_of_the_cpu() {
     let Some(gpu) = testing::gpu() else { return };
@@ -92,8 +99,7 @@ fn colour_losses_and_gradients_are_those_of_the_cpu() {
         let found = ViewLoss::new([slots[2 * slot], slots[2 * slot + 1]], pixels, lambda_dssim);
         assert!((found.color.loss - expected.loss).abs() < 1e-6, "{found:?} {expected:?}");
         assert!((found.color.psnr() - expected.psnr()).abs() < 1e-4, "{found:?} {expected:?}");
-        let found: Vec<f32> =
-            losses.v_colors.read(&gpu).unwrap().iter().flat_map(|v| [v[0], v[1], v[2]]).collect();
+        let found = flat(&losses.v_colors.read(&gpu).unwrap());
         let tolerance = if lambda_dssim > 0.0 { 2e-5 } else { 1e-7 };
         compare("gradient of the colours", &found, v.pixels.as_flattened(), tolerance);
         if lambda_dssim == 0.0 {
@@ -128,6 +134,120 @@ fn instance_losses_count_what_is_labelled_and_unsupported() {
         let expected = -198.0 * 0.5_f64.ln() - 2.0 * 1e-8_f64.ln() + coverage;
         assert_eq!(found.unsupported, 2.0);
         assert!((found.instance_sum / expected - 1.0).abs() < 1e-6, "{} {expected}", found.instance_sum);
+    }
+}
+
+/// Exposures of so many cameras, none of them neutral.
+fn some_exposures(cameras: usize) -> Exposures {
+    let mut exposures = Exposures::neutral((0..cameras).map(|k| format!("camera {k:04}")).collect());
+    let values = (0..cameras * WIDTH).map(|k| 0.2 * wave(k, 0.71)).collect();
+    let zeros = vec![0.0; cameras * WIDTH];
+    exposures.set_arrays([values, zeros.clone(), zeros]);
+    exposures
+}
+
+#[test]
+fn exposed_colours_and_their_gradients_are_those_of_the_cpu() {
+    let Some(gpu) = testing::gpu() else { return };
+    let (rendered, target) = images();
+    let pixels = rendered.pixels.len();
+    let (camera, cameras) = (1, some_exposures(3));
+    let resident = CameraExposures::upload(&gpu, &cameras).unwrap();
+    let mut exposure = GpuExposure::new(&gpu).unwrap();
+    let mut losses = GpuLosses::new(&gpu).unwrap();
+    let on_device = GpuTarget::new(&gpu, &target, None).unwrap();
+    let colors = GpuVec::from_slice(&gpu, "colors", &four(&rendered.pixels)).unwrap();
+    let blended = GpuVec::<[f32; 4]>::zeros(&gpu, "blended", pixels).unwrap();
+    let faults = GpuVec::<u32>::zeros(&gpu, "faults", fault::WORDS).unwrap();
+    // Sums are those in double precision; another view of the camera adds to them.
+    let mut expected = [0.0_f64; WIDTH];
+    for lambda_dssim in [0.0, 0.2] {
+        let of_camera = cameras.at("camera 0001");
+        let mut recorded = rendered.clone();
+        of_camera.apply(&mut recorded);
+        let mut v = PixelGrid::filled(0, 0, [0.0; 3]);
+        let loss = color_loss(&recorded, &target, lambda_dssim, 0.5, &mut v, &mut SsimScratch::default());
+        for (v, color) in v.pixels.iter().zip(&rendered.pixels) {
+            for c in 0..3 {
+                expected[c] += f64::from(v[c]) * f64::from(of_camera.gain[c]) * f64::from(color[c]);
+                expected[3 + c] += f64::from(v[c]);
+            }
+        }
+        of_camera.pull_back(&rendered, &mut v);
+
+        let weights = LossWeights { lambda_dssim, view: 0.5, ..LossWeights::default() };
+        let mut commands = Commands::new(&gpu, None);
+        let v_colors = &losses.v_colors;
+        exposure
+            .expose(&gpu, &mut commands, (&resident, camera), (&colors, pixels), v_colors, &faults)
+            .unwrap();
+        let images = (&exposure.recorded, &blended);
+        losses.record(&gpu, &mut commands, images, &on_device, &weights, 2).unwrap();
+        exposure.pull_back(&gpu, &mut commands, &resident, &colors, &losses.v_colors, &faults);
+        commands.submit();
+        let found = exposure.recorded.read(&gpu).unwrap();
+        compare("recorded", &flat(&found), recorded.pixels.as_flattened(), 1e-6);
+        assert!(found.iter().all(|pixel| pixel[3] == 0.5), "the transmittance stays");
+        let slots = losses.results().read(&gpu).unwrap();
+        let found = ViewLoss::new([slots[4], slots[5]], pixels, lambda_dssim);
+        assert!((found.color.loss - loss.loss).abs() < 1e-6, "{found:?} {loss:?}");
+        let found = flat(&losses.v_colors.read(&gpu).unwrap());
+        let tolerance = if lambda_dssim > 0.0 { 2e-5 } else { 1e-6 };
+        compare("gradient of the colours", &found, v.pixels.as_flattened(), tolerance);
+        let gradients = resident.gradients().read(&gpu).unwrap();
+        let expected = expected.map(|sum| sum as f32);
+        compare("gradient of the exposure", &gradients[WIDTH..2 * WIDTH], &expected, 1e-5);
+        assert!(gradients[..WIDTH].iter().chain(&gradients[2 * WIDTH..]).all(|g| *g == 0.0));
+    }
+    assert_eq!(faults.read(&gpu).unwrap()[0], 0);
+    losses.v_colors.write(&gpu, 700, &[[0.0, 1e25, 0.0, 0.0]]);
+    let mut commands = Commands::new(&gpu, None);
+    exposure.pull_back(&gpu, &mut commands, &resident, &colors, &losses.v_colors, &faults);
+    commands.submit();
+    assert_eq!(faults.read(&gpu).unwrap()[..2], [fault::EXPOSURES, 0]);
+}
+
+#[test]
+fn exposures_move_as_on_the_cpu() {
+    let Some(gpu) = testing::gpu() else { return };
+    let exposure = GpuExposure::new(&gpu).unwrap();
+    let faults = GpuVec::<u32>::zeros(&gpu, "faults", fault::WORDS).unwrap();
+    // More than the kernel has invocations.
+    for cameras in [2, 300] {
+        let mut cpu = some_exposures(cameras);
+        let resident = CameraExposures::upload(&gpu, &cpu).unwrap();
+        for t in 1..=5_u32 {
+            let mut gradients = vec![0.0; cameras * WIDTH];
+            for camera in (0..cameras).filter(|camera| !(camera + t as usize).is_multiple_of(3)) {
+                let gradient: [f32; WIDTH] =
+                    std::array::from_fn(|k| 1e-2 * wave(WIDTH * camera + k, 0.3 + t as f32));
+                cpu.add(&format!("camera {camera:04}"), &gradient);
+                gradients[WIDTH * camera..][..WIDTH].copy_from_slice(&gradient);
+            }
+            cpu.step(RATES[0]);
+            resident.gradients().write(&gpu, 0, &gradients);
+            let mut commands = Commands::new(&gpu, None);
+            exposure.step(&gpu, &mut commands, step_of(RATES[0], t), &resident, &faults);
+            commands.submit();
+        }
+        let found = resident.read(&gpu).unwrap();
+        for ((name, found), expected) in
+            ["exposures", "first moments", "second moments"].iter().zip(&found).zip(cpu.arrays())
+        {
+            compare(name, found, expected, TOLERANCE);
+        }
+        let unused = resident.gradients().read(&gpu).unwrap();
+        assert!(unused.iter().all(|gradient| *gradient == 0.0));
+
+        // While steps wait for the host nothing moves, and gradients are taken all the same.
+        faults.write(&gpu, 1, &[1]);
+        resident.gradients().write(&gpu, 0, &vec![f32::NAN; cameras * WIDTH]);
+        let mut commands = Commands::new(&gpu, None);
+        exposure.step(&gpu, &mut commands, step_of(RATES[0], 6), &resident, &faults);
+        commands.submit();
+        assert_eq!(resident.read(&gpu).unwrap(), found);
+        assert_eq!(resident.gradients().read(&gpu).unwrap(), unused);
+        faults.write(&gpu, 1, &[0]);
     }
 }
 

@@ -10,6 +10,17 @@ use crate::events::{Stage, TrainEvent};
 use crate::schedule::falls_on;
 
 impl Trainer {
+    /// Judgements that fall before the step to come: the host is brought up to date, as the degree of spherical
+    /// harmonics depends on them.
+    pub(super) fn judge_before_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
+        let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
+        if !self.judges_sh(stage, iteration) {
+            return Ok(());
+        }
+        self.fetch_from_device()?;
+        self.judge_sh(stage, iteration, events)
+    }
+
     /// Events that fall on the step just done.
     pub(super) fn rare_events(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
         let (stage, iteration) = (self.progress.stage, self.progress.iteration);
@@ -28,12 +39,13 @@ impl Trainer {
                         || falls_on(iteration, densify.opacity_reset_every))
             }
         };
+        let judges = self.judges_heads(stage, iteration) || self.settles(stage, iteration);
         let is_late = self.device.as_ref().is_some_and(|device| device.since_fetch >= FETCH_EVERY);
-        if !(rearranges || is_late) {
+        if !(rearranges || is_late || judges) {
             return Ok(());
         }
         let start = Instant::now();
-        if rearranges && stage != Stage::Instance && !is_late {
+        if rearranges && stage != Stage::Instance && !is_late && !judges {
             self.densify_on_device(stage, iteration, events)?;
         } else {
             self.fetch_from_device()?;
@@ -44,6 +56,8 @@ impl Trainer {
                 self.densify(stage, iteration, events)?;
                 self.gaussians_changed();
             }
+            self.judge_heads(stage, iteration, events)?;
+            self.settle(stage, iteration, events)?;
         }
         self.times.rearrange += start.elapsed();
         self.times.total += start.elapsed();

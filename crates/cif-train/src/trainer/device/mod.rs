@@ -13,8 +13,10 @@
 //! | `events` | what happens between steps |
 //! | `probe`, `kept` | whether the GPU is faster: trial steps, and undoing them |
 //! | `rearrange` | changes of the set of Gaussians, with their rows staying there |
+//! | `draw` | views between steps |
 //! | `identities` | label mass for the identity stage |
 
+mod draw;
 mod events;
 mod flight;
 mod identities;
@@ -43,6 +45,7 @@ use super::{Trainer, initialize};
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
+use crate::wgpu::exposure::GpuExposure;
 use crate::wgpu::judge::GpuJudge;
 use crate::wgpu::losses::{GpuLosses, GpuTarget};
 use crate::wgpu::motion::GpuMotion;
@@ -60,6 +63,7 @@ pub(super) struct DeviceTraining {
     gpu: Gpu,
     rasterizer: Rasterizer,
     losses: GpuLosses,
+    exposure: GpuExposure,
     optimiser: GpuOptimiser,
     motion: GpuMotion,
     judge: GpuJudge,
@@ -115,6 +119,7 @@ impl Trainer {
         self.device = Some(Box::new(DeviceTraining {
             rasterizer: Rasterizer::new(gpu)?,
             losses: GpuLosses::new(gpu)?,
+            exposure: GpuExposure::new(gpu)?,
             optimiser: GpuOptimiser::new(gpu)?,
             motion: GpuMotion::new(gpu)?,
             judge: GpuJudge::new(gpu)?,
@@ -156,14 +161,9 @@ impl Trainer {
 
     /// Names every setting that is on and not supported.
     fn refuse_unsupported(&self) -> Result<(), TrainError> {
-        let (effects, adam) = (&self.config.effects, &self.config.adam);
         let settings: Vec<&str> = [
             ("stages.tile_share", self.config.stages.tile_share < 1.0),
-            ("adam.fresh_row_bias_correction", adam.fresh_row_bias_correction),
-            ("effects.still_every", effects.still_every > 0),
-            ("effects.sh_gain", effects.sh_gain > 0.0),
-            ("effects.head_gain", effects.head_gain > 0.0),
-            ("effects.exposure", effects.exposure),
+            ("adam.fresh_row_bias_correction", self.config.adam.fresh_row_bias_correction),
         ]
         .into_iter()
         .filter_map(|(name, is_on)| is_on.then_some(name))
@@ -228,7 +228,11 @@ impl Trainer {
         if let Some(resident) = &device.resident
             && device.ahead
         {
-            resident.fetch(&device.gpu, &mut self.field, &mut self.optimiser, &mut self.statistics)?;
+            let exposures = self.progress.exposures.as_mut();
+            let (field, optimiser) = (&mut self.field, &mut self.optimiser);
+            resident.fetch(&device.gpu, field, optimiser, &mut self.statistics, exposures)?;
+            // From here on the host goes on from what it has.
+            device.fetched = Some(self.counters());
         }
         device.ahead = false;
         device.since_fetch = 0;
@@ -269,7 +273,7 @@ impl Trainer {
     /// Says that the host has changed everything.
     pub(super) fn everything_changed(&mut self) {
         if let Some(device) = &mut self.device {
-            device.stale = Stale { gaussians: true, identities: true, deformation: true };
+            device.stale = Stale::EVERYTHING;
         }
     }
 

@@ -10,6 +10,8 @@ use cif_render::wgpu::{
 use super::super::optimiser::Optimiser;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
+use crate::exposure::Exposures;
+use crate::wgpu::exposure::CameraExposures;
 use crate::wgpu::optimiser::GpuMoments;
 
 /// What the host has changed since it was sent.
@@ -18,6 +20,12 @@ pub(super) struct Stale {
     pub(super) gaussians: bool,
     pub(super) identities: bool,
     pub(super) deformation: bool,
+    pub(super) exposures: bool,
+}
+
+impl Stale {
+    pub(super) const EVERYTHING: Self =
+        Self { gaussians: true, identities: true, deformation: true, exposures: true };
 }
 
 /// The deformation with its moments (planes, network) and gradients.
@@ -50,6 +58,7 @@ pub(super) struct Resident {
     pub(super) statistics: GpuVec<[f32; 4]>,
     pub(super) deformation: Option<ResidentDeformation>,
     pub(super) identities: Option<ResidentIdentities>,
+    pub(super) exposures: Option<CameraExposures>,
 }
 
 /// Moments of the Gaussians in the layout of the device: first or second.
@@ -133,6 +142,7 @@ impl Resident {
             statistics: GpuVec::zeros(gpu, "statistics of densification", 0)?,
             deformation: None,
             identities: None,
+            exposures: None,
         })
     }
 
@@ -144,6 +154,7 @@ impl Resident {
         field: &Field,
         optimiser: &Optimiser,
         statistics: &DensifyStatistics,
+        exposures: Option<&Exposures>,
     ) -> Result<(), GpuError> {
         if stale.gaussians {
             let n = field.gaussians.len();
@@ -185,6 +196,10 @@ impl Resident {
                 }
             };
         }
+        if stale.exposures {
+            self.exposures =
+                exposures.map(|exposures| CameraExposures::upload(gpu, exposures)).transpose()?;
+        }
         if stale.identities {
             self.identities = match &field.identities {
                 None => None,
@@ -201,6 +216,7 @@ impl Resident {
         field: &mut Field,
         optimiser: &mut Optimiser,
         statistics: &mut DensifyStatistics,
+        exposures: Option<&mut Exposures>,
     ) -> Result<(), TrainError> {
         // Everything is read before anything is changed, so that a device lost on the way leaves the host whole.
         let parameters = (self.canonical.geometry.read(gpu)?, self.canonical.sh.read(gpu)?);
@@ -231,12 +247,16 @@ impl Resident {
                 resident.moments.second.read(gpu)?,
             ]),
         };
+        let of_cameras = self.exposures.as_ref().map(|resident| resident.read(gpu)).transpose()?;
         debug_assert_eq!(geometry(&field.gaussians).len(), parameters.0.len(), "the set changes on the host");
         field.gaussians = gaussians(&parameters.0, parameters.1);
         for (second, rows) in [false, true].into_iter().zip(moments) {
             set_moment_rows(optimiser, second, rows);
         }
         *statistics = statistics_of(&rows);
+        if let (Some(target), Some(arrays)) = (exposures, of_cameras) {
+            target.set_arrays(arrays);
+        }
         if let (Some(target), Some(([planes, first, second], [mlp, mlp_first, mlp_second]))) =
             (&mut field.deformation, deformation)
         {

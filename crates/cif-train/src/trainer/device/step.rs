@@ -10,7 +10,7 @@ use cif_render::RenderSettings;
 use super::super::frames::TrainFrame;
 use super::super::guard::MAX_RATE;
 use super::super::optimiser::StepRates;
-use super::super::step::{RENORMALISE_EVERY, StepLoss};
+use super::super::step::{RENORMALISE_EVERY, StepLoss, exposure_rate};
 use super::super::{InstancePass, Trainer};
 use super::DeviceTraining;
 use super::flight::Flight;
@@ -28,6 +28,10 @@ pub(super) struct StepView {
     pub(super) view: usize,
     pub(super) index: usize,
     pub(super) frame: Arc<TrainFrame>,
+    /// Whether the pixels that effects are judged by train nothing.
+    pub(super) leaves_judged: bool,
+    /// Number of the camera among those whose exposures are learnt.
+    pub(super) camera: Option<u32>,
 }
 
 /// A step, so that it can be recorded, and recorded again.
@@ -43,6 +47,7 @@ pub(super) struct StepPlan {
     pub(super) calibration: GroupStep,
     pub(super) planes: GroupStep,
     pub(super) mlp: GroupStep,
+    pub(super) exposures: GroupStep,
     /// Groups that move, as bits of the fault word.
     pub(super) moving: u32,
     /// What is wrong with the step before it is recorded, likewise.
@@ -65,6 +70,7 @@ impl StepPlan {
             (fault::CALIBRATIONS, &mut self.calibration),
             (fault::PLANES, &mut self.planes),
             (fault::MLP, &mut self.mlp),
+            (fault::EXPOSURES, &mut self.exposures),
         ];
         for (bit, group) in counted {
             group.steps -= u32::from(groups & bit != 0);
@@ -79,8 +85,12 @@ impl Trainer {
         &mut self,
         events: &mut Vec<TrainEvent>,
     ) -> Result<StepLoss, TrainError> {
-        let result = if self.debug_validation { self.validated_step(events) } else { self.unwatched_step() };
-        let result = result.and_then(|()| self.rare_events(events));
+        let result = self
+            .judge_before_step(events)
+            .and_then(
+                |()| if self.debug_validation { self.validated_step(events) } else { self.unwatched_step() },
+            )
+            .and_then(|()| self.rare_events(events));
         events.append(&mut self.arrived);
         result.map_err(|error| self.device_failed(error))?;
         Ok(self.last_loss)
@@ -120,10 +130,12 @@ impl Trainer {
     pub(super) fn send(&mut self, device: &mut DeviceTraining) -> Result<(), TrainError> {
         if device.resident.is_none() {
             device.resident = Some(Resident::new(&device.gpu)?);
-            device.stale = Stale { gaussians: true, identities: true, deformation: true };
+            device.stale = Stale::EVERYTHING;
         }
         let Some(resident) = &mut device.resident else { return Ok(()) };
-        resident.send(&device.gpu, device.stale, &self.field, &self.optimiser, &self.statistics)?;
+        let exposures = self.progress.exposures.as_ref();
+        let (field, optimiser) = (&self.field, &self.optimiser);
+        resident.send(&device.gpu, device.stale, field, optimiser, &self.statistics, exposures)?;
         if device.stale.gaussians {
             device.motion.send(&device.gpu, self.guide_of())?;
             device.losses.leave_out(&device.gpu, self.travelling_labels().unwrap_or(&[]))?;
@@ -139,7 +151,16 @@ impl Trainer {
         for k in 0..batch {
             let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));
             let frame = self.frames.get(&self.dataset, view)?;
-            views.push(StepView { view, index: self.frames.index(view), frame });
+            let index = self.frames.index(view);
+            let name = &self.dataset.frames[index].camera_name;
+            let camera = self.progress.exposures.as_ref().and_then(|all| all.position(name));
+            views.push(StepView {
+                view,
+                index,
+                frame,
+                leaves_judged: self.leaves_out_judged(stage, iteration, index),
+                camera: camera.map(|camera| camera as u32),
+            });
         }
         let settings = RenderSettings {
             instances: (stage == Stage::Instance && self.instance_pass == InstancePass::On)
@@ -195,6 +216,14 @@ impl Trainer {
             planes = group(&mut optimiser.planes, fault::PLANES, rates.planes, rates.planes);
             mlp = group(&mut optimiser.mlp, fault::MLP, rates.mlp, rates.mlp);
         }
+        let mut exposures = GroupStep::default();
+        if let Some(all) = &mut self.progress.exposures {
+            let steps = all.steps_mut();
+            *steps += 1;
+            moving |= fault::EXPOSURES;
+            exposures =
+                GroupStep { rate: exposure_rate(&self.config, self.progress.total_steps), steps: *steps };
+        }
         Ok(StepPlan {
             labelled: views.iter().map(|view| view.frame.labelled).sum(),
             views,
@@ -210,6 +239,7 @@ impl Trainer {
             calibration,
             planes,
             mlp,
+            exposures,
             moving,
             known,
             gaussians: self.field.gaussians.len(),
@@ -232,6 +262,9 @@ impl Trainer {
         ];
         for (bit, moments) in counted {
             moments.steps -= u32::from(groups & bit != 0);
+        }
+        if let Some(exposures) = &mut self.progress.exposures {
+            *exposures.steps_mut() -= u32::from(groups & fault::EXPOSURES != 0);
         }
     }
 

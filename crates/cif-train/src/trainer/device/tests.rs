@@ -11,16 +11,19 @@ use crate::clock::{Clock, Seconds};
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::exposure::Exposures;
 use crate::trainer::MAX_ROLLBACKS_IN_A_ROW;
 
-fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
+pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
     let mut config = small_config();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (6, 12, 6);
     config.stages.batch = 2;
     config.report.step_every = 1;
+    config.effects.exposure = true;
     let mut trainer = Trainer::new(dataset, config).unwrap();
+    assert!(trainer.progress.exposures.is_some());
     if let Some(gpu) = gpu {
         trainer.use_gpu(gpu).unwrap();
     }
@@ -28,44 +31,53 @@ fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
 }
 
 /// What steps change, brought to the host.
-fn state(trainer: &mut Trainer) -> (Field, Optimiser, DensifyStatistics) {
+fn state(trainer: &mut Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
     trainer.fetch_from_device().unwrap();
-    (trainer.field.clone(), trainer.optimiser.clone(), trainer.statistics.clone())
+    host(trainer)
+}
+
+/// What the host has of it.
+fn host(trainer: &Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
+    let exposures = trainer.progress.exposures.clone().unwrap();
+    (trainer.field.clone(), trainer.optimiser.clone(), trainer.statistics.clone(), exposures)
 }
 
 /// One step, and what it told.
-fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
+pub(super) fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainEvent>) {
     let mut events = Vec::new();
     let result = trainer.step(&mut events).map(drop);
     (result, events)
 }
 
-/// Puts a value into the gradients of the next step, behind the back of everything.
-fn damage(trainer: &mut Trainer, geometry: [f32; 12]) {
+/// Puts a value into the gradients of the next step, behind the back of everything: into those of a Gaussian's
+/// geometry, or of the exposures.
+fn damage(trainer: &mut Trainer, column: Option<usize>, value: f32) {
     let device = trainer.device.as_mut().unwrap();
     let resident = device.resident.as_ref().unwrap();
-    resident.gradients.geometry.write(&device.gpu, 3, &[geometry]);
-}
-
-fn only(column: usize, value: f32) -> [f32; 12] {
-    let mut row = [0.0; 12];
-    row[column] = value;
-    row
+    match column {
+        Some(column) => {
+            let mut row = [0.0; 12];
+            row[column] = value;
+            resident.gradients.geometry.write(&device.gpu, 3, &[row]);
+        }
+        None => resident.exposures.as_ref().unwrap().gradients().write(&device.gpu, 7, &[value]),
+    }
 }
 
 #[test]
 fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_not_been() {
     let Some(gpu) = testing::gpu() else { return };
-    for (geometry, tensor) in [
-        (only(1, f32::NAN), "gradient of means"),
-        (only(3, 1e25), "gradient of opacity_logits"),
-        (only(9, f32::INFINITY), "gradient of quaternions"),
+    for (column, value, tensor) in [
+        (Some(1), f32::NAN, "gradient of means"),
+        (Some(3), 1e25, "gradient of opacity_logits"),
+        (Some(9), f32::INFINITY, "gradient of quaternions"),
+        (None, f32::NAN, "gradient of exposures"),
     ] {
         let (mut trainer, _folder) = trainer(Some(&gpu));
         step(&mut trainer).0.unwrap();
         let before = state(&mut trainer);
         let (iteration, counters) = (trainer.iteration(), before.1.groups().map(|(_, m)| m.steps));
-        damage(&mut trainer, geometry);
+        damage(&mut trainer, column, value);
         let mut told = Vec::new();
         for _ in 0..4 {
             let (result, events) = step(&mut trainer);
@@ -91,6 +103,9 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
             assert_eq!(*now, then + 3, "{name}");
             assert!(moments.first.iter().all(|v| v.is_finite()));
         }
+        let mut exposures = trainer.progress.exposures.clone().unwrap();
+        assert_eq!(*exposures.steps_mut(), *before.3.clone().steps_mut() + 3);
+        assert!(exposures.arrays()[0].iter().all(|value| value.is_finite() && *value != 0.0));
         // The same steps without the bad one.
         let (mut other, _folder) = self::trainer(Some(&gpu));
         step(&mut other).0.unwrap();
@@ -247,7 +262,7 @@ fn a_device_lost_after_a_change_of_the_set_leaves_what_was_fetched_before_it() {
     let error = (0..20).find_map(|_| step(&mut trainer).0.err()).expect("the device is lost");
     assert!(matches!(error, TrainError::Gpu(_)), "{error}");
     assert_eq!((trainer.iteration(), trainer.steps_done()), (1, 1));
-    assert!((trainer.field.clone(), trainer.optimiser.clone(), trainer.statistics.clone()) == before);
+    assert!(host(&trainer) == before);
 }
 
 #[test]

@@ -22,7 +22,9 @@ impl Trainer {
         let Some(resident) = &device.resident else { return Ok(unknown) };
         // The trial may change anything: all of it is put back.
         let kept = self.keep();
-        let fetched = resident.fetch(&device.gpu, &mut self.field, &mut self.optimiser, &mut self.statistics);
+        let exposures = self.progress.exposures.as_mut();
+        let (field, optimiser) = (&mut self.field, &mut self.optimiser);
+        let fetched = resident.fetch(&device.gpu, field, optimiser, &mut self.statistics, exposures);
         let mut events = Vec::new();
         let result = fetched.and_then(|()| {
             self.uncount(plan.moving);
@@ -51,6 +53,7 @@ impl Trainer {
     pub(super) fn validated_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
         self.fetch_from_device()?;
         let (snapshot, statistics) = (self.snapshot(), self.statistics.clone());
+        let exposures = self.progress.exposures.clone();
         let psnr_before = self.progress.psnr;
         let fault = match self.fault_before_step() {
             Some(fault) => {
@@ -68,6 +71,7 @@ impl Trainer {
         self.progress.iteration -= 1;
         let undone = self.roll_back(fault, snapshot, psnr_before, events);
         self.statistics = statistics;
+        self.progress.exposures = exposures;
         self.everything_changed();
         self.progress.iteration += 1;
         if undone.is_err() {

@@ -35,6 +35,7 @@ impl Trainer {
             gpu,
             rasterizer,
             losses,
+            exposure,
             optimiser,
             motion,
             targets,
@@ -89,12 +90,23 @@ impl Trainer {
                 .instances
                 .is_some_and(|instances| instances.normalisation == InstanceNormalisation::Coverage),
             leaves_out: plan.stage == Stage::Coarse && self.travelling_labels().is_some(),
-            leaves_judged: false,
+            leaves_judged: view.leaves_judged,
         };
-        let images = (rasterizer.colors(), rasterizer.blended());
+        let exposed = resident.exposures.as_ref().zip(view.camera);
+        let colors = rasterizer.colors();
+        let mut recorded = colors;
+        if let Some(camera) = exposed {
+            let pixels = target.size[0] as usize * target.size[1] as usize;
+            exposure.expose(gpu, &mut commands, camera, (colors, pixels), &losses.v_colors, faults)?;
+            recorded = &exposure.recorded;
+        }
+        let images = (recorded, rasterizer.blended());
         losses.record(gpu, &mut commands, images, target, &weights, *slot)?;
         if plan.stage == Stage::Instance && !self.config.instance.color_loss {
             commands.clear(&losses.v_colors);
+        }
+        if let Some((cameras, _)) = exposed {
+            exposure.pull_back(gpu, &mut commands, cameras, colors, &losses.v_colors, faults);
         }
         rasterizer.backward(gpu, &mut commands, posed, rows, labels, &losses.v_colors)?;
 
@@ -179,6 +191,9 @@ impl Trainer {
                     faults,
                 );
             }
+            if let Some(cameras) = &resident.exposures {
+                exposure.step(gpu, &mut commands, plan.exposures, cameras, faults);
+            }
             if let Some(deformation) = &resident.deformation {
                 optimiser.step_deformation(
                     gpu,
@@ -241,7 +256,7 @@ fn add_stage_times(times: &mut StepTimes, stages: &[(&'static str, Duration)]) {
             "project" => &mut render.project,
             "sort by depth" | "bin" | "emit" | "sort by tile" | "ranges" => &mut render.bin,
             "rasterize" => &mut render.rasterize,
-            "losses" => &mut times.losses,
+            "losses" | "exposure" => &mut times.losses,
             "cotangents" | "rasterize backward" => &mut render.rasterize_backward,
             "gather gradients" | "project backward" | "identity backward" | "guidance" => {
                 &mut render.project_backward
