@@ -212,6 +212,11 @@ impl Moments {
             picked
         };
         (self.first, self.second) = (pick(&self.first), pick(&self.second));
+        self.gather_births(origins);
+    }
+
+    /// The part of [`Self::gather`] that tells when rows were made.
+    pub(crate) fn gather_births(&mut self, origins: &[Option<u32>]) {
         if !self.births.is_empty() {
             self.births =
                 origins.iter().map(|o| o.map_or(self.steps, |row| self.births[row as usize])).collect();

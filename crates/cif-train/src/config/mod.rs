@@ -158,8 +158,7 @@ pub struct RatesConfig {
 #[serde(default, deny_unknown_fields)]
 pub struct AdamConfig {
     /// Rows made after the start correct their bias from their own first step, default off: they share the
-    /// group's step count, and their first step is 3.16 times the rate (methods reference 7, row 26). Runs on the
-    /// processor alone.
+    /// group's step count, and their first step is 3.16 times the rate (methods reference 7, row 26).
     pub fresh_row_bias_correction: bool,
     /// Rows not visible in any view of a step keep still instead of moving by their momentum, default off.
     pub visible_rows_only: bool,

@@ -270,12 +270,23 @@ impl Optimiser {
         }
     }
 
-    /// Zero moments for another number of Gaussians; steps stay counted.
-    pub(super) fn resize_rows(&mut self, n: usize) {
+    /// Follows a change of the set whose moments are elsewhere, which are zero here.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn gather_births(&mut self, origins: &[Option<u32>]) {
         for moments in self.gaussian_groups_mut() {
-            moments.first = vec![0.0; n * moments.width];
-            moments.second = vec![0.0; n * moments.width];
+            moments.first = vec![0.0; origins.len() * moments.width];
+            moments.second = vec![0.0; origins.len() * moments.width];
+            moments.gather_births(origins);
         }
+    }
+
+    /// Steps after which the rows of Gaussians were made, a row after another; empty where all share the steps of
+    /// their group.
+    #[cfg(feature = "wgpu")]
+    pub(super) fn births(&self) -> Vec<u32> {
+        let groups =
+            [&self.means, &self.log_scales, &self.quaternions, &self.opacity, &self.occupancy, &self.sh];
+        (0..self.means.births.len()).flat_map(|row| groups.map(|moments| moments.births[row])).collect()
     }
 
     /// Follows a relocation: fresh moments for relocated rows, and for opacity and occupancy of sources.

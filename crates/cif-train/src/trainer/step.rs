@@ -363,7 +363,8 @@ impl Trainer {
         #[cfg(not(feature = "wgpu"))]
         let follows = false;
         if follows {
-            self.optimiser.resize_rows(change.gaussians.len());
+            #[cfg(feature = "wgpu")]
+            self.optimiser.gather_births(&change.origins);
         } else {
             self.optimiser.gather(&change.origins);
         }

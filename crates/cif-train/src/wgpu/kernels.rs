@@ -68,12 +68,14 @@ cif_render::shared_struct! {
         pub lowest_occupancy: f32,
         /// As above.
         pub highest_occupancy: f32,
+        /// 1 when rows have corrections of their own age, which rates then lack.
+        pub own_corrections: u32,
+        /// Steps done of the coefficients, this one included.
+        pub sh_steps: u32,
         /// Pads to 16 bytes.
-        pub unused_0: f32,
-        /// As above.
-        pub unused_1: f32,
-        /// As above.
-        pub unused_2: f32,
+        pub unused: u32,
+        /// Steps done of the geometry, this one included.
+        pub geometry_steps: [[u32; 4]; 3],
     }
 }
 
@@ -90,12 +92,12 @@ cif_render::shared_struct! {
         pub second: f32,
         /// Parameters stay within plus and minus this.
         pub limit: f32,
+        /// 1 when floats have corrections of their own age, which the rate then lacks.
+        pub own_corrections: u32,
+        /// Steps done, this one included.
+        pub steps: u32,
         /// Pads to 16 bytes.
-        pub unused_0: f32,
-        /// As above.
-        pub unused_1: f32,
-        /// As above.
-        pub unused_2: f32,
+        pub unused: u32,
     }
 }
 
@@ -169,6 +171,10 @@ cif_render::shared_struct! {
     }
 }
 
+/// Groups of a Gaussian whose rows remember when they were made: centres, log-scales, quaternions, opacity, occupancy,
+/// coefficients.
+pub const BIRTH_GROUPS: usize = 6;
+
 /// Bit of an origin that marks a fresh row.
 pub const FRESH: u32 = 1 << 31;
 
@@ -237,6 +243,7 @@ const CONSTANTS: Snippet = Snippet {
             ("SSIM_C2", Constant::Float(C2)),
             ("NO_ROTATION", Constant::Float(NO_ROTATION as f32)),
             ("SH_FLOATS", Constant::Unsigned(SH_FLOATS as u32)),
+            ("BIRTH_GROUPS", Constant::Unsigned(BIRTH_GROUPS as u32)),
             ("FRESH", Constant::Unsigned(FRESH)),
             ("EXPOSURE_FLOATS", Constant::Unsigned(EXPOSURE_FLOATS as u32)),
             ("PAIRS_WORD", Constant::Unsigned(GpuStatistics::PAIRS as u32)),
@@ -309,7 +316,7 @@ pub const ADAM_GAUSSIANS: Module = Module {
     name: "adam_gaussians",
     text: include_str!("adam_gaussians.wgsl"),
     imports: &[CONSTANTS, GAUSSIAN_RATES, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, ReadWrite],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, ReadWrite, Read, Read],
     entries: &["adam_geometry", "adam_sh"],
 };
 
@@ -318,7 +325,7 @@ pub const ADAM_NETWORK: Module = Module {
     name: "adam_network",
     text: include_str!("adam_network.wgsl"),
     imports: &[CONSTANTS, GROUP_RATES, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, Read],
     entries: &["adam_network"],
 };
 

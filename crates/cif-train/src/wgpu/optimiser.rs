@@ -13,6 +13,9 @@ use super::kernels::{
 };
 use crate::adam::{BiasCorrection, PlaneWeights, factors};
 
+/// Ages with corrections of their own; older ones have none left in single precision.
+const AGES: usize = 1 << 15;
+
 /// Rate of a group and the steps that it has done with this one.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct GroupStep {
@@ -25,6 +28,14 @@ pub struct GroupStep {
 impl GroupStep {
     /// Rate and correction of the first moment together, and correction of the second.
     pub(super) fn corrected(self) -> (f32, f32) {
+        self.corrected_unless(false)
+    }
+
+    /// The same, but no corrections where rows have their `own`.
+    fn corrected_unless(self, own: bool) -> (f32, f32) {
+        if own {
+            return (self.rate, 1.0);
+        }
         let bias = BiasCorrection::after(self.steps.max(1));
         (self.rate * bias.first, bias.second)
     }
@@ -55,6 +66,8 @@ pub struct GaussianStep {
     pub renormalise: bool,
     /// Limits of the occupancy logit.
     pub occupancy_limits: Option<[f32; 2]>,
+    /// Rows correct their bias from when they were made.
+    pub own_corrections: bool,
 }
 
 impl GaussianStep {
@@ -67,14 +80,16 @@ impl GaussianStep {
             (self.quaternions, 8..12),
         ];
         let mut rates = GaussianRates::default();
+        let own = self.own_corrections;
         for (group, components) in groups {
-            let (rate, second) = group.corrected();
+            let (rate, second) = group.corrected_unless(own);
             for k in components {
+                rates.geometry_steps[k / 4][k % 4] = group.steps;
                 rates.geometry[k / 4][k % 4] = rate;
                 rates.geometry_second[k / 4][k % 4] = second;
             }
         }
-        let (sh_base, sh_second) = self.sh.corrected();
+        let (sh_base, sh_second) = self.sh.corrected_unless(own);
         let [low, high] = self.occupancy_limits.unwrap_or([f32::MIN, f32::MAX]);
         GaussianRates {
             gaussians: gaussians as u32,
@@ -82,10 +97,12 @@ impl GaussianStep {
             renormalise: u32::from(self.renormalise),
             sh_active: self.sh_active as u32,
             sh_base,
-            sh_rest: GroupStep { rate: self.sh_rest, ..self.sh }.corrected().0,
+            sh_rest: GroupStep { rate: self.sh_rest, ..self.sh }.corrected_unless(own).0,
             sh_second,
             lowest_occupancy: low,
             highest_occupancy: high,
+            own_corrections: u32::from(own),
+            sh_steps: self.sh.steps,
             ..rates
         }
     }
@@ -121,6 +138,10 @@ pub struct GpuOptimiser {
     calibration_rates: Uniform<GroupRates>,
     plane_rates: Uniform<PlaneRates>,
     plane_places: GpuVec<[u32; 4]>,
+    /// By age, where any row has its own.
+    corrections: GpuVec<[f32; 2]>,
+    /// Of what has no rows of its own.
+    no_births: GpuVec<u32>,
     counts: [Uniform<Accumulation>; 6],
     geometry: Kernel,
     sh: Kernel,
@@ -158,6 +179,8 @@ impl GpuOptimiser {
             calibration_rates: Uniform::new(gpu, "rates of the calibrations", &GroupRates::default()),
             plane_rates: Uniform::new(gpu, "rates of the planes", &PlaneRates::default()),
             plane_places: GpuVec::zeros(gpu, "places of the planes", 0)?,
+            corrections: GpuVec::zeros(gpu, "corrections by age", 0)?,
+            no_births: GpuVec::zeros(gpu, "no births", 0)?,
             counts: std::array::from_fn(|_| Uniform::new(gpu, "count", &Accumulation::default())),
             geometry,
             sh,
@@ -168,6 +191,18 @@ impl GpuOptimiser {
             add_statistics,
             identity,
         })
+    }
+
+    /// Gets ready for rows that correct their bias from when they were made.
+    ///
+    /// # Errors
+    /// When the device is out of memory.
+    pub fn allow_own_corrections(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
+        // Nothing has an age of 0 when it moves.
+        let bias = |age: usize| BiasCorrection::after(age.max(1) as u32);
+        let by_age: Vec<[f32; 2]> = (0..AGES).map(bias).map(|bias| [bias.first, bias.second]).collect();
+        self.corrections.replace(gpu, &by_age)?;
+        Ok(())
     }
 
     fn count(&self, gpu: &Gpu, count: Count, value: usize) -> &Uniform<Accumulation> {
@@ -277,14 +312,15 @@ impl GpuOptimiser {
     }
 
     /// Records the step of all Gaussians; gradients become zero. While the second word of `faults` makes steps wait,
-    /// nothing moves here and in the steps of the other groups. `moments` are the first and the second.
+    /// nothing moves here and in the steps of the other groups. `moments` are the first and the second, `births` the
+    /// steps after which rows were made, `[N, BIRTH_GROUPS]`, or nothing.
     pub fn step_gaussians(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         step: &GaussianStep,
         (parameters, gradients): (&GpuGaussians, &GpuGaussians),
-        moments: &[GpuGaussians; 2],
+        (moments, births): (&[GpuGaussians; 2], &GpuVec<u32>),
         screen: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) {
@@ -301,6 +337,8 @@ impl GpuOptimiser {
                 second.geometry.binding(),
                 screen.binding(),
                 faults.binding(),
+                births.binding(),
+                self.corrections.binding(),
             ],
         );
         let sh = self.sh.bind(
@@ -313,6 +351,8 @@ impl GpuOptimiser {
                 second.sh.binding(),
                 screen.binding(),
                 faults.binding(),
+                births.binding(),
+                self.corrections.binding(),
             ],
         );
         commands.stage("optimiser: Gaussians", |stage| {
@@ -321,21 +361,32 @@ impl GpuOptimiser {
         });
     }
 
-    /// Records the step of the calibrations, which stay within plus and minus `limit`.
+    /// Records the step of the calibrations, which stay within plus and minus `limit`; they correct their bias from
+    /// when they were made where `births` are given.
     pub fn step_calibrations(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         (step, limit): (GroupStep, f32),
         (parameters, gradients): (&GpuVec<f32>, &GpuVec<f32>),
-        moments: &GpuMoments,
+        (moments, births): (&GpuMoments, &GpuVec<u32>),
         faults: &GpuVec<u32>,
     ) {
-        let (rate, second) = step.corrected();
+        let own = !births.is_empty();
+        let (rate, second) = step.corrected_unless(own);
         let floats = parameters.len();
         self.calibration_rates.write(
             gpu,
-            &GroupRates { floats: floats as u32, parts: 1, rate, second, limit, ..GroupRates::default() },
+            &GroupRates {
+                floats: floats as u32,
+                parts: 1,
+                rate,
+                second,
+                limit,
+                own_corrections: u32::from(own),
+                steps: step.steps,
+                ..GroupRates::default()
+            },
         );
         let group = self.network.bind(
             gpu,
@@ -346,6 +397,8 @@ impl GpuOptimiser {
                 moments.first.binding(),
                 moments.second.binding(),
                 faults.binding(),
+                births.binding(),
+                self.corrections.binding(),
             ],
         );
         commands.stage("optimiser: Gaussians", |s| s.dispatch(&self.network, &group, workgroups(floats, 64)));
@@ -403,6 +456,8 @@ impl GpuOptimiser {
                 of_network.first.binding(),
                 of_network.second.binding(),
                 faults.binding(),
+                self.no_births.binding(),
+                self.corrections.binding(),
             ],
         );
         commands.stage("optimiser: planes", |stage| {

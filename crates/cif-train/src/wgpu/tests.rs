@@ -264,6 +264,15 @@ fn step_of(rate: f32, steps: u32) -> GroupStep {
 
 #[test]
 fn gaussians_move_as_on_the_cpu() {
+    gaussians_move(false);
+}
+
+#[test]
+fn rows_made_later_correct_their_bias_as_on_the_cpu() {
+    gaussians_move(true);
+}
+
+fn gaussians_move(own_corrections: bool) {
     let Some(gpu) = testing::gpu() else { return };
     let n = 150;
     let start = some_gaussians(n, 0.31, 1.0);
@@ -273,11 +282,15 @@ fn gaussians_move_as_on_the_cpu() {
     let screen: Vec<[f32; 4]> = (0..n).map(|r| [0.0, 0.0, 1.0, f32::from(r % 4 != 1)]).collect();
     let on_device = GpuVec::from_slice(&gpu, "screen", &screen).unwrap();
     let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
-    let optimiser = GpuOptimiser::new(&gpu).unwrap();
+    let mut optimiser = GpuOptimiser::new(&gpu).unwrap();
+    let mut births = GpuVec::<u32>::zeros(&gpu, "births", 0).unwrap();
+    if own_corrections {
+        optimiser.allow_own_corrections(&gpu).unwrap();
+    }
     let visible: Vec<f32> = screen.iter().map(|row| row[3]).collect();
 
     let mut cpu = start.clone();
-    let group = |width| Moments::zeros(n, width, false);
+    let group = |width| Moments::zeros(n, width, own_corrections);
     let mut m = [group(3), group(3), group(4), group(1), group(1), group(SH_FLOATS)];
     for t in 1..=6_u32 {
         let (visible_only, occupancy) = (t > 3, if t > 2 { 1e-2 } else { 0.0 });
@@ -285,6 +298,18 @@ fn gaussians_move_as_on_the_cpu() {
         let mut g = some_gaussians(n, 0.17 + t as f32 * 0.05, if t == 2 { 1e-22 } else { 1e-3 });
         gradients.geometry.write(&gpu, 0, &geometry(&g));
         gradients.sh.write(&gpu, 0, &g.sh_coefficients);
+        if own_corrections && t > 1 {
+            // Some rows are made anew after every step, and the opacity of all after the fourth.
+            for (group, moments) in m.iter_mut().enumerate() {
+                let steps = moments.steps;
+                for row in 0..n {
+                    if row % 7 == t as usize || (group == 3 && t == 5) {
+                        moments.births[row] = steps;
+                    }
+                }
+            }
+        }
+        let born: Vec<Vec<u32>> = m.iter().map(|moments| moments.births.clone()).collect();
         let visible = visible_only.then_some(&visible[..]);
         let uniform = RowRates::Uniform;
         m[0].step(cpu.means.as_flattened_mut(), g.means.as_flattened_mut(), uniform(2e-3), visible).unwrap();
@@ -310,6 +335,10 @@ fn gaussians_move_as_on_the_cpu() {
             visible,
         )
         .unwrap();
+        if own_corrections {
+            let of_row = |row: usize| std::array::from_fn::<u32, 6, _>(|group| born[group][row]);
+            births.replace(&gpu, &(0..n).flat_map(of_row).collect::<Vec<u32>>()).unwrap();
+        }
         let step = GaussianStep {
             means: step_of(2e-3, t),
             log_scales: step_of(5e-3, t),
@@ -320,6 +349,7 @@ fn gaussians_move_as_on_the_cpu() {
             sh_rest: 1.25e-4,
             sh_active: 27,
             visible_only,
+            own_corrections,
             ..GaussianStep::default()
         };
         let mut commands = Commands::new(&gpu, None);
@@ -328,7 +358,7 @@ fn gaussians_move_as_on_the_cpu() {
             &mut commands,
             &step,
             (&parameters, &gradients),
-            &moments,
+            (&moments, &births),
             &on_device,
             &faults,
         );
@@ -362,6 +392,7 @@ fn limits_and_unit_quaternions() {
     let parameters = GpuGaussians::upload(&gpu, &start).unwrap();
     let moments = [GpuGaussians::zeros(&gpu, 3).unwrap(), GpuGaussians::zeros(&gpu, 3).unwrap()];
     let screen = GpuVec::<[f32; 4]>::zeros(&gpu, "screen", 3).unwrap();
+    let no_births = GpuVec::<u32>::zeros(&gpu, "births", 0).unwrap();
     let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
     let optimiser = GpuOptimiser::new(&gpu).unwrap();
     let gradients = GpuGaussians::upload(&gpu, &some_gaussians(3, 0.2, 1e-3)).unwrap();
@@ -380,7 +411,7 @@ fn limits_and_unit_quaternions() {
         &mut commands,
         &step,
         (&parameters, &gradients),
-        &moments,
+        (&moments, &no_births),
         &screen,
         &faults,
     );
@@ -401,7 +432,7 @@ fn limits_and_unit_quaternions() {
         &mut commands,
         &step,
         (&parameters, &gradients),
-        &moments,
+        (&moments, &no_births),
         &screen,
         &faults,
     );
@@ -502,13 +533,19 @@ fn planes_network_and_calibrations_move_as_on_the_cpu() {
         let zeros = |label, n: usize| GpuMoments::upload(&gpu, label, &vec![0.0; n], &vec![0.0; n]).unwrap();
         let moments = [zeros("planes", planes), zeros("mlp", mlp)];
         let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
+        let mut births = GpuVec::<u32>::zeros(&gpu, "births", 0).unwrap();
+        // Entries correct their bias from when they were made, in one of the cases.
+        let own_corrections = encoding == TimeEncoding::Compat;
+        if own_corrections {
+            optimiser.allow_own_corrections(&gpu).unwrap();
+        }
         let weights = PlaneWeights { smoothness: 1e-2, time_smoothness: 2e-2, time_sparsity: 1e-2 };
         let calibrations = GpuVec::from_slice(&gpu, "calibrations", &[0.0_f32, 9.99, -9.99, 1.0]).unwrap();
         let of_calibrations = zeros("calibrations", 4);
 
         let mut cpu = field.clone();
         let (mut p, mut w) = (Moments::zeros(planes, 1, false), Moments::zeros(mlp, 1, false));
-        let (mut c, mut mu) = (Moments::zeros(4, 1, false), [0.0_f32, 9.99, -9.99, 1.0]);
+        let (mut c, mut mu) = (Moments::zeros(4, 1, own_corrections), [0.0_f32, 9.99, -9.99, 1.0]);
         for t in 1..=5_u32 {
             let mut g: Vec<f32> = (0..planes).map(|k| 1e-4 * wave(k, 0.3 + t as f32)).collect();
             let mut h: Vec<f32> = (0..mlp).map(|k| 1e-3 * wave(k, 0.7 + t as f32)).collect();
@@ -528,6 +565,10 @@ fn planes_network_and_calibrations_move_as_on_the_cpu() {
             let v_mu = GpuVec::from_slice(&gpu, "v_mu", &[1e-3_f32, -1.0, 1.0, 0.0]).unwrap();
             step_planes(&mut p, &mut cpu.planes, &mut g, &config, &weights, 1e-2, &mut Vec::new()).unwrap();
             w.step(&mut cpu.mlp, &mut h, RowRates::Uniform(2e-3), None).unwrap();
+            if own_corrections && t == 3 {
+                c.births[0] = 2;
+            }
+            births.replace(&gpu, &c.births).unwrap();
             c.step(&mut mu, &mut [1e-3, -1.0, 1.0, 0.0], RowRates::Uniform(1e-2), None).unwrap();
             mu.iter_mut().for_each(|v| *v = v.clamp(-10.0, 10.0));
             let mut commands = Commands::new(&gpu, None);
@@ -547,7 +588,7 @@ fn planes_network_and_calibrations_move_as_on_the_cpu() {
                 &mut commands,
                 (step_of(1e-2, t), 10.0),
                 (&calibrations, &v_mu),
-                &of_calibrations,
+                (&of_calibrations, &births),
                 &faults,
             );
             commands.submit();

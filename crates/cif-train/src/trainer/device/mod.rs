@@ -116,11 +116,15 @@ impl Trainer {
     pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
         self.refuse_unsupported()?;
         self.refuse_too_large(gpu)?;
+        let mut optimiser = GpuOptimiser::new(gpu)?;
+        if self.config.adam.fresh_row_bias_correction {
+            optimiser.allow_own_corrections(gpu)?;
+        }
         self.device = Some(Box::new(DeviceTraining {
             rasterizer: Rasterizer::new(gpu)?,
             losses: GpuLosses::new(gpu)?,
             exposure: GpuExposure::new(gpu)?,
-            optimiser: GpuOptimiser::new(gpu)?,
+            optimiser,
             motion: GpuMotion::new(gpu)?,
             judge: GpuJudge::new(gpu)?,
             rearranger: GpuRearranger::new(gpu)?,
@@ -161,13 +165,10 @@ impl Trainer {
 
     /// Names every setting that is on and not supported.
     fn refuse_unsupported(&self) -> Result<(), TrainError> {
-        let settings: Vec<&str> = [
-            ("stages.tile_share", self.config.stages.tile_share < 1.0),
-            ("adam.fresh_row_bias_correction", self.config.adam.fresh_row_bias_correction),
-        ]
-        .into_iter()
-        .filter_map(|(name, is_on)| is_on.then_some(name))
-        .collect();
+        let settings: Vec<&str> = [("stages.tile_share", self.config.stages.tile_share < 1.0)]
+            .into_iter()
+            .filter_map(|(name, is_on)| is_on.then_some(name))
+            .collect();
         if settings.is_empty() { Ok(()) } else { Err(TrainError::NotOnGpu { settings: settings.join(", ") }) }
     }
 

@@ -53,6 +53,7 @@ impl Trainer {
             (Ok(()), Some(origins), Some(resident)) => {
                 let moved = resident.rearrange(&device.gpu, &device.rearranger, &origins, resets);
                 moved.and_then(|()| {
+                    resident.births.replace(&device.gpu, &self.optimiser.births())?;
                     let rows = geometry(&self.field.gaussians);
                     resident.canonical.geometry.replace(&device.gpu, &rows)?;
                     resident.statistics.replace(&device.gpu, &statistic_rows(&self.statistics))?;

@@ -42,6 +42,8 @@ pub(super) struct ResidentIdentities {
     pub(super) log_calibrations: GpuVec<f32>,
     pub(super) gradients: GpuVec<f32>,
     pub(super) moments: GpuMoments,
+    /// As those of the Gaussians.
+    pub(super) births: GpuVec<u32>,
 }
 
 /// Everything of a run that stays on the device.
@@ -49,6 +51,8 @@ pub(super) struct Resident {
     pub(super) canonical: GpuGaussians,
     /// First and second moments, in the layout of the parameters.
     pub(super) moments: [GpuGaussians; 2],
+    /// Steps after which rows were made, `[N, BIRTH_GROUPS]`, where they correct their bias from there.
+    pub(super) births: GpuVec<u32>,
     pub(super) gradients: GpuGaussians,
     /// At the time of a view.
     pub(super) posed: GpuGaussians,
@@ -116,6 +120,7 @@ impl ResidentIdentities {
             log_calibrations: GpuVec::from_slice(gpu, "calibrations", &rows.log_calibrations)?,
             gradients: GpuVec::zeros(gpu, "gradients of the calibrations", rows.labels.len())?,
             moments: GpuMoments::upload(gpu, "moments of the calibrations", &moments.first, &moments.second)?,
+            births: GpuVec::from_slice(gpu, "births of the calibrations", &moments.births)?,
         })
     }
 }
@@ -136,6 +141,7 @@ impl Resident {
         Ok(Self {
             canonical: none()?,
             moments: [none()?, none()?],
+            births: GpuVec::zeros(gpu, "births", 0)?,
             gradients: none()?,
             posed: none()?,
             screen: GpuVec::zeros(gpu, "screen gradients", 0)?,
@@ -162,6 +168,7 @@ impl Resident {
             for (second, moments) in [false, true].into_iter().zip(&mut self.moments) {
                 moments.replace(gpu, &moment_rows(optimiser, second))?;
             }
+            self.births.replace(gpu, &optimiser.births())?;
             self.gradients = GpuGaussians::zeros(gpu, n)?;
             self.posed.geometry.resize(gpu, n)?;
             let moves_sh = field.deformation.as_ref().is_some_and(|d| d.config.heads.sh);

@@ -202,6 +202,7 @@ impl Trainer {
             sh_rest: rates.sh_rest,
             sh_active: 3 * coefficient_count(self.field.sh_degree),
             visible_only: self.config.adam.visible_rows_only,
+            own_corrections: self.config.adam.fresh_row_bias_correction,
             renormalise: (self.progress.total_steps + 1).is_multiple_of(RENORMALISE_EVERY),
             occupancy_limits: (stage == Stage::Instance && !self.config.ablates(Ablation::ConstantOccupancy))
                 .then(|| self.config.instance.occupancy_limits.map(logit)),

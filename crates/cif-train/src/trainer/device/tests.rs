@@ -8,6 +8,7 @@ use super::super::guard_tests::support::{Scene, capture, small_config};
 use super::super::optimiser::Optimiser;
 use super::Trainer;
 use crate::clock::{Clock, Seconds};
+use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent};
@@ -15,6 +16,10 @@ use crate::exposure::Exposures;
 use crate::trainer::MAX_ROLLBACKS_IN_A_ROW;
 
 pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
+    trainer_with(gpu, |_| {})
+}
+
+fn trainer_with(gpu: Option<&Gpu>, edit: impl FnOnce(&mut TrainConfig)) -> (Trainer, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
     let mut config = small_config();
@@ -22,6 +27,7 @@ pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     config.stages.batch = 2;
     config.report.step_every = 1;
     config.effects.exposure = true;
+    edit(&mut config);
     let mut trainer = Trainer::new(dataset, config).unwrap();
     assert!(trainer.progress.exposures.is_some());
     if let Some(gpu) = gpu {
@@ -204,8 +210,10 @@ fn views_without_room_are_drawn_again_and_no_bit_differs() {
 #[test]
 fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
     let Some(gpu) = testing::gpu() else { return };
-    let run = |fetches: bool| {
-        let (mut trainer, _folder) = trainer(Some(&gpu));
+    let run = |fetches: bool, own_corrections: bool| {
+        let (mut trainer, _folder) = trainer_with(Some(&gpu), |config| {
+            config.adam.fresh_row_bias_correction = own_corrections;
+        });
         // Half of them are large; opacities that fall, from 0.1 or where they are reset to, go.
         let mut sizes: Vec<f32> =
             trainer.field.gaussians.log_scales.iter().map(|s| s[0].max(s[1]).max(s[2]).exp()).collect();
@@ -237,12 +245,18 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
         }
         (state(&mut trainer), result, kinds)
     };
-    let (on_device, on_host) = (run(false), run(true));
-    assert!(on_device.2.iter().all(|count| *count > 0), "cloned, split, pruned: {:?}", on_device.2);
-    assert_eq!(on_device.1, on_host.1, "Gaussians after every step");
-    assert!(on_device.0.0.gaussians == on_host.0.0.gaussians, "parameters");
-    assert!(on_device.0.1 == on_host.0.1, "moments");
-    assert!(on_device.0.2 == on_host.0.2, "statistics");
+    let mut ends = Vec::new();
+    for own_corrections in [false, true] {
+        let (on_device, on_host) = (run(false, own_corrections), run(true, own_corrections));
+        assert!(on_device.2.iter().all(|count| *count > 0), "cloned, split, pruned: {:?}", on_device.2);
+        assert_eq!(on_device.1, on_host.1, "Gaussians after every step");
+        assert!(on_device.0.0.gaussians == on_host.0.0.gaussians, "parameters");
+        assert!(on_device.0.1 == on_host.0.1, "moments");
+        assert!(on_device.0.2 == on_host.0.2, "statistics");
+        assert_eq!(on_device.0.1.births().iter().any(|birth| *birth > 0), own_corrections);
+        ends.push(on_device.0.0.gaussians.means);
+    }
+    assert!(ends[0] != ends[1], "rows made later move otherwise");
 }
 
 #[test]

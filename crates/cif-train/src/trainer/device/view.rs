@@ -176,7 +176,7 @@ impl Trainer {
                 &mut commands,
                 &plan.step,
                 (&resident.canonical, &resident.gradients),
-                &resident.moments,
+                (&resident.moments, &resident.births),
                 &resident.screen,
                 faults,
             );
@@ -187,7 +187,7 @@ impl Trainer {
                     &mut commands,
                     (plan.calibration, self.config.instance.calibration_limit),
                     (&identities.log_calibrations, &identities.gradients),
-                    &identities.moments,
+                    (&identities.moments, &identities.births),
                     faults,
                 );
             }
