@@ -405,6 +405,8 @@ impl Trainer {
             return Ok(());
         }
         let relocated = apply(&mut self.field, &plan, &context, &mut rng);
+        #[cfg(feature = "wgpu")]
+        self.relocates_on_device(&plan.pairs);
         self.optimiser.relocate(&relocated.weak, &relocated.sources, &relocated.entry_origins);
         for pair in &plan.pairs {
             self.guidance.copy(pair.weak, pair.source);

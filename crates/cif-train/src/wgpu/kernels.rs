@@ -168,6 +168,14 @@ cif_render::shared_struct! {
         pub fresh_are_zero: u32,
         /// A float of every row that becomes zero; beyond the row for none.
         pub zero_column: u32,
+        /// Bits of the floats that become zero in marked rows.
+        pub restarted_columns: u32,
+        /// Pads to 16 bytes.
+        pub unused_0: u32,
+        /// As above.
+        pub unused_1: u32,
+        /// As above.
+        pub unused_2: u32,
     }
 }
 
@@ -177,6 +185,9 @@ pub const BIRTH_GROUPS: usize = 6;
 
 /// Bit of an origin that marks a fresh row.
 pub const FRESH: u32 = 1 << 31;
+
+/// Bit of an origin that marks a row of which some floats start afresh.
+pub const RESTARTED: u32 = 1 << 30;
 
 cif_render::shared_struct! {
     /// How a step is judged.
@@ -245,6 +256,7 @@ const CONSTANTS: Snippet = Snippet {
             ("SH_FLOATS", Constant::Unsigned(SH_FLOATS as u32)),
             ("BIRTH_GROUPS", Constant::Unsigned(BIRTH_GROUPS as u32)),
             ("FRESH", Constant::Unsigned(FRESH)),
+            ("RESTARTED", Constant::Unsigned(RESTARTED)),
             ("EXPOSURE_FLOATS", Constant::Unsigned(EXPOSURE_FLOATS as u32)),
             ("PAIRS_WORD", Constant::Unsigned(GpuStatistics::PAIRS as u32)),
             ("WANTED_PAIRS_WORD", Constant::Unsigned(GpuStatistics::WANTED_PAIRS as u32)),

@@ -18,6 +18,8 @@ pub struct RowRule {
     pub fresh_are_zero: bool,
     /// A float of every row that becomes zero.
     pub zero_column: Option<u32>,
+    /// Bits of the floats that become zero in rows marked by [`super::kernels::RESTARTED`].
+    pub restarted_columns: u32,
 }
 
 impl GpuRearranger {
@@ -28,7 +30,8 @@ impl GpuRearranger {
         Ok(Self { rearrange })
     }
 
-    /// Records an array's new rows, in memory of their own. `origins` are old rows, with [`FRESH`] added for fresh ones.
+    /// Records an array's new rows, in memory of their own. `origins` are old rows, with [`FRESH`] and
+    /// [`super::kernels::RESTARTED`] added as marks.
     ///
     /// # Errors
     /// When they exceed what the device binds, with the arithmetic; the array stays as it was.
@@ -50,6 +53,8 @@ impl GpuRearranger {
                 width: width as u32,
                 fresh_are_zero: u32::from(rule.fresh_are_zero),
                 zero_column: rule.zero_column.unwrap_or(u32::MAX),
+                restarted_columns: rule.restarted_columns,
+                ..Rearrangement::default()
             },
         );
         let bindings = [uniform.binding(), origins.binding(), array.binding(), after.binding()];

@@ -45,8 +45,10 @@ impl Trainer {
             return Ok(());
         }
         let start = Instant::now();
-        if rearranges && stage != Stage::Instance && !is_late && !judges {
-            self.densify_on_device(stage, iteration, events)?;
+        // New estimates of identities begin with everything that is known.
+        let refreshes = stage == Stage::Instance && falls_on(iteration, self.config.identity.refresh_every);
+        if rearranges && !refreshes && !is_late && !judges {
+            self.rearrange_on_device(stage, iteration, events)?;
         } else {
             self.fetch_from_device()?;
             if rearranges && stage == Stage::Instance {

@@ -1,23 +1,38 @@
-//! Densification, pruning and opacity resets with the rows staying on the device. The host decides as it does for
-//! itself, from geometry and statistics, 64 bytes of each Gaussian; harmonics and moments, 672 bytes, are moved there.
+//! Densification, pruning, opacity resets and relocations with the rows staying on the device. The host decides as it
+//! does for itself, from geometry and statistics, 64 bytes of each Gaussian, and for relocations from the deformation and
+//! the calibrations, too; harmonics and moments, 672 bytes, are moved there.
 
 use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::{Commands, Gpu, GpuError, GpuGaussians, GpuVec};
 
 use super::super::Trainer;
-use super::resident::{Resident, statistic_rows, statistics_of};
+use super::resident::{Resident, ResidentIdentities, statistic_rows, statistics_of};
 use crate::densify::Rearrangement;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
+use crate::resample::Pair;
 use crate::schedule::falls_on;
+use crate::wgpu::kernels::{FRESH, RESTARTED};
 use crate::wgpu::rearrange::{GpuRearranger, RowRule, compose};
 
-/// Float of the opacity logit in the geometry of a Gaussian.
+/// Float of the opacity logit in the geometry of a Gaussian, and of the occupancy logit.
 const OPACITY_COLUMN: u32 = 3;
+const OCCUPANCY_COLUMN: u32 = 7;
+
+/// What the host decides from.
+struct Basis {
+    geometry: Vec<[f32; 12]>,
+    statistics: Vec<[f32; 4]>,
+    /// Planes and network.
+    deformation: Option<[Vec<f32>; 2]>,
+    /// Calibrations, first and second moments.
+    calibrations: Option<[Vec<f32>; 3]>,
+}
 
 impl Trainer {
-    /// What [`Trainer::densify`] does, on the device.
-    pub(super) fn densify_on_device(
+    /// What [`Trainer::densify`] does, or in the instance stage [`Trainer::instance_events`] without new estimates, on the
+    /// device.
+    pub(super) fn rearrange_on_device(
         &mut self,
         stage: Stage,
         iteration: u32,
@@ -25,30 +40,34 @@ impl Trainer {
     ) -> Result<(), TrainError> {
         let Some(mut device) = self.device.take() else { return Ok(()) };
         let received = self.receive(&mut device, true);
-        let read = received.and_then(|()| {
-            let Some(resident) = &device.resident else { return Ok(None) };
-            let geometry = resident.canonical.geometry.read(&device.gpu)?;
-            Ok(Some((geometry, resident.statistics.read(&device.gpu)?)))
+        let relocates = stage == Stage::Instance;
+        let read = received.and_then(|()| match &device.resident {
+            Some(resident) => Ok(Some(resident.basis(&device.gpu, relocates)?)),
+            None => Ok(None),
         });
-        if let (Ok(Some((rows, statistics))), Some(fetched)) = (&read, &mut device.fetched) {
-            // Should the device be lost, the host stands where it was fetched last.
-            if fetched.kept.is_none() {
-                fetched.kept = Some(self.keep());
+        let basis = match read {
+            Ok(Some(basis)) => basis,
+            other => {
+                self.device = Some(device);
+                return other.map(drop);
             }
-            // Colours stay those that were fetched last, until the next fetch.
-            let colors = std::mem::take(&mut self.field.gaussians.sh_coefficients);
-            self.field.gaussians = gaussians(rows, colors);
-            self.statistics = statistics_of(statistics);
-            device.origins = Some((0..rows.len() as u32).collect());
+        };
+        if let Some(fetched) = &mut device.fetched
+            && fetched.kept.is_none()
+        {
+            // Should the device be lost, the host stands where it was fetched last.
+            fetched.kept = Some(self.keep());
         }
+        device.origins = Some((0..basis.geometry.len() as u32).collect());
         self.device = Some(device);
-        if read?.is_none() {
-            return Ok(());
-        }
-        let densified = self.densify(stage, iteration, events);
+        self.take_basis(basis);
+        let densified = match stage {
+            Stage::Instance => self.instance_events(iteration, events),
+            _ => self.densify(stage, iteration, events),
+        };
         let Some(mut device) = self.device.take() else { return densified };
         let origins = device.origins.take();
-        let resets = falls_on(iteration, self.config.densify.opacity_reset_every);
+        let resets = !relocates && falls_on(iteration, self.config.densify.opacity_reset_every);
         let followed = match (&densified, origins, &mut device.resident) {
             (Ok(()), Some(origins), Some(resident)) => {
                 let moved = resident.rearrange(&device.gpu, &device.rearranger, &origins, resets);
@@ -62,6 +81,11 @@ impl Trainer {
                     {
                         resident.parameters.set_still(&device.gpu, &deformation.still)?;
                     }
+                    if relocates && let Some(rows) = &self.field.identities {
+                        let instances = self.field.instances.len();
+                        let sent = ResidentIdentities::send(&device.gpu, rows, instances, &self.optimiser)?;
+                        resident.identities = Some(sent);
+                    }
                     device.motion.send(&device.gpu, self.guide_of())
                 })
             }
@@ -70,6 +94,34 @@ impl Trainer {
         let followed = followed.and_then(|()| device.make_room(self.field.gaussians.len()));
         self.device = Some(device);
         densified.and(followed.map_err(TrainError::from))
+    }
+
+    /// Takes over what the device has; colours stay those that were fetched last, until the next fetch.
+    fn take_basis(&mut self, basis: Basis) {
+        let colors = std::mem::take(&mut self.field.gaussians.sh_coefficients);
+        self.field.gaussians = gaussians(&basis.geometry, colors);
+        self.statistics = statistics_of(&basis.statistics);
+        if let (Some(target), Some([planes, mlp])) = (&mut self.field.deformation, basis.deformation) {
+            (target.planes, target.mlp) = (planes, mlp);
+        }
+        if let (Some(target), Some([values, first, second])) =
+            (&mut self.field.identities, basis.calibrations)
+        {
+            target.log_calibrations = values;
+            let moments = &mut self.optimiser.calibration;
+            (moments.first, moments.second) = (first, second);
+        }
+    }
+
+    /// Notes relocations that happen on the device too: `weak` rows become copies of `sources`, whose opacity and occupancy
+    /// start afresh.
+    pub(in crate::trainer) fn relocates_on_device(&mut self, pairs: &[Pair]) {
+        if let Some(origins) = self.device.as_mut().and_then(|device| device.origins.as_mut()) {
+            for pair in pairs {
+                origins[pair.weak as usize] = pair.source | FRESH;
+                origins[pair.source as usize] = pair.source | RESTARTED;
+            }
+        }
     }
 
     /// Notes a change of the set that happens on the device too; says whether it does. The host's moments are then
@@ -84,6 +136,27 @@ impl Trainer {
 }
 
 impl Resident {
+    fn basis(&self, gpu: &Gpu, relocates: bool) -> Result<Basis, GpuError> {
+        let deformation = match self.deformation.as_ref().filter(|_| relocates) {
+            Some(of) => Some([of.parameters.planes.read(gpu)?, of.parameters.mlp.read(gpu)?]),
+            None => None,
+        };
+        let calibrations = match self.identities.as_ref().filter(|_| relocates) {
+            Some(of) => Some([
+                of.log_calibrations.read(gpu)?,
+                of.moments.first.read(gpu)?,
+                of.moments.second.read(gpu)?,
+            ]),
+            None => None,
+        };
+        Ok(Basis {
+            geometry: self.canonical.geometry.read(gpu)?,
+            statistics: self.statistics.read(gpu)?,
+            deformation,
+            calibrations,
+        })
+    }
+
     /// Moves what has a row per Gaussian; geometry and statistics are sent by the caller.
     fn rearrange(
         &mut self,
@@ -101,8 +174,12 @@ impl Resident {
         let mut commands = Commands::new(gpu, None);
         let copies = RowRule::default();
         rearranger.record(gpu, &mut commands, &origins, &mut self.canonical.sh, copies)?;
-        let of_sh = RowRule { fresh_are_zero: true, zero_column: None };
-        let of_geometry = RowRule { zero_column: resets_opacities.then_some(OPACITY_COLUMN), ..of_sh };
+        let of_sh = RowRule { fresh_are_zero: true, ..RowRule::default() };
+        let of_geometry = RowRule {
+            zero_column: resets_opacities.then_some(OPACITY_COLUMN),
+            restarted_columns: 1 << OPACITY_COLUMN | 1 << OCCUPANCY_COLUMN,
+            ..of_sh
+        };
         for moments in &mut self.moments {
             rearranger.record(gpu, &mut commands, &origins, &mut moments.geometry, of_geometry)?;
             rearranger.record(gpu, &mut commands, &origins, &mut moments.sh, of_sh)?;

@@ -112,7 +112,12 @@ pub(super) fn statistics_of(rows: &[[f32; 4]]) -> DensifyStatistics {
 }
 
 impl ResidentIdentities {
-    fn send(gpu: &Gpu, rows: &Identities, instances: usize, optimiser: &Optimiser) -> Result<Self, GpuError> {
+    pub(super) fn send(
+        gpu: &Gpu,
+        rows: &Identities,
+        instances: usize,
+        optimiser: &Optimiser,
+    ) -> Result<Self, GpuError> {
         let moments = &optimiser.calibration;
         Ok(Self {
             rows: DeviceIdentities::from_identities(gpu, rows, instances)?,

@@ -260,6 +260,49 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
 }
 
 #[test]
+fn rows_relocated_on_the_device_end_as_those_that_the_host_relocates() {
+    let Some(gpu) = testing::gpu() else { return };
+    let run = |fetches: bool, own_corrections: bool| {
+        let (mut trainer, _folder) = trainer_with(Some(&gpu), |config| {
+            config.adam.fresh_row_bias_correction = own_corrections;
+            (config.resample.from, config.resample.every, config.resample.until) = (1, 3, 100);
+            config.stages.instance = 12;
+        });
+        trainer.enter(Stage::Fine).unwrap();
+        for _ in 0..4 {
+            step(&mut trainer).0.unwrap();
+        }
+        trainer.fetch_from_device().unwrap();
+        trainer.estimate_identities(true).unwrap();
+        trainer.begin(Stage::Instance);
+        let mut relocated = Vec::new();
+        for _ in 0..10 {
+            if fetches && let Some(device) = &mut trainer.device {
+                device.since_fetch = super::FETCH_EVERY;
+            }
+            let (stepped, events) = step(&mut trainer);
+            stepped.unwrap();
+            for event in events {
+                if let TrainEvent::Resampled { iteration, pairs, sources, .. } = event {
+                    relocated.push((iteration, pairs, sources));
+                }
+            }
+            let is_ahead = trainer.device.as_ref().is_some_and(|device| device.ahead);
+            assert_eq!(is_ahead, !fetches, "rows stay on the device unless they are fetched");
+        }
+        (state(&mut trainer), relocated)
+    };
+    for own_corrections in [false, true] {
+        let (on_device, on_host) = (run(false, own_corrections), run(true, own_corrections));
+        assert!(on_device.1.len() == 3 && on_device.1[0].1 > 0, "{:?}", on_device.1);
+        assert_eq!(on_device.1, on_host.1);
+        assert!(on_device.0.0.identities == on_host.0.0.identities, "identities");
+        assert!(on_device.0.0 == on_host.0.0, "parameters");
+        assert!(on_device.0.1 == on_host.0.1, "moments");
+    }
+}
+
+#[test]
 fn a_device_lost_after_a_change_of_the_set_leaves_what_was_fetched_before_it() {
     let Some(_) = testing::gpu() else { return };
     let gpu = Gpu::open().unwrap();
