@@ -316,7 +316,8 @@ pub struct EffectsConfig {
     /// Steps between tests for Gaussians that stand still, which then skip the deformation network; default 0:
     /// every Gaussian goes through it.
     pub still_every: u32,
-    /// Share of the fine steps before the first test, default 0.15.
+    /// Share of the fine steps before the first test, default 0.15; where all cameras stay in place, their images
+    /// tell at once.
     pub still_from: f32,
     /// Displacement from its mean, as a fraction of the extent, up to which a Gaussian may be taken to stand
     /// still, default 0.002. Less counts, down to a quarter, where that much shows.

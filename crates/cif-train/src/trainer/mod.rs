@@ -8,6 +8,7 @@
 //! | `optimiser` | which parameter groups there are, and how fast they move |
 //! | `guard` | what happens to a step that leaves the finite numbers |
 //! | `still` | which Gaussians skip the deformation network |
+//! | `changes` | where cameras that stay in place see the capture change |
 //! | `earned` | what has to show that it helps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `identity` | how identity rows come about |
@@ -23,6 +24,7 @@
 //! run that was interrupted and resumed ends bit for bit where an uninterrupted one ends, on any number of
 //! threads.
 
+mod changes;
 #[cfg(feature = "wgpu")]
 mod device;
 mod draw;
@@ -53,6 +55,7 @@ use cif_field::Field;
 use cif_render::Gradients;
 use cif_render::cpu::{Renderer, SimdLevel};
 
+use self::changes::Changes;
 #[cfg(feature = "wgpu")]
 pub use self::device::Probe;
 #[cfg(feature = "wgpu")]
@@ -117,6 +120,9 @@ pub struct Trainer {
     unseen: Vec<bool>,
     /// Labelled pixels per instance, of the frames that identities were estimated from.
     label_pixels: Vec<f64>,
+    /// Whether every camera stays in place, and where these see changes, once that is asked.
+    shows_changes: bool,
+    changes: Option<Changes>,
     /// Paths that Gaussians are held to.
     guidance: Guidance,
     renderer: Renderer,
@@ -212,6 +218,8 @@ impl Trainer {
             statistics: DensifyStatistics::zeros(n),
             unseen: Vec::new(),
             label_pixels: Vec::new(),
+            shows_changes: Changes::are_shown(&dataset, &frames),
+            changes: None,
             guidance: Guidance::default(),
             renderer: Renderer::new(SimdLevel::Auto),
             gradients: Gradients::zeros(&field),

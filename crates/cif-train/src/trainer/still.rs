@@ -4,7 +4,9 @@
 //! A Gaussian that stands still keeps the mean of what the network did to it: that is added to its canonical
 //! parameters once, and the network then leaves it alone, forward and backward. What has not learnt to move yet
 //! looks like what never will: so nothing settles among others that move, and a changing few of those that stand
-//! still go through the network all the same. Where these learn to move, their neighbours are handed back.
+//! still go through the network all the same. Where these learn to move, their neighbours are handed back. Where all
+//! cameras stay in place, their images tell from the start: what they see change stays in the network, and the rest
+//! leaves it.
 
 use std::collections::BTreeMap;
 
@@ -12,14 +14,15 @@ use cif_field::deformation::Deformation;
 use cif_field::deformation::evaluate::Deltas;
 use cif_field::{Field, Gaussians};
 use rand::RngExt;
+use rayon::prelude::*;
 
 use super::Trainer;
+use super::changes::{Changes, Sight};
 use super::earned::gain;
 use crate::config::EffectsConfig;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::random::{Purpose, stream};
-use crate::schedule::falls_on;
 
 /// Times at which the network is probed.
 const PROBES: usize = 8;
@@ -56,7 +59,8 @@ impl Trainer {
     /// Whether Gaussians are tested after a step.
     pub(super) fn settles(&self, stage: Stage, iteration: u32) -> bool {
         let last = self.plan.iterations(&self.config, stage);
-        self.field.deformation.is_some() && falls_due(&self.config.effects, stage, iteration, last)
+        self.field.deformation.is_some()
+            && falls_due(&self.config.effects, self.first_test(), stage, iteration, last)
     }
 
     /// The test for Gaussians that stand still, where it falls on this step: of a ladder of limits, the highest
@@ -75,14 +79,29 @@ impl Trainer {
             displacement: effects.still_displacement * self.field.extent,
             shape: effects.still_shape,
         };
-        let rows: Vec<u32> = (0..self.field.len() as u32).collect();
-        let motions = probe(deformation, &self.field.gaussians, &rows, &probe_times(&self.dataset.times));
-        let settings = self.color_settings();
         let allowed = f64::from(effects.still_loss);
+        let rows: Vec<u32> = (0..self.field.len() as u32).collect();
+        let mut motions = probe(deformation, &self.field.gaussians, &rows, &probe_times(&self.dataset.times));
+        let sights = self.sights(&motions)?;
+        for (motion, _) in motions.iter_mut().zip(&sights).filter(|(_, sight)| **sight == Sight::Steady) {
+            // Nothing tells this motion from none.
+            (motion.displacement, motion.shape) = (0.0, 0.0);
+        }
+        let settings = self.color_settings();
         let before = self.judged_error(None, &settings)?;
-        let watched = self.draw_watched(stage);
+        let mut watched = self.draw_watched(stage);
+        for (watched, _) in watched.iter_mut().zip(&sights).filter(|(_, sight)| **sight == Sight::Steady) {
+            *watched = false;
+        }
         let restless = restless(&self.field, &motions, highest);
-        let awake: Vec<bool> = watched.iter().zip(&restless).map(|(a, b)| *a || *b).collect();
+        let awake: Vec<bool> = (0..motions.len())
+            .map(|row| match sights.get(row) {
+                Some(Sight::Steady) => false,
+                // In the instance stage nothing learns to move any more.
+                Some(Sight::Changing) if stage == Stage::Fine => true,
+                _ => watched[row] || restless[row],
+            })
+            .collect();
         // Not far above the rung that held last time, so that few are tried in vain.
         let mut rung = self.progress.still_rung.saturating_sub(1);
         let (mut settled, mut error) = (0, before);
@@ -131,11 +150,41 @@ impl Trainer {
                 self.plan.has_instances
                     || (iteration..last)
                         .take(every as usize)
-                        .any(|later| falls_due(&self.config.effects, stage, later, last))
-                    || iteration < first_test(self.config.effects.still_from, last)
+                        .any(|later| falls_due(&self.config.effects, self.first_test(), stage, later, last))
+                    || iteration < self.first_test()
             }
             _ => iteration <= 1,
         }
+    }
+
+    /// Step of the fine stage on which the first test falls: its first, where images tell what moves.
+    fn first_test(&self) -> u32 {
+        if self.shows_changes {
+            return 1;
+        }
+        let fine_steps = f64::from(self.plan.iterations(&self.config, Stage::Fine));
+        ((f64::from(self.config.effects.still_from) * fine_steps).round() as u32).max(1)
+    }
+
+    /// What cameras that stay in place see at each Gaussian, where it is in the mean; empty without such cameras.
+    fn sights(&mut self, motions: &[Motion]) -> Result<Vec<Sight>, TrainError> {
+        if !self.shows_changes {
+            return Ok(Vec::new());
+        }
+        if self.changes.is_none() {
+            self.changes = Some(Changes::find(&self.dataset, &self.frames)?);
+        }
+        let (Some(changes), Some(deformation)) = (&self.changes, &self.field.deformation) else {
+            return Ok(Vec::new());
+        };
+        let sight = |(row, motion): (usize, &Motion)| {
+            let mut place = self.field.gaussians.means[row];
+            if !deformation.is_still(row) {
+                accumulate(&mut place, &motion.mean.position, 1.0);
+            }
+            changes.at(place)
+        };
+        Ok(motions.par_iter().enumerate().map(sight).collect())
     }
 
     /// Which Gaussians go through the network until the next test though they could stand still. None in the
@@ -165,23 +214,17 @@ impl Trainer {
 
 /// Whether a test falls on a step: at a share of the fine stage, then every so many steps, never at its end, where
 /// nothing is left to make good for it; and once more when the instance stage begins.
-fn falls_due(effects: &EffectsConfig, stage: Stage, iteration: u32, last: u32) -> bool {
+fn falls_due(effects: &EffectsConfig, first_test: u32, stage: Stage, iteration: u32, last: u32) -> bool {
     if effects.still_every == 0 || iteration >= last {
         return false;
     }
     match stage {
         Stage::Fine => {
-            let from = first_test(effects.still_from, last);
-            iteration == from || (iteration > from && falls_on(iteration - from, effects.still_every))
+            iteration >= first_test && (iteration - first_test).is_multiple_of(effects.still_every)
         }
         Stage::Instance => iteration == 1,
         _ => false,
     }
-}
-
-/// Step of the fine stage on which the first test falls.
-fn first_test(share: f32, fine_steps: u32) -> u32 {
-    ((f64::from(share) * f64::from(fine_steps)).round() as u32).max(1)
 }
 
 /// Evenly spread captured times.
@@ -373,14 +416,15 @@ mod tests {
     fn tests_fall_after_the_warm_up_and_never_at_the_end() {
         let effects = EffectsConfig { still_every: 50, still_from: 0.25, ..EffectsConfig::default() };
         let due = |stage, last: u32| -> Vec<u32> {
-            (1..=last).filter(|step| falls_due(&effects, stage, *step, last)).collect()
+            let first_test = (0.25 * f64::from(last)).round() as u32;
+            (1..=last).filter(|step| falls_due(&effects, first_test, stage, *step, last)).collect()
         };
         assert_eq!(due(Stage::Fine, 200), [50, 100, 150]);
         assert_eq!(due(Stage::Fine, 170), [43, 93, 143]);
         assert_eq!(due(Stage::Instance, 101), [1]);
         assert!(due(Stage::Coarse, 200).is_empty());
         let never = EffectsConfig { still_every: 0, ..effects };
-        assert!(!falls_due(&never, Stage::Fine, 50, 200));
+        assert!(!falls_due(&never, 50, Stage::Fine, 50, 200));
     }
 
     #[test]
