@@ -5,8 +5,8 @@
 //! parameters once, and the network then leaves it alone, forward and backward. What has not learnt to move yet
 //! looks like what never will: so nothing settles among others that move, and a changing few of those that stand
 //! still go through the network all the same. Where these learn to move, their neighbours are handed back. Where all
-//! cameras stay in place, their images tell from the start: what they see change stays in the network, and the rest
-//! leaves it.
+//! cameras stay in place, their images tell from the start: what they see change stays in the network for half of the
+//! fine stage, and the rest leaves it at once.
 
 use std::collections::BTreeMap;
 
@@ -72,6 +72,7 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
+        let last = self.plan.iterations(&self.config, stage);
         let due = self.settles(stage, iteration);
         let Some(deformation) = self.field.deformation.as_ref().filter(|_| due) else { return Ok(()) };
         let effects = &self.config.effects;
@@ -97,8 +98,8 @@ impl Trainer {
         let awake: Vec<bool> = (0..motions.len())
             .map(|row| match sights.get(row) {
                 Some(Sight::Steady) => false,
-                // In the instance stage nothing learns to move any more.
-                Some(Sight::Changing) if stage == Stage::Fine => true,
+                // By then the network has learnt what moves.
+                Some(Sight::Changing) if stage == Stage::Fine && iteration <= last / 2 => true,
                 _ => watched[row] || restless[row],
             })
             .collect();
