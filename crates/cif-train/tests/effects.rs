@@ -3,7 +3,7 @@
 
 mod support;
 
-use cif_dataset::Dataset;
+use cif_dataset::{Dataset, Split};
 use cif_train::exposure::{Exposure, trained_exposures};
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::plan::EffectKind;
@@ -123,6 +123,33 @@ fn what_stands_still_skips_the_network_and_what_moves_does_not() {
     assert!(share(2) < 0.3 && share(0) > 0.5, "{} {} {}", share(0), share(1), share(2));
     let (with, without) = (score(&trainer), score(&whole));
     assert!(with > without - 0.5, "{with} dB against {without} dB");
+}
+
+#[test]
+fn cameras_that_stay_in_place_tell_from_the_first_step_what_stands_still() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene::default());
+    // The first test of the fine stage: on which step, and the share of Gaussians that it settles.
+    let first_test = |dataset: &Dataset| {
+        let mut trainer = Trainer::new(dataset.clone(), still_config()).unwrap();
+        let mut first = None;
+        let outcome = trainer.run(&mut |event, _| {
+            if let TrainEvent::Settled { stage: Stage::Fine, iteration, still, gaussians, .. } = event {
+                first.get_or_insert((*iteration, *still as f64 / *gaussians as f64));
+            }
+            if first.is_some() { Control::Stop } else { Control::Continue }
+        });
+        assert_eq!(outcome.unwrap(), Outcome::Interrupted);
+        first.unwrap()
+    };
+    let (step, share) = first_test(&dataset);
+    assert_eq!(step, 1);
+    assert!(share > 0.1 && share < 0.95, "the third ball and its shadow are seen to change: {share}");
+
+    let mut moving = dataset;
+    let frame = moving.frames.iter_mut().find(|frame| frame.split == Split::Train).unwrap();
+    frame.camera.camera_from_world.translation.x += 1e-3;
+    assert_ne!(first_test(&moving).0, 1, "images of a camera that moves change everywhere");
 }
 
 #[test]
