@@ -21,6 +21,6 @@ mkdir -p "$out"
 "$cif" eval "$out/scene.cif" "$capture"
 "$cif" render "$out/scene.cif" --capture "$capture" --split val --backend auto -o "$out/novel" --force
 
-# Where the time of a step goes: on the device, where it has timestamps, and on the processor.
-"$cif" bench step "$capture" --scene "$out/scene.cif" --backend wgpu
-"$cif" bench step "$capture" --scene "$out/scene.cif" --backend cpu
+# Where the time of a step goes: on the device, stage by stage beside the least that each needs, where it has timestamps;
+# and on the processor.
+"$cif" bench step "$capture" --scene "$out/scene.cif" --backend wgpu --warm-up 3 --steps 10

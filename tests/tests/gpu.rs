@@ -97,10 +97,83 @@ fn a_gpu_renders_what_the_processor_renders() {
         assert!(far * 50 < a.len(), "{layer}: {far} of {} values differ", a.len());
         assert!(a.iter().any(|value| *value > 0), "{layer} shows something");
     }
+    // A draft leaves the same out on both, and keeps colours in 16 bits on the GPU.
+    for backend in ["cpu", "wgpu"] {
+        let line = "render scene.cif --camera views.json --quality draft --backend";
+        let told = cif(path, &format!("{line} {backend} -o draft_{backend}")).succeeds().stderr;
+        assert!(told.contains("draft: PSNR"), "{told}");
+    }
+    let [a, b] = ["draft_cpu", "draft_wgpu"]
+        .map(|name| image::open(path.join(name).join("rgb/a.png")).unwrap().into_rgb8().into_raw());
+    let far = a.iter().zip(&b).filter(|(a, b)| a.abs_diff(**b) > 1).count();
+    assert!(far * 50 < a.len(), "{far} of {} values differ", a.len());
     let software = facts["adapters"][0]["software"].as_bool().unwrap();
     let told = cif(path, "render scene.cif --camera views.json -o auto").succeeds().stderr;
     assert!(told.contains(if software { "software" } else { "a view" }), "{told}");
     cif(path, "render scene.cif --camera views.json --exr --backend wgpu -o exr").fails(2, &["EXR"]);
+}
+
+#[test]
+fn a_step_is_told_by_stage_beside_its_floor_and_the_processor() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let Some(facts) = gpu(path) else { return };
+    cif_test::capture::write(&path.join("table"), 4);
+    let line = "bench step table --backend wgpu --steps 2 --warm-up 1 --set model.spatial_resolution=[8,8,8]";
+    let told = cif(path, &format!("{line} --json -")).succeeds().stdout;
+    let report: Value = serde_json::from_str(&told).expect("JSON on stdout");
+    let device = &report["device"];
+    for key in ["bytes_per_second", "flops_per_second", "step_ms", "processor_step_ms"] {
+        assert!(device[key].as_f64().unwrap_or_default() > 0.0, "{key}: {device:#}");
+    }
+    let ratio = device["processor_step_ms"].as_f64().unwrap() / device["step_ms"].as_f64().unwrap();
+    assert!((device["times_as_fast_as_processor"].as_f64().unwrap() / ratio - 1.0).abs() < 1e-9);
+    assert!(device["subgroups"].is_string(), "{device:#}");
+    let stages = device["stages"].as_array().unwrap();
+    if facts["adapters"][0]["timestamps"].as_bool().unwrap() {
+        for name in ["deform", "project", "sort by depth", "rasterize", "losses", "optimiser: planes"] {
+            let stage = stages.iter().find(|stage| stage["name"] == name);
+            let stage = stage.unwrap_or_else(|| panic!("{name}: {device:#}"));
+            for key in ["ms", "floor_ms", "share_of_floor", "bytes"] {
+                assert!(stage[key].as_f64().unwrap_or_default() > 0.0, "{name}, {key}: {stage:#}");
+            }
+            assert!(stage["floor_by"] == "memory" || stage["floor_by"] == "arithmetic", "{stage:#}");
+        }
+        let blended = stages.iter().find(|stage| stage["name"] == "rasterize").unwrap();
+        assert!(blended["flops"].as_f64().unwrap() > 0.0, "pairs are counted on the processor: {blended:#}");
+    }
+    let table = cif(path, line).succeeds().stdout;
+    assert!(table.contains("GB/s by a copy") && table.contains("the processor does such a step"), "{table}");
+}
+
+#[test]
+fn features_that_are_held_back_change_no_picture_and_are_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let Some(facts) = gpu(path) else { return };
+    write_scene(path);
+    let with = |features: &str, line: &str| {
+        let mut command = std::process::Command::new(CIF);
+        command.args(line.split_whitespace()).current_dir(path);
+        command.env("CIF_GPU_FEATURES", features).env("NO_COLOR", "1").output().unwrap()
+    };
+    for features in ["all", "none"] {
+        let line = format!("render scene.cif --camera views.json --backend wgpu -o {features}");
+        let rendered = with(features, &line);
+        assert!(rendered.status.success(), "{}", String::from_utf8_lossy(&rendered.stderr));
+    }
+    let picture = |features: &str| std::fs::read(path.join(features).join("rgb/a.png")).unwrap();
+    assert_eq!(picture("all"), picture("none"));
+    let text = String::from_utf8(with("none", "info --gpu").stdout).unwrap();
+    assert!(text.contains("CIF_GPU_FEATURES") && !text.contains("times of stages"), "{text}");
+    if !facts["adapters"][0]["subgroups"].is_null() {
+        let all = String::from_utf8(with("all", "info --gpu").stdout).unwrap();
+        assert!(all.contains("its subgroups are") && all.contains("known numbers"), "{all}");
+        assert!(text.contains("its subgroups are not used"), "{text}");
+    }
+    let refused = with("tensors", "info --gpu");
+    let text = String::from_utf8_lossy(&refused.stderr);
+    assert!(!refused.status.success() && text.contains("subgroups, timestamps"), "{text}");
 }
 
 #[test]

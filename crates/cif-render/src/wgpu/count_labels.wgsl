@@ -101,8 +101,9 @@ fn visit(quadrant: u32, first: u32, count: u32, local: u32, p: ptr<function, Pix
     let part = local % 8u;
     if (own < count) {
         let sums = local * PAIR_SUMS;
-        for (var column = 0u; column < HALF_TILE; column += 1u) {
-            let at = part * HALF_TILE + column;
+        for (var k = 0u; k < HALF_TILE; k += 1u) {
+            // Every eighth starts at another column, so that they read from different banks of memory.
+            let at = part * HALF_TILE + (k + part) % HALF_TILE;
             let share = shares[own * 64u + at];
             if (share != 0.0) {
                 let place = places[quadrant * 64u + at];

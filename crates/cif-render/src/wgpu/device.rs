@@ -3,15 +3,13 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::error::GpuError;
+use super::features::GpuFeatures;
+use super::workgroup::{Form, SubgroupUse, self_check};
 
 /// Interfaces that are asked for GPUs. OpenGL is left out: its drivers are listed twice where Vulkan is there, and
 /// compute is optional in it.
 const BACKENDS: wgpu::Backends =
     wgpu::Backends::VULKAN.union(wgpu::Backends::METAL).union(wgpu::Backends::DX12);
-
-/// Features that are used where an adapter has them and never required.
-const WELCOME: wgpu::Features =
-    wgpu::Features::SUBGROUP.union(wgpu::Features::TIMESTAMP_QUERY).union(wgpu::Features::SHADER_F16);
 
 /// What an adapter is called and can do, for `cif info --gpu` and logs.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,10 +26,12 @@ pub struct AdapterFacts {
     pub software: bool,
     /// Whether kernels can be timed on the device.
     pub timestamps: bool,
-    /// Sizes of its subgroups, where kernels can use them.
+    /// Least and largest size of its subgroups, where kernels can use them.
     pub subgroups: Option<(u32, u32)>,
-    /// Whether 16-bit floats can be computed with.
+    /// Whether kernels can compute in 16-bit floats.
     pub half_floats: bool,
+    /// Whether kernels can read numbers that are kept in 16-bit floats.
+    pub packed_half_floats: bool,
     /// Limits that decide how large a scene may be and how kernels are cut.
     pub limits: [(&'static str, u64); 6],
     /// What is missing for the kernels to run; empty when they do.
@@ -53,6 +53,10 @@ impl AdapterFacts {
                 .contains(wgpu::Features::SUBGROUP)
                 .then_some((info.subgroup_min_size, info.subgroup_max_size)),
             half_floats: features.contains(wgpu::Features::SHADER_F16),
+            packed_half_floats: adapter
+                .get_downlevel_capabilities()
+                .flags
+                .contains(wgpu::DownlevelFlags::SHADER_F16_IN_F32),
             limits: named_limits(&limits),
             missing: missing(&limits),
             name: info.name,
@@ -109,6 +113,7 @@ pub struct Gpu {
     device: wgpu::Device,
     queue: wgpu::Queue,
     facts: Arc<AdapterFacts>,
+    subgroups: Arc<SubgroupUse>,
     fault: Fault,
 }
 
@@ -120,11 +125,20 @@ impl Gpu {
     }
 
     /// Opens the best adapter: discrete before integrated before virtual before software. The environment variable
-    /// `WGPU_ADAPTER_NAME` restricts the choice to adapters whose name contains it.
+    /// `WGPU_ADAPTER_NAME` restricts the choice to adapters whose name contains it, and `CIF_GPU_FEATURES` what is used
+    /// of them, see [`GpuFeatures::from_environment`].
     ///
     /// # Errors
     /// When there is none, when it is below the core limits of WebGPU, or when the driver refuses.
     pub fn open() -> Result<Self, GpuError> {
+        Self::open_with(GpuFeatures::from_environment()?)
+    }
+
+    /// As [`Self::open`], using what `features` allow and the adapter has.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn open_with(features: GpuFeatures) -> Result<Self, GpuError> {
         let wanted = std::env::var("WGPU_ADAPTER_NAME").unwrap_or_default();
         let all = adapters();
         let names: Vec<String> = all.iter().map(|adapter| adapter.get_info().name).collect();
@@ -137,10 +151,10 @@ impl Gpu {
             };
             return Err(GpuError::NoAdapter { backends: "Vulkan, Metal and Direct3D 12".to_owned(), found });
         };
-        Self::of(&adapter)
+        Self::of(&adapter, features)
     }
 
-    fn of(adapter: &wgpu::Adapter) -> Result<Self, GpuError> {
+    fn of(adapter: &wgpu::Adapter, features: GpuFeatures) -> Result<Self, GpuError> {
         let facts = AdapterFacts::of(adapter);
         if !facts.missing.is_empty() {
             return Err(GpuError::TooSmall { adapter: facts.name, missing: facts.missing.join("; ") });
@@ -157,7 +171,7 @@ impl Gpu {
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("cif"),
-            required_features: adapter.features() & WELCOME,
+            required_features: adapter.features() & features.welcome(facts.software),
             required_limits: limits,
             ..Default::default()
         };
@@ -188,7 +202,49 @@ impl Gpu {
                 *fault = Some(GpuError::Lost(message));
             }
         });
-        Ok(Self { device, queue, facts: Arc::new(facts), fault })
+        let has_subgroups = device.features().contains(wgpu::Features::SUBGROUP);
+        let subgroups = match (has_subgroups, facts.subgroups) {
+            (true, _) => SubgroupUse::Used,
+            (false, Some(_)) if facts.software && features.subgroups => SubgroupUse::Software,
+            (false, Some(_)) => SubgroupUse::HeldBack,
+            (false, None) => SubgroupUse::Missing,
+        };
+        let gpu = Self { device, queue, facts: Arc::new(facts), subgroups: Arc::new(subgroups), fault };
+        gpu.checked()
+    }
+
+    /// Itself with subgroups that are used only where they compute known numbers right.
+    fn checked(self) -> Result<Self, GpuError> {
+        if self.form() == Form::Portable {
+            return Ok(self);
+        }
+        let wrong = match self_check(&self) {
+            Ok(wrong) => wrong,
+            Err(error @ (GpuError::OutOfMemory(_) | GpuError::Lost(_))) => return Err(error),
+            Err(error) => Some(error.to_string()),
+        };
+        Ok(match wrong {
+            None => self,
+            Some(what) => {
+                *self.fault.lock().unwrap_or_else(PoisonError::into_inner) = None;
+                Self { subgroups: Arc::new(SubgroupUse::Wrong(what)), ..self }
+            }
+        })
+    }
+
+    /// Whether kernels work by subgroups, and why not.
+    #[must_use]
+    pub fn subgroups(&self) -> &SubgroupUse {
+        &self.subgroups
+    }
+
+    /// The form in which kernels are compiled.
+    #[must_use]
+    pub fn form(&self) -> Form {
+        match *self.subgroups {
+            SubgroupUse::Used => Form::Subgroups,
+            _ => Form::Portable,
+        }
     }
 
     /// The device.

@@ -33,6 +33,15 @@ pub enum GpuError {
         /// What the driver says.
         message: String,
     },
+    /// A feature that is to be held back or not, and is none.
+    #[error(
+        "CIF_GPU_FEATURES names \"{name}\", which is no optional feature; it may be all, none, or some of subgroups, \
+         timestamps, separated by commas"
+    )]
+    UnknownFeature {
+        /// What was named.
+        name: String,
+    },
     /// Something does not fit the limits of the device.
     #[error(
         "{what}: {count} x {item_bytes} bytes = {bytes} bytes, but this GPU binds at most {limit} bytes at a time; \

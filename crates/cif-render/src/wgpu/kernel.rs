@@ -1,8 +1,9 @@
 //! Compute kernels from embedded WGSL files.
 //!
 //! A [`Module`] is one WGSL file with what it imports and the bindings it declares, in order. Line by line,
-//! `#import name` is replaced by the snippet of that name, once; snippets may import others. Constants and
-//! structures that Rust knows are snippets made by [`constants`] and [`structures`], so that nothing is typed twice.
+//! `#import name` is replaced by the snippet of that name, once; snippets may import others. `#paste name` is replaced
+//! each time. Constants and structures that Rust knows are snippets made by [`constants`] and [`structures`], so that
+//! nothing is typed twice; what exists in two forms is chosen for the device, see [`super::workgroup`].
 //!
 //! A [`Kernel`] is one entry point of a module on a device. [`Commands`] records dispatches, grouped into stages
 //! that are timed on the device where it has timestamps.
@@ -11,6 +12,7 @@ use super::buffers::GpuVec;
 use super::device::Gpu;
 use super::error::GpuError;
 use super::layout::Layout;
+use super::workgroup::Form;
 
 /// Text that modules import.
 #[derive(Clone, Copy, Debug)]
@@ -48,31 +50,43 @@ pub struct Module {
 }
 
 impl Module {
-    /// The text with its imports.
+    /// The text with its imports, in the portable form.
     ///
     /// # Panics
     /// When the file imports what the module does not list.
     #[must_use]
     pub fn source(&self) -> String {
+        self.source_in(Form::Portable)
+    }
+
+    /// The text with its imports, in a form.
+    ///
+    /// # Panics
+    /// As [`Self::source`].
+    #[must_use]
+    pub fn source_in(&self, form: Form) -> String {
         let mut done = Vec::new();
         let mut out = String::new();
-        self.expand(self.text, &mut done, &mut out);
+        self.expand(self.text, form, &mut done, &mut out);
         out
     }
 
-    fn expand(&self, text: &str, done: &mut Vec<&'static str>, out: &mut String) {
+    fn expand(&self, text: &str, form: Form, done: &mut Vec<&'static str>, out: &mut String) {
         for line in text.lines() {
-            let Some(name) = line.trim().strip_prefix("#import ") else {
+            let directive = line.trim();
+            let imported = directive.strip_prefix("#import ");
+            let Some(name) = imported.or_else(|| directive.strip_prefix("#paste ")) else {
                 out.push_str(line);
                 out.push('\n');
                 continue;
             };
-            let snippet = self.imports.iter().find(|snippet| snippet.name == name.trim());
+            let snippet =
+                form.snippets().iter().chain(self.imports).find(|snippet| snippet.name == name.trim());
             let snippet =
                 snippet.unwrap_or_else(|| panic!("{}.wgsl imports `{name}`, which is not there", self.name));
-            if !done.contains(&snippet.name) {
+            if imported.is_none() || !done.contains(&snippet.name) {
                 done.push(snippet.name);
-                self.expand(&(snippet.text)(), done, out);
+                self.expand(&(snippet.text)(), form, done, out);
             }
         }
     }
@@ -129,7 +143,7 @@ impl Kernel {
     /// # Errors
     /// When the driver rejects it.
     pub fn compile_with(gpu: &Gpu, module: &Module, declarations: &str) -> Result<Vec<Self>, GpuError> {
-        let source = format!("{declarations}{}", module.source());
+        let source = format!("{declarations}{}", module.source_in(gpu.form()));
         let device = gpu.device();
         let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
         let shader = device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -424,12 +438,13 @@ mod tests {
         const B: Snippet = Snippet { name: "b", text: || "const B = 1;".to_owned() };
         let module = Module {
             name: "test",
-            text: "#import b\n#import a\n#import a\nfn f() {}",
+            text: "#import b\n#import a\n#import a\nfn f() {}\n#paste b\n#paste b",
             imports: &[A, B],
             bindings: &[],
             entries: &[],
         };
-        assert_eq!(module.source(), "const B = 1;\nconst A = B;\nfn f() {}\n");
+        let expected = "const B = 1;\nconst A = B;\nfn f() {}\nconst B = 1;\nconst B = 1;\n";
+        assert_eq!(module.source(), expected, "imported once, pasted each time");
     }
 
     #[test]

@@ -3,6 +3,8 @@
 //! | module | holds |
 //! |---|---|
 //! | [`device`] | which GPU, what it can do, what went wrong on it |
+//! | [`features`] | optional features, and holding them back |
+//! | [`workgroup`] | what invocations do together, through workgroup memory or by subgroups |
 //! | [`kernel`] | kernels from WGSL files, recorded commands, times on the device |
 //! | [`gaussians`], [`identities`] | Gaussians and their gradients, and identities, on the device |
 //! | [`faults`] | what no optimiser may take |
@@ -18,9 +20,10 @@
 //! | [`sort`] | prefix sums and radix sorts |
 //! | [`rasterizer`] | the stages in order, in both directions |
 //! | [`renderer`] | pictures of fields |
+//! | [`speed`] | what a device can do at most |
 //!
 //! Kernels need the core limits of WebGPU and no more: 8 storage buffers, 16 KiB of workgroup memory and 256
-//! invocations per workgroup.
+//! invocations per workgroup. Subgroups are used where they are there.
 
 pub mod buffers;
 pub mod cache;
@@ -29,6 +32,7 @@ pub mod deform;
 pub mod device;
 pub mod error;
 pub mod faults;
+pub mod features;
 pub mod gaussians;
 pub mod identities;
 pub mod kernel;
@@ -36,10 +40,12 @@ pub mod layout;
 pub mod rasterizer;
 pub mod renderer;
 pub mod sort;
+pub mod speed;
 pub mod stages;
 pub mod testing;
 pub mod validation;
 pub mod view;
+pub mod workgroup;
 
 pub use ::wgpu::{BindGroup, SubmissionIndex as Submission};
 pub use buffers::{Arriving, GpuVec, Letter, Mailbox, Recorded, Uniform};
@@ -48,6 +54,7 @@ pub use counts::GpuIdentityCounts;
 pub use deform::{DeformationGradients, GpuDeformation};
 pub use device::{AdapterFacts, Gpu};
 pub use error::GpuError;
+pub use features::GpuFeatures;
 pub use gaussians::GpuGaussians;
 pub use identities::{DeviceIdentities, packed_entries};
 pub use kernel::{
@@ -58,11 +65,14 @@ pub use layout::{Layout, Member, Shared, WgslType};
 pub use rasterizer::{GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput};
 pub use renderer::GpuRenderer;
 pub use sort::{Count, RadixSort, Scan, SortArrays};
+pub use speed::DeviceSpeed;
 pub use view::{Splat, View};
+pub use workgroup::{Form, SubgroupUse};
 
 /// Every WGSL file of this crate, for the test that validates them.
 pub const MODULES: &[&Module] = &[
     &stages::PROJECT,
+    &stages::PROJECT_PACKED,
     &stages::SCAN,
     &stages::SORT,
     &stages::BIN,
@@ -79,6 +89,8 @@ pub const MODULES: &[&Module] = &[
     &stages::PROJECT_BACKWARD,
     &counts::COUNT_LABELS,
     &counts::GATHER_COUNTS,
+    &workgroup::SELF_CHECK,
+    &speed::SPEED,
 ];
 
 /// Every structure that Rust and WGSL share.

@@ -8,10 +8,10 @@
 #import view
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read> posed: array<vec4f>;
-@group(0) @binding(2) var<storage, read> sh: array<f32>;
 @group(0) @binding(3) var<storage, read_write> splats: array<Splat>;
 @group(0) @binding(4) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> depth_order: array<u32>;
+#import coefficients
 #import footprint
 
 fn color_of(row: u32, direction: vec3f) -> vec3f {
@@ -19,8 +19,7 @@ fn color_of(row: u32, direction: vec3f) -> vec3f {
     let count = (view.sh_degree + 1u) * (view.sh_degree + 1u);
     var color = vec3f(0.5);
     for (var m = 0u; m < count; m += 1u) {
-        let at = row * SH_FLOATS + m * 3u;
-        color += basis[m] * vec3f(sh[at], sh[at + 1u], sh[at + 2u]);
+        color += basis[m] * coefficient(row, m);
     }
     return color;
 }

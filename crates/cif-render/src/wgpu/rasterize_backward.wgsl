@@ -189,7 +189,9 @@ fn visit(
         let passes = (splat.passes >> shift) & 3u;
         if (passes != 0u) {
             let dy = splat.mean.y - (f32(origin.y + part) + 0.5);
-            for (var column = 0u; column < HALF_TILE; column += 1u) {
+            for (var k = 0u; k < HALF_TILE; k += 1u) {
+                // Every eighth starts at another column, so that they read from different banks of memory.
+                let column = (k + part) % HALF_TILE;
                 let at = part * HALF_TILE + column;
                 let share = shares[own * 64u + at];
                 let dx = splat.mean.x - (f32(origin.x + column) + 0.5);

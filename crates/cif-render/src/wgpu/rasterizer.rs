@@ -15,11 +15,11 @@ use super::buffers::{GpuVec, Recorded, Uniform};
 use super::cache::BindCache;
 use super::device::Gpu;
 use super::error::GpuError;
-use super::gaussians::{GEOMETRY_FLOATS, GpuGaussians};
+use super::gaussians::{GEOMETRY_FLOATS, GpuGaussians, PACKED_SH_WORDS};
 use super::identities::DeviceIdentities;
 use super::kernel::{Commands, workgroups};
 use super::sort::{Count, RadixSort, Scan, SortArrays};
-use super::stages::Kernels;
+use super::stages::{Kernels, PROJECT_PACKED, entries};
 use super::view::{PAIR_SUMS, Splat, View, work};
 use crate::RenderSettings;
 
@@ -234,7 +234,40 @@ impl Rasterizer {
         identities: Option<&DeviceIdentities>,
         input: &ViewInput<'_>,
     ) -> Result<(), GpuError> {
-        let n = gaussians.geometry.len();
+        let PosedInput { geometry, sh } = gaussians;
+        self.project_from(gpu, commands, geometry, (sh.buffer(), false), identities, input)
+    }
+
+    /// As [`Self::project`], with spherical harmonics as [`super::gaussians::packed_sh`] makes them; for pictures, as
+    /// [`Self::backward`] reads full ones.
+    ///
+    /// # Errors
+    /// As [`Self::project`].
+    ///
+    /// # Panics
+    /// As [`Self::project`].
+    pub fn project_packed(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        geometry: &GpuVec<[f32; GEOMETRY_FLOATS]>,
+        sh: &GpuVec<[u32; PACKED_SH_WORDS]>,
+        identities: Option<&DeviceIdentities>,
+        input: &ViewInput<'_>,
+    ) -> Result<(), GpuError> {
+        self.project_from(gpu, commands, geometry, (sh.buffer(), true), identities, input)
+    }
+
+    fn project_from(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        geometry: &GpuVec<[f32; GEOMETRY_FLOATS]>,
+        (sh, packed): (&wgpu::Buffer, bool),
+        identities: Option<&DeviceIdentities>,
+        input: &ViewInput<'_>,
+    ) -> Result<(), GpuError> {
+        let n = geometry.len();
         let mut view = View::new(input.camera, input.settings, n);
         if let Some(identities) = identities {
             assert_eq!(identities.row_offsets.len(), n + 1, "a row of identities per Gaussian");
@@ -265,20 +298,28 @@ impl Rasterizer {
         let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
         commands.clear(&arrays.work);
         let uniform = self.uniform.buffer();
+        if packed && self.kernels.project_packed.is_none() {
+            let [kernel] = entries(gpu, &PROJECT_PACKED)?;
+            self.kernels.project_packed = Some(kernel);
+        }
+        let kernel = match &self.kernels.project_packed {
+            Some(kernel) if packed => kernel,
+            _ => &self.kernels.project,
+        };
         let project = self.cache.get(
             gpu,
-            ("project", 0),
-            &self.kernels.project,
+            ("project", u32::from(packed)),
+            kernel,
             &[
                 uniform,
-                gaussians.geometry.buffer(),
-                gaussians.sh.buffer(),
+                geometry.buffer(),
+                sh,
                 arrays.splats.buffer(),
                 arrays.depth.keys[0].buffer(),
                 arrays.depth.values[0].buffer(),
             ],
         );
-        commands.stage("project", |stage| stage.dispatch(&self.kernels.project, &project, workgroups(n, 64)));
+        commands.stage("project", |stage| stage.dispatch(kernel, &project, workgroups(n, 64)));
 
         let mut sorted = Ok(0);
         commands.stage("sort by depth", |stage| {

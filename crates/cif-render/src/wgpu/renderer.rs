@@ -3,10 +3,11 @@
 use cif_field::Field;
 use cif_geometry::{PinholeCamera, PixelGrid};
 
+use super::buffers::GpuVec;
 use super::deform::GpuDeformation;
 use super::device::Gpu;
 use super::error::GpuError;
-use super::gaussians::GpuGaussians;
+use super::gaussians::{GpuGaussians, PACKED_SH_WORDS, geometry, packed_sh};
 use super::identities::DeviceIdentities;
 use super::kernel::Commands;
 use super::rasterizer::{PosedInput, Rasterizer, ViewInput};
@@ -21,7 +22,9 @@ pub struct GpuRenderer {
     gpu: Gpu,
     rasterizer: Rasterizer,
     poser: Renderer,
+    /// Without spherical harmonics where those are packed.
     canonical: GpuGaussians,
+    packed_sh: Option<GpuVec<[u32; PACKED_SH_WORDS]>>,
     deformation: Option<GpuDeformation>,
     /// At the time of the view, where anything moves.
     posed: GpuGaussians,
@@ -34,6 +37,20 @@ impl GpuRenderer {
     /// # Errors
     /// When the field exceeds what the device binds, with the arithmetic; when the driver rejects the kernels.
     pub fn new(gpu: &Gpu, field: &Field) -> Result<Self, GpuError> {
+        Self::with(gpu, field, false)
+    }
+
+    /// As [`Self::new`], with spherical harmonics above the constant band in 16-bit floats, see [`packed_sh`]: 104
+    /// bytes per Gaussian instead of 192. Colours differ by less than half an 8-bit level. Fields whose spherical
+    /// harmonics change with time keep full ones.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn compact(gpu: &Gpu, field: &Field) -> Result<Self, GpuError> {
+        Self::with(gpu, field, true)
+    }
+
+    fn with(gpu: &Gpu, field: &Field, compact: bool) -> Result<Self, GpuError> {
         let identities = field
             .identities
             .as_ref()
@@ -41,15 +58,35 @@ impl GpuRenderer {
             .transpose()?;
         let learned = field.deformation.as_ref().filter(|_| field.tracks.is_none());
         let deformation = learned.map(|deformation| GpuDeformation::new(gpu, deformation)).transpose()?;
+        let packs = compact
+            && gpu.facts().packed_half_floats
+            && field.tracks.is_none()
+            && !deformation.as_ref().is_some_and(GpuDeformation::moves_sh);
+        let gaussians = &field.gaussians;
+        let (canonical, packed_sh) = if packs {
+            let rows: Vec<_> = gaussians.sh_coefficients.iter().map(packed_sh).collect();
+            let mut canonical = GpuGaussians::zeros(gpu, 0)?;
+            canonical.geometry.replace(gpu, &geometry(gaussians))?;
+            (canonical, Some(GpuVec::from_slice(gpu, "packed spherical harmonics", &rows)?))
+        } else {
+            (GpuGaussians::upload(gpu, gaussians)?, None)
+        };
         Ok(Self {
             rasterizer: Rasterizer::new(gpu)?,
             poser: Renderer::new(SimdLevel::Auto),
-            canonical: GpuGaussians::upload(gpu, &field.gaussians)?,
+            canonical,
+            packed_sh,
             deformation,
             posed: GpuGaussians::zeros(gpu, 0)?,
             identities,
             gpu: gpu.clone(),
         })
+    }
+
+    /// Whether spherical harmonics are in 16-bit floats.
+    #[must_use]
+    pub fn is_compact(&self) -> bool {
+        self.packed_sh.is_some()
     }
 
     /// Renders a view for looking at or measuring; `field` is the one that the renderer was made for.
@@ -88,7 +125,12 @@ impl GpuRenderer {
         } else {
             (&self.canonical).into()
         };
-        self.rasterizer.draw(&self.gpu, commands, posed, identities, &input, channels.depth)
+        let (gpu, rasterizer) = (&self.gpu, &mut self.rasterizer);
+        let Some(sh) = &self.packed_sh else {
+            return rasterizer.draw(gpu, commands, posed, identities, &input, channels.depth);
+        };
+        rasterizer.project_packed(gpu, &mut commands, posed.geometry, sh, identities, &input)?;
+        rasterizer.draw_projected(gpu, commands, identities, camera, channels.depth)
     }
 }
 
@@ -107,9 +149,21 @@ impl Rasterizer {
         input: &ViewInput<'_>,
         with_depth: bool,
     ) -> Result<RenderedImage, GpuError> {
-        let (width, height) = (input.camera.width, input.camera.height);
-        let pixels = width as usize * height as usize;
         self.project(gpu, &mut commands, posed, identities, input)?;
+        self.draw_projected(gpu, commands, identities, input.camera, with_depth)
+    }
+
+    /// As [`Self::draw`], of a view whose projection `commands` hold.
+    fn draw_projected(
+        &mut self,
+        gpu: &Gpu,
+        commands: Commands<'_>,
+        identities: Option<&DeviceIdentities>,
+        camera: &PinholeCamera,
+        with_depth: bool,
+    ) -> Result<RenderedImage, GpuError> {
+        let (width, height) = (camera.width, camera.height);
+        let pixels = width as usize * height as usize;
         self.measure(gpu, commands)?;
         let mut commands = Commands::new(gpu, None);
         self.rasterize(gpu, &mut commands, identities, None)?;

@@ -9,7 +9,8 @@
 @group(0) @binding(2) var<storage, read_write> values: array<u32>;
 @group(0) @binding(3) var<storage, read_write> sums: array<u32>;
 
-var<workgroup> partial: array<u32, 256>;
+const INVOCATIONS: u32 = 256u;
+#import workgroup
 
 fn count() -> u32 {
     if (parameters.work_element == NONE) {
@@ -18,32 +19,11 @@ fn count() -> u32 {
     return work[parameters.work_element];
 }
 
-fn saturating(a: u32, b: u32) -> u32 {
-    let sum = a + b;
-    return select(sum, 0xffffffffu, sum < a);
-}
-
-// Inclusive over the workgroup; returns what lies before the invocation.
-fn before(local: u32, value: u32) -> u32 {
-    partial[local] = value;
-    workgroupBarrier();
-    for (var step = 1u; step < 256u; step *= 2u) {
-        var left = 0u;
-        if (local >= step) {
-            left = partial[local - step];
-        }
-        workgroupBarrier();
-        partial[local] = saturating(partial[local], left);
-        workgroupBarrier();
-    }
-    return select(0u, partial[max(local, 1u) - 1u], local > 0u);
-}
-
-// Sum of the four values of an invocation.
-fn own_sum(block: u32, local: u32, total: u32) -> u32 {
+// Sum of the four values of a rank.
+fn own_sum(block: u32, rank: u32, total: u32) -> u32 {
     var sum = 0u;
     for (var k = 0u; k < 4u; k += 1u) {
-        let index = block * SCAN_BLOCK + local * 4u + k;
+        let index = block * SCAN_BLOCK + rank * 4u + k;
         if (index < total) {
             sum = saturating(sum, values[index]);
         }
@@ -52,46 +32,58 @@ fn own_sum(block: u32, local: u32, total: u32) -> u32 {
 }
 
 @compute @workgroup_size(256)
-fn reduce(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
+fn reduce(
+    @builtin(workgroup_id) workgroup: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
     let block = item_of(workgroup, 0u, 1u);
     let total = count();
-    let sum = own_sum(block, local, total);
-    let left = before(local, sum);
-    if (local == 255u && block * SCAN_BLOCK < total) {
-        sums[block] = saturating(left, sum);
+    // The sum of all is the same in any order.
+    let sums_before = before_in_workgroup(lane, own_sum(block, local, total));
+    if (local == 0u && block * SCAN_BLOCK < total) {
+        sums[block] = sums_before.y;
     }
 }
 
 @compute @workgroup_size(256)
-fn spine(@builtin(local_invocation_index) local: u32) {
+fn spine(
+    #paste lane_builtins
+) {
+    #paste lane
+    let rank = rank_of(lane);
     let blocks = (count() + SCAN_BLOCK - 1u) / SCAN_BLOCK;
     var carry = 0u;
     for (var first = 0u; first < blocks; first += 256u) {
-        let index = first + local;
+        let index = first + rank;
         var sum = 0u;
         if (index < blocks) {
             sum = sums[index];
         }
-        let left = before(local, sum);
+        let sums_before = before_in_workgroup(lane, sum);
         if (index < blocks) {
-            sums[index] = saturating(carry, left);
+            sums[index] = saturating(carry, sums_before.x);
         }
-        carry = saturating(carry, partial[255]);
-        workgroupBarrier();
+        carry = saturating(carry, sums_before.y);
     }
 }
 
 @compute @workgroup_size(256)
-fn spread(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
+fn spread(
+    @builtin(workgroup_id) workgroup: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
+    let rank = rank_of(lane);
     let block = item_of(workgroup, 0u, 1u);
     let total = count();
-    let sum = own_sum(block, local, total);
-    var running = before(local, sum);
+    let sum = own_sum(block, rank, total);
+    var running = before_in_workgroup(lane, sum).x;
     if (block * SCAN_BLOCK < total) {
         running = saturating(running, sums[block]);
     }
     for (var k = 0u; k < 4u; k += 1u) {
-        let index = block * SCAN_BLOCK + local * 4u + k;
+        let index = block * SCAN_BLOCK + rank * 4u + k;
         if (index < total) {
             let value = values[index];
             values[index] = running;

@@ -182,3 +182,74 @@ impl RadixSort {
         Ok(passes as usize % 2)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wgpu::kernel::Commands;
+    use crate::wgpu::testing;
+
+    fn number(k: usize) -> u32 {
+        (k as u32 ^ 0x5bd1).wrapping_mul(0x9e37_79b1)
+    }
+
+    #[test]
+    fn prefix_sums_saturate_and_are_those_of_the_host_in_both_forms() {
+        for gpu in testing::gpus() {
+            let mut scan = Scan::new(&gpu).unwrap();
+            let none = GpuVec::<u32>::zeros(&gpu, "work", work::LEN).unwrap();
+            // Within a workgroup, over several, over several rounds of the spine; small, and overflowing half way.
+            for (count, largest) in
+                [(1, 9), (255, 9), (1024, 9), (1025, 9), (5000, 1000), (300_000, 13_000), (300_000, 29_000)]
+            {
+                let values: Vec<u32> = (0..count).map(|k| number(k) % largest).collect();
+                let array = GpuVec::from_slice(&gpu, "values", &values).unwrap();
+                let mut commands = Commands::new(&gpu, None);
+                commands.stage("scan", |stage| {
+                    let place = ("test", count as u32);
+                    let mut cache = BindCache::default();
+                    scan.record(&gpu, &mut cache, stage, place, &array, Count::Host(count), count, &none)
+                        .unwrap();
+                });
+                commands.submit();
+                let mut sum = 0_u32;
+                for (k, (found, value)) in array.read(&gpu).unwrap().into_iter().zip(values).enumerate() {
+                    assert_eq!(found, sum, "{:?}: {k} of {count} below {largest}", gpu.form());
+                    sum = sum.saturating_add(value);
+                }
+                assert_eq!(sum == u32::MAX, largest == 29_000, "{sum}");
+            }
+        }
+    }
+
+    #[test]
+    fn sorts_are_stable_in_both_forms() {
+        for gpu in testing::gpus() {
+            let (mut scan, mut sort) = (Scan::new(&gpu).unwrap(), RadixSort::new(&gpu).unwrap());
+            let none = GpuVec::<u32>::zeros(&gpu, "work", work::LEN).unwrap();
+            for count in [1, 2047, 2049, 70_000] {
+                // Many equal keys, and the largest.
+                let keys: Vec<u32> =
+                    (0..count).map(|k| if k % 11 == 0 { u32::MAX } else { number(k / 3) }).collect();
+                let mut expected: Vec<u32> = (0..count as u32).collect();
+                expected.sort_by_key(|k| keys[*k as usize]);
+                let mut arrays = SortArrays::new(&gpu, "test").unwrap();
+                arrays.resize(&gpu, count).unwrap();
+                arrays.keys[0].write(&gpu, 0, &keys);
+                arrays.values[0].write(&gpu, 0, &(0..count as u32).collect::<Vec<u32>>());
+                let mut commands = Commands::new(&gpu, None);
+                let mut result = 0;
+                commands.stage("sort", |stage| {
+                    let mut cache = BindCache::default();
+                    let count = Count::Host(count);
+                    result = sort
+                        .record(&gpu, &mut cache, stage, &mut scan, "test", &arrays, count, 32, &none)
+                        .unwrap();
+                });
+                commands.submit();
+                let found = arrays.values[result].read_range(&gpu, 0, count).unwrap();
+                assert!(found == expected, "{:?}: {count} keys", gpu.form());
+            }
+        }
+    }
+}

@@ -5,18 +5,22 @@ use super::error::GpuError;
 use super::kernel::Access::{Read, ReadWrite, Uniform};
 use super::kernel::{Kernel, Module};
 use super::view::{
-    COLOR_ONLY, CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT,
-    STAGING, TILES, VIEW, WITH_INSTANCES,
+    COEFFICIENTS, COLOR_ONLY, CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, PACKED_COEFFICIENTS,
+    SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, STAGING, TILES, VIEW, WITH_INSTANCES,
 };
 
 /// Projection.
 pub const PROJECT: Module = Module {
     name: "project",
     text: include_str!("project.wgsl"),
-    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT],
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, COEFFICIENTS],
     bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["project"],
 };
+
+/// Projection of Gaussians whose spherical harmonics are in 16-bit floats.
+pub const PROJECT_PACKED: Module =
+    Module { imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, PACKED_COEFFICIENTS], ..PROJECT };
 
 /// Prefix sum.
 pub const SCAN: Module = Module {
@@ -138,6 +142,8 @@ pub const PROJECT_BACKWARD: Module = Module {
 #[derive(Debug)]
 pub(crate) struct Kernels {
     pub(crate) project: Kernel,
+    /// Compiled when the first of them is drawn.
+    pub(crate) project_packed: Option<Kernel>,
     pub(crate) count: Kernel,
     pub(crate) gather: Kernel,
     pub(crate) plan: Kernel,
@@ -160,6 +166,7 @@ impl Kernels {
         let one = |module: &Module| entries(gpu, module).map(|[kernel]| kernel);
         Ok(Self {
             project: one(&PROJECT)?,
+            project_packed: None,
             count,
             gather,
             plan,

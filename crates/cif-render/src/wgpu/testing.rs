@@ -1,6 +1,8 @@
 //! The GPU that tests run on: `CIF_TEST_GPU=off|auto|require`.
 
 use super::device::Gpu;
+use super::features::GpuFeatures;
+use super::workgroup::Form;
 
 /// The GPU for a test, or `None` with the reason on stderr. `off` skips, `auto` (the default) takes what is there,
 /// software rasterisers too, and `require` insists.
@@ -28,4 +30,26 @@ pub fn gpu() -> Option<Gpu> {
         },
         _ => panic!("CIF_TEST_GPU is {wish}; it may be off, auto or require"),
     }
+}
+
+/// The GPU for a test of kernels that exist in two forms: in the form that it works in, then in the other, where it has
+/// subgroups. Empty where [`gpu`] is `None`.
+///
+/// # Panics
+/// As [`gpu`].
+#[must_use]
+pub fn gpus() -> Vec<Gpu> {
+    let Some(gpu) = gpu() else { return Vec::new() };
+    let other = match gpu.form() {
+        Form::Portable => gpu.facts().subgroups.map(|_| GpuFeatures::ALL),
+        Form::Subgroups => Some(GpuFeatures::NONE),
+    };
+    let other = other.map(|features| match Gpu::open_with(features) {
+        Ok(other) => {
+            assert_ne!(other.form(), gpu.form(), "{}", other.subgroups());
+            other
+        }
+        Err(error) => panic!("the same GPU with other features: {error}"),
+    });
+    std::iter::once(gpu).chain(other).collect()
 }

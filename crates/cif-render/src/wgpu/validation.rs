@@ -2,11 +2,12 @@
 
 use std::fmt::Write as _;
 
-use naga::valid::{Capabilities, ValidationFlags, Validator};
+use naga::valid::{Capabilities, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator};
 use naga::{AddressSpace, StorageAccess, TypeInner};
 
 use super::kernel::{Access, Module};
 use super::layout::Layout;
+use super::workgroup::Form;
 
 /// Storage buffers of an entry point in the core of WebGPU.
 const MAX_STORAGE_BUFFERS: usize = 8;
@@ -15,8 +16,9 @@ const MAX_WORKGROUP_BYTES: u32 = 16_384;
 /// Invocations of a workgroup in the core of WebGPU.
 const MAX_INVOCATIONS: u32 = 256;
 
-/// Checks that a module is valid WGSL without any optional feature, that its bindings and entry points are the listed
-/// ones, that structures lie as in Rust, and that every entry point keeps to the core limits of WebGPU.
+/// Checks that a module is valid WGSL, without any optional feature and in the form with subgroups, that its bindings
+/// and entry points are the listed ones, that structures lie as in Rust, and that every entry point keeps to the core
+/// limits of WebGPU.
 ///
 /// # Errors
 /// With everything that is wrong, a line each.
@@ -29,10 +31,28 @@ pub fn validate(module: &Module, layouts: &[Layout]) -> Result<(), String> {
 /// # Errors
 /// As [`validate`].
 pub fn validate_with(module: &Module, declarations: &str, layouts: &[Layout]) -> Result<(), String> {
-    let source = format!("{declarations}{}", module.source());
+    let wrong: String = Form::ALL
+        .into_iter()
+        .filter_map(|form| validate_in(form, module, declarations, layouts).err())
+        .collect();
+    if wrong.is_empty() { Ok(()) } else { Err(wrong) }
+}
+
+fn validate_in(form: Form, module: &Module, declarations: &str, layouts: &[Layout]) -> Result<(), String> {
+    let source = format!("{declarations}{}", module.source_in(form));
     let parsed = naga::front::wgsl::parse_str(&source)
         .map_err(|error| format!("{}.wgsl: {}", module.name, error.emit_to_string(&source)))?;
-    let information = Validator::new(ValidationFlags::all(), Capabilities::empty())
+    // `unpack2x16float` is core WGSL, though naga has a name for it.
+    let core = Capabilities::SHADER_FLOAT16_IN_FLOAT32;
+    let (capabilities, stages, operations) = match form {
+        Form::Portable => (core, ShaderStages::empty(), SubgroupOperationSet::empty()),
+        Form::Subgroups => {
+            (core | Capabilities::SUBGROUP, ShaderStages::COMPUTE, SubgroupOperationSet::all())
+        }
+    };
+    let information = Validator::new(ValidationFlags::all(), capabilities)
+        .subgroup_stages(stages)
+        .subgroup_operations(operations)
         .validate(&parsed)
         .map_err(|error| format!("{}.wgsl: {}", module.name, error.emit_to_string(&source)))?;
     let mut wrong = String::new();
@@ -193,6 +213,9 @@ mod tests {
             fn run(@builtin(local_invocation_index) i: u32) { shared_values[i] = 1.0; out[i] = shared_values[0]; }\n";
         fails(Module { text: greedy, ..PROBE }, &layout, "20000 bytes");
         fails(Module { text: greedy, ..PROBE }, &layout, "512 invocations");
+        // What only devices with subgroups do, in a file that is for all.
+        let always = GOOD.replace("probe.c;", "subgroupAdd(probe.c);");
+        fails(Module { text: Box::leak(always.into_boxed_str()), ..PROBE }, &layout, "probe.wgsl");
         // Validity at all: a uniform that is written.
         let invalid = GOOD.replace("out[i] = ", "probe.c = ");
         fails(Module { text: Box::leak(invalid.into_boxed_str()), ..PROBE }, &layout, "probe.wgsl");

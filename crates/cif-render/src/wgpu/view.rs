@@ -5,6 +5,7 @@ use cif_field::gaussians::SH_FLOATS;
 use cif_geometry::spherical_harmonics::{BAND_0, BAND_1, BAND_2, BAND_3};
 use cif_geometry::{PinholeCamera, quaternion};
 
+use super::gaussians::PACKED_SH_WORDS;
 use super::kernel::{Constant, MAX_WORKGROUPS, Snippet, constants, structures};
 use super::layout::Shared;
 use crate::constants::{
@@ -232,6 +233,7 @@ fn shared_constants() -> String {
         ("TILE", Unsigned(TILE)),
         ("HALF_TILE", Unsigned(TILE / 2)),
         ("SH_FLOATS", Unsigned(SH_FLOATS as u32)),
+        ("PACKED_SH_WORDS", Unsigned(PACKED_SH_WORDS as u32)),
         ("MAX_WORKGROUPS", Unsigned(MAX_WORKGROUPS)),
         ("SCAN_BLOCK", Unsigned(SCAN_BLOCK as u32)),
         ("SORT_BLOCK", Unsigned(SORT_BLOCK as u32)),
@@ -273,6 +275,12 @@ pub const NUMBERS: Snippet =
 /// Spherical harmonics.
 pub const HARMONICS: Snippet =
     Snippet { name: "harmonics", text: || include_str!("shared/harmonics.wgsl").to_owned() };
+/// How projection reads spherical harmonics.
+pub(crate) const COEFFICIENTS: Snippet =
+    Snippet { name: "coefficients", text: || include_str!("shared/coefficients.wgsl").to_owned() };
+/// As above, from 16-bit floats.
+pub(crate) const PACKED_COEFFICIENTS: Snippet =
+    Snippet { name: "coefficients", text: || include_str!("shared/packed_coefficients.wgsl").to_owned() };
 pub(crate) const FOOTPRINT: Snippet =
     Snippet { name: "footprint", text: || include_str!("shared/footprint.wgsl").to_owned() };
 pub(crate) const SPLAT: Snippet =

@@ -27,22 +27,8 @@ struct Guide {
 @group(0) @binding(6) var<storage, read_write> v_posed: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> v_canonical: array<vec4f>;
 
-var<workgroup> shared_sums: array<vec4f, 128>;
-
-// Sum over the workgroup, for every thread.
-fn sum_over(local: u32, value: vec4f) -> vec4f {
-    shared_sums[local] = value;
-    workgroupBarrier();
-    for (var half = 64u; half > 0u; half /= 2u) {
-        if local < half {
-            shared_sums[local] += shared_sums[local + half];
-        }
-        workgroupBarrier();
-    }
-    let sum = shared_sums[0];
-    workgroupBarrier();
-    return sum;
-}
+const INVOCATIONS: u32 = 128u;
+#import workgroup
 
 // Gradient of a pull of weight and reach.
 fn pulled(r: vec3f, pull: vec2f) -> vec3f {
@@ -82,7 +68,11 @@ fn nearest_rotation(correlation: mat3x3f) -> mat3x3f {
 }
 
 @compute @workgroup_size(128)
-fn follow(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
+fn follow(
+    @builtin(workgroup_id) group: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
     let own = group.x + 1u;
     var displaced = vec4f(0.0);
     var place = vec4f(0.0);
@@ -92,8 +82,8 @@ fn follow(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
             place += vec4f(canonical[3u * row].xyz, 0.0);
         }
     }
-    let sum_displaced = sum_over(local, displaced);
-    let sum_place = sum_over(local, place);
+    let sum_displaced = sum_of_workgroup(lane, displaced);
+    let sum_place = sum_of_workgroup(lane, place);
     let count = max(sum_displaced.w, 1.0);
     let now = sum_displaced.xyz / count;
     let before = sum_place.xyz / count;
@@ -110,9 +100,9 @@ fn follow(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
             columns[2] += a * b.z;
         }
     }
-    let c0 = sum_over(local, columns[0]);
-    let c1 = sum_over(local, columns[1]);
-    let c2 = sum_over(local, columns[2]);
+    let c0 = sum_of_workgroup(lane, columns[0]);
+    let c1 = sum_of_workgroup(lane, columns[1]);
+    let c2 = sum_of_workgroup(lane, columns[2]);
     let rotation = nearest_rotation(mat3x3f(c0.xyz, c1.xyz, c2.xyz));
     var pull = vec4f(0.0);
     for (var row = local; row < motion.gaussians; row += 128u) {
@@ -121,7 +111,7 @@ fn follow(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
             pull += vec4f(pulled(r, motion.path), 0.0);
         }
     }
-    let sum_pull = sum_over(local, pull);
+    let sum_pull = sum_of_workgroup(lane, pull);
     if local == 0u {
         let away = now - before - shifts[group.x].xyz;
         guides[group.x].now = now;

@@ -23,22 +23,15 @@
 // Per label, whether its pixels train nothing.
 @group(0) @binding(8) var<storage, read> left_out: array<u32>;
 
-var<workgroup> shared_sums: array<vec4f, 256>;
-
-// Sum over the workgroup, in the first element.
-fn reduce(local: u32, value: vec4f) {
-    shared_sums[local] = value;
-    workgroupBarrier();
-    for (var half = 128u; half > 0u; half /= 2u) {
-        if local < half {
-            shared_sums[local] += shared_sums[local + half];
-        }
-        workgroupBarrier();
-    }
-}
+const INVOCATIONS: u32 = 256u;
+#import workgroup
 
 @compute @workgroup_size(256)
-fn losses(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
+fn losses(
+    @builtin(workgroup_id) group: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
     let workgroup = group.y * MAX_WORKGROUPS + group.x;
     let pixel = workgroup * 256u + local;
     var sums = vec4f(0.0);
@@ -59,27 +52,29 @@ fn losses(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
             }
         }
     }
-    reduce(local, sums);
+    let sum = sum_of_workgroup(lane, sums);
     if local == 0u {
-        partial_sums[2u * workgroup] = shared_sums[0];
+        partial_sums[2u * workgroup] = sum;
         partial_sums[2u * workgroup + 1u] = vec4f(0.0);
     }
 }
 
 // Adds the workgroups' sums; one workgroup.
 @compute @workgroup_size(256)
-fn total(@builtin(local_invocation_index) local: u32) {
+fn total(
+    #paste lane_builtins
+) {
+    #paste lane
     let workgroups = (settings.pixels + 255u) / 256u;
     for (var part = 0u; part < 2u; part++) {
         var sums = vec4f(0.0);
         for (var k = local; k < workgroups; k += 256u) {
             sums += partial_sums[2u * k + part];
         }
-        reduce(local, sums);
+        let sum = sum_of_workgroup(lane, sums);
         if local == 0u {
-            results[2u * settings.slot + part] = shared_sums[0];
+            results[2u * settings.slot + part] = sum;
         }
-        workgroupBarrier();
     }
 }
 

@@ -15,7 +15,8 @@
 @group(0) @binding(5) var<storage, read_write> v_colors: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
 
-var<workgroup> shared_sums: array<vec4f, 256>;
+const INVOCATIONS: u32 = 256u;
+#import workgroup
 
 fn tap(distance: u32) -> f32 {
     return settings.window[distance / 4u][distance % 4u];
@@ -74,7 +75,11 @@ fn blur_column(image: u32, pixel: u32) -> vec4f {
 
 // Similarity of every pixel, and what its gradient is made of.
 @compute @workgroup_size(256)
-fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
+fn compare(
+    @builtin(workgroup_id) group: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
     let workgroup = group.y * MAX_WORKGROUPS + group.x;
     let pixel = workgroup * 256u + local;
     var similarity = vec4f(0.0);
@@ -95,16 +100,9 @@ fn compare(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
         maps[settings.pixels + pixel] = v * (-similarity / d);
         maps[2u * settings.pixels + pixel] = v * (2.0 * a / (c * d));
     }
-    shared_sums[local] = vec4f(similarity.x + similarity.y + similarity.z, 0.0, 0.0, 0.0);
-    workgroupBarrier();
-    for (var half = 128u; half > 0u; half /= 2u) {
-        if local < half {
-            shared_sums[local] += shared_sums[local + half];
-        }
-        workgroupBarrier();
-    }
+    let sum = sum_of_workgroup(lane, vec4f(similarity.x + similarity.y + similarity.z, 0.0, 0.0, 0.0));
     if local == 0u {
-        partial_sums[2u * workgroup + 1u] = shared_sums[0];
+        partial_sums[2u * workgroup + 1u] = sum;
     }
 }
 

@@ -7,7 +7,7 @@ use cif_render::Gradients;
 use cif_render::wgpu::deform::{DeformationGradients, FIXED_UNITS, SPLITS, ZERO_SUM};
 use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::validation::validate;
-use cif_render::wgpu::{Commands, GpuDeformation, GpuGaussians, GpuStatistics, GpuVec, Layout, testing};
+use cif_render::wgpu::{Commands, Gpu, GpuDeformation, GpuGaussians, GpuStatistics, GpuVec, Layout, testing};
 
 use super::exposure::{CameraExposures, GpuExposure};
 use super::judge::GpuJudge;
@@ -80,7 +80,10 @@ fn flat(pixels: &[[f32; 4]]) -> Vec<f32> {
 
 #[test]
 fn colour_losses_and_gradients_are_those_of_the_cpu() {
-    let Some(gpu) = testing::gpu() else { return };
+    testing::gpus().into_iter().for_each(colour_losses_on);
+}
+
+fn colour_losses_on(gpu: Gpu) {
     let (rendered, target) = images();
     let pixels = rendered.pixels.len();
     let mut losses = GpuLosses::new(&gpu).unwrap();
@@ -96,6 +99,10 @@ fn colour_losses_and_gradients_are_those_of_the_cpu() {
         losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, slot).unwrap();
         commands.submit();
         let slots = losses.results().read(&gpu).unwrap();
+        let mut commands = Commands::new(&gpu, None);
+        losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, slot).unwrap();
+        commands.submit();
+        assert_eq!(losses.results().read(&gpu).unwrap(), slots, "sums repeat to the bit");
         let found = ViewLoss::new([slots[2 * slot], slots[2 * slot + 1]], pixels, lambda_dssim);
         assert!((found.color.loss - expected.loss).abs() < 1e-6, "{found:?} {expected:?}");
         assert!((found.color.psnr() - expected.psnr()).abs() < 1e-4, "{found:?} {expected:?}");
@@ -110,7 +117,10 @@ fn colour_losses_and_gradients_are_those_of_the_cpu() {
 
 #[test]
 fn instance_losses_count_what_is_labelled_and_unsupported() {
-    let Some(gpu) = testing::gpu() else { return };
+    testing::gpus().into_iter().for_each(instance_losses_on);
+}
+
+fn instance_losses_on(gpu: Gpu) {
     let target = PixelGrid::filled(20, 15, [10_u8; 3]);
     let mut labels = PixelGrid::filled(20, 15, 0_u16);
     let mut blended = vec![[0.0, 0.5, 0.25, 0.0]; 300];
@@ -695,7 +705,10 @@ fn identities_are_a_softmax_over_the_support() {
 
 #[test]
 fn pulls_are_those_of_the_cpu_and_leave_the_direct_path_alone() {
-    let Some(gpu) = testing::gpu() else { return };
+    testing::gpus().into_iter().for_each(pulls_on);
+}
+
+fn pulls_on(gpu: Gpu) {
     let n = 700;
     let canonical = some_gaussians(n, 0.31, 1.0);
     let guide_of: Vec<u16> = (0..n).map(|row| (row % 7) as u16 % 4).collect();

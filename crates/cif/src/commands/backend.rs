@@ -1,6 +1,6 @@
 //! `--backend`: whether the processor or a GPU does the work.
 
-use cif_render::wgpu::Gpu;
+use cif_render::wgpu::{Gpu, SubgroupUse};
 use cif_train::{TrainError, Trainer};
 use clap::ValueEnum;
 
@@ -31,7 +31,7 @@ impl Backend {
 
     /// The GPU to use, if any; `auto` takes no software rasteriser for one.
     pub(super) fn open(self) -> Result<Option<Gpu>, Error> {
-        match self {
+        let gpu = match self {
             Self::Cpu => Ok(None),
             Self::Wgpu => Gpu::open().map(Some).map_err(Error::plain),
             Self::Auto => Ok(match Gpu::open() {
@@ -48,7 +48,13 @@ impl Backend {
                     None
                 }
             }),
+        }?;
+        if let Some(gpu) = &gpu
+            && let SubgroupUse::Wrong(_) = gpu.subgroups()
+        {
+            eprintln!("note: subgroups of {} are {}", gpu.facts().name, gpu.subgroups());
         }
+        Ok(gpu)
     }
 
     /// Makes a trainer's steps run on the GPU, and says so; `auto` tries steps on both for a second, takes what is

@@ -6,11 +6,17 @@ use std::time::Duration;
 
 use cif_dataset::{Dataset, Layout};
 use cif_field::Field;
+#[cfg(feature = "wgpu")]
+use cif_render::wgpu::Gpu;
 use cif_train::metrics::training_config;
+#[cfg(feature = "wgpu")]
+use cif_train::wgpu::floors::StepShape;
 use cif_train::{InstancePass, Stage, StepTimes, TrainConfig, Trainer};
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::{Map, Value, json};
 
+#[cfg(feature = "wgpu")]
+use super::bench_device::{OnDevice, StageTimes};
 use super::{CaptureOptions, Simd, print_warnings, scene, train};
 use crate::error::Error;
 use crate::output;
@@ -45,7 +51,11 @@ scene: give a scene to measure what training costs in the end.
 
 In the instance stage every view is measured twice, with the instance pass and without, which tells
 what the pass adds to colour. --instances repeats that from the same start with a longer table of
-instances, the labels spread over it. Nothing is saved of the training done.")]
+instances, the labels spread over it. Nothing is saved of the training done.
+
+On a GPU (--backend wgpu) every stage is also timed there, beside its floor: the bytes that it has to
+move and the operations that it has to do at the least, at the speeds that a copy and a loop of
+multiplications and additions reach on the same device. The same steps are then done on the processor.")]
 struct Step {
     /// Folder of the capture
     capture: PathBuf,
@@ -202,12 +212,16 @@ fn measure(
     let mut series = Vec::new();
     let mut simd = String::new();
     #[cfg(feature = "wgpu")]
-    let gpu = command.backend.open()?;
+    let (gpu, mut device) = (command.backend.open()?, None);
     for table in std::iter::once(None).chain(tables.into_iter().map(Some)) {
-        let (dataset, config, field) = (dataset.clone(), config.clone(), field.clone());
-        let mut trainer =
-            Trainer::for_measuring(dataset, config, field, stage, command.warm_up).map_err(Error::plain)?;
-        trainer.set_simd(command.simd.into());
+        let start = || {
+            let (dataset, config, field) = (dataset.clone(), config.clone(), field.clone());
+            let mut trainer = Trainer::for_measuring(dataset, config, field, stage, command.warm_up)
+                .map_err(Error::plain)?;
+            trainer.set_simd(command.simd.into());
+            Ok::<_, Error>(trainer)
+        };
+        let mut trainer = start()?;
         if let Some(count) = table {
             trainer.spread_instances(usize::from(count));
         }
@@ -218,9 +232,41 @@ fn measure(
             trainer.time_gpu_stages();
             simd = trainer.gpu_name().map_or(simd, str::to_owned);
         }
-        series.push(Series::measure(&mut trainer, command)?);
+        let measured = Series::measure(&mut trainer, command)?;
+        #[cfg(feature = "wgpu")]
+        if let (Some(gpu), None, Some(_)) = (&gpu, table, trainer.gpu_name()) {
+            device = Some(beside_processor(command, gpu, &trainer, &measured, start)?);
+        }
+        series.push(measured);
     }
-    Ok(Report { stage, warm_up: command.warm_up, simd, series })
+    Ok(Report {
+        stage,
+        warm_up: command.warm_up,
+        simd,
+        series,
+        #[cfg(feature = "wgpu")]
+        device,
+    })
+}
+
+/// Stages on the device beside their floors, and the same steps on the processor.
+#[cfg(feature = "wgpu")]
+fn beside_processor(
+    command: &Step,
+    gpu: &Gpu,
+    trainer: &Trainer,
+    measured: &Series,
+    start: impl FnOnce() -> Result<Trainer, Error>,
+) -> Result<OnDevice, Error> {
+    let mut processor = start()?;
+    let on_processor = Series::measure(&mut processor, command)?;
+    // Pairs are evaluated in the same views there, and counted.
+    let shape = StepShape {
+        evaluated_pairs: processor.step_shape(&on_processor.steps).evaluated_pairs,
+        ..trainer.step_shape(&measured.steps)
+    };
+    let wall = |series: &Series| cost(&series.steps, |step| step.total).mean;
+    OnDevice::new(gpu, &measured.device, &shape, [wall(measured), wall(&on_processor)])
 }
 
 /// Measured steps with one table of instances.
@@ -229,15 +275,26 @@ struct Series {
     steps: Vec<StepTimes>,
     /// The same views without the instance pass; empty in other stages.
     without: Vec<StepTimes>,
+    /// What stages took on a GPU, step by step.
+    #[cfg(feature = "wgpu")]
+    device: Vec<StageTimes>,
 }
 
 impl Series {
     fn measure(trainer: &mut Trainer, command: &Step) -> Result<Self, Error> {
         let compares = trainer.stage() == Stage::Instance;
         let instances = trainer.field().instances.len();
-        let mut series = Self { instances, steps: Vec::new(), without: Vec::new() };
+        let mut series = Self {
+            instances,
+            steps: Vec::new(),
+            without: Vec::new(),
+            #[cfg(feature = "wgpu")]
+            device: Vec::new(),
+        };
         for step in 0..command.warm_up + command.steps {
             let with = trainer.measure_step(InstancePass::On).map_err(Error::plain)?;
+            #[cfg(feature = "wgpu")]
+            let on_device = trainer.take_gpu_stages();
             let without = match compares {
                 true => {
                     // In turns, so that whatever else the machine does falls on both.
@@ -246,7 +303,11 @@ impl Series {
                 }
                 false => None,
             };
+            #[cfg(feature = "wgpu")]
+            drop(trainer.take_gpu_stages());
             if step >= command.warm_up {
+                #[cfg(feature = "wgpu")]
+                series.device.push(on_device);
                 series.steps.push(with);
                 series.without.extend(without);
             }
@@ -326,6 +387,9 @@ struct Report {
     simd: String,
     /// The capture's own table of instances first.
     series: Vec<Series>,
+    /// Stages on a GPU.
+    #[cfg(feature = "wgpu")]
+    device: Option<OnDevice>,
 }
 
 /// A count per step, and the time that one of them takes.
@@ -420,6 +484,10 @@ impl Report {
                 }))
             })
             .collect();
+        #[cfg(feature = "wgpu")]
+        let device = self.device.as_ref().map(OnDevice::json);
+        #[cfg(not(feature = "wgpu"))]
+        let device = Value::Null;
         json!({
             "stage": self.stage,
             "steps": self.steps().len(),
@@ -431,6 +499,7 @@ impl Report {
             "units": units,
             "evaluated_pairs_per_second_and_thread": self.pair_rate(),
             "instance_pass": passes,
+            "device": device,
         })
     }
 
@@ -468,6 +537,10 @@ impl Report {
         println!("{table}\n");
         let rate = number(self.pair_rate().map(|rate| rate / 1e6), 1);
         println!("{rate} million evaluated pairs per second and thread (rasterize)");
+        #[cfg(feature = "wgpu")]
+        if let Some(device) = &self.device {
+            device.print();
+        }
         if self.series.iter().all(|series| series.without.is_empty()) {
             return;
         }

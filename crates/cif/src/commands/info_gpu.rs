@@ -1,50 +1,66 @@
 //! `cif info --gpu`: GPUs, their features and limits, and what of them is used.
 
-use cif_render::wgpu::{AdapterFacts, Gpu, Rasterizer};
+use cif_render::wgpu::{AdapterFacts, Gpu, GpuFeatures, Rasterizer, SubgroupUse};
 use serde_json::{Value, json};
 
 use crate::error::Error;
 
 pub(super) fn run(as_json: bool) -> Result<(), Error> {
+    let allowed = GpuFeatures::from_environment().map_err(Error::plain)?;
     let adapters = Gpu::adapters();
     // Opened like any command would, kernels included: a GPU that is listed may still refuse.
-    let opened = Gpu::open().and_then(|gpu| Rasterizer::new(&gpu).map(|_| gpu.facts().clone()));
+    let opened = Gpu::open_with(allowed).and_then(|gpu| Rasterizer::new(&gpu).map(|_| gpu));
     if as_json {
-        let adapters: Vec<Value> = adapters.iter().map(facts).collect();
-        let (used, fault) = match &opened {
-            Ok(used) => (json!(used.name), Value::Null),
-            Err(error) => (Value::Null, json!(error.to_string())),
+        let adapters: Vec<Value> = adapters.iter().map(|adapter| facts(adapter, allowed)).collect();
+        let (used, subgroups, fault) = match &opened {
+            Ok(gpu) => (json!(gpu.facts().name), json!(gpu.subgroups().to_string()), Value::Null),
+            Err(error) => (Value::Null, Value::Null, json!(error.to_string())),
         };
-        println!("{:#}", json!({ "adapters": adapters, "used": used, "fault": fault }));
+        let text = json!({ "adapters": adapters, "used": used, "used_subgroups": subgroups, "fault": fault });
+        println!("{text:#}");
         return Ok(());
     }
     for adapter in &adapters {
-        print(adapter);
+        print(adapter, allowed);
     }
     match opened {
-        Ok(used) if used.software => {
-            println!(
-                "--backend wgpu takes {}; --backend auto takes the processor, as it is faster",
-                used.name
-            );
+        Ok(gpu) => {
+            let name = &gpu.facts().name;
+            if gpu.facts().software {
+                println!("--backend wgpu takes {name}; --backend auto takes the processor, as it is faster");
+            } else {
+                println!("--backend wgpu takes {name}; its kernels compile");
+            }
+            if *gpu.subgroups() != SubgroupUse::Missing {
+                println!("its subgroups are {}", gpu.subgroups());
+            }
         }
-        Ok(used) => println!("--backend wgpu takes {}; its kernels compile", used.name),
         Err(error) => println!("--backend wgpu cannot be used: {error}"),
+    }
+    if !(allowed.subgroups && allowed.timestamps) {
+        println!("{} holds optional features back", GpuFeatures::VARIABLE);
     }
     Ok(())
 }
 
 /// What is used of an adapter, in words.
-fn paths(adapter: &AdapterFacts) -> Vec<String> {
+fn paths(adapter: &AdapterFacts, allowed: GpuFeatures) -> Vec<String> {
     let mut paths =
         vec!["32-bit floats, workgroup memory, no float atomics (results repeat to the bit)".to_owned()];
-    if adapter.timestamps {
+    let subgroups = if adapter.software { allowed.software_subgroups } else { allowed.subgroups };
+    if adapter.subgroups.is_some() && subgroups {
+        paths.push("subgroups for sums over workgroups, after a check of known numbers".to_owned());
+    }
+    if adapter.packed_half_floats {
+        paths.push("16-bit storage of spherical harmonics in draft renders, computed in 32 bits".to_owned());
+    }
+    if adapter.timestamps && allowed.timestamps {
         paths.push("times of stages from the device".to_owned());
     }
     paths
 }
 
-fn facts(adapter: &AdapterFacts) -> Value {
+fn facts(adapter: &AdapterFacts, allowed: GpuFeatures) -> Value {
     let limits: serde_json::Map<String, Value> =
         adapter.limits.iter().map(|(name, value)| (name.replace(' ', "_"), json!(value))).collect();
     json!({
@@ -56,13 +72,14 @@ fn facts(adapter: &AdapterFacts) -> Value {
         "timestamps": adapter.timestamps,
         "subgroups": adapter.subgroups,
         "half_floats": adapter.half_floats,
+        "packed_half_floats": adapter.packed_half_floats,
         "limits": limits,
         "missing": adapter.missing,
-        "used": paths(adapter),
+        "used": paths(adapter, allowed),
     })
 }
 
-fn print(adapter: &AdapterFacts) {
+fn print(adapter: &AdapterFacts, allowed: GpuFeatures) {
     println!("{} ({}, {})", adapter.name, adapter.interface, adapter.kind);
     let row = |name: &str, value: String| println!("{name:>28}  {value}");
     row("driver", adapter.driver.clone());
@@ -72,12 +89,13 @@ fn print(adapter: &AdapterFacts) {
         || "no".to_owned(),
         |(least, most)| if least == most { format!("of {least}") } else { format!("of {least} to {most}") },
     );
-    row("subgroups", format!("{subgroups} (not used)"));
-    row("16-bit floats", format!("{} (not used)", has(adapter.half_floats)));
+    row("subgroups", subgroups);
+    let (computed, kept) = (has(adapter.half_floats), has(adapter.packed_half_floats));
+    row("16-bit floats", format!("{kept} for storage, {computed} for arithmetic (which is not used)"));
     for (name, value) in &adapter.limits {
         row(name, value.to_string());
     }
-    for path in paths(adapter) {
+    for path in paths(adapter, allowed) {
         row("used", path);
     }
     for missing in &adapter.missing {

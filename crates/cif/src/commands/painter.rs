@@ -32,6 +32,15 @@ pub(super) struct Sample<'a> {
     pub(super) time: f64,
     pub(super) settings: &'a RenderSettings,
     pub(super) channels: Channels,
+    /// Whether a GPU keeps spherical harmonics in 16-bit floats.
+    pub(super) compact: bool,
+}
+
+#[cfg(feature = "wgpu")]
+impl Sample<'_> {
+    fn renderer(&self, gpu: &Gpu) -> Result<GpuRenderer, GpuError> {
+        if self.compact { GpuRenderer::compact(gpu, self.field) } else { GpuRenderer::new(gpu, self.field) }
+    }
 }
 
 impl Painter {
@@ -48,9 +57,7 @@ impl Painter {
         let name = format!("{} ({})", facts.name, facts.interface);
         if backend == Backend::Wgpu {
             eprintln!("rendering on {name}");
-            return GpuRenderer::new(&gpu, sample.field)
-                .map(|renderer| Self::Gpu(Box::new(renderer)))
-                .map_err(Error::plain);
+            return sample.renderer(&gpu).map(|renderer| Self::Gpu(Box::new(renderer))).map_err(Error::plain);
         }
         let mut processor = Renderer::new(simd);
         let start = std::time::Instant::now();
@@ -76,7 +83,7 @@ impl Painter {
 /// A renderer on the GPU, and the time of a view once everything is warm.
 #[cfg(feature = "wgpu")]
 fn probe(gpu: &Gpu, sample: &Sample<'_>) -> Result<(GpuRenderer, std::time::Duration), GpuError> {
-    let mut renderer = GpuRenderer::new(gpu, sample.field)?;
+    let mut renderer = sample.renderer(gpu)?;
     let view = |renderer: &mut GpuRenderer| {
         renderer.render(sample.field, sample.camera, sample.time, sample.settings, sample.channels)
     };

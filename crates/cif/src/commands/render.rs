@@ -73,8 +73,8 @@ pub(super) struct Render {
     /// Vector instructions: `auto` takes the widest that the processor has
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
-    /// What renders: `auto` measures the first view where there is a GPU, and tells what is faster. EXR files and
-    /// draft quality need the processor
+    /// What renders: `auto` measures the first view where there is a GPU, and tells what is faster. EXR files need the
+    /// processor
     #[cfg(feature = "wgpu")]
     #[arg(long, value_name = "BACKEND", default_value = "auto")]
     backend: super::backend::Backend,
@@ -108,7 +108,8 @@ enum What {
 /// Care of a render.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum QualityName {
-    /// Without Gaussians whose opacity and occupancy are both below 0.3
+    /// Without Gaussians whose opacity and occupancy are both below 0.3; on a GPU, view-dependent colour is kept in
+    /// 16-bit floats where it does not change with time, for less than half a level
     Draft,
     /// Everything that the scene holds
     Final,
@@ -284,18 +285,12 @@ fn painter(
             "leave --backend wgpu or --exr out",
         ));
     }
-    let draft = command.quality == QualityName::Draft;
-    if draft && command.backend == Backend::Wgpu {
-        return Err(Error::usage(
-            "--quality draft is what the processor leaves out, a GPU leaves nothing out",
-            "leave --backend wgpu or --quality draft out",
-        ));
-    }
-    let (false, Some(Shot { view, .. })) = (command.exr || draft, views.first()) else {
+    let (false, Some(Shot { view, .. })) = (command.exr, views.first()) else {
         return Ok(Painter::cpu(command.simd.into()));
     };
     let time = command.time.or(view.time).unwrap_or(0.0);
-    let sample = Sample { field, camera: &view.camera, time, settings, channels };
+    let compact = command.quality == QualityName::Draft;
+    let sample = Sample { field, camera: &view.camera, time, settings, channels, compact };
     Painter::choose(command.backend, command.simd.into(), &sample)
 }
 

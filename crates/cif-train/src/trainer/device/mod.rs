@@ -8,6 +8,7 @@
 //! |---|---|
 //! | `resident` | what lies on the device, fetching and sending |
 //! | `step`, `view` | one step, and one view of it |
+//! | `shape` | what steps took by stage, and what they worked on |
 //! | `flight` | steps on their way: what is read of them later, room for pairs, bad steps |
 //! | `validation` | where a bad step went wrong, and every array of a step looked at |
 //! | `events` | what happens between steps |
@@ -24,6 +25,7 @@ mod kept;
 mod probe;
 mod rearrange;
 mod resident;
+mod shape;
 mod step;
 #[cfg(test)]
 mod tests;
@@ -31,6 +33,7 @@ mod validation;
 mod view;
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use cif_field::gaussians::SH_FLOATS;
 use cif_render::wgpu::deform::Shape;
@@ -95,6 +98,8 @@ pub(super) struct DeviceTraining {
     waits: bool,
     /// Times every stage, where the device can.
     timestamps: Option<Timestamps>,
+    /// What they took, until it is asked for.
+    stage_times: Vec<(&'static str, Duration)>,
 }
 
 /// Counters that belong to the host's field and moments.
@@ -144,6 +149,7 @@ impl Trainer {
             slot: 0,
             waits: false,
             timestamps: None,
+            stage_times: Vec::new(),
             gpu: gpu.clone(),
         }));
         Ok(())

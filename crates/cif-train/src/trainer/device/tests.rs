@@ -13,7 +13,7 @@ use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent};
 use crate::exposure::Exposures;
-use crate::trainer::MAX_ROLLBACKS_IN_A_ROW;
+use crate::trainer::{InstancePass, MAX_ROLLBACKS_IN_A_ROW};
 
 pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     trainer_with(gpu, |_| {})
@@ -425,5 +425,36 @@ fn a_fault_of_the_device_leaves_a_run_that_goes_on_on_the_processor() {
         let mut resumed = Trainer::resume(trainer.dataset().clone(), checkpoint).unwrap();
         assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         assert_eq!(resumed.steps_done(), 24);
+    }
+}
+
+#[test]
+fn every_stage_of_a_step_has_a_floor() {
+    let Some(gpu) = testing::gpu() else { return };
+    let mut seen = std::collections::BTreeSet::new();
+    for stage in [Stage::Coarse, Stage::Fine, Stage::Instance] {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
+        let mut trainer = Trainer::for_measuring(dataset, small_config(), None, stage, 2).unwrap();
+        trainer.use_gpu(&gpu).unwrap();
+        trainer.time_gpu_stages();
+        let steps = [trainer.measure_step(InstancePass::On).unwrap()];
+        let shape = trainer.step_shape(&steps);
+        assert!(shape.views > 0.0 && shape.visible > 0.0 && shape.pairs > 0.0, "{shape:?}");
+        assert_eq!(shape.deformation.is_some(), stage != Stage::Coarse);
+        assert_eq!(shape.identity_entries > 0.0, stage == Stage::Instance);
+        for (name, _) in trainer.take_gpu_stages() {
+            let floor = crate::wgpu::floors::floor(name, &shape);
+            let floor = floor.unwrap_or_else(|| panic!("{name} has no floor"));
+            assert!(floor.bytes.is_finite() && floor.flops.is_finite(), "{name}: {floor:?}");
+            assert!(floor.bytes > 0.0 || name == "judge", "{stage}, {name}: {floor:?}");
+            seen.insert(name);
+        }
+        assert!(trainer.take_gpu_stages().is_empty(), "they are taken once");
+    }
+    if gpu.has_timestamps() {
+        for name in ["project", "deform backward: planes", "losses", "identity backward", "judge"] {
+            assert!(seen.contains(name), "{name} was timed: {seen:?}");
+        }
     }
 }

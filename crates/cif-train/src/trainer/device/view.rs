@@ -44,6 +44,7 @@ impl Trainer {
             faults,
             slot,
             timestamps,
+            stage_times,
             ..
         } = device;
         let fresh;
@@ -221,7 +222,9 @@ impl Trainer {
         let submission = commands.submit();
         let letter = letter.send();
         if let Some(timestamps) = timestamps {
-            add_stage_times(&mut self.times, &timestamps.read(gpu)?);
+            let stages = timestamps.read(gpu)?;
+            add_stage_times(&mut self.times, &stages);
+            stage_times.extend(stages);
         }
         let pixels = target.size[0] as usize * target.size[1] as usize;
         let about = AboutView {

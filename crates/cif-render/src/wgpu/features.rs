@@ -1,0 +1,78 @@
+//! Optional features: used where an adapter has them, never required, and held back where that is asked.
+
+use super::error::GpuError;
+
+/// Which optional features devices may use.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct GpuFeatures {
+    /// Sums over workgroups by subgroups.
+    pub subgroups: bool,
+    /// The same where software stands in for a GPU: it loops over subgroups, which is slower than memory.
+    pub software_subgroups: bool,
+    /// Times of stages from the device.
+    pub timestamps: bool,
+}
+
+impl GpuFeatures {
+    /// Whatever the adapter has.
+    pub const ALL: Self = Self { subgroups: true, software_subgroups: true, timestamps: true };
+    /// Whatever the adapter has and is faster with.
+    pub const USUAL: Self = Self { software_subgroups: false, ..Self::ALL };
+    /// The core of WebGPU alone.
+    pub const NONE: Self = Self { subgroups: false, software_subgroups: false, timestamps: false };
+    /// The environment variable that holds features back.
+    pub const VARIABLE: &str = "CIF_GPU_FEATURES";
+
+    /// What [`Self::VARIABLE`] allows; [`Self::USUAL`] where it is not set.
+    ///
+    /// # Errors
+    /// When it names a feature that is not there.
+    pub fn from_environment() -> Result<Self, GpuError> {
+        std::env::var(Self::VARIABLE).map_or(Ok(Self::USUAL), |text| Self::parse(&text))
+    }
+
+    /// From `all`, `none`, or names separated by commas.
+    ///
+    /// # Errors
+    /// When a name is not there.
+    pub fn parse(text: &str) -> Result<Self, GpuError> {
+        let mut features = Self::NONE;
+        for name in text.split(',').map(str::trim) {
+            match name {
+                "all" if text.trim() == "all" => features = Self::ALL,
+                "none" if text.trim() == "none" => {}
+                "subgroups" => (features.subgroups, features.software_subgroups) = (true, true),
+                "timestamps" => features.timestamps = true,
+                _ => return Err(GpuError::UnknownFeature { name: name.to_owned() }),
+            }
+        }
+        Ok(features)
+    }
+
+    /// As wgpu has them.
+    pub(super) fn welcome(self, in_software: bool) -> wgpu::Features {
+        let mut features = wgpu::Features::empty();
+        let subgroups = if in_software { self.software_subgroups } else { self.subgroups };
+        features.set(wgpu::Features::SUBGROUP, subgroups);
+        features.set(wgpu::Features::TIMESTAMP_QUERY, self.timestamps);
+        features
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn features_are_named_and_others_refused() {
+        let parse = GpuFeatures::parse;
+        assert_eq!(parse("all"), Ok(GpuFeatures::ALL));
+        assert_eq!(parse(" none "), Ok(GpuFeatures::NONE));
+        assert_eq!(parse("timestamps"), Ok(GpuFeatures { timestamps: true, ..GpuFeatures::NONE }));
+        assert_eq!(parse("subgroups, timestamps"), Ok(GpuFeatures::ALL));
+        for wrong in ["", "f64", "none,subgroups", "all,timestamps", "subgroups,"] {
+            let error = parse(wrong).unwrap_err().to_string();
+            assert!(error.contains("CIF_GPU_FEATURES") && error.contains("subgroups, timestamps"), "{error}");
+        }
+    }
+}

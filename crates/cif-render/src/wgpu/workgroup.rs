@@ -1,0 +1,202 @@
+//! What the invocations of a workgroup do together, in two forms of one interface: through workgroup memory, which
+//! every device has, and by subgroups. A module imports `workgroup`, pastes `lane_builtins` into the parameters of its
+//! entry points and `lane` at their start; which form it gets is the device's. Drivers are not taken at their word: a
+//! device uses subgroups only after known numbers have come out right.
+
+use super::buffers::GpuVec;
+use super::device::Gpu;
+use super::error::GpuError;
+use super::kernel::{Access, Commands, Kernel, Module, Snippet};
+
+/// How the invocations of a workgroup work together.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Form {
+    /// Through workgroup memory.
+    #[default]
+    Portable,
+    /// By subgroups.
+    Subgroups,
+}
+
+impl Form {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Portable, Self::Subgroups];
+
+    /// What modules get under the names `workgroup`, `lane_builtins` and `lane`.
+    ///
+    /// Subgroup built-ins are parameters and no members of a structure, for naga 30 misses those in HLSL; and it takes
+    /// no `enable subgroups;`.
+    #[must_use]
+    pub fn snippets(self) -> &'static [Snippet; 3] {
+        match self {
+            Self::Portable => &[
+                Snippet { name: "workgroup", text: || include_str!("shared/workgroup.wgsl").to_owned() },
+                Snippet {
+                    name: "lane_builtins",
+                    text: || "@builtin(local_invocation_index) local: u32,".to_owned(),
+                },
+                Snippet { name: "lane", text: || "let lane = Lane(local);".to_owned() },
+            ],
+            Self::Subgroups => &[
+                Snippet {
+                    name: "workgroup",
+                    text: || include_str!("shared/workgroup_by_subgroups.wgsl").to_owned(),
+                },
+                Snippet {
+                    name: "lane_builtins",
+                    text: || {
+                        "@builtin(local_invocation_index) local: u32,\n\
+                         @builtin(subgroup_id) subgroup: u32,\n\
+                         @builtin(num_subgroups) subgroups: u32,"
+                            .to_owned()
+                    },
+                },
+                Snippet {
+                    name: "lane",
+                    text: || {
+                        "let lane = Lane(local, subgroup, subgroups, subgroupExclusiveAdd(1u));".to_owned()
+                    },
+                },
+            ],
+        }
+    }
+}
+
+/// Whether a device works by subgroups.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum SubgroupUse {
+    /// It does, and known numbers came out right.
+    Used,
+    /// The adapter has none.
+    Missing,
+    /// `CIF_GPU_FEATURES` does not name them.
+    HeldBack,
+    /// Software stands in for a GPU, and loops over them.
+    Software,
+    /// Known numbers came out wrong: what did.
+    Wrong(String),
+}
+
+impl std::fmt::Display for SubgroupUse {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Used => f.write_str("used for sums over workgroups, after known numbers came out right"),
+            Self::Missing => f.write_str("not there, sums go through workgroup memory"),
+            Self::HeldBack => f.write_str("not used, as CIF_GPU_FEATURES says"),
+            Self::Software => f.write_str(
+                "not used, because software loops over them (CIF_GPU_FEATURES=all uses them all the same)",
+            ),
+            Self::Wrong(what) => write!(f, "not used, because this driver does not get them right: {what}"),
+        }
+    }
+}
+
+/// Compares what the device computes of known numbers.
+pub const SELF_CHECK: Module = Module {
+    name: "self_check",
+    text: include_str!("self_check.wgsl"),
+    imports: &[],
+    bindings: &[Access::ReadWrite],
+    entries: &["self_check"],
+};
+
+const INVOCATIONS: usize = 256;
+
+/// Runs [`SELF_CHECK`] in the form of the device, which may be any; says what came out wrong, if anything did.
+///
+/// # Errors
+/// When the device is lost, or rejects the kernel.
+pub fn self_check(gpu: &Gpu) -> Result<Option<String>, GpuError> {
+    let kernel = Kernel::compile(gpu, &SELF_CHECK)?.remove(0);
+    let found = GpuVec::<[u32; 4]>::zeros(gpu, "known numbers", 3 * INVOCATIONS)?;
+    let group = kernel.bind(gpu, &[found.binding()]);
+    let mut commands = Commands::new(gpu, None);
+    commands.stage("self-check", |stage| stage.dispatch(&kernel, &group, [1, 1, 1]));
+    commands.submit();
+    Ok(differences(&found.read(gpu)?))
+}
+
+/// The first difference from the known numbers.
+fn differences(found: &[[u32; 4]]) -> Option<String> {
+    let locals = 0..INVOCATIONS as u32;
+    let sum = |of: fn(u32) -> f32| locals.clone().map(of).sum::<f32>();
+    let sums = [sum(|i| i as f32), sum(|_| 1.0), sum(|i| 0.25 * (i % 7) as f32), sum(|i| -((i * i) as f32))];
+    let before = |rank: u32, of: fn(u32) -> u32| (0..rank).map(of).fold(0_u32, u32::saturating_add);
+    let small: fn(u32) -> u32 = |rank| 3 * rank + 1;
+    let large: fn(u32) -> u32 = |rank| 0x0101_0101 + rank;
+    let all = INVOCATIONS as u32;
+    let mut ranks = [false; INVOCATIONS];
+    for (local, rows) in found.chunks_exact(3).enumerate() {
+        let of_sums = rows[0].map(f32::from_bits);
+        if of_sums != sums {
+            return Some(format!("sums of a workgroup are {of_sums:?} for invocation {local}, not {sums:?}"));
+        }
+        let [rank, ..] = rows[1];
+        match ranks.get_mut(rank as usize) {
+            Some(taken) if !*taken => *taken = true,
+            _ => return Some(format!("invocation {local} has rank {rank}, which is taken or too large")),
+        }
+        let expected = [before(rank, small), before(all, small), before(rank, large), before(all, large)];
+        let of_counts = [rows[1][1], rows[1][2], rows[1][3], rows[2][0]];
+        if of_counts != expected {
+            return Some(format!("prefix sums at rank {rank} are {of_counts:?}, not {expected:?}"));
+        }
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::wgpu::testing;
+
+    #[test]
+    fn known_numbers_come_out_right_in_both_forms() {
+        for gpu in testing::gpus() {
+            assert_eq!(self_check(&gpu), Ok(None), "{:?}", gpu.form());
+        }
+    }
+
+    #[test]
+    fn wrong_numbers_are_told() {
+        let locals = 0..INVOCATIONS as u32;
+        let sum = |of: fn(u32) -> f32| locals.clone().map(of).sum::<f32>().to_bits();
+        let sums =
+            [sum(|i| i as f32), sum(|_| 1.0), sum(|i| 0.25 * (i % 7) as f32), sum(|i| -((i * i) as f32))];
+        let below = |rank: u32| (0..rank).map(|k| 0x0101_0101 + k).fold(0_u32, u32::saturating_add);
+        // Ranks in an order of their own.
+        let right: Vec<[u32; 4]> = locals
+            .flat_map(|local| {
+                let rank = (local * 37 + 11) % INVOCATIONS as u32;
+                let small = |rank: u32| 3 * (rank * rank.saturating_sub(1) / 2) + rank;
+                let counts = [rank, small(rank), small(INVOCATIONS as u32), below(rank)];
+                [sums, counts, [below(INVOCATIONS as u32), 0, 0, 0]]
+            })
+            .collect();
+        assert_eq!(differences(&right), None);
+        assert_eq!(below(INVOCATIONS as u32), u32::MAX, "the large numbers overflow");
+        let fails = |at: usize, value: [u32; 4], expected: &str| {
+            let mut wrong = right.clone();
+            wrong[at] = value;
+            let told = differences(&wrong).unwrap_or_default();
+            assert!(told.contains(expected), "{expected} not in: {told}");
+        };
+        fails(0, [sums[0], sums[1], sums[2], sums[3] + 1], "sums of a workgroup");
+        fails(3 * 9 + 1, right[3 * 8 + 1], "taken");
+        fails(3 * 9 + 1, [900, 0, 0, 0], "too large");
+        let [rank, small, all, large] = right[3 * 200 + 1];
+        fails(3 * 200 + 1, [rank, small + 1, all, large], "prefix sums");
+        fails(3 * 200 + 2, [0; 4], "prefix sums");
+    }
+
+    #[test]
+    fn modules_get_the_form_they_are_asked_for() {
+        let portable = SELF_CHECK.source_in(Form::Portable);
+        assert!(!portable.contains("subgroupAdd") && !portable.contains("@builtin(subgroup"), "{portable}");
+        let by_subgroups = SELF_CHECK.source_in(Form::Subgroups);
+        assert!(
+            by_subgroups.contains("subgroupAdd(value)") && by_subgroups.contains("@builtin(subgroup_id)")
+        );
+        assert_eq!(SELF_CHECK.source(), portable);
+    }
+}

@@ -1,0 +1,190 @@
+//! What the stages of a step take on a GPU, beside the least that they could: `cif bench step --backend wgpu`.
+
+use std::time::Duration;
+
+use cif_render::wgpu::{DeviceSpeed, Gpu};
+use cif_train::wgpu::floors::{StepShape, floor};
+use serde_json::{Value, json};
+
+use crate::error::Error;
+
+/// Stages of one step and what they took, in the order in which they ran.
+pub(super) type StageTimes = Vec<(&'static str, Duration)>;
+
+/// Steps on a GPU.
+pub(super) struct OnDevice {
+    name: String,
+    subgroups: String,
+    speed: DeviceSpeed,
+    stages: Vec<StageRow>,
+    /// Mean wall time of a step on the device and on the processor, milliseconds.
+    step_ms: [f64; 2],
+}
+
+/// A stage, mean of a step.
+struct StageRow {
+    name: &'static str,
+    ms: f64,
+    floor_ms: f64,
+    bytes: f64,
+    flops: f64,
+    by_memory: bool,
+}
+
+impl OnDevice {
+    /// From the stages of every measured step, what they worked on, and the mean wall time of a step here and on the
+    /// processor.
+    pub(super) fn new(
+        gpu: &Gpu,
+        steps: &[StageTimes],
+        shape: &StepShape,
+        step_ms: [f64; 2],
+    ) -> Result<Self, Error> {
+        let speed = DeviceSpeed::measure(gpu).map_err(Error::plain)?;
+        Ok(Self {
+            name: format!("{} ({})", gpu.facts().name, gpu.facts().interface),
+            subgroups: gpu.subgroups().to_string(),
+            stages: rows(steps, shape, &speed),
+            speed,
+            step_ms,
+        })
+    }
+
+    pub(super) fn json(&self) -> Value {
+        let stages: Vec<Value> = self
+            .stages
+            .iter()
+            .map(|row| {
+                json!({
+                    "name": row.name,
+                    "ms": row.ms,
+                    "floor_ms": row.floor_ms,
+                    "share_of_floor": row.share(),
+                    "floor_by": row.floor_by(),
+                    "bytes": row.bytes,
+                    "flops": row.flops,
+                })
+            })
+            .collect();
+        let [here, processor] = self.step_ms;
+        json!({
+            "name": self.name,
+            "subgroups": self.subgroups,
+            "bytes_per_second": self.speed.bytes_per_second,
+            "flops_per_second": self.speed.flops_per_second,
+            "stages": stages,
+            "step_ms": here,
+            "processor_step_ms": processor,
+            "times_as_fast_as_processor": (here > 0.0).then(|| processor / here),
+        })
+    }
+
+    pub(super) fn print(&self) {
+        println!(
+            "\n{}: {:.1} GB/s by a copy, {:.1} GFLOP/s by multiplying and adding; subgroups are {}",
+            self.name,
+            self.speed.bytes_per_second / 1e9,
+            self.speed.flops_per_second / 1e9,
+            self.subgroups
+        );
+        let [here, processor] = self.step_ms;
+        if self.stages.is_empty() {
+            println!("it has no timestamps, so its stages are not timed");
+        } else {
+            let mut table =
+                super::table(["stage on the device", "ms", "floor ms", "of floor", "by", "MB", "MFLOP"]);
+            for row in &self.stages {
+                table.add_row([
+                    row.name.to_owned(),
+                    format!("{:.3}", row.ms),
+                    format!("{:.3}", row.floor_ms),
+                    row.share().map_or_else(String::new, |share| format!("{:.0} %", 100.0 * share)),
+                    row.floor_by().to_owned(),
+                    format!("{:.2}", row.bytes / 1e6),
+                    format!("{:.2}", row.flops / 1e6),
+                ]);
+            }
+            let sum = |of: fn(&StageRow) -> f64| self.stages.iter().map(of).sum::<f64>();
+            let (ms, floor) = (sum(|row| row.ms), sum(|row| row.floor_ms));
+            table.add_row([
+                "all".to_owned(),
+                format!("{ms:.3}"),
+                format!("{floor:.3}"),
+                if ms > 0.0 { format!("{:.0} %", 100.0 * floor / ms) } else { String::new() },
+                String::new(),
+                format!("{:.2}", sum(|row| row.bytes) / 1e6),
+                format!("{:.2}", sum(|row| row.flops) / 1e6),
+            ]);
+            println!("{table}");
+            println!(
+                "the floor is what the stage has to move and to compute at the least, at the speeds above; steps wait \
+                 for the device here, which they do not in training"
+            );
+        }
+        println!(
+            "the processor does such a step in {processor:.3} ms, the device in {here:.3}: {:.2} times as fast",
+            processor / here.max(1e-9)
+        );
+    }
+}
+
+impl StageRow {
+    /// Share of the floor that is reached.
+    fn share(&self) -> Option<f64> {
+        (self.ms > 0.0).then(|| self.floor_ms / self.ms)
+    }
+
+    fn floor_by(&self) -> &'static str {
+        match (self.floor_ms > 0.0, self.by_memory) {
+            (false, _) => "latency",
+            (true, true) => "memory",
+            (true, false) => "arithmetic",
+        }
+    }
+}
+
+/// Means over steps, by stage, in the order in which stages first ran; those without a floor are left out.
+fn rows(steps: &[StageTimes], shape: &StepShape, speed: &DeviceSpeed) -> Vec<StageRow> {
+    let mut rows: Vec<StageRow> = Vec::new();
+    for (name, time) in steps.iter().flatten() {
+        let ms = 1e3 * time.as_secs_f64() / steps.len() as f64;
+        if let Some(row) = rows.iter_mut().find(|row| row.name == *name) {
+            row.ms += ms;
+        } else if let Some(floor) = floor(name, shape) {
+            rows.push(StageRow {
+                name,
+                ms,
+                floor_ms: 1e3 * floor.seconds(speed),
+                bytes: floor.bytes,
+                flops: floor.flops,
+                by_memory: floor.is_by_memory(speed),
+            });
+        }
+    }
+    rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn stages_are_means_over_steps_beside_their_floors() {
+        let ms = Duration::from_millis;
+        let steps = [
+            vec![("project", ms(2)), ("accumulate", ms(1)), ("accumulate", ms(2)), ("judge", ms(1))],
+            vec![("project", ms(4)), ("accumulate", ms(3))],
+        ];
+        let shape = StepShape { views: 1.0, gaussians: 1000.0, ..StepShape::default() };
+        let speed = DeviceSpeed { bytes_per_second: 1e8, flops_per_second: 1e9 };
+        let rows = rows(&steps, &shape, &speed);
+        assert_eq!(rows.iter().map(|row| row.name).collect::<Vec<_>>(), ["project", "accumulate", "judge"]);
+        assert!((rows[0].ms - 3.0).abs() < 1e-9 && (rows[1].ms - 3.0).abs() < 1e-9);
+        // 120 kB at 100 MB/s, beside 220 kFLOP at 1 GFLOP/s.
+        assert!((rows[0].floor_ms - 1.2).abs() < 1e-9 && rows[0].floor_by() == "memory");
+        assert!((rows[0].share().unwrap() - 0.4).abs() < 1e-9);
+        assert_eq!(rows[2].floor_by(), "latency");
+        let slow = DeviceSpeed { flops_per_second: 1e7, ..speed };
+        assert_eq!(super::rows(&steps, &shape, &slow)[0].floor_by(), "arithmetic");
+    }
+}
