@@ -100,7 +100,15 @@ impl Trainer {
     pub(super) fn unwatched_step(&mut self) -> Result<(), TrainError> {
         let Some(mut device) = self.device.take() else { return Ok(()) };
         let waits = device.waits;
-        let result = self.step_on(&mut device).and_then(|()| self.receive(&mut device, waits));
+        let result = self.step_on(&mut device).and_then(|()| {
+            let start = Instant::now();
+            let received = self.receive(&mut device, waits);
+            // Only what waits is measured.
+            if waits {
+                self.times.total += start.elapsed();
+            }
+            received
+        });
         self.device = Some(device);
         result
     }
