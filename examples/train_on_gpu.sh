@@ -1,7 +1,7 @@
 #!/bin/sh
 # Trains the example capture on a GPU, goes on with it on the processor, and compares what both need for a step.
 # Usage: examples/train_on_gpu.sh [OUT] [further options of `cif train`]; CIF names the command, else the one on PATH.
-# Without a GPU, Mesa's lavapipe runs the same kernels on the processor: some 20 times slower, with the same result.
+# Without a GPU, Mesa's lavapipe runs the same kernels on the processor: tens of times slower, to the same quality.
 set -eu
 capture=$(cd "$(dirname "$0")" && pwd)/tabletop-mini
 out=${1:-out/gpu}
