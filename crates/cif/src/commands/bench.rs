@@ -535,8 +535,10 @@ impl Report {
             ]);
         }
         println!("{table}\n");
-        let rate = number(self.pair_rate().map(|rate| rate / 1e6), 1);
-        println!("{rate} million evaluated pairs per second and thread (rasterize)");
+        // A GPU does not count the pairs that it evaluates.
+        if let Some(rate) = self.pair_rate().filter(|rate| *rate > 0.0) {
+            println!("{:.1} million evaluated pairs per second and thread (rasterize)", rate / 1e6);
+        }
         #[cfg(feature = "wgpu")]
         if let Some(device) = &self.device {
             device.print();

@@ -121,9 +121,11 @@ impl OnDevice {
                  for the device here, which they do not in training"
             );
         }
+        let (faster, slower) = if here < processor { (here, processor) } else { (processor, here) };
         println!(
-            "the processor does such a step in {processor:.3} ms, the device in {here:.3}: {:.2} times as fast",
-            processor / here.max(1e-9)
+            "the processor does such a step in {processor:.3} ms, the device in {here:.3}: {} is {:.1} times faster",
+            if here < processor { "the device" } else { "the processor" },
+            slower / faster.max(1e-9)
         );
     }
 }
