@@ -44,6 +44,15 @@ impl PinholeCamera {
         (p.z > 0.0).then(|| (self.focal_px * DVec2::new(p.x, p.y) / p.z + self.principal_px, p.z))
     }
 
+    /// Column and row of the pixel that shows a world point; `None` where it is behind the camera or beyond the image.
+    #[must_use]
+    pub fn pixel_of(&self, point_in_world: DVec3) -> Option<[u32; 2]> {
+        let (pixel, _) = self.project(point_in_world)?;
+        let size = DVec2::new(f64::from(self.width), f64::from(self.height));
+        let inside = pixel.cmpge(DVec2::ZERO).all() && pixel.cmplt(size).all();
+        inside.then_some([pixel.x as u32, pixel.y as u32])
+    }
+
     /// World-space direction (not normalised, z = 1 in the camera frame) through a pixel position.
     #[must_use]
     pub fn ray(&self, pixel: DVec2) -> DVec3 {
@@ -91,6 +100,16 @@ mod tests {
         let point = DVec3::new(0.4, -0.3, 1.5);
         let (pixel, depth) = camera.project(point).unwrap();
         assert!((camera.centre() + camera.ray(pixel) * depth - point).length() < 1e-12);
+    }
+
+    #[test]
+    fn a_pixel_shows_what_lies_before_it_only() {
+        let camera = camera();
+        let along = |pixel, depth| camera.centre() + camera.ray(pixel) * depth;
+        assert_eq!(camera.pixel_of(along(DVec2::new(63.9, 0.1), 2.0)), Some([63, 0]));
+        assert_eq!(camera.pixel_of(along(DVec2::new(64.1, 0.1), 2.0)), None);
+        assert_eq!(camera.pixel_of(along(DVec2::new(63.9, -0.1), 2.0)), None);
+        assert_eq!(camera.pixel_of(along(DVec2::new(31.5, 20.5), -2.0)), None);
     }
 
     #[test]

@@ -53,10 +53,7 @@ pub(crate) fn draw(cameras: &[PinholeCamera], half_edge: Option<f64>) -> Vec<[f3
 
 /// Whether a point falls into the image.
 pub(super) fn sees(camera: &PinholeCamera, point: DVec3) -> bool {
-    camera.project(point).is_some_and(|(pixel, _)| {
-        pixel.cmpge(DVec2::ZERO).all()
-            && pixel.cmplt(DVec2::new(f64::from(camera.width), f64::from(camera.height))).all()
-    })
+    camera.pixel_of(point).is_some()
 }
 
 /// Centre and half edge of the box that the cameras look at.

@@ -119,9 +119,7 @@ impl GpuRenderer {
             if deformation.moves_sh() {
                 self.posed.sh.resize(&self.gpu, self.canonical.len())?;
             }
-            deformation.forward(&self.gpu, &mut commands, time, &self.canonical, &self.posed);
-            let sh = if deformation.moves_sh() { &self.posed.sh } else { &self.canonical.sh };
-            PosedInput { geometry: &self.posed.geometry, sh }
+            deformation.pose(&self.gpu, &mut commands, time, &self.canonical, &self.posed)
         } else {
             (&self.canonical).into()
         };

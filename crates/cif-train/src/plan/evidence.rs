@@ -245,14 +245,10 @@ fn exposures(
         for (index, frame) in spread(frames, EXPOSED_IMAGES) {
             let image = dataset.load_image(index, [1.0; 3])?;
             for (position, color) in &points {
-                let Some((pixel, _)) = frame.camera.project(DVec3::from(position.map(f64::from))) else {
+                let Some([x, y]) = frame.camera.pixel_of(DVec3::from(position.map(f64::from))) else {
                     continue;
                 };
-                let (x, y) = (pixel.x.floor(), pixel.y.floor());
-                if x < 0.0 || y < 0.0 || x >= f64::from(image.width) || y >= f64::from(image.height) {
-                    continue;
-                }
-                let seen = image.at(x as u32, y as u32);
+                let seen = image.at(x, y);
                 for channel in 0..3 {
                     let pair = [seen[channel], color[channel]];
                     // Near black and white, cameras do not record in proportion.

@@ -94,13 +94,9 @@ impl Changes {
         let point = DVec3::from(point.map(f64::from));
         let (mut seen, mut changing) = (0, 0);
         for View { camera, changes } in &self.views {
-            let Some((pixel, _)) = camera.project(point) else { continue };
-            let (x, y) = (pixel.x.floor(), pixel.y.floor());
-            if x < 0.0 || y < 0.0 || x >= f64::from(changes.width) || y >= f64::from(changes.height) {
-                continue;
-            }
+            let Some([x, y]) = camera.pixel_of(point) else { continue };
             seen += 1;
-            changing += usize::from(*changes.at(x as u32, y as u32));
+            changing += usize::from(*changes.at(x, y));
         }
         match (seen, changing) {
             (0, _) => Sight::Unseen,

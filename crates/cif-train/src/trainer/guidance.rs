@@ -259,15 +259,11 @@ impl Trainer {
                     continue;
                 }
                 let place = track.at(times, frame.time) + offset;
-                let Some((pixel, _)) = frame.camera.project(place) else { continue };
-                let (x, y) = (pixel.x.floor(), pixel.y.floor());
-                if x < 0.0 || y < 0.0 || x >= f64::from(labels.width) || y >= f64::from(labels.height) {
-                    continue;
-                }
-                let found = *labels.at(x as u32, y as u32);
+                let Some([x, y]) = frame.camera.pixel_of(place) else { continue };
+                let found = *labels.at(x, y);
                 if found == label {
                     inside += 1.0;
-                    let color = data.image.at(x as u32, y as u32);
+                    let color = data.image.at(x, y);
                     sum += DVec3::from(color.map(|c| f64::from(c) / 255.0));
                 } else if found == UNLABELLED {
                     outside += 1.0;

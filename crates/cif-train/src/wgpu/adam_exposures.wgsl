@@ -16,11 +16,14 @@
 
 #import adam
 
-var<workgroup> gains: array<vec4f, 256>;
-var<workgroup> offsets: array<vec4f, 256>;
+const INVOCATIONS: u32 = 256u;
+#import workgroup
 
 @compute @workgroup_size(256)
-fn adam_exposures(@builtin(local_invocation_index) local: u32) {
+fn adam_exposures(
+    #paste lane_builtins
+) {
+    #paste lane
     let waits = atomicLoad(&faults[1]) != 0u;
     var gain_sum = vec4f(0.0);
     var offset_sum = vec4f(0.0);
@@ -47,18 +50,8 @@ fn adam_exposures(@builtin(local_invocation_index) local: u32) {
             }
         }
     }
-    gains[local] = gain_sum;
-    offsets[local] = offset_sum;
-    workgroupBarrier();
-    for (var half = 128u; half > 0u; half /= 2u) {
-        if local < half {
-            gains[local] += gains[local + half];
-            offsets[local] += offsets[local + half];
-        }
-        workgroupBarrier();
-    }
-    let mean_gain = gains[0] / f32(rates.cameras);
-    let mean_offset = offsets[0] / f32(rates.cameras);
+    let mean_gain = sum_of_workgroup(lane, gain_sum) / f32(rates.cameras);
+    let mean_offset = sum_of_workgroup(lane, offset_sum) / f32(rates.cameras);
     for (var camera = local; camera < rates.cameras && !waits; camera += 256u) {
         let first = EXPOSURE_FLOATS * camera;
         for (var channel = 0u; channel < 3u; channel++) {

@@ -19,8 +19,8 @@
 // Bits of the step, and whether steps wait for the host.
 @group(0) @binding(7) var<storage, read_write> faults: array<atomic<u32>>;
 
-var<workgroup> by_gain: array<vec4f, 256>;
-var<workgroup> by_offset: array<vec4f, 256>;
+const INVOCATIONS: u32 = 256u;
+#import workgroup
 
 // The transmittance stays.
 fn gain() -> vec4f {
@@ -33,20 +33,6 @@ fn offset() -> vec4f {
     return vec4f(values[first], values[first + 1u], values[first + 2u], 0.0);
 }
 
-// Sums over the workgroup, in the first elements.
-fn reduce(local: u32, gain_sum: vec4f, offset_sum: vec4f) {
-    by_gain[local] = gain_sum;
-    by_offset[local] = offset_sum;
-    workgroupBarrier();
-    for (var half = 128u; half > 0u; half /= 2u) {
-        if local < half {
-            by_gain[local] += by_gain[local + half];
-            by_offset[local] += by_offset[local + half];
-        }
-        workgroupBarrier();
-    }
-}
-
 @compute @workgroup_size(256)
 fn expose(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
     let pixel = (group.y * MAX_WORKGROUPS + group.x) * 256u + local;
@@ -56,7 +42,11 @@ fn expose(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) 
 }
 
 @compute @workgroup_size(256)
-fn pull_back(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
+fn pull_back(
+    @builtin(workgroup_id) group: vec3u,
+    #paste lane_builtins
+) {
+    #paste lane
     let workgroup = group.y * MAX_WORKGROUPS + group.x;
     let pixel = workgroup * 256u + local;
     var gain_sum = vec4f(0.0);
@@ -67,17 +57,21 @@ fn pull_back(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_inde
         gain_sum = v * colors[pixel];
         v_colors[pixel] = v;
     }
-    reduce(local, gain_sum, offset_sum);
+    let by_gain = sum_of_workgroup(lane, gain_sum);
+    let by_offset = sum_of_workgroup(lane, offset_sum);
     // The grid is folded, so there may be workgroups without pixels.
     if local == 0u && workgroup * 256u < settings.pixels {
-        partial_sums[2u * workgroup] = by_gain[0];
-        partial_sums[2u * workgroup + 1u] = by_offset[0];
+        partial_sums[2u * workgroup] = by_gain;
+        partial_sums[2u * workgroup + 1u] = by_offset;
     }
 }
 
 // Adds the workgroups' sums to the gradient of the camera; one workgroup.
 @compute @workgroup_size(256)
-fn add_gradient(@builtin(local_invocation_index) local: u32) {
+fn add_gradient(
+    #paste lane_builtins
+) {
+    #paste lane
     let workgroups = (settings.pixels + 255u) / 256u;
     var gain_sum = vec4f(0.0);
     var offset_sum = vec4f(0.0);
@@ -85,12 +79,13 @@ fn add_gradient(@builtin(local_invocation_index) local: u32) {
         gain_sum += partial_sums[2u * k];
         offset_sum += partial_sums[2u * k + 1u];
     }
-    reduce(local, gain_sum, offset_sum);
+    let by_gain = sum_of_workgroup(lane, gain_sum);
+    let by_offset = sum_of_workgroup(lane, offset_sum);
     if local == 0u {
         for (var channel = 0u; channel < 3u; channel++) {
             let at = EXPOSURE_FLOATS * settings.camera + channel;
-            let by_log_gain = gradients[at] + by_gain[0][channel];
-            let by_shift = gradients[at + 3u] + by_offset[0][channel];
+            let by_log_gain = gradients[at] + by_gain[channel];
+            let by_shift = gradients[at + 3u] + by_offset[channel];
             gradients[at] = by_log_gain;
             gradients[at + 3u] = by_shift;
             if is_beyond(by_log_gain) || is_beyond(by_shift) {

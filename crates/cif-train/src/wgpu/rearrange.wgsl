@@ -1,5 +1,6 @@
 // Rows of an array after a change of the set of Gaussians: those that stay are moved, copies and children take their
-// parent's row, or zeros where they start afresh; some floats of marked rows start afresh, too. Rust twins: densify.rs, adam/mod.rs `Moments::gather`.
+// parent's row, or zeros where they start afresh; some floats of marked rows start afresh, too. Rust twins: densify.rs,
+// adam/mod.rs `Moments::gather`.
 
 #import constants
 #import rearrangement

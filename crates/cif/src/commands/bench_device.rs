@@ -121,11 +121,11 @@ impl OnDevice {
                  for the device here, which they do not in training"
             );
         }
-        let (faster, slower) = if here < processor { (here, processor) } else { (processor, here) };
+        let (faster, times) =
+            if here < processor { ("device", processor / here) } else { ("processor", here / processor) };
         println!(
-            "the processor does such a step in {processor:.3} ms, the device in {here:.3}: {} is {:.1} times faster",
-            if here < processor { "the device" } else { "the processor" },
-            slower / faster.max(1e-9)
+            "the processor does such a step in {processor:.3} ms, the device in {here:.3}: the {faster} is \
+             {times:.1} times faster"
         );
     }
 }

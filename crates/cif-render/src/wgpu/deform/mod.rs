@@ -22,6 +22,7 @@ use cif_field::Deformation as FieldDeformation;
 use self::moving::MovingRows;
 use super::faults::{self, FAULTS};
 use super::gaussians::GpuGaussians;
+use super::rasterizer::PosedInput;
 use super::{
     Access, Commands, Gpu, GpuError, GpuVec, Kernel, Layout, Module, Shared, Snippet, Uniform, structures,
     workgroups,
@@ -249,6 +250,20 @@ impl GpuDeformation {
             gaussians: gaussians as u32,
             first: 0,
         }
+    }
+
+    /// Records what [`Self::forward`] does; what is to be drawn then.
+    pub fn pose<'a>(
+        &self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        time: f64,
+        canonical: &'a GpuGaussians,
+        posed: &'a GpuGaussians,
+    ) -> PosedInput<'a> {
+        self.forward(gpu, commands, time, canonical, posed);
+        let sh = if self.moves_sh() { &posed.sh } else { &canonical.sh };
+        PosedInput { geometry: &posed.geometry, sh }
     }
 
     /// Records the moving of `canonical` to `time` in [0, 1] into `posed`, which has as many rows; only a head that

@@ -113,9 +113,7 @@ impl StandIn {
     ) -> PosedInput<'a> {
         match self.deformation.as_ref().or(of_field) {
             Some(deformation) if self.moves => {
-                deformation.forward(gpu, commands, time, &self.canonical, &self.posed);
-                let sh = if deformation.moves_sh() { &self.posed.sh } else { &self.canonical.sh };
-                PosedInput { geometry: &self.posed.geometry, sh }
+                deformation.pose(gpu, commands, time, &self.canonical, &self.posed)
             }
             _ => (&self.canonical).into(),
         }

@@ -171,11 +171,10 @@ impl Trainer {
 
     /// Names every setting that is on and not supported.
     fn refuse_unsupported(&self) -> Result<(), TrainError> {
-        let settings: Vec<&str> = [("stages.tile_share", self.config.stages.tile_share < 1.0)]
-            .into_iter()
-            .filter_map(|(name, is_on)| is_on.then_some(name))
-            .collect();
-        if settings.is_empty() { Ok(()) } else { Err(TrainError::NotOnGpu { settings: settings.join(", ") }) }
+        if self.config.stages.tile_share < 1.0 {
+            return Err(TrainError::NotOnGpu { settings: "stages.tile_share".to_owned() });
+        }
+        Ok(())
     }
 
     /// Refuses a scene that may not fit, before any time is spent on it.

@@ -134,10 +134,7 @@ impl Resident {
     /// The Gaussians at a time in 0..=1, deformed if the field moves.
     pub(super) fn pose(&self, gpu: &Gpu, commands: &mut Commands<'_>, time: f64) -> PosedInput<'_> {
         let Some(deformation) = &self.deformation else { return (&self.canonical).into() };
-        let moving = &deformation.parameters;
-        moving.forward(gpu, commands, time, &self.canonical, &self.posed);
-        let sh = if moving.moves_sh() { &self.posed.sh } else { &self.canonical.sh };
-        PosedInput { geometry: &self.posed.geometry, sh }
+        deformation.parameters.pose(gpu, commands, time, &self.canonical, &self.posed)
     }
 
     /// Nothing yet.
