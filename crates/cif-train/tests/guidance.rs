@@ -76,6 +76,45 @@ fn a_travelling_object_is_followed() {
 }
 
 #[test]
+fn masks_tell_early_what_stands_still() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = dataset(folder.path(), 12);
+    let mut config = guided();
+    config.effects.still_every = 100;
+    // Step and share of Gaussians that stand still after each test of the fine stage.
+    let tests = |config: &TrainConfig| {
+        let mut tests = Vec::new();
+        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+        trainer
+            .run(&mut |event, _| {
+                if let TrainEvent::Settled { stage: Stage::Fine, iteration, still, gaussians, .. } = event {
+                    tests.push((*iteration, *still as f64 / *gaussians as f64));
+                }
+                Control::Continue
+            })
+            .unwrap();
+        (tests, trainer.into_field())
+    };
+    let (told, field) = tests(&config);
+    assert!(told[0].0 == 15 && told[0].1 > 0.5, "{told:?}");
+    let followed = path(&field, 2);
+    assert!((followed - DVec3::new(TRAVEL, 0.0, 0.0)).length() < 0.25, "{followed}");
+    let still = &field.deformation.as_ref().unwrap().still;
+    let share =
+        |rows: &[u32]| rows.iter().filter(|row| still[**row as usize]).count() as f64 / rows.len() as f64;
+    // Where the ball is first; the floor is nobody's, and every Gaussian has a most probable instance.
+    let start = DVec3::new(-TRAVEL / 2.0, 0.25, -0.75);
+    let means = field.deformed(0.0).means;
+    let mut ball = field.members(2);
+    ball.retain(|row| (DVec3::from(means[*row as usize].map(f64::from)) - start).length() < 0.25);
+    assert!(ball.len() > 10 && share(&ball) < 0.1, "{} of {}", share(&ball), ball.len());
+    assert!(share(&field.members(0)) > 0.5, "{}", share(&field.members(0)));
+    // Without paths, what the network learns first has to tell.
+    config.motion.guidance = 0.0;
+    assert_eq!(tests(&config).0[0].0, 45);
+}
+
+#[test]
 fn neither_threads_nor_interruptions_change_the_result() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = dataset(folder.path(), 6);

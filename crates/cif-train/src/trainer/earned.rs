@@ -10,7 +10,7 @@ use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
 use super::draw::Views;
-use super::still::{probe, probe_times};
+use super::motions::{probe, probe_times};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::schedule::{falls_on, sh_degree};

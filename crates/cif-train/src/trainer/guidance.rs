@@ -50,6 +50,16 @@ pub(super) struct Guidance {
 }
 
 impl Guidance {
+    /// Whether Gaussians of travelling objects are told from the others.
+    pub(super) fn knows_what_travels(&self) -> bool {
+        !self.guides.is_empty()
+    }
+
+    /// Whether a Gaussian was made for a travelling object.
+    pub(super) fn travels(&self, row: usize) -> bool {
+        self.guide_of.get(row).is_some_and(|guide| *guide > 0)
+    }
+
     pub(super) fn gather(&mut self, parents: &[u32]) {
         if !self.guide_of.is_empty() {
             self.guide_of = parents.iter().map(|row| self.guide_of[*row as usize]).collect();

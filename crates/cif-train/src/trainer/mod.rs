@@ -39,6 +39,7 @@ mod guidance;
 mod identity;
 mod initialize;
 mod measure;
+mod motions;
 mod optimiser;
 mod pacing;
 mod progress;
