@@ -12,8 +12,8 @@ use crate::error::Error;
 /// Tell which effects a capture calls for, and what they cost
 #[derive(Debug, Args)]
 #[command(after_help = "\
-`cif train --effects auto` follows this plan and records it in the scene. Each line tells the flag of `cif train` that
-decides otherwise; settings that are typed or in a --config file win over the plan.
+`cif train` follows this plan (unless the preset is paper, or --effects says otherwise) and records it in the scene.
+Each line tells the flag of `cif train` that decides otherwise; settings that are typed or in a --config file win over the plan.
 
   cif plan captures/table
   cif train captures/table -o table.cif --effects auto,-instances")]
@@ -26,7 +26,7 @@ pub(super) struct Plan {
     /// Named settings that the capture would be trained with: draft, standard or paper
     #[arg(long, value_name = "NAME", default_value = "standard")]
     preset: String,
-    /// Effects: all (as the preset says), auto (as the capture calls for) or none, then single ones
+    /// Effects: auto (as the capture calls for), all (as the preset says) or none, then single ones
     /// on or off, as in auto,+motion,-instances
     #[arg(long, value_name = "LIST", default_value = "auto", allow_hyphen_values = true)]
     effects: EffectChoice,

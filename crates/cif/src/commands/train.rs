@@ -84,9 +84,9 @@ pub(super) struct Train {
     /// Settings file; only what differs needs to be in it
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
-    /// Effects: all (as the preset says), auto (as the capture calls for, see `cif plan`) or none, then single
+    /// Effects: auto (as the capture calls for, see `cif plan`), all (as the preset says) or none, then single
     /// ones on or off, as in auto,+motion,-instances; typed settings and those of a file win
-    /// [default: all]
+    /// [default: auto, and all with the preset paper]
     #[arg(long, value_name = "LIST", allow_hyphen_values = true, conflicts_with_all = ["resume", "from"])]
     effects: Option<EffectChoice>,
     /// Any setting by its key in SCENE.train.toml, e.g. --set rates.opacity=0.02
@@ -396,13 +396,11 @@ fn load_source(path: &Path) -> Result<Checkpoint, Error> {
     Checkpoint::load(path).map_err(Error::plain)
 }
 
-/// What the capture calls for.
+/// What the capture calls for; the paper's settings stay as they are unless the user says otherwise.
 fn plan(command: &Train, dataset: &Dataset) -> Result<EffectPlan, Error> {
     let config = resolve(command, None, dataset.layout, None)?;
-    let choice = command
-        .effects
-        .clone()
-        .unwrap_or_else(|| EffectChoice { basis: Basis::All, ..EffectChoice::default() });
+    let basis = if config.preset == Preset::Paper { Basis::All } else { Basis::Auto };
+    let choice = command.effects.clone().unwrap_or(EffectChoice { basis, ..EffectChoice::default() });
     EffectPlan::new(dataset, &config, &choice).map_err(Error::plain)
 }
 
