@@ -80,7 +80,7 @@ fn masks_tell_early_what_stands_still() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = dataset(folder.path(), 12);
     let mut config = guided();
-    config.effects.still_every = 100;
+    (config.effects.still_every, config.effects.still_told) = (100, 15);
     // Step and share of Gaussians that stand still after each test of the fine stage.
     let tests = |config: &TrainConfig| {
         let mut tests = Vec::new();

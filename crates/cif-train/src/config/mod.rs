@@ -319,6 +319,9 @@ pub struct EffectsConfig {
     /// Share of the fine steps before the first test, default 0.15; where all cameras stay in place, their images
     /// tell at once.
     pub still_from: f32,
+    /// Latest fine step of the first test where masks tell which objects travel, default 350. In a stage 15 times as
+    /// long, everything else is taken to stand still on it if that hardly shows.
+    pub still_told: u32,
     /// Displacement from its mean, as a fraction of the extent, up to which a Gaussian may be taken to stand
     /// still, default 0.002. Less counts, down to a quarter, where that much shows.
     pub still_displacement: f32,

@@ -288,6 +288,7 @@ impl Default for EffectsConfig {
             instances: true,
             still_every: 0,
             still_from: 0.15,
+            still_told: 350,
             still_displacement: 0.002,
             still_shape: 0.2,
             still_awake: 0.03,

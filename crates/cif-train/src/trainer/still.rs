@@ -25,10 +25,12 @@ use crate::random::{Purpose, stream};
 /// and forth.
 const RELEASE: f32 = 2.0;
 
-/// Where masks tell the travelling objects: latest share of the fine stage on which the first test falls, and the
-/// loss, dB on held-out pixels, up to which everything else is taken to stand still on it.
-const TOLD_FROM: f64 = 0.05;
+/// Where masks tell the travelling objects: loss, dB on held-out pixels, up to which everything else is taken to stand
+/// still on the first test.
 const TOLD_LOSS: f64 = 0.1;
+
+/// How much longer the fine stage must be for that, so that what settled too early can make up for it.
+const TOLD_STEPS: f64 = 15.0;
 
 /// Rungs of the ladder of limits, each half of the one above.
 pub(super) const RUNGS: u32 = 3;
@@ -165,16 +167,18 @@ impl Trainer {
             return 1;
         }
         let fine_steps = f64::from(self.plan.iterations(&self.config, Stage::Fine));
-        let from = f64::from(self.config.effects.still_from);
-        let from = if self.guidance.knows_what_travels() { from.min(TOLD_FROM) } else { from };
-        ((from * fine_steps).round() as u32).max(1)
+        let from = (f64::from(self.config.effects.still_from) * fine_steps).round() as u32;
+        let told = if self.guidance.knows_what_travels() { self.config.effects.still_told } else { from };
+        from.min(told).max(1)
     }
 
-    /// Whether masks tell on this step what stands still: on the first test, when the network has learnt next to
-    /// nothing that could be lost.
+    /// Whether masks tell on this step what stands still: on the first test, when the network has helped everything
+    /// into place and learnt little else that could be lost.
     fn is_told(&self, stage: Stage, iteration: u32) -> bool {
+        let fine_steps = self.plan.iterations(&self.config, Stage::Fine);
         stage == Stage::Fine
             && iteration == self.first_test()
+            && TOLD_STEPS * f64::from(iteration) <= f64::from(fine_steps)
             && !self.shows_changes
             && self.guidance.knows_what_travels()
     }
