@@ -3,7 +3,6 @@
 use glam::DVec3;
 
 use super::GREY;
-use super::random::sees;
 use crate::{Dataset, Error};
 
 /// Training frames that are looked at.
@@ -24,11 +23,8 @@ pub(crate) fn sample_colors(dataset: &Dataset, positions: &[[f32; 3]]) -> Result
         let image = dataset.load_image(index, [0.5; 3])?;
         for (position, (sum, seen)) in positions.iter().zip(&mut sums) {
             let point = DVec3::from_array(position.map(f64::from));
-            if !sees(camera, point) {
-                continue;
-            }
-            if let Some((pixel, _)) = camera.project(point) {
-                let color = image.at(pixel.x as u32, pixel.y as u32);
+            if let Some([x, y]) = camera.pixel_of(point) {
+                let color = image.at(x, y);
                 for c in 0..3 {
                     sum[c] += u32::from(color[c]);
                 }

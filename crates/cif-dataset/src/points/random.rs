@@ -41,7 +41,7 @@ pub(crate) fn draw(cameras: &[PinholeCamera], half_edge: Option<f64>) -> Vec<[f3
             break;
         }
         let point = uniform();
-        if cameras.iter().any(|camera| sees(camera, point)) {
+        if cameras.iter().any(|camera| camera.pixel_of(point).is_some()) {
             points.push(point.as_vec3().to_array());
         }
     }
@@ -49,11 +49,6 @@ pub(crate) fn draw(cameras: &[PinholeCamera], half_edge: Option<f64>) -> Vec<[f3
         points.extend((0..count).map(|_| uniform().as_vec3().to_array()));
     }
     points
-}
-
-/// Whether a point falls into the image.
-pub(super) fn sees(camera: &PinholeCamera, point: DVec3) -> bool {
-    camera.pixel_of(point).is_some()
 }
 
 /// Centre and half edge of the box that the cameras look at.

@@ -172,6 +172,7 @@ fn add(gaussians: &mut Gaussians, row: usize, deltas: &Deltas<f32>, sign: f32) {
     accumulate(&mut gaussians.sh_coefficients[row], &deltas.sh, sign);
 }
 
+/// Adds values, weighted, to totals.
 pub(super) fn accumulate<const LENGTH: usize>(
     totals: &mut [f32; LENGTH],
     values: &[f32; LENGTH],

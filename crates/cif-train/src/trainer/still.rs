@@ -7,7 +7,7 @@
 //! still go through the network all the same. Where these learn to move, their neighbours are handed back. Where all
 //! cameras stay in place, their images tell from the start: what they see change stays in the network for half of the
 //! fine stage, and the rest leaves it at once. Where masks tell which objects travel, the same holds for these from
-//! an early step on, provided that it hardly shows; what else moves is then handed back.
+//! an early step of a long stage on, provided that it hardly shows; what else moves is then handed back.
 
 use rand::RngExt;
 use rayon::prelude::*;
@@ -64,28 +64,28 @@ impl Trainer {
         let rows: Vec<u32> = (0..self.field.len() as u32).collect();
         let mut motions = probe(deformation, &self.field.gaussians, &rows, &probe_times(&self.dataset.times));
         let sights = self.sights(&motions)?;
-        for (motion, _) in motions.iter_mut().zip(&sights).filter(|(_, sight)| **sight == Sight::Steady) {
-            // Nothing tells this motion from none.
-            (motion.displacement, motion.shape) = (0.0, 0.0);
-        }
         let mut watched = self.draw_watched(stage);
-        for (watched, _) in watched.iter_mut().zip(&sights).filter(|(_, sight)| **sight == Sight::Steady) {
-            *watched = false;
+        for (row, _) in sights.iter().enumerate().filter(|(_, sight)| **sight == Sight::Steady) {
+            // Nothing tells this motion from none.
+            (motions[row].displacement, motions[row].shape) = (0.0, 0.0);
+            watched[row] = false;
         }
+        let travels: Vec<bool> = (0..motions.len()).map(|row| self.guidance.travels(row)).collect();
         let restless = restless(&self.field, &motions, highest);
+        // In the second half the network has learnt what moves.
         let learns = stage == Stage::Fine && iteration <= last / 2;
         let awake: Vec<bool> = (0..motions.len())
             .map(|row| match sights.get(row) {
                 Some(Sight::Steady) => false,
                 Some(Sight::Changing) if learns => true,
-                _ => watched[row] || restless[row] || (learns && self.guidance.travels(row)),
+                _ => watched[row] || restless[row] || (learns && travels[row]),
             })
             .collect();
         let settings = self.color_settings();
         let mut error = self.judged_error(None, &settings)?;
         let mut settled = None;
         if self.is_told(stage, iteration) {
-            let stands = |trainer: &Self, row: usize| !watched[row] && !trainer.guidance.travels(row);
+            let stands = |row: usize| !watched[row] && !travels[row];
             settled = self.try_to_settle(&motions, stands, &mut error, TOLD_LOSS)?;
         }
         let mut released = 0;
@@ -94,7 +94,7 @@ impl Trainer {
             let mut rung = self.progress.still_rung.saturating_sub(1);
             while settled.is_none() && rung < RUNGS {
                 let limits = highest.scaled(0.5_f32.powi(rung as i32));
-                let rests = |_: &Self, row: usize| !awake[row] && limits.hold(&motions[row]);
+                let rests = |row: usize| !awake[row] && limits.hold(&motions[row]);
                 settled = self.try_to_settle(&motions, rests, &mut error, allowed)?;
                 rung += u32::from(settled.is_none());
             }
@@ -124,12 +124,12 @@ impl Trainer {
     fn try_to_settle(
         &mut self,
         motions: &[Motion],
-        wanted: impl Fn(&Self, usize) -> bool,
+        wanted: impl Fn(usize) -> bool,
         error: &mut f64,
         allowed: f64,
     ) -> Result<Option<usize>, TrainError> {
         let mut trial = self.field.clone();
-        let found = put_to_rest(&mut trial, motions, |row| wanted(self, row));
+        let found = put_to_rest(&mut trial, motions, wanted);
         if found > 0 {
             let after = self.judged_error(Some(&trial), &self.color_settings())?;
             if gain(after, *error) > allowed {

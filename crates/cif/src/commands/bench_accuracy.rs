@@ -30,7 +30,8 @@ use crate::{interrupt, output};
 #[command(after_help = "\
 Ladders change one thing each and keep the rest: presets, iterations, resolution, gaussians,
 deformation, sh, instance, speedups train a scene per rung; precision, storage, render and export use
-the scene that the base trains. Every rung is scored on the held-out frames.
+the scene that the base trains. Every rung is scored on the held-out frames. All train what their
+settings have, as `cif train --effects all` does.
 
   cif bench accuracy captures/table -o report --quick
   cif bench accuracy captures/table -o report --ladders iterations,gaussians
