@@ -1,7 +1,7 @@
 // Blends the splats of a tile into pixels, front to back, for colour and for the probability of each pixel's own label
-// at once. A workgroup is a quadrant of a tile, an invocation a pixel. Writes the composited colour with the
-// transmittance, and depth D, label probability M_y and instance transmittance S. Rust twin: cpu/rasterize.rs.
-// Source: methods reference 3.1 (pixel loop) and 4.2.
+// at once. A workgroup is a tile, an invocation a pixel of each of its quadrants, so that what is read of a splat serves
+// four. Writes the composited colour with the transmittance, and depth D, label probability M_y and instance
+// transmittance S. Rust twin: cpu/rasterize.rs. Source: methods reference 3.1 (pixel loop) and 4.2.
 
 #import constants
 #import variant
@@ -16,75 +16,121 @@
 @group(0) @binding(6) var<storage, read> identities: array<vec2u>;
 @group(0) @binding(7) var<storage, read_write> colors: array<vec4f>;
 @group(0) @binding(8) var<storage, read_write> blended: array<vec4f>;
-#import staging
+#import tile_staging
 #import identity
+
+struct Pixel {
+    centre: vec2f,
+    // Passes that still let light through.
+    open: u32,
+    label: u32,
+    color: vec3f,
+    depth: f32,
+    transmittance: f32,
+    probability: f32,
+    instance_transmittance: f32,
+}
+
+fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
+    var p: Pixel;
+    let at = quadrant_origin(tile, quadrant) + vec2u(local % HALF_TILE, local / HALF_TILE);
+    p.centre = vec2f(at) + 0.5;
+    p.transmittance = 1.0;
+    p.instance_transmittance = 1.0;
+    if (all(at < view.size)) {
+        if (WITH_INSTANCES && view.label_pixels != 0u) {
+            p.label = labels[at.y * view.size.x + at.x];
+        }
+        p.open = COLOR_PASS | select(0u, INSTANCE_PASS, p.label != 0u);
+    }
+    return p;
+}
+
+// Adds a splat to a pixel.
+fn blend(splat: Staged, passes: u32, identity: f32, p: ptr<function, Pixel>) {
+    let open = passes & (*p).open;
+    if (open == 0u) {
+        return;
+    }
+    let peak = peak_at(splat.conic.xyz, splat.mean - (*p).centre);
+    if ((open & COLOR_PASS) != 0u) {
+        let alpha = min(MAX_ALPHA, splat.conic.w * peak);
+        if (alpha >= MIN_ALPHA) {
+            let weight = (*p).transmittance * alpha;
+            let next = (*p).transmittance - weight;
+            if (next < MIN_TRANSMITTANCE) {
+                (*p).open &= ~COLOR_PASS;
+            } else {
+                (*p).color += weight * splat.color.xyz;
+                (*p).depth += weight * splat.depth;
+                (*p).transmittance = next;
+            }
+        }
+    }
+    if (WITH_INSTANCES && (open & INSTANCE_PASS) != 0u) {
+        let alpha = min(MAX_ALPHA, splat.color.w * peak);
+        if (alpha >= MIN_ALPHA) {
+            let weight = (*p).instance_transmittance * alpha;
+            let next = (*p).instance_transmittance - weight;
+            if (next < MIN_TRANSMITTANCE) {
+                (*p).open &= ~INSTANCE_PASS;
+            } else {
+                (*p).probability += weight * identity;
+                (*p).instance_transmittance = next;
+            }
+        }
+    }
+}
+
+fn write(p: Pixel) {
+    let at = vec2u(p.centre);
+    if (all(at < view.size)) {
+        let position = at.y * view.size.x + at.x;
+        colors[position] = vec4f(p.color + p.transmittance * view.background.xyz, p.transmittance);
+        blended[position] = vec4f(p.depth, p.probability, p.instance_transmittance, 0.0);
+    }
+}
 
 @compute @workgroup_size(64)
 fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    let tile = workgroup.xy / 2u;
-    let origin = workgroup.xy * HALF_TILE;
-    let pixel = origin + vec2u(local % HALF_TILE, local / HALF_TILE);
-    let inside = all(pixel < view.size);
-    let position = pixel.y * view.size.x + pixel.x;
-    let centre = vec2f(pixel) + 0.5;
-    var label = 0u;
-    if (WITH_INSTANCES && inside && view.label_pixels != 0u) {
-        label = labels[position];
-    }
-    // Passes that still let light through here.
-    var open = select(0u, COLOR_PASS | select(0u, INSTANCE_PASS, label != 0u), inside);
-    var color = vec3f(0.0);
-    var depth = 0.0;
-    var transmittance = 1.0;
-    var probability = 0.0;
-    var instance_transmittance = 1.0;
-
+    let tile = workgroup.xy;
     let range = tile_ranges[tile.y * view.tiles.x + tile.x];
-    let wanted = COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES && view.label_pixels != 0u);
-    for (var first = range.x; first < range.y; first += 64u) {
-        if (!any_live(open != 0u, local)) {
+    var p0 = pixel_of(tile, 0u, local);
+    var p1 = pixel_of(tile, 1u, local);
+    var p2 = pixel_of(tile, 2u, local);
+    var p3 = pixel_of(tile, 3u, local);
+    let own_labels = vec4u(p0.label, p1.label, p2.label, p3.label);
+    for (var first = range.x; first < range.y; first += STAGED) {
+        let open = p0.open | (p1.open << 2u) | (p2.open << 4u) | (p3.open << 6u);
+        let alive = stage_tile(first, range.y, tile, open, local);
+        if (alive == 0u) {
             break;
         }
-        let count = stage(first, range.y, origin, wanted, local);
+        let count = min(STAGED, range.y - first);
         for (var k = 0u; k < count; k += 1u) {
-            let passes = staged[k].passes & open;
-            if (passes == 0u) {
-                continue;
+            let splat = staged[k];
+            let passes = atomicLoad(&staged_passes[k]) & alive;
+            var identity = vec4f(0.0);
+            if (WITH_INSTANCES && (passes & INSTANCE_IN_TILE) != 0u) {
+                identity = probabilities_of(splat.row_first, splat.row_end, own_labels);
             }
-            let conic = staged[k].conic;
-            let peak = peak_at(conic.xyz, staged[k].mean - centre);
-            if ((passes & COLOR_PASS) != 0u) {
-                let alpha = min(MAX_ALPHA, conic.w * peak);
-                if (alpha >= MIN_ALPHA) {
-                    let weight = transmittance * alpha;
-                    let next = transmittance - weight;
-                    if (next < MIN_TRANSMITTANCE) {
-                        open &= ~COLOR_PASS;
-                    } else {
-                        color += weight * staged[k].color.xyz;
-                        depth += weight * staged[k].depth;
-                        transmittance = next;
-                    }
-                }
+            if ((passes & 3u) != 0u) {
+                blend(splat, passes & 3u, identity.x, &p0);
             }
-            if (WITH_INSTANCES && (passes & INSTANCE_PASS) != 0u) {
-                let alpha = min(MAX_ALPHA, staged[k].color.w * peak);
-                if (alpha >= MIN_ALPHA) {
-                    let weight = instance_transmittance * alpha;
-                    let next = instance_transmittance - weight;
-                    if (next < MIN_TRANSMITTANCE) {
-                        open &= ~INSTANCE_PASS;
-                    } else {
-                        probability +=
-                            weight * probability_of(staged[k].row_first, staged[k].row_end, label - 1u);
-                        instance_transmittance = next;
-                    }
-                }
+            if ((passes & 12u) != 0u) {
+                blend(splat, (passes >> 2u) & 3u, identity.y, &p1);
+            }
+            if ((passes & 48u) != 0u) {
+                blend(splat, (passes >> 4u) & 3u, identity.z, &p2);
+            }
+            if ((passes & 192u) != 0u) {
+                blend(splat, (passes >> 6u) & 3u, identity.w, &p3);
             }
         }
+        workgroupBarrier();
     }
-    if (inside) {
-        colors[position] = vec4f(color + transmittance * view.background.xyz, transmittance);
-        blended[position] = vec4f(depth, probability, instance_transmittance, 0.0);
-    }
+    write(p0);
+    write(p1);
+    write(p2);
+    write(p3);
 }

@@ -1,7 +1,8 @@
 // Gradient of a tile, front to back: transmittances are replayed as the forward pass made them and never divided. A
-// workgroup is a tile. For eight splats and a quadrant at a time, invocations are first pixels, which leave four
-// numbers per splat in workgroup memory, and then eighths of splats, which sum them over pixels in a fixed order: no
-// atomics, one store per (tile, splat) pair. Rust twin: cpu/rasterize_backward.rs. Source: methods reference 3.2, 4.2.
+// workgroup is a tile, an invocation a pixel of each of its quadrants. For four splats at a time, invocations first sum
+// over their own pixels and leave that in workgroup memory; then each takes a sum of a splat over all invocations, in a
+// fixed order: no atomics, one store per (tile, splat) pair and sum. Sums by subgroups would take ten instructions where
+// this takes a store and a load. Rust twin: cpu/rasterize_backward.rs. Source: methods reference 3.2, 4.2.
 //
 // A pair's ten sums: v_sigma dx, v_sigma dy (mean); v_sigma dx dx, dx dy, dy dy (conic); v_colour; v_sigma of colour;
 // weighted q. And per entry of its identity row the weighted responsibility for that label.
@@ -21,32 +22,19 @@
 @group(0) @binding(8) var<storage, read_write> label_mass: array<f32>;
 #import identity
 
+#import tile_staging
+
 // Splats that are summed at a time.
-const BATCH: u32 = 8u;
+const BATCH: u32 = 4u;
+// Sums of a pair.
+const SUMS: u32 = 10u;
 
-struct Staged {
-    mean: vec2f,
-    // Two bits of passes per quadrant.
-    passes: u32,
-    pair: u32,
-    // Conic and opacity.
-    conic: vec4f,
-    // Colour and occupancy.
-    color: vec4f,
-    row_first: u32,
-    row_end: u32,
-    // First label slot.
-    slot: u32,
-    unused: u32,
-}
-
-var<workgroup> staged: array<Staged, 64>;
-// Of the batch on the quadrant: T alpha, v_sigma of colour, weighted q, weighted r. Then partial sums.
-var<workgroup> shares: array<vec4f, 512>;
-// v_colour of the quadrant's pixels and their labels.
-var<workgroup> pixels: array<vec4f, 64>;
-var<workgroup> live: atomic<u32>;
-var<workgroup> live_quadrants: u32;
+// Of every splat of the batch and sum, by invocation.
+var<workgroup> partial_sums: array<f32, 2560>;
+// Weighted r of every splat of the batch, by invocation, a quadrant each.
+var<workgroup> responsibilities: array<vec4f, 256>;
+// Labels by invocation, 16 bits each, quadrants 0 and 1 first.
+var<workgroup> pixel_labels: array<vec2u, 64>;
 
 struct Pixel {
     centre: vec2f,
@@ -71,8 +59,6 @@ struct Sums {
     second: vec4f,
     // v_sigma of colour, weighted q.
     third: vec2f,
-    // Responsibility for the entry of the identity row whose index is the invocation's eighth.
-    mass: f32,
 }
 
 fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
@@ -96,8 +82,8 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
     return p;
 }
 
-// What a splat does to a pixel: the four shares; steps the pixel.
-fn replay(splat: Staged, passes: u32, p: ptr<function, Pixel>) -> vec4f {
+// What a splat does to a pixel: T alpha, v_sigma of colour, weighted q, weighted r; steps the pixel.
+fn replay(splat: Staged, passes: u32, identity: f32, p: ptr<function, Pixel>) -> vec4f {
     var shares_of_pixel = vec4f(0.0);
     let open = passes & (*p).open;
     if (open == 0u) {
@@ -133,7 +119,6 @@ fn replay(splat: Staged, passes: u32, p: ptr<function, Pixel>) -> vec4f {
             if (next < MIN_TRANSMITTANCE) {
                 (*p).open &= ~INSTANCE_PASS;
             } else {
-                let identity = probability_of(splat.row_first, splat.row_end, (*p).label - 1u);
                 let r = weight * (identity * (*p).inverse);
                 // 1 - c_i, clamped against rounding at the tail.
                 (*p).hidden = max((*p).hidden - r, 0.0);
@@ -153,77 +138,45 @@ fn replay(splat: Staged, passes: u32, p: ptr<function, Pixel>) -> vec4f {
     return shares_of_pixel;
 }
 
-// Adds a quadrant's pixels to the sums of the invocation's splat; steps the invocation's pixel. Every invocation of the
-// workgroup must come here.
-fn visit(
-    quadrant: u32,
-    origin: vec2u,
-    first: u32,
-    count: u32,
-    local: u32,
+// Adds what a splat does to a pixel to its sums; returns the weighted r.
+fn add(
+    splat: Staged,
+    passes: u32,
+    identity: f32,
     p: ptr<function, Pixel>,
     sums: ptr<function, Sums>,
-) {
-    let shift = 2u * quadrant;
-    let was_open = (*p).open != 0u;
-    for (var k = 0u; k < count; k += 1u) {
-        let passes = (staged[first + k].passes >> shift) & 3u;
-        if (passes != 0u) {
-            var share = vec4f(0.0);
-            if ((*p).open != 0u) {
-                share = replay(staged[first + k], passes, p);
-            }
-            shares[k * 64u + local] = share;
-        }
-    }
-    pixels[local] = vec4f((*p).v_color, f32((*p).label));
-    if ((*p).open != 0u) {
-        atomicOr(&live, 1u << quadrant);
-    }
-    workgroupBarrier();
-
-    let own = local / 8u;
-    let part = local % 8u;
-    if (own < count) {
-        let splat = staged[first + own];
-        let passes = (splat.passes >> shift) & 3u;
-        if (passes != 0u) {
-            let dy = splat.mean.y - (f32(origin.y + part) + 0.5);
-            for (var k = 0u; k < HALF_TILE; k += 1u) {
-                // Every eighth starts at another column, so that they read from different banks of memory.
-                let column = (k + part) % HALF_TILE;
-                let at = part * HALF_TILE + column;
-                let share = shares[own * 64u + at];
-                let dx = splat.mean.x - (f32(origin.x + column) + 0.5);
-                let v_mean = share.y + view.mean_geometry * share.z;
-                let v_conic = share.y + view.full_geometry * share.z;
-                (*sums).first += vec4f(v_mean * dx, v_mean * dy, v_conic * dx * dx, v_conic * dx * dy);
-                (*sums).second += vec4f(v_conic * dy * dy, share.x * pixels[at].xyz);
-                (*sums).third += share.yz;
-            }
-            if (WITH_INSTANCES && (passes & INSTANCE_PASS) != 0u) {
-                for (var entry = part; splat.row_first + entry < splat.row_end; entry += 8u) {
-                    let label = f32(identities[splat.row_first + entry].x + 1u);
-                    var mass = 0.0;
-                    for (var at = 0u; at < 64u; at += 1u) {
-                        if (pixels[at].w == label) {
-                            mass += shares[own * 64u + at].w;
-                        }
-                    }
-                    if (entry < 8u) {
-                        (*sums).mass += mass;
-                    } else {
-                        label_mass[splat.slot + entry] += mass;
-                    }
-                }
-            }
-        }
-    }
-    workgroupBarrier();
+) -> f32 {
+    let share = replay(splat, passes, identity, p);
+    let d = splat.mean - (*p).centre;
+    let v_mean = share.y + view.mean_geometry * share.z;
+    let v_conic = share.y + view.full_geometry * share.z;
+    (*sums).first += vec4f(v_mean * d, v_conic * d.x * d);
+    (*sums).second += vec4f(v_conic * d.y * d.y, share.x * (*p).v_color);
+    (*sums).third += share.yz;
+    return share.w;
 }
 
-fn has_row(splat: Staged) -> bool {
-    return WITH_INSTANCES && splat.row_first < splat.row_end;
+// Sum of the values of the pixels that have a label.
+fn of_label(label: u32, labels: vec4u, values: vec4f) -> f32 {
+    let own = select(vec4f(0.0), values, labels == vec4u(label));
+    return own.x + own.y + own.z + own.w;
+}
+
+// Nothing reaches these pairs.
+fn clear_pairs(first: u32, end: u32) {
+    for (var index = first; index < end; index += 64u) {
+        let entry = entries[index];
+        for (var value = 0u; value < SUMS; value += 1u) {
+            pair_sums[entry.x * PAIR_SUMS + value] = 0.0;
+        }
+        if (WITH_INSTANCES) {
+            let row = entry.y & INDEX_MASK;
+            let length = row_offsets[row + 1u] - row_offsets[row];
+            for (var k = 0u; k < length; k += 1u) {
+                label_mass[entry.z + k] = 0.0;
+            }
+        }
+    }
 }
 
 @compute @workgroup_size(64)
@@ -234,82 +187,112 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
     var p1 = pixel_of(tile, 1u, local);
     var p2 = pixel_of(tile, 2u, local);
     var p3 = pixel_of(tile, 3u, local);
-    if (local == 0u) {
-        live_quadrants = 15u;
-    }
-    workgroupBarrier();
-    for (var first = range.x; first < range.y; first += 64u) {
-        let index = first + local;
-        if (index < range.y) {
-            let entry = entries[index];
-            let row = entry.y & INDEX_MASK;
-            let splat = splats[row];
-            var item: Staged;
-            item.mean = splat.mean;
-            item.pair = entry.x;
-            item.conic = splat.conic;
-            item.color = splat.color;
-            item.slot = entry.z;
-            let drawn = (entry.y >> PASS_SHIFT) & (COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES));
-            for (var quadrant = 0u; quadrant < 4u; quadrant += 1u) {
-                let passes = drawn & passes_in_quadrant(splat, quadrant_origin(tile, quadrant));
-                item.passes |= passes << (2u * quadrant);
-            }
-            if (WITH_INSTANCES) {
-                item.row_first = row_offsets[row];
-                item.row_end = row_offsets[row + 1u];
-                // Longer rows than there are eighths are summed in place.
-                for (var k = item.row_first + 8u; k < item.row_end; k += 1u) {
-                    label_mass[entry.z + k - item.row_first] = 0.0;
-                }
-            }
-            staged[local] = item;
+    let labels = vec4u(p0.label, p1.label, p2.label, p3.label);
+    pixel_labels[local] = labels.xz | (labels.yw << vec2u(16u));
+    for (var first = range.x; first < range.y; first += STAGED) {
+        let open = p0.open | (p1.open << 2u) | (p2.open << 4u) | (p3.open << 6u);
+        let alive = stage_tile(first, range.y, tile, open, local);
+        if (alive == 0u) {
+            clear_pairs(first + local, range.y);
+            break;
         }
-        workgroupBarrier();
-        let staged_count = min(64u, range.y - first);
+        var longest_row = 0u;
+        if (WITH_INSTANCES) {
+            longest_row = workgroupUniformLoad(&longest);
+        }
+        let staged_count = min(STAGED, range.y - first);
         for (var batch = 0u; batch < staged_count; batch += BATCH) {
             let count = min(BATCH, staged_count - batch);
-            let quadrants = workgroupUniformLoad(&live_quadrants);
-            if (local == 0u) {
-                atomicStore(&live, 0u);
+            for (var k = 0u; k < count; k += 1u) {
+                let splat = staged[batch + k];
+                let passes = atomicLoad(&staged_passes[batch + k]) & alive;
+                var identity = vec4f(0.0);
+                if (WITH_INSTANCES && (passes & INSTANCE_IN_TILE) != 0u) {
+                    identity = probabilities_of(splat.row_first, splat.row_end, labels);
+                }
+                var sums: Sums;
+                var responsibility = vec4f(0.0);
+                if ((passes & 3u) != 0u) {
+                    responsibility.x = add(splat, passes & 3u, identity.x, &p0, &sums);
+                }
+                if ((passes & 12u) != 0u) {
+                    responsibility.y = add(splat, (passes >> 2u) & 3u, identity.y, &p1, &sums);
+                }
+                if ((passes & 48u) != 0u) {
+                    responsibility.z = add(splat, (passes >> 4u) & 3u, identity.z, &p2, &sums);
+                }
+                if ((passes & 192u) != 0u) {
+                    responsibility.w = add(splat, (passes >> 6u) & 3u, identity.w, &p3, &sums);
+                }
+                let at = k * SUMS * 64u + local;
+                partial_sums[at] = sums.first.x;
+                partial_sums[at + 64u] = sums.first.y;
+                partial_sums[at + 128u] = sums.first.z;
+                partial_sums[at + 192u] = sums.first.w;
+                partial_sums[at + 256u] = sums.second.x;
+                partial_sums[at + 320u] = sums.second.y;
+                partial_sums[at + 384u] = sums.second.z;
+                partial_sums[at + 448u] = sums.second.w;
+                partial_sums[at + 512u] = sums.third.x;
+                partial_sums[at + 576u] = sums.third.y;
+                if (WITH_INSTANCES) {
+                    responsibilities[k * 64u + local] = responsibility;
+                }
             }
             workgroupBarrier();
-            var sums: Sums;
-            if ((quadrants & 1u) != 0u) {
-                visit(0u, quadrant_origin(tile, 0u), batch, count, local, &p0, &sums);
-            }
-            if ((quadrants & 2u) != 0u) {
-                visit(1u, quadrant_origin(tile, 1u), batch, count, local, &p1, &sums);
-            }
-            if ((quadrants & 4u) != 0u) {
-                visit(2u, quadrant_origin(tile, 2u), batch, count, local, &p2, &sums);
-            }
-            if ((quadrants & 8u) != 0u) {
-                visit(3u, quadrant_origin(tile, 3u), batch, count, local, &p3, &sums);
-            }
-            shares[3u * local] = sums.first;
-            shares[3u * local + 1u] = sums.second;
-            shares[3u * local + 2u] = vec4f(sums.third, 0.0, 0.0);
-            if (local == 0u) {
-                live_quadrants = atomicLoad(&live);
+
+            let own = local / 16u;
+            let part = local % 16u;
+            if (own < count && part < SUMS) {
+                let sums = (own * SUMS + part) * 64u;
+                var sum = vec4f(0.0);
+                for (var k = local; k < local + 64u; k += 4u) {
+                    // Every invocation starts at another place, so that they read from different banks of memory.
+                    sum += vec4f(
+                        partial_sums[sums + k % 64u],
+                        partial_sums[sums + (k + 1u) % 64u],
+                        partial_sums[sums + (k + 2u) % 64u],
+                        partial_sums[sums + (k + 3u) % 64u],
+                    );
+                }
+                pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = (sum.x + sum.y) + (sum.z + sum.w);
             }
             workgroupBarrier();
-            let own = local / 8u;
-            let part = local % 8u;
-            if (own < count) {
-                let splat = staged[batch + own];
-                for (var value = part; value < PAIR_SUMS; value += 8u) {
-                    var sum = 0.0;
-                    for (var k = 0u; k < 8u; k += 1u) {
-                        sum += shares[3u * (own * 8u + k) + value / 4u][value % 4u];
+            for (var entry = 0u; entry < longest_row; entry += 4u) {
+                let row_first = staged[batch + own].row_first + entry;
+                let row_end = select(0u, staged[batch + own].row_end, own < count);
+                // Of four entries of the row, over the pixels of four invocations.
+                var mass = vec4f(0.0);
+                if (row_first < row_end) {
+                    var wanted = vec4u(0u);
+                    for (var k = 0u; k < min(4u, row_end - row_first); k += 1u) {
+                        wanted[k] = identities[row_first + k].x + 1u;
                     }
-                    pair_sums[splat.pair * PAIR_SUMS + value] = sum;
+                    for (var at = part; at < 64u; at += 16u) {
+                        let values = responsibilities[own * 64u + at];
+                        let packed = pixel_labels[at];
+                        let found = vec4u(packed & vec2u(0xffffu), packed >> vec2u(16u)).xzyw;
+                        mass += vec4f(
+                            of_label(wanted.x, found, values),
+                            of_label(wanted.y, found, values),
+                            of_label(wanted.z, found, values),
+                            of_label(wanted.w, found, values),
+                        );
+                    }
                 }
-                if (has_row(splat) && splat.row_first + part < splat.row_end) {
-                    label_mass[splat.slot + part] = sums.mass;
+                for (var k = 0u; k < 4u; k += 1u) {
+                    partial_sums[4u * local + k] = mass[k];
                 }
+                workgroupBarrier();
+                if (part < 4u && row_first + part < row_end) {
+                    var sum = 0.0;
+                    for (var k = 0u; k < 16u; k += 1u) {
+                        sum += partial_sums[4u * (16u * own + k) + part];
+                    }
+                    label_mass[staged[batch + own].slot + entry + part] = sum;
+                }
+                workgroupBarrier();
             }
-            workgroupBarrier();
         }
     }
 }

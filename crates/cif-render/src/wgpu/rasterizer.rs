@@ -538,7 +538,7 @@ impl Rasterizer {
             ],
         );
         commands.stage("rasterize", |stage| {
-            stage.dispatch(kernel, &rasterize, [2 * view.tiles[0], 2 * view.tiles[1], 1]);
+            stage.dispatch(kernel, &rasterize, [view.tiles[0], view.tiles[1], 1]);
         });
         Ok(())
     }

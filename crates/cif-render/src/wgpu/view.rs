@@ -287,8 +287,8 @@ pub(crate) const SPLAT: Snippet =
     Snippet { name: "splat", text: || include_str!("shared/splat.wgsl").to_owned() };
 pub(crate) const TILES: Snippet =
     Snippet { name: "tiles", text: || include_str!("shared/tiles.wgsl").to_owned() };
-pub(crate) const STAGING: Snippet =
-    Snippet { name: "staging", text: || include_str!("shared/staging.wgsl").to_owned() };
+pub(crate) const TILE_STAGING: Snippet =
+    Snippet { name: "tile_staging", text: || include_str!("shared/tile_staging.wgsl").to_owned() };
 pub(crate) const IDENTITY: Snippet =
     Snippet { name: "identity", text: || include_str!("shared/identity.wgsl").to_owned() };
 /// Declares that the instance pass is drawn, or is not: what a kernel does not do costs nothing then.

@@ -1,12 +1,11 @@
 // Rows of identities: (dense instance index, bits of its probability), ascending indices.
 
-// Probability of an instance in a row; 0 outside its support.
-fn probability_of(first: u32, end: u32, instance: u32) -> f32 {
+// Probabilities of four labels (dense index + 1) in a row; 0 outside its support.
+fn probabilities_of(first: u32, end: u32, labels: vec4u) -> vec4f {
+    var found = vec4f(0.0);
     for (var entry = first; entry < end; entry += 1u) {
         let item = identities[entry];
-        if (item.x >= instance) {
-            return select(0.0, bitcast<f32>(item.y), item.x == instance);
-        }
+        found = select(found, vec4f(bitcast<f32>(item.y)), labels == vec4u(item.x + 1u));
     }
-    return 0.0;
+    return found;
 }

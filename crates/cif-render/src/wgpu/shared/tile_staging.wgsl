@@ -1,0 +1,68 @@
+// Splats of a tile in workgroup memory, in order, with the quadrants that each pass draws them in: two bits per
+// quadrant, 0 and 1 above, 2 and 3 below.
+
+const STAGED: u32 = 16u;
+// Bits of the instance pass.
+const INSTANCE_IN_TILE: u32 = 170u;
+
+struct Staged {
+    mean: vec2f,
+    depth: f32,
+    pair: u32,
+    // Conic and opacity.
+    conic: vec4f,
+    // Colour and occupancy.
+    color: vec4f,
+    // First label slot, and identity row.
+    slot: u32,
+    row_first: u32,
+    row_end: u32,
+}
+
+var<workgroup> staged: array<Staged, STAGED>;
+var<workgroup> staged_passes: array<atomic<u32>, STAGED>;
+// Passes that any pixel lets light through.
+var<workgroup> live: atomic<u32>;
+// Entries of the longest identity row.
+var<workgroup> longest: atomic<u32>;
+
+// Stages entries from `first` on; returns the passes that any pixel lets light through, of which `open` is what the
+// invocation knows. Every invocation of the workgroup must come here, and meet between what it reads and the next call.
+fn stage_tile(first: u32, end: u32, tile: vec2u, open: u32, local: u32) -> u32 {
+    if (local < STAGED) {
+        atomicStore(&staged_passes[local], 0u);
+    }
+    if (local == 0u) {
+        atomicStore(&live, 0u);
+        atomicStore(&longest, 0u);
+    }
+    workgroupBarrier();
+    atomicOr(&live, open);
+    // An invocation tells one quadrant of an entry.
+    let place = local / 4u;
+    let quadrant = local % 4u;
+    if (first + place < end) {
+        let entry = entries[first + place];
+        let row = entry.y & INDEX_MASK;
+        let splat = splats[row];
+        let drawn = (entry.y >> PASS_SHIFT) & (COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES));
+        let passes = drawn & passes_in_quadrant(splat, quadrant_origin(tile, quadrant));
+        atomicOr(&staged_passes[place], passes << (2u * quadrant));
+        if (quadrant == 0u) {
+            var item: Staged;
+            item.mean = splat.mean;
+            item.depth = splat.depth;
+            item.pair = entry.x;
+            item.conic = splat.conic;
+            item.color = splat.color;
+            if (WITH_INSTANCES) {
+                item.slot = entry.z;
+                item.row_first = row_offsets[row];
+                item.row_end = row_offsets[row + 1u];
+                atomicMax(&longest, item.row_end - item.row_first);
+            }
+            staged[place] = item;
+        }
+    }
+    return workgroupUniformLoad(&live);
+}
