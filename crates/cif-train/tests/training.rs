@@ -3,9 +3,10 @@
 
 mod support;
 
-use cif_field::Field;
+use cif_field::{Field, Gaussians};
+use cif_train::config::InstanceGeometry;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
-use cif_train::{Control, Outcome, Stage, TrainError, TrainEvent, Trainer};
+use cif_train::{Ablation, Control, Outcome, Stage, TrainError, TrainEvent, Trainer};
 use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 fn assert_equal(a: &Field, b: &Field) {
@@ -105,6 +106,30 @@ fn another_seed_gives_another_result() {
     let first = train(dataset.clone(), config.clone());
     config.seed += 1;
     assert!(first.field().gaussians != train(dataset, config).field().gaussians);
+}
+
+#[test]
+fn the_instance_loss_moves_gaussians_only_where_it_may() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+    let gaussians = |geometry, weight: f32| {
+        let mut config = small_config();
+        (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 20, 20);
+        config.instance.ablate.insert(Ablation::NoResampling);
+        (config.instance.geometry, config.loss.lambda_instance) = (geometry, weight);
+        train(dataset.clone(), config).into_field().gaussians
+    };
+    let shape = |gaussians: &Gaussians| (gaussians.log_scales.clone(), gaussians.quaternions.clone());
+    let [off, off_strong] = [0.01, 0.5].map(|weight| gaussians(InstanceGeometry::Off, weight));
+    assert!(
+        off.means == off_strong.means && shape(&off) == shape(&off_strong),
+        "only colours move Gaussians"
+    );
+    assert!(off.occupancy_logits != off_strong.occupancy_logits, "the loss is there");
+    let means_only = gaussians(InstanceGeometry::MeansOnly, 0.5);
+    assert!(means_only.means != off.means);
+    let full = gaussians(InstanceGeometry::Full, 0.5);
+    assert!(full.means != off.means && shape(&full) != shape(&off));
 }
 
 #[test]

@@ -35,11 +35,11 @@ pub enum Ablation {
 #[serde(rename_all = "snake_case")]
 pub enum InstanceGeometry {
     /// Means, scales and rotations.
-    #[default]
     Full,
     /// Means only.
     MeansOnly,
-    /// None.
+    /// None: colours alone say where Gaussians are.
+    #[default]
     Off,
 }
 

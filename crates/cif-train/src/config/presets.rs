@@ -70,6 +70,7 @@ fn paper(layout: Layout) -> TrainConfig {
         opacity_reset_every: 3_000,
         ..config.densify
     };
+    config.instance.geometry = super::InstanceGeometry::Full;
     config.resample = ResampleConfig { from: 100, until: 2_500, every: 100, ..config.resample };
     // The published method has no such losses.
     config.motion = MotionConfig { guidance: 0.0, stillness: 0.0, misfit: 0.0, ..config.motion };
@@ -258,7 +259,7 @@ impl Default for InstanceConfig {
             occupancy_limits: [0.005, 0.999],
             calibration_limit: 10.0,
             normalisation: super::Normalisation::None,
-            geometry: super::InstanceGeometry::Full,
+            geometry: super::InstanceGeometry::Off,
             color_loss: true,
             ablate: std::collections::BTreeSet::new(),
         }

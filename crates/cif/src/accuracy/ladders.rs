@@ -125,6 +125,8 @@ pub struct Base {
     pub is_dynamic: bool,
     /// The capture has masks.
     pub has_instances: bool,
+    /// The instance loss moves Gaussians.
+    pub instances_move_geometry: bool,
 }
 
 fn train(id: &str, label: impl Into<String>, settings: &[String]) -> Rung {
@@ -275,16 +277,16 @@ fn ladder(name: &'static str, base: &Base) -> Ladder {
                 Vec::new()
             },
         ),
-        "speedups" => ("Approximations", "Settings that save time in training, one by one.", {
+        "speedups" => ("Approximations", "Settings that save or cost time in training, one by one.", {
             let mut rungs = vec![train("", "none", &[])];
             let one = |id: &str, label: &str, setting: &str| train(id, label, &[setting.to_owned()]);
             if base.has_instances {
                 rungs.push(one("speedup-stride", "identities from every 4th frame", "identity.stride=4"));
-                rungs.push(one(
-                    "speedup-geometry",
-                    "instances leave geometry alone",
-                    "instance.geometry=off",
-                ));
+                rungs.push(if base.instances_move_geometry {
+                    one("geometry-off", "instances leave geometry alone", "instance.geometry=off")
+                } else {
+                    one("geometry-full", "instances move geometry", "instance.geometry=full")
+                });
             }
             if !quick {
                 rungs.push(one("speedup-tiles-quarter", "a quarter of the tiles", "stages.tile_share=0.25"));
@@ -400,6 +402,7 @@ mod tests {
             downscale: 1,
             is_dynamic: true,
             has_instances: true,
+            instances_move_geometry: false,
         }
     }
 

@@ -547,6 +547,7 @@ mod tests {
             downscale: 1,
             is_dynamic: true,
             has_instances: true,
+            instances_move_geometry: false,
         };
         let record = |k: usize| Record {
             cpu_s: 1.0 + k as f64,

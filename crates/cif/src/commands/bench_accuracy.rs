@@ -8,6 +8,7 @@ use cif_dataset::{Dataset, Split};
 use cif_field::Field;
 use cif_geometry::PinholeCamera;
 use cif_render::RenderedImage;
+use cif_train::config::InstanceGeometry;
 use cif_train::metrics::trained_settings;
 use cif_train::{Preset, SystemClock, TrainConfig, Trainer};
 use clap::Args;
@@ -104,6 +105,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         downscale: config.downscale.unwrap_or(1),
         is_dynamic: dataset.times.len() > 1,
         has_instances: dataset.frames.iter().any(|frame| frame.mask.is_some()),
+        instances_move_geometry: config.instance.geometry != InstanceGeometry::Off,
     };
     let mut all = ladders(&base);
     all.retain(|ladder| command.ladders.is_empty() || command.ladders.iter().any(|name| name == ladder.name));

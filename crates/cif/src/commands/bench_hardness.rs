@@ -26,8 +26,8 @@ const MAX_MIOU_LOSS: f64 = 1.0;
 /// Train hard variants of a capture and compare them with the capture itself
 #[derive(Debug, Args)]
 #[command(after_help = "\
-Every variant is trained with the same settings and seed, with all effects as `cif train --effects all`
-does, and scored on the same held-out frames.
+Every variant is trained with the same settings and seed, with all effects, as by --effects all of
+`cif train`, and scored on the same held-out frames.
 Scaling and moving the capture must not change PSNR by 0.3 dB or mIoU by 1 point; every variant must
 end with a finite scene. Exit code 1 when one does not.
 

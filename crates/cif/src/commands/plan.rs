@@ -13,8 +13,8 @@ use crate::error::Error;
 #[derive(Debug, Args)]
 #[command(after_help = "\
 `cif train` follows this plan (unless the preset is paper, or --effects says otherwise) and records it in the scene.
-Each line tells the flag of `cif train` that decides otherwise; settings that are typed or in a --config file win over
-the plan.
+Each line tells the flag of `cif train` that decides otherwise; settings that are typed or in a
+--config file win over the plan.
 
   cif plan captures/table
   cif train captures/table -o table.cif --effects auto,-instances")]
