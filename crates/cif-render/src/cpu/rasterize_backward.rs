@@ -237,6 +237,7 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
         Some(GeometryPath::MeansOnly) => (zero, one),
         Some(GeometryPath::Off) | None => (zero, zero),
     };
+    let moves_geometry = instances.is_some_and(|instances| instances.geometry != GeometryPath::Off);
     let weight = instances.map_or(0.0, |instances| instances.weight);
 
     for (pair, entry) in entries.iter().enumerate() {
@@ -291,7 +292,9 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
                 let at = prepared.footprint(simd, group);
                 let (q, finished) = seen.instances_backward(simd, &at, group, replay, &mut sums);
                 live_instances.finish(group, finished);
-                sums.add_moments(&at, q * seen.full_geometry, q * seen.mean_geometry);
+                if moves_geometry {
+                    sums.add_moments(&at, q * seen.full_geometry, q * seen.mean_geometry);
+                }
             }
             let slots = replay.mass.len();
             for (out, mass) in label_mass[pair * slots..(pair + 1) * slots].iter_mut().zip(&replay.mass) {
