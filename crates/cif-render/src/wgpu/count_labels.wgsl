@@ -49,7 +49,7 @@ var<workgroup> partial_sums: array<f32, 768>;
 
 fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
     var p: Pixel;
-    let at = quadrant_origin(tile, quadrant) + vec2u(local % HALF_TILE, local / HALF_TILE);
+    let at = pixel_in_quadrant(tile, quadrant, local);
     p.centre = vec2f(at) + 0.5;
     p.transmittance = 1.0;
     var place = TOTAL;

@@ -33,7 +33,7 @@ struct Pixel {
 
 fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
     var p: Pixel;
-    let at = quadrant_origin(tile, quadrant) + vec2u(local % HALF_TILE, local / HALF_TILE);
+    let at = pixel_in_quadrant(tile, quadrant, local);
     p.centre = vec2f(at) + 0.5;
     p.transmittance = 1.0;
     p.instance_transmittance = 1.0;
@@ -101,7 +101,7 @@ fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
     var p3 = pixel_of(tile, 3u, local);
     let own_labels = vec4u(p0.label, p1.label, p2.label, p3.label);
     for (var first = range.x; first < range.y; first += STAGED) {
-        let open = p0.open | (p1.open << 2u) | (p2.open << 4u) | (p3.open << 6u);
+        let open = vec4u(p0.open, p1.open, p2.open, p3.open);
         let alive = stage_tile(first, range.y, tile, open, local);
         if (alive == 0u) {
             break;

@@ -51,6 +51,11 @@ fn quadrant_origin(tile: vec2u, quadrant: u32) -> vec2u {
     return tile * TILE + vec2u(quadrant & 1u, quadrant >> 1u) * HALF_TILE;
 }
 
+// Pixel of an invocation, of 64, in a quadrant.
+fn pixel_in_quadrant(tile: vec2u, quadrant: u32, local: u32) -> vec2u {
+    return quadrant_origin(tile, quadrant) + vec2u(local % HALF_TILE, local / HALF_TILE);
+}
+
 // Passes of a splat in a quadrant.
 fn passes_in_quadrant(splat: Splat, origin: vec2u) -> u32 {
     let first = vec2f(origin) + 0.5;

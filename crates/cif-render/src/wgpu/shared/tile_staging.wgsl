@@ -26,9 +26,10 @@ var<workgroup> live: atomic<u32>;
 // Entries of the longest identity row.
 var<workgroup> longest: atomic<u32>;
 
-// Stages entries from `first` on; returns the passes that any pixel lets light through, of which `open` is what the
-// invocation knows. Every invocation of the workgroup must come here, and meet between what it reads and the next call.
-fn stage_tile(first: u32, end: u32, tile: vec2u, open: u32, local: u32) -> u32 {
+// Stages entries from `first` on; returns the passes that any pixel lets light through, of which `open` are those of the
+// invocation's pixels, a quadrant each. Every invocation of the workgroup must come here, and meet between what it reads
+// and the next call.
+fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32 {
     if (local < STAGED) {
         atomicStore(&staged_passes[local], 0u);
     }
@@ -37,7 +38,7 @@ fn stage_tile(first: u32, end: u32, tile: vec2u, open: u32, local: u32) -> u32 {
         atomicStore(&longest, 0u);
     }
     workgroupBarrier();
-    atomicOr(&live, open);
+    atomicOr(&live, open.x | (open.y << 2u) | (open.z << 4u) | (open.w << 6u));
     // An invocation tells one quadrant of an entry.
     let place = local / 4u;
     let quadrant = local % 4u;
