@@ -107,7 +107,9 @@ fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
             break;
         }
         let count = min(STAGED, range.y - first);
-        for (var k = 0u; k < count; k += 1u) {
+        // A loop that ends at its foot: software that walks both sides of every branch goes through others once more.
+        var k = 0u;
+        loop {
             let splat = staged[k];
             let passes = atomicLoad(&staged_passes[k]) & alive;
             var identity = vec4f(0.0);
@@ -125,6 +127,10 @@ fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
             }
             if ((passes & 192u) != 0u) {
                 blend(splat, (passes >> 6u) & 3u, identity.w, &p3);
+            }
+            continuing {
+                k += 1u;
+                break if k >= count;
             }
         }
         workgroupBarrier();

@@ -162,6 +162,60 @@ fn of_label(label: u32, labels: vec4u, values: vec4f) -> f32 {
     return own.x + own.y + own.z + own.w;
 }
 
+// Label mass of the batch, from the responsibilities of all invocations: of four entries of every row at a time. Every
+// invocation of the workgroup must come here.
+fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32, longest_row: u32) {
+    var entry = 0u;
+    loop {
+        let row_first = staged[batch + own].row_first + entry;
+        let row_end = select(0u, staged[batch + own].row_end, own < count);
+        var mass = vec4f(0.0);
+        if (row_first < row_end) {
+            let last = row_end - 1u;
+            let wanted = vec4u(
+                identities[row_first].x,
+                identities[min(row_first + 1u, last)].x,
+                identities[min(row_first + 2u, last)].x,
+                identities[min(row_first + 3u, last)].x,
+            ) + 1u;
+            // Of the pixels of four invocations.
+            var at = part;
+            loop {
+                let values = responsibilities[own * 64u + at];
+                let packed = pixel_labels[at];
+                let found = vec4u(packed & vec2u(0xffffu), packed >> vec2u(16u)).xzyw;
+                mass += vec4f(
+                    of_label(wanted.x, found, values),
+                    of_label(wanted.y, found, values),
+                    of_label(wanted.z, found, values),
+                    of_label(wanted.w, found, values),
+                );
+                continuing {
+                    at += 16u;
+                    break if at >= 64u;
+                }
+            }
+        }
+        partial_sums[4u * local] = mass.x;
+        partial_sums[4u * local + 1u] = mass.y;
+        partial_sums[4u * local + 2u] = mass.z;
+        partial_sums[4u * local + 3u] = mass.w;
+        workgroupBarrier();
+        if (part < 4u && row_first + part < row_end) {
+            var sum = 0.0;
+            for (var k = 0u; k < 16u; k += 1u) {
+                sum += partial_sums[4u * (16u * own + k) + part];
+            }
+            label_mass[staged[batch + own].slot + entry + part] = sum;
+        }
+        workgroupBarrier();
+        continuing {
+            entry += 4u;
+            break if entry >= longest_row;
+        }
+    }
+}
+
 // Nothing reaches these pairs.
 fn clear_pairs(first: u32, end: u32) {
     for (var index = first; index < end; index += 64u) {
@@ -201,9 +255,12 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
             longest_row = workgroupUniformLoad(&longest);
         }
         let staged_count = min(STAGED, range.y - first);
-        for (var batch = 0u; batch < staged_count; batch += BATCH) {
+        // Loops that end at their foot: software that walks both sides of every branch goes through others once more.
+        var batch = 0u;
+        loop {
             let count = min(BATCH, staged_count - batch);
-            for (var k = 0u; k < count; k += 1u) {
+            var k = 0u;
+            loop {
                 let splat = staged[batch + k];
                 let passes = atomicLoad(&staged_passes[batch + k]) & alive;
                 var identity = vec4f(0.0);
@@ -238,6 +295,10 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
                 if (WITH_INSTANCES) {
                     responsibilities[k * 64u + local] = responsibility;
                 }
+                continuing {
+                    k += 1u;
+                    break if k >= count;
+                }
             }
             workgroupBarrier();
 
@@ -246,52 +307,29 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
             if (own < count && part < SUMS) {
                 let sums = (own * SUMS + part) * 64u;
                 var sum = vec4f(0.0);
-                for (var k = local; k < local + 64u; k += 4u) {
-                    // Every invocation starts at another place, so that they read from different banks of memory.
+                // Every invocation starts at another place, so that they read from different banks of memory.
+                var at = local;
+                loop {
                     sum += vec4f(
-                        partial_sums[sums + k % 64u],
-                        partial_sums[sums + (k + 1u) % 64u],
-                        partial_sums[sums + (k + 2u) % 64u],
-                        partial_sums[sums + (k + 3u) % 64u],
+                        partial_sums[sums + at % 64u],
+                        partial_sums[sums + (at + 1u) % 64u],
+                        partial_sums[sums + (at + 2u) % 64u],
+                        partial_sums[sums + (at + 3u) % 64u],
                     );
+                    continuing {
+                        at += 4u;
+                        break if at >= local + 64u;
+                    }
                 }
                 pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = (sum.x + sum.y) + (sum.z + sum.w);
             }
             workgroupBarrier();
-            for (var entry = 0u; entry < longest_row; entry += 4u) {
-                let row_first = staged[batch + own].row_first + entry;
-                let row_end = select(0u, staged[batch + own].row_end, own < count);
-                // Of four entries of the row, over the pixels of four invocations.
-                var mass = vec4f(0.0);
-                if (row_first < row_end) {
-                    var wanted = vec4u(0u);
-                    for (var k = 0u; k < min(4u, row_end - row_first); k += 1u) {
-                        wanted[k] = identities[row_first + k].x + 1u;
-                    }
-                    for (var at = part; at < 64u; at += 16u) {
-                        let values = responsibilities[own * 64u + at];
-                        let packed = pixel_labels[at];
-                        let found = vec4u(packed & vec2u(0xffffu), packed >> vec2u(16u)).xzyw;
-                        mass += vec4f(
-                            of_label(wanted.x, found, values),
-                            of_label(wanted.y, found, values),
-                            of_label(wanted.z, found, values),
-                            of_label(wanted.w, found, values),
-                        );
-                    }
-                }
-                for (var k = 0u; k < 4u; k += 1u) {
-                    partial_sums[4u * local + k] = mass[k];
-                }
-                workgroupBarrier();
-                if (part < 4u && row_first + part < row_end) {
-                    var sum = 0.0;
-                    for (var k = 0u; k < 16u; k += 1u) {
-                        sum += partial_sums[4u * (16u * own + k) + part];
-                    }
-                    label_mass[staged[batch + own].slot + entry + part] = sum;
-                }
-                workgroupBarrier();
+            if (longest_row > 0u) {
+                sum_responsibilities(own, part, local, count, batch, longest_row);
+            }
+            continuing {
+                batch += BATCH;
+                break if batch >= staged_count;
             }
         }
     }

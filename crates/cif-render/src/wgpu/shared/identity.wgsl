@@ -3,9 +3,16 @@
 // Probabilities of four labels (dense index + 1) in a row; 0 outside its support.
 fn probabilities_of(first: u32, end: u32, labels: vec4u) -> vec4f {
     var found = vec4f(0.0);
-    for (var entry = first; entry < end; entry += 1u) {
-        let item = identities[entry];
-        found = select(found, vec4f(bitcast<f32>(item.y)), labels == vec4u(item.x + 1u));
+    if (first < end) {
+        var entry = first;
+        loop {
+            let item = identities[entry];
+            found = select(found, vec4f(bitcast<f32>(item.y)), labels == vec4u(item.x + 1u));
+            continuing {
+                entry += 1u;
+                break if entry >= end;
+            }
+        }
     }
     return found;
 }
