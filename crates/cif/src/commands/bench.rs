@@ -526,7 +526,8 @@ impl Report {
         }
         println!("{table}\n");
         let mut table = super::table(["work", "per step", "ns each", "of"]);
-        for unit in self.units() {
+        // What was not counted, or not done, has no line.
+        for unit in self.units().into_iter().filter(|unit| unit.ns_each.is_some()) {
             table.add_row([
                 unit.name.to_owned(),
                 format!("{:.0}", unit.per_step),
