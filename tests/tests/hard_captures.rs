@@ -33,6 +33,7 @@ fn hard_captures_end_with_a_finite_scene() {
         assert!(row["psnr"].as_f64().is_some_and(f64::is_finite), "{row:#}");
         assert_eq!(row["rolled_back"], 0, "{row:#}");
     }
+    assert!(rows[0]["notes"].to_string().contains("mean of 3 seeds: PSNR"), "{}", rows[0]);
     let of = |name: &str| rows.iter().find(|row| row["name"] == name).unwrap_or_else(|| panic!("{name}"));
     // The same frame, up to rounding: even short runs end close together.
     for name in ["scaled-down", "moved"] {
