@@ -379,17 +379,13 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
         let preset = if heads.opacity { Extent::Full } else { Extent::Off };
         effects.push(effect(
             EffectKind::Appearing,
-            preset,
+            if found.appearing.is_empty() { preset } else { Extent::Full },
             preset,
             "",
             if found.appearing.is_empty() {
                 "by their masks, none appears or vanishes inside the view".to_owned()
             } else {
-                format!(
-                    "these appear or vanish inside the view: {}; opacities that change show them better, and cost \
-                     mIoU where it was measured",
-                    found.appearing.join(", ")
-                )
+                format!("these appear or vanish inside the view: {}", found.appearing.join(", "))
             },
             "opacities that change: two layers of the network".to_owned(),
         ));

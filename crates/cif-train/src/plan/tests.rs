@@ -132,9 +132,8 @@ fn cameras_that_disagree_and_instances_that_appear_count() {
     assert!(!config.effects.exposure && !config.model.heads.opacity);
     let found = Evidence { exposures: Some((8, 1.3)), appearing: vec!["kite".to_owned()], ..found() };
     let (plan, config) = self::plan(&found, "auto");
-    // Opacities that change were not worth it where it was measured.
-    assert!(config.effects.exposure && !config.model.heads.opacity);
-    assert!(self::plan(&found, "auto,+appearing").1.model.heads.opacity);
+    assert!(config.effects.exposure && config.model.heads.opacity);
+    assert!(self::plan(&calm, "auto,+appearing").1.model.heads.opacity);
     let why = |kind| plan.effects.iter().find(|effect| effect.effect == kind).unwrap().evidence.clone();
     assert!(why(EffectKind::Exposure).contains("30 %") && why(EffectKind::Appearing).contains("kite"));
     assert_eq!(self::plan(&found, "all").1, TrainConfig::default(), "all takes no evidence");
