@@ -27,10 +27,10 @@ written beside the scene as SCENE.train.toml, which --config accepts again.
   cif train captures/table -o table.cif --masks masks_tracker --iterations-fine 8000 --seed 3
   cif train captures/table -o table.cif --config mine.toml --set densify.max_gaussians=30000
 
-Measured: draft on examples/tabletop-mini (60 frames of 128 x 96) takes 60 s on two cores and reaches
-28.4 dB PSNR and 96 % mIoU on held-out frames (make demo);
-standard on a capture of 256 x 192 took under five minutes on one core and reached 29.3 dB and 96 %; paper
-is not measured. `cif bench accuracy` measures this on your capture and machine.
+Measured: draft on examples/tabletop-mini (60 frames of 128 x 96) takes 56 s on two cores and reaches
+28.4 dB PSNR and 97 % mIoU on held-out frames (make demo);
+standard on a capture of 256 x 192 took six minutes on one core and reached 29.4 dB and 98 %; paper is
+not measured. `cif bench accuracy` measures this on your capture and machine.
 
 Other masks or variants on one reconstruction, without training it again (settings that are not typed
 are those of the scene it comes from):
