@@ -70,13 +70,6 @@ pub enum TrainError {
     #[cfg(feature = "wgpu")]
     #[error(transparent)]
     Gpu(#[from] cif_render::wgpu::GpuError),
-    /// Settings that only the processor supports.
-    #[cfg(feature = "wgpu")]
-    #[error("not supported on a GPU: {settings}; switch it off, or train with --backend cpu")]
-    NotOnGpu {
-        /// Their keys.
-        settings: String,
-    },
     /// All Gaussians were pruned.
     #[error(
         "{stage} stage, step {iteration}: every Gaussian was pruned; the cameras may look past the initial \

@@ -5,8 +5,8 @@
 //! on its window, which reaches into the tiles beside its own: those are rendered and differentiated too, but their
 //! own pixels do not count. Source: methods reference 11, idea 6.
 
+use cif_render::TileChoice;
 use cif_render::constants::TILE;
-use cif_render::cpu::TileChoice;
 use rand::Rng;
 use rand::seq::SliceRandom;
 

@@ -36,5 +36,5 @@ mod vector;
 
 pub use counts::IdentityCounts;
 pub use level::SimdLevel;
-pub use renderer::{ForwardPass, NotFinite, Renderer, TileChoice, ViewStatistics};
+pub use renderer::{ForwardPass, NotFinite, Renderer, ViewStatistics};
 pub use timing::StageTimes;

@@ -20,8 +20,8 @@ use super::identities::DeviceIdentities;
 use super::kernel::{Commands, workgroups};
 use super::sort::{Count, RadixSort, Scan, SortArrays};
 use super::stages::{Kernels, PROJECT_PACKED, entries};
-use super::view::{PAIR_SUMS, Splat, View, work};
-use crate::RenderSettings;
+use super::view::{COLOR_PASS, INSTANCE_PASS, PAIR_SUMS, Splat, View, work};
+use crate::{RenderSettings, TileChoice};
 
 /// Labels of a view on the device.
 #[derive(Clone, Copy, Debug)]
@@ -58,6 +58,8 @@ pub struct ViewInput<'a> {
     pub settings: &'a RenderSettings,
     /// Labels, for the instance pass of training.
     pub labels: Option<LabelInput<'a>>,
+    /// Tiles that are drawn, `None` for all: others have the colour of the background and no gradient.
+    pub tiles: Option<TileChoice<'a>>,
 }
 
 /// Counts of a view.
@@ -117,6 +119,7 @@ struct Arrays {
     splats: GpuVec<Splat>,
     /// Keys are depths, values Gaussians.
     depth: SortArrays,
+    tile_choice: GpuVec<u32>,
     tile_counts: GpuVec<u32>,
     pair_offsets: GpuVec<u32>,
     slot_offsets: GpuVec<u32>,
@@ -144,6 +147,7 @@ impl Arrays {
         Ok(Self {
             splats: GpuVec::zeros(gpu, "splats", 0)?,
             depth: SortArrays::new(gpu, "depth order")?,
+            tile_choice: GpuVec::zeros(gpu, "chosen tiles", 0)?,
             tile_counts: GpuVec::zeros(gpu, "tile counts", 0)?,
             pair_offsets: GpuVec::zeros(gpu, "pair offsets", 0)?,
             slot_offsets: GpuVec::zeros(gpu, "label slot offsets", 0)?,
@@ -282,6 +286,14 @@ impl Rasterizer {
             view.pixel_weight = labels.weight / labels.labelled_pixels.max(1) as f32;
         }
         let arrays = &mut self.arrays;
+        if let Some(tiles) = input.tiles {
+            tiles.check(input.camera.width, input.camera.height);
+            view.chooses_tiles = 1;
+            let passes = tiles.drawn.iter().zip(tiles.labelled).map(|(drawn, labelled)| {
+                if *drawn { COLOR_PASS | if *labelled { INSTANCE_PASS } else { 0 } } else { 0 }
+            });
+            arrays.tile_choice.replace(gpu, &passes.collect::<Vec<_>>())?;
+        }
         arrays.splats.resize(gpu, n)?;
         arrays.depth.resize(gpu, n)?;
         arrays.tile_counts.resize(gpu, n)?;
@@ -349,6 +361,7 @@ impl Rasterizer {
                 arrays.pair_offsets.buffer(),
                 arrays.slot_offsets.buffer(),
                 arrays.work.buffer(),
+                arrays.tile_choice.buffer(),
             ],
         );
         let mut scanned = Ok(());
@@ -461,6 +474,7 @@ impl Rasterizer {
                 arrays.pair_offsets.buffer(),
                 arrays.slot_offsets.buffer(),
                 arrays.work.buffer(),
+                arrays.tile_choice.buffer(),
             ],
         );
         let emit = self.cache.get(
@@ -476,6 +490,7 @@ impl Rasterizer {
                 arrays.tiles.keys[0].buffer(),
                 arrays.tiles.values[0].buffer(),
                 arrays.pairs.buffer(),
+                arrays.tile_choice.buffer(),
             ],
         );
         // One more than there are tiles: pairs of no tile go last.
@@ -771,6 +786,12 @@ impl Rasterizer {
     #[must_use]
     pub fn blended(&self) -> &GpuVec<[f32; 4]> {
         &self.arrays.blended
+    }
+
+    /// Passes that draw each tile, a bit each, row by row, of a view of which some tiles alone are drawn.
+    #[must_use]
+    pub fn tile_choice(&self) -> &GpuVec<u32> {
+        &self.arrays.tile_choice
     }
 
     /// Per pixel: most probable label (dense index + 1, 0 = none), its probability, coverage, entropy in nats.

@@ -102,7 +102,7 @@ impl GpuRenderer {
         channels: Channels,
     ) -> Result<RenderedImage, GpuError> {
         let settings = settings.for_outputs(field, channels);
-        let input = ViewInput { camera, settings: &settings, labels: None };
+        let input = ViewInput { camera, settings: &settings, labels: None, tiles: None };
         let identities = self.identities.as_ref().filter(|_| settings.instances.is_some());
         let mut commands = Commands::new(&self.gpu, None);
         let posed = if field.tracks.is_some() {

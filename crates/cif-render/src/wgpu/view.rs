@@ -22,6 +22,10 @@ pub(crate) const SORT_BLOCK: usize = 2048;
 pub(crate) const PAIR_SUMS: usize = 12;
 /// Depth key of what is not visible.
 const NOT_VISIBLE: u32 = u32::MAX;
+/// Bits of the passes that draw something.
+pub const COLOR_PASS: u32 = 1;
+/// As above.
+pub const INSTANCE_PASS: u32 = 2;
 /// "The count comes with the parameters, not from the work counts."
 pub(crate) const NONE: u32 = u32::MAX;
 /// Remainder 1 - c_i that is rounding, as in `cpu/rasterize_backward.rs`.
@@ -103,8 +107,8 @@ crate::shared_struct! {
         pub full_geometry: f32,
         /// Share that reaches means.
         pub mean_geometry: f32,
-        /// Pads to 16 bytes.
-        pub unused: f32,
+        /// 1 when some tiles alone are drawn.
+        pub chooses_tiles: u32,
     }
 }
 
@@ -238,6 +242,8 @@ fn shared_constants() -> String {
         ("SCAN_BLOCK", Unsigned(SCAN_BLOCK as u32)),
         ("SORT_BLOCK", Unsigned(SORT_BLOCK as u32)),
         ("PAIR_SUMS", Unsigned(PAIR_SUMS as u32)),
+        ("COLOR_PASS", Unsigned(COLOR_PASS)),
+        ("INSTANCE_PASS", Unsigned(INSTANCE_PASS)),
         ("NOT_VISIBLE", Unsigned(NOT_VISIBLE)),
         ("NONE", Unsigned(NONE)),
         ("OCCUPANCY_OWN", Unsigned(OCCUPANCY_OWN)),

@@ -219,7 +219,8 @@ pub struct DensifyConfig {
     pub gradient_threshold: f32,
     /// Largest scale, as a fraction of the extent, that is cloned rather than split, default 0.01.
     pub split_scale: f32,
-    /// No additions beyond this many Gaussians, default 12 000; those with the largest gradient go first.
+    /// No additions beyond this many Gaussians, default 12 000; those with the largest gradient go first. What
+    /// travelling objects start with comes on top, see `motion.gaussians`.
     pub max_gaussians: u32,
     /// Steps between prunings, default 100; 0 never.
     pub prune_every: u32,

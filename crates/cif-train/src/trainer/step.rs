@@ -264,7 +264,7 @@ impl Trainer {
     }
 
     /// Tiles that a view of a step is learnt from; `None` for all.
-    fn tiles_of_view(
+    pub(super) fn tiles_of_view(
         &self,
         stage: Stage,
         iteration: u32,

@@ -2,10 +2,11 @@
 
 use cif_field::gaussians::SH_FLOATS;
 use cif_geometry::quaternion::MIN_NORM;
-use cif_render::constants::MIN_LABEL_PROBABILITY;
+use cif_render::constants::{MIN_LABEL_PROBABILITY, TILE};
 use cif_render::wgpu::Access::{Read, ReadWrite, Uniform};
 use cif_render::wgpu::deform::{FIXED_POINT, PLANES_FAULT};
 use cif_render::wgpu::faults::FAULTS;
+use cif_render::wgpu::view::INSTANCE_PASS;
 use cif_render::wgpu::{
     Constant, Gpu, GpuError, GpuStatistics, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet,
     constants, structures,
@@ -38,6 +39,12 @@ cif_render::shared_struct! {
         pub similarity_weight: f32,
         /// 1 when pixels of some labels train nothing, 2 when the pixels that are judged by train nothing.
         pub leaves_out: u32,
+        /// Tiles of a row when some tiles alone count, or 0.
+        pub tile_columns: u32,
+        /// Rows of pixels.
+        pub height: u32,
+        /// Pads to 16 bytes.
+        pub unused: [u32; 2],
         /// Taps of the window of the similarity, from the centre outwards.
         pub window: [[f32; 4]; 2],
     }
@@ -250,6 +257,8 @@ const CONSTANTS: Snippet = Snippet {
             ("SMALLEST_SECOND", Constant::Float(f32::MIN_POSITIVE)),
             ("MIN_NORM", Constant::Float(MIN_NORM as f32)),
             ("MIN_LABEL_PROBABILITY", Constant::Float(MIN_LABEL_PROBABILITY)),
+            ("TILE", Constant::Unsigned(TILE)),
+            ("INSTANCE_PASS", Constant::Unsigned(INSTANCE_PASS)),
             ("SSIM_C1", Constant::Float(C1)),
             ("SSIM_C2", Constant::Float(C2)),
             ("NO_ROTATION", Constant::Float(NO_ROTATION as f32)),
@@ -285,23 +294,34 @@ const REARRANGEMENT: Snippet =
     Snippet { name: "rearrangement", text: || structures(&[Rearrangement::layout()]) };
 const JUDGEMENT: Snippet = Snippet { name: "judgement", text: || structures(&[Judgement::layout()]) };
 const MOTION: Snippet = Snippet { name: "motion", text: || structures(&[Motion::layout()]) };
+const COUNTED_TILES: Snippet =
+    Snippet { name: "counted_tiles", text: || include_str!("counted_tiles.wgsl").to_owned() };
 const ADAM: Snippet = Snippet { name: "adam", text: || include_str!("adam.wgsl").to_owned() };
 
 /// Colour loss, and the value of the instance loss.
 pub const LOSSES: Module = Module {
     name: "losses",
     text: include_str!("losses.wgsl"),
-    imports: &[CONSTANTS, LOSS_SETTINGS],
+    imports: &[CONSTANTS, LOSS_SETTINGS, COUNTED_TILES],
     bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
-    entries: &["losses", "total", "leave_out"],
+    entries: &["losses", "total"],
+};
+
+/// Pixels that train nothing.
+pub const LEAVE_OUT: Module = Module {
+    name: "leave_out",
+    text: include_str!("leave_out.wgsl"),
+    imports: &[CONSTANTS, LOSS_SETTINGS],
+    bindings: &[Uniform, Read, Read, ReadWrite],
+    entries: &["leave_out"],
 };
 
 /// Structural similarity.
 pub const SSIM: Module = Module {
     name: "ssim",
     text: include_str!("ssim.wgsl"),
-    imports: &[CONSTANTS, LOSS_SETTINGS],
-    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    imports: &[CONSTANTS, LOSS_SETTINGS, COUNTED_TILES],
+    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read],
     entries: &["blur_rows", "compare", "blur_maps", "add_gradient"],
 };
 
@@ -398,6 +418,7 @@ pub const DISPLACEMENT: Module = Module {
 /// Every WGSL file of this crate.
 pub const MODULES: &[&Module] = &[
     &LOSSES,
+    &LEAVE_OUT,
     &SSIM,
     &EXPOSURE,
     &ADAM_EXPOSURES,

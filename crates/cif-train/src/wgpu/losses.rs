@@ -1,9 +1,10 @@
 //! Losses of a view on the device.
 
 use cif_geometry::PixelGrid;
+use cif_render::constants::TILE;
 use cif_render::wgpu::{Commands, Gpu, GpuError, GpuVec, Kernel, Uniform, workgroups};
 
-use super::kernels::{LOSSES, LossSettings, SSIM, entries};
+use super::kernels::{LEAVE_OUT, LOSSES, LossSettings, SSIM, entries};
 use crate::losses::ColorLoss;
 use crate::losses::ssim::window;
 
@@ -52,9 +53,18 @@ impl GpuTarget {
     }
 }
 
+/// Tiles whose pixels count.
+#[derive(Clone, Copy, Debug)]
+pub struct CountedTiles<'a> {
+    /// As [`cif_render::wgpu::Rasterizer::tile_choice`].
+    pub choice: &'a GpuVec<u32>,
+    /// How many times each counts.
+    pub weight: f64,
+}
+
 /// How a view is compared.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct LossWeights {
+pub struct LossWeights<'a> {
     /// Share of the structural dissimilarity.
     pub lambda_dssim: f32,
     /// Of the view in the step.
@@ -67,6 +77,8 @@ pub struct LossWeights {
     pub leaves_out: bool,
     /// Whether the pixels that effects are judged by are left out of the gradient.
     pub leaves_judged: bool,
+    /// Tiles that count, `None` for all.
+    pub tiles: Option<CountedTiles<'a>>,
 }
 
 /// Losses on the device.
@@ -81,6 +93,8 @@ pub struct GpuLosses {
     maps: GpuVec<[f32; 4]>,
     settings: Uniform<LossSettings>,
     left_out: GpuVec<u32>,
+    /// Stands in where all tiles count.
+    no_choice: GpuVec<u32>,
     losses: Kernel,
     total: Kernel,
     leave_out: Kernel,
@@ -93,7 +107,8 @@ impl GpuLosses {
     /// # Errors
     /// When the driver rejects a kernel.
     pub fn new(gpu: &Gpu) -> Result<Self, GpuError> {
-        let [losses, total, leave_out] = entries(gpu, &LOSSES)?;
+        let [losses, total] = entries(gpu, &LOSSES)?;
+        let [leave_out] = entries(gpu, &LEAVE_OUT)?;
         Ok(Self {
             v_colors: GpuVec::zeros(gpu, "gradient of the colours", 0)?,
             results: GpuVec::zeros(gpu, "losses", 2 * SLOTS)?,
@@ -102,6 +117,7 @@ impl GpuLosses {
             maps: GpuVec::zeros(gpu, "maps of the similarity", 0)?,
             settings: Uniform::new(gpu, "loss settings", &LossSettings::default()),
             left_out: GpuVec::zeros(gpu, "labels left out", 0)?,
+            no_choice: GpuVec::zeros(gpu, "no choice of tiles", 0)?,
             losses,
             total,
             leave_out,
@@ -139,7 +155,7 @@ impl GpuLosses {
         commands: &mut Commands<'_>,
         (colors, blended): (&GpuVec<[f32; 4]>, &GpuVec<[f32; 4]>),
         target: &GpuTarget,
-        weights: &LossWeights,
+        weights: &LossWeights<'_>,
         slot: usize,
     ) -> Result<(), GpuError> {
         assert!(slot < SLOTS, "{slot} is no slot");
@@ -155,7 +171,8 @@ impl GpuLosses {
         self.maps.resize(gpu, if with_similarity { 3 * pixels } else { 0 })?;
         // As on the CPU: in double precision up to the weight of a value.
         let values = (pixels * 3).max(1) as f64;
-        let share = |weight: f64| (weight * f64::from(weights.view) / values) as f32;
+        let of_pixel = weights.tiles.map_or(1.0, |tiles| tiles.weight);
+        let share = |weight: f64| (weight * f64::from(weights.view) * of_pixel / values) as f32;
         let taps = window();
         self.settings.write(
             gpu,
@@ -168,9 +185,13 @@ impl GpuLosses {
                 absolute_weight: share(f64::from(1.0 - weights.lambda_dssim)),
                 similarity_weight: share(-f64::from(weights.lambda_dssim)),
                 leaves_out,
+                tile_columns: weights.tiles.map_or(0, |_| width.div_ceil(TILE)),
+                height,
+                unused: [0; 2],
                 window: [[taps[0], taps[1], taps[2], taps[3]], [taps[4], taps[5], 0.0, 0.0]],
             },
         );
+        let choice = weights.tiles.map_or(&self.no_choice, |tiles| tiles.choice);
         let bindings = [
             self.settings.binding(),
             colors.binding(),
@@ -180,9 +201,17 @@ impl GpuLosses {
             self.v_colors.binding(),
             self.partial_sums.binding(),
             self.results.binding(),
-            self.left_out.binding(),
+            choice.binding(),
         ];
-        let leave_out = self.leave_out.bind(gpu, &bindings);
+        let leave_out = self.leave_out.bind(
+            gpu,
+            &[
+                self.settings.binding(),
+                target.labels.binding(),
+                self.left_out.binding(),
+                self.v_colors.binding(),
+            ],
+        );
         let losses = self.losses.bind(gpu, &bindings);
         let total = self.total.bind(gpu, &bindings);
         let similarity = self.similarity.each_ref().map(|kernel| {
@@ -196,6 +225,7 @@ impl GpuLosses {
                     self.maps.binding(),
                     self.v_colors.binding(),
                     self.partial_sums.binding(),
+                    choice.binding(),
                 ],
             )
         });
@@ -227,19 +257,20 @@ pub struct ViewLoss {
 }
 
 impl ViewLoss {
-    /// From the two vectors of a slot.
+    /// From the two vectors of a slot, where every pixel that counts does so `of_pixel` times.
     #[must_use]
-    pub fn new([sums, similarity]: [[f32; 4]; 2], pixels: usize, lambda_dssim: f32) -> Self {
+    pub fn new([sums, similarity]: [[f32; 4]; 2], pixels: usize, lambda_dssim: f32, of_pixel: f64) -> Self {
         let values = (pixels * 3).max(1) as f64;
         let share = f64::from(lambda_dssim);
-        let mut loss = (1.0 - share) * f64::from(sums[0]) / values;
+        let [absolute, squared, instance, unsupported] = sums.map(|sum| of_pixel * f64::from(sum));
+        let mut loss = (1.0 - share) * absolute / values;
         if lambda_dssim > 0.0 {
-            loss += share * (1.0 - f64::from(similarity[0]) / values);
+            loss += share * (1.0 - of_pixel * f64::from(similarity[0]) / values);
         }
         Self {
-            color: ColorLoss { loss, mean_squared_error: f64::from(sums[1]) / values },
-            instance_sum: f64::from(sums[2]),
-            unsupported: f64::from(sums[3]),
+            color: ColorLoss { loss, mean_squared_error: squared / values },
+            instance_sum: instance,
+            unsupported,
         }
     }
 }

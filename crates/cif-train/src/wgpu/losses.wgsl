@@ -20,8 +20,8 @@
 @group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
 // As a workgroup's sums, for the view.
 @group(0) @binding(7) var<storage, read_write> results: array<vec4f>;
-// Per label, whether its pixels train nothing.
-@group(0) @binding(8) var<storage, read> left_out: array<u32>;
+@group(0) @binding(8) var<storage, read> tile_choice: array<u32>;
+#import counted_tiles
 
 const INVOCATIONS: u32 = 256u;
 #import workgroup
@@ -36,6 +36,9 @@ fn losses(
     let pixel = workgroup * 256u + local;
     var sums = vec4f(0.0);
     if pixel < settings.pixels {
+        v_colors[pixel] = vec4f(0.0);
+    }
+    if pixel < settings.pixels && counts(pixel) {
         let difference = colors[pixel].xyz - unpack4x8unorm(targets[pixel]).xyz;
         v_colors[pixel] = vec4f(settings.absolute_weight * sign(difference), 0.0);
         let absolute = abs(difference);
@@ -75,27 +78,5 @@ fn total(
         if local == 0u {
             results[2u * settings.slot + part] = sum;
         }
-    }
-}
-
-// Takes the gradient from pixels of labels that are left out, and from those that are judged by.
-@compute @workgroup_size(256)
-fn leave_out(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index) local: u32) {
-    let pixel = (group.y * MAX_WORKGROUPS + group.x) * 256u + local;
-    if pixel >= settings.pixels {
-        return;
-    }
-    var leaves_out = false;
-    if (settings.leaves_out & 1u) != 0u {
-        leaves_out = left_out[labels[pixel]] != 0u;
-    }
-    if (settings.leaves_out & 2u) != 0u {
-        let column = pixel % settings.width;
-        let row = pixel / settings.width;
-        leaves_out = leaves_out
-            || (column % JUDGED_SPACING == JUDGED_COLUMN && row % JUDGED_SPACING == JUDGED_ROW);
-    }
-    if leaves_out {
-        v_colors[pixel] = vec4f(0.0);
     }
 }

@@ -14,6 +14,8 @@
 @group(0) @binding(4) var<storage, read_write> maps: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> v_colors: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
+@group(0) @binding(7) var<storage, read> tile_choice: array<u32>;
+#import counted_tiles
 
 const INVOCATIONS: u32 = 256u;
 #import workgroup
@@ -60,12 +62,11 @@ fn blur_rows(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_inde
 }
 
 fn blur_column(image: u32, pixel: u32) -> vec4f {
-    let height = settings.pixels / settings.width;
     let row = pixel / settings.width;
     var sum = vec4f(0.0);
     for (var k = 0u; k < 11u; k++) {
         let at = row + k;
-        if at >= 5u && at < height + 5u {
+        if at >= 5u && at < settings.height + 5u {
             let other = pixel + k * settings.width - 5u * settings.width;
             sum += tap(u32(abs(i32(k) - 5))) * rows[image * settings.pixels + other];
         }
@@ -83,7 +84,11 @@ fn compare(
     let workgroup = group.y * MAX_WORKGROUPS + group.x;
     let pixel = workgroup * 256u + local;
     var similarity = vec4f(0.0);
-    if pixel < settings.pixels {
+    if pixel < settings.pixels && !counts(pixel) {
+        for (var image = 0u; image < 3u; image++) {
+            maps[image * settings.pixels + pixel] = vec4f(0.0);
+        }
+    } else if pixel < settings.pixels {
         let m1 = blur_column(0u, pixel);
         let m2 = blur_column(1u, pixel);
         let s1 = blur_column(2u, pixel) - m1 * m1;

@@ -32,8 +32,8 @@ use super::project::{Splat, ViewConstants, project};
 use super::rasterize::{TileImage, rasterize_tile};
 use super::tile::{GROUPS, TilePlace};
 use super::timing::{StageTimes, timed};
-use crate::constants::{MIN_LABEL_PROBABILITY, TILE};
-use crate::{InstanceNormalisation, RenderSettings};
+use crate::constants::MIN_LABEL_PROBABILITY;
+use crate::{InstanceNormalisation, RenderSettings, TileChoice};
 
 /// Gaussians handled by one task.
 const CHUNK: usize = 512;
@@ -76,15 +76,6 @@ pub struct ForwardPass {
     pub unsupported_pixels: usize,
     /// Counts.
     pub statistics: ViewStatistics,
-}
-
-/// Tiles of a view that a forward pass takes part in, row by row, [`TILE`] pixels wide and high.
-#[derive(Clone, Copy, Debug)]
-pub struct TileChoice<'a> {
-    /// Drawn and differentiated.
-    pub drawn: &'a [bool],
-    /// Those whose labels count.
-    pub labelled: &'a [bool],
 }
 
 /// State of the last forward pass that the backward pass needs.
@@ -193,9 +184,8 @@ impl Renderer {
         if let Some(labels) = labels {
             assert_eq!((labels.width, labels.height), (camera.width, camera.height), "label map size");
         }
-        if let Some(TileChoice { drawn, labelled }) = tiles {
-            let count = (camera.width.div_ceil(TILE) * camera.height.div_ceil(TILE)) as usize;
-            assert_eq!([drawn.len(), labelled.len()], [count; 2], "tiles of the view");
+        if let Some(tiles) = tiles {
+            tiles.check(camera.width, camera.height);
         }
         self.prepare(field, camera, time, settings, tiles.map(|tiles| tiles.drawn));
         let identities = labels.map(|labels| {

@@ -1,8 +1,6 @@
 // A Gaussian on the image, and how it blends into a pixel. Every kernel that walks the splats of a tile uses these
 // functions, so that all take the same decisions. Rust twin: cpu/tile.rs. Source: methods reference 3.1.
 
-const COLOR_PASS: u32 = 1u;
-const INSTANCE_PASS: u32 = 2u;
 const PASS_SHIFT: u32 = 30u;
 const INDEX_MASK: u32 = 0x3fffffffu;
 const NO_SPLAT: u32 = 0xffffffffu;

@@ -36,6 +36,8 @@ pub(super) struct AboutView {
     /// Labelled pixels, 0 without the instance pass.
     pub(super) labelled: usize,
     pub(super) lambda_dssim: f32,
+    /// How many times a pixel that counts does so.
+    pub(super) of_pixel: f64,
     pub(super) gaussians: usize,
 }
 
@@ -77,15 +79,16 @@ impl ViewRead {
 
     fn news(self) -> Option<ViewNews> {
         let Words::Here(words) = self.words else { return None };
+        let about = self.about;
         let (losses, rest) = words.split_at(LOSS_WORDS);
         let (counts, found) = rest.split_at(GpuStatistics::WORDS);
         let number = |k: usize| f32::from_bits(losses[k]);
         let sums = [0, 4].map(|first| [0, 1, 2, 3].map(|k| number(first + k)));
         Some(ViewNews {
-            loss: ViewLoss::new(sums, self.about.pixels, self.about.lambda_dssim),
+            loss: ViewLoss::new(sums, about.pixels, about.lambda_dssim, about.of_pixel),
             counts: GpuStatistics::of(counts),
             faults: [found[0], found[1]],
-            about: self.about,
+            about,
         })
     }
 }

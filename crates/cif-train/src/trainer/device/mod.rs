@@ -119,7 +119,6 @@ impl Trainer {
     /// When a setting is on that the GPU does not support, named; when the scene may grow beyond what the device
     /// holds, with the arithmetic; when the driver rejects a kernel.
     pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
-        self.refuse_unsupported()?;
         self.refuse_too_large(gpu)?;
         let mut optimiser = GpuOptimiser::new(gpu)?;
         if self.config.adam.fresh_row_bias_correction {
@@ -167,14 +166,6 @@ impl Trainer {
             device.waits = true;
             device.timestamps = Timestamps::new(&device.gpu);
         }
-    }
-
-    /// Names every setting that is on and not supported.
-    fn refuse_unsupported(&self) -> Result<(), TrainError> {
-        if self.config.stages.tile_share < 1.0 {
-            return Err(TrainError::NotOnGpu { settings: "stages.tile_share".to_owned() });
-        }
-        Ok(())
     }
 
     /// Refuses a scene that may not fit, before any time is spent on it.
