@@ -22,15 +22,15 @@ fn gather_gradients(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
         return;
     }
     let row = depth_order[rank];
-    var sums: array<f32, 10>;
-    for (var k = 0u; k < 10u; k += 1u) {
+    var sums: array<f32, GRADIENT_SUMS>;
+    for (var k = 0u; k < GRADIENT_SUMS; k += 1u) {
         sums[k] = 0.0;
     }
     // Without pairs at all when the lists did not fit.
     let last = select(0u, pair_offsets[rank + 1u], work[WORK_PAIRS] > 0u);
     for (var pair = pair_offsets[rank]; pair < last; pair += 1u) {
         if (pairs[pair].x != NO_SPLAT) {
-            for (var k = 0u; k < 10u; k += 1u) {
+            for (var k = 0u; k < GRADIENT_SUMS; k += 1u) {
                 sums[k] += pair_sums[pair * PAIR_SUMS + k];
             }
         }

@@ -5,6 +5,7 @@
 
 #import constants
 #import variant
+#import direction
 #import view
 #import splat
 @group(0) @binding(0) var<uniform> view: View;

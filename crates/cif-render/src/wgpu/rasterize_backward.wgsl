@@ -9,6 +9,7 @@
 
 #import constants
 #import variant
+#import direction
 #import view
 #import splat
 @group(0) @binding(0) var<uniform> view: View;
@@ -20,19 +21,16 @@
 @group(0) @binding(6) var<storage, read> cotangents: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> pair_sums: array<f32>;
 @group(0) @binding(8) var<storage, read_write> label_mass: array<f32>;
-#import identity
-
 #import tile_staging
+#import identity
 
 // Splats that are summed at a time.
 const BATCH: u32 = 4u;
-// Sums of a pair.
-const SUMS: u32 = 10u;
 
 // Of every splat of the batch and sum, by invocation.
-var<workgroup> partial_sums: array<f32, 2560>;
+var<workgroup> partial_sums: array<f32, BATCH * GRADIENT_SUMS * 64u>;
 // Weighted r of every splat of the batch, by invocation, a quadrant each.
-var<workgroup> responsibilities: array<vec4f, 256>;
+var<workgroup> responsibilities: array<vec4f, BATCH * 64u>;
 // Labels by invocation, 16 bits each, quadrants 0 and 1 first.
 var<workgroup> pixel_labels: array<vec2u, 64>;
 
@@ -220,7 +218,7 @@ fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32,
 fn clear_pairs(first: u32, end: u32) {
     for (var index = first; index < end; index += 64u) {
         let entry = entries[index];
-        for (var value = 0u; value < SUMS; value += 1u) {
+        for (var value = 0u; value < GRADIENT_SUMS; value += 1u) {
             pair_sums[entry.x * PAIR_SUMS + value] = 0.0;
         }
         if (WITH_INSTANCES) {
@@ -281,7 +279,7 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
                 if ((passes & 192u) != 0u) {
                     responsibility.w = add(splat, (passes >> 6u) & 3u, identity.w, &p3, &sums);
                 }
-                let at = k * SUMS * 64u + local;
+                let at = k * GRADIENT_SUMS * 64u + local;
                 partial_sums[at] = sums.first.x;
                 partial_sums[at + 64u] = sums.first.y;
                 partial_sums[at + 128u] = sums.first.z;
@@ -304,8 +302,8 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
 
             let own = local / 16u;
             let part = local % 16u;
-            if (own < count && part < SUMS) {
-                let sums = (own * SUMS + part) * 64u;
+            if (own < count && part < GRADIENT_SUMS) {
+                let sums = (own * GRADIENT_SUMS + part) * 64u;
                 var sum = vec4f(0.0);
                 // Every invocation starts at another place, so that they read from different banks of memory.
                 var at = local;

@@ -5,7 +5,7 @@ use super::error::GpuError;
 use super::kernel::Access::{Read, ReadWrite, Uniform};
 use super::kernel::{Kernel, Module};
 use super::view::{
-    COEFFICIENTS, COLOR_ONLY, CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, PACKED_COEFFICIENTS,
+    BACKWARD, COEFFICIENTS, COLOR_ONLY, CONSTANTS, FOOTPRINT, FORWARD, HARMONICS, IDENTITY, NUMBERS, PACKED_COEFFICIENTS,
     SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, TILE_STAGING, TILES, VIEW, WITH_INSTANCES,
 };
 
@@ -71,14 +71,14 @@ pub const RANGES: Module = Module {
 pub const RASTERIZE: Module = Module {
     name: "rasterize",
     text: include_str!("rasterize.wgsl"),
-    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, IDENTITY],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, FORWARD, TILE_STAGING, IDENTITY],
     bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize"],
 };
 
 /// Blending of colour alone.
 pub const RASTERIZE_COLOR: Module =
-    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, IDENTITY], ..RASTERIZE };
+    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, FORWARD, TILE_STAGING, IDENTITY], ..RASTERIZE };
 
 /// Instance images.
 pub const DENSE: Module = Module {
@@ -102,14 +102,14 @@ pub const COTANGENTS: Module = Module {
 pub const RASTERIZE_BACKWARD: Module = Module {
     name: "rasterize_backward",
     text: include_str!("rasterize_backward.wgsl"),
-    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, IDENTITY],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY],
     bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize_backward"],
 };
 
 /// Gradients of pairs from colour alone.
 pub const RASTERIZE_BACKWARD_COLOR: Module =
-    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, IDENTITY], ..RASTERIZE_BACKWARD };
+    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY], ..RASTERIZE_BACKWARD };
 
 /// Gradients of splats.
 pub const GATHER_GRADIENTS: Module = Module {

@@ -20,6 +20,8 @@ pub(crate) const SCAN_BLOCK: usize = 1024;
 pub(crate) const SORT_BLOCK: usize = 2048;
 /// Numbers kept per (tile, splat) pair by the backward pass.
 pub(crate) const PAIR_SUMS: usize = 12;
+/// Those of them that gradients take.
+const GRADIENT_SUMS: usize = 10;
 /// Depth key of what is not visible.
 const NOT_VISIBLE: u32 = u32::MAX;
 /// Bits of the passes that draw something.
@@ -242,6 +244,7 @@ fn shared_constants() -> String {
         ("SCAN_BLOCK", Unsigned(SCAN_BLOCK as u32)),
         ("SORT_BLOCK", Unsigned(SORT_BLOCK as u32)),
         ("PAIR_SUMS", Unsigned(PAIR_SUMS as u32)),
+        ("GRADIENT_SUMS", Unsigned(GRADIENT_SUMS as u32)),
         ("COLOR_PASS", Unsigned(COLOR_PASS)),
         ("INSTANCE_PASS", Unsigned(INSTANCE_PASS)),
         ("NOT_VISIBLE", Unsigned(NOT_VISIBLE)),
@@ -303,6 +306,12 @@ pub(crate) const WITH_INSTANCES: Snippet =
 /// As above.
 pub(crate) const COLOR_ONLY: Snippet =
     Snippet { name: "variant", text: || "const WITH_INSTANCES: bool = false;\n".to_owned() };
+/// Declares that what gradients need is staged, or is not.
+pub(crate) const BACKWARD: Snippet =
+    Snippet { name: "direction", text: || "const BACKWARD: bool = true;\n".to_owned() };
+/// As above.
+pub(crate) const FORWARD: Snippet =
+    Snippet { name: "direction", text: || "const BACKWARD: bool = false;\n".to_owned() };
 pub(crate) const SCAN_PARAMETERS: Snippet =
     Snippet { name: "scan_parameters", text: || structures(&[ScanParameters::layout()]) };
 pub(crate) const SORT_PARAMETERS: Snippet =

@@ -8,12 +8,13 @@ const INSTANCE_IN_TILE: u32 = 170u;
 struct Staged {
     mean: vec2f,
     depth: f32,
+    // Of gradients alone.
     pair: u32,
     // Conic and opacity.
     conic: vec4f,
     // Colour and occupancy.
     color: vec4f,
-    // First label slot, and identity row.
+    // First label slot, of gradients alone, and identity row.
     slot: u32,
     row_first: u32,
     row_end: u32,
@@ -23,7 +24,7 @@ var<workgroup> staged: array<Staged, STAGED>;
 var<workgroup> staged_passes: array<atomic<u32>, STAGED>;
 // Passes that any pixel lets light through.
 var<workgroup> live: atomic<u32>;
-// Entries of the longest identity row.
+// Entries of the longest identity row, for gradients alone.
 var<workgroup> longest: atomic<u32>;
 
 // Stages entries from `first` on; returns the passes that any pixel lets light through, of which `open` are those of the
@@ -53,13 +54,15 @@ fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32
             var item: Staged;
             item.mean = splat.mean;
             item.depth = splat.depth;
-            item.pair = entry.x;
             item.conic = splat.conic;
             item.color = splat.color;
             if (WITH_INSTANCES) {
-                item.slot = entry.z;
                 item.row_first = row_offsets[row];
                 item.row_end = row_offsets[row + 1u];
+            }
+            if (BACKWARD) {
+                item.pair = entry.x;
+                item.slot = entry.z;
                 atomicMax(&longest, item.row_end - item.row_first);
             }
             staged[place] = item;
