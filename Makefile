@@ -77,9 +77,7 @@ test-usd: build
 
 lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo fmt --all --check
-	cargo clippy --locked --all-targets -- -D warnings
-	cargo clippy --locked -p cif-python -- -D warnings
-	cargo clippy --locked -p cif-usd --features python --all-targets -- -D warnings
+	cargo clippy --locked --workspace --all-targets -- -D warnings
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
