@@ -103,6 +103,46 @@ fn padded(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
     low - margin..high + margin
 }
 
+/// Size of the names of marks, pixels.
+const NAME_SIZE: i32 = 11;
+
+/// What is taken of a plot, pixels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Area {
+    left: i32,
+    top: i32,
+    right: i32,
+    bottom: i32,
+}
+
+impl Area {
+    fn of_mark((x, y): (i32, i32)) -> Self {
+        Self { left: x - 5, top: y - 5, right: x + 5, bottom: y + 5 }
+    }
+
+    fn meets(&self, other: &Self) -> bool {
+        self.left < other.right
+            && other.left < self.right
+            && self.top < other.bottom
+            && other.top < self.bottom
+    }
+
+    /// Where the name of a mark hides nothing that is taken; where nothing is free, the nearest place.
+    fn beside((x, y): (i32, i32), name: &str, right_first: bool, taken: &[Self]) -> Self {
+        let width = 6 * name.chars().count() as i32;
+        let sides = [x + 8, x - 8 - width];
+        let [near, far] = if right_first { sides } else { [sides[1], sides[0]] };
+        // Below on the right and above on the left are off a front that rises; farther rows come last.
+        let rows = |left: i32| if left > x { [6, -18, 20, -32] } else { [-18, 6, -32, 20] };
+        let places = (0..4).flat_map(|row| [near, far].map(|left| (left, y + rows(left)[row])));
+        let areas =
+            places.map(|(left, top)| Self { left, top, right: left + width, bottom: top + NAME_SIZE + 2 });
+        let first = areas.clone().next();
+        let free = areas.clone().find(|area| !taken.iter().any(|other| area.meets(other)));
+        free.or(first).unwrap_or(Self::of_mark((x, y)))
+    }
+}
+
 /// Draws a plot; none when nothing can be shown.
 pub(super) fn svg(plot: &Plot<'_>) -> Option<String> {
     let place = |x: f64| if plot.log { x.max(1e-9).log10() } else { x };
@@ -175,16 +215,19 @@ fn draw<'a>(
             .draw_series(marks)?
             .label(&series.name)
             .legend(move |(x, y)| Circle::new((x + 8, y), 5, color.filled()));
-        chart.draw_series(series.points.iter().filter(|(.., name)| !name.is_empty()).map(
-            |(x, y, name)| {
-                // Towards the middle of the plot, and off the front, which rises to the right.
-                let right = place(*x) < middle;
-                let width = 6 * name.chars().count() as i32;
-                let offset = if right { (8, 6) } else { (-8 - width, -18) };
-                EmptyElement::at((place(*x), *y))
-                    + Text::new(name.clone(), offset, ("sans-serif", 11).into_font().color(&INK.mix(0.85)))
-            },
-        ))?;
+    }
+    let marks = plot.series.iter().filter(|series| !series.line).flat_map(|series| &series.points);
+    let pixels: Vec<(i32, i32)> =
+        marks.clone().map(|(x, y, _)| chart.backend_coord(&(place(*x), *y))).collect();
+    let mut taken: Vec<Area> = pixels.iter().copied().map(Area::of_mark).collect();
+    for ((x, y, name), pixel) in marks.zip(pixels).filter(|((.., name), _)| !name.is_empty()) {
+        // Towards the middle of the plot, where that is free.
+        let area = Area::beside(pixel, name, place(*x) < middle, &taken);
+        let offset = (area.left - pixel.0, area.top - pixel.1);
+        taken.push(area);
+        let style = ("sans-serif", NAME_SIZE).into_font().color(&INK.mix(0.85));
+        let text = EmptyElement::at((place(*x), *y)) + Text::new(name.clone(), offset, style);
+        chart.draw_series([text])?;
     }
     if plot.series.len() > 1 {
         chart
@@ -231,6 +274,20 @@ mod tests {
         }
         assert!(!text.contains("http://www.w3.org/1999/xlink"), "nothing from elsewhere");
         assert_eq!(svg(&Plot { series: Vec::new(), ..plot }), None);
+    }
+
+    #[test]
+    fn names_of_close_marks_do_not_lie_on_each_other() {
+        let mut taken: Vec<Area> = [(100, 50), (103, 52), (97, 49)].map(Area::of_mark).into();
+        for at in [(100, 50), (103, 52), (97, 49)] {
+            let area = Area::beside(at, "planes 16", true, &taken);
+            assert!(!taken.iter().any(|other| area.meets(other)), "{area:?} in {taken:?}");
+            taken.push(area);
+        }
+        let alone = Area::beside((10, 10), "a", true, &[]);
+        assert_eq!(alone, Area { left: 18, top: 16, right: 24, bottom: 29 });
+        let everywhere = Area { left: -999, top: -999, right: 999, bottom: 999 };
+        assert_eq!(Area::beside((10, 10), "a", true, &[everywhere]), alone, "nothing is free");
     }
 
     #[test]
