@@ -146,6 +146,32 @@ fn a_step_is_told_by_stage_beside_its_floor_and_the_processor() {
     assert!(table.contains("GB/s by a copy") && table.contains("the processor does such a step"), "{table}");
 }
 
+/// Steps differ in their constants, for which a driver may keep what it compiled.
+#[test]
+fn memory_does_not_grow_with_the_steps() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    if gpu(path).is_none() {
+        return;
+    }
+    cif_test::capture::write(&path.join("table"), 4);
+    let peak_mb = |steps: u32| {
+        let line = format!(
+            "train table -o {steps}.cif --backend wgpu --preset draft --log {steps}.jsonl \
+             --set stages.coarse={steps} --set stages.fine=1 --set stages.instance=0 --set densify.until=1"
+        );
+        cif(path, &line).succeeds();
+        let log = std::fs::read_to_string(path.join(format!("{steps}.jsonl"))).unwrap();
+        let finished = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+        finished.filter_map(|event| event["peak_rss_mb"].as_f64()).next_back()
+    };
+    let Some((few, many)) = peak_mb(40).zip(peak_mb(440)) else {
+        eprintln!("skipped: this system does not tell how much memory a process takes");
+        return;
+    };
+    assert!(many < few + 50.0, "{few} MB after 40 steps, {many} MB after 440");
+}
+
 #[test]
 fn features_that_are_held_back_change_no_picture_and_are_told() {
     let folder = tempfile::tempdir().unwrap();

@@ -352,7 +352,7 @@ impl<T: Pod> Uniform<T> {
         let buffer = gpu.device().create_buffer(&wgpu::BufferDescriptor {
             label: Some(label),
             size: (size_of::<T>() as u64).next_multiple_of(16),
-            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::COPY_DST,
+            usage: wgpu::BufferUsages::UNIFORM | wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_DST,
             mapped_at_creation: false,
         });
         let uniform = Self { buffer, marker: PhantomData };

@@ -11,6 +11,9 @@ use super::workgroup::{Form, SubgroupUse, self_check};
 const BACKENDS: wgpu::Backends =
     wgpu::Backends::VULKAN.union(wgpu::Backends::METAL).union(wgpu::Backends::DX12);
 
+/// Uniform blocks of a kernel, at the most.
+pub(super) const MOST_UNIFORM_BLOCKS: u32 = 2;
+
 /// What an adapter is called and can do, for `cif info --gpu` and logs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AdapterFacts {
@@ -114,6 +117,7 @@ pub struct Gpu {
     queue: wgpu::Queue,
     facts: Arc<AdapterFacts>,
     subgroups: Arc<SubgroupUse>,
+    constants_in_storage: bool,
     fault: Fault,
 }
 
@@ -160,14 +164,24 @@ impl Gpu {
             return Err(GpuError::TooSmall { adapter: facts.name, missing: facts.missing.join("; ") });
         }
         let found = adapter.limits();
+        let core = wgpu::Limits::defaults();
+        let with_constants = core.max_storage_buffers_per_shader_stage + MOST_UNIFORM_BLOCKS;
+        let constants_in_storage = facts.software
+            && features.software_storage
+            && found.max_storage_buffers_per_shader_stage >= with_constants;
         // Exactly the core limits, so that a kernel that needs more fails everywhere and not on small GPUs only;
         // buffers alone may be as large as the adapter allows.
         let limits = wgpu::Limits {
+            max_storage_buffers_per_shader_stage: if constants_in_storage {
+                with_constants
+            } else {
+                core.max_storage_buffers_per_shader_stage
+            },
             max_storage_buffer_binding_size: found
                 .max_storage_buffer_binding_size
                 .min(u64::from(u32::MAX) & !3),
             max_buffer_size: found.max_buffer_size,
-            ..wgpu::Limits::defaults()
+            ..core
         };
         let descriptor = wgpu::DeviceDescriptor {
             label: Some("cif"),
@@ -209,8 +223,8 @@ impl Gpu {
             (false, Some(_)) => SubgroupUse::HeldBack,
             (false, None) => SubgroupUse::Missing,
         };
-        let gpu = Self { device, queue, facts: Arc::new(facts), subgroups: Arc::new(subgroups), fault };
-        gpu.checked()
+        let (facts, subgroups) = (Arc::new(facts), Arc::new(subgroups));
+        Self { device, queue, facts, subgroups, constants_in_storage, fault }.checked()
     }
 
     /// Itself with subgroups that are used only where they compute known numbers right.
@@ -236,6 +250,14 @@ impl Gpu {
     #[must_use]
     pub fn subgroups(&self) -> &SubgroupUse {
         &self.subgroups
+    }
+
+    /// Whether kernels find their constants in storage and not in uniform blocks. So it is where software stands in for
+    /// a GPU: Mesa's (22.3) compiles a kernel anew, at each dispatch, for the values of a uniform block that its
+    /// branches depend on, and keeps every one of them until the kernel goes.
+    #[must_use]
+    pub fn constants_in_storage(&self) -> bool {
+        self.constants_in_storage
     }
 
     /// The form in which kernels are compiled.

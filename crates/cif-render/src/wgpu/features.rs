@@ -9,17 +9,22 @@ pub struct GpuFeatures {
     pub subgroups: bool,
     /// The same where software stands in for a GPU: it loops over subgroups, which is slower than memory.
     pub software_subgroups: bool,
+    /// Constants of kernels in storage where software stands in for a GPU, see [`super::Gpu::constants_in_storage`]:
+    /// more storage buffers than the core has.
+    pub software_storage: bool,
     /// Times of stages from the device.
     pub timestamps: bool,
 }
 
 impl GpuFeatures {
     /// Whatever the adapter has.
-    pub const ALL: Self = Self { subgroups: true, software_subgroups: true, timestamps: true };
+    pub const ALL: Self =
+        Self { subgroups: true, software_subgroups: true, software_storage: true, timestamps: true };
     /// Whatever the adapter has and is faster with.
     pub const USUAL: Self = Self { software_subgroups: false, ..Self::ALL };
     /// The core of WebGPU alone.
-    pub const NONE: Self = Self { subgroups: false, software_subgroups: false, timestamps: false };
+    pub const NONE: Self =
+        Self { subgroups: false, software_subgroups: false, software_storage: false, timestamps: false };
     /// The environment variable that holds features back.
     pub const VARIABLE: &str = "CIF_GPU_FEATURES";
 
@@ -36,7 +41,7 @@ impl GpuFeatures {
     /// # Errors
     /// When a name is not there.
     pub fn parse(text: &str) -> Result<Self, GpuError> {
-        let mut features = Self::NONE;
+        let mut features = Self { software_storage: text.trim() != "none", ..Self::NONE };
         for name in text.split(',').map(str::trim) {
             match name {
                 "all" if text.trim() == "all" => features = Self::ALL,
@@ -68,7 +73,8 @@ mod tests {
         let parse = GpuFeatures::parse;
         assert_eq!(parse("all"), Ok(GpuFeatures::ALL));
         assert_eq!(parse(" none "), Ok(GpuFeatures::NONE));
-        assert_eq!(parse("timestamps"), Ok(GpuFeatures { timestamps: true, ..GpuFeatures::NONE }));
+        let timestamps = GpuFeatures { subgroups: false, software_subgroups: false, ..GpuFeatures::ALL };
+        assert_eq!(parse("timestamps"), Ok(timestamps));
         assert_eq!(parse("subgroups, timestamps"), Ok(GpuFeatures::ALL));
         for wrong in ["", "f64", "none,subgroups", "all,timestamps", "subgroups,"] {
             let error = parse(wrong).unwrap_err().to_string();

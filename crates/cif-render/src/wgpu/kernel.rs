@@ -143,7 +143,10 @@ impl Kernel {
     /// # Errors
     /// When the driver rejects it.
     pub fn compile_with(gpu: &Gpu, module: &Module, declarations: &str) -> Result<Vec<Self>, GpuError> {
-        let source = format!("{declarations}{}", module.source_in(gpu.form()));
+        let mut source = format!("{declarations}{}", module.source_in(gpu.form()));
+        if gpu.constants_in_storage() {
+            source = source.replace("var<uniform>", "var<storage, read>");
+        }
         let device = gpu.device();
         let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
         let shader = device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -159,6 +162,9 @@ impl Kernel {
                 visibility: wgpu::ShaderStages::COMPUTE,
                 ty: wgpu::BindingType::Buffer {
                     ty: match access {
+                        Access::Uniform if gpu.constants_in_storage() => {
+                            wgpu::BufferBindingType::Storage { read_only: true }
+                        }
                         Access::Uniform => wgpu::BufferBindingType::Uniform,
                         Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
                         Access::ReadWrite => wgpu::BufferBindingType::Storage { read_only: false },

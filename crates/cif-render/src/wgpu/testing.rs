@@ -33,7 +33,7 @@ pub fn gpu() -> Option<Gpu> {
 }
 
 /// The GPU for a test of kernels that exist in two forms: in the form that it works in, then in the other, where it has
-/// subgroups. Empty where [`gpu`] is `None`.
+/// subgroups; that one with constants in uniform blocks, in software too. Empty where [`gpu`] is `None`.
 ///
 /// # Panics
 /// As [`gpu`].
@@ -41,12 +41,15 @@ pub fn gpu() -> Option<Gpu> {
 pub fn gpus() -> Vec<Gpu> {
     let Some(gpu) = gpu() else { return Vec::new() };
     let other = match gpu.form() {
-        Form::Portable => gpu.facts().subgroups.map(|_| GpuFeatures::ALL),
+        Form::Portable => {
+            gpu.facts().subgroups.map(|_| GpuFeatures { software_storage: false, ..GpuFeatures::ALL })
+        }
         Form::Subgroups => Some(GpuFeatures::NONE),
     };
     let other = other.map(|features| match Gpu::open_with(features) {
         Ok(other) => {
             assert_ne!(other.form(), gpu.form(), "{}", other.subgroups());
+            assert!(!other.constants_in_storage());
             other
         }
         Err(error) => panic!("the same GPU with other features: {error}"),

@@ -5,6 +5,7 @@ use std::fmt::Write as _;
 use naga::valid::{Capabilities, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator};
 use naga::{AddressSpace, StorageAccess, TypeInner};
 
+use super::device::MOST_UNIFORM_BLOCKS;
 use super::kernel::{Access, Module};
 use super::layout::Layout;
 use super::workgroup::Form;
@@ -75,6 +76,10 @@ fn validate_in(form: Form, module: &Module, declarations: &str, layouts: &[Layou
         if found != Some(*access) {
             complain(format!("binding {index} is {found:?}, Rust binds {access:?}"));
         }
+    }
+    let blocks = module.bindings.iter().filter(|access| **access == Access::Uniform).count();
+    if blocks > MOST_UNIFORM_BLOCKS as usize {
+        complain(format!("{blocks} uniform blocks, where software has room for {MOST_UNIFORM_BLOCKS}"));
     }
     for (_, variable) in parsed.global_variables.iter() {
         if let Some(binding) = &variable.binding

@@ -51,6 +51,11 @@ fn paths(adapter: &AdapterFacts, allowed: GpuFeatures) -> Vec<String> {
     if adapter.subgroups.is_some() && subgroups {
         paths.push("subgroups for sums over workgroups, after a check of known numbers".to_owned());
     }
+    if adapter.software && allowed.software_storage {
+        paths.push(
+            "constants in storage, as software compiles kernels anew for those in uniform blocks".to_owned(),
+        );
+    }
     if adapter.packed_half_floats {
         paths.push("16-bit storage of spherical harmonics in draft renders, computed in 32 bits".to_owned());
     }
