@@ -274,7 +274,11 @@ fn number(value: Option<f64>) -> String {
 }
 
 fn signed(value: Option<f64>) -> String {
-    value.map_or(String::new(), |value| format!("{value:+.2}"))
+    // What rounds to nothing has no sign.
+    value.map_or(
+        String::new(),
+        |value| if value.abs() < 0.005 { "0.00".to_owned() } else { format!("{value:+.2}") },
+    )
 }
 
 fn tell(row: &Row) {
@@ -358,5 +362,11 @@ mod tests {
         let colour_only = mean_of(&[run(28.0, None), run(29.0, None)]);
         assert_eq!((colour_only.psnr, colour_only.miou), (Some(28.5), None));
         assert_eq!(colour_only.notes, ["mean of 2 seeds: PSNR 28.00 to 29.00 dB"]);
+    }
+
+    #[test]
+    fn changes_have_a_sign_unless_they_round_to_nothing() {
+        let texts = [-0.004, 0.0, 0.004, -0.006, 0.16].map(|value| signed(Some(value)));
+        assert_eq!(texts, ["0.00", "0.00", "0.00", "-0.01", "+0.16"]);
     }
 }
