@@ -162,8 +162,8 @@ fn memory_does_not_grow_with_the_steps() {
         );
         cif(path, &line).succeeds();
         let log = std::fs::read_to_string(path.join(format!("{steps}.jsonl"))).unwrap();
-        let finished = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
-        finished.filter_map(|event| event["peak_rss_mb"].as_f64()).next_back()
+        let events = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
+        events.filter_map(|event| event["peak_rss_mb"].as_f64()).next_back()
     };
     let Some((few, many)) = peak_mb(40).zip(peak_mb(440)) else {
         eprintln!("skipped: this system does not tell how much memory a process takes");

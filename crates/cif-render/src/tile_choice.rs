@@ -7,7 +7,7 @@ use crate::constants::TILE;
 pub struct TileChoice<'a> {
     /// Drawn and differentiated.
     pub drawn: &'a [bool],
-    /// Those whose labels count.
+    /// Those of them whose labels count.
     pub labelled: &'a [bool],
 }
 

@@ -338,7 +338,7 @@ impl Recorded<u32> {
     }
 }
 
-/// A small block of constants that kernels read as a uniform.
+/// A small block of constants that kernels read as a uniform, or from storage, see [`Gpu::constants_in_storage`].
 #[derive(Debug)]
 pub struct Uniform<T> {
     buffer: wgpu::Buffer,

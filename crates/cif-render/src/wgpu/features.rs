@@ -41,11 +41,11 @@ impl GpuFeatures {
     /// # Errors
     /// When a name is not there.
     pub fn parse(text: &str) -> Result<Self, GpuError> {
-        let mut features = Self { software_storage: text.trim() != "none", ..Self::NONE };
+        let mut features = Self { software_storage: true, ..Self::NONE };
         for name in text.split(',').map(str::trim) {
             match name {
                 "all" if text.trim() == "all" => features = Self::ALL,
-                "none" if text.trim() == "none" => {}
+                "none" if text.trim() == "none" => features = Self::NONE,
                 "subgroups" => (features.subgroups, features.software_subgroups) = (true, true),
                 "timestamps" => features.timestamps = true,
                 _ => return Err(GpuError::UnknownFeature { name: name.to_owned() }),

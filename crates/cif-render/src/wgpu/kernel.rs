@@ -162,11 +162,10 @@ impl Kernel {
                 visibility: wgpu::ShaderStages::COMPUTE,
                 ty: wgpu::BindingType::Buffer {
                     ty: match access {
-                        Access::Uniform if gpu.constants_in_storage() => {
+                        Access::Uniform if !gpu.constants_in_storage() => wgpu::BufferBindingType::Uniform,
+                        Access::Uniform | Access::Read => {
                             wgpu::BufferBindingType::Storage { read_only: true }
                         }
-                        Access::Uniform => wgpu::BufferBindingType::Uniform,
-                        Access::Read => wgpu::BufferBindingType::Storage { read_only: true },
                         Access::ReadWrite => wgpu::BufferBindingType::Storage { read_only: false },
                     },
                     has_dynamic_offset: false,

@@ -168,6 +168,26 @@ impl Arrays {
             no_entries: GpuVec::zeros(gpu, "no identities", 1)?,
         })
     }
+
+    /// What `bin.wgsl` binds, before pairs have room and after.
+    fn bin_bindings<'a>(
+        &'a self,
+        uniform: &'a wgpu::Buffer,
+        depth_result: usize,
+        rows: &'a GpuVec<u32>,
+    ) -> [&'a wgpu::Buffer; 9] {
+        [
+            uniform,
+            self.splats.buffer(),
+            self.depth.values[depth_result].buffer(),
+            rows.buffer(),
+            self.tile_counts.buffer(),
+            self.pair_offsets.buffer(),
+            self.slot_offsets.buffer(),
+            self.work.buffer(),
+            self.tile_choice.buffer(),
+        ]
+    }
 }
 
 /// Arrays of a rasterized view.
@@ -289,8 +309,10 @@ impl Rasterizer {
         if let Some(tiles) = input.tiles {
             tiles.check(input.camera.width, input.camera.height);
             view.chooses_tiles = 1;
-            let passes = tiles.drawn.iter().zip(tiles.labelled).map(|(drawn, labelled)| {
-                if *drawn { COLOR_PASS | if *labelled { INSTANCE_PASS } else { 0 } } else { 0 }
+            let passes = tiles.drawn.iter().zip(tiles.labelled).map(|passes| match passes {
+                (true, true) => COLOR_PASS | INSTANCE_PASS,
+                (true, false) => COLOR_PASS,
+                (false, _) => 0,
             });
             arrays.tile_choice.replace(gpu, &passes.collect::<Vec<_>>())?;
         }
@@ -352,17 +374,7 @@ impl Rasterizer {
             gpu,
             ("bin", 0),
             &self.kernels.count,
-            &[
-                uniform,
-                arrays.splats.buffer(),
-                arrays.depth.values[self.depth_result].buffer(),
-                rows.buffer(),
-                arrays.tile_counts.buffer(),
-                arrays.pair_offsets.buffer(),
-                arrays.slot_offsets.buffer(),
-                arrays.work.buffer(),
-                arrays.tile_choice.buffer(),
-            ],
+            &arrays.bin_bindings(uniform, self.depth_result, rows),
         );
         let mut scanned = Ok(());
         commands.stage("bin", |stage| {
@@ -465,17 +477,7 @@ impl Rasterizer {
             gpu,
             ("bin", 0),
             &kernels.count,
-            &[
-                uniform,
-                arrays.splats.buffer(),
-                order.buffer(),
-                rows.buffer(),
-                arrays.tile_counts.buffer(),
-                arrays.pair_offsets.buffer(),
-                arrays.slot_offsets.buffer(),
-                arrays.work.buffer(),
-                arrays.tile_choice.buffer(),
-            ],
+            &arrays.bin_bindings(uniform, self.depth_result, rows),
         );
         let emit = self.cache.get(
             gpu,

@@ -192,6 +192,7 @@ impl GpuLosses {
             },
         );
         let choice = weights.tiles.map_or(&self.no_choice, |tiles| tiles.choice);
+        // Kernels of one file share its bindings.
         let bindings = [
             self.settings.binding(),
             colors.binding(),
@@ -203,19 +204,10 @@ impl GpuLosses {
             self.results.binding(),
             choice.binding(),
         ];
-        let leave_out = self.leave_out.bind(
-            gpu,
-            &[
-                self.settings.binding(),
-                target.labels.binding(),
-                self.left_out.binding(),
-                self.v_colors.binding(),
-            ],
-        );
         let losses = self.losses.bind(gpu, &bindings);
-        let total = self.total.bind(gpu, &bindings);
-        let similarity = self.similarity.each_ref().map(|kernel| {
-            kernel.bind(
+        let similarity = with_similarity.then(|| {
+            let [first, ..] = &self.similarity;
+            first.bind(
                 gpu,
                 &[
                     self.settings.binding(),
@@ -229,17 +221,28 @@ impl GpuLosses {
                 ],
             )
         });
+        let leave_out = (leaves_out != 0).then(|| {
+            self.leave_out.bind(
+                gpu,
+                &[
+                    self.settings.binding(),
+                    target.labels.binding(),
+                    self.left_out.binding(),
+                    self.v_colors.binding(),
+                ],
+            )
+        });
         commands.stage("losses", |stage| {
             stage.dispatch(&self.losses, &losses, workgroups(pixels, WORKGROUP));
-            if with_similarity {
-                for (kernel, bind_group) in self.similarity.iter().zip(&similarity) {
+            if let Some(bind_group) = &similarity {
+                for kernel in &self.similarity {
                     stage.dispatch(kernel, bind_group, workgroups(pixels, WORKGROUP));
                 }
             }
-            if leaves_out != 0 {
-                stage.dispatch(&self.leave_out, &leave_out, workgroups(pixels, WORKGROUP));
+            if let Some(bind_group) = &leave_out {
+                stage.dispatch(&self.leave_out, bind_group, workgroups(pixels, WORKGROUP));
             }
-            stage.dispatch(&self.total, &total, [1, 1, 1]);
+            stage.dispatch(&self.total, &losses, [1, 1, 1]);
         });
         Ok(())
     }

@@ -20,11 +20,36 @@
 @group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
 // As a workgroup's sums, for the view.
 @group(0) @binding(7) var<storage, read_write> results: array<vec4f>;
+// Passes that draw each tile, where some tiles alone count.
 @group(0) @binding(8) var<storage, read> tile_choice: array<u32>;
 #import counted_tiles
 
 const INVOCATIONS: u32 = 256u;
 #import workgroup
+
+// Sums of a pixel; leaves its gradient.
+fn compare(pixel: u32) -> vec4f {
+    if !counts(pixel) {
+        v_colors[pixel] = vec4f(0.0);
+        return vec4f(0.0);
+    }
+    let difference = colors[pixel].xyz - unpack4x8unorm(targets[pixel]).xyz;
+    v_colors[pixel] = vec4f(settings.absolute_weight * sign(difference), 0.0);
+    let absolute = abs(difference);
+    var sums = vec4f(absolute.x + absolute.y + absolute.z, dot(difference, difference), 0.0, 0.0);
+    if settings.with_instances != 0u {
+        if labels[pixel] != 0u {
+            let probability = blended[pixel].y;
+            sums.z = -log(max(probability, MIN_LABEL_PROBABILITY));
+            if probability < MIN_LABEL_PROBABILITY {
+                sums.w = 1.0;
+            } else if settings.by_coverage != 0u {
+                sums.z += log(1.0 - blended[pixel].z);
+            }
+        }
+    }
+    return sums;
+}
 
 @compute @workgroup_size(256)
 fn losses(
@@ -36,24 +61,7 @@ fn losses(
     let pixel = workgroup * 256u + local;
     var sums = vec4f(0.0);
     if pixel < settings.pixels {
-        v_colors[pixel] = vec4f(0.0);
-    }
-    if pixel < settings.pixels && counts(pixel) {
-        let difference = colors[pixel].xyz - unpack4x8unorm(targets[pixel]).xyz;
-        v_colors[pixel] = vec4f(settings.absolute_weight * sign(difference), 0.0);
-        let absolute = abs(difference);
-        sums = vec4f(absolute.x + absolute.y + absolute.z, dot(difference, difference), 0.0, 0.0);
-        if settings.with_instances != 0u {
-            if labels[pixel] != 0u {
-                let probability = blended[pixel].y;
-                sums.z = -log(max(probability, MIN_LABEL_PROBABILITY));
-                if probability < MIN_LABEL_PROBABILITY {
-                    sums.w = 1.0;
-                } else if settings.by_coverage != 0u {
-                    sums.z += log(1.0 - blended[pixel].z);
-                }
-            }
-        }
+        sums = compare(pixel);
     }
     let sum = sum_of_workgroup(lane, sums);
     if local == 0u {

@@ -14,6 +14,7 @@
 @group(0) @binding(4) var<storage, read_write> maps: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> v_colors: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
+// Passes that draw each tile, where some tiles alone count.
 @group(0) @binding(7) var<storage, read> tile_choice: array<u32>;
 #import counted_tiles
 

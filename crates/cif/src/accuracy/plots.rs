@@ -134,12 +134,13 @@ impl Area {
         let [near, far] = if right_first { sides } else { [sides[1], sides[0]] };
         // Below on the right and above on the left are off a front that rises; farther rows come last.
         let rows = |left: i32| if left > x { [6, -18, 20, -32] } else { [-18, 6, -32, 20] };
-        let places = (0..4).flat_map(|row| [near, far].map(|left| (left, y + rows(left)[row])));
-        let areas =
-            places.map(|(left, top)| Self { left, top, right: left + width, bottom: top + NAME_SIZE + 2 });
-        let first = areas.clone().next();
-        let free = areas.clone().find(|area| !taken.iter().any(|other| area.meets(other)));
-        free.or(first).unwrap_or(Self::of_mark((x, y)))
+        let areas: [Self; 8] = std::array::from_fn(|k| {
+            let left = [near, far][k % 2];
+            let top = y + rows(left)[k / 2];
+            Self { left, top, right: left + width, bottom: top + NAME_SIZE + 2 }
+        });
+        let is_free = |area: &&Self| !taken.iter().any(|other| area.meets(other));
+        *areas.iter().find(is_free).unwrap_or(&areas[0])
     }
 }
 

@@ -58,7 +58,7 @@ impl Backend {
     }
 
     /// Makes a trainer's steps run on the GPU, and says so; `auto` tries steps on both for a second, takes what is
-    /// faster, and stays on the processor where the GPU does not support what is asked.
+    /// faster, and stays on the processor where the GPU cannot hold the scene or fails.
     pub(super) fn apply(self, gpu: Option<&Gpu>, trainer: &mut Trainer) -> Result<(), Error> {
         let Some(gpu) = gpu else { return Ok(()) };
         let name = format!("{} ({})", gpu.facts().name, gpu.facts().interface);

@@ -116,8 +116,7 @@ impl Trainer {
     /// Makes the steps of this run run on a GPU. May be called before or between runs.
     ///
     /// # Errors
-    /// When a setting is on that the GPU does not support, named; when the scene may grow beyond what the device
-    /// holds, with the arithmetic; when the driver rejects a kernel.
+    /// When the scene may grow beyond what the device holds, with the arithmetic; when the driver rejects a kernel.
     pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
         self.refuse_too_large(gpu)?;
         let mut optimiser = GpuOptimiser::new(gpu)?;
