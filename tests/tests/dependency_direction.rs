@@ -5,8 +5,9 @@ use std::collections::BTreeMap;
 use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, Package};
 
 /// Row of every crate; 0 is the lowest.
-const ROWS: [(&str, u32); 12] = [
+const ROWS: [(&str, u32); 13] = [
     ("cif-geometry", 0),
+    ("cif-output", 0),
     ("cif-dataset", 1),
     ("cif-field", 1),
     ("cif-render", 2),

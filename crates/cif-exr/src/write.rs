@@ -3,6 +3,7 @@
 use std::io::BufWriter;
 use std::path::Path;
 
+use cif_output::NewFile;
 use exr::prelude::{
     AnyChannel, AnyChannels, AttributeValue, Blocks, Compression, Encoding, Image, ImageAttributes,
     IntegerBounds, Layer, LayerAttributes, LineOrder, Text, Vec2, WritableImage,
@@ -50,21 +51,10 @@ pub fn write(path: &Path, frame: &Frame<'_>) -> Result<(), ExrError> {
     let layer = Layer::new(size, header, ENCODING, AnyChannels::sort(channels));
     let image =
         Image { attributes: ImageAttributes::new(IntegerBounds::from_dimensions(size)), layer_data: layer };
-    let folder = match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent,
-        _ => Path::new("."),
-    };
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".cif-");
-    // Temporary files are private by default; the result should have the usual permissions.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let file = builder.tempfile_in(folder).map_err(refused)?;
+    let new = NewFile::create(path).map_err(refused)?;
     image
         .write()
-        .to_buffered(BufWriter::new(file.as_file()))
+        .to_buffered(BufWriter::new(new.file()))
         .map_err(|error| ExrError::Encode { path: path.to_owned(), reason: error.to_string() })?;
-    file.as_file().sync_all().map_err(refused)?;
-    file.persist(path).map_err(|error| refused(error.error))?;
-    Ok(())
+    new.finish().map_err(refused)
 }

@@ -4,7 +4,8 @@ use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
-use cif_scene::files::{FileError, folder_of};
+use cif_output::NewFile;
+use cif_scene::files::{FileError, folder_of, target_of};
 use serde_json::{Value, json};
 
 use crate::GltfError;
@@ -71,8 +72,10 @@ pub fn relabel(
     }
     let mut document: Value = serde_json::from_slice(&text)
         .map_err(|error| unreadable(format!("its JSON is damaged ({error}); export it again")))?;
+    let target = target_of(output, false)?;
     let folder = |path: &Path| std::fs::canonicalize(folder_of(path)).ok();
-    if folder(path) != folder(output) && names_files(&document) {
+    let original = std::fs::canonicalize(path).map_err(read)?;
+    if folder(&original) != folder(&target) && names_files(&document) {
         return Err(invalid(format!(
             "the file names others beside it, which {} would not find; write into the same folder",
             output.display()
@@ -102,7 +105,7 @@ pub fn relabel(
         Ok(())
     });
     let unwritable = |source| FileError::Write { path: output.to_owned(), source };
-    crate::write::persist(written.map_err(unwritable)?, output).map_err(unwritable)?;
+    written.and_then(NewFile::finish).map_err(unwritable)?;
     Ok(done)
 }
 

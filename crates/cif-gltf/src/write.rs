@@ -7,10 +7,10 @@ use std::fs::File;
 use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
+use cif_output::{NewFile, finish_all};
 use cif_scene::SceneGraph;
-use cif_scene::files::{FileError, existing_folder, folder_of};
+use cif_scene::files::{FileError, existing_folder, target_of};
 use serde::Deserialize;
-use tempfile::NamedTempFile;
 
 use crate::author::{Authored, author};
 use crate::{ExportOptions, ExportSummary, GENERATOR_PREFIX, GltfError};
@@ -41,7 +41,8 @@ pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), Gl
     checked_kind(path, options).map(|_| ())
 }
 
-fn checked_kind(path: &Path, options: ExportOptions) -> Result<Kind, GltfError> {
+/// The kind of an output and where its links lead.
+fn checked_kind(path: &Path, options: ExportOptions) -> Result<(Kind, PathBuf), GltfError> {
     let kind = kind_of(path)?;
     existing_folder(path)?;
     let ours = is_ours(path);
@@ -51,8 +52,9 @@ fn checked_kind(path: &Path, options: ExportOptions) -> Result<Kind, GltfError> 
     if path.exists() && !options.force && !ours {
         return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
+    let target = target_of(path, kind == Kind::Text)?;
     if kind == Kind::Text {
-        let buffer = buffer_path(path);
+        let buffer = buffer_path(&target);
         if buffer.is_dir() {
             return Err(GltfError::IsFolder { path: buffer });
         }
@@ -61,7 +63,7 @@ fn checked_kind(path: &Path, options: ExportOptions) -> Result<Kind, GltfError> 
             return Err(FileError::Foreign { path: buffer }.into());
         }
     }
-    Ok(kind)
+    Ok((kind, target))
 }
 
 /// Whether cif wrote a file: its generator says so. Only the JSON is read.
@@ -97,7 +99,7 @@ pub(crate) fn export(
     path: &Path,
     options: ExportOptions,
 ) -> Result<ExportSummary, GltfError> {
-    let kind = checked_kind(path, options)?;
+    let (kind, target) = checked_kind(path, options)?;
     let mut authored = author(graph)?;
     let failed = |source: io::Error| FileError::Write { path: path.to_owned(), source };
     let mut paths = vec![path.to_owned()];
@@ -108,21 +110,19 @@ pub(crate) fn export(
             if total > u64::from(u32::MAX) {
                 return Err(GltfError::TooLarge { path: path.to_owned(), bytes: total });
             }
-            let file = written(path, |out| write_binary(out, &json, &authored)).map_err(failed)?;
-            persist(file, path).map_err(failed)?;
+            let new = written(path, |out| write_binary(out, &json, &authored)).map_err(failed)?;
+            new.finish().map_err(failed)?;
             total
         }
         Kind::Text => {
-            let buffer = buffer_path(path);
+            let buffer = buffer_path(&target);
             let name = buffer.file_name().unwrap_or_default().to_string_lossy().into_owned();
             let uri = percent_encoding::utf8_percent_encode(&name, percent_encoding::NON_ALPHANUMERIC);
             authored.document.buffers[0].uri = Some(uri.to_string());
             let json = serde_json::to_vec_pretty(&authored.document).map_err(|error| failed(error.into()))?;
             let heavy = written(&buffer, |out| write_arrays(out, &authored)).map_err(failed)?;
             let light = written(path, |out| out.write_all(&json)).map_err(failed)?;
-            // Both are whole before either is replaced.
-            persist(heavy, &buffer).map_err(failed)?;
-            persist(light, path).map_err(failed)?;
+            finish_all([heavy, light]).map_err(failed)?;
             paths.push(buffer);
             json.len() as u64 + authored.bytes
         }
@@ -137,27 +137,17 @@ pub(crate) fn export(
     })
 }
 
-/// Writes a temporary file in the folder of `path`.
+/// Writes a file that is still to be finished.
 pub(crate) fn written(
     path: &Path,
-    write: impl FnOnce(&mut BufWriter<&mut NamedTempFile>) -> io::Result<()>,
-) -> io::Result<NamedTempFile> {
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".cif-export-");
-    // Temporary files are private by default; the result should have the usual permissions.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let mut file = builder.tempfile_in(folder_of(path))?;
-    let mut out = BufWriter::with_capacity(1 << 16, &mut file);
+    write: impl FnOnce(&mut BufWriter<&File>) -> io::Result<()>,
+) -> io::Result<NewFile> {
+    let new = NewFile::create(path)?;
+    let mut out = BufWriter::with_capacity(1 << 16, new.file());
     write(&mut out)?;
     out.flush()?;
     drop(out);
-    file.as_file().sync_all()?;
-    Ok(file)
-}
-
-pub(crate) fn persist(file: NamedTempFile, path: &Path) -> io::Result<()> {
-    file.persist(path).map(drop).map_err(|error| error.error)
+    Ok(new)
 }
 
 fn padded(length: usize) -> u64 {

@@ -8,9 +8,9 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use cif_geometry::spherical_harmonics::coefficient_count;
-use cif_scene::files::{FileError, existing_folder, folder_of};
+use cif_output::{NewFile, inside};
+use cif_scene::files::{FileError, existing_folder, folder_of, target_of};
 use cif_scene::{CaptureFrame, Node, SceneGraph, Splats};
-use tempfile::NamedTempFile;
 
 use crate::pose::world_splats;
 use crate::{ExportOptions, ExportSummary, PlyError};
@@ -52,6 +52,7 @@ fn check_file(path: &Path, force: bool) -> Result<(), PlyError> {
         return Err(PlyError::InTheWay { path: path.to_owned(), found: "a folder", wanted: "a file" });
     }
     existing_folder(path)?;
+    target_of(path, false)?;
     if path.exists() && !force && !is_ours(path) {
         return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
@@ -78,7 +79,8 @@ pub(crate) fn export(
     options: &ExportOptions,
 ) -> Result<ExportSummary, PlyError> {
     check_target(path, options)?;
-    let jobs = jobs(graph, path, options);
+    let jobs =
+        jobs(graph, path, options).map_err(|source| FileError::Write { path: path.to_owned(), source })?;
     for job in &jobs {
         // Folders that do not exist yet hold nothing.
         if folder_of(&job.path).is_dir() {
@@ -106,40 +108,33 @@ pub(crate) fn export(
     Ok(summary)
 }
 
-fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> Vec<Job<'a>> {
+fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> io::Result<Vec<Job<'a>>> {
     let at = options.time_code.unwrap_or_else(|| graph.time_codes.start());
     let codes = if options.sequence { graph.time_codes.samples.clone() } else { vec![at] };
     let visible = |code: f64| move |node: &&Node| node.is_visible(code) && !node.splats.is_empty();
     let mut jobs = Vec::new();
     for code in codes {
-        let number = format!("{:04}.ply", code.round());
+        let number = format!("{:04}", code.round());
         if options.split {
             for node in graph.nodes.iter().filter(visible(code)) {
-                let path = if options.sequence {
-                    path.join(&node.name).join(&number)
-                } else {
-                    path.join(format!("{}.ply", node.name))
-                };
+                let name =
+                    if options.sequence { format!("{}/{number}", node.name) } else { node.name.clone() };
+                let path = inside(path, &name, "ply")?;
                 jobs.push(Job { path, time_code: code, frame: graph.frame, nodes: vec![node] });
             }
         } else {
-            let path = if options.sequence { path.join(&number) } else { path.to_owned() };
+            let path = if options.sequence { inside(path, &number, "ply")? } else { path.to_owned() };
             let nodes = graph.nodes.iter().filter(visible(code)).collect();
             jobs.push(Job { path, time_code: code, frame: graph.frame, nodes });
         }
     }
-    jobs
+    Ok(jobs)
 }
 
 /// Writes a file through a temporary one in the same folder; its size.
 fn write(job: &Job<'_>) -> io::Result<u64> {
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".cif-export-");
-    // Temporary files are private by default; the result should have the usual permissions.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let mut file: NamedTempFile = builder.tempfile_in(folder_of(&job.path))?;
-    let mut out = BufWriter::with_capacity(1 << 16, &mut file);
+    let new = NewFile::create(&job.path)?;
+    let mut out = BufWriter::with_capacity(1 << 16, new.file());
     let degree = job.nodes.iter().map(|node| node.splats.sh_degree).max().unwrap_or(0);
     let count = job.nodes.iter().map(|node| node.splats.len()).sum();
     out.write_all(header(count, degree, job.time_code, &job.frame).as_bytes())?;
@@ -148,9 +143,8 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     }
     out.flush()?;
     drop(out);
-    file.as_file().sync_all()?;
-    let bytes = file.as_file().metadata()?.len();
-    file.persist(&job.path).map_err(|error| error.error)?;
+    let bytes = new.file().metadata()?.len();
+    new.finish()?;
     Ok(bytes)
 }
 

@@ -3,6 +3,8 @@
 use std::io;
 use std::path::{Path, PathBuf};
 
+pub use cif_output::folder_of;
+
 /// Why a file cannot be read or written, whatever its format.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -20,6 +22,17 @@ pub enum FileError {
     Foreign {
         /// The file.
         path: PathBuf,
+    },
+    /// A link to another folder, where the files that the output names would not be found through the link.
+    #[error(
+        "{path} is a link to {target}; files that it names lie beside it and would not be found through the link: name \
+         the target itself"
+    )]
+    LinkElsewhere {
+        /// Output.
+        path: PathBuf,
+        /// Where the link leads.
+        target: PathBuf,
     },
     /// Writing failed.
     #[error("{path} could not be written: {source}")]
@@ -39,15 +52,6 @@ pub enum FileError {
     },
 }
 
-/// Folder of a file; `.` for a bare name.
-#[must_use]
-pub fn folder_of(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-        _ => PathBuf::from("."),
-    }
-}
-
 /// The folder that a file is to be written into.
 ///
 /// # Errors
@@ -57,14 +61,27 @@ pub fn existing_folder(path: &Path) -> Result<PathBuf, FileError> {
     if folder.is_dir() { Ok(folder) } else { Err(FileError::NoFolder { folder, path: path.to_owned() }) }
 }
 
+/// The file that an output is written to: where links lead, which stay. `with_others`: the output names files that
+/// are written beside it.
+///
+/// # Errors
+/// When something that is no file is there, or a link leaves the folder of files that belong together.
+pub fn target_of(path: &Path, with_others: bool) -> Result<PathBuf, FileError> {
+    let target =
+        cif_output::target(path).map_err(|source| FileError::Write { path: path.to_owned(), source })?;
+    let folder = |path: &Path| folder_of(path).canonicalize().ok();
+    if with_others && folder(&target) != folder(path) {
+        return Err(FileError::LinkElsewhere { path: path.to_owned(), target });
+    }
+    Ok(target)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn bare_names_lie_here_and_missing_folders_are_told() {
-        assert_eq!(folder_of(Path::new("a.glb")), Path::new("."));
-        assert_eq!(folder_of(Path::new("b/a.glb")), Path::new("b"));
+    fn missing_folders_are_told() {
         assert_eq!(existing_folder(Path::new("a.glb")).unwrap(), Path::new("."));
         let error = existing_folder(Path::new("no such/place/a.glb")).unwrap_err().to_string();
         assert!(error.starts_with("no such/place: no such folder; create it first"), "{error}");

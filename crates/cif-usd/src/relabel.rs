@@ -2,7 +2,8 @@
 
 use std::path::Path;
 
-use cif_scene::files::folder_of;
+use cif_output::Scratch;
+use cif_scene::files::{folder_of, target_of};
 use pyo3::BoundObject;
 use pyo3::prelude::*;
 
@@ -38,16 +39,15 @@ pub(crate) fn relabel(
     if output.extension() != path.extension() {
         return Err(refused(format!("{} has another ending; keep .{extension}", output.display())));
     }
-    let folder = folder_of(output);
-    let moved = std::fs::canonicalize(&folder).ok() != std::fs::canonicalize(folder_of(path)).ok();
+    let target = target_of(output, false)?;
+    let folder = folder_of(&target);
+    let original = std::fs::canonicalize(path).map(|path| folder_of(&path));
+    let moved = std::fs::canonicalize(&folder).ok() != original.ok();
     let unwritable =
         |source: std::io::Error| UsdError::Write { path: output.to_owned(), reason: source.to_string() };
-    let suffix = format!(".{extension}");
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".cif-").suffix(&suffix);
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    let copy = builder.tempfile_in(&folder).map_err(unwritable)?.into_temp_path();
+    // Beside the output, where the copy finds the files that it names.
+    let scratch = Scratch::inside(&folder).map_err(unwritable)?;
+    let copy = scratch.file(&extension);
     std::fs::copy(path, &copy).map_err(unwritable)?;
     let done = pxr::with(|pxr| {
         let python = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
@@ -80,7 +80,7 @@ pub(crate) fn relabel(
         }
         Ok(done)
     })?;
-    copy.persist(output).map_err(|error| unwritable(error.error))?;
+    scratch.finish(|| std::fs::rename(&copy, &target)).map_err(unwritable)?;
     Ok(done)
 }
 

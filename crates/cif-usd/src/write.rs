@@ -4,8 +4,9 @@ use std::ffi::OsString;
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use cif_output::Scratch;
 use cif_scene::SceneGraph;
-use cif_scene::files::{FileError, existing_folder, folder_of};
+use cif_scene::files::{FileError, existing_folder, folder_of, target_of};
 use pyo3::prelude::*;
 
 use crate::author::{self, Scene, Storage};
@@ -71,6 +72,8 @@ pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), Us
 
 /// What will be written where.
 struct Target {
+    /// The file, where links lead.
+    path: PathBuf,
     kind: Kind,
     /// Whether arrays go to payloads.
     split: bool,
@@ -92,11 +95,18 @@ fn checked(pxr: &Pxr<'_>, path: &Path, options: ExportOptions) -> Result<Target,
     if path.exists() && !options.force && !is_ours(pxr, path) {
         return Err(FileError::Foreign { path: path.to_owned() }.into());
     }
-    let payloads = payloads_of(path);
+    let target = target_of(path, split)?;
+    let payloads = payloads_of(&target);
+    if payloads.is_symlink() {
+        return Err(UsdError::Write {
+            path: path.to_owned(),
+            reason: format!("{} is a link, which would be replaced; choose another name", payloads.display()),
+        });
+    }
     if split && payloads.exists() && !options.force && !is_folder_of_ours(pxr, &payloads) {
         return Err(FileError::Foreign { path: payloads }.into());
     }
-    Ok(Target { kind, split })
+    Ok(Target { path: target, kind, split })
 }
 
 pub(crate) fn export(
@@ -109,14 +119,13 @@ pub(crate) fn export(
         let failed = |reason: String| UsdError::Write { path: path.to_owned(), reason };
         let system = |error: std::io::Error| failed(error.to_string());
         // A folder of our own on the same disk: renaming is atomic, and a failure leaves nothing behind.
-        let scratch =
-            tempfile::Builder::new().prefix(".cif-export-").tempdir_in(folder_of(path)).map_err(system)?;
-        let written = write(pxr, graph, path, &target, options, scratch.path())
-            .map_err(|error| failed(reason(pxr.py, &error)))?;
+        let scratch = Scratch::inside(&folder_of(&target.path)).map_err(system)?;
+        let folder = scratch.folder().map_err(system)?;
+        let written =
+            write(pxr, graph, &target, options, &folder).map_err(|error| failed(reason(pxr.py, &error)))?;
         let bytes = written.sync().map_err(system)?;
-        written
-            .replace(path, scratch.path(), || is_folder_of_ours(pxr, &payloads_of(path)))
-            .map_err(system)?;
+        let may_go = is_folder_of_ours(pxr, &payloads_of(&target.path));
+        scratch.finish(|| written.replace(&target.path, &folder, may_go)).map_err(system)?;
         Ok(ExportSummary {
             path: path.to_owned(),
             bytes,
@@ -151,11 +160,11 @@ impl Written {
         Ok(bytes)
     }
 
-    /// Moves the stage into place. Old payloads step aside first and come back when something fails; `ours` tells
-    /// whether payloads that the new stage does not need may go.
-    fn replace(&self, path: &Path, scratch: &Path, ours: impl FnOnce() -> bool) -> std::io::Result<()> {
+    /// Moves the stage into place. Old payloads step aside first and come back when something fails; `may_go`
+    /// tells whether payloads that the new stage does not need may go.
+    fn replace(&self, path: &Path, scratch: &Path, may_go: bool) -> std::io::Result<()> {
         let (place, aside) = (payloads_of(path), scratch.join("replaced"));
-        let steps_aside = place.exists() && (self.payloads.is_some() || (place.is_dir() && ours()));
+        let steps_aside = place.exists() && (self.payloads.is_some() || (place.is_dir() && may_go));
         if steps_aside {
             fs::rename(&place, &aside)?;
         }
@@ -182,14 +191,13 @@ impl Written {
 fn write(
     pxr: &Pxr<'_>,
     graph: &SceneGraph,
-    path: &Path,
     target: &Target,
     options: ExportOptions,
     folder: &Path,
 ) -> PyResult<Written> {
     let root = folder.join(if target.kind == Kind::Text { "scene.usda" } else { "scene.usdc" });
     let payloads = target.split.then(|| folder.join("payloads"));
-    let name = payloads_of(path).file_name().map(OsString::from).unwrap_or_default();
+    let name = payloads_of(&target.path).file_name().map(OsString::from).unwrap_or_default();
     let Some(name) = name.to_str().filter(|name| !name.contains('@')) else {
         return Err(pyo3::exceptions::PyOSError::new_err(
             "USD cannot refer to files whose name is not Unicode or has an @ in it; choose another name",

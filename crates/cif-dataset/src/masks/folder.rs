@@ -2,13 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use tempfile::TempDir;
+use cif_output::{Scratch, folder_of};
 
 use crate::Error;
 
 /// A folder being filled beside its final place.
 pub(super) struct NewFolder {
-    partial: TempDir,
+    scratch: Scratch,
+    partial: PathBuf,
     place: PathBuf,
 }
 
@@ -28,19 +29,16 @@ impl NewFolder {
                 "something is there already; give a new folder, or empty this one",
             ));
         }
-        let parent = match place.parent() {
-            Some(parent) if !parent.as_os_str().is_empty() => parent,
-            _ => Path::new("."),
-        };
-        std::fs::create_dir_all(parent).map_err(Error::write(parent))?;
-        let partial =
-            tempfile::Builder::new().prefix(".partial").tempdir_in(parent).map_err(Error::write(parent))?;
-        Ok(Self { partial, place: place.to_owned() })
+        let parent = folder_of(place);
+        std::fs::create_dir_all(&parent).map_err(Error::write(&parent))?;
+        let scratch = Scratch::inside(&parent).map_err(Error::write(&parent))?;
+        let partial = scratch.folder().map_err(Error::write(&parent))?;
+        Ok(Self { scratch, partial, place: place.to_owned() })
     }
 
     /// Where files are written for now.
     pub(super) fn path(&self) -> &Path {
-        self.partial.path()
+        &self.partial
     }
 
     /// Moves the folder to its place.
@@ -48,18 +46,13 @@ impl NewFolder {
     /// # Errors
     /// When it cannot be moved.
     pub(super) fn finish(self) -> Result<(), Error> {
-        if self.place.is_dir() {
-            std::fs::remove_dir(&self.place).map_err(Error::write(&self.place))?;
-        }
-        #[cfg(unix)]
-        {
-            // A temporary folder is private; what is kept should be readable as any other.
-            use std::os::unix::fs::PermissionsExt;
-            let permissions = std::fs::Permissions::from_mode(0o755);
-            std::fs::set_permissions(self.partial.path(), permissions).map_err(Error::write(&self.place))?;
-        }
-        std::fs::rename(self.partial.path(), &self.place).map_err(Error::write(&self.place))?;
-        let _ = self.partial.keep();
-        Ok(())
+        let Self { scratch, partial, place } = self;
+        let renames = || {
+            if place.is_dir() {
+                std::fs::remove_dir(&place)?;
+            }
+            std::fs::rename(&partial, &place)
+        };
+        scratch.finish(renames).map_err(Error::write(&place))
     }
 }

@@ -117,7 +117,7 @@ pub enum CheckpointError {
 impl CheckpointError {
     /// A write failure in words: which folder, and what to do.
     pub(super) fn writing(path: &std::path::Path, source: io::Error) -> Self {
-        let folder = super::write::folder_of(path);
+        let folder = cif_output::folder_of(path);
         let folder = folder.display();
         let problem = match source.kind() {
             io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded | io::ErrorKind::FileTooLarge => {

@@ -1,10 +1,10 @@
 //! Writing: validated first, streamed, atomic.
 
 use std::collections::BTreeMap;
-use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
+use cif_output::NewFile;
 use safetensors::Dtype;
 use safetensors::tensor::TensorInfo;
 use serde::Serialize;
@@ -47,14 +47,6 @@ pub(super) fn save(
     replace_file(path, |file| write(file, path, field, training))
 }
 
-/// The folder that holds `path`.
-pub(super) fn folder_of(path: &Path) -> PathBuf {
-    match path.parent() {
-        Some(parent) if !parent.as_os_str().is_empty() => parent.to_owned(),
-        _ => PathBuf::from("."),
-    }
-}
-
 /// Runs `write` on a temporary file in the folder of `path`, and gives it that name once it is on disk.
 /// On failure the temporary file is removed and whatever `path` was stays.
 pub(super) fn replace_file(
@@ -62,42 +54,12 @@ pub(super) fn replace_file(
     write: impl FnOnce(&mut dyn Write) -> Result<(), CheckpointError>,
 ) -> Result<(), CheckpointError> {
     let failed = |source: io::Error| CheckpointError::writing(path, source);
-    // A link keeps pointing where it points; its target is what is replaced.
-    let target = if path.is_symlink() { fs::canonicalize(path).map_err(failed)? } else { path.to_owned() };
-    match fs::metadata(&target) {
-        Ok(metadata) if !metadata.is_file() => {
-            let problem = if metadata.is_dir() { "it is a folder" } else { "it is not a regular file" };
-            return Err(CheckpointError::Write {
-                path: path.to_owned(),
-                problem: problem.to_owned(),
-                source: None,
-            });
-        }
-        _ => {}
-    }
-    let folder = folder_of(&target);
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".cif-").suffix(".tmp");
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        // As a plainly created file: the process's umask decides, not the private mode of temporary files.
-        builder.permissions(fs::Permissions::from_mode(0o666));
-    }
-    let temporary = builder.tempfile_in(&folder).map_err(failed)?;
-    {
-        let mut buffered = BufWriter::with_capacity(1 << 20, temporary.as_file());
-        write(&mut buffered)?;
-        buffered.flush().map_err(failed)?;
-    }
-    temporary.as_file().sync_all().map_err(failed)?;
-    temporary.persist(&target).map_err(|error| failed(error.error))?;
-    #[cfg(unix)]
-    if let Ok(folder) = File::open(&folder) {
-        // The rename survives a power cut only once the folder is synced; not every file system can.
-        let _ = folder.sync_all();
-    }
-    Ok(())
+    let new = NewFile::create(path).map_err(failed)?;
+    let mut buffered = BufWriter::with_capacity(1 << 20, new.file());
+    write(&mut buffered)?;
+    buffered.flush().map_err(failed)?;
+    drop(buffered);
+    new.finish().map_err(failed)
 }
 
 /// Writes the bytes of a file.

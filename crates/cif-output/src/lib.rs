@@ -1,0 +1,20 @@
+//! Output files: written whole or not at all, never in place of anything else, and cleaned up after.
+//!
+//! | module | answers |
+//! |---|---|
+//! | `name` | which names of frames may become paths, and the path of such a name in a folder |
+//! | `place` | where an output goes once links are followed |
+//! | `unfinished` | temporary files beside their outputs, which never outlive their process for long |
+//!
+//! Outputs are written to a temporary file in their own folder, which takes their name once it is on the disk.
+//! Temporary files begin with `.cif-tmp-`, have a random name and are locked by the process that writes them. They
+//! are removed when writing fails and by [`abandon`]; those of a process that was killed are not locked any more, and
+//! go when the next output is written into their folder.
+
+mod name;
+mod place;
+mod unfinished;
+
+pub use name::{check_name, inside};
+pub use place::{Place, folder_of, place, target};
+pub use unfinished::{NewFile, Scratch, abandon, finish_all, probe, write};

@@ -1,0 +1,64 @@
+//! Names of frames and views, which become parts of paths.
+
+use std::io;
+use std::path::{Component, Path, PathBuf};
+
+/// Checks that `name`, parts separated by `/`, stays inside any folder that it is joined to.
+///
+/// # Errors
+/// What is wrong with it, as the predicate of a sentence: `is an absolute path`.
+pub fn check_name(name: &str) -> Result<(), &'static str> {
+    if name.is_empty() {
+        return Err("is empty");
+    }
+    if name.chars().any(char::is_control) {
+        return Err("holds control characters");
+    }
+    if name.starts_with(['/', '\\']) || Path::new(name).is_absolute() {
+        return Err("is an absolute path");
+    }
+    // Scenes and captures travel between systems: a backslash separates folders on some of them.
+    for part in name.split(['/', '\\']) {
+        match part {
+            "" => return Err("has an empty part"),
+            "." | ".." => return Err("has . or .. as a part"),
+            _ => {}
+        }
+    }
+    if Path::new(name).components().any(|part| !matches!(part, Component::Normal(_))) {
+        return Err("is no relative path");
+    }
+    Ok(())
+}
+
+/// The path of the output `name` with an extension in `folder`.
+///
+/// # Errors
+/// As [`check_name`].
+pub fn inside(folder: &Path, name: &str, extension: &str) -> io::Result<PathBuf> {
+    check_name(name).map_err(|problem| {
+        io::Error::new(io::ErrorKind::InvalidInput, format!("the name {name:?} {problem}"))
+    })?;
+    Ok(folder.join(format!("{name}.{extension}")))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_stay_in_their_folder() {
+        let folder = Path::new("out");
+        for name in ["000012", "cam03/0007", "a.b", "..a", "a b", "Küche/1"] {
+            assert_eq!(inside(folder, name, "png").unwrap(), Path::new(&format!("out/{name}.png")));
+        }
+        for name in
+            ["", "/etc/x", "../x", "a/../../x", "..", ".", "a//b", "a/", "\\x", "a\\..\\..\\x", "a\n", "\0"]
+        {
+            let error = inside(folder, name, "png").unwrap_err().to_string();
+            assert!(error.contains("the name"), "{name:?}: {error}");
+        }
+        #[cfg(windows)]
+        assert!(check_name("C:x").is_err());
+    }
+}

@@ -1,0 +1,63 @@
+//! Where stages go: links stay what they are, and nothing unfinished stays beside them.
+#![cfg(unix)]
+
+use std::fs;
+use std::os::unix::fs::symlink;
+use std::path::Path;
+
+use super::{scenes::Maker, session};
+use crate::{ExportOptions, export, read_scene, relabel};
+
+fn names(folder: &Path) -> Vec<String> {
+    let entries = fs::read_dir(folder).unwrap();
+    let mut names: Vec<String> =
+        entries.map(|entry| entry.unwrap().file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+#[test]
+fn links_stay_and_their_targets_are_written() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    fs::create_dir(at("disk")).unwrap();
+    let scene = Maker::new(3).scene();
+    let options = ExportOptions::default();
+
+    // Payloads lie beside the target, which is also beside the link.
+    symlink("v2.usda", at("scene.usda")).unwrap();
+    for _ in 0..2 {
+        export(&scene, &at("scene.usda"), options).unwrap();
+    }
+    assert!(at("scene.usda").is_symlink());
+    assert_eq!(names(folder.path()), ["disk", "scene.usda", "v2.payloads", "v2.usda"]);
+    let read = read_scene(&at("scene.usda")).unwrap();
+    assert_eq!(read.nodes.len(), scene.nodes.len());
+    let label = &scene.nodes[0].name;
+    relabel(&at("scene.usda"), &at("scene.usda"), label, "other", None).unwrap();
+    assert!(at("scene.usda").is_symlink());
+    assert_eq!(names(folder.path()), ["disk", "scene.usda", "v2.payloads", "v2.usda"]);
+
+    // Through a link from elsewhere they would not be found; a file that holds everything may lie anywhere.
+    symlink("disk/far.usda", at("far.usda")).unwrap();
+    let error = export(&scene, &at("far.usda"), options).unwrap_err().to_string();
+    assert!(error.contains("is a link to"), "{error}");
+    symlink("disk/far.usdc", at("far.usdc")).unwrap();
+    export(&scene, &at("far.usdc"), options).unwrap();
+    assert!(at("far.usdc").is_symlink());
+    assert_eq!(names(&at("disk")), ["far.usdc"]);
+}
+
+#[test]
+fn payloads_behind_a_link_are_not_replaced() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    fs::create_dir(at("theirs")).unwrap();
+    symlink("theirs", at("scene.payloads")).unwrap();
+    let options = ExportOptions { force: true, ..ExportOptions::default() };
+    let error = export(&Maker::new(3).scene(), &at("scene.usda"), options).unwrap_err().to_string();
+    assert!(error.contains("scene.payloads is a link"), "{error}");
+    assert_eq!(names(folder.path()), ["scene.payloads", "theirs"]);
+}
