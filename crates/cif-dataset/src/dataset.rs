@@ -1,6 +1,6 @@
 //! What every capture becomes, whatever its layout.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
 use glam::DVec3;
@@ -53,7 +53,8 @@ pub struct OpenOptions {
 /// One image of a capture: where it is, and the ideal pinhole camera it has once loaded.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Frame {
-    /// Unique name inside the capture, e.g. `000012` or `cam03/0007`.
+    /// Unique name inside the capture, e.g. `000012` or `cam03/0007`: a relative path without `.` and `..`, which
+    /// [`cif_output::inside`] joins to a folder.
     pub name: String,
     /// Camera the frame belongs to, e.g. `cam03`; moving cameras keep one name.
     pub camera_name: String,
@@ -143,6 +144,17 @@ pub struct FrameData {
 }
 
 impl Dataset {
+    /// The files that the frames and the initial points are read from, which nothing may overwrite.
+    pub fn files(&self) -> impl Iterator<Item = &Path> {
+        let points = match &self.points.source {
+            PointSource::File(path) => Some(path.as_path()),
+            PointSource::Random => None,
+        };
+        let frames =
+            self.frames.iter().flat_map(|frame| [Some(frame.image.as_path()), frame.mask.as_deref()]);
+        frames.chain([points]).flatten()
+    }
+
     /// Indices of the frames to train on, ascending.
     #[must_use]
     pub fn train_frames(&self) -> Vec<usize> {

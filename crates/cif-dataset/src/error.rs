@@ -110,6 +110,19 @@ pub enum Error {
         /// Where the camera should be.
         camera: PathBuf,
     },
+    /// The name of a frame cannot name files in a folder.
+    #[error(
+        "{}: the name of frame {frame:?} {problem}; name images by paths inside the folder of the capture",
+        path.display()
+    )]
+    FrameName {
+        /// File that lists the frame.
+        path: PathBuf,
+        /// Frame of the capture.
+        frame: String,
+        /// What is wrong.
+        problem: &'static str,
+    },
     /// Two frames share a name.
     #[error("{}: frame {frame} is listed twice; keep one of the two", path.display())]
     DuplicateFrame {

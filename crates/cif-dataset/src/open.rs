@@ -346,6 +346,12 @@ fn frames(
 ) -> Result<(Vec<Frame>, bool, Vec<(u32, u32)>), Error> {
     let mut names = BTreeSet::new();
     for frame in &draft.frames {
+        // Whoever writes a file per frame joins its name to a folder.
+        cif_output::check_name(&frame.name).map_err(|problem| Error::FrameName {
+            path: frame.camera.source.clone(),
+            frame: frame.name.clone(),
+            problem,
+        })?;
         if !names.insert(frame.name.as_str()) {
             return Err(Error::DuplicateFrame {
                 path: frame.camera.source.clone(),

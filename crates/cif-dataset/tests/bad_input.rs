@@ -457,3 +457,27 @@ fn images_cannot_be_reduced_by_nothing() {
     let options = OpenOptions { downscale: Some(0), ..OpenOptions::default() };
     holds(&failure_with(&hypernerf(2), &options), &["reduced by 0"]);
 }
+
+#[test]
+fn frame_names_stay_inside_a_folder() {
+    // Whoever writes a picture per frame joins its name to a folder.
+    let folder = hypernerf(3);
+    for name in ["rgb/1x/a", "camera/a"] {
+        std::fs::create_dir(folder.path().join(name)).unwrap();
+    }
+    let renamed = "a/../000001";
+    for file in ["dataset.json", "metadata.json"] {
+        let path = folder.path().join(file);
+        let text = std::fs::read_to_string(&path).unwrap();
+        write(&path, text.replace("\"000001\"", &format!("\"{renamed}\"")));
+    }
+    holds(&failure(&folder), &[renamed, "..", "inside the folder of the capture"]);
+
+    let folder = dnerf(2, 1);
+    let path = folder.path().join("images").join("../train/r_000.png");
+    std::fs::create_dir(folder.path().join("images")).unwrap();
+    edit_json(&folder.path().join("transforms_train.json"), |value| {
+        value["frames"][0]["file_path"] = json!(path.strip_prefix(folder.path()).unwrap());
+    });
+    holds(&failure(&folder), &["transforms_train.json", "images/../train/r_000"]);
+}

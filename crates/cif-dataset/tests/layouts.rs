@@ -2,10 +2,13 @@
 
 mod support;
 
+use std::path::Path;
+
 use cif_dataset::{Dataset, Layout, OpenOptions, PointSource, Split};
 use glam::{DVec2, DVec3};
 use serde_json::json;
 use support::*;
+use tempfile::TempDir;
 
 fn names(dataset: &Dataset, split: Split) -> Vec<&str> {
     dataset.split_frames(split).into_iter().map(|index| dataset.frames[index].name.as_str()).collect()
@@ -325,4 +328,34 @@ fn other_pairs_of_layouts_need_a_choice() {
     holds(&failure(&folder), &["d-nerf", "nerfstudio", "--layout", "transforms.json"]);
     let options = OpenOptions { layout: Some(Layout::Nerfstudio), ..OpenOptions::default() };
     assert_eq!(Dataset::open(folder.path(), &options).unwrap().layout, Layout::Nerfstudio);
+}
+
+#[test]
+fn absolute_paths_of_images_give_names_inside_the_capture() {
+    // As some tools write them: inside the capture, in a folder elsewhere, or up and down again.
+    let absolute = |root: &Path, folder: &TempDir, file: &str| {
+        edit_json(&folder.path().join(file), |value| {
+            for frame in value["frames"].as_array_mut().unwrap() {
+                let path = frame["file_path"].as_str().unwrap().trim_start_matches("./").to_owned();
+                frame["file_path"] = json!(root.join(path));
+            }
+        });
+    };
+    let folder = dnerf(2, 1);
+    for file in ["transforms_train.json", "transforms_test.json"] {
+        absolute(folder.path(), &folder, file);
+    }
+    let dataset = open(&folder);
+    assert_eq!(names(&dataset, Split::Train), ["train/r_000", "train/r_001"]);
+    assert_eq!(names(&dataset, Split::Val), ["test/r_000"]);
+
+    let (elsewhere, folder) = (dnerf(2, 1), dnerf(2, 1));
+    for file in ["transforms_train.json", "transforms_test.json"] {
+        absolute(elsewhere.path(), &folder, file);
+    }
+    assert_eq!(names(&open(&folder), Split::Train), ["train/r_000", "train/r_001"]);
+
+    let folder = nerfstudio(2);
+    absolute(&folder.path().join("images/.."), &folder, "transforms.json");
+    assert_eq!(names(&open(&folder), Split::Train), ["0001"]);
 }

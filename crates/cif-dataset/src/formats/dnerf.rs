@@ -3,6 +3,8 @@
 //! Held out is `transforms_test.json`, as in the base code; `transforms_val.json` is read only where there is
 //! no test file. Without any time the capture is static.
 
+use std::path::Path;
+
 use super::{Draft, DraftFrame, Source, customary_points, transforms};
 use crate::{Error, Split};
 
@@ -35,23 +37,29 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         None
     };
 
+    let mut files = Vec::new();
+    for (path, split) in [(Some(train.clone()), Split::Train), (held_out, Split::Val)] {
+        let Some(path) = path else { continue };
+        files.push((transforms::read(&path)?, path, split));
+    }
+    let file_paths: Vec<&Path> =
+        files.iter().flat_map(|(file, ..)| &file.frames).map(|entry| entry.file_path.as_path()).collect();
+    let mut inner = transforms::inside(root, &file_paths).into_iter();
     let mut frames = Vec::new();
     let mut times = Vec::new();
     let mut frames_per_second = None;
-    for (path, split) in [(Some(train.clone()), Split::Train), (held_out, Split::Val)] {
-        let Some(path) = path else { continue };
-        let file = transforms::read(&path)?;
+    for (file, path, split) in &files {
         frames_per_second = frames_per_second.or(file.fps);
-        for entry in &file.frames {
+        for (entry, inner) in file.frames.iter().zip(inner.by_ref()) {
             times.push(entry.time);
             frames.push(DraftFrame {
-                name: transforms::frame_name(&entry.file_path),
+                name: transforms::frame_name(&inner),
                 camera_name: "camera".to_owned(),
                 time: 0.0,
-                split,
-                image: transforms::image(root, &path, entry)?,
+                split: *split,
+                image: transforms::image(root, path, entry)?,
                 mask: entry.mask_path.as_ref().map(|mask| root.join(transforms::clean(mask))),
-                camera: transforms::camera(&path, &file, entry)?,
+                camera: transforms::camera(path, file, entry)?,
             });
         }
     }

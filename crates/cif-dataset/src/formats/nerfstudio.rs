@@ -16,14 +16,15 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let path = root.join("transforms.json");
     let file = transforms::read(&path)?;
     let mut warnings = Vec::new();
-    let folder = common_folder(&file);
+    let file_paths: Vec<&Path> = file.frames.iter().map(|entry| entry.file_path.as_path()).collect();
+    let inner = transforms::inside(root, &file_paths);
+    let folder = transforms::common_folder(inner.iter().map(PathBuf::as_path));
     let folders: BTreeSet<PathBuf> = file.frames.iter().map(|entry| folder_of(&entry.file_path)).collect();
     let times: Vec<Option<f64>> = file.frames.iter().map(|entry| entry.time).collect();
     let times = transforms::normalised_times(&path, &times)?;
     let mut frames = Vec::with_capacity(file.frames.len());
-    for (entry, time) in file.frames.iter().zip(times) {
-        let inner = transforms::clean(&entry.file_path);
-        let inner = inner.strip_prefix(&folder).unwrap_or(&inner);
+    for ((entry, inner), time) in file.frames.iter().zip(&inner).zip(times) {
+        let inner = inner.strip_prefix(&folder).unwrap_or(inner);
         frames.push(DraftFrame {
             name: transforms::frame_name(inner),
             camera_name: camera_name(inner, folders.len()),
@@ -92,24 +93,6 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
 /// Folder of a path.
 fn folder_of(path: &Path) -> PathBuf {
     transforms::clean(path).parent().map(Path::to_owned).unwrap_or_default()
-}
-
-/// The folder that all images share.
-fn common_folder(file: &TransformsFile) -> PathBuf {
-    let mut common: Option<PathBuf> = None;
-    for entry in &file.frames {
-        let folder = folder_of(&entry.file_path);
-        common = Some(match common {
-            None => folder,
-            Some(common) => common
-                .components()
-                .zip(folder.components())
-                .take_while(|(a, b)| a == b)
-                .map(|(a, _)| a)
-                .collect(),
-        });
-    }
-    common.unwrap_or_default()
 }
 
 /// Images in several folders are several cameras, named by folder; else there is one moving camera.

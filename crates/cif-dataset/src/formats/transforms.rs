@@ -1,6 +1,6 @@
 //! The `transforms*.json` files of NeRF, D-NeRF, instant-ngp and nerfstudio.
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use cif_geometry::LensDistortion;
 use glam::DVec2;
@@ -81,7 +81,38 @@ pub(super) fn image(root: &Path, path: &Path, entry: &FrameEntry) -> Result<Path
 
 /// A relative path without `./`.
 pub(super) fn clean(path: &Path) -> PathBuf {
-    path.components().filter(|part| !matches!(part, std::path::Component::CurDir)).collect()
+    path.components().filter(|part| !matches!(part, Component::CurDir)).collect()
+}
+
+/// The paths of images without `./`, and relative to the capture where they lie inside it or, as some tools write
+/// them, all outside of it in one folder: such paths become names of frames.
+pub(super) fn inside(root: &Path, file_paths: &[&Path]) -> Vec<PathBuf> {
+    let real_root = root.canonicalize();
+    let roots = [Some(root), real_root.as_deref().ok()];
+    let paths: Vec<PathBuf> = file_paths
+        .iter()
+        .map(|path| {
+            let path = clean(path);
+            let below = roots.into_iter().flatten().find_map(|root| path.strip_prefix(root).ok());
+            below.filter(|_| path.is_absolute()).map(Path::to_owned).unwrap_or(path)
+        })
+        .collect();
+    let leaves =
+        |path: &PathBuf| path.is_absolute() || path.components().any(|part| part == Component::ParentDir);
+    if !paths.iter().all(leaves) {
+        return paths;
+    }
+    let folder = common_folder(paths.iter().map(PathBuf::as_path));
+    paths.iter().map(|path| path.strip_prefix(&folder).unwrap_or(path).to_owned()).collect()
+}
+
+/// The folder that all of some files share, as far as their paths tell.
+pub(super) fn common_folder<'a>(paths: impl Iterator<Item = &'a Path>) -> PathBuf {
+    let folders = paths.map(|path| path.parent().unwrap_or(Path::new("")).to_owned());
+    let shared = |a: PathBuf, b: PathBuf| {
+        a.components().zip(b.components()).take_while(|(a, b)| a == b).map(|(a, _)| a).collect()
+    };
+    folders.reduce(shared).unwrap_or_default()
 }
 
 /// Path of an image without `./` and extension, with `/` between its parts.

@@ -121,7 +121,8 @@ pub fn split_tracker_masks(
         .map(|(entry, path)| {
             let tracked = mask::decode(path)?;
             let remapped: PixelGrid<u16> = tracked.map(|id| new_id.get(id).copied().unwrap_or(0));
-            let target = folder.path().join(format!("{}.png", entry.frame));
+            let target =
+                cif_output::inside(folder.path(), &entry.frame, "png").map_err(Error::write(out_dir))?;
             if let Some(parent) = target.parent() {
                 std::fs::create_dir_all(parent).map_err(Error::write(parent))?;
             }

@@ -74,10 +74,8 @@ impl ZigzagIndex {
         let index: Self = json::read(&path)?;
         let mut names = BTreeSet::new();
         for entry in &index.images {
-            let escapes = Path::new(&entry.frame)
-                .components()
-                .any(|part| !matches!(part, std::path::Component::Normal(_)));
-            if entry.view >= index.views.len() || escapes || entry.frame.is_empty() {
+            let escapes = cif_output::check_name(&entry.frame).is_err();
+            if entry.view >= index.views.len() || escapes {
                 return Err(Error::invalid(
                     &path,
                     format!("the entry of {} is damaged; write it again", entry.image),
