@@ -77,7 +77,7 @@ fn a_sound_scene_passes_and_a_broken_one_is_repaired() {
     assert_eq!(of("degenerate", "quaternions")["first"], serde_json::json!([7]));
     assert_eq!(of("not finite", "deformation.planes")["count"], 1);
 
-    cif(path, "check broken.cif --fix broken.cif").fails(2, &["that is the scene itself"]);
+    cif(path, "check broken.cif --fix broken.cif").fails(2, &["broken.cif is read by this command"]);
     cif(path, "check broken.cif --fix table.cif").fails(1, &["exists"]);
     let told = cif(path, "check broken.cif --fix repaired.cif").succeeds().stdout;
     assert!(told.contains("3 x Gaussians that cannot be drawn were removed"), "{told}");

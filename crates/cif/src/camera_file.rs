@@ -1,5 +1,6 @@
 //! Camera files: views that no capture has.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_geometry::{PinholeCamera, RigidTransform};
@@ -68,14 +69,20 @@ pub fn read(path: &Path) -> Result<Vec<View>, Error> {
     if entries.is_empty() {
         return Err(Error::failed(format!("{} holds no view", path.display()), FORMAT_HELP));
     }
+    let mut names = BTreeMap::new();
     entries
         .into_iter()
         .enumerate()
         .map(|(index, entry)| {
             let name = entry.name.clone().unwrap_or_else(|| format!("{index:04}"));
-            view(entry, &name).map_err(|problem| {
+            let refused = |problem: String| {
                 Error::failed(format!("{}: view {index} ({name}): {problem}", path.display()), FORMAT_HELP)
-            })
+            };
+            // Some file systems take names that differ in case for one.
+            if let Some(other) = names.insert(name.to_lowercase(), index) {
+                return Err(refused(format!("view {other} has this name too; every view needs its own")));
+            }
+            view(entry, &name).map_err(refused)
         })
         .collect()
 }
@@ -84,9 +91,7 @@ fn view(entry: Entry, name: &str) -> Result<View, String> {
     if entry.width == 0 || entry.height == 0 || entry.width > 16_384 || entry.height > 16_384 {
         return Err(format!("size {} x {}: expected 1 to 16384 pixels", entry.width, entry.height));
     }
-    if name.is_empty() || name.split('/').any(|part| part.is_empty() || part == "..") {
-        return Err(format!("name {name:?} cannot name a file"));
-    }
+    cif_output::check_name(name).map_err(|problem| format!("name {name:?} {problem}"))?;
     let size = DVec2::new(f64::from(entry.width), f64::from(entry.height));
     let focal_px = match (entry.focal_px, entry.vertical_fov_deg) {
         (Some(focal), None) => DVec2::from(focal),

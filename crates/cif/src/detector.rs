@@ -18,6 +18,7 @@ use tempfile::TempDir;
 
 use crate::error::Error;
 use crate::mask_query::FoundMasks;
+use crate::output::{self, Outputs};
 use crate::pictures::{Picture, save_rgb};
 
 /// Most bytes and lines of a failing command's last words.
@@ -52,9 +53,13 @@ pub fn detect(
         std::fs::create_dir(inside).map_err(Error::io("create the folder", inside))?;
     }
     let words = words(command, &images, &masks, prompt)?;
+    // Frames of several folders may have one flat name.
+    let mut outputs = Outputs::new(false);
     for index in frames {
+        let name = flat_name(&dataset.frames[*index].name);
+        outputs.picture(&images, &name, "png")?;
         let image: Picture = dataset.load_image(*index, background).map_err(Error::plain)?;
-        save_rgb(&images.join(format!("{}.png", flat_name(&dataset.frames[*index].name))), &image)?;
+        save_rgb(&output::inside(&images, &name, "png")?, &image)?;
     }
     run(&words, &folder.path().join("stderr"))?;
     let files = found_masks(dataset, &masks).map_err(|_| {

@@ -44,9 +44,10 @@ use miette::{GraphicalReportHandler, GraphicalTheme};
 pub use error::Error;
 
 /// From here on the process ends without a word when whatever reads its output has seen enough, as in
-/// `cif eval ... | head`. For processes that are nothing but the command: others would end with it.
+/// `cif eval ... | head`, and signals end it without leaving unfinished files behind. For processes that are nothing but the command: others would end with it.
 pub fn end_with_reader() {
     sigpipe::reset();
+    interrupt::end_cleanly();
 }
 
 /// Runs a command line, the first argument being the name of the program, and returns the exit code:

@@ -1,18 +1,151 @@
 //! Output files and folders: checked before the work starts, written whole or not at all.
 
+use std::collections::BTreeMap;
 use std::fs;
-use std::io::Write;
-use std::path::Path;
+use std::io;
+use std::path::{Path, PathBuf};
 
-use cif_scene::files::folder_of;
-use tempfile::NamedTempFile;
+use cif_output::{Place, folder_of};
 
 use crate::error::Error;
 
-/// Checks that `path` can be written and that nothing there would be lost.
+/// What a command reads and what it is about to write: no file may be both, and none may be written twice.
+#[derive(Debug)]
+pub struct Outputs {
+    overwrite: bool,
+    read: BTreeMap<PathBuf, PathBuf>,
+    written: BTreeMap<PathBuf, PathBuf>,
+}
+
+impl Outputs {
+    /// Nothing yet. With `overwrite` existing files may be replaced; inputs never.
+    #[must_use]
+    pub fn new(overwrite: bool) -> Self {
+        Self { overwrite, read: BTreeMap::new(), written: BTreeMap::new() }
+    }
+
+    /// Adds an input.
+    ///
+    /// # Errors
+    /// When it is an output already.
+    pub fn reads(&mut self, path: &Path) -> Result<(), Error> {
+        let real = real(path);
+        if let Some(output) = self.written.get(&real) {
+            return Err(is_input(output));
+        }
+        self.read.insert(real, path.to_owned());
+        Ok(())
+    }
+
+    /// Adds the files of a capture as inputs.
+    ///
+    /// # Errors
+    /// When one is an output already.
+    pub fn reads_capture(&mut self, dataset: &cif_dataset::Dataset) -> Result<(), Error> {
+        dataset.files().try_for_each(|path| self.reads(path))
+    }
+
+    /// Adds a file to write, and checks that it can be written.
+    ///
+    /// # Errors
+    /// When it is an input or another output, and as [`check_file`].
+    pub fn file(&mut self, path: &Path) -> Result<(), Error> {
+        self.add(path)?;
+        check_file(path, self.overwrite)
+    }
+
+    /// Adds a text to write, which may also go to a terminal, a pipe or a device such as `/dev/null`.
+    ///
+    /// # Errors
+    /// As [`Outputs::file`].
+    pub fn text(&mut self, path: &Path) -> Result<(), Error> {
+        if matches!(cif_output::place(path), Ok(Place::Stream(_))) { Ok(()) } else { self.file(path) }
+    }
+
+    /// Adds the picture of a frame or view, `folder/name.extension`, whose folders need not exist yet.
+    ///
+    /// # Errors
+    /// When the name leads out of the folder, or the file is an input or another output.
+    pub fn picture(&mut self, folder: &Path, name: &str, extension: &str) -> Result<(), Error> {
+        let path = inside(folder, name, extension)?;
+        self.add(&path)
+    }
+
+    /// Adds a file to write that is checked elsewhere.
+    ///
+    /// # Errors
+    /// When it is an input or another output.
+    pub fn add(&mut self, path: &Path) -> Result<(), Error> {
+        let real = real(path);
+        if self.read.contains_key(&real) {
+            return Err(is_input(path));
+        }
+        match self.written.insert(real, path.to_owned()) {
+            None => Ok(()),
+            Some(other) if other == path => Err(Error::failed(
+                format!("{} would be written twice", path.display()),
+                "give the outputs, or the views, names of their own",
+            )),
+            Some(other) => Err(Error::failed(
+                format!(
+                    "{} and {} are one file, which would be written twice",
+                    other.display(),
+                    path.display()
+                ),
+                "give the outputs names of their own",
+            )),
+        }
+    }
+}
+
+fn is_input(path: &Path) -> Error {
+    Error::usage(
+        format!("{} is read by this command, so it is not written", path.display()),
+        "name another file; inputs are kept, also with --force",
+    )
+}
+
+/// The file that a path leads to: links followed, as far as there is anything.
+fn real(path: &Path) -> PathBuf {
+    let target = match cif_output::place(path) {
+        Ok(Place::File(target) | Place::Stream(target)) => target,
+        Err(_) => path.to_owned(),
+    };
+    let absolute = std::path::absolute(&target).unwrap_or(target);
+    let known = absolute.ancestors().find_map(|ancestor| Some((ancestor, ancestor.canonicalize().ok()?)));
+    match known {
+        Some((ancestor, real)) => match absolute.strip_prefix(ancestor) {
+            Ok(rest) if !rest.as_os_str().is_empty() => real.join(rest),
+            _ => real,
+        },
+        None => absolute,
+    }
+}
+
+/// Whether an output goes to the standard output, where nothing else is printed then.
+#[must_use]
+pub fn is_stdout(path: &Path) -> bool {
+    ["-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"].iter().any(|name| path == Path::new(name))
+}
+
+/// The path of the picture of a frame or view in a folder.
 ///
 /// # Errors
-/// When the folder is missing or refuses files, when `path` is a folder, or exists without `overwrite`.
+/// When the name leads out of the folder.
+pub fn inside(folder: &Path, name: &str, extension: &str) -> Result<PathBuf, Error> {
+    cif_output::inside(folder, name, extension).map_err(|error| {
+        Error::failed(
+            format!("{error}, so no file in {} can have it", folder.display()),
+            "name frames and views by paths inside their folder",
+        )
+    })
+}
+
+/// Checks that `path` can be written and that nothing there would be lost. A link leads to the file that is written.
+///
+/// # Errors
+/// When the folder is missing or refuses files, when `path` is a folder or no regular file, or exists without
+/// `overwrite`.
 pub fn check_file(path: &Path, overwrite: bool) -> Result<(), Error> {
     if path.is_dir() {
         return Err(Error::failed(
@@ -20,13 +153,24 @@ pub fn check_file(path: &Path, overwrite: bool) -> Result<(), Error> {
             format!("name a file, for example {}", path.join("scene.cif").display()),
         ));
     }
-    if path.exists() && !overwrite {
+    let target = match cif_output::target(path) {
+        Ok(target) => target,
+        // Files can be no folders; told below.
+        Err(error) if error.kind() == io::ErrorKind::NotADirectory => path.to_owned(),
+        Err(error) => {
+            return Err(Error::failed(
+                format!("{} cannot be written: {error}", path.display()),
+                "choose another name",
+            ));
+        }
+    };
+    if target.exists() && !overwrite {
         return Err(Error::failed(
             format!("{} exists and is not overwritten", path.display()),
             "give --force to replace it, or choose another name",
         ));
     }
-    let folder = folder_of(path);
+    let folder = folder_of(&target);
     if !folder.is_dir() {
         return Err(Error::failed(
             format!("the folder {} for {} does not exist", folder.display(), path.display()),
@@ -58,31 +202,30 @@ pub fn check_folder(path: &Path, overwrite: bool) -> Result<(), Error> {
     probe(path)
 }
 
-/// Writes a whole file through a temporary one in the same folder, so that a failure leaves the old one.
+/// Writes a whole file; a failure leaves the old one, a link stays one, and streams are written to.
 ///
 /// # Errors
 /// When the file system refuses, for example because the disk is full.
 pub fn write_file(path: &Path, bytes: &[u8]) -> Result<(), Error> {
-    let mut file = temporary(&folder_of(path)).map_err(Error::io("write to the folder of", path))?;
-    file.write_all(bytes).and_then(|()| file.as_file().sync_all()).map_err(Error::io("write", path))?;
-    file.persist(path).map_err(|error| Error::io("replace", path)(error.error))?;
-    Ok(())
+    cif_output::write(path, bytes).map_err(Error::io("write", path))
+}
+
+/// Creates an empty file in the folder for temporary files, for a scene that its own place refuses. Others may write
+/// into that folder: the name is random, and nothing that is there is followed or replaced.
+///
+/// # Errors
+/// When that folder refuses it, too.
+pub fn rescue_file(path: &Path) -> io::Result<PathBuf> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let file = tempfile::Builder::new().prefix("rescued-").suffix(&format!("-{name}")).tempfile()?;
+    file.into_temp_path().keep().map_err(|error| error.error)
 }
 
 fn probe(folder: &Path) -> Result<(), Error> {
-    temporary(folder).map(drop).map_err(|source| Error::Failed {
+    cif_output::probe(folder).map_err(|source| Error::Failed {
         message: format!("cannot write to the folder {}: {source}", folder.display()),
         help: Some("check its permissions and the free space, or choose another folder".to_owned()),
     })
-}
-
-fn temporary(folder: &Path) -> std::io::Result<NamedTempFile> {
-    let mut builder = tempfile::Builder::new();
-    builder.prefix(".cif-");
-    // Temporary files are private by default; the result should have the usual permissions.
-    #[cfg(unix)]
-    builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-    builder.tempfile_in(folder)
 }
 
 #[cfg(test)]
@@ -118,5 +261,61 @@ mod tests {
         assert!(check_folder(&target, false).is_err());
         check_folder(&target, true).unwrap();
         assert!(check_folder(&target.join("x"), true).unwrap_err().to_string().contains("is a file"));
+    }
+
+    #[test]
+    fn inputs_are_no_outputs() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = folder.path().join("t.cif");
+        fs::write(&scene, "precious").unwrap();
+        let mut outputs = Outputs::new(true);
+        outputs.reads(&scene).unwrap();
+        let error = outputs.file(&folder.path().join("./t.cif")).unwrap_err();
+        assert!(error.to_string().contains("t.cif is read by this command"), "{error}");
+        #[cfg(unix)]
+        {
+            let link = folder.path().join("link.cif");
+            std::os::unix::fs::symlink("t.cif", &link).unwrap();
+            assert!(outputs.file(&link).is_err());
+        }
+        // The other way about: what is read turns out later.
+        let late = folder.path().join("late.json");
+        outputs.file(&late).unwrap();
+        assert!(outputs.reads(&late).is_err());
+    }
+
+    #[test]
+    fn nothing_is_written_twice() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut outputs = Outputs::new(true);
+        outputs.picture(&folder.path().join("rgb"), "0001", "png").unwrap();
+        outputs.picture(&folder.path().join("depth"), "0001", "png").unwrap();
+        let error = outputs.picture(&folder.path().join("rgb"), "0001", "png").unwrap_err();
+        assert!(error.to_string().contains("twice"), "{error}");
+        let error = outputs.picture(folder.path(), "../0001", "png").unwrap_err();
+        assert!(error.to_string().contains("../0001"), "{error}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn devices_stay_devices() {
+        let null = Path::new("/dev/null");
+        let mut outputs = Outputs::new(false);
+        outputs.text(null).unwrap();
+        outputs.text(null).unwrap();
+        assert!(check_file(null, true).unwrap_err().to_string().contains("not a regular file"));
+        write_file(null, b"x").unwrap();
+        assert!(!fs::metadata(null).unwrap().is_file());
+    }
+
+    #[test]
+    fn rescued_files_have_names_that_nobody_guesses() {
+        let [first, second] = [0, 1].map(|_| rescue_file(Path::new("far/table.cif")).unwrap());
+        let name = first.file_name().unwrap().to_string_lossy().into_owned();
+        assert!(name.starts_with("rescued-") && name.ends_with("-table.cif"), "{name}");
+        assert_ne!(first, second);
+        for path in [first, second] {
+            fs::remove_file(path).unwrap();
+        }
     }
 }

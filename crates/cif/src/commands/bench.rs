@@ -1,7 +1,7 @@
 //! `cif bench`: what a training step costs, and where; what accuracy costs, of scenes and of exported motion; how
 //! hard captures fare.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use cif_dataset::{Dataset, Layout};
@@ -19,7 +19,7 @@ use serde_json::{Map, Value, json};
 use super::bench_device::{OnDevice, StageTimes};
 use super::{CaptureOptions, Simd, print_warnings, scene, train};
 use crate::error::Error;
-use crate::output;
+use crate::output::{self, Outputs};
 use crate::settings::Layers;
 
 /// Measure what a training step, an export or accuracy costs, and how hard captures fare
@@ -125,9 +125,11 @@ pub(super) fn run(command: &Bench) -> Result<(), Error> {
 }
 
 fn step(command: &Step) -> Result<(), Error> {
-    let to_stdout = command.json.as_deref() == Some(Path::new("-"));
+    let to_stdout = command.json.as_deref().is_some_and(output::is_stdout);
     if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
-        output::check_file(path, command.force)?;
+        let mut outputs = Outputs::new(command.force);
+        command.scene.as_deref().map_or(Ok(()), |scene| outputs.reads(scene))?;
+        outputs.text(path)?;
     }
     if !command.instances.is_empty() && command.stage.is_some_and(|stage| stage != StageName::Instance) {
         return Err(no_instances());

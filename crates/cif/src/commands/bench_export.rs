@@ -12,7 +12,7 @@ use serde::Serialize;
 use super::model_options::ModelOptions;
 use super::{motion_table, scene};
 use crate::error::Error;
-use crate::output;
+use crate::output::{self, Outputs};
 
 /// Tell what accuracy of motion costs
 #[derive(Debug, Args)]
@@ -160,9 +160,11 @@ impl Format {
 }
 
 pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
-    let to_stdout = command.json.as_deref() == Some(Path::new("-"));
+    let to_stdout = command.json.as_deref().is_some_and(output::is_stdout);
     if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
-        output::check_file(path, command.force)?;
+        let mut outputs = Outputs::new(command.force);
+        outputs.reads(&command.scene)?;
+        outputs.text(path)?;
     }
     let field = scene::load(&command.scene)?;
     let folder = tempfile::tempdir()

@@ -1,6 +1,6 @@
 //! `cif check`: whether a scene is numerically sound, and a repaired copy of one that is not.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use cif_field::health::{self, Finding, Repair, Severity};
 use cif_field::{Checkpoint, Field, StateTensor};
@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 
 use super::scene;
 use crate::error::Error;
-use crate::output;
+use crate::output::Outputs;
 
 /// Blended weight over all recorded views, in pixels, below which a Gaussian was never seen.
 const MIN_MASS: f64 = 1e-3;
@@ -49,16 +49,9 @@ pub(super) struct Check {
 
 pub(super) fn run(command: &Check) -> Result<(), Error> {
     if let Some(target) = &command.fix {
-        let same = |a: &Path, b: &Path| {
-            a == b || a.canonicalize().ok().is_some_and(|a| b.canonicalize().ok() == Some(a))
-        };
-        if same(&command.scene, target) {
-            return Err(Error::usage(
-                format!("--fix {}: that is the scene itself", target.display()),
-                "name another file; the broken one is kept",
-            ));
-        }
-        output::check_file(target, command.force)?;
+        let mut outputs = Outputs::new(command.force);
+        outputs.reads(&command.scene)?;
+        outputs.file(target)?;
     }
     if command.scene.is_dir() {
         // The usual words for a capture in place of a scene.

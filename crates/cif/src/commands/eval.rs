@@ -1,6 +1,6 @@
 //! `cif eval`: scores a scene on the held-out frames of a capture.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use cif_dataset::Split;
 use cif_field::Field;
@@ -10,6 +10,7 @@ use serde_json::{Value, json};
 
 use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::error::Error;
+use crate::output::Outputs;
 use crate::pictures::{
     Picture, depth_picture, error_picture, instance_picture, rgb_picture, save_rgb, side_by_side,
 };
@@ -70,17 +71,23 @@ impl From<SplitName> for Split {
 }
 
 pub(super) fn run(command: &Eval) -> Result<(), Error> {
-    let to_stdout = command.json.as_deref() == Some(Path::new("-"));
+    let to_stdout = command.json.as_deref().is_some_and(output::is_stdout);
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.scene)?;
     if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
-        output::check_file(path, command.force)?;
+        outputs.text(path)?;
     }
     let field = scene::load(&command.scene)?;
     let mut capture = command.capture_options.clone();
     capture.downscale = capture.downscale.or(scene::trained_downscale(&field));
     let dataset = capture.open(&command.capture)?;
     print_warnings(&dataset);
+    outputs.reads_capture(&dataset)?;
     if let Some(folder) = &command.images {
         output::check_folder(folder, command.force)?;
+        for index in dataset.split_frames(command.split.into()) {
+            outputs.picture(folder, &dataset.frames[index].name, "png")?;
+        }
     }
     let options = EvaluationOptions {
         split: command.split.into(),
@@ -94,7 +101,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
             return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
         }
         match &command.images {
-            Some(folder) => save_rgb(&folder.join(format!("{}.png", view.frame.name)), &panel(&view)),
+            Some(folder) => save_rgb(&output::inside(folder, &view.frame.name, "png")?, &panel(&view)),
             None => Ok(()),
         }
     })?;

@@ -13,7 +13,7 @@ use super::model_options::ModelOptions;
 use super::{motion_table, scene};
 use crate::error::Error;
 use crate::ground_truth::{self, MotionError};
-use crate::output;
+use crate::output::{self, Outputs};
 
 /// Export a scene as USD, glTF or PLY, one prim or node per object
 #[derive(Debug, Args)]
@@ -97,17 +97,20 @@ pub(super) struct Export {
 }
 
 pub(super) fn run(command: &Export) -> Result<(), Error> {
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.scene)?;
+    command.ground_truth.as_deref().map_or(Ok(()), |truth| outputs.reads(truth))?;
     if let Some(path) = &command.usd {
         check_stage_name(path)?;
-        output::check_file(path, command.force)?;
+        outputs.file(path)?;
         cif_usd::check_target(path, writing(command)).map_err(Error::plain)?;
     }
-    let report_to_stdout = command.report_json.as_deref() == Some(Path::new("-"));
+    let report_to_stdout = command.report_json.as_deref().is_some_and(output::is_stdout);
     if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
-        output::check_file(path, command.force)?;
+        outputs.text(path)?;
     }
-    command.gltf.check(command.force)?;
-    command.ply.check(command.force)?;
+    command.gltf.check(command.force, &mut outputs)?;
+    command.ply.check(command.force, &mut outputs)?;
     let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
     let field = scene::load(&command.scene)?;
     scene::note_frame(&scene::frame(&field)?, command.ply.ply.is_some());

@@ -7,7 +7,7 @@ use cif_scene::{SceneGraph, SceneOptions};
 use clap::Args;
 
 use crate::error::Error;
-use crate::output;
+use crate::output::Outputs;
 
 #[derive(Debug, Args)]
 pub(super) struct Gltf {
@@ -19,7 +19,7 @@ pub(super) struct Gltf {
 
 impl Gltf {
     /// Checks the target before the work starts.
-    pub(super) fn check(&self, force: bool) -> Result<(), Error> {
+    pub(super) fn check(&self, force: bool, outputs: &mut Outputs) -> Result<(), Error> {
         let Some(path) = &self.gltf else { return Ok(()) };
         let known = ["glb", "gltf"].contains(&ending(path).as_str());
         if !known {
@@ -28,9 +28,9 @@ impl Gltf {
                 "end the name in .glb (one file) or .gltf (text beside a .bin)",
             ));
         }
-        output::check_file(path, force)?;
+        outputs.file(path)?;
         if ending(path) == "gltf" {
-            output::check_file(&path.with_extension("bin"), force)?;
+            outputs.file(&path.with_extension("bin"))?;
         }
         cif_gltf::check_target(path, cif_gltf::ExportOptions { force }).map_err(Error::plain)
     }

@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::query::code_at;
 use crate::error::Error;
-use crate::output;
+use crate::output::{self, Outputs};
 
 #[derive(Debug, Args)]
 pub(super) struct Ply {
@@ -32,7 +32,7 @@ impl Ply {
     }
 
     /// Checks the target before the work starts.
-    pub(super) fn check(&self, force: bool) -> Result<(), Error> {
+    pub(super) fn check(&self, force: bool, outputs: &mut Outputs) -> Result<(), Error> {
         let Some(path) = &self.ply else { return Ok(()) };
         if let Some(time) = self.ply_time
             && !(0.0..=1.0).contains(&time)
@@ -57,7 +57,7 @@ impl Ply {
             ));
         }
         cif_ply::check_target(path, self.options(force)).map_err(Error::plain)?;
-        if folder { output::check_folder(path, force) } else { output::check_file(path, force) }
+        if folder { output::check_folder(path, force) } else { outputs.file(path) }
     }
 
     /// Writes the files.

@@ -8,7 +8,8 @@ use serde_json::json;
 use super::diff::{cameras, print_objects};
 use super::scene;
 use crate::error::Error;
-use crate::{graph_file, output};
+use crate::graph_file;
+use crate::output::Outputs;
 
 /// Turn USD, glTF or PLY into a scene, or bring edits of an exported file home
 #[derive(Debug, Args)]
@@ -56,7 +57,10 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
             "end its name in .cif",
         ));
     }
-    output::check_file(&command.output, command.force)?;
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.file)?;
+    command.base.as_deref().map_or(Ok(()), |base| outputs.reads(base))?;
+    outputs.file(&command.output)?;
     // Before the file is read, which may take longer.
     let base = command.base.as_deref().map(scene::load).transpose()?;
     let graph = graph_file::read_following(&command.file, command.follow_external)?;

@@ -7,7 +7,7 @@ use clap::Args;
 
 use super::scene::{self, Format};
 use crate::error::Error;
-use crate::output;
+use crate::output::Outputs;
 
 /// Give an object another label
 #[derive(Debug, Args)]
@@ -43,11 +43,21 @@ pub(super) struct Label {
 pub(super) fn run(command: &Label) -> Result<(), Error> {
     let label = checked(&command.label, "the label")?;
     let category = command.category.as_deref().map(|category| checked(category, "--category")).transpose()?;
+    let format = scene::format(&command.path)?;
     if let Some(output) = &command.output {
-        output::check_file(output, command.force)?;
+        let ending = |path: &Path| path.extension().map(|ending| ending.to_ascii_lowercase());
+        if ending(output) != ending(&command.path) {
+            return Err(Error::usage(
+                format!("-o {}: labels do not change what a file is", output.display()),
+                format!("give it the ending of {}; cif export writes other formats", command.path.display()),
+            ));
+        }
+        let mut outputs = Outputs::new(command.force);
+        outputs.reads(&command.path)?;
+        outputs.file(output)?;
     }
     let target = command.output.as_deref().unwrap_or(&command.path);
-    let (before, after) = match scene::format(&command.path)? {
+    let (before, after) = match format {
         Format::Scene => in_scene(&command.path, target, &command.instance, label, category)?,
         Format::Usd => {
             let done = cif_usd::relabel(&command.path, target, &command.instance, label, category)

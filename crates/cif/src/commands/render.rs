@@ -24,6 +24,7 @@ use super::painter::Sample;
 use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
+use crate::output::Outputs;
 use crate::pictures::{depth_picture, instance_picture, rgb_picture, save_grey, save_rgb};
 use crate::quality::{self, Quality};
 use crate::{interrupt, output};
@@ -133,7 +134,15 @@ impl From<ExrColor> for ColorEncoding {
     }
 }
 
+/// Folder of the EXR files inside the output.
+const EXR_FOLDER: &str = "exr";
+
 impl What {
+    /// Folder of the layer inside the output: its name, as it is typed.
+    fn folder(self) -> String {
+        self.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default()
+    }
+
     fn of_instances(self) -> bool {
         matches!(
             self,
@@ -181,8 +190,18 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
             "leave --quality draft or --exr away",
         ));
     }
-    let views = views(command, &field)?;
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.scene)?;
+    let views = views(command, &field, &mut outputs)?;
     output::check_folder(&command.output, command.force)?;
+    for Shot { view, .. } in &views {
+        for what in &what {
+            outputs.picture(&command.output.join(what.folder()), &view.name, "png")?;
+        }
+        if command.exr {
+            outputs.picture(&command.output.join(EXR_FOLDER), &view.name, "exr")?;
+        }
+    }
     let depth = command.exr || what.contains(&What::Depth) || what.contains(&What::DepthColor);
     let instances = wanted || (command.exr && field.identities.is_some());
     let settings = scene::render_settings(&field);
@@ -312,8 +331,9 @@ struct Shot {
     camera: String,
 }
 
-fn views(command: &Render, field: &Field) -> Result<Vec<Shot>, Error> {
+fn views(command: &Render, field: &Field, outputs: &mut Outputs) -> Result<Vec<Shot>, Error> {
     if let Some(path) = &command.camera {
+        outputs.reads(path)?;
         let mut views = camera_file::read(path)?;
         // Cameras are given in the world of the capture.
         let frame = scene::frame(field)?;
@@ -329,6 +349,7 @@ fn views(command: &Render, field: &Field) -> Result<Vec<Shot>, Error> {
     options.no_masks = options.masks.is_none();
     options.downscale = options.downscale.or(scene::trained_downscale(field));
     let dataset = options.open(capture)?;
+    outputs.reads_capture(&dataset)?;
     print_warnings(&dataset);
     let split = command.split.into();
     let views: Vec<Shot> = dataset
@@ -384,7 +405,7 @@ fn write_exr(
         .as_ref()
         .map(|identities| renderer.instance_ranks(identities, cif_exr::cryptomatte::RANKS));
     let motion = motion(renderer, image, place);
-    let path = command.output.join("exr").join(format!("{}.exr", view.name));
+    let path = output::inside(&command.output.join(EXR_FOLDER), &view.name, "exr")?;
     let folder = folder_of(&path);
     std::fs::create_dir_all(&folder).map_err(Error::io("create the folder", &folder))?;
     let frame = cif_exr::Frame {
@@ -435,8 +456,7 @@ fn objects(field: &Field) -> Vec<cif_exr::Object> {
 }
 
 fn write(what: What, field: &Field, image: &RenderedImage, folder: &Path, name: &str) -> Result<(), Error> {
-    let layer = what.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default();
-    let path = folder.join(layer).join(format!("{name}.png"));
+    let path = output::inside(&folder.join(what.folder()), name, "png")?;
     let unit = |values: &PixelGrid<f32>| scaled(values, 65_535.0);
     match (what, &image.depth, &image.instances) {
         (What::Rgb, ..) => save_rgb(&path, &rgb_picture(&image.color)),

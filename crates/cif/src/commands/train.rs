@@ -13,6 +13,7 @@ use clap::{Args, ValueEnum};
 use super::train_budget::{Goals, Timing};
 use super::{CaptureOptions, Simd, print_warnings, scene};
 use crate::error::Error;
+use crate::output::Outputs;
 use crate::progress::Progress;
 use crate::settings::Layers;
 use crate::{interrupt, output};
@@ -169,11 +170,8 @@ enum AblationName {
 pub(super) fn run(command: &Train) -> Result<(), Error> {
     let mut timing = Timing::start();
     // Everything that can be refused is refused before the first image is read.
-    output::check_file(&command.output, command.force || command.resume)?;
     let settings_path = command.output.with_extension("train.toml");
-    if let Some(log) = &command.log {
-        output::check_file(log, command.force || command.resume)?;
-    }
+    check_outputs(command, &settings_path)?;
     let checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
     let source = command.from.as_deref().map(load_source).transpose()?;
     let base = source.as_ref().and_then(|source| cif_train::metrics::training_config(&source.field));
@@ -271,6 +269,17 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     logged
 }
 
+/// Checks what is written against what is there, and that no file is written twice or both read and written. Only the
+/// settings may be those of an earlier run, which are written again.
+fn check_outputs(command: &Train, settings_path: &Path) -> Result<(), Error> {
+    let mut outputs = Outputs::new(command.force || command.resume);
+    let config = command.config.as_deref().filter(|config| *config != settings_path);
+    [config, command.from.as_deref()].into_iter().flatten().try_for_each(|input| outputs.reads(input))?;
+    outputs.file(&command.output)?;
+    outputs.add(settings_path)?;
+    command.log.as_deref().map_or(Ok(()), |log| outputs.text(log))
+}
+
 /// Runs to the end or to a request to stop. The second value is a state that could not be saved on the way.
 fn train(
     trainer: &mut Trainer,
@@ -319,14 +328,13 @@ impl StepCount {
 /// hours of training may be in it.
 fn save(checkpoint: &Checkpoint, path: &Path) -> Result<(), Error> {
     let Err(error) = checkpoint.save(path) else { return Ok(()) };
-    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let rescue = std::env::temp_dir().join(format!("rescued-{}-{name}", std::process::id()));
-    Err(match checkpoint.save(&rescue) {
-        Ok(()) => Error::failed(
+    let rescued = output::rescue_file(path).ok().filter(|rescue| checkpoint.save(rescue).is_ok());
+    Err(match rescued {
+        Some(rescue) => Error::failed(
             error.to_string(),
             format!("the scene was saved as {} instead; move it where there is space", rescue.display()),
         ),
-        Err(_) => Error::failed(error.to_string(), "make space, then train again"),
+        None => Error::failed(error.to_string(), "make space, then train again"),
     })
 }
 

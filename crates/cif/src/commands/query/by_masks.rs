@@ -197,7 +197,7 @@ fn evaluate(
         let rendered = render(field, &found.rows, &frame.camera, frame.time, renderer, settings);
         if let Some(folder) = &options.output {
             let picture: PixelGrid<u16> = rendered.map(|inside| if *inside { u16::MAX } else { 0 });
-            save_grey(&folder.join(format!("{}.png", frame.name)), &picture)?;
+            save_grey(&output::inside(folder, &frame.name, "png")?, &picture)?;
         }
         pairs.push((frame.name.as_str(), rendered, truth));
     }
