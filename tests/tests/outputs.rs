@@ -58,6 +58,11 @@ fn unfinished(folder: &Path) -> Vec<String> {
     names.filter(|name| name.starts_with(".cif-")).collect()
 }
 
+#[cfg(unix)]
+fn make_pipe(path: &Path) {
+    assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success());
+}
+
 #[test]
 fn photographs_are_never_written() {
     let folder = with_scene();
@@ -150,39 +155,60 @@ fn links_and_devices_stay_what_they_are() {
     // The .bin would lie where the link is not.
     cif(path, "export t.cif --gltf t.gltf").fails(1, &["t.gltf is a link", "name the target itself"]);
 
-    cif(path, "export t.cif --report-json /dev/null --force").succeeds();
-    assert!(!fs::metadata("/dev/null").unwrap().is_file());
+    // A pipe of our own stands for devices, which a broken command would destroy.
+    let pipe = path.join("pipe.cif");
+    make_pipe(&pipe);
+    let reader = std::thread::spawn({
+        let pipe = pipe.clone();
+        move || fs::read_to_string(pipe).unwrap()
+    });
+    cif(path, "export t.cif --report-json pipe.cif --force").succeeds();
+    assert!(reader.join().unwrap().contains("motion"));
+    cif(path, "label t.cif --instance 1 x -o pipe.cif --force").fails(1, &["not a regular file"]);
+    assert!(std::os::unix::fs::FileTypeExt::is_fifo(&fs::metadata(&pipe).unwrap().file_type()));
     let printed = cif(path, "export t.cif --report-json /dev/stdout").succeeds().stdout;
     let report: Value = serde_json::from_str(&printed).unwrap();
     assert!(report["motion"].is_array(), "{printed}");
-    symlink("/dev/null", path.join("null.cif")).unwrap();
-    cif(path, "label t.cif --instance 1 x -o null.cif --force").fails(1, &["not a regular file"]);
     assert!(unfinished(path).is_empty());
 }
 
-#[cfg(unix)]
+#[cfg(target_os = "linux")]
 #[test]
 fn signals_end_a_command_and_leave_nothing_unfinished() {
-    use std::process::{Command, Stdio};
+    use std::process::{Child, Command, Stdio};
 
     let folder = with_scene();
     let path = folder.path();
     // What a killed command left is gone once the next one has written into the folder.
     fs::write(path.join(".cif-tmp-leftover"), "half of a scene").unwrap();
-    assert!(Command::new("mkfifo").arg(path.join("pipe")).status().unwrap().success());
-    for signal in ["-INT", "-TERM"] {
-        // Nobody reads the pipe, so that the command waits there once it has written the rest.
-        let mut command = Command::new(CIF);
-        command.args(["export", "t.cif", "--ply", "a.ply", "--report-json", "pipe", "--force"]);
-        command.current_dir(path).stdout(Stdio::null()).stderr(Stdio::null());
+    make_pipe(&path.join("pipe"));
+    // Nobody reads the pipe, so that the command waits there once it has written the rest.
+    let line = ["export", "t.cif", "--ply", "a.ply", "--report-json", "pipe", "--force"];
+    let begin = |command: &mut Command| {
+        let command = command.args(line).current_dir(path).stdout(Stdio::null()).stderr(Stdio::null());
         let mut child = command.spawn().unwrap();
         while !path.join("a.ply").exists() {
             assert!(child.try_wait().unwrap().is_none(), "it ended by itself");
             std::thread::sleep(std::time::Duration::from_millis(10));
         }
+        fs::remove_file(path.join("a.ply")).unwrap();
+        child
+    };
+    let send = |signal: &str, child: &Child| {
         assert!(Command::new("kill").arg(signal).arg(child.id().to_string()).status().unwrap().success());
+    };
+    for signal in ["-INT", "-TERM"] {
+        // Tests in the background are started to ignore SIGINT.
+        let mut child = begin(Command::new("env").args(["--default-signal=INT", CIF]));
+        send(signal, &child);
         assert_eq!(child.wait().unwrap().code(), Some(130), "{signal}");
         assert!(unfinished(path).is_empty(), "{signal}");
-        fs::remove_file(path.join("a.ply")).unwrap();
     }
+    // As under nohup: the signal stays ignored, and the command ends by what it waits for.
+    let mut child = begin(Command::new("sh").args(["-c", "trap '' HUP; exec \"$0\" \"$@\"", CIF]));
+    send("-HUP", &child);
+    std::thread::sleep(std::time::Duration::from_millis(100));
+    assert!(child.try_wait().unwrap().is_none(), "it was ended");
+    assert!(fs::read_to_string(path.join("pipe")).unwrap().contains("motion"));
+    assert!(child.wait().unwrap().success());
 }
