@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -72,6 +73,27 @@ def test_find_returns_prims(stage_path: Path) -> None:
     assert labels == {"class": ["mug", "red mug"], "instance": ["red_mug_001"]}
     with pytest.raises(cif.CifError, match=r"no\.usda: no such file"):
         cif.usd.find("no.usda", "x")
+
+
+def test_labels_with_brackets_are_found_by_their_own_names(tmp_path: Path) -> None:
+    stage = Usd.Stage.CreateNew(str(tmp_path / "shelves.usda"))
+    label = "shelf [left] {2}"
+    for name, text in [("Left", label), ("Right", "shelf l 2")]:
+        prim = stage.DefinePrim(f"/{name}", "Xform")
+        UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr().Set([text])
+    stage.GetRootLayer().Save()
+    assert names(cif.usd.find(stage, label)) == ["Left"]
+    assert [found["label"] for found in cif.query_stage(tmp_path / "shelves.usda", label)] == [label]
+    assert names(cif.usd.find(stage, "SHELF ?l*")) == ["Left"]
+
+
+def test_pipes_are_no_stages(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.usda"
+    os.mkfifo(pipe)
+    with pytest.raises(cif.CifError, match=r"pipe\.usda.*named pipe"):
+        cif.query_stage(pipe, "x")
+    with pytest.raises(cif.CifError, match=r"pipe\.usda.*named pipe"):
+        cif.import_scene(pipe)
 
 
 def test_find_over_time(foreign: Path) -> None:

@@ -140,6 +140,44 @@ fn settings_that_cannot_be_are_refused_before_anything_is_read() {
 }
 
 #[test]
+fn settings_out_of_range_name_the_line_or_the_flag() {
+    let folder = folder();
+    let path = folder.path();
+    fs::write(path.join("mine.toml"), "seed = 3\n\n[stages]\nbatch = 0\n").unwrap();
+    cif(path, "train nowhere -o a.cif --config mine.toml").fails(1, &["mine.toml:4", "stages.batch", "is 0"]);
+    cif(path, "train nowhere -o a.cif --set rates.opacity=-1").fails(1, &["--set rates.opacity", "is -1"]);
+    cif(path, "train nowhere -o a.cif --config mine.toml --batch 0").fails(1, &["--batch", "is 0"]);
+    cif(path, "bench step nowhere --set stages.batch=0").fails(1, &["--set stages.batch", "is 0"]);
+}
+
+/// Nothing waits for a pipe that nobody writes to, or reads a device without an end.
+#[cfg(unix)]
+#[test]
+fn pipes_and_devices_are_refused() {
+    let folder = folder();
+    let path = folder.path();
+    let kinds = ["cif", "glb", "ply", "toml"];
+    for kind in kinds {
+        let pipe = path.join(format!("pipe.{kind}"));
+        assert!(std::process::Command::new("mkfifo").arg(pipe).status().unwrap().success());
+        std::os::unix::fs::symlink("/dev/zero", path.join(format!("zero.{kind}"))).unwrap();
+    }
+    for (name, words) in [("pipe", "a named pipe"), ("zero", "a device")] {
+        for (line, kind) in [
+            ("info {}.cif", "cif"),
+            ("check {}.cif", "cif"),
+            ("query {}.cif --label mug", "cif"),
+            ("query {}.glb --label mug", "glb"),
+            ("label {}.glb --instance 1 mug", "glb"),
+            ("import {}.ply -o a.cif", "ply"),
+            ("train nowhere -o a.cif --config {}.toml", "toml"),
+        ] {
+            cif(path, &line.replace("{}", name)).fails(1, &[&format!("{name}.{kind}"), words]);
+        }
+    }
+}
+
+#[test]
 fn outputs_are_checked_before_training() {
     let folder = with_capture();
     let path = folder.path();

@@ -8,6 +8,7 @@ use cargo_metadata::{DependencyKind, Metadata, MetadataCommand, Package};
 const ROWS: [(&str, u32); 13] = [
     ("cif-geometry", 0),
     ("cif-output", 0),
+    ("cif-input", 0),
     ("cif-dataset", 1),
     ("cif-field", 1),
     ("cif-render", 2),

@@ -130,6 +130,27 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     cif(path, "info short.cif").fails(1, &["short.cif", "cut short"]);
 }
 
+/// What is told to go on with can be pasted into a shell, whatever files are called.
+#[cfg(unix)]
+#[test]
+fn the_command_to_go_on_with_can_be_pasted() {
+    let folder = with_capture(4);
+    let path = folder.path();
+    fs::rename(path.join("table"), path.join("my table")).unwrap();
+    let start = ["train", "my table", "-o", "it's $HOME.cif", "--stop-after", "1"];
+    let stopped = run(CIF, path, start.into_iter().chain(TINY.split_whitespace())).succeeds();
+    let (_, line) = stopped.stderr.split_once("go on with: cif ").expect("the command is told");
+    let script = format!("\"$CIF\" {}", line.lines().next().unwrap());
+    let status = std::process::Command::new("sh")
+        .args(["-c", &script])
+        .current_dir(path)
+        .env("CIF", CIF)
+        .stderr(std::process::Stdio::null())
+        .status();
+    assert!(status.unwrap().success(), "{script}");
+    assert!(Checkpoint::load(path.join("it's $HOME.cif")).unwrap().training.is_none());
+}
+
 #[test]
 fn an_interrupted_run_resumes_to_the_same_scene() {
     let folder = with_capture(6);

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use crate::files::json;
+use crate::files::{json, listing};
 use crate::{Error, InstanceLabel};
 
 #[derive(Deserialize)]
@@ -56,6 +56,12 @@ pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u
         let text = |text: Option<String>| text.filter(|text| !text.trim().is_empty());
         let label = text(entry.label).unwrap_or_else(|| default_label(id));
         let category = text(entry.category).unwrap_or_else(|| label.clone());
+        if [&label, &category].iter().any(|text| text.contains('\0')) {
+            return Err(Error::invalid(
+                path,
+                format!("the label or category of id {id} holds a NUL character; leave it out"),
+            ));
+        }
         if labels.insert(id, InstanceLabel { id, label, category }).is_some() {
             return Err(Error::invalid(path, format!("id {id} is listed twice; keep one entry")));
         }
@@ -74,7 +80,7 @@ pub(crate) fn file_for(root: &Path, mask_folder: Option<&Path>) -> Option<PathBu
         .into_iter()
         .chain([root])
         .map(|folder| folder.join("instances.json"))
-        .find(|path| path.is_file())
+        .find(|path| listing::is_there(path))
 }
 
 /// The instances that occur in the masks, ascending id, named by the file where it names them.

@@ -37,10 +37,10 @@ impl Layout {
 
     fn fits(self, root: &Path) -> bool {
         match self {
-            Self::HyperNerf | Self::Neu3d | Self::Nerfstudio => root.join(self.marker()).is_file(),
-            Self::DNerf => {
-                root.join("transforms_train.json").is_file() || root.join("transforms_test.json").is_file()
-            }
+            Self::HyperNerf | Self::Neu3d | Self::Nerfstudio => listing::is_there(&root.join(self.marker())),
+            Self::DNerf => ["transforms_train.json", "transforms_test.json"]
+                .iter()
+                .any(|name| listing::is_there(&root.join(name))),
             Self::Colmap => colmap_sparse_folder(root).is_some(),
         }
     }

@@ -108,7 +108,7 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
                     let mut name = candidate.clone().into_os_string();
                     name.push(".");
                     name.push(extension);
-                    Some(PathBuf::from(name)).filter(|path| path.is_file())
+                    Some(PathBuf::from(name)).filter(|path| listing::is_there(path))
                 })
             })
         })

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use cif_geometry::PinholeCamera;
 use rayon::prelude::*;
 
-use crate::files::{image, json};
+use crate::files::{image, json, listing};
 use crate::formats::{self, Draft, Source, some_of};
 use crate::load::{centred, reduced_size};
 use crate::{
@@ -117,7 +117,7 @@ impl Dataset {
     /// Groups of `splits.json` (`interp`, `novel`, ...) for held-out frames.
     fn read_groups(&mut self) -> Result<(), Error> {
         let path = self.root.join("splits.json");
-        if !path.is_file() {
+        if !listing::is_there(&path) {
             return Ok(());
         }
         let groups: BTreeMap<String, serde_json::Value> = json::read(&path)?;
@@ -198,7 +198,7 @@ impl Dataset {
             ));
         }
         for frame in &self.frames {
-            if let Some(mask) = frame.mask.as_ref().filter(|mask| !mask.is_file()) {
+            if let Some(mask) = frame.mask.as_ref().filter(|mask| !listing::is_there(mask)) {
                 return Err(Error::MissingFile {
                     path: mask.clone(),
                     fix: format!(
@@ -358,6 +358,16 @@ fn frames(
                 frame: frame.name.clone(),
             });
         }
+    }
+    if let Some(frame) = draft.frames.iter().find(|frame| frame.camera_name.contains('\0')) {
+        return Err(Error::Intrinsics {
+            path: frame.camera.source.clone(),
+            frame: frame.name.clone(),
+            problem: format!(
+                "its camera is called {:?}, with a NUL character; leave it out",
+                frame.camera_name
+            ),
+        });
     }
     if !draft.frames.iter().any(|frame| frame.split == Split::Train) {
         return Err(Error::invalid(root, "no frame is left to train on; add frames to the training list"));

@@ -481,3 +481,52 @@ fn frame_names_stay_inside_a_folder() {
     });
     holds(&failure(&folder), &["transforms_train.json", "images/../train/r_000"]);
 }
+
+#[cfg(unix)]
+#[test]
+fn pipes_in_a_capture_are_named_and_not_waited_for() {
+    for name in ["dataset.json", "camera/000001.json", "rgb/1x/000001.png", "masks/000000.png", "points.npy"]
+    {
+        let folder = hypernerf(3);
+        let path = folder.path().join(name);
+        fs::remove_file(&path).unwrap();
+        assert!(std::process::Command::new("mkfifo").arg(&path).status().unwrap().success());
+        holds(&failure(&folder), &[name, "named pipe", "regular file"]);
+    }
+    let folder = hypernerf(3);
+    let path = folder.path().join("instances.json");
+    fs::remove_file(&path).unwrap();
+    std::os::unix::fs::symlink("/dev/zero", &path).unwrap();
+    holds(&failure(&folder), &["instances.json", "a device"]);
+}
+
+#[test]
+fn labels_that_usd_would_cut_are_refused() {
+    let folder = hypernerf(3);
+    write_json(&folder.path().join("instances.json"), &json!([{"id": 1, "label": "red\u{0} mug"}]));
+    holds(&failure(&folder), &["instances.json", "id 1", "NUL"]);
+}
+
+#[test]
+fn images_cannot_claim_more_pixels_than_their_bytes_hold() {
+    // The width and the height of a PNG stand behind its mark; their checksum follows the header.
+    let enlarged = |path: &std::path::Path| {
+        let mut bytes = fs::read(path).unwrap();
+        bytes[16..24].copy_from_slice(&[0, 0, 0x30, 0, 0, 0, 0x30, 0]);
+        let checksum = crc32(&bytes[12..29]);
+        bytes[29..33].copy_from_slice(&checksum.to_be_bytes());
+        fs::write(path, bytes).unwrap();
+    };
+    for name in ["rgb/1x/000001.png", "masks/000000.png"] {
+        let folder = hypernerf(3);
+        enlarged(&folder.path().join(name));
+        holds(&failure(&folder), &[name, "12288 x 12288", "bytes can hold"]);
+    }
+}
+
+/// The checksum of PNG chunks.
+fn crc32(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |crc, byte| {
+        (0..8).fold(crc ^ u32::from(*byte), |crc, _| crc >> 1 ^ (0xedb8_8320 & 0_u32.wrapping_sub(crc & 1)))
+    })
+}

@@ -174,6 +174,8 @@ pub fn repair(field: &mut Field) -> Result<Vec<Repair>, HealthError> {
             );
         }
     }
+    let renamed = mend_names(field);
+    tell(renamed, "names with NUL characters go without them");
     let clamped = clamp_scales(&mut field.gaussians);
     tell(clamped, "log-scales outside -20 to 10 take the limit that the renderer clamps them to");
     let drawable: Vec<u32> =
@@ -446,6 +448,18 @@ fn replace_bad(values: &mut [f32], by: f32) -> usize {
     replaced
 }
 
+/// Takes NUL characters out of the names of instances and cameras.
+fn mend_names(field: &mut Field) -> usize {
+    let of_instances = field.instances.iter_mut().flat_map(|one| [&mut one.label, &mut one.category]);
+    let names = of_instances.chain(field.cameras.iter_mut().map(|record| &mut record.name));
+    let mut mended = 0;
+    for name in names.filter(|name| name.contains('\0')) {
+        name.retain(|character| character != '\0');
+        mended += 1;
+    }
+    mended
+}
+
 /// Calibrations that are not finite become 0, estimates the smallest of their row.
 fn mend_identities(rows: &mut Identities) -> usize {
     let mut mended = replace_bad(&mut rows.log_calibrations, 0.0);
@@ -561,6 +575,19 @@ mod tests {
         assert!(found(&field).iter().any(|f| (f.0, f.1) == ("structure", "identities")));
         let repairs = repair(&mut field).unwrap();
         assert!(field.identities.is_none() && repairs[0].what.contains("cif train --from"), "{repairs:?}");
+    }
+
+    #[test]
+    fn names_that_would_be_cut_in_usd_are_refused_and_mended() {
+        let mut field = testing::field(10, 3);
+        field.instances[0].label = "red\0 mug".to_owned();
+        field.cameras[0].name = "left\0".to_owned();
+        let error = field.validate().unwrap_err().to_string();
+        assert!(error.contains("NUL") && error.contains("instance 0"), "{error}");
+        assert!(found(&field).iter().any(|f| f.0 == "structure"));
+        let repairs = repair(&mut field).unwrap();
+        assert_eq!((repairs[0].count, field.instances[0].label.as_str()), (2, "red mug"), "{repairs:?}");
+        field.validate().unwrap();
     }
 
     #[test]

@@ -9,6 +9,9 @@ use crate::{Deformation, Field, Gaussians, Identities, Instance, RecordedCamera,
 /// Largest deviation of a camera rotation from orthonormality.
 const MAX_ORTHONORMALITY_ERROR: f64 = 1e-3;
 
+/// Why a text with one is refused: it would come back from USD as another.
+const NUL: &str = "a NUL character, at which USD ends texts; leave it out";
+
 /// A broken rule of [`Field`].
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[non_exhaustive]
@@ -362,12 +365,18 @@ fn validate_instances(instances: &[Instance]) -> Result<(), FieldError> {
         if let Some(other) = owners[usize::from(instance.id)].replace(index) {
             return broken(index, format!("has the id {} of instance {other}", instance.id));
         }
+        if [&instance.label, &instance.category].iter().any(|text| text.contains('\0')) {
+            return broken(index, format!("has a label or class with {NUL}"));
+        }
     }
     Ok(())
 }
 
 fn validate_camera(record: &RecordedCamera, times: usize) -> Result<(), String> {
     let camera = &record.camera;
+    if record.name.contains('\0') {
+        return Err(format!("has a name with {NUL}"));
+    }
     if record.time_index >= times {
         return Err(format!("has the time index {}, but there are {times} times", record.time_index));
     }

@@ -48,7 +48,7 @@ pub(crate) fn author(graph: &SceneGraph) -> Result<Authored<'_>, GltfError> {
 struct Author<'a> {
     graph: &'a SceneGraph,
     first_time_code: f64,
-    names: Vec<String>,
+    names: naming::Names,
     document: Document,
     arrays: Vec<Array<'a>>,
     bytes: u64,
@@ -73,10 +73,12 @@ impl<'a> Author<'a> {
         if !(graph.meters_per_unit > 0.0 && graph.meters_per_unit.is_finite()) {
             return wrong("its unit has no length");
         }
+        let mut names = naming::Names::default();
+        names.take(conventions::WORLD.to_owned());
         Ok(Self {
             graph,
             first_time_code: first_time_code(graph),
-            names: vec![conventions::WORLD.to_owned()],
+            names,
             document: Document::default(),
             arrays: Vec::new(),
             bytes: 0,
@@ -88,9 +90,7 @@ impl<'a> Author<'a> {
 
     /// A node name that no other node has: engines bind animation tracks by name.
     fn unique(&mut self, name: &str) -> String {
-        let name = naming::unique(name.to_owned(), |name| self.names.iter().any(|taken| taken == name));
-        self.names.push(name.clone());
-        name
+        self.names.take(name.to_owned())
     }
 
     fn push(&mut self, node: document::Node) -> usize {

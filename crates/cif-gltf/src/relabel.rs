@@ -1,6 +1,5 @@
 //! Another label for an object of a file: only the JSON changes, everything else is copied.
 
-use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::Path;
 
@@ -51,8 +50,9 @@ pub fn relabel(
     if output.extension() != path.extension() {
         return Err(invalid(format!("{} has another ending; keep that of the file", output.display())));
     }
-    let size = std::fs::metadata(path).map_err(read)?.len();
-    let mut file = BufReader::new(File::open(path).map_err(read)?);
+    let file = cif_input::open(path).map_err(read)?;
+    let size = file.metadata().map_err(read)?.len();
+    let mut file = BufReader::new(file);
     let mut start = Vec::new();
     file.by_ref().take(20).read_to_end(&mut start).map_err(read)?;
     let binary = start.starts_with(MAGIC);

@@ -1,6 +1,5 @@
 //! PLY files of splats, ASCII and binary, whatever the order of their properties.
 
-use std::fs::File;
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
@@ -48,12 +47,8 @@ impl PropertyAccess for Ignored {
 pub(crate) fn read(path: &Path) -> Result<SceneGraph, PlyError> {
     let failed = |source| FileError::Read { path: path.to_owned(), source };
     let invalid = |what: String| PlyError::Invalid { path: path.to_owned(), what };
-    let file = File::open(path).map_err(failed)?;
-    let metadata = file.metadata().map_err(failed)?;
-    if !metadata.is_file() {
-        return Err(invalid("it is not a file".to_owned()));
-    }
-    let size = metadata.len();
+    let file = cif_input::open(path).map_err(failed)?;
+    let size = file.metadata().map_err(failed)?.len();
     let mut reader = Reader::new(BufReader::with_capacity(1 << 16, file));
     let parser = Parser::<Ignored>::new();
     let damaged = |error: ParseError| {

@@ -187,6 +187,24 @@ pub(crate) fn find<'py>(
     arrays::to_python(py, &found)
 }
 
+/// Labels with wildcards.
+#[pyclass(frozen, module = "cif")]
+pub(crate) struct LabelPattern {
+    inner: cif_scene::LabelPattern,
+}
+
+#[pymethods]
+impl LabelPattern {
+    #[new]
+    fn new(text: &str) -> Self {
+        Self { inner: cif_scene::LabelPattern::new(text) }
+    }
+
+    fn matches(&self, label: &str) -> bool {
+        self.inner.matches(label)
+    }
+}
+
 /// Prims of a stage by label.
 #[pyfunction]
 #[pyo3(signature = (path, label, time_code=None))]

@@ -51,7 +51,13 @@ fn sparse_identities(probabilities: &PyReadonlyArrayDyn<'_, f32>, instances: usi
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
     };
-    for row in arrays::values(probabilities).chunks_exact(instances) {
+    for (index, row) in arrays::values(probabilities).chunks_exact(instances).enumerate() {
+        if let Some(column) = row.iter().position(|value| !(value.is_finite() && *value >= 0.0)) {
+            return Err(PyValueError::new_err(format!(
+                "identities hold {} at row {index}, column {column}: probabilities are finite and at least 0",
+                row[column]
+            )));
+        }
         // What a row lacks of one belongs to no instance.
         let sum: f32 = row.iter().sum();
         if sum <= 0.0 {

@@ -45,6 +45,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<camera::Camera>()?;
     module.add_class::<dataset::Dataset>()?;
     module.add_class::<field::Field>()?;
+    module.add_class::<export::LabelPattern>()?;
     module.add_function(wrap_pyfunction!(run, module)?)?;
     module.add_function(wrap_pyfunction!(end_with_reader, module)?)?;
     module.add_function(wrap_pyfunction!(dataset::open_dataset, module)?)?;

@@ -12,8 +12,8 @@ use crate::node::{self, Naming, NodeInput};
 use crate::opacities::{self, Opacities};
 use crate::source::FieldMotion;
 use crate::{
-    MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, proxy, visibility,
-    world,
+    MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, naming, proxy,
+    visibility, world,
 };
 
 /// Share of an instance's weight that may be outliers when a motion model is chosen.
@@ -65,8 +65,9 @@ pub fn build_from(
 
     let input = NodeInput { field, reference: &reference, identities: &identities };
     let mut nodes: Vec<Node> = Vec::with_capacity(groups.len());
+    let mut names = naming::Names::default();
     for ((owner, group), chosen) in group_owners.iter().zip(&groups).zip(chosen) {
-        let naming = Naming::of(field, *owner, &nodes);
+        let naming = Naming::of(field, *owner, &mut names);
         nodes.push(node::node(&input, naming, group, chosen));
     }
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);

@@ -5,7 +5,8 @@ use cif_field::RecordedCamera;
 use crate::{CameraSample, CameraTrack, naming};
 
 /// One track per camera name; views at one time under one name go to tracks of their own (`name_2`, ...),
-/// trained views first. `time_code` gives the time code of a time index, `None` outside the exported range.
+/// trained views first. `time_code` gives the time code of a time index, later ones to later times, `None` outside the
+/// exported range.
 #[must_use]
 pub fn camera_tracks(
     cameras: &[RecordedCamera],
@@ -14,22 +15,26 @@ pub fn camera_tracks(
     let mut order: Vec<&RecordedCamera> = cameras.iter().collect();
     order.sort_by(|a, b| (&a.name, a.time_index, !a.trained).cmp(&(&b.name, b.time_index, !b.trained)));
     let mut tracks: Vec<CameraTrack> = Vec::new();
-    // Tracks from here on carry the label at hand.
-    let mut first_of_label = 0;
+    let mut names = naming::Names::default();
+    // Tracks from the first on carry the label at hand, those before the second have a view at the time at hand.
+    let (mut first_of_label, mut first_free) = (0, 0);
     for recorded in order {
         let Some(time_code) = time_code(recorded.time_index) else { continue };
         let sample = CameraSample { time_code, camera: recorded.camera };
         if tracks.get(first_of_label).is_none_or(|track| track.label != recorded.name) {
             first_of_label = tracks.len();
+            first_free = tracks.len();
         }
-        let free = tracks[first_of_label..]
-            .iter_mut()
-            .find(|track| track.samples.last().is_some_and(|last| last.time_code < time_code));
+        let last = tracks.get(first_of_label).and_then(|track| track.samples.last());
+        if last.is_some_and(|last| last.time_code < time_code) {
+            first_free = first_of_label;
+        }
+        let free = tracks.get_mut(first_free);
+        first_free += 1;
         match free {
             Some(track) => track.samples.push(sample),
             None => {
-                let base = naming::identifier(&recorded.name, "camera");
-                let name = naming::unique(base, |name| tracks.iter().any(|track| track.name == name));
+                let name = names.take(naming::identifier(&recorded.name, "camera"));
                 tracks.push(CameraTrack { name, label: recorded.name.clone(), samples: vec![sample] });
             }
         }
@@ -54,6 +59,15 @@ mod tests {
             camera_from_world: pose,
         };
         RecordedCamera { name: name.into(), time_index, trained, camera }
+    }
+
+    /// Quadratic searches took a minute here.
+    #[test]
+    fn eighty_thousand_cameras_of_one_name_have_names_of_their_own() {
+        let cameras: Vec<_> = (0..80_000).map(|k| recorded("cam", k / 40_000, true, 0.0)).collect();
+        let tracks = camera_tracks(&cameras, |index| Some(index as f64));
+        assert_eq!((tracks.len(), tracks[39_999].name.as_str()), (40_000, "cam_40000"));
+        assert!(tracks.iter().all(|track| track.samples.len() == 2));
     }
 
     #[test]

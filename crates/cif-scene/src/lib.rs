@@ -23,6 +23,7 @@
 //! | [`camera_tracks`] | recorded cameras as tracks over time |
 //! | [`naming`] | names that every format accepts |
 //! | [`report`] | what the chosen motion models cost and miss |
+//! | [`label_pattern`] | labels with wildcards |
 //! | [`query`] | nodes by label |
 //! | [`diff`] | what differs between two graphs, object by object |
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
@@ -48,6 +49,7 @@ pub mod files;
 pub mod frames;
 pub mod graph;
 pub mod keys;
+pub mod label_pattern;
 pub mod level_of_detail;
 pub mod motion;
 pub mod naming;
@@ -80,6 +82,7 @@ pub use graph::{
     CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, Node, NodeKind,
     Origin, Part, PartsMotion, PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
+pub use label_pattern::LabelPattern;
 pub use level_of_detail::level_of_detail;
 pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
 pub use placement::PlacedSplats;

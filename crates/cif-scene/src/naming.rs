@@ -1,5 +1,7 @@
 //! Names that every format accepts: `[A-Za-z0-9_]`, not starting with a digit.
 
+use std::collections::{BTreeMap, BTreeSet};
+
 /// Name of the node that holds everything outside the instances.
 pub const BACKGROUND: &str = "background";
 
@@ -39,16 +41,30 @@ pub fn label_of_name(name: &str, id: u16) -> String {
     if label.is_empty() { name.to_owned() } else { label }
 }
 
-/// `name`, or `name_2`, `name_3`, ... where it is taken.
-#[must_use]
-pub fn unique(name: String, taken: impl Fn(&str) -> bool) -> String {
-    if !taken(&name) {
-        return name;
+/// Names that were given, so that none is given twice.
+#[derive(Clone, Debug, Default)]
+pub struct Names {
+    taken: BTreeSet<String>,
+    /// Last number given to a name that was asked for again.
+    numbers: BTreeMap<String, u64>,
+}
+
+impl Names {
+    /// Gives `name`, or `name_2`, `name_3`, ... where it is taken.
+    pub fn take(&mut self, name: String) -> String {
+        if self.taken.insert(name.clone()) {
+            return name;
+        }
+        // Names are never free again, so that the search goes on where it ended.
+        let number = self.numbers.entry(name.clone()).or_insert(1);
+        loop {
+            *number += 1;
+            let candidate = format!("{name}_{number}");
+            if self.taken.insert(candidate.clone()) {
+                return candidate;
+            }
+        }
     }
-    (2_u64..)
-        .map(|number| format!("{name}_{number}"))
-        .find(|candidate| !taken(candidate))
-        .expect("there are more numbers than names")
 }
 
 #[cfg(test)]
@@ -81,8 +97,11 @@ mod tests {
 
     #[test]
     fn taken_names_are_numbered() {
-        let taken = ["a", "a_2"];
-        assert_eq!(unique("a".into(), |name| taken.contains(&name)), "a_3");
-        assert_eq!(unique("b".into(), |name| taken.contains(&name)), "b");
+        let mut names = Names::default();
+        let mut take = |name: &str| names.take(name.to_owned());
+        assert_eq!(
+            ["a_2", "a", "a", "a", "b", "a_2"].map(&mut take),
+            ["a_2", "a", "a_3", "a_4", "b", "a_2_2"]
+        );
     }
 }

@@ -23,12 +23,11 @@ pub(crate) struct Naming {
 }
 
 impl Naming {
-    pub(crate) fn of(field: &Field, owner: Option<usize>, nodes: &[Node]) -> Self {
+    pub(crate) fn of(field: &Field, owner: Option<usize>, names: &mut naming::Names) -> Self {
         match owner {
             Some(index) => {
                 let instance = &field.instances[index];
-                let name = naming::instance_name(&instance.label, instance.id);
-                let name = naming::unique(name, |name| nodes.iter().any(|node| node.name == name));
+                let name = names.take(naming::instance_name(&instance.label, instance.id));
                 Self {
                     kind: NodeKind::Instance { id: instance.id, index },
                     name,
@@ -38,7 +37,7 @@ impl Naming {
             }
             None => Self {
                 kind: NodeKind::Background,
-                name: naming::BACKGROUND.to_owned(),
+                name: names.take(naming::BACKGROUND.to_owned()),
                 label: naming::BACKGROUND.to_owned(),
                 category: naming::BACKGROUND.to_owned(),
             },

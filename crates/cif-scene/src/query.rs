@@ -1,15 +1,14 @@
 //! Nodes by label.
 
 use cif_geometry::Bounds;
-use globset::{GlobBuilder, GlobMatcher};
 use serde::Serialize;
 
-use crate::{SceneGraph, world};
+use crate::{LabelPattern, SceneGraph, world};
 
 /// What to look for, and when.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelQuery {
-    /// Label, class or instance name; case does not matter, `*`, `?` and `[...]` are wildcards.
+    /// Label, class or instance name; see [`LabelPattern`].
     pub pattern: String,
     /// Time code at which transforms, boxes and labels are taken; `None` takes the default time.
     pub time_code: Option<f64>,
@@ -38,14 +37,6 @@ pub struct LabelMatch {
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum QueryError {
-    /// Not a glob.
-    #[error("'{pattern}' is not a label pattern: {reason}")]
-    Pattern {
-        /// Given pattern.
-        pattern: String,
-        /// What is wrong with it.
-        reason: String,
-    },
     /// No object carries the label.
     #[error("no object is labelled '{pattern}' in {place}; known labels: {}", list(.known))]
     Unknown {
@@ -63,20 +54,10 @@ fn list(known: &[String]) -> String {
 }
 
 impl LabelQuery {
-    /// Compiles the pattern.
-    ///
-    /// # Errors
-    /// [`QueryError::Pattern`] when it is no glob.
-    pub fn matcher(&self) -> Result<GlobMatcher, QueryError> {
-        GlobBuilder::new(self.pattern.trim())
-            .case_insensitive(true)
-            .literal_separator(false)
-            .build()
-            .map(|glob| glob.compile_matcher())
-            .map_err(|error| QueryError::Pattern {
-                pattern: self.pattern.clone(),
-                reason: error.kind().to_string(),
-            })
+    /// The pattern, ready to match.
+    #[must_use]
+    pub fn matcher(&self) -> LabelPattern {
+        LabelPattern::new(&self.pattern)
     }
 
     /// The error for a pattern that matches none of `known`; sorts them and drops doubles.
@@ -98,15 +79,15 @@ pub fn corners(bounds: &Bounds) -> (Option<[f64; 3]>, Option<[f64; 3]>) {
 /// Without a time code the first sample counts.
 ///
 /// # Errors
-/// When the pattern is no glob, or nothing matches.
+/// When nothing matches.
 pub fn query(graph: &SceneGraph, query: &LabelQuery, place: &str) -> Result<Vec<LabelMatch>, QueryError> {
-    let matcher = query.matcher()?;
+    let matcher = query.matcher();
     let time_code = query.time_code.unwrap_or_else(|| graph.time_codes.start());
     let mut known = Vec::new();
     let mut found = Vec::new();
     for node in &graph.nodes {
         let names = [&node.label, &node.category, &node.name];
-        if names.iter().any(|name| matcher.is_match(name.as_str())) {
+        if names.iter().any(|name| matcher.matches(name)) {
             let rows = world::world_matrix(&graph.frame, &node.world_transform(time_code));
             let (low, high) = corners(&world::world_bounds(&graph.frame, node.bounds(time_code)));
             found.push(LabelMatch {

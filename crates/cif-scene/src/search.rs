@@ -26,7 +26,7 @@ pub const TAXONOMY_INSTANCE: &str = "instance";
 /// What to look for; an object has to meet every condition given.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ObjectQuery {
-    /// Label, class or unique name; case does not matter, `*`, `?` and `[...]` are wildcards.
+    /// Label, class or unique name; see [`crate::LabelPattern`].
     pub label: Option<String>,
     /// Only labels of this taxonomy count; [`TAXONOMY_CLASS`] holds classes and human labels,
     /// [`TAXONOMY_INSTANCE`] unique names.
@@ -93,6 +93,9 @@ impl ObjectQuery {
     }
 }
 
+/// Most time codes that are sampled in an interval.
+const MAX_CODES: f64 = 10_000.0;
+
 /// Time codes at which speed and box are sampled: around a time code half a code to either side, over an interval its
 /// ends and the whole codes between them.
 #[must_use]
@@ -107,13 +110,10 @@ pub fn sampled_codes(when: When, start: f64, end: f64) -> Vec<f64> {
             let mut codes = vec![first];
             // An interval far outside the samples is not walked code by code.
             let (from, to) = (first.max(start).floor(), last.min(end).ceil());
-            let mut code = from + 1.0;
-            while code < to {
-                if code > first && code < last {
-                    codes.push(code);
-                }
-                code += 1.0;
-            }
+            // Nor is one of a timeline without measure.
+            let step = ((to - from) / MAX_CODES).ceil().max(1.0);
+            let walked = (1..).map(|k| from + step * f64::from(k)).take_while(|code| *code < to);
+            codes.extend(walked.filter(|code| *code > first && *code < last));
             codes.push(last);
             codes
         }
@@ -163,7 +163,7 @@ pub fn volume(hulls: f64, bounds: &Bounds) -> (Option<f64>, Option<VolumeOf>) {
 /// hidden at the time, or over the whole interval, do not count. `path` makes the path of a node from its name.
 ///
 /// # Errors
-/// When the pattern is no glob, or no node carries the label at all.
+/// When no node carries the label at all.
 pub fn search(
     graph: &SceneGraph,
     wanted: &ObjectQuery,
@@ -171,7 +171,7 @@ pub fn search(
     path: impl Fn(&str) -> String,
 ) -> Result<Vec<ObjectMatch>, QueryError> {
     let label_query = wanted.label_query();
-    let matcher = label_query.as_ref().map(LabelQuery::matcher).transpose()?;
+    let matcher = label_query.as_ref().map(LabelQuery::matcher);
     let codes = &graph.time_codes;
     let sampled = sampled_codes(wanted.when, codes.start(), codes.end());
     let at = match wanted.when {
@@ -188,8 +188,7 @@ pub fn search(
         .into_iter()
         .filter_map(|(taxonomy, name)| wanted.counts(taxonomy).then_some(name))
         .collect();
-        let carries =
-            names.iter().any(|name| matcher.as_ref().is_none_or(|glob| glob.is_match(name.as_str())));
+        let carries = names.iter().any(|name| matcher.as_ref().is_none_or(|pattern| pattern.matches(name)));
         known.extend(names.into_iter().cloned());
         labelled |= carries;
         if carries && let Some(object) = describe(graph, node, wanted, at, &sampled, &path) {
@@ -251,6 +250,9 @@ mod tests {
         assert_eq!(sampled_codes(When::At(12.0), 0.0, 10.0), [9.5, 10.0]);
         assert_eq!(sampled_codes(When::Over(1.5, 4.0), 0.0, 10.0), [1.5, 2.0, 3.0, 4.0]);
         assert_eq!(sampled_codes(When::Over(-1e300, 1e300), 0.0, 2.0), [-1e300, 1.0, 1e300]);
+        // One more than these numbers is these numbers again.
+        assert!(sampled_codes(When::Over(0.0, 1e30), 1e17, 1e18).len() < 10_003);
+        assert!(sampled_codes(When::Over(-1e30, 1e30), -1e30, 1e30).len() < 10_003);
     }
 
     #[test]

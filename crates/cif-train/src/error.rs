@@ -1,6 +1,6 @@
 //! What stops a run.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
@@ -126,6 +126,14 @@ pub enum TrainError {
         /// Stage it stands in.
         stage: Stage,
     },
+    /// Something is wrong with the scene that the run goes on from.
+    #[error("{}: {problem}", path.display())]
+    Scene {
+        /// File of the scene.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: Box<TrainError>,
+    },
     /// The checkpoint belongs to another capture.
     #[error("the checkpoint was trained on another capture: {what} was {expected}, and is {found} in {}", root.display())]
     OtherCapture {
@@ -138,4 +146,21 @@ pub enum TrainError {
         /// Folder of the capture given.
         root: PathBuf,
     },
+}
+
+impl TrainError {
+    /// The error with the file of the scene that a run goes on from, where something is wrong with that scene:
+    /// readers of scenes in memory do not know it.
+    #[must_use]
+    pub fn of_scene(self, path: &Path) -> Self {
+        match self {
+            Self::Config(_)
+            | Self::Deformation(_)
+            | Self::RecordedMotion { .. }
+            | Self::NoState
+            | Self::BadState { .. }
+            | Self::OtherCapture { .. } => Self::Scene { path: path.to_owned(), problem: Box::new(self) },
+            other => other,
+        }
+    }
 }

@@ -216,7 +216,10 @@ fn a_checkpoint_is_refused_without_state_or_for_another_capture() {
     assert!(error.to_string().contains("adam.means.second"), "{error}");
     let mut newer = trainer.checkpoint(true);
     newer.training.as_mut().unwrap().json["version"] = 99.into();
-    assert!(matches!(refuse(dataset, newer), TrainError::BadState { .. }));
+    let error = refuse(dataset, newer);
+    assert!(matches!(error, TrainError::BadState { .. }));
+    let named = error.of_scene(std::path::Path::new("table.cif")).to_string();
+    assert!(named.starts_with("table.cif: the training state"), "{named}");
 }
 
 #[test]

@@ -14,7 +14,7 @@ use crate::{UsdError, conventions, tokens};
 
 pub(crate) fn search(path: &Path, wanted: &ObjectQuery) -> Result<Vec<ObjectMatch>, UsdError> {
     let label_query = wanted.label_query();
-    let matcher = label_query.as_ref().map(LabelQuery::matcher).transpose()?;
+    let matcher = label_query.as_ref().map(LabelQuery::matcher);
     pxr::with(|pxr| {
         let stage = crate::read::open::open(pxr, path)?;
         let python = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
@@ -28,7 +28,7 @@ pub(crate) fn search(path: &Path, wanted: &ObjectQuery) -> Result<Vec<ObjectMatc
                 by_taxonomy.iter().filter(|(taxonomy, labels)| wanted.counts(taxonomy) && !labels.is_empty());
             let labels: Vec<String> = counted.flat_map(|(_, labels)| labels.clone()).collect();
             let carries = match &matcher {
-                Some(glob) => labels.iter().any(|label| glob.is_match(label)),
+                Some(pattern) => labels.iter().any(|label| pattern.matches(label)),
                 None => !labels.is_empty(),
             };
             known.extend(labels);

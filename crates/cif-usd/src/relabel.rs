@@ -26,9 +26,7 @@ pub(crate) fn relabel(
     let extension =
         path.extension().map(|extension| extension.to_string_lossy().to_lowercase()).unwrap_or_default();
     let refused = |problem: String| UsdError::Relabel { path: path.to_owned(), problem };
-    if !path.is_file() {
-        return Err(UsdError::NotFound { path: path.to_owned() });
-    }
+    crate::read::open::check_file(path)?;
     if !EXTENSIONS.contains(&extension.as_str()) {
         return Err(refused(
             "labels are edited in .usda, .usdc and .usd; label the scene it was exported from, or unpack the \

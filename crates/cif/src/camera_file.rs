@@ -59,7 +59,7 @@ struct Entry {
 /// # Errors
 /// When it cannot be read, is not in the format, or describes an impossible camera.
 pub fn read(path: &Path) -> Result<Vec<View>, Error> {
-    let text = std::fs::read_to_string(path).map_err(Error::io("read the camera file", path))?;
+    let text = cif_input::read_to_string(path).map_err(Error::io("read the camera file", path))?;
     let entries: Vec<Entry> = serde_json::from_str(&text).map_err(|error| {
         let start =
             text.split_inclusive('\n').take(error.line().saturating_sub(1)).map(str::len).sum::<usize>();

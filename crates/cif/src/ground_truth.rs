@@ -70,7 +70,7 @@ pub struct MotionError {
 /// # Errors
 /// When it cannot be read, or is not in the format.
 pub fn read(path: &Path) -> Result<GroundTruth, Error> {
-    let text = std::fs::read_to_string(path).map_err(Error::io("read the known motion", path))?;
+    let text = cif_input::read_to_string(path).map_err(Error::io("read the known motion", path))?;
     let truth: GroundTruth = serde_json::from_str(&text).map_err(|error| {
         Error::failed(
             format!("{}: {error}", path.display()),

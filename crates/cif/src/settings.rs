@@ -3,8 +3,11 @@
 //! Works on any configuration type: keys are those the type serialises, values are checked by deserialising
 //! it after every single change, so that an error always points at the one key that caused it.
 
-use std::path::Path;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
 
+use cif_train::TrainConfig;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 use toml::de::{DeTable, DeValue};
@@ -17,6 +20,15 @@ use crate::error::Error;
 pub struct Layers<T> {
     table: Table,
     value: T,
+    /// Keys that were set, in the order of time.
+    origins: Vec<(String, Origin)>,
+}
+
+/// Where a value came from.
+#[derive(Clone, Debug)]
+enum Origin {
+    Flag(String),
+    File { path: PathBuf, text: Rc<str>, span: Range<usize> },
 }
 
 impl<T: Serialize + DeserializeOwned> Layers<T> {
@@ -27,7 +39,7 @@ impl<T: Serialize + DeserializeOwned> Layers<T> {
     #[must_use]
     pub fn new(preset: T) -> Self {
         let table = Table::try_from(&preset).expect("configurations serialise to TOML tables");
-        Self { table, value: preset }
+        Self { table, value: preset, origins: Vec::new() }
     }
 
     /// Lays the keys of a TOML file over the present values.
@@ -35,15 +47,19 @@ impl<T: Serialize + DeserializeOwned> Layers<T> {
     /// # Errors
     /// At the first key that is unknown or has an impossible value, with its line.
     pub fn file(&mut self, path: &Path) -> Result<(), Error> {
-        let text = std::fs::read_to_string(path).map_err(Error::io("read the settings", path))?;
+        let text = cif_input::read_to_string(path).map_err(Error::io("read the settings", path))?;
         let parsed = DeTable::parse(&text).map_err(|error| {
             Error::in_text(path, &text, error.span().unwrap_or(0..0), error.message().trim(), None)
         })?;
+        let shared: Rc<str> = text.as_str().into();
         for leaf in leaves(parsed.get_ref(), "") {
             self.assign(&leaf.key, leaf.value).map_err(|rejected| {
-                let span = if rejected.unknown { leaf.key_span } else { leaf.value_span };
+                let span = if rejected.unknown { leaf.key_span } else { leaf.value_span.clone() };
                 Error::in_text(path, &text, span, rejected.message, rejected.help)
             })?;
+            let origin =
+                Origin::File { path: path.to_owned(), text: Rc::clone(&shared), span: leaf.value_span };
+            self.origins.push((leaf.key, origin));
         }
         Ok(())
     }
@@ -76,7 +92,26 @@ impl<T: Serialize + DeserializeOwned> Layers<T> {
         self.assign(key, value.into()).map_err(|rejected| Error::Failed {
             message: format!("{flag}: {}", rejected.message),
             help: rejected.help,
-        })
+        })?;
+        self.origins.push((key.to_owned(), Origin::Flag(flag.to_owned())));
+        Ok(())
+    }
+
+    /// The error for a value that cannot work, with the line of the file or the flag that it came from. A key that
+    /// nobody set was made impossible by another of its table: the last one that was set is pointed at.
+    #[must_use]
+    pub fn refused(&self, key: &str, message: String) -> Error {
+        let name = key.split('[').next().unwrap_or(key);
+        let table = |key: &str| key.rsplit_once('.').map(|(table, _)| table.to_owned());
+        let last = |fits: &dyn Fn(&str) -> bool| self.origins.iter().rev().find(|(key, _)| fits(key));
+        let found = last(&|key| key == name).or_else(|| last(&|key| table(key) == table(name)));
+        match found.map(|(_, origin)| origin) {
+            Some(Origin::File { path, text, span }) => {
+                Error::in_text(path, text, span.clone(), message, None)
+            }
+            Some(Origin::Flag(flag)) => Error::plain(format!("{flag}: {message}")),
+            None => Error::plain(message),
+        }
     }
 
     /// The result.
@@ -112,6 +147,19 @@ impl<T: Serialize + DeserializeOwned> Layers<T> {
     }
 }
 
+impl Layers<TrainConfig> {
+    /// The result, where every setting can work.
+    ///
+    /// # Errors
+    /// At the first setting that cannot, see [`Layers::refused`].
+    pub fn validated(self) -> Result<TrainConfig, Error> {
+        match self.value.validate() {
+            Ok(()) => Ok(self.value),
+            Err(error) => Err(self.refused(error.key, error.to_string())),
+        }
+    }
+}
+
 struct Rejected {
     unknown: bool,
     message: String,
@@ -120,9 +168,9 @@ struct Rejected {
 
 struct Leaf {
     key: String,
-    key_span: std::ops::Range<usize>,
+    key_span: Range<usize>,
     value: Value,
-    value_span: std::ops::Range<usize>,
+    value_span: Range<usize>,
 }
 
 /// Values of a parsed file in the order of the text, tables opened.
@@ -295,6 +343,28 @@ mod tests {
     fn broken_toml_names_the_line() {
         let error = file("seed = 3\nrate = \n").unwrap_err();
         assert!(error.to_string().contains("settings.toml:2"), "{error}");
+    }
+
+    #[test]
+    fn values_out_of_range_name_the_line_or_the_flag_that_they_came_from() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mine.toml");
+        std::fs::write(&path, "seed = 3\n[model]\nspatial_resolution = [0, 8, 8]\n").unwrap();
+        let refused = |set: &[&str], file: bool| {
+            let mut layers = Layers::new(TrainConfig::default());
+            if file {
+                layers.file(&path).unwrap();
+            }
+            set.iter().for_each(|assignment| layers.assignment(assignment).unwrap());
+            layers.validated().unwrap_err().to_string()
+        };
+        let text = refused(&[], true);
+        assert!(text.contains("mine.toml:3: setting `model.spatial_resolution[0]` is 0"), "{text}");
+        let text = refused(&["rates.opacity=-1"], false);
+        assert!(text.starts_with("--set rates.opacity: setting `rates.opacity` is -1"), "{text}");
+        // Nobody set stages.fine_includes_coarse; what is incompatible with it is pointed at.
+        let text = refused(&["stages.fine=1", "seed=4"], false);
+        assert!(text.starts_with("--set stages.fine: "), "{text}");
     }
 
     #[test]

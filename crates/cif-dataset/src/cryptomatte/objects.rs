@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use crate::files::json;
+use crate::files::{json, listing};
 use crate::{Error, InstanceLabel};
 
 /// Mask value by object id; 0 for what belongs to no instance.
@@ -20,7 +20,8 @@ const OBJECTS_FILE: &str = "objects.json";
 /// # Errors
 /// When the file does not hold names with ids from 0 to 65 535.
 pub(crate) fn explicit(folder: Option<&Path>) -> Result<BTreeMap<String, u16>, Error> {
-    let Some(path) = folder.map(|folder| folder.join(OBJECTS_FILE)).filter(|path| path.is_file()) else {
+    let Some(path) = folder.map(|folder| folder.join(OBJECTS_FILE)).filter(|path| listing::is_there(path))
+    else {
         return Ok(BTreeMap::new());
     };
     let value: serde_json::Value = json::read(&path)?;

@@ -34,7 +34,7 @@ pub struct Header {
 /// # Errors
 /// When the file is missing, damaged, no EXR, or has no Cryptomatte with a manifest.
 pub fn read_header(path: &Path) -> Result<Header, Error> {
-    let file_size = std::fs::metadata(path).map_err(Error::read(path))?.len();
+    let file_size = cif_input::check(path).map_err(Error::read(path))?;
     let meta = MetaData::read_from_file(path, false)
         .map_err(|error| Error::mask(path, format!("not a readable EXR file ({error}); export it again")))?;
     let Some(first) = meta.headers.first() else {
@@ -138,7 +138,7 @@ fn side_car(path: &Path, file: &str) -> Result<String, Error> {
         return Err(Error::mask(path, format!("its manifest {file} lies outside its folder")));
     }
     let manifest = path.with_file_name(file);
-    std::fs::read_to_string(&manifest).map_err(Error::read(&manifest))
+    cif_input::read_to_string(&manifest).map_err(Error::read(&manifest))
 }
 
 fn parse_manifest(path: &Path, manifest: &str, hashed: bool) -> Result<BTreeMap<String, u32>, Error> {
@@ -150,6 +150,12 @@ fn parse_manifest(path: &Path, manifest: &str, hashed: bool) -> Result<BTreeMap<
     })?;
     let mut objects = BTreeMap::new();
     for (name, hexadecimal) in entries {
+        if name.contains('\0') {
+            return Err(Error::mask(
+                path,
+                format!("its manifest names {name:?}, with a NUL character; leave it out"),
+            ));
+        }
         let id = u32::from_str_radix(&hexadecimal, 16).map_err(|_| {
             Error::mask(
                 path,

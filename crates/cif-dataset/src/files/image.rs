@@ -7,6 +7,7 @@ use std::path::Path;
 use cif_geometry::PixelGrid;
 use image::{DynamicImage, ImageDecoder, ImageReader};
 
+use super::MAX_DEFLATE_RATIO;
 use crate::Error;
 
 /// What the header of an image says.
@@ -22,7 +23,8 @@ fn problem(path: &Path) -> impl Fn(image::ImageError) -> Error + '_ {
 }
 
 fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, Error> {
-    ImageReader::open(path).map_err(Error::read(path))?.with_guessed_format().map_err(Error::read(path))
+    let file = cif_input::open(path).map_err(Error::read(path))?;
+    ImageReader::new(BufReader::new(file)).with_guessed_format().map_err(Error::read(path))
 }
 
 /// Reads the header of an image, and for PNG checks that the file is whole.
@@ -38,6 +40,13 @@ pub(crate) fn probe(path: &Path) -> Result<ImageHeader, Error> {
         return Err(Error::Image { path: path.to_owned(), problem: "it has no pixels".to_owned() });
     }
     let has_alpha = decoder.color_type().has_alpha();
+    let size = cif_input::check(path).map_err(Error::read(path))?;
+    // Palettes of one bit are decoded to three bytes.
+    if png && decoder.total_bytes() / 24 > size.saturating_mul(MAX_DEFLATE_RATIO) {
+        let problem =
+            format!("its header claims {width} x {height} pixels, more than its {size} bytes can hold");
+        return Err(Error::Image { path: path.to_owned(), problem });
+    }
     if png && !ends_with_iend(path)? {
         // Bytes after the end are legal, so that only decoding can tell.
         decode(path)?;
@@ -47,7 +56,7 @@ pub(crate) fn probe(path: &Path) -> Result<ImageHeader, Error> {
 
 /// Whether the last chunk of a PNG file is there.
 fn ends_with_iend(path: &Path) -> Result<bool, Error> {
-    let mut file = File::open(path).map_err(Error::read(path))?;
+    let mut file = cif_input::open(path).map_err(Error::read(path))?;
     let size = file.metadata().map_err(Error::read(path))?.len();
     file.seek(SeekFrom::Start(size.saturating_sub(8))).map_err(Error::read(path))?;
     let mut tail = Vec::new();

@@ -14,11 +14,11 @@ const MAX_BYTES: u64 = 1 << 30;
 /// # Errors
 /// When it cannot be read, or its text does not fit `T`; the message has line and column.
 pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Error> {
-    let size = std::fs::metadata(path).map_err(Error::read(path))?.len();
+    let size = cif_input::check(path).map_err(Error::read(path))?;
     if size > MAX_BYTES {
         return Err(Error::invalid(path, format!("{size} bytes are too many for a JSON file of a capture")));
     }
-    let text = std::fs::read(path).map_err(Error::read(path))?;
+    let text = cif_input::read(path).map_err(Error::read(path))?;
     serde_json::from_slice(&text).map_err(|error| Error::Json {
         path: path.to_owned(),
         line: error.line(),

@@ -47,6 +47,11 @@ pub(crate) fn count_images_below(folder: &Path) -> Result<usize, Error> {
     Ok(count)
 }
 
+/// Whether a file is there, if only one that its reader will refuse, such as a named pipe.
+pub(crate) fn is_there(path: &Path) -> bool {
+    path.exists() && !path.is_dir()
+}
+
 /// Whether the extension is one of an image that can be read.
 pub(crate) fn is_image(path: &Path) -> bool {
     has_extension(path, &["png", "jpg", "jpeg"])
@@ -66,7 +71,7 @@ pub(crate) fn stem(path: &Path) -> String {
 
 /// The image at `path`, or with an extension added where the capture leaves it out.
 pub(crate) fn with_image_extension(path: &Path) -> Option<PathBuf> {
-    if is_image(path) && path.is_file() {
+    if is_image(path) && is_there(path) {
         return Some(path.to_owned());
     }
     ["png", "jpg", "jpeg", "PNG", "JPG", "JPEG"]
@@ -77,5 +82,5 @@ pub(crate) fn with_image_extension(path: &Path) -> Option<PathBuf> {
             name.push(extension);
             PathBuf::from(name)
         })
-        .find(|candidate| candidate.is_file())
+        .find(|candidate| is_there(candidate))
 }

@@ -7,6 +7,7 @@ use std::path::Path;
 use cif_geometry::PixelGrid;
 use png::{BitDepth, ColorType, Decoder, Limits, Transformations};
 
+use super::MAX_DEFLATE_RATIO;
 use crate::Error;
 
 /// Larger masks than this are refused before anything is allocated.
@@ -22,7 +23,8 @@ pub(crate) struct MaskHeader {
 }
 
 fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
-    let file = File::open(path).map_err(Error::read(path))?;
+    let file = cif_input::open(path).map_err(Error::read(path))?;
+    let size = file.metadata().map_err(Error::read(path))?.len();
     let mut decoder = Decoder::new_with_limits(BufReader::new(file), Limits { bytes: 1 << 31 });
     // Palette indices and 16-bit values must arrive as they are stored.
     decoder.set_transformations(Transformations::IDENTITY);
@@ -49,6 +51,14 @@ fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
     }
     if u64::from(info.width) * u64::from(info.height) > MAX_PIXELS {
         return Err(Error::mask(path, format!("{} x {} pixels are too many", info.width, info.height)));
+    }
+    let row = (u64::from(info.width) * info.bits_per_pixel() as u64).div_ceil(8);
+    if row * u64::from(info.height) > size.saturating_mul(MAX_DEFLATE_RATIO) {
+        let problem = format!(
+            "its header claims {} x {} pixels, more than its {size} bytes can hold; export it again",
+            info.width, info.height
+        );
+        return Err(Error::mask(path, problem));
     }
     Ok(reader)
 }
@@ -112,7 +122,7 @@ pub(crate) fn decode_binary(path: &Path) -> Result<PixelGrid<u16>, Error> {
     let damaged = |error: image::ImageError| {
         Error::mask(path, format!("it cannot be decoded ({error}); export it again"))
     };
-    let file = File::open(path).map_err(Error::read(path))?;
+    let file = cif_input::open(path).map_err(Error::read(path))?;
     let mut reader = image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png);
     let mut limits = image::Limits::default();
     (limits.max_image_width, limits.max_image_height) = (Some(1 << 16), Some(1 << 16));

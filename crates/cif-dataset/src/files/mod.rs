@@ -7,3 +7,6 @@ pub(crate) mod mask;
 pub(crate) mod npy;
 pub(crate) mod ply;
 pub(crate) mod video;
+
+/// No PNG holds more than this per byte, as DEFLATE cannot pack more: a header that claims more is not believed.
+pub(crate) const MAX_DEFLATE_RATIO: u64 = 1032;

@@ -22,7 +22,7 @@ pub(crate) struct Matrix {
 /// # Errors
 /// When the file is not such a matrix, or shorter than its header claims.
 pub(crate) fn read_matrix(path: &Path) -> Result<Matrix, Error> {
-    let bytes = std::fs::read(path).map_err(Error::read(path))?;
+    let bytes = cif_input::read(path).map_err(Error::read(path))?;
     check_header(&bytes).map_err(|problem| Error::invalid(path, problem))?;
     let file = NpyFile::new(bytes.as_slice())
         .map_err(|error| Error::invalid(path, format!("not a NumPy array ({error})")))?;

@@ -1,6 +1,5 @@
 //! Vertices of PLY files, ASCII and binary.
 
-use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
@@ -53,7 +52,7 @@ impl PropertyAccess for Vertex {
 /// # Errors
 /// When the file is no PLY, lacks x, y, z, or is shorter than its header claims.
 pub(crate) fn read_points(path: &Path) -> Result<RawPoints, Error> {
-    let file = File::open(path).map_err(Error::read(path))?;
+    let file = cif_input::open(path).map_err(Error::read(path))?;
     let size = file.metadata().map_err(Error::read(path))?.len();
     let mut reader = Reader::new(BufReader::new(file));
     let parser = Parser::<Vertex>::new();

@@ -23,6 +23,7 @@ pub(crate) fn frames(root: &Path, video: &Path, images: &Path) -> Result<Vec<Pat
 }
 
 fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Result<Vec<PathBuf>, Error> {
+    cif_input::check(video).map_err(Error::read(video))?;
     let name = listing::stem(video);
     let caches =
         [root.join(CACHE), std::env::temp_dir().join(format!("cif_frames_{:016x}", fingerprint(root)))];

@@ -6,6 +6,7 @@
 use std::path::Path;
 
 use super::{Draft, DraftFrame, Source, customary_points, transforms};
+use crate::files::listing;
 use crate::{Error, Split};
 
 /// Half edge of the box for random points (methods reference 1.1).
@@ -15,19 +16,19 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let root = source.root;
     let [train, val, test] =
         ["train", "val", "test"].map(|split| root.join(format!("transforms_{split}.json")));
-    if !train.is_file() {
+    if !listing::is_there(&train) {
         return Err(Error::MissingFile { path: train, fix: "it lists the frames to train on".to_owned() });
     }
     let mut warnings = Vec::new();
-    let held_out = if test.is_file() {
-        if val.is_file() {
+    let held_out = if listing::is_there(&test) {
+        if listing::is_there(&val) {
             warnings.push(format!(
                 "{}: not used; the frames of transforms_test.json are the held-out ones",
                 val.display()
             ));
         }
         Some(test)
-    } else if val.is_file() {
+    } else if listing::is_there(&val) {
         Some(val)
     } else {
         warnings.push(format!(

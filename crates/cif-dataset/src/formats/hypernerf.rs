@@ -55,7 +55,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let list_path = root.join("dataset.json");
     let list: DatasetFile = json::read(&list_path)?;
     let metadata_path = root.join("metadata.json");
-    if !metadata_path.is_file() {
+    if !listing::is_there(&metadata_path) {
         return Err(Error::MissingFile {
             path: metadata_path,
             fix: "a HyperNeRF capture keeps warp_id (time) and camera_id of every frame there".to_owned(),
@@ -81,7 +81,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         last_warp = last_warp.max(warp);
         let camera_path = root.join("camera").join(format!("{id}.json"));
         let image = listing::with_image_extension(&images.join(id));
-        let image = match (image, camera_path.is_file()) {
+        let image = match (image, listing::is_there(&camera_path)) {
             (Some(image), true) => image,
             (Some(image), false) => return Err(Error::ImageWithoutCamera { image, camera: camera_path }),
             (None, _) => {

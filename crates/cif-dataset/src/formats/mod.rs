@@ -20,6 +20,7 @@ use std::path::{Path, PathBuf};
 use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec2, DVec3};
 
+use crate::files::listing;
 use crate::points::RawPoints;
 use crate::{Error, Layout, OpenOptions, Split};
 
@@ -139,12 +140,12 @@ pub(crate) fn customary_points(root: &Path) -> Result<Option<(RawPoints, PathBuf
         "fused.ply",
     ] {
         let path = root.join(name);
-        if path.is_file() {
+        if listing::is_there(&path) {
             return Ok(Some((crate::files::ply::read_points(&path)?, path)));
         }
     }
     let path = root.join("points.npy");
-    if path.is_file() {
+    if listing::is_there(&path) {
         return Ok(Some((crate::points::read_npy(&path)?, path)));
     }
     Ok(None)

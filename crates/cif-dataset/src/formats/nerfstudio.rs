@@ -69,7 +69,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let points = match &file.ply_file_path {
         Some(name) => {
             let ply_path = root.join(transforms::clean(name));
-            if !ply_path.is_file() {
+            if !listing::is_there(&ply_path) {
                 return Err(Error::MissingFile {
                     path: ply_path,
                     fix: "ply_file_path in transforms.json names it; restore it or remove the entry"

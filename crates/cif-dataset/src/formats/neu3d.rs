@@ -107,7 +107,7 @@ fn views(root: &Path) -> Result<Vec<View>, Error> {
             images = listing::images(&folder)?;
         }
         let movie = root.join(format!("{name}.mp4"));
-        if images.is_empty() && movie.is_file() {
+        if images.is_empty() && listing::is_there(&movie) {
             images = video::frames(root, &movie, &folder.join("images"))?;
         }
         if images.is_empty() {

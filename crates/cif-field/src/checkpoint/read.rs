@@ -2,7 +2,6 @@
 //! one by one straight into place.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -36,12 +35,7 @@ fn validated(checkpoint: Checkpoint, path: &Path) -> Result<Checkpoint, Checkpoi
 /// As [`load`], with whatever values the file holds; shapes and sizes are right.
 pub(super) fn load_unchecked(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
     let failed = |source: io::Error| CheckpointError::Read { path: path.to_owned(), source };
-    let file = File::open(path).map_err(failed)?;
-    let metadata = file.metadata().map_err(failed)?;
-    if !metadata.is_file() {
-        let message = if metadata.is_dir() { "it is a folder" } else { "it is not a regular file" };
-        return Err(failed(io::Error::other(message)));
-    }
+    let file = cif_input::open(path).map_err(failed)?;
     read_unchecked(&mut BufReader::new(file), path, with_training)
 }
 

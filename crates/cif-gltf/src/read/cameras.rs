@@ -15,6 +15,7 @@ use crate::extras::{self, Cif};
 /// Reads the cameras of the scene; those that cannot be taken over are said in the warnings.
 pub(crate) fn read(builder: &mut Builder<'_>, placed: &[Placed]) -> Vec<CameraTrack> {
     let mut tracks: Vec<CameraTrack> = Vec::new();
+    let mut names = naming::Names::default();
     for placed in placed {
         let source = builder.stage.source;
         let node = &source.root.nodes[placed.index];
@@ -47,7 +48,7 @@ pub(crate) fn read(builder: &mut Builder<'_>, placed: &[Placed]) -> Vec<CameraTr
             builder.warnings.push(format!("{name}: the camera has no angle of view or no pose; left out"));
             continue;
         }
-        let name = naming::unique(name, |name| tracks.iter().any(|track| track.name == name));
+        let name = names.take(name);
         tracks.push(CameraTrack { name, label, samples });
     }
     tracks

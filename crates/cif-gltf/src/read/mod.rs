@@ -16,7 +16,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use cif_field::SortMetric;
-use cif_scene::{CaptureFrame, Motion, NodeKind, Origin, SceneGraph, TimeCodes, UpAxis};
+use cif_scene::{CaptureFrame, Motion, NodeKind, Origin, SceneGraph, TimeCodes, UpAxis, naming};
 use glam::{DAffine3, DVec3};
 
 use self::animation::Curves;
@@ -65,6 +65,7 @@ pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
         world: world.as_ref().map(|(placed, _)| (placed.index, moved)),
         warnings: &mut warnings,
         nodes: Vec::new(),
+        names: naming::Names::default(),
         used_ids: BTreeSet::new(),
         next_index: next_index(&hierarchy),
         next_row: (!is_traced(&source)).then_some(0),
@@ -75,6 +76,12 @@ pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
     }
     let cameras = cameras::read(&mut builder, &hierarchy.placed);
     let mut nodes = builder.nodes;
+    let objects = nodes.iter().flat_map(|node| [&node.label, &node.category]);
+    if let Some(name) =
+        objects.chain(cameras.iter().map(|track| &track.label)).find(|name| name.contains('\0'))
+    {
+        return Err(source.invalid(format!("the name {name:?}"), "it holds a NUL character; leave it out"));
+    }
     nodes.sort_by_key(|node| node.kind == NodeKind::Background);
     if nodes.is_empty() {
         return Err(GltfError::NoSplats { path: path.to_owned(), found: what_else(&source) });

@@ -69,6 +69,8 @@ pub(crate) struct Builder<'a> {
     pub(crate) world: Option<(usize, Option<DAffine3>)>,
     pub(crate) warnings: &'a mut Vec<String>,
     pub(crate) nodes: Vec<Node>,
+    /// Names of the nodes.
+    pub(crate) names: naming::Names,
     /// Ids of instances that are made already.
     pub(crate) used_ids: BTreeSet<u16>,
     /// Ids that our nodes carry.
@@ -177,11 +179,12 @@ impl Builder<'_> {
             object.stretch.determinant().cbrt()
         });
         let stretch = DMat3::from_diagonal(DVec3::splat(factor));
-        let mut parts = Vec::new();
+        let mut parts: Vec<Part> = Vec::new();
+        let mut names = naming::Names::default();
         if !splats.is_empty() {
             apply(splats, &stretch);
             let splats = 0..splats.len();
-            parts.push(part("whole".to_owned(), splats, DVec3::ZERO, Vec::new()));
+            parts.push(part(names.take("whole".to_owned()), splats, DVec3::ZERO, Vec::new()));
         }
         let position = |placed: &&Placed| match &placed.cif {
             Some(Cif::Part(part)) => part.part,
@@ -202,7 +205,7 @@ impl Builder<'_> {
                 Some(Cif::Part(part)) => (part.name.clone(), DVec3::from_array(part.pivot)),
                 _ => (format!("part_{:02}", parts.len()), movement.rest.translation),
             };
-            let name = naming::unique(name, |name| parts.iter().any(|part: &Part| part.name == name));
+            let name = names.take(name);
             let (pivot, mut track) = placement(&movement, written, false);
             for pose in &mut track {
                 pose.translation *= factor;
@@ -258,7 +261,7 @@ impl Builder<'_> {
         } else {
             naming::instance_name(&object.label, id)
         };
-        let name = self.unique(name);
+        let name = self.names.take(name);
         Ok(Named {
             kind: NodeKind::Instance { id, index: position },
             name,
@@ -271,10 +274,10 @@ impl Builder<'_> {
         })
     }
 
-    fn background(&self, object: &Object) -> Named {
+    fn background(&mut self, object: &Object) -> Named {
         Named {
             kind: NodeKind::Background,
-            name: self.unique(object.name.clone()),
+            name: self.names.take(object.name.clone()),
             label: object.label.clone(),
             category: object.category.clone(),
             pivot: Some(DVec3::from_array(object.pivot)),
@@ -296,7 +299,7 @@ impl Builder<'_> {
         let label = label.unwrap_or_else(|| "object".to_owned());
         Ok(Named {
             kind: NodeKind::Instance { id, index },
-            name: self.unique(naming::instance_name(&label, id)),
+            name: self.names.take(naming::instance_name(&label, id)),
             category: label.clone(),
             label,
             pivot: None,
@@ -304,10 +307,6 @@ impl Builder<'_> {
             source_frames: None,
             mean_occupancy: None,
         })
-    }
-
-    fn unique(&self, name: String) -> String {
-        naming::unique(name, |name| self.nodes.iter().any(|node| node.name == name))
     }
 
     fn new_instance(&mut self, node: usize) -> Result<(u16, usize), GltfError> {

@@ -1,8 +1,6 @@
 //! A glTF file in memory: its JSON, checked for what must be understood, and its buffers.
 
 use std::collections::BTreeMap;
-use std::fs;
-use std::io::Read;
 use std::ops::Range;
 use std::path::{Component, Path, PathBuf};
 use std::rc::Rc;
@@ -38,10 +36,7 @@ impl Source {
     /// Reads a file and everything it refers to.
     pub(crate) fn open(path: &Path) -> Result<Self, GltfError> {
         let failed = |source| FileError::Read { path: path.to_owned(), source };
-        if !fs::metadata(path).map_err(failed)?.is_file() {
-            return Err(unreadable(path, "it is not a file"));
-        }
-        let bytes = fs::read(path).map_err(failed)?;
+        let bytes = cif_input::read(path).map_err(failed)?;
         let (json, binary) =
             if bytes.starts_with(b"glTF") { split(path, &bytes)? } else { (0..bytes.len(), None) };
         let mut value: Value = serde_json::from_slice(&bytes[json])
@@ -131,14 +126,7 @@ impl Source {
 
     fn read_beside(&self, path: &Path, uri: &str) -> Result<Vec<u8>, String> {
         let failed = |error: std::io::Error| format!("{uri} cannot be read ({error})");
-        let file = fs::File::open(path).map_err(failed)?;
-        let metadata = file.metadata().map_err(failed)?;
-        if !metadata.is_file() {
-            return Err(format!("{uri} is not a file"));
-        }
-        let mut bytes = Vec::new();
-        file.take(metadata.len()).read_to_end(&mut bytes).map_err(failed)?;
-        Ok(bytes)
+        cif_input::read(path).map_err(failed)
     }
 
     /// Bytes of a buffer view.

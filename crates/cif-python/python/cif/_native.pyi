@@ -155,7 +155,7 @@ class Field:
     def query(self, points: NDArray[np.float64], time: float = 0.0) -> dict[str, NDArray[Any]]:
         """Tell what is at points [P, 3]: existence [P], instance [P] (-1 for none), probabilities [P, K]."""
     def find(self, label: str, time_code: float | None = None) -> list[dict[str, Any]]:
-        """Return objects by label, class or name (globs, any case): path, transform, low, high."""
+        """Return objects by label, class or name (see LabelPattern): path, transform, low, high."""
     def export(
         self,
         path: str | os.PathLike[str],
@@ -203,10 +203,17 @@ def open_dataset(
 ) -> Dataset:
     """Open a capture; masks name a folder inside it or anywhere."""
 
+class LabelPattern:
+    """A label to look for: ``*`` stands for any characters and ``?`` for one; case does not matter."""
+
+    def __init__(self, text: str) -> None: ...
+    def matches(self, label: str) -> bool:
+        """Tell whether a label is spelled so."""
+
 def query_stage(
     path: str | os.PathLike[str], label: str, time_code: float | None = None
 ) -> list[dict[str, Any]]:
-    """Return the prims that carry a label (globs, any case); an unknown label lists the known ones."""
+    """Return the prims that carry a label (see LabelPattern); an unknown label lists the known ones."""
 
 def import_scene(
     path: str | os.PathLike[str], *, base: Field | None = None, force_base: bool = False

@@ -11,13 +11,11 @@ Works on every stage with semantic labels (``UsdSemantics.LabelsAPI``), whoever 
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable
-from fnmatch import translate
 from pathlib import Path
 from typing import TYPE_CHECKING, Union
 
-from ._native import CifError
+from ._native import CifError, LabelPattern
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -40,7 +38,7 @@ def find(
 ) -> list[Usd.Prim]:
     """Return the prims that carry a label, in stage order.
 
-    ``label`` is a pattern (``*``, ``?``, ``[...]``; case does not matter) for any label of the prim: its class,
+    ``label`` is a pattern (``*`` and ``?`` are wildcards; case does not matter) for any label of the prim: its class,
     its human label or its unique name; ``None`` takes every labelled prim. ``taxonomy`` lets only labels of one
     taxonomy count, such as ``"class"`` or ``"instance"``. Labels are those at ``time``: a time code, a
     ``(first, last)`` interval in which they hold at any time, or by default the default time. With
@@ -50,7 +48,7 @@ def find(
     where its file has changed. Open it yourself to decide how long it lives.
     """
     opened = _open(stage)
-    pattern = None if label is None else re.compile(translate(label.strip()), re.IGNORECASE)
+    pattern = None if label is None else LabelPattern(label)
     found = []
     for prim, by_taxonomy in _walk(opened, time, inherited):
         names = [
@@ -59,7 +57,7 @@ def find(
             if taxonomy is None or key == taxonomy
             for name in values
         ]
-        if any(pattern is None or pattern.fullmatch(name) for name in names):
+        if any(pattern is None or pattern.matches(name) for name in names):
             found.append(prim)
     return found
 

@@ -1,5 +1,6 @@
 //! Cameras that differ. They say how the scene was captured: edits of them are told, never applied.
 
+use std::collections::BTreeMap;
 use std::fmt;
 
 use cif_geometry::PinholeCamera;
@@ -53,16 +54,20 @@ impl fmt::Display for CameraChange {
 
 /// Cameras that differ, matched by name: those of the first graph in its order, then added ones.
 pub(super) fn changes(before: &SceneGraph, after: &SceneGraph) -> Vec<CameraChange> {
-    let named = |tracks: &'_ [CameraTrack], name: &str| tracks.iter().position(|track| track.name == name);
+    let named = |tracks: &[CameraTrack]| -> BTreeMap<String, usize> {
+        // Of several of one name the first counts.
+        tracks.iter().enumerate().rev().map(|(index, track)| (track.name.clone(), index)).collect()
+    };
+    let (first_of, second_of) = (named(&before.cameras), named(&after.cameras));
     let change = |track: &CameraTrack, kind| CameraChange { name: track.name.clone(), kind };
-    let kept = before.cameras.iter().filter_map(|first| match named(&after.cameras, &first.name) {
-        Some(second) => compare(first, &after.cameras[second]).map(|kind| change(first, kind)),
+    let kept = before.cameras.iter().filter_map(|first| match second_of.get(&first.name) {
+        Some(&second) => compare(first, &after.cameras[second]).map(|kind| change(first, kind)),
         None => Some(change(first, CameraChangeKind::Removed)),
     });
     let added = after
         .cameras
         .iter()
-        .filter(|track| named(&before.cameras, &track.name).is_none())
+        .filter(|track| !first_of.contains_key(&track.name))
         .map(|track| change(track, CameraChangeKind::Added));
     kept.chain(added).collect()
 }

@@ -1,7 +1,7 @@
 //! Cameras: recorded ones and those of others.
 
 use cif_geometry::PinholeCamera;
-use cif_scene::{CameraSample, CameraTrack};
+use cif_scene::{CameraSample, CameraTrack, naming};
 use glam::{DVec2, DVec3};
 use pyo3::prelude::*;
 
@@ -25,7 +25,7 @@ const LENS: [(&str, f64); 5] = [
 pub(super) fn read<'py>(
     reading: &Reading<'_, 'py>,
     prim: &Bound<'py, PyAny>,
-    taken: &[String],
+    taken: &mut naming::Names,
 ) -> PyResult<Option<CameraTrack>> {
     let earliest = reading.pxr.earliest()?;
     let path = super::values::path(prim)?;

@@ -110,12 +110,12 @@ pub(super) fn names<'py>(
 }
 
 /// Name of a node for a prim: its own, made usable and unique.
-pub(super) fn node_name(prim: &Bound<'_, PyAny>, taken: &[String]) -> PyResult<String> {
+pub(super) fn node_name(prim: &Bound<'_, PyAny>, taken: &mut naming::Names) -> PyResult<String> {
     let name = text(&prim.call_method0("GetName")?)?;
     let usable = name.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
         && name.chars().all(|character| character.is_ascii_alphanumeric() || character == '_');
     let name = if usable { name } else { naming::identifier(&name, "instance") };
-    Ok(naming::unique(name, |name| taken.iter().any(|taken| taken == name)))
+    Ok(taken.take(name))
 }
 
 /// Changes of visibility of a prim, through its own attribute and those of its ancestors.

@@ -3,7 +3,7 @@
 use cif_geometry::{Bounds, RigidTransform};
 use cif_scene::{
     ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, MotionReport, Node, NodeKind, Part,
-    PartsMotion, PointProxy, PoseSample, Splats, extent,
+    PartsMotion, PointProxy, PoseSample, Splats, extent, naming,
 };
 use glam::{DAffine3, DQuat, DVec3};
 use pyo3::prelude::*;
@@ -45,7 +45,7 @@ pub(super) fn read<'py>(
     reading: &Reading<'_, 'py>,
     owner: &Owner<'py>,
     kind: NodeKind,
-    taken: &[String],
+    taken: &mut naming::Names,
 ) -> Result<Node, UsdError> {
     let python = |error: PyErr| reading.python(&error);
     let collapses = |path: &str| {
@@ -206,15 +206,15 @@ fn merge(sets: impl Iterator<Item = Splats>) -> Splats {
 /// Every piece a part with its own track.
 fn in_parts(owner: &Owner<'_>, pieces: Vec<Piece>, track: &Track) -> PyResult<(Motion, Splats)> {
     let (mut parts, mut sets, mut start) = (Vec::<Part>::new(), Vec::new(), 0);
+    let mut names = naming::Names::default();
     for (piece, prim) in pieces.into_iter().zip(&owner.splats) {
         let Placement::Rigid { track, baked: map } = piece.placement else { continue };
         let set = baked(piece.splats, map.unwrap_or(DAffine3::IDENTITY));
         let carrier = prim.carrier(&owner.prim)?;
-        let names: Vec<String> = parts.iter().map(|part| part.name.clone()).collect();
         let turned = track.rest.rotation != DQuat::IDENTITY;
         let samples = if track.samples.is_empty() && turned { vec![track.rest] } else { track.samples };
         parts.push(Part {
-            name: labels::node_name(&carrier, &names)?,
+            name: labels::node_name(&carrier, &mut names)?,
             splats: start..start + set.len(),
             pivot: part_pivot(&carrier)?.unwrap_or(track.rest.translation),
             track: samples,

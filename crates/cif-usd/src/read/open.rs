@@ -3,17 +3,24 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
+use cif_scene::files::FileError;
 use pyo3::prelude::*;
 use pyo3::types::PyList;
 
 use crate::UsdError;
 use crate::pxr::{Pxr, reason};
 
+/// Refuses what is no regular file: usd-core would wait for the end of a pipe.
+pub(crate) fn check_file(path: &Path) -> Result<(), UsdError> {
+    cif_input::check(path).map(drop).map_err(|source| match source.kind() {
+        std::io::ErrorKind::NotFound => UsdError::NotFound { path: path.to_owned() },
+        _ => FileError::Read { path: path.to_owned(), source }.into(),
+    })
+}
+
 /// A stage.
 pub(crate) fn open<'py>(pxr: &Pxr<'py>, path: &Path) -> Result<Bound<'py, PyAny>, UsdError> {
-    if !path.is_file() {
-        return Err(UsdError::NotFound { path: path.to_owned() });
-    }
+    check_file(path)?;
     pxr.usd
         .getattr("Stage")
         .and_then(|class| class.call_method1("Open", (path.as_os_str(),)))
@@ -42,9 +49,7 @@ pub(crate) fn open_with_layers<'py>(
     path: &Path,
     follow_external: bool,
 ) -> Result<(Bound<'py, PyAny>, u64), UsdError> {
-    if !path.is_file() {
-        return Err(UsdError::NotFound { path: path.to_owned() });
-    }
+    check_file(path)?;
     let unreadable = |reason: String| UsdError::Unreadable { path: path.to_owned(), reason };
     let file = path.canonicalize().map_err(|error| unreadable(error.to_string()))?;
     let mut walk = Walk {
@@ -122,6 +127,10 @@ impl<'py> Walk<'_, 'py> {
                 if !self.is_allowed(Path::new(outer(&resolved))) {
                     let path = self.path.to_owned();
                     return Err(UsdError::ExternalAsset { path, layer: layer_name, asset });
+                }
+                if let Err(error) = cif_input::check(outer(&resolved)) {
+                    let reason = format!("{resolved}, which {layer_name} names, cannot be read: {error}");
+                    return Err(UsdError::Unreadable { path: self.path.to_owned(), reason });
                 }
                 open.push(self.layer(&resolved)?);
             }

@@ -3,8 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use cif_scene::{LabelMatch, LabelQuery};
-use globset::GlobMatcher;
+use cif_scene::{LabelMatch, LabelPattern, LabelQuery};
 use pyo3::prelude::*;
 
 use super::open::open;
@@ -12,7 +11,7 @@ use crate::pxr::{self, Pxr, reason};
 use crate::{UsdError, conventions, tokens};
 
 pub(crate) fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdError> {
-    let matcher = query.matcher()?;
+    let matcher = query.matcher();
     pxr::with(|pxr| {
         let stage = open(pxr, path)?;
         let (found, known) = search(pxr, &stage, query, &matcher)
@@ -67,7 +66,7 @@ fn search<'py>(
     pxr: &Pxr<'py>,
     stage: &Bound<'py, PyAny>,
     query: &LabelQuery,
-    matcher: &GlobMatcher,
+    matcher: &LabelPattern,
 ) -> PyResult<(Vec<LabelMatch>, Vec<String>)> {
     let time = pxr.time_code(query.time_code)?;
     let labels_api = pxr.usd_semantics.getattr("LabelsAPI")?;
@@ -103,7 +102,7 @@ fn search<'py>(
             labels.sort();
             by_taxonomy.insert(taxonomy, labels);
         }
-        if by_taxonomy.values().flatten().any(|label| matcher.is_match(label)) {
+        if by_taxonomy.values().flatten().any(|label| matcher.matches(label)) {
             found.push(describe(&prim, &by_taxonomy, &time, &labels_api, &transforms, &boxes)?);
         }
         known.extend(by_taxonomy.into_values().flatten());

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_field::SortMetric;
-use cif_scene::{CaptureFrame, Node, NodeKind, Origin, SceneGraph, SceneOptions, TimeCodes, UpAxis};
+use cif_scene::{CaptureFrame, Node, NodeKind, Origin, SceneGraph, SceneOptions, TimeCodes, UpAxis, naming};
 use pyo3::prelude::*;
 
 use super::arrays::Arrays;
@@ -127,15 +127,14 @@ fn read<'py>(
     }
     let kinds = kinds(reading, &owners).map_err(failed)?;
     let mut nodes: Vec<Node> = Vec::with_capacity(owners.len());
+    let mut names = naming::Names::default();
     for (owner, kind) in owners.iter().zip(kinds) {
-        let taken: Vec<String> = nodes.iter().map(|node| node.name.clone()).collect();
-        nodes.push(nodes::read(reading, owner, kind, &taken)?);
+        nodes.push(nodes::read(reading, owner, kind, &mut names)?);
     }
     let mut cameras = Vec::with_capacity(camera_prims.len());
+    let mut names = naming::Names::default();
     for prim in &camera_prims {
-        let taken: Vec<String> =
-            cameras.iter().map(|camera: &cif_scene::CameraTrack| camera.name.clone()).collect();
-        cameras.extend(cameras::read(reading, prim, &taken).map_err(failed)?);
+        cameras.extend(cameras::read(reading, prim, &mut names).map_err(failed)?);
     }
     let text_info = |name: &str| info::<String>(stage, name).map_err(failed);
     let up_axis = match text_info("upAxis")?.as_deref() {

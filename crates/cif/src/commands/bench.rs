@@ -184,9 +184,7 @@ fn resolve(command: &Step, field: Option<&Field>, layout: Layout) -> Result<Trai
     for assignment in &command.set {
         layers.assignment(assignment)?;
     }
-    let config = layers.finish();
-    config.validate().map_err(Error::plain)?;
-    Ok(config)
+    layers.validated()
 }
 
 fn measure(

@@ -216,9 +216,7 @@ fn base_config(command: &BenchAccuracy, layout: cif_dataset::Layout) -> Result<T
     for assignment in &command.set {
         layers.assignment(assignment)?;
     }
-    let config = layers.finish();
-    config.validate().map_err(Error::plain)?;
-    Ok(config)
+    layers.validated()
 }
 
 /// A report under way.
@@ -316,7 +314,7 @@ impl Bench {
                 for setting in settings {
                     layers.assignment(setting)?;
                 }
-                layers.finish()
+                layers.validated()?
             }
             _ => self.config.clone(),
         };

@@ -206,9 +206,7 @@ fn resolve(command: &BenchHardness, layout: Layout) -> Result<TrainConfig, Error
     for assignment in &command.set {
         layers.assignment(assignment)?;
     }
-    let config = layers.finish();
-    config.validate().map_err(Error::plain)?;
-    Ok(config)
+    layers.validated()
 }
 
 /// Trains and scores one capture; whatever goes wrong is noted.

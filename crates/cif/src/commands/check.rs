@@ -98,7 +98,10 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
             command.scene.display(),
             findings.len()
         ),
-        format!("repair it into a new file: cif check {} --fix repaired.cif", command.scene.display()),
+        format!(
+            "repair it into a new file: {}",
+            super::command_line(&["check", &command.scene.to_string_lossy(), "--fix", "repaired.cif"])
+        ),
     ))
 }
 

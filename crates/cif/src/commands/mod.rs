@@ -235,9 +235,29 @@ fn print_warnings(dataset: &cif_dataset::Dataset) {
     }
 }
 
+/// A command of cif that can be pasted into a shell, whatever its words hold.
+fn command_line<S: AsRef<str>>(words: &[S]) -> String {
+    let words = std::iter::once("cif").chain(words.iter().map(AsRef::as_ref));
+    // Arguments hold no NUL character, the only one that no shell takes.
+    shlex::Quoter::new().allow_nul(true).join(words).unwrap_or_default()
+}
+
 /// A plain table with a heading.
 fn table<'a>(heading: impl IntoIterator<Item = &'a str>) -> comfy_table::Table {
     let mut table = comfy_table::Table::new();
     table.load_style(comfy_table::presets::NOTHING).set_header(heading);
     table
+}
+
+#[cfg(test)]
+mod tests {
+    use super::command_line;
+
+    #[test]
+    fn commands_can_be_pasted_into_a_shell() {
+        let words = ["train", "my table", "-o", "it's \"new\".cif", "--masks", "$HOME/*", "--resume"];
+        let line = command_line(&words);
+        assert_eq!(shlex::split(&line).unwrap()[1..], words);
+        assert_eq!(command_line(&["train", "table", "-o", "a.cif"]), "cif train table -o a.cif");
+    }
 }

@@ -18,9 +18,10 @@ use crate::error::Error;
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Without conditions every object is listed; several conditions must all hold. Labels match the name,
-class or unique name of an object; case does not matter, * and ? are wildcards. Boxes hold the splats
-to three standard deviations; volumes are those of the colliders, where there are any, else of the
-boxes; speeds are world units per second. Stages of other programs need semantic labels only.
+class or unique name of an object; case does not matter, * stands for any characters and ? for one.
+Boxes hold the splats to three standard deviations; volumes are those of the colliders, where there
+are any, else of the boxes; speeds are world units per second. Stages of other programs need semantic
+labels only.
 Time in a stage or glTF file is its time code, which counts captured frames; in a .cif it runs from 0
 (first captured time) to 1 (last).
 
@@ -42,7 +43,7 @@ pub(super) struct Query {
     #[arg(value_name = "FILE")]
     path: PathBuf,
     /// Label to look for
-    #[arg(long, value_name = "GLOB")]
+    #[arg(long, value_name = "PATTERN")]
     label: Option<String>,
     /// Labels that count: class (classes and human labels), instance (unique names), or another taxonomy of a stage
     #[arg(long, value_name = "NAME")]

@@ -11,7 +11,7 @@ use cif_train::{
 use clap::{Args, ValueEnum};
 
 use super::train_budget::{Goals, Timing};
-use super::{CaptureOptions, Simd, print_warnings, scene};
+use super::{CaptureOptions, Simd, command_line, print_warnings, scene};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::progress::Progress;
@@ -197,7 +197,9 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     }
 
     let mut trainer = match checkpoint {
-        Some(checkpoint) => Trainer::resume(dataset, checkpoint),
+        Some(checkpoint) => {
+            Trainer::resume(dataset, checkpoint).map_err(|error| error.of_scene(&command.output))
+        }
         None => {
             let plan = match &source {
                 Some(_) => None,
@@ -214,7 +216,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
             let trainer = match (source, &command.from) {
                 (Some(source), Some(path)) => {
                     let name = path.file_name().unwrap_or_default().to_string_lossy();
-                    Trainer::from_scene(dataset, config, source, &name)
+                    Trainer::from_scene(dataset, config, source, &name).map_err(|error| error.of_scene(path))
                 }
                 _ => Trainer::new(dataset, config),
             };
@@ -350,30 +352,32 @@ fn stopped_by(error: &TrainError, trainer: &Trainer, path: &Path) -> Error {
     }
 }
 
-/// The command line that goes on with this run.
+/// The command line that goes on with this run, to be pasted into a shell.
 fn resume_command(command: &Train) -> String {
     let capture = &command.capture_options;
-    let mut line = format!("cif train {} -o {}", command.capture.display(), command.output.display());
+    let path = |path: &Path| path.display().to_string();
+    let mut words = vec!["train".to_owned(), path(&command.capture), "-o".to_owned(), path(&command.output)];
+    let mut option = |name: &str, value: String| words.extend([name.to_owned(), value]);
     if let Some(masks) = &capture.masks {
-        line += &format!(" --masks {}", masks.display());
-    }
-    if capture.no_masks {
-        line += " --no-masks";
-    }
-    if capture.center_principal_point {
-        line += " --center-principal-point";
+        option("--masks", path(masks));
     }
     if let Some(layout) = capture.layout.and_then(|layout| layout.to_possible_value()) {
-        line += &format!(" --layout {}", layout.get_name());
+        option("--layout", layout.get_name().to_owned());
     }
     if command.simd != Simd::Auto {
-        line += &format!(" --simd {}", command.simd.name());
+        option("--simd", command.simd.name().to_owned());
     }
     #[cfg(feature = "wgpu")]
     if command.backend != super::backend::Backend::Cpu {
-        line += &format!(" --backend {}", command.backend.name());
+        option("--backend", command.backend.name().to_owned());
     }
-    line + " --resume"
+    let switches = [
+        (capture.no_masks, "--no-masks"),
+        (capture.center_principal_point, "--center-principal-point"),
+        (true, "--resume"),
+    ];
+    words.extend(switches.into_iter().filter(|(on, _)| *on).map(|(_, name)| name.to_owned()));
+    command_line(&words)
 }
 
 fn load_state(path: &Path) -> Result<Checkpoint, Error> {
@@ -422,7 +426,11 @@ fn resolve(
     let typed = command.preset.as_deref().map(|name| preset(name, "--preset")).transpose()?;
     let from_file = command.config.as_deref().map(preset_in_file).transpose()?.flatten();
     let mut base = match (typed.or(from_file), source) {
-        (None, Some(source)) => source.clone(),
+        (None, Some(source)) => {
+            let place = command.from.as_deref().unwrap_or(Path::new("the scene"));
+            source.validate().map_err(|error| Error::plain(format!("{}: {error}", place.display())))?;
+            source.clone()
+        }
         (named, _) => TrainConfig::preset(named.unwrap_or_default(), layout),
     };
     if let Some(plan) = plan {
@@ -478,9 +486,7 @@ fn resolve(
     for assignment in &command.set {
         layers.assignment(assignment)?;
     }
-    let config = layers.finish();
-    config.validate().map_err(Error::plain)?;
-    Ok(config)
+    layers.validated()
 }
 
 pub(super) fn preset(name: &str, place: &str) -> Result<Preset, Error> {
@@ -491,7 +497,7 @@ pub(super) fn preset(name: &str, place: &str) -> Result<Preset, Error> {
 
 /// The preset that a settings file starts from; other problems of the file are found when it is applied.
 fn preset_in_file(path: &Path) -> Result<Option<Preset>, Error> {
-    let text = std::fs::read_to_string(path).map_err(Error::io("read the settings", path))?;
+    let text = cif_input::read_to_string(path).map_err(Error::io("read the settings", path))?;
     let Ok(table) = text.parse::<toml::Table>() else { return Ok(None) };
     let place = format!("{}: key `preset`", path.display());
     table.get("preset").and_then(toml::Value::as_str).map(|name| preset(name, &place)).transpose()

@@ -8,6 +8,7 @@ use std::path::Path;
 use super::model::MODELS;
 use super::{Camera, Image, Reconstruction};
 use crate::Error;
+use crate::files::listing;
 use crate::points::RawPoints;
 
 /// Reads the three files; points may be missing.
@@ -48,7 +49,7 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
 
     let mut positions = Vec::new();
     let mut colors = Vec::new();
-    if points_path.is_file() {
+    if listing::is_there(&points_path) {
         let bytes = load(&points_path)?;
         let mut cursor = Cursor { path: &points_path, bytes: &bytes };
         for _ in 0..cursor.u64()? {
@@ -65,13 +66,13 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
 }
 
 fn load(path: &Path) -> Result<Vec<u8>, Error> {
-    if !path.is_file() {
+    if !listing::is_there(path) {
         return Err(Error::MissingFile {
             path: path.to_owned(),
             fix: "export the reconstruction from COLMAP (cameras, images, points3D)".to_owned(),
         });
     }
-    std::fs::read(path).map_err(Error::read(path))
+    cif_input::read(path).map_err(Error::read(path))
 }
 
 struct Cursor<'a> {

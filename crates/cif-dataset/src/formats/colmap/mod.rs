@@ -49,7 +49,9 @@ pub(crate) fn sparse_folder(root: &Path) -> Option<PathBuf> {
     ["sparse/0", "sparse", "colmap/sparse/0"]
         .iter()
         .map(|name| root.join(name))
-        .find(|folder| folder.join("cameras.bin").is_file() || folder.join("cameras.txt").is_file())
+        .find(|folder| {
+            listing::is_there(&folder.join("cameras.bin")) || listing::is_there(&folder.join("cameras.txt"))
+        })
         // A folder without cameras still marks the layout, so that the reader can say what is missing.
         .or_else(|| Some(root.join("sparse/0")).filter(|folder| folder.is_dir()))
 }
@@ -59,9 +61,9 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let missing = |path: PathBuf, fix: &str| Error::MissingFile { path, fix: fix.to_owned() };
     let folder = sparse_folder(root)
         .ok_or_else(|| missing(root.join("sparse/0"), "a COLMAP capture keeps its reconstruction there"))?;
-    let reconstruction = if folder.join("cameras.bin").is_file() {
+    let reconstruction = if listing::is_there(&folder.join("cameras.bin")) {
         binary::read(&folder)?
-    } else if folder.join("cameras.txt").is_file() {
+    } else if listing::is_there(&folder.join("cameras.txt")) {
         text::read(&folder)?
     } else {
         return Err(missing(
@@ -82,7 +84,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         let relative = transforms::clean(Path::new(&image.name));
         let name = transforms::frame_name(&relative);
         let path = image_folder.join(&relative);
-        if !path.is_file() {
+        if !listing::is_there(&path) {
             return Err(Error::CameraWithoutImage { frame: name, source_file: images_path, image: path });
         }
         let camera = cameras.get(&image.camera).ok_or_else(|| Error::Intrinsics {

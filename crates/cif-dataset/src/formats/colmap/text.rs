@@ -6,6 +6,7 @@ use std::str::FromStr;
 
 use super::{Camera, Image, Reconstruction};
 use crate::Error;
+use crate::files::listing;
 use crate::points::RawPoints;
 
 /// Reads the three files; points may be missing.
@@ -48,7 +49,7 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
         rows.next();
     }
     let mut points = RawPoints { positions: Vec::new(), colors: Some(Vec::new()) };
-    if points_path.is_file() {
+    if listing::is_there(&points_path) {
         for (number, line) in lines(&points_path)?.iter().filter(|(_, line)| !line.is_empty()) {
             let mut words = Words { path: &points_path, number: *number, words: line.split_whitespace() };
             let _: u64 = words.next("POINT3D_ID")?;
@@ -64,13 +65,13 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
 
 /// Lines without comments, with their numbers from 1; empty lines are kept.
 fn lines(path: &Path) -> Result<Vec<(usize, String)>, Error> {
-    if !path.is_file() {
+    if !listing::is_there(path) {
         return Err(Error::MissingFile {
             path: path.to_owned(),
             fix: "export the reconstruction from COLMAP (cameras, images, points3D)".to_owned(),
         });
     }
-    let text = std::fs::read_to_string(path).map_err(Error::read(path))?;
+    let text = cif_input::read_to_string(path).map_err(Error::read(path))?;
     Ok(text
         .lines()
         .enumerate()

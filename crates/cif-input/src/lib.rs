@@ -1,0 +1,97 @@
+//! Opens the files that people give. Readers take regular files only: opening a named pipe blocks until somebody
+//! writes to it, and a device such as `/dev/zero` may never end. Links are followed.
+//!
+//! Errors do not name the file, as those of [`std::fs`] do not: the readers that call this name it.
+
+use std::fs::{self, File, FileType};
+use std::io;
+use std::path::Path;
+
+/// Checks that a path names a regular file, and gives its length in bytes. For libraries that open paths themselves.
+///
+/// # Errors
+/// When nothing is there, it may not be looked at, or it is no regular file.
+pub fn check(path: impl AsRef<Path>) -> io::Result<u64> {
+    let metadata = fs::metadata(path)?;
+    if metadata.is_file() {
+        return Ok(metadata.len());
+    }
+    let kind = kind(metadata.file_type());
+    Err(io::Error::new(io::ErrorKind::InvalidInput, format!("it is {kind}; a regular file is needed here")))
+}
+
+/// Opens a regular file for reading.
+///
+/// # Errors
+/// As [`check`], and when it may not be read.
+pub fn open(path: impl AsRef<Path>) -> io::Result<File> {
+    check(&path)?;
+    File::open(path)
+}
+
+/// All bytes of a regular file.
+///
+/// # Errors
+/// As [`open`], and when reading fails.
+pub fn read(path: impl AsRef<Path>) -> io::Result<Vec<u8>> {
+    check(&path)?;
+    fs::read(path)
+}
+
+/// The text of a regular file.
+///
+/// # Errors
+/// As [`read`], and when it is not UTF-8.
+pub fn read_to_string(path: impl AsRef<Path>) -> io::Result<String> {
+    check(&path)?;
+    fs::read_to_string(path)
+}
+
+/// What is there in place of a regular file, in words.
+fn kind(found: FileType) -> &'static str {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        if found.is_fifo() {
+            return "a named pipe";
+        }
+        if found.is_socket() {
+            return "a socket";
+        }
+        if found.is_char_device() || found.is_block_device() {
+            return "a device";
+        }
+    }
+    if found.is_dir() { "a folder" } else { "something else" }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regular_files_are_read_and_folders_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file");
+        fs::write(&path, "text").unwrap();
+        assert_eq!(check(&path).unwrap(), 4);
+        assert_eq!(read_to_string(&path).unwrap(), "text");
+        assert_eq!(read(&path).unwrap(), b"text");
+        assert!(check(folder.path()).unwrap_err().to_string().contains("it is a folder"));
+        assert_eq!(open(folder.path().join("none")).unwrap_err().kind(), io::ErrorKind::NotFound);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn what_blocks_or_never_ends_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let pipe = folder.path().join("pipe");
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let link = folder.path().join("link");
+        std::os::unix::fs::symlink(&pipe, &link).unwrap();
+        for path in [&pipe, &link] {
+            assert!(open(path).unwrap_err().to_string().contains("a named pipe"));
+        }
+        assert!(read("/dev/zero").unwrap_err().to_string().contains("a device"));
+    }
+}
