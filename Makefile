@@ -13,13 +13,14 @@ MATURIN := maturin==1.16.0
 PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
 
-.PHONY: help build demo plugin test test-rust test-python lint format clean
+.PHONY: help build demo plugin test test-rust test-python fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
 	@echo "make demo    train, evaluate, export, query and render the small capture into $(OUT)"
 	@echo "make plugin  the Blender extension, into out/"
 	@echo "make test    all tests, Rust and Python"
+	@echo "make fuzz    damaged files for every reader, MINUTES=60 long; READER= picks one"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make format  put the formatting right"
 
@@ -74,6 +75,13 @@ test-usd: build
 	PYTHONPATH=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
 	LD_LIBRARY_PATH=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
 	cargo test --locked -p cif-usd --features python
+
+# Runs on with random seeds; failing inputs are kept in target/tmp/fuzz-failures.
+MINUTES ?= 10
+READER ?=
+fuzz:
+	CIF_FUZZ_MINUTES=$(MINUTES) CIF_FUZZ_READER=$(READER) \
+	cargo test --locked -p cif-test --test fuzz_readers readers -- --nocapture
 
 lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo fmt --all --check

@@ -406,7 +406,8 @@ fn frames(
                 camera_name: frame.camera_name.clone(),
                 camera,
                 lens,
-                time: frame.time,
+                // A negative zero is a zero: equal times are the same bits.
+                time: frame.time + 0.0,
                 time_index: 0,
                 split: frame.split,
                 group: None,

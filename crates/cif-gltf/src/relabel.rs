@@ -124,7 +124,7 @@ fn edit(
     label: &str,
     category: Option<&str>,
 ) -> Result<Relabelled, String> {
-    let Some(nodes) = document["nodes"].as_array_mut() else {
+    let Some(nodes) = document.get_mut("nodes").and_then(Value::as_array_mut) else {
         return Err("the file has no nodes".to_owned());
     };
     let name = |node: &Value| node["name"].as_str().unwrap_or_default().to_owned();
@@ -149,7 +149,7 @@ fn edit(
     };
     let node = &mut nodes[index];
     let before_name = name(node);
-    let Some(ours) = node.pointer_mut("/extras/cif") else {
+    let Some(ours) = node.pointer_mut("/extras/cif").and_then(Value::as_object_mut) else {
         node["name"] = json!(label);
         return Ok(Relabelled {
             node: label.to_owned(),
@@ -158,14 +158,14 @@ fn edit(
             category: label.to_owned(),
         });
     };
-    let text = |key: &str| ours[key].as_str().unwrap_or_default().to_owned();
+    let text = |key: &str| ours.get(key).and_then(Value::as_str).unwrap_or_default().to_owned();
     let (before, old_category) = (text("label"), text("category"));
     let category = match category {
         Some(category) => category.to_owned(),
         None if old_category == before => label.to_owned(),
         None => old_category,
     };
-    ours["label"] = json!(label);
-    ours["category"] = json!(category);
+    ours.insert("label".to_owned(), json!(label));
+    ours.insert("category".to_owned(), json!(category));
     Ok(Relabelled { node: before_name, before, label: label.to_owned(), category })
 }

@@ -97,6 +97,15 @@ impl Exposures {
         }
     }
 
+    /// Whether names ascend and every camera has finite values and moments: what was read may be anything.
+    pub(crate) fn are_whole(&self) -> bool {
+        let fits = |values: &Vec<f32>| {
+            values.len() == WIDTH * self.cameras.len() && values.iter().all(|value| value.is_finite())
+        };
+        self.cameras.is_sorted_by(|a, b| a < b)
+            && [&self.values, &self.first, &self.second].into_iter().all(fits)
+    }
+
     /// The exposures that a scene was trained with, where they are of these cameras.
     pub(crate) fn start_with(mut self, known: &BTreeMap<String, Exposure>) -> Self {
         for (camera, values) in self.cameras.iter().zip(self.values.chunks_exact_mut(WIDTH)) {

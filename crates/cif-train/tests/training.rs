@@ -214,6 +214,18 @@ fn a_checkpoint_is_refused_without_state_or_for_another_capture() {
     damaged.training.as_mut().unwrap().tensors.remove("adam.means.second");
     let error = refuse(dataset.clone(), damaged);
     assert!(error.to_string().contains("adam.means.second"), "{error}");
+    let exposures =
+        serde_json::json!({"cameras": ["a", "b"], "values": [0.0], "first": [], "second": [], "steps": 0});
+    for (key, value, problem) in [
+        ("sh_judged", 255.into(), "spherical harmonics"),
+        ("total_steps", u64::MAX.into(), "steps"),
+        ("exposures", exposures, "exposures"),
+    ] {
+        let mut wild = trainer.checkpoint(true);
+        wild.training.as_mut().unwrap().json["progress"][key] = value;
+        let error = refuse(dataset.clone(), wild).to_string();
+        assert!(error.contains("not usable") && error.contains(problem), "{error}");
+    }
     let mut newer = trainer.checkpoint(true);
     newer.training.as_mut().unwrap().json["version"] = 99.into();
     let error = refuse(dataset, newer);

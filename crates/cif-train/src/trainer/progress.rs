@@ -85,10 +85,28 @@ pub(super) struct Source {
 /// Weight of the newest view in the running PSNR.
 const PSNR_SHARE: f64 = 0.02;
 
+/// More steps than any run does.
+const MAX_STEPS: u64 = 1 << 48;
+
 /// PSNR that equal images count as, dB.
 const MAX_PSNR: f64 = 100.0;
 
 impl Progress {
+    /// What no run leads to, in progress that was read.
+    pub(super) fn problem(&self) -> Option<&'static str> {
+        let degrees = [self.sh_start, self.sh_judged, self.sh_cap.unwrap_or(0)];
+        let steps = self.steps.values().chain([&self.total_steps]);
+        if degrees.iter().any(|degree| *degree > 3) {
+            Some("it knows a degree of spherical harmonics beyond 3")
+        } else if self.iteration == u32::MAX || steps.copied().any(|steps| steps > MAX_STEPS) {
+            Some("it counts more steps than can be done")
+        } else if self.exposures.as_ref().is_some_and(|exposures| !exposures.are_whole()) {
+            Some("its exposures do not fit their cameras")
+        } else {
+            None
+        }
+    }
+
     /// A step of the current stage is done.
     pub(super) fn count_step(&mut self) {
         self.iteration += 1;
@@ -165,7 +183,7 @@ impl Plan {
         match stage {
             Stage::Coarse if self.is_dynamic => config.stages.coarse,
             Stage::Fine if self.is_dynamic => config.fine_iterations(),
-            Stage::Fine => config.stages.coarse + config.fine_iterations(),
+            Stage::Fine => config.stages.coarse.saturating_add(config.fine_iterations()),
             Stage::Instance if self.has_instances => config.stages.instance,
             _ => 0,
         }

@@ -47,7 +47,8 @@ impl State {
         if json.get("version").and_then(serde_json::Value::as_u64) != Some(u64::from(VERSION)) {
             return Err(unusable("it was written by another version of the trainer"));
         }
-        serde_json::from_value(json).map_err(|error| unusable(error.to_string()))
+        let state: Self = serde_json::from_value(json).map_err(|error| unusable(error.to_string()))?;
+        state.progress.problem().map_or(Ok(state), |problem| Err(unusable(problem)))
     }
 }
 
