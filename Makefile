@@ -81,7 +81,7 @@ MINUTES ?= 10
 READER ?=
 fuzz:
 	CIF_FUZZ_MINUTES=$(MINUTES) CIF_FUZZ_READER=$(READER) \
-	cargo test --locked -p cif-test --test fuzz_readers readers -- --nocapture
+	cargo test --locked --test fuzz_readers readers -- --nocapture
 
 lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo fmt --all --check

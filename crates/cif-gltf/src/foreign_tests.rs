@@ -421,7 +421,7 @@ fn buffers_beside_the_file_are_read_and_none_elsewhere() {
         ("https://example.org/a.bin", "put that file beside this one"),
         ("file:///etc/passwd", "put that file beside this one"),
         ("absent.bin", "cannot be read"),
-        ("data", "not a file"),
+        ("data", "it is a folder"),
         ("short.bin", "cut off"),
         ("data:application/octet-stream;base64,@@", "not base64"),
         ("data:nothing", "no data"),

@@ -259,7 +259,7 @@ fn damaged_files_say_what_is_wrong() {
         let error = read(&path).unwrap_err().to_string();
         assert!(error.contains(says) && error.contains("a.ply"), "{says}: {error}");
     }
-    assert!(read(folder.path()).unwrap_err().to_string().contains("not a file"));
+    assert!(read(folder.path()).unwrap_err().to_string().contains("it is a folder"));
 }
 
 #[test]
