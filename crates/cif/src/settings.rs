@@ -351,7 +351,9 @@ mod tests {
         let path = folder.path().join("mine.toml");
         std::fs::write(&path, "seed = 3\n[model]\nspatial_resolution = [0, 8, 8]\n").unwrap();
         let refused = |set: &[&str], file: bool| {
-            let mut layers = Layers::new(TrainConfig::default());
+            let mut preset = TrainConfig::default();
+            preset.stages.fine_includes_coarse = true;
+            let mut layers = Layers::new(preset);
             if file {
                 layers.file(&path).unwrap();
             }
