@@ -97,6 +97,15 @@ def test_wrong_arrays_are_named(field: cif.Field) -> None:
         cif.Field.from_arrays(**good, instances=[{"id": 1, "label": "red\0mug"}])
     with pytest.raises(ValueError, match="rotation"):
         cif.Camera(4, 4, (4.0, 4.0), camera_from_world=np.diag([1.0, 1.0, -1.0, 1.0]))
+    for width, height, told in [
+        (2**32 - 1, 2**32 - 1, "a side of 4294967295, more than the 65536"),
+        (60_000, 60_000, "has 3600000000, more than the 268435456"),
+        (0, 4, "has none"),
+    ]:
+        with pytest.raises(ValueError, match=told):
+            cif.Camera(width, height, (4.0, 4.0))
+        with pytest.raises(ValueError, match=told):
+            cif.Camera(4, 4, (4.0, 4.0)).resized(width, height)
 
 
 def test_the_command_runs_in_process(tmp_path: Path) -> None:

@@ -91,6 +91,62 @@ fn a_sound_scene_passes_and_a_broken_one_is_repaired() {
     cif(path, "check repaired.cif").succeeds();
 }
 
+/// Rewrites what a scene says about itself behind its back.
+fn rewrite(path: &Path, change: impl FnOnce(&mut Value)) {
+    let bytes = fs::read(path).unwrap();
+    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let mut header: Value = serde_json::from_slice(&bytes[8..8 + length]).unwrap();
+    let mut field: Value =
+        serde_json::from_str(header["__metadata__"]["cif.field"].as_str().unwrap()).unwrap();
+    change(&mut field);
+    header["__metadata__"]["cif.field"] = field.to_string().into();
+    let mut header = header.to_string().into_bytes();
+    header.resize(header.len().next_multiple_of(8), b' ');
+    let mut written = (header.len() as u64).to_le_bytes().to_vec();
+    written.extend(header);
+    written.extend(&bytes[8 + length..]);
+    fs::write(path, written).unwrap();
+}
+
+#[test]
+fn camera_sizes_are_checked_before_memory_is_taken() {
+    let folder = with_scene();
+    let path = folder.path();
+    let resize = |name: &str, width: u32, height: u32| {
+        fs::copy(path.join("table.cif"), path.join(name)).unwrap();
+        rewrite(&path.join(name), |field| {
+            for record in field["cameras"].as_array_mut().unwrap().drain(1..) {
+                drop(record);
+            }
+            let camera = &mut field["cameras"][0]["camera"];
+            let factor = f64::from(width) / camera["width"].as_f64().unwrap();
+            for key in ["focal_px", "principal_px"] {
+                for axis in 0..2 {
+                    camera[key][axis] = (camera[key][axis].as_f64().unwrap() * factor).into();
+                }
+            }
+            (camera["width"], camera["height"]) = (width.into(), height.into());
+        });
+    };
+    for (width, height, pixels) in
+        [(60_000, 60_000, "has 3600000000, more than"), (u32::MAX, u32::MAX, "a side of 4294967295")]
+    {
+        resize("huge.cif", width, height);
+        let run = cif(path, "check huge.cif --json");
+        assert_eq!(run.code, Some(1), "{}", run.stderr);
+        let report: Value = serde_json::from_str(&run.stdout).unwrap();
+        assert_eq!(report["views_checked"], false);
+        let told = report["findings"].to_string();
+        assert!(told.contains("camera") && told.contains(pixels), "{told}");
+        cif(path, "render huge.cif --capture table -o out").fails(1, &["huge.cif", pixels]);
+    }
+    // As wide, and within the limit.
+    resize("wide.cif", 60_000, 16);
+    let run = cif(path, "check wide.cif --json").succeeds();
+    let report: Value = serde_json::from_str(&run.stdout).unwrap();
+    assert_eq!(report["views_checked"], true);
+}
+
 #[test]
 fn what_is_no_scene_or_beyond_repair_is_named() {
     let folder = tempfile::tempdir().unwrap();

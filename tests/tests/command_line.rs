@@ -129,6 +129,7 @@ fn settings_that_cannot_be_are_refused_before_anything_is_read() {
     cif(path, "train nowhere -o a.cif --set stages.fien=3").fails(1, &["stages.fien", "stages.fine"]);
     cif(path, "train nowhere -o a.cif --set stages.fine=many").fails(1, &["stages.fine"]);
     cif(path, "train nowhere -o a.cif --batch 0").fails(1, &["stages.batch"]);
+    cif(path, "train nowhere -o a.cif --batch 4294967295").fails(1, &["stages.batch", "1 to 1024"]);
     cif(path, "train nowhere -o a.cif --config none.toml").fails(1, &["none.toml"]);
     fs::write(path.join("mine.toml"), "seed = 3\n\n[stages]\nfien = 20\n").unwrap();
     cif(path, "train nowhere -o a.cif --config mine.toml").fails(1, &["mine.toml:4", "fien", "stages.fine"]);
@@ -309,4 +310,61 @@ fn a_reader_that_leaves_is_no_fault() {
     assert!(!stderr.contains("panicked"), "{stderr}");
     // SIGPIPE
     assert_eq!(ended.status.signal(), Some(13), "{stderr}");
+}
+
+/// What a command told, a line each, of warnings or of notes.
+fn told<'a>(run: &'a Run, kind: &str) -> Vec<&'a str> {
+    run.stderr.lines().filter(|line| line.starts_with(kind)).collect()
+}
+
+#[test]
+fn captures_that_a_scene_does_not_know_are_told() {
+    let folder = with_capture();
+    let path = folder.path();
+    let tiny = "--iterations-coarse 2 --iterations-fine 2 --iterations-instance 2 -q \
+                --set model.spatial_resolution=[8,8,8]";
+    cif(path, &format!("train table -o table.cif {tiny}")).succeeds();
+    for line in ["eval table.cif table", "eval table.cif table --split train --downscale 2"] {
+        let run = cif(path, line).succeeds();
+        assert!(told(&run, "warning:").is_empty() && told(&run, "note:").is_empty(), "{}", run.stderr);
+    }
+
+    // Another place, with other things in it.
+    capture::write(&path.join("other"), 4);
+    for frame in 0..4 {
+        capture::edit(&path.join(format!("other/camera/{frame:06}.json")), |camera| {
+            camera["position"][0] = serde_json::json!(camera["position"][0].as_f64().unwrap() + 4.0);
+        });
+    }
+    capture::edit(&path.join("other/instances.json"), |instances| {
+        instances[0]["label"] = "grey dog".into();
+    });
+    let run = cif(path, "eval table.cif other").succeeds();
+    let warnings = told(&run, "warning:").join("\n");
+    for word in ["1 of 1 views", "`table`", "3 is grey dog in the masks and red ball in the scene"] {
+        assert!(warnings.contains(word), "{word} in {}", run.stderr);
+    }
+    let run = cif(path, "render table.cif --capture other -o out").succeeds();
+    assert!(told(&run, "warning:").join("\n").contains("1 of 1 views"), "{}", run.stderr);
+}
+
+#[test]
+fn points_behind_all_cameras_are_told() {
+    let folder = with_capture();
+    let path = folder.path();
+    let info = cif(path, "info table").succeeds().stdout;
+    assert!(!info.contains("lie behind"), "{info}");
+    for frame in 0..4 {
+        // The camera looks back over its shoulder.
+        capture::edit(&path.join(format!("table/camera/{frame:06}.json")), |camera| {
+            for row in [0, 2] {
+                for column in 0..3 {
+                    let value = camera["orientation"][row][column].as_f64().unwrap();
+                    camera["orientation"][row][column] = serde_json::json!(-value);
+                }
+            }
+        });
+    }
+    let info = cif(path, "info table").succeeds().stdout;
+    assert!(info.contains("points.npy: 0 of its 640 points") && info.contains("640 lie behind"), "{info}");
 }

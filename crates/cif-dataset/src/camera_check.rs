@@ -2,6 +2,7 @@
 
 use std::path::Path;
 
+use cif_geometry::camera::check_image_size;
 use cif_geometry::{LensDistortion, PinholeCamera, RigidTransform};
 use glam::DVec2;
 
@@ -25,6 +26,9 @@ pub(crate) fn finish(
     let problem = |problem: String| {
         Err(Error::Intrinsics { path: draft.source.clone(), frame: frame.to_owned(), problem })
     };
+    if let Err(too_large) = check_image_size(loaded.0, loaded.1) {
+        return problem(format!("{too_large}; reduce the images, for example by 2 (--downscale 2)"));
+    }
     let image_size = DVec2::new(f64::from(stored.0), f64::from(stored.1));
     let size = draft.size.unwrap_or(image_size);
     let whole = |size: f64| size.is_finite() && (1.0..=f64::from(u32::MAX)).contains(&size);
@@ -169,6 +173,16 @@ mod tests {
             let error = finish(&camera, "7", (64, 48), (64, 48)).unwrap_err().to_string();
             assert!(error.contains("focal length"), "{error}");
         }
+    }
+
+    #[test]
+    fn sizes_beyond_the_limit_are_refused_with_the_numbers() {
+        let mut camera = draft();
+        camera.size = None;
+        let error = finish(&camera, "7", (60_000, 60_000), (60_000, 60_000)).unwrap_err().to_string();
+        assert!(error.contains("frame 7") && error.contains("3600000000"), "{error}");
+        assert!(error.contains("--downscale"), "{error}");
+        assert!(finish(&camera, "7", (60_000, 60_000), (15_000, 15_000)).is_ok(), "reduced on loading");
     }
 
     #[test]

@@ -65,6 +65,7 @@ impl Dataset {
             dataset.attach_masks(options.masks.as_deref(), &stored_sizes)?;
         }
         dataset.points = dataset.initial_points(draft.points, draft.random_box)?;
+        dataset.warnings.extend(points::unseen_warning(&dataset));
         dataset.enter_own_frame();
         Ok(dataset)
     }

@@ -380,9 +380,8 @@ fn validate_camera(record: &RecordedCamera, times: usize) -> Result<(), String> 
     if record.time_index >= times {
         return Err(format!("has the time index {}, but there are {times} times", record.time_index));
     }
-    if camera.width == 0 || camera.height == 0 {
-        return Err(format!("has an image of {} x {} pixels", camera.width, camera.height));
-    }
+    cif_geometry::camera::check_image_size(camera.width, camera.height)
+        .map_err(|problem| format!("is not usable: {problem}"))?;
     if !(camera.focal_px.is_finite() && camera.focal_px.min_element() > 0.0) {
         return Err(format!("has the focal lengths {}", camera.focal_px));
     }

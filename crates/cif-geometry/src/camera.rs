@@ -5,6 +5,36 @@ use serde::{Deserialize, Serialize};
 
 use crate::RigidTransform;
 
+/// Most columns, and most rows, of an image.
+pub const MAX_IMAGE_SIDE: u32 = 1 << 16;
+
+/// Most pixels of an image: 16 384 x 16 384, of which colours in single precision take 3 GiB.
+pub const MAX_IMAGE_PIXELS: u64 = 1 << 28;
+
+/// Refuses sizes that no image of cif has: none or more than [`MAX_IMAGE_SIDE`] columns or rows, more than
+/// [`MAX_IMAGE_PIXELS`] pixels. What takes sizes from a file or a caller asks before it takes memory for pixels.
+///
+/// # Errors
+/// What is wrong, with the size and the limit.
+pub fn check_image_size(width: u32, height: u32) -> Result<(), String> {
+    let pixels = u64::from(width) * u64::from(height);
+    if pixels == 0 {
+        Err(format!("an image of {width} x {height} pixels has none"))
+    } else if width.max(height) > MAX_IMAGE_SIDE {
+        Err(format!(
+            "an image of {width} x {height} pixels has a side of {}, more than the {MAX_IMAGE_SIDE} that are possible",
+            width.max(height)
+        ))
+    } else if pixels > MAX_IMAGE_PIXELS {
+        Err(format!(
+            "an image of {width} x {height} pixels has {pixels}, more than the {MAX_IMAGE_PIXELS} (as of 16384 x \
+             16384) that are possible"
+        ))
+    } else {
+        Ok(())
+    }
+}
+
 /// A pinhole camera without skew or distortion.
 ///
 /// `pixel = focal_px * (x / z, y / z) + principal_px` for a point (x, y, z) in the camera frame.
@@ -110,6 +140,22 @@ mod tests {
         assert_eq!(camera.pixel_of(along(DVec2::new(64.1, 0.1), 2.0)), None);
         assert_eq!(camera.pixel_of(along(DVec2::new(63.9, -0.1), 2.0)), None);
         assert_eq!(camera.pixel_of(along(DVec2::new(31.5, 20.5), -2.0)), None);
+    }
+
+    #[test]
+    fn images_have_pixels_within_limits() {
+        for (width, height) in [(1, 1), (1920, 1080), (65_536, 4096), (16_384, 16_384), (1, 65_536)] {
+            assert_eq!(check_image_size(width, height), Ok(()), "{width} x {height}");
+        }
+        for (width, height, told) in [
+            (0, 48, "0 x 48 pixels has none"),
+            (60_000, 60_000, "has 3600000000, more than the 268435456"),
+            (65_537, 1, "a side of 65537, more than the 65536"),
+            (u32::MAX, u32::MAX, "a side of 4294967295"),
+        ] {
+            let problem = check_image_size(width, height).unwrap_err();
+            assert!(problem.contains(told), "{problem}");
+        }
     }
 
     #[test]

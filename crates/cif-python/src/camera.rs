@@ -1,5 +1,6 @@
 //! Pinhole cameras.
 
+use cif_geometry::camera::check_image_size;
 use cif_geometry::{PinholeCamera, RigidTransform};
 use glam::{DMat3, DVec2, DVec3};
 use numpy::{PyArray2, PyReadonlyArrayDyn};
@@ -29,8 +30,9 @@ impl Camera {
         principal: Option<(f64, f64)>,
         camera_from_world: Option<PyReadonlyArrayDyn<'_, f64>>,
     ) -> PyResult<Self> {
-        if width == 0 || height == 0 || !(focal.0 > 0.0 && focal.1 > 0.0) {
-            return Err(PyValueError::new_err("width, height and both focal lengths must be above 0"));
+        check_image_size(width, height).map_err(PyValueError::new_err)?;
+        if !(focal.0 > 0.0 && focal.1 > 0.0) {
+            return Err(PyValueError::new_err("both focal lengths must be above 0"));
         }
         let centre = (f64::from(width) / 2.0, f64::from(height) / 2.0);
         let principal = principal.unwrap_or(centre);
@@ -82,9 +84,7 @@ impl Camera {
     }
 
     fn resized(&self, width: u32, height: u32) -> PyResult<Self> {
-        if width == 0 || height == 0 {
-            return Err(PyValueError::new_err("width and height must be above 0"));
-        }
+        check_image_size(width, height).map_err(PyValueError::new_err)?;
         Ok(Self { inner: self.inner.resized(width, height) })
     }
 

@@ -88,9 +88,7 @@ pub fn read(path: &Path) -> Result<Vec<View>, Error> {
 }
 
 fn view(entry: Entry, name: &str) -> Result<View, String> {
-    if entry.width == 0 || entry.height == 0 || entry.width > 16_384 || entry.height > 16_384 {
-        return Err(format!("size {} x {}: expected 1 to 16384 pixels", entry.width, entry.height));
-    }
+    cif_geometry::camera::check_image_size(entry.width, entry.height)?;
     cif_output::check_name(name).map_err(|problem| format!("name {name:?} {problem}"))?;
     let size = DVec2::new(f64::from(entry.width), f64::from(entry.height));
     let focal_px = match (entry.focal_px, entry.vertical_fov_deg) {
@@ -180,6 +178,9 @@ mod tests {
 
     #[test]
     fn impossible_cameras_are_named() {
+        let size = r#"[{"width": 60000, "height": 60000, "focal_px": [5, 5]}]"#;
+        let error = parse(size).unwrap_err().to_string();
+        assert!(error.contains("view 0") && error.contains("3600000000"), "{error}");
         let base = r#""name": "a", "width": 8, "height": 8"#;
         for (rest, expected) in [
             (r#""position": [0,0,0], "look_at": [0,0,1]"#, "focal_px"),

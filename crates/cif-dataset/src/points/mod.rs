@@ -2,6 +2,7 @@
 
 mod color;
 mod random;
+mod sight;
 
 use std::collections::HashMap;
 use std::path::Path;
@@ -11,6 +12,7 @@ use glam::DVec3;
 
 pub(crate) use color::sample_colors;
 pub(crate) use random::draw;
+pub(crate) use sight::unseen_warning;
 
 use crate::files::npy;
 use crate::{Error, PointCloud};

@@ -78,7 +78,7 @@ pub struct StagesConfig {
     pub fine_includes_coarse: bool,
     /// Instance steps, default 1500; skipped without masks.
     pub instance: u32,
-    /// Views per step, default 1 (A27: all stages alike).
+    /// Views per step, 1 to 1024, default 1 (A27: all stages alike).
     pub batch: u32,
     /// Share of a view's tiles of 16 x 16 pixels, drawn anew for every view, that a step renders and learns from;
     /// (0, 1], default 1: all. The gradient stays right on average, with more noise; only what pixels cost is saved,

@@ -48,8 +48,9 @@ fn absent_keys_take_defaults_and_unknown_keys_are_refused() {
 #[test]
 fn impossible_settings_are_refused_by_key() {
     type Change = fn(&mut TrainConfig);
-    let changes: [(&str, Change); 10] = [
+    let changes: [(&str, Change); 11] = [
         ("stages.batch", |c| c.stages.batch = 0),
+        ("stages.batch", |c| c.stages.batch = u32::MAX),
         ("near", |c| c.near = f32::NAN),
         ("background[1]", |c| c.background[1] = 1.5),
         ("model.multipliers", |c| c.model.multipliers.clear()),

@@ -4,6 +4,9 @@ use thiserror::Error;
 
 use super::{Ablation, TrainConfig};
 
+/// Most views per step: a step holds the images of all of its views in memory.
+const MAX_BATCH: u32 = 1024;
+
 /// A setting that cannot work.
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[error("setting `{key}` is {value}: {expected}")]
@@ -34,7 +37,12 @@ impl TrainConfig {
         if let Some(downscale) = self.downscale {
             at_least("downscale", downscale, 1, "expected 1, 2, 4, ...")?;
         }
-        at_least("stages.batch", stages.batch, 1, "expected at least 1 view per step")?;
+        check(
+            (1..=MAX_BATCH).contains(&stages.batch),
+            "stages.batch",
+            stages.batch,
+            "expected 1 to 1024 views per step",
+        )?;
         check(
             stages.tile_share > 0.0 && stages.tile_share <= 1.0,
             "stages.tile_share",

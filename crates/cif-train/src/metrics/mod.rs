@@ -5,10 +5,12 @@
 //! | [`image`] | PSNR and SSIM of one picture |
 //! | [`instance`] | every instance metric, from per-frame confusion counts |
 //! | [`evaluate`](mod@evaluate) | renders the held-out frames of a capture and fills both in |
+//! | [`fit`] | whether a capture is the one that a scene was trained on |
 //!
 //! A metric without anything to measure is `None` (`n/a`), never 0 or 100.
 
 pub mod evaluate;
+pub mod fit;
 pub mod image;
 pub mod instance;
 

@@ -15,6 +15,10 @@ const CHUNK: usize = 4_096;
 /// Side of the cells in which Gaussians have neighbours, relative to the extent.
 const AROUND: f32 = 0.02;
 
+/// Cells from the origin up to which neighbouring cells are told apart: whole numbers beyond are not all exact in double
+/// precision. What lies farther away is put into the last cell.
+const FARTHEST_CELL: f64 = 9.0e15;
+
 /// Share of its neighbours that must move for a Gaussian to be kept awake, and fewest of them.
 const RESTLESS: f64 = 0.2;
 const FEWEST_MOVING: u32 = 3;
@@ -64,7 +68,8 @@ pub(super) fn restless(field: &Field, motions: &[Motion], limits: Limits) -> Vec
         let moved = if deformation.is_still(row) { [0.0; 3] } else { motion.mean.position };
         std::array::from_fn(|axis| {
             let place = field.gaussians.means[row][axis] + moved[axis];
-            (f64::from(place) / f64::from(AROUND * field.extent)).floor() as i64
+            let cell = (f64::from(place) / f64::from(AROUND * field.extent)).floor();
+            cell.clamp(-FARTHEST_CELL, FARTHEST_CELL) as i64
         })
     };
     // Rows that go through the network, and of these those that move, by cell.
@@ -327,6 +332,24 @@ mod tests {
         field.deformation.as_mut().unwrap().still.clear();
         motions.iter_mut().skip(4).for_each(|motion| motion.displacement = 0.0);
         assert_eq!(restless(&field, &motions, limits), [false; 60]);
+    }
+
+    #[test]
+    fn what_is_farther_away_than_cells_are_counted_stays_among_its_own() {
+        let mut field = field();
+        let far = [1e17, -1e17, 1e30, -3e38, f32::MAX];
+        for (row, place) in field.gaussians.means.iter_mut().enumerate() {
+            *place = [0.0; 3];
+            place[row % 3] = far[row % far.len()];
+        }
+        let still =
+            Deltas { position: [0.0; 3], scale: [0.0; 3], rotation: [0.0; 4], opacity: 0.0, sh: [0.0; 48] };
+        let motions = vec![Motion { mean: still, displacement: 0.1, shape: 0.0 }; 60];
+        let limits = Limits { displacement: 0.01, shape: 1.0 };
+        for extent in [1.0, 1e-30, 1e30] {
+            field.extent = extent;
+            assert_eq!(restless(&field, &motions, limits), [true; 60], "{extent}");
+        }
     }
 
     #[test]

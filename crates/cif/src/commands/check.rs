@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use cif_field::health::{self, Finding, Repair, Severity};
 use cif_field::{Checkpoint, Field, StateTensor};
-use cif_geometry::PixelGrid;
+use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::UNLABELLED;
 use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
 use clap::Args;
@@ -105,6 +105,20 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
     ))
 }
 
+/// Most pixels of a view in which Gaussians are looked for: 4096 x 4096, which take about 1 GiB. Larger views are looked
+/// at in this size, in which Gaussians appear no less.
+const MAX_CHECKED_PIXELS: f64 = 16_777_216.0;
+
+/// The view, at a size at which Gaussians are looked for.
+fn within_memory(camera: &PinholeCamera) -> PinholeCamera {
+    let factor = (MAX_CHECKED_PIXELS / (f64::from(camera.width) * f64::from(camera.height))).sqrt();
+    if factor >= 1.0 {
+        return *camera;
+    }
+    let reduced = |side: u32| ((f64::from(side) * factor).floor() as u32).max(1);
+    camera.resized(reduced(camera.width), reduced(camera.height))
+}
+
 /// Gaussians that none of the views it was trained on shows; `None` where no view is recorded.
 fn never_seen(field: &Field) -> Option<Vec<bool>> {
     let trained = field.cameras.iter().any(|record| record.trained);
@@ -112,7 +126,7 @@ fn never_seen(field: &Field) -> Option<Vec<bool>> {
     let mut renderer = Renderer::new(SimdLevel::Auto);
     let mut counts = IdentityCounts::zeros(field.len(), 0);
     for record in field.cameras.iter().filter(|record| record.trained || !trained) {
-        let camera = &record.camera;
+        let camera = &within_memory(&record.camera);
         let labels = PixelGrid::filled(camera.width, camera.height, UNLABELLED);
         let time = field.timeline.times.get(record.time_index).copied().unwrap_or_default();
         renderer.count_identities(field, camera, time, &settings, &labels, &mut counts);

@@ -8,7 +8,7 @@ use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameVi
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
 
-use super::{CaptureOptions, Simd, print_warnings, scene};
+use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::pictures::{
@@ -83,6 +83,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
     let dataset = capture.open(&command.capture)?;
     print_warnings(&dataset);
     outputs.reads_capture(&dataset)?;
+    print_misfits(&field, &dataset, command.split.into());
     if let Some(folder) = &command.images {
         output::check_folder(folder, command.force)?;
         for index in dataset.split_frames(command.split.into()) {

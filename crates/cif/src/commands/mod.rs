@@ -242,6 +242,17 @@ fn command_line<S: AsRef<str>>(words: &[S]) -> String {
     shlex::Quoter::new().allow_nul(true).join(words).unwrap_or_default()
 }
 
+/// Tells in what the views of a capture, and its instances, differ from what a scene recorded of its own capture.
+fn print_misfits(field: &cif_field::Field, dataset: &cif_dataset::Dataset, split: cif_dataset::Split) {
+    use cif_train::metrics::fit::{Severity, misfits};
+    for misfit in misfits(field, dataset, split) {
+        match misfit.severity {
+            Severity::Warning => eprintln!("warning: {}", misfit.message),
+            Severity::Note => eprintln!("note: {}", misfit.message),
+        }
+    }
+}
+
 /// A plain table with a heading.
 fn table<'a>(heading: impl IntoIterator<Item = &'a str>) -> comfy_table::Table {
     let mut table = comfy_table::Table::new();

@@ -21,7 +21,7 @@ use super::eval::SplitName;
 use super::painter::Painter;
 #[cfg(feature = "wgpu")]
 use super::painter::Sample;
-use super::{CaptureOptions, Simd, print_warnings, scene};
+use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
 use crate::output::Outputs;
@@ -352,6 +352,7 @@ fn views(command: &Render, field: &Field, outputs: &mut Outputs) -> Result<Vec<S
     outputs.reads_capture(&dataset)?;
     print_warnings(&dataset);
     let split = command.split.into();
+    print_misfits(field, &dataset, split);
     let views: Vec<Shot> = dataset
         .frames
         .iter()

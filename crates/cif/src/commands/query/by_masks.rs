@@ -12,7 +12,7 @@ use clap::{Args, ValueEnum};
 use serde_json::json;
 
 use super::Query;
-use crate::commands::{CaptureOptions, LayoutName, print_warnings, scene};
+use crate::commands::{CaptureOptions, LayoutName, print_misfits, print_warnings, scene};
 use crate::detector::{Detected, detect};
 use crate::error::Error;
 use crate::mask_query::{Agreement, Found, FoundMasks, Selection, agreement, find, render};
@@ -122,6 +122,7 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     }
     .open(capture)?;
     print_warnings(&dataset);
+    print_misfits(&field, &dataset, Split::Train);
     if let Some(folder) = &options.output {
         output::check_folder(folder, false)?;
     }
