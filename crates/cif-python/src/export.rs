@@ -207,14 +207,16 @@ impl LabelPattern {
 
 /// Prims of a stage by label.
 #[pyfunction]
-#[pyo3(signature = (path, label, time_code=None))]
+#[pyo3(signature = (path, label, time_code=None, *, follow_external=false))]
 pub(crate) fn query_stage<'py>(
     py: Python<'py>,
     path: PathBuf,
     label: String,
     time_code: Option<f64>,
+    follow_external: bool,
 ) -> PyResult<Bound<'py, PyAny>> {
-    let found = cif_usd::query(&path, &LabelQuery { pattern: label, time_code }).map_err(cif_error)?;
+    let query = LabelQuery { pattern: label, time_code };
+    let found = cif_usd::query(&path, &query, cif_usd::ReadOptions { follow_external }).map_err(cif_error)?;
     arrays::to_python(py, &found)
 }
 

@@ -107,6 +107,41 @@ pub enum UsdError {
         /// Asset as written there.
         asset: String,
     },
+    /// A layer or stage whose prims usd-core cannot follow.
+    #[error(
+        "{path}: {layer}: {what}, and at most {limit} levels are read, since usd-core follows them by recursion; bring the \
+         prims nearer to the root"
+    )]
+    TooDeep {
+        /// The stage.
+        path: PathBuf,
+        /// Layer that it was met in.
+        layer: String,
+        /// What is how deep.
+        what: String,
+        /// Most levels.
+        limit: u32,
+    },
+    /// References or instances that multiply beyond what can be composed.
+    #[error(
+        "{path}: references, payloads and instances make about {prims} prims of the {written} that its layers hold, and \
+         at most {limit} are read; {largest} alone brings in {of_largest}. Take copies of copies out, or deactivate what \
+         is not needed"
+    )]
+    TooManyPrims {
+        /// The stage.
+        path: PathBuf,
+        /// Prims in its layers.
+        written: u64,
+        /// Prims once expanded.
+        prims: u64,
+        /// Path of the prim below the root that brings in most.
+        largest: String,
+        /// Prims that it brings in.
+        of_largest: u64,
+        /// Most prims.
+        limit: u64,
+    },
     /// A stage of ours in another layout.
     #[error(
         "{path} was written by {generator} in layout {found}, and this version reads layout {expected}: {}",

@@ -10,13 +10,17 @@ use glam::{DMat4, DVec3};
 use pyo3::prelude::*;
 
 use crate::pxr::{self, Pxr, reason};
-use crate::{UsdError, conventions, tokens};
+use crate::{ReadOptions, UsdError, conventions, tokens};
 
-pub(crate) fn search(path: &Path, wanted: &ObjectQuery) -> Result<Vec<ObjectMatch>, UsdError> {
+pub(crate) fn search(
+    path: &Path,
+    wanted: &ObjectQuery,
+    options: ReadOptions,
+) -> Result<Vec<ObjectMatch>, UsdError> {
     let label_query = wanted.label_query();
     let matcher = label_query.as_ref().map(LabelQuery::matcher);
     pxr::with(|pxr| {
-        let stage = crate::read::open::open(pxr, path)?;
+        let stage = crate::read::open::open(pxr, path, options)?;
         let python = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
         let search = Search::new(pxr, &stage, wanted).map_err(python)?;
         let (mut known, mut labelled, mut found) = (Vec::new(), false, Vec::new());

@@ -138,14 +138,14 @@ pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError>
 /// the query's time code, or at the default time.
 ///
 /// # Errors
-/// Missing or unreadable file, no usd-core, bad pattern, or a label that nothing carries (the error lists those
-/// that are known).
-pub fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdError> {
+/// Missing or unreadable file, no usd-core, bad pattern, layers that are missing or lie outside the stage's folder, more
+/// prims than can be composed, or a label that nothing carries (the error lists those that are known).
+pub fn query(path: &Path, query: &LabelQuery, options: ReadOptions) -> Result<Vec<LabelMatch>, UsdError> {
     #[cfg(feature = "python")]
-    return read::query::query(path, query);
+    return read::query::query(path, query, options);
     #[cfg(not(feature = "python"))]
     {
-        let _ = (path, query);
+        let _ = (path, query, options);
         Err(UsdError::NotBuilt)
     }
 }
@@ -155,12 +155,12 @@ pub fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdErro
 ///
 /// # Errors
 /// As [`query`].
-pub fn search(path: &Path, wanted: &ObjectQuery) -> Result<Vec<ObjectMatch>, UsdError> {
+pub fn search(path: &Path, wanted: &ObjectQuery, options: ReadOptions) -> Result<Vec<ObjectMatch>, UsdError> {
     #[cfg(feature = "python")]
-    return find::search(path, wanted);
+    return find::search(path, wanted, options);
     #[cfg(not(feature = "python"))]
     {
-        let _ = (path, wanted);
+        let _ = (path, wanted, options);
         Err(UsdError::NotBuilt)
     }
 }
@@ -231,7 +231,7 @@ pub fn write_stage(graph: &SceneGraph, path: &Path) -> Result<(), UsdError> {
 ///
 /// # Errors
 /// Missing or unreadable file, no usd-core, no splats, values that make no sense (the error names the prim),
-/// layers that are missing or lie outside the stage's folder, another layout of ours.
+/// layers that are missing or lie outside the stage's folder, more prims than can be composed, another layout of ours.
 pub fn read_scene(path: &Path) -> Result<SceneGraph, UsdError> {
     read_scene_with(path, ReadOptions::default())
 }
@@ -259,13 +259,13 @@ pub fn query_stage(path: &Path, pattern: &str, time: Option<f64>) -> Result<Vec<
     let of = |time_code| LabelQuery { pattern: pattern.to_owned(), time_code };
     #[cfg(feature = "python")]
     return match time {
-        Some(time) => query(path, &of(Some(read::query::time_code(path, time)?))),
-        None => query(path, &of(None)),
+        Some(time) => query(path, &of(Some(read::query::time_code(path, time)?)), ReadOptions::default()),
+        None => query(path, &of(None), ReadOptions::default()),
     };
     #[cfg(not(feature = "python"))]
     {
         let _ = time;
-        query(path, &of(None))
+        query(path, &of(None), ReadOptions::default())
     }
 }
 
@@ -287,7 +287,7 @@ mod tests {
     #[test]
     fn a_build_without_usd_says_how_to_get_it() {
         let query_of = LabelQuery { pattern: "*".into(), time_code: None };
-        let error = query(Path::new("scene.usda"), &query_of).unwrap_err();
+        let error = query(Path::new("scene.usda"), &query_of, ReadOptions::default()).unwrap_err();
         assert!(error.to_string().contains("this build of cif has no USD"), "{error}");
         assert!(usd_version().is_err());
         assert!(check_target(Path::new("scene.usda"), ExportOptions::default()).is_err());

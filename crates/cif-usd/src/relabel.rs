@@ -49,6 +49,7 @@ pub(crate) fn relabel(
     std::fs::copy(path, &copy).map_err(unwritable)?;
     let done = pxr::with(|pxr| {
         let python = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
+        crate::read::open::check_size(pxr, path)?;
         let stage = pxr
             .usd
             .getattr("Stage")

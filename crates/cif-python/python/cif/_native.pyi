@@ -211,9 +211,16 @@ class LabelPattern:
         """Tell whether a label is spelled so."""
 
 def query_stage(
-    path: str | os.PathLike[str], label: str, time_code: float | None = None
+    path: str | os.PathLike[str],
+    label: str,
+    time_code: float | None = None,
+    *,
+    follow_external: bool = False,
 ) -> list[dict[str, Any]]:
-    """Return the prims that carry a label (see LabelPattern); an unknown label lists the known ones."""
+    """Return the prims that carry a label (see LabelPattern); an unknown label lists the known ones.
+
+    Layers outside the folder of the stage are read with ``follow_external`` alone.
+    """
 
 def import_scene(
     path: str | os.PathLike[str], *, base: Field | None = None, force_base: bool = False

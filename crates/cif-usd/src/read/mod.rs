@@ -3,8 +3,11 @@
 mod arrays;
 mod bake;
 mod cameras;
+mod expansion;
 mod frames;
 mod labels;
+mod layer_spec;
+mod nesting;
 mod nodes;
 pub(crate) mod open;
 pub(crate) mod query;

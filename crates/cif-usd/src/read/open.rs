@@ -1,14 +1,17 @@
 //! Opening a stage, after a look at every layer that it is made of.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use cif_scene::files::FileError;
 use pyo3::prelude::*;
-use pyo3::types::PyList;
 
-use crate::UsdError;
+pub(crate) use super::expansion::Instances;
+use super::expansion::{LayerSpec, MAX_LEVELS, MAX_PRIMS, expand};
+use super::layer_spec::{Clip, Described, describe};
+use super::nesting;
 use crate::pxr::{Pxr, reason};
+use crate::{ReadOptions, UsdError};
 
 /// Refuses what is no regular file: usd-core would wait for the end of a pipe.
 pub(crate) fn check_file(path: &Path) -> Result<(), UsdError> {
@@ -18,9 +21,25 @@ pub(crate) fn check_file(path: &Path) -> Result<(), UsdError> {
     })
 }
 
-/// A stage.
-pub(crate) fn open<'py>(pxr: &Pxr<'py>, path: &Path) -> Result<Bound<'py, PyAny>, UsdError> {
-    check_file(path)?;
+/// A stage of which instances are not looked into, after the look at its layers that [`open_with_layers`] takes.
+pub(crate) fn open<'py>(
+    pxr: &Pxr<'py>,
+    path: &Path,
+    options: ReadOptions,
+) -> Result<Bound<'py, PyAny>, UsdError> {
+    open_with_layers(pxr, path, options, Instances::Once).map(|(stage, _)| stage)
+}
+
+/// Refuses a stage whose prims are more, or nested deeper, than usd-core can take, wherever its layers lie.
+pub(crate) fn check_size(pxr: &Pxr<'_>, path: &Path) -> Result<(), UsdError> {
+    let mut walk = Walk::new(pxr, path, ReadOptions { follow_external: true })?;
+    walk.skip_missing = true;
+    walk.visit(&path.to_string_lossy())?;
+    walk.check_size(Instances::Once)
+}
+
+/// A stage, whatever it is made of.
+fn open_unchecked<'py>(pxr: &Pxr<'py>, path: &Path) -> Result<Bound<'py, PyAny>, UsdError> {
     pxr.usd
         .getattr("Stage")
         .and_then(|class| class.call_method1("Open", (path.as_os_str(),)))
@@ -43,27 +62,22 @@ pub(super) fn open_at_rate<'py>(
     open().map_err(|error| UsdError::Unreadable { path: path.to_owned(), reason: reason(pxr.py, &error) })
 }
 
-/// A stage whose layers all exist and, unless others are allowed, lie in its folder; and the size of their files.
+/// A stage whose layers all exist and, unless others are allowed, lie in its folder, and whose prims are no more, and
+/// nested no deeper, than usd-core can take; and the size of its files.
 pub(crate) fn open_with_layers<'py>(
     pxr: &Pxr<'py>,
     path: &Path,
-    follow_external: bool,
+    options: ReadOptions,
+    instances: Instances,
 ) -> Result<(Bound<'py, PyAny>, u64), UsdError> {
-    check_file(path)?;
-    let unreadable = |reason: String| UsdError::Unreadable { path: path.to_owned(), reason };
-    let file = path.canonicalize().map_err(|error| unreadable(error.to_string()))?;
-    let mut walk = Walk {
-        pxr,
-        path,
-        folder: file.parent().map(Path::to_owned).unwrap_or_default(),
-        follow_external,
-        seen: BTreeSet::new(),
-        bytes: 0,
-    };
-    let root = walk.layer(&path.to_string_lossy())?;
-    walk.visit(&root)?;
+    let mut walk = Walk::new(pxr, path, options)?;
+    // Layers stay open until the stage holds them, so that each is parsed once.
+    let layers = walk.visit(&path.to_string_lossy())?;
+    walk.check_size(instances)?;
     let bytes = walk.bytes;
-    Ok((open(pxr, path)?, bytes))
+    let stage = open_unchecked(pxr, path)?;
+    drop(layers);
+    Ok((stage, bytes))
 }
 
 struct Walk<'a, 'py> {
@@ -71,16 +85,47 @@ struct Walk<'a, 'py> {
     path: &'a Path,
     folder: PathBuf,
     follow_external: bool,
-    seen: BTreeSet<String>,
+    /// Layers that do not exist are no error.
+    skip_missing: bool,
+    /// Files met, and their size.
+    files: BTreeSet<String>,
     bytes: u64,
+    /// Layers met, by identifier, and the root among them.
+    specs: BTreeMap<String, LayerSpec>,
+    root: String,
 }
 
-impl<'py> Walk<'_, 'py> {
+impl<'a, 'py> Walk<'a, 'py> {
+    fn new(pxr: &'a Pxr<'py>, path: &'a Path, options: ReadOptions) -> Result<Self, UsdError> {
+        check_file(path)?;
+        let unreadable = |reason: String| UsdError::Unreadable { path: path.to_owned(), reason };
+        let file = path.canonicalize().map_err(|error| unreadable(error.to_string()))?;
+        Ok(Self {
+            pxr,
+            path,
+            folder: file.parent().map(Path::to_owned).unwrap_or_default(),
+            follow_external: options.follow_external,
+            skip_missing: false,
+            files: BTreeSet::new(),
+            bytes: 0,
+            specs: BTreeMap::new(),
+            root: String::new(),
+        })
+    }
+
     fn unreadable(&self, error: &PyErr) -> UsdError {
         UsdError::Unreadable { path: self.path.to_owned(), reason: reason(self.pxr.py, error) }
     }
 
+    /// Opens a layer; one of text is looked through first, since usd-core parses it by recursion.
     fn layer(&self, name: &str) -> Result<Bound<'py, PyAny>, UsdError> {
+        let levels = nesting::deepest(Path::new(outer(name))).map_err(|error| UsdError::Unreadable {
+            path: self.path.to_owned(),
+            reason: format!("{name}: {error}"),
+        })?;
+        if levels > MAX_LEVELS as usize {
+            return Err(self.too_deep(name, format!("its brackets are nested {levels} deep")));
+        }
         let layer = self
             .pxr
             .sdf
@@ -94,32 +139,69 @@ impl<'py> Walk<'_, 'py> {
         Ok(layer)
     }
 
-    /// Checks what a layer needs, and so on.
-    fn visit(&mut self, root: &Bound<'py, PyAny>) -> Result<(), UsdError> {
-        let mut open = vec![root.clone()];
+    fn too_deep(&self, layer: &str, what: String) -> UsdError {
+        UsdError::TooDeep { path: self.path.to_owned(), layer: layer.to_owned(), what, limit: MAX_LEVELS }
+    }
+
+    /// Refuses what usd-core would be busy with for hours, or end the process over.
+    fn check_size(&self, instances: Instances) -> Result<(), UsdError> {
+        let expansion = expand(&self.specs, &self.root, instances);
+        if expansion.levels > MAX_LEVELS {
+            let what = format!("its prims are nested {} deep, references included", expansion.levels);
+            return Err(self.too_deep(&self.root, what));
+        }
+        if expansion.prims > MAX_PRIMS {
+            let (largest, of_largest) = expansion.largest.unwrap_or_default();
+            return Err(UsdError::TooManyPrims {
+                path: self.path.to_owned(),
+                written: expansion.written,
+                prims: expansion.prims,
+                largest,
+                of_largest,
+                limit: MAX_PRIMS,
+            });
+        }
+        Ok(())
+    }
+
+    /// Opens a layer and all that it needs, and checks each.
+    fn visit(&mut self, root: &str) -> Result<Vec<Bound<'py, PyAny>>, UsdError> {
+        let root = self.layer(root)?;
+        let identifier = |layer: &Bound<'py, PyAny>| layer.getattr("identifier")?.extract::<String>();
+        self.root = identifier(&root).map_err(|error| self.unreadable(&error))?;
+        let (mut open, mut met) = (vec![root], Vec::new());
         while let Some(layer) = open.pop() {
-            let (identifier, real, mut assets) =
-                described(&layer).map_err(|error| self.unreadable(&error))?;
-            if !self.seen.insert(identifier.clone()) {
+            let name = identifier(&layer).map_err(|error| self.unreadable(&error))?;
+            if self.specs.contains_key(&name) {
                 continue;
             }
+            let described = describe(&layer).map_err(|error| self.unreadable(&error))?;
+            let Described { identifier: layer_name, file, mut assets, clips, mut spec, too_deep } = described;
+            if let Some(prim) = too_deep {
+                let start: String = prim.chars().take(40).collect();
+                let what = format!("{start}... is nested more than {MAX_LEVELS} deep");
+                return Err(self.too_deep(&layer_name, what));
+            }
             // Layers in one package share its file.
-            let file = outer(&real);
-            if self.seen.insert(format!("file {file}")) {
+            let file = outer(&file);
+            if self.files.insert(file.to_owned()) {
                 self.bytes += std::fs::metadata(file).map_or(0, |data| data.len());
             }
-            for clip in clips(self.pxr, &layer).map_err(|error| self.unreadable(&error))? {
+            for clip in clips {
                 match clip {
                     Clip::Asset(asset) => assets.push(asset),
                     Clip::Template(template) => {
-                        assets.extend(self.numbered(&layer, &identifier, &template)?)
+                        assets.extend(self.numbered(&layer, &layer_name, &template)?)
                     }
                 }
             }
             // A reference to another prim of the same stage names no file.
             for asset in assets.into_iter().filter(|asset| !asset.is_empty()) {
                 let resolved = self.resolve(&layer, &asset).map_err(|error| self.unreadable(&error))?;
-                let layer_name = identifier.clone();
+                let layer_name = layer_name.clone();
+                if resolved.is_empty() && self.skip_missing {
+                    continue;
+                }
                 if resolved.is_empty() {
                     let path = self.path.to_owned();
                     return Err(UsdError::MissingAsset { path, layer: layer_name, asset });
@@ -132,10 +214,15 @@ impl<'py> Walk<'_, 'py> {
                     let reason = format!("{resolved}, which {layer_name} names, cannot be read: {error}");
                     return Err(UsdError::Unreadable { path: self.path.to_owned(), reason });
                 }
-                open.push(self.layer(&resolved)?);
+                let target = self.layer(&resolved)?;
+                let target_name = identifier(&target).map_err(|error| self.unreadable(&error))?;
+                spec.targets.insert(asset, target_name);
+                open.push(target);
             }
+            self.specs.insert(layer_name, spec);
+            met.push(layer);
         }
-        Ok(())
+        Ok(met)
     }
 
     fn is_allowed(&self, file: &Path) -> bool {
@@ -188,58 +275,6 @@ impl<'py> Walk<'_, 'py> {
         let resolver = self.pxr.ar.call_method0("GetResolver")?;
         resolver.call_method1("Resolve", (path,))?.str()?.extract()
     }
-}
-
-/// What the value clips of a prim name.
-enum Clip {
-    Asset(String),
-    Template(String),
-}
-
-/// Files of the value clips of a layer: composition does not count them among what it needs.
-fn clips<'py>(pxr: &Pxr<'py>, layer: &Bound<'py, PyAny>) -> PyResult<Vec<Clip>> {
-    let mut clips = Vec::new();
-    let paths = PyList::empty(pxr.py);
-    let root = pxr.sdf.getattr("Path")?.getattr("absoluteRootPath")?;
-    layer.call_method1("Traverse", (root, paths.getattr("append")?))?;
-    for path in paths {
-        let is_prim = path.call_method0("IsPrimPath")?.is_truthy()?
-            || path.call_method0("IsPrimVariantSelectionPath")?.is_truthy()?;
-        if !is_prim {
-            continue;
-        }
-        let spec = layer.call_method1("GetPrimAtPath", (&path,))?;
-        if spec.is_none() || !spec.call_method1("HasInfo", ("clips",))?.is_truthy()? {
-            continue;
-        }
-        let sets = spec.call_method1("GetInfo", ("clips",))?;
-        for set in sets.call_method0("values")?.try_iter()? {
-            let set = set?;
-            let get = |key: &str| set.call_method1("get", (key,));
-            let files = get("assetPaths")?;
-            let manifest = get("manifestAssetPath")?;
-            let files =
-                if files.is_none() { Vec::new() } else { files.try_iter()?.collect::<PyResult<_>>()? };
-            for file in files.into_iter().chain((!manifest.is_none()).then_some(manifest)) {
-                clips.push(Clip::Asset(file.getattr("path")?.extract()?));
-            }
-            let template = get("templateAssetPath")?;
-            if !template.is_none() {
-                clips.push(Clip::Template(template.extract()?));
-            }
-        }
-    }
-    Ok(clips)
-}
-
-/// Identifier, file and needed assets of a layer.
-fn described(layer: &Bound<'_, PyAny>) -> PyResult<(String, String, Vec<String>)> {
-    let assets = layer.call_method0("GetCompositionAssetDependencies")?;
-    Ok((
-        layer.getattr("identifier")?.extract()?,
-        layer.getattr("realPath")?.extract()?,
-        assets.try_iter()?.map(|asset| asset?.extract()).collect::<PyResult<_>>()?,
-    ))
 }
 
 /// The file of a path that may point into a package, `a.usdz[b.usdc]`.

@@ -8,12 +8,16 @@ use pyo3::prelude::*;
 
 use super::open::open;
 use crate::pxr::{self, Pxr, reason};
-use crate::{UsdError, conventions, tokens};
+use crate::{ReadOptions, UsdError, conventions, tokens};
 
-pub(crate) fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, UsdError> {
+pub(crate) fn query(
+    path: &Path,
+    query: &LabelQuery,
+    options: ReadOptions,
+) -> Result<Vec<LabelMatch>, UsdError> {
     let matcher = query.matcher();
     pxr::with(|pxr| {
-        let stage = open(pxr, path)?;
+        let stage = open(pxr, path, options)?;
         let (found, known) = search(pxr, &stage, query, &matcher)
             .map_err(|error| UsdError::Python { reason: reason(pxr.py, &error) })?;
         if found.is_empty() {
@@ -26,7 +30,7 @@ pub(crate) fn query(path: &Path, query: &LabelQuery) -> Result<Vec<LabelMatch>, 
 /// Time code of a normalised time.
 pub(crate) fn time_code(path: &Path, time: f64) -> Result<f64, UsdError> {
     pxr::with(|pxr| {
-        let stage = open(pxr, path)?;
+        let stage = open(pxr, path, ReadOptions::default())?;
         let range = || -> PyResult<(Vec<f64>, Vec<f64>)> {
             let start: f64 = stage.call_method0("GetStartTimeCode")?.extract()?;
             let end: f64 = stage.call_method0("GetEndTimeCode")?.extract()?;

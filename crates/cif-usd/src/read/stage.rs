@@ -12,6 +12,7 @@ use super::arrays::Arrays;
 use super::frames::Frames;
 use super::labels::{self, Recorded};
 use super::nodes::{self, Owner};
+use super::open::Instances;
 use super::splats::SplatPrim;
 use super::values::{self, plain, text};
 use super::{cameras, open};
@@ -68,7 +69,7 @@ struct Mark {
 
 pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, UsdError> {
     pxr::with(|pxr| {
-        let (stage, bytes) = open::open_with_layers(pxr, path, options.follow_external)?;
+        let (stage, bytes) = open::open_with_layers(pxr, path, options, Instances::Each)?;
         let failed = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
         let mut mark = mark(&stage).map_err(failed)?;
         let expected = i64::from(tokens::LAYOUT_VERSION);

@@ -4,9 +4,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use cif_scene::files::FileError;
+use cif_scene::{LabelQuery, ObjectQuery};
 
 use super::{python, scenes::Maker, session};
-use crate::{ExportOptions, ReadOptions, UsdError, export, read_scene, read_scene_with};
+use crate::{
+    ExportOptions, ReadOptions, UsdError, export, query, read_scene, read_scene_with, relabel, search,
+};
 
 /// One splat prim of two splats under /World/Thing, with `change` made to it before saving.
 pub(super) fn stage_with(folder: &Path, change: &str) -> PathBuf {
@@ -195,10 +198,99 @@ fn missing_and_distant_layers_are_refused() {
     assert!(matches!(read_scene(&over), Err(UsdError::ExternalAsset { .. })));
     let read = read_scene_with(&over, ReadOptions { follow_external: true }).unwrap();
     assert_eq!(read.nodes, written.nodes);
+    // Queries look at no more files than reading does.
+    let (everything, stars) =
+        (ObjectQuery::default(), LabelQuery { pattern: "*".to_owned(), time_code: None });
+    let refused = search(&over, &everything, ReadOptions::default()).unwrap_err();
+    assert!(matches!(refused, UsdError::ExternalAsset { .. }), "{refused}");
+    let refused = query(&over, &stars, ReadOptions::default()).unwrap_err();
+    assert!(matches!(refused, UsdError::ExternalAsset { .. }), "{refused}");
+    let everywhere = ReadOptions { follow_external: true };
+    let found = search(&over, &everything, everywhere).unwrap().len();
+    assert_eq!((found, query(&over, &stars, everywhere).unwrap().len()), (written.nodes.len(), found));
     // The same from above needs no permission.
     let over = folder.path().join("over.usda");
     fs::write(&over, "#usda 1.0\n(\n    subLayers = [@inner/a.usda@]\n)\n").unwrap();
     assert_eq!(read_scene(&over).unwrap().nodes, written.nodes);
+}
+
+/// A splat prim, as text.
+const SPLAT: &str = "def ParticleField3DGaussianSplat \"s\"\n{\npoint3f[] positions = [(0, 0, 0)]\n\
+                     quatf[] orientations = [(1, 0, 0, 0)]\nfloat3[] scales = [(1, 1, 1)]\nfloat[] opacities = [1]\n\
+                     }\n";
+
+#[test]
+fn prims_that_are_nested_too_deep_are_refused_before_usd_follows_them() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, levels: usize| {
+        let path = folder.path().join(name);
+        let text = ["def Xform \"a\"\n{\n".repeat(levels), SPLAT.to_owned(), "}\n".repeat(levels)].concat();
+        fs::write(&path, format!("#usda 1.0\n{text}")).unwrap();
+        path
+    };
+    let sound = read_scene(&write("sound.usda", 800)).unwrap();
+    assert_eq!(sound.nodes.len(), 1);
+    let deep = write("deep.usda", 15_000);
+    let over = folder.path().join("over.usda");
+    fs::write(&over, "#usda 1.0\n(\nsubLayers = [@deep.usda@]\n)\n").unwrap();
+    let binary = folder.path().join("binary.usdc");
+    python(
+        &binary,
+        "
+from pxr import Sdf
+layer = Sdf.Layer.CreateAnonymous('.usdc')
+Sdf.CreatePrimInLayer(layer, '/a' * 1200).specifier = Sdf.SpecifierDef
+layer.Export(path)
+",
+    );
+    for path in [&deep, &over, &binary] {
+        for error in [
+            read_scene(path).unwrap_err(),
+            search(path, &ObjectQuery::default(), ReadOptions::default()).unwrap_err(),
+            relabel(path, path, "a", "mug", None).unwrap_err(),
+        ] {
+            assert!(matches!(error, UsdError::TooDeep { limit: 1000, .. }), "{error}");
+            assert!(error.to_string().contains("1000 levels"), "{error}");
+        }
+    }
+    assert!(read_scene(&deep).unwrap_err().to_string().contains("nested 15002 deep"));
+}
+
+#[test]
+fn copies_of_copies_are_counted_before_they_are_made() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, levels: usize, instanceable: bool| {
+        let mut text = format!("#usda 1.0\nclass Xform \"P0\"\n{{\n{SPLAT}}}\n");
+        for level in 1..=levels {
+            let copy = |k: usize| {
+                let below = level - 1;
+                format!(
+                    "def \"c{k}\" (\ninstanceable = {instanceable}\nreferences = </P{below}>\n)\n{{\n}}\n"
+                )
+            };
+            let copies: String = (0..10).map(copy).collect();
+            text += &format!("class Xform \"P{level}\"\n{{\n{copies}}}\n");
+        }
+        text += &format!("def Xform \"World\" (\nreferences = </P{levels}>\n)\n{{\n}}\n");
+        let path = folder.path().join(name);
+        fs::write(&path, text).unwrap();
+        path
+    };
+    assert_eq!(read_scene(&write("few.usda", 2, true)).unwrap().nodes.len(), 100);
+    let instances = write("instances.usda", 8, true);
+    assert!(fs::metadata(&instances).unwrap().len() < 6_000);
+    let error = read_scene(&instances).unwrap_err();
+    let UsdError::TooManyPrims { written: 92, prims, limit: 250_000, .. } = error else { panic!("{error}") };
+    assert!(prims > 200_000_000, "{prims}");
+    // A query does not look into instances, which usd-core composes once.
+    assert!(search(&instances, &ObjectQuery::default(), ReadOptions::default()).unwrap().is_empty());
+    let copies = write("copies.usda", 8, false);
+    let error = search(&copies, &ObjectQuery::default(), ReadOptions::default()).unwrap_err();
+    for word in ["copies.usda", "92 that its layers hold", "at most 250000", "brings in 211111111"] {
+        assert!(error.to_string().contains(word), "{word} in {error}");
+    }
 }
 
 #[test]

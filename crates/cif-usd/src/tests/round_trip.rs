@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 use super::scenes::Maker;
 use super::session;
-use crate::{ExportOptions, Payloads, export, read_scene};
+use crate::{ExportOptions, Payloads, ReadOptions, export, read_scene};
 
 /// Where scenes lie: at the origin, far from it, in other units, or both.
 const FRAMES: [CaptureFrame; 4] = [
@@ -145,8 +145,10 @@ fn a_far_scene_stands_in_the_world_of_its_capture() {
         assert_eq!(head.contains("double3 xformOp:scale"), frame.scale != 1.0, "{head}");
         // Queries of the stage and of the graph tell the same places, in the world.
         let wanted = LabelQuery { pattern: "*".into(), time_code: Some(graph.time_codes.start()) };
-        let (stage, scene) =
-            (crate::query(&path, &wanted).unwrap(), cif_scene::query(&graph, &wanted, "graph").unwrap());
+        let (stage, scene) = (
+            crate::query(&path, &wanted, ReadOptions::default()).unwrap(),
+            cif_scene::query(&graph, &wanted, "graph").unwrap(),
+        );
         assert_eq!(stage.len(), scene.len());
         for (a, b) in stage.iter().zip(&scene) {
             let scale = 1.0 / frame.scale;
@@ -165,7 +167,7 @@ fn a_far_scene_stands_in_the_world_of_its_capture() {
         }
         let everything = ObjectQuery { label: Some("*".into()), ..ObjectQuery::default() };
         let (stage, scene) = (
-            crate::search(&path, &everything).unwrap(),
+            crate::search(&path, &everything, ReadOptions::default()).unwrap(),
             cif_scene::search(&graph, &everything, "graph", str::to_owned).unwrap(),
         );
         for a in &stage {

@@ -73,6 +73,9 @@ pub(super) struct Query {
     /// Interval of time: objects that are there at any time in it
     #[arg(long, value_name = "FROM:TO", conflicts_with = "time", allow_hyphen_values = true)]
     interval: Option<String>,
+    /// Read layers that a stage brings in from outside its folder
+    #[arg(long)]
+    follow_external: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -98,7 +101,10 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     let place = command.path.display().to_string();
     let found = match format {
         Format::Scene => in_scene(&command.path, wanted)?,
-        Format::Usd => cif_usd::search(&command.path, &wanted).map_err(Error::plain)?,
+        Format::Usd => {
+            let options = cif_usd::ReadOptions { follow_external: command.follow_external };
+            cif_usd::search(&command.path, &wanted, options).map_err(Error::plain)?
+        }
         Format::Gltf => {
             let graph = cif_gltf::read_scene(&command.path).map_err(Error::plain)?;
             cif_scene::search(&graph, &wanted, &place, str::to_owned).map_err(Error::plain)?
