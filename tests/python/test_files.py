@@ -77,6 +77,30 @@ def test_stages_of_others_can_be_queried(tmp_path: Path) -> None:
     assert found["path"] == "/Car" and found["low"] is None
 
 
+def test_queries_stay_in_the_folder(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    text = """#usda 1.0
+    (
+        defaultPrim = "Car"
+    )
+    def Xform "Car" (prepend apiSchemas = ["SemanticsLabelsAPI:class"]) {
+        token[] semantics:labels:class = ["sedan"]
+    }
+    """
+    (tmp_path / "library.usda").write_text(text)
+    shot = tmp_path / "shots" / "shot.usda"
+    shot.parent.mkdir()
+    shot.write_text('#usda 1.0\ndef "Hero" (references = @../library.usda@) {\n}\n')
+    with pytest.raises(cif.CifError, match="outside the folder"):
+        cif.query_stage(shot, "sedan")
+    (found,) = cif.query_stage(shot, "sedan", follow_external=True)
+    assert found["path"] == "/Hero"
+    assert cif.run(["query", str(shot), "--label", "sedan"]) == 1
+    said = capfd.readouterr().err
+    assert "../library.usda" in said and "--follow-external" in said, said
+    assert cif.run(["query", str(shot), "--label", "sedan", "--follow-external"]) == 0
+    assert "/Hero" in capfd.readouterr().out
+
+
 def test_motion_errors_stop_an_export(field: cif.Field, tmp_path: Path) -> None:
     def broken(time: float) -> None:
         raise KeyError(f"no frame at {time}")

@@ -148,6 +148,24 @@ fn camera_sizes_are_checked_before_memory_is_taken() {
 }
 
 #[test]
+fn points_at_absurd_distances_train_to_a_sound_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    capture::write(&path.join("table"), 5);
+    let points = path.join("table/points.npy");
+    let mut bytes = fs::read(&points).unwrap();
+    let first = bytes.len() - 6 * 12;
+    for (point, far) in bytes[first..].chunks_exact_mut(12).zip([1e17_f32, -1e17, 1e20, -1e30, 1e38, 3e38]) {
+        point[8..].copy_from_slice(&far.to_le_bytes());
+    }
+    fs::write(&points, bytes).unwrap();
+    let line = "train table -o far.cif -q --iterations-coarse 2 --iterations-fine 4 --iterations-instance 4 \
+                --set model.spatial_resolution=[8,8,8]";
+    cif(path, line).succeeds();
+    cif(path, "check far.cif").succeeds();
+}
+
+#[test]
 fn what_is_no_scene_or_beyond_repair_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();

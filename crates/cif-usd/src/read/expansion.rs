@@ -7,9 +7,9 @@ use std::rc::Rc;
 /// Most prims of a stage that is opened. usd-core takes some 40 us and 1 KB for each that it composes.
 pub(crate) const MAX_PRIMS: u64 = 250_000;
 
-/// Deepest nesting of prims, a reference counted like a level. usd-core follows both by calling itself; stages of people
-/// have a few dozen.
-pub(crate) const MAX_LEVELS: u32 = 1_000;
+/// Deepest nesting of prims, a reference counted like a level. usd-core follows both by calling itself, which takes up to 2 KB of
+/// stack a level, and threads have 2 MB; stages of people have a few dozen levels.
+pub(crate) const MAX_LEVELS: u32 = 500;
 
 /// A reference, payload, inherit or specialise.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -26,7 +26,7 @@ pub(super) struct PrimSpec {
     /// Paths of the prims directly below.
     pub(super) children: Vec<String>,
     /// Paths of the variants of every variant set, of which one is chosen.
-    pub(super) variants: Vec<Vec<String>>,
+    pub(super) variants: BTreeMap<String, Vec<String>>,
     pub(super) arcs: Vec<Arc>,
     pub(super) instanceable: Option<bool>,
     pub(super) active: Option<bool>,
@@ -74,7 +74,7 @@ pub(super) fn expand(layers: &BTreeMap<String, LayerSpec>, root: &str, instances
     let stack = counting.stack(root);
     let top = Place { stack, path: "/".to_owned() };
     let whole = counting.size(top.clone());
-    let mut largest = None;
+    let mut largest: Option<(String, u64)> = None;
     for child in counting.merged(&top).children {
         let size = counting.size(Place { stack, path: child.clone() }).prims;
         if largest.as_ref().is_none_or(|(_, most)| size > *most) {
@@ -90,7 +90,8 @@ pub(super) fn expand(layers: &BTreeMap<String, LayerSpec>, root: &str, instances
             levels = levels.max(size.levels);
         }
     }
-    let written = layers.values().map(|layer| layer.prims.len().saturating_sub(1) as u64).sum();
+    let is_prim = |path: &&String| *path != "/" && !path.ends_with('}');
+    let written = layers.values().map(|layer| layer.prims.keys().filter(is_prim).count() as u64).sum();
     Expansion { written, prims, levels, largest }
 }
 
@@ -111,7 +112,7 @@ struct Size {
 #[derive(Default)]
 struct Merged {
     children: Vec<String>,
-    variants: Vec<Vec<String>>,
+    variants: BTreeMap<String, BTreeSet<String>>,
     arcs: Vec<Place>,
     is_instance: bool,
 }
@@ -174,7 +175,9 @@ impl<'a> Counting<'a> {
         let mut seen = BTreeSet::new();
         for (layer, spec) in &specs {
             merged.children.extend(spec.children.iter().filter(|child| seen.insert(*child)).cloned());
-            merged.variants.extend(spec.variants.iter().cloned());
+            for (set, variants) in &spec.variants {
+                merged.variants.entry(set.clone()).or_default().extend(variants.iter().cloned());
+            }
             for Arc { asset, prim } in &spec.arcs {
                 let stack = match layer.targets.get(asset) {
                     _ if asset.is_empty() => place.stack,
@@ -213,7 +216,7 @@ impl<'a> Counting<'a> {
         parts.extend(merged.children.into_iter().map(|path| (Part::Child, below(path))));
         parts.extend(merged.arcs.into_iter().map(|place| (Part::Arc, place)));
         let sets = merged.variants.len();
-        for (set, variants) in merged.variants.into_iter().enumerate() {
+        for (set, variants) in merged.variants.into_values().enumerate() {
             parts.extend(variants.into_iter().map(|path| (Part::Variant(set), below(path))));
         }
         Open { place, parts, next: 0, size: Size { prims: 1, levels: 0 }, variants: vec![0; sets] }
@@ -334,7 +337,7 @@ mod tests {
         let mut root = layer(&[("/A", &[]), ("/A{lod=full}", &[]), ("/A{lod=half}", &[])]);
         root.prims.get_mut("/").unwrap().children.truncate(1);
         let variants = ["/A{lod=full}", "/A{lod=half}"].map(str::to_owned).to_vec();
-        root.prims.get_mut("/A").unwrap().variants.push(variants);
+        root.prims.get_mut("/A").unwrap().variants.insert("lod".to_owned(), variants);
         for (path, children) in [("/A{lod=full}", 3), ("/A{lod=half}", 2)] {
             let spec = root.prims.get_mut(path).unwrap();
             spec.children = (0..children).map(|k| format!("{path}c{k}")).collect();

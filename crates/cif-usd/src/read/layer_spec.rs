@@ -1,6 +1,9 @@
 //! What a layer says about its prims, read without composing anything.
 
+use std::collections::HashMap;
+
 use pyo3::prelude::*;
+use pyo3::types::PyList;
 
 use super::expansion::{Arc, LayerSpec, MAX_LEVELS, PrimSpec};
 
@@ -50,39 +53,49 @@ pub(super) fn describe(layer: &Bound<'_, PyAny>) -> PyResult<Described> {
         },
         too_deep: None,
     };
-    // Prims to be read, with their depths: usd-core would walk them by recursion.
-    let mut open = vec![(layer.getattr("pseudoRoot")?, 0)];
-    while let Some((prim, depth)) = open.pop() {
-        let path = path_of(&prim)?;
-        if depth > MAX_LEVELS {
-            described.too_deep = Some(path);
+    let paths = PyList::empty(layer.py());
+    let root = layer.getattr("pseudoRoot")?.getattr("path")?;
+    layer.call_method1("Traverse", (root, paths.getattr("append")?))?;
+    let mut prims: HashMap<String, PrimSpec> = HashMap::new();
+    for path in paths {
+        let is_prim = path.call_method0("IsPrimPath")?.is_truthy()?
+            || path.call_method0("IsPrimVariantSelectionPath")?.is_truthy()?;
+        if !is_prim {
+            continue;
+        }
+        let levels: u32 = path.getattr("pathElementCount")?.extract()?;
+        let text: String = path.getattr("pathString")?.extract()?;
+        if levels > MAX_LEVELS {
+            described.too_deep = Some(text);
             break;
         }
-        let mut spec = PrimSpec::default();
-        for child in prim.getattr("nameChildren")?.try_iter()? {
-            let child = child?;
-            spec.children.push(path_of(&child)?);
-            open.push((child, depth + 1));
+        let prim = layer.call_method1("GetPrimAtPath", (&path,))?;
+        // The path of a variant set without a variant names no prim.
+        if prim.is_none() {
+            continue;
         }
-        if depth > 0 {
-            for set in prim.getattr("variantSets")?.call_method0("values")?.try_iter()? {
-                let mut variants = Vec::new();
-                for variant in set?.getattr("variants")?.call_method0("values")?.try_iter()? {
-                    let inside = variant?.getattr("primSpec")?;
-                    variants.push(path_of(&inside)?);
-                    open.push((inside, depth + 1));
-                }
-                spec.variants.push(variants);
-            }
-            metadata(&prim, &mut spec, &mut described.clips)?;
+        let (parent, set) = above(&text);
+        let parent = prims.entry(parent.to_owned()).or_default();
+        match set {
+            Some(set) => parent.variants.entry(set.to_owned()).or_default().push(text.clone()),
+            None => parent.children.push(text.clone()),
         }
-        described.spec.prims.insert(path, spec);
+        metadata(&prim, prims.entry(text).or_default(), &mut described.clips)?;
     }
+    described.spec.prims = prims;
     Ok(described)
 }
 
-fn path_of(prim: &Bound<'_, PyAny>) -> PyResult<String> {
-    prim.getattr("path")?.str()?.extract()
+/// The path above that of a prim or a variant, `/A{lod=full}B` or `/A{lod=full}`, and the set of a variant.
+fn above(path: &str) -> (&str, Option<&str>) {
+    if let Some((parent, selection)) = path.strip_suffix('}').and_then(|path| path.rsplit_once('{')) {
+        return (parent, Some(selection.split('=').next().unwrap_or_default()));
+    }
+    match path.rfind(['/', '}']) {
+        Some(0) | None => ("/", None),
+        Some(end) if path.as_bytes()[end] == b'/' => (&path[..end], None),
+        Some(end) => (&path[..=end], None),
+    }
 }
 
 /// Arcs, clips and switches of a prim.
@@ -132,4 +145,23 @@ fn of_clips(sets: &Bound<'_, PyAny>, clips: &mut Vec<Clip>) -> PyResult<()> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::above;
+
+    #[test]
+    fn paths_tell_what_is_above_them() {
+        for (path, parent, set) in [
+            ("/A", "/", None),
+            ("/A/B", "/A", None),
+            ("/A{lod=full}", "/A", Some("lod")),
+            ("/A{lod=full}B", "/A{lod=full}", None),
+            ("/A{lod=full}B/C", "/A{lod=full}B", None),
+            ("/A{lod=full}{look=new}", "/A{lod=full}", Some("look")),
+        ] {
+            assert_eq!(above(path), (parent, set), "{path}");
+        }
+    }
 }
