@@ -1,7 +1,6 @@
 //! The field that a run starts from. Source: methods reference 1.1.
 
 use cif_dataset::{Dataset, Split};
-use cif_field::gaussians::LOG_SCALE_RANGE;
 use cif_field::{Deformation, DeformationConfig, Field, Gaussians, Instance, RecordedCamera, Timeline};
 use cif_geometry::scalar::logit;
 use glam::DVec3;
@@ -66,8 +65,7 @@ fn shrink_outliers(gaussians: &mut Gaussians, dataset: &Dataset) {
         let is_inside = mean.cmpge(core.low).all() && mean.cmple(core.high).all();
         let distance = centres.iter().map(|centre| centre.distance(mean)).fold(f64::INFINITY, f64::min);
         if !is_inside && distance.is_finite() {
-            // Larger ones are clamped when they are drawn, and get no gradient.
-            let largest = ((OUTLIER_ANGLE * distance).ln() as f32).min(LOG_SCALE_RANGE.1);
+            let largest = (OUTLIER_ANGLE * distance).ln() as f32;
             *log_scale = log_scale.map(|s| s.min(largest));
         }
     }
