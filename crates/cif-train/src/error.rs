@@ -81,6 +81,9 @@ pub enum TrainError {
         /// Step, from 1.
         iteration: u32,
     },
+    /// A stop was requested before the run had anything to save.
+    #[error("stopped before the first step")]
+    Stopped,
     /// No labels for the instance stage.
     #[error("{}: no training mask has a labelled pixel, so there is no instance stage", root.display())]
     NoLabels {

@@ -199,7 +199,8 @@ pub enum TrainEvent {
         /// One sentence.
         message: String,
     },
-    /// A checkpoint is wanted now: `report.checkpoint_every`, or [`Control::Save`] was returned.
+    /// A checkpoint is wanted now: `report.checkpoint_seconds` or `report.checkpoint_every` says so, a stage has ended,
+    /// or [`Control::Save`] was returned.
     CheckpointDue {
         /// Stage.
         stage: Stage,
@@ -242,7 +243,7 @@ pub enum Control {
 pub enum Outcome {
     /// All stages are done.
     Finished,
-    /// The observer stopped it; [`Trainer::checkpoint`] with state can be resumed.
+    /// The observer or a [`Stop`](crate::Stop) stopped it; [`Trainer::checkpoint`] with state can be resumed.
     Interrupted,
 }
 

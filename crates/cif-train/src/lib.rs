@@ -6,6 +6,7 @@
 //! | [`plan`] | which effects a capture calls for |
 //! | [`trainer`] | how a run goes through its stages, stops and resumes |
 //! | [`events`] | what a run tells its observer |
+//! | [`stop`] | how a run is asked to stop |
 //! | [`schedule`] | learning rates, spherical-harmonics degree |
 //! | [`losses`] | colour losses and their gradients |
 //! | [`budget`] | how a run fits into the time there is |
@@ -55,6 +56,7 @@ pub mod plan;
 mod random;
 pub mod resample;
 pub mod schedule;
+pub mod stop;
 pub mod tiles;
 pub mod tracks;
 pub mod trainer;
@@ -67,6 +69,7 @@ pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent, TrainerView};
 pub use plan::{EffectChoice, EffectPlan};
+pub use stop::{Start, Stop};
 #[cfg(feature = "wgpu")]
 pub use trainer::Probe;
 pub use trainer::{Fault, InstancePass, StepTimes, Trainer, Work};

@@ -3,10 +3,17 @@
 
 mod support;
 
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
 use cif_field::{Field, Gaussians};
 use cif_train::config::InstanceGeometry;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
-use cif_train::{Ablation, Control, Outcome, Stage, TrainError, TrainEvent, Trainer};
+use cif_train::{
+    Ablation, Clock, Control, Outcome, Seconds, Stage, Start, Stop, TrainConfig, TrainError, TrainEvent,
+    Trainer,
+};
 use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 fn assert_equal(a: &Field, b: &Field) {
@@ -22,7 +29,7 @@ fn a_run_reaches_its_quality_and_reports_its_stages() {
     config.stages.fine = 500;
     config.report.evaluate_every = 200;
     let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
-    let (mut stages, mut names) = (Vec::new(), std::collections::BTreeSet::new());
+    let (mut stages, mut names) = (Vec::new(), BTreeSet::new());
     let outcome = trainer
         .run(&mut |event, view| {
             let json = serde_json::to_value(event).unwrap();
@@ -80,6 +87,114 @@ fn a_resumed_run_ends_where_the_uninterrupted_one_ends() {
         assert_eq!(resumed.steps_left(), total - stop_at);
         assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         assert_equal(resumed.field(), whole.field());
+    }
+}
+
+/// Settings under which a short run does everything that a run can do between its steps.
+fn eventful_config() -> TrainConfig {
+    let mut config = small_config();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 40, 30);
+    (config.motion.guidance, config.motion.stillness, config.motion.rehearsal) = (10.0, 1.0, 30);
+    config.motion.gaussians = 40;
+    (config.densify.from, config.densify.every, config.densify.max_gaussians) = (5, 10, 1_200);
+    (config.effects.still_every, config.effects.still_from, config.effects.still_told) = (10, 0.2, 10);
+    (config.effects.sh_gain, config.effects.head_gain, config.model.sh_interval) = (0.01, 0.01, 7);
+    (config.identity.refresh_every, config.report.evaluate_every) = (10, 25);
+    config
+}
+
+fn eventful_capture(folder: &std::path::Path) -> cif_dataset::Dataset {
+    capture(folder, Scene { times: 12, views: 12, rolls: Some(0.9), one_camera: true, ..Scene::default() })
+}
+
+#[test]
+fn a_run_may_be_stopped_inside_everything_it_does() {
+    const FIRST: u32 = 40;
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = eventful_capture(folder.path());
+    let config = eventful_config();
+    let whole = train(dataset.clone(), config.clone());
+    assert!(whole.field().deformation.is_some());
+    // Each part of the run is stopped at one of its first questions, later where it would come no further.
+    let (mut state, mut stopped, mut limit) = (None::<cif_field::Checkpoint>, Vec::new(), FIRST);
+    let finished = (0..500).find_map(|_| {
+        let asked = Arc::new(AtomicU32::new(0));
+        let stop = Stop::when(move || asked.fetch_add(1, Ordering::Relaxed) >= limit);
+        let start = Start { dataset: dataset.clone(), stop };
+        let begun = match state.clone() {
+            None => Trainer::new(start, config.clone()),
+            Some(state) => Trainer::resume(start, state),
+        };
+        let mut trainer = match begun {
+            Ok(trainer) => trainer,
+            Err(TrainError::Stopped) => {
+                limit += 5;
+                return None;
+            }
+            Err(error) => panic!("{error}"),
+        };
+        let outcome = trainer.run(&mut |_, _| Control::Continue).unwrap();
+        if outcome == Outcome::Finished {
+            return Some(trainer);
+        }
+        trainer.field().validate().unwrap();
+        let checkpoint = trainer.checkpoint(true);
+        let progress = checkpoint.training.as_ref().unwrap().json["progress"].clone();
+        let place = (trainer.stage(), trainer.iteration(), progress["after_step"].clone());
+        limit = if stopped.last() == Some(&place) { limit + 5 } else { FIRST };
+        stopped.push(place);
+        state = Some(checkpoint);
+        None
+    });
+    assert_equal(finished.unwrap().field(), whole.field());
+    let at = |stage: Stage, iteration: u32| stopped.iter().any(|(s, i, _)| (*s, *i) == (stage, iteration));
+    assert!(at(Stage::Coarse, 20), "rehearsal: {stopped:?}");
+    assert!(at(Stage::Identity, 0), "identities: {stopped:?}");
+    let behind_steps: BTreeSet<&str> = stopped.iter().filter_map(|(_, _, after)| after.as_str()).collect();
+    assert!(behind_steps.len() >= 3, "judgements and the like: {stopped:?}");
+}
+
+/// A clock by which minutes pass between any two looks.
+struct Hasty(AtomicU32);
+
+impl Clock for Hasty {
+    fn now(&self) -> Seconds {
+        Seconds { wall_s: 100.0 * f64::from(self.0.fetch_add(1, Ordering::Relaxed)), cpu_s: 0.0 }
+    }
+}
+
+#[test]
+fn saving_by_time_changes_nothing_and_every_state_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = eventful_capture(folder.path());
+    let run = |seconds: u32| {
+        let mut config = eventful_config();
+        config.report.checkpoint_seconds = seconds;
+        let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
+        trainer.set_clock(Arc::new(Hasty(AtomicU32::new(0))));
+        let mut states = Vec::new();
+        trainer
+            .run(&mut |event, view| {
+                if let TrainEvent::CheckpointDue { stage, iteration } = event {
+                    states.push((*stage, *iteration, view.checkpoint(true)));
+                }
+                Control::Continue
+            })
+            .unwrap();
+        (trainer.into_field(), states)
+    };
+    let (never, none) = run(0);
+    assert!(none.is_empty());
+    let (often, states) = run(TrainConfig::default().report.checkpoint_seconds);
+    assert_equal(&often, &never);
+    for stage in [Stage::Fine, Stage::Identity, Stage::Instance] {
+        assert!(states.iter().any(|(at, done, _)| (*at, *done) == (stage, 0)), "one as {stage} begins");
+    }
+    assert!(states.iter().any(|(_, done, _)| *done > 0), "and others by time");
+    for (_, _, state) in states.into_iter().step_by(3) {
+        let mut resumed = Trainer::resume(dataset.clone(), state).unwrap();
+        assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+        assert_equal(resumed.field(), &never);
     }
 }
 

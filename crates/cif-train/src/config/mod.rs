@@ -368,6 +368,9 @@ pub struct ReportConfig {
     pub withhold: u32,
     /// Steps between requests to save a checkpoint, default 0: never.
     pub checkpoint_every: u32,
+    /// Seconds between requests to save a checkpoint, default 300; there is one at the end of each stage as well. At
+    /// least a hundred times what saving takes lies between two by time. 0: neither. Results do not depend on it.
+    pub checkpoint_seconds: u32,
 }
 
 impl TrainConfig {

@@ -311,6 +311,7 @@ impl Default for ReportConfig {
             curve_frames: 4,
             withhold: 0,
             checkpoint_every: 0,
+            checkpoint_seconds: 300,
         }
     }
 }

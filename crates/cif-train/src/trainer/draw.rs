@@ -29,6 +29,7 @@ impl Trainer {
             return self.draw_on_device(trial, views, each);
         }
         for index in views.frames {
+            self.check_stop()?;
             let frame = &self.dataset.frames[*index];
             let field = trial.unwrap_or(&self.field);
             let rendered =

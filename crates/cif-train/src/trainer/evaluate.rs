@@ -91,6 +91,7 @@ impl Trainer {
         let count = held_out.len().min(self.config.report.evaluate_frames as usize);
         let frames = (0..count)
             .map(|k| {
+                self.check_stop()?;
                 let index = held_out[k * held_out.len() / count];
                 Ok((index, self.dataset.load_frame(index, self.config.background)?))
             })
@@ -129,7 +130,10 @@ impl Trainer {
                 let name = |index: &usize| self.dataset.frames[*index].name.clone();
                 self.progress.curve.frames = kind;
                 self.progress.curve.frame_names = indices.iter().map(name).collect();
-                let load = |index| Ok((index, self.dataset.load_frame(index, self.config.background)?));
+                let load = |index| {
+                    self.check_stop()?;
+                    Ok((index, self.dataset.load_frame(index, self.config.background)?))
+                };
                 indices.into_iter().map(load).collect::<Result<_, TrainError>>()?
             }
         };

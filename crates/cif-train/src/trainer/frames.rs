@@ -8,6 +8,7 @@ use cif_render::UNLABELLED;
 use rayon::prelude::*;
 
 use crate::error::TrainError;
+use crate::stop::Stop;
 use crate::tracks::{misfits, observe};
 
 /// A decoded frame.
@@ -33,7 +34,12 @@ const BATCH: usize = 32;
 
 impl FrameStore {
     /// Decodes frames until the budget is used.
-    pub(super) fn open(dataset: &Dataset, background: [f32; 3], budget: u64) -> Result<Self, TrainError> {
+    pub(super) fn open(
+        dataset: &Dataset,
+        background: [f32; 3],
+        budget: u64,
+        stop: &Stop,
+    ) -> Result<Self, TrainError> {
         let mut label_of_id = vec![UNLABELLED; usize::from(u16::MAX) + 1];
         for (k, instance) in dataset.instances.iter().enumerate() {
             label_of_id[usize::from(instance.id)] = k as u16 + 1;
@@ -46,6 +52,7 @@ impl FrameStore {
         }
         let mut used = 0;
         for start in (0..store.frames.len()).step_by(BATCH) {
+            stop.check()?;
             let end = (start + BATCH).min(store.frames.len());
             if used > budget {
                 break;
@@ -99,10 +106,12 @@ impl FrameStore {
         &mut self,
         dataset: &Dataset,
         limit: f64,
+        stop: &Stop,
     ) -> Result<Vec<usize>, TrainError> {
         let mut masked = Vec::new();
         let mut seen = Vec::new();
         for k in 0..self.len() {
+            stop.check()?;
             if let Some(labels) = &self.get(dataset, k)?.labels {
                 let frame = &dataset.frames[self.index(k)];
                 masked.push(k);

@@ -14,6 +14,7 @@ use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::exposure::trained_exposures;
+use crate::stop::Start;
 
 /// Times that differ by less are the same.
 const SAME_TIME: f64 = 1e-9;
@@ -32,14 +33,15 @@ impl Trainer {
     ///
     /// # Errors
     /// When a setting cannot work; when the scene is of other times, frames or cameras than the capture, does
-    /// not move, or is not reconstructed yet; when no training mask has a labelled pixel; or when a frame cannot
-    /// be read.
+    /// not move, or is not reconstructed yet; when no training mask has a labelled pixel; when a frame cannot be
+    /// read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
     pub fn from_scene(
-        mut dataset: Dataset,
+        start: impl Into<Start>,
         mut config: TrainConfig,
         scene: Checkpoint,
         name: &str,
     ) -> Result<Self, TrainError> {
+        let Start { mut dataset, stop } = start.into();
         config.validate()?;
         // Settings of a scene without instances say that there shall be none; here they are all there is to train.
         config.effects.instances = true;
@@ -81,7 +83,7 @@ impl Trainer {
         field.instances = initialize::instances(&dataset);
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
         (field.background, field.sort_metric) = (config.background, config.sort_metric);
-        let mut trainer = Self::assemble(dataset, yardstick, config, field, Some(progress))?;
+        let mut trainer = Self::assemble(Start { dataset, stop }, yardstick, config, field, Some(progress))?;
         if !trainer.plan.has_instances {
             return Err(TrainError::NoLabels { root: trainer.dataset.root });
         }

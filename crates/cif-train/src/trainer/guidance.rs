@@ -167,6 +167,7 @@ impl Trainer {
         let mut observations = vec![Vec::new(); k];
         let scene = with_contacts.then(|| self.without_outliers()).flatten();
         for view in 0..self.frames.len() {
+            self.stop.check()?;
             let data = self.frames.get(&self.dataset, view)?;
             let Some(labels) = &data.labels else { continue };
             let settings = RenderSettings { deform: false, ..self.color_settings() };
@@ -252,7 +253,10 @@ impl Trainer {
         let mut rng = stream(self.config.seed, Purpose::Guidance, u64::from(label));
         let wanted = self.config.motion.gaussians as usize;
         let frames: Vec<_> = (0..self.frames.len())
-            .map(|view| Ok((self.frames.index(view), self.frames.get(&self.dataset, view)?)))
+            .map(|view| {
+                self.stop.check()?;
+                Ok((self.frames.index(view), self.frames.get(&self.dataset, view)?))
+            })
             .collect::<Result<_, TrainError>>()?;
         let (mut positions, mut colors) = (Vec::new(), Vec::new());
         for _ in 0..wanted * 40 {
@@ -319,6 +323,7 @@ impl Trainer {
         let times = self.dataset.times.clone();
         let mut rng = stream(self.config.seed, Purpose::Guidance, 0);
         for _ in 0..self.config.motion.rehearsal {
+            self.stop.check()?;
             let time = times[rng.random_range(0..times.len())];
             self.renderer.displace(&self.field, time);
             let guided = self.guidance.guide_of.iter().filter(|guide| **guide > 0).count().max(1) as f32;

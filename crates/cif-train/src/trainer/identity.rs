@@ -15,8 +15,14 @@ impl Trainer {
     /// Estimates the rows of all Gaussians; `starts` also sets occupancy to where the instance stage begins.
     pub(super) fn estimate_identities(&mut self, starts: bool) -> Result<TrainEvent, TrainError> {
         let k = self.field.instances.len();
-        self.label_pixels = vec![0.0; k];
-        let (counts, frames) = self.count_labels()?;
+        let before = std::mem::replace(&mut self.label_pixels, vec![0.0; k]);
+        let (counts, frames) = match self.count_labels() {
+            Ok(counted) => counted,
+            Err(error) => {
+                self.label_pixels = before;
+                return Err(error);
+            }
+        };
         let extent = f64::from(self.field.extent);
         let estimated = estimate(&counts, &self.field.gaussians, extent, &self.config.identity);
         if starts {
@@ -52,6 +58,7 @@ impl Trainer {
         let mut counts = IdentityCounts::zeros(self.field.gaussians.len(), self.field.instances.len());
         let mut frames = 0;
         for view in (0..self.frames.len()).step_by(self.config.identity.stride as usize) {
+            self.check_stop()?;
             let data = self.frames.get(&self.dataset, view)?;
             let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
             let frame = &self.dataset.frames[self.frames.index(view)];

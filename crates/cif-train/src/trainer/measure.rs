@@ -61,7 +61,7 @@ impl Trainer {
         } else if field.deformation.is_none() && dataset.times.len() > 1 && config.effects.motion {
             field.deformation = Some(initialize::initial_deformation(&dataset, &config)?);
         }
-        let mut trainer = Self::assemble(dataset, yardstick, config, field, None)?;
+        let mut trainer = Self::assemble(dataset.into(), yardstick, config, field, None)?;
         if stage == Stage::Instance {
             if !trainer.plan.has_instances {
                 return Err(TrainError::NoLabels { root: trainer.dataset.root.clone() });

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `initialize` | what a run starts from |
 //! | `progress` | which stages there are, and where the run stands |
+//! | `run` | how it goes through its stages, and where it may be stopped |
 //! | `step` | what one step does |
 //! | `optimiser` | which parameter groups there are, and how fast they move |
 //! | `guard` | what happens to a step that leaves the finite numbers |
@@ -17,6 +18,7 @@
 //! | `draw` | how views are rendered between steps |
 //! | `evaluate` | what a run has reached, on a few frames |
 //! | `pacing` | when stages end by time, or by what was reached |
+//! | `saving` | when a run asks to be saved |
 //! | `times`, `measure` | where the time of a step goes |
 //! | `device` | how steps run on a GPU, behind the feature `wgpu` |
 //!
@@ -44,6 +46,8 @@ mod optimiser;
 mod pacing;
 mod progress;
 mod provenance;
+mod run;
+mod saving;
 mod state;
 mod step;
 mod still;
@@ -72,22 +76,21 @@ pub use self::measure::InstancePass;
 use self::optimiser::Optimiser;
 use self::pacing::Pacing;
 use self::progress::{Plan, Progress};
-use self::step::{Scratch, StepLoss};
+use self::saving::Saving;
+use self::step::Scratch;
+#[cfg(feature = "wgpu")]
+use self::step::StepLoss;
 pub use self::times::{StepTimes, Work};
 use crate::clock::{Clock, SystemClock};
 use crate::config::TrainConfig;
-use crate::curve::{Curve, MIN_GAP};
+use crate::curve::Curve;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
-use crate::events::{Control, Outcome, Stage, TrainEvent, TrainerView};
+use crate::events::Stage;
+#[cfg(feature = "wgpu")]
+use crate::events::TrainEvent;
 use crate::exposure::Exposures;
-use crate::schedule::falls_on;
-
-/// Observer of a run.
-type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
-
-/// Share of unsupported pixels from which the user is told (methods reference 4.4).
-const MANY_UNSUPPORTED: f64 = 0.01;
+use crate::stop::{Start, Stop};
 
 /// Names that a warning lists at most.
 const MOST_NAMES: usize = 8;
@@ -137,6 +140,10 @@ pub struct Trainer {
     instance_pass: InstancePass,
     /// Where the run reads time.
     clock: Arc<dyn Clock>,
+    /// What may stop the run between two events.
+    stop: Stop,
+    /// When the next state is saved by time.
+    saving: Saving,
     /// Frames that the curve is measured on.
     yardstick: Yardstick,
     /// A budget that stages keep to.
@@ -154,34 +161,18 @@ pub struct Trainer {
     arrived: Vec<TrainEvent>,
 }
 
-/// What the observer asked for since it was last obeyed.
-#[derive(Default)]
-struct Requests {
-    save: bool,
-    stop: bool,
-}
-
-impl Requests {
-    fn add(&mut self, control: Control) {
-        match control {
-            Control::Continue => {}
-            Control::Save => self.save = true,
-            Control::Stop => self.stop = true,
-        }
-    }
-}
-
 impl Trainer {
     /// A run at its start; training frames are decoded into memory.
     ///
     /// # Errors
     /// When a setting cannot work, the capture has no training frame or no initial point, or a frame cannot
-    /// be read.
-    pub fn new(mut dataset: Dataset, config: TrainConfig) -> Result<Self, TrainError> {
+    /// be read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
+    pub fn new(start: impl Into<Start>, config: TrainConfig) -> Result<Self, TrainError> {
+        let Start { mut dataset, stop } = start.into();
         config.validate()?;
         let yardstick = Yardstick::withhold(&mut dataset, &config);
         let field = initialize::initial_field(&dataset, &config)?;
-        let mut trainer = Self::assemble(dataset, yardstick, config, field, None)?;
+        let mut trainer = Self::assemble(Start { dataset, stop }, yardstick, config, field, None)?;
         trainer.warn_of_capture();
         trainer.find_travelling()?;
         let first = trainer.plan.from(&trainer.config, Stage::Coarse);
@@ -191,9 +182,9 @@ impl Trainer {
         Ok(trainer)
     }
 
-    /// Everything but the state of the optimiser; frames of `yardstick` are no training frames of `dataset`.
+    /// Everything but the state of the optimiser; frames of `yardstick` are no training frames of the capture.
     fn assemble(
-        dataset: Dataset,
+        Start { dataset, stop }: Start,
         yardstick: Yardstick,
         config: TrainConfig,
         field: Field,
@@ -203,12 +194,12 @@ impl Trainer {
             return Err(TrainError::RecordedMotion { groups: tracks.groups.len() });
         }
         let budget = u64::from(config.frame_memory_mib) << 20;
-        let mut frames = FrameStore::open(&dataset, config.background, budget)?;
+        let mut frames = FrameStore::open(&dataset, config.background, budget, &stop)?;
         let has_instances =
             config.effects.instances && !dataset.instances.is_empty() && frames.has_labels(&dataset);
         let mut warnings = Vec::new();
         if has_instances && config.motion.misfit > 0.0 {
-            let left_out = frames.leave_out_misfits(&dataset, f64::from(config.motion.misfit))?;
+            let left_out = frames.leave_out_misfits(&dataset, f64::from(config.motion.misfit), &stop)?;
             warnings.extend(misfit_warning(&dataset, &left_out));
         }
         let n = field.gaussians.len();
@@ -229,6 +220,8 @@ impl Trainer {
             debug_validation: false,
             instance_pass: InstancePass::On,
             clock: Arc::new(SystemClock::start()),
+            stop,
+            saving: Saving::default(),
             yardstick,
             pacing: None,
             warnings,
@@ -382,222 +375,5 @@ impl Trainer {
     /// Sets times and counts to zero.
     pub fn reset_times(&mut self) {
         self.times = StepTimes::default();
-    }
-
-    /// Runs all stages that are left; `observer` sees every event and may stop the run.
-    ///
-    /// # Errors
-    /// When a frame cannot be read, or too many steps in a row leave the finite numbers; the field then still is
-    /// finite.
-    pub fn run(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
-        let result = self.run_stages(observer);
-        self.field.provenance = self.provenance();
-        result
-    }
-
-    fn run_stages(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
-        let mut requests = Requests::default();
-        for message in std::mem::take(&mut self.warnings) {
-            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
-        }
-        loop {
-            let stage = self.progress.stage;
-            if stage == Stage::Done {
-                break;
-            }
-            let iterations = self.plan.iterations(&self.config, stage);
-            let started = TrainEvent::StageStarted {
-                stage,
-                iteration: self.progress.iteration,
-                iterations,
-                gaussians: self.field.gaussians.len(),
-            };
-            requests.add(self.emit(observer, &started));
-            if stage == Stage::Identity {
-                if requests.stop {
-                    return Ok(Outcome::Interrupted);
-                }
-                let start = self.clock.now();
-                let event = self.estimate_identities(true)?;
-                self.progress.add_time(stage, self.clock.now() - start);
-                requests.add(self.emit(observer, &event));
-                if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
-                    && !empty_instances.is_empty()
-                {
-                    let message = format!(
-                        "no Gaussian is most probably of instance {empty_instances:?}: too small, or hidden \
-                         in the frames with masks"
-                    );
-                    requests.add(self.emit(observer, &TrainEvent::Warning { message }));
-                }
-            } else {
-                let outcome = self.run_steps(stage, observer, &mut requests);
-                // Whatever ended the steps, the field is whole again.
-                let fetched = self.fetch_from_gpu();
-                #[cfg(feature = "wgpu")]
-                for event in self.arrived_events() {
-                    requests.add(self.emit(observer, &event));
-                }
-                if outcome? == Outcome::Interrupted {
-                    return fetched.map(|()| Outcome::Interrupted);
-                }
-                fetched?;
-            }
-            let next = self.plan.after(&self.config, stage);
-            let ends = stage == Stage::Identity || next == Stage::Done || self.progress.iteration >= MIN_GAP;
-            if ends {
-                self.follow_curve(stage, true, observer, &mut requests)?;
-            }
-            self.enter(next)?;
-            if requests.stop && self.progress.stage != Stage::Done {
-                return Ok(Outcome::Interrupted);
-            }
-        }
-        if let Some(message) = self.missed_targets() {
-            self.emit(observer, &TrainEvent::Warning { message });
-        }
-        let finished = TrainEvent::Finished {
-            wall_s: self.progress.total_wall_s(),
-            iterations: self.progress.total_steps,
-            gaussians: self.field.gaussians.len(),
-            psnr: self.progress.psnr.unwrap_or(0.0),
-            peak_rss_mb: provenance::peak_rss_mb(),
-            rolled_back: self.progress.rollbacks.total,
-            work: self.progress.work,
-        };
-        self.emit(observer, &finished);
-        Ok(Outcome::Finished)
-    }
-
-    /// Steps of the current stage until its end or a stop.
-    fn run_steps(
-        &mut self,
-        stage: Stage,
-        observer: &mut Observer<'_>,
-        requests: &mut Requests,
-    ) -> Result<Outcome, TrainError> {
-        let mut events = Vec::new();
-        let (mut lap, mut lap_steps) = (0.0, 0);
-        self.pace_stage(stage);
-        // A budget or a target may change how many there are.
-        while self.progress.iteration < self.plan.iterations(&self.config, stage) {
-            if requests.stop {
-                return Ok(Outcome::Interrupted);
-            }
-            let start = self.clock.now();
-            let loss = self.step(&mut events)?;
-            let spent = self.clock.now() - start;
-            self.progress.add_time(stage, spent);
-            (lap, lap_steps) = (lap + spent.wall_s, lap_steps + 1);
-            for message in std::mem::take(&mut self.warnings) {
-                events.push(TrainEvent::Warning { message });
-            }
-            for event in events.drain(..) {
-                requests.add(self.emit(observer, &event));
-            }
-            let iteration = self.progress.iteration;
-            let iterations = self.plan.iterations(&self.config, stage);
-            if falls_on(iteration, self.config.report.step_every) || iteration == iterations {
-                let rate = f64::from(lap_steps) / lap.max(1e-9);
-                let event = self.step_event(stage, iterations, &loss, rate);
-                requests.add(self.emit(observer, &event));
-                (lap, lap_steps) = (0.0, 0);
-            }
-            if let Some(share) = loss.unsupported.filter(|share| *share > MANY_UNSUPPORTED)
-                && !self.progress.warned_of_unsupported
-            {
-                self.progress.warned_of_unsupported = true;
-                let message = format!(
-                    "{:.1} % of the labelled pixels of step {iteration} are covered by no Gaussian of their \
-                     instance; more Gaussians or a longer fine stage may help",
-                    100.0 * share
-                );
-                requests.add(self.emit(observer, &TrainEvent::Warning { message }));
-            }
-            self.follow_curve(stage, false, observer, requests)?;
-            self.follow_budget(stage);
-            let total = (self.progress.total_steps % u64::from(u32::MAX)) as u32;
-            if falls_on(total, self.config.report.evaluate_every) {
-                self.fetch_from_gpu()?;
-                let event = self.evaluate(stage)?;
-                requests.add(self.emit(observer, &event));
-            }
-            if falls_on(total, self.config.report.checkpoint_every) || requests.save {
-                requests.save = false;
-                self.fetch_from_gpu()?;
-                requests.add(self.emit(observer, &TrainEvent::CheckpointDue { stage, iteration }));
-            }
-        }
-        Ok(Outcome::Finished)
-    }
-
-    /// Measures a point of the curve where one is due, and acts on it.
-    fn follow_curve(
-        &mut self,
-        stage: Stage,
-        ends: bool,
-        observer: &mut Observer<'_>,
-        requests: &mut Requests,
-    ) -> Result<(), TrainError> {
-        let Some(event) = self.measure_curve(stage, ends)? else { return Ok(()) };
-        requests.add(self.emit(observer, &event));
-        if let TrainEvent::Measured { point, .. } = &event
-            && let Some(message) = self.follow_targets(point)
-        {
-            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
-        }
-        Ok(())
-    }
-
-    fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, rate: f64) -> TrainEvent {
-        TrainEvent::Step {
-            stage,
-            iteration: self.progress.iteration,
-            iterations,
-            loss: loss.total,
-            color_loss: loss.color,
-            instance_loss: loss.instance,
-            unsupported_px: loss.unsupported,
-            gaussians: self.field.gaussians.len(),
-            psnr: self.progress.psnr.unwrap_or(0.0),
-            iterations_per_second: rate,
-            eta_s: self.steps_left() as f64 / rate,
-        }
-    }
-
-    fn emit(&self, observer: &mut Observer<'_>, event: &TrainEvent) -> Control {
-        observer(event, &TrainerView { trainer: self })
-    }
-
-    /// Brings the field and the optimiser up to date where steps run on a GPU.
-    fn fetch_from_gpu(&mut self) -> Result<(), TrainError> {
-        #[cfg(feature = "wgpu")]
-        self.fetch_from_device()?;
-        Ok(())
-    }
-
-    /// Begins a stage: the fine stage gets its deformation and a new optimiser (methods reference 1.3).
-    fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
-        if stage == Stage::Fine {
-            if self.plan.is_dynamic {
-                self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
-            }
-            self.start_guidance()?;
-            self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
-            self.gradients = Gradients::zeros(&self.field);
-        }
-        self.begin(stage);
-        Ok(())
-    }
-
-    /// Stands at the start of a stage, with the field and the optimiser as they are.
-    fn begin(&mut self, stage: Stage) {
-        self.progress.stage = stage;
-        self.progress.iteration = 0;
-        self.progress.sh_start = self.field.sh_degree;
-        self.progress.opacities_were_reset = false;
-        self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
-        #[cfg(feature = "wgpu")]
-        self.everything_changed();
     }
 }

@@ -56,6 +56,9 @@ pub(super) struct Progress {
     /// What was planned for the capture, as recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effects: Option<serde_json::Value>,
+    /// What is still to follow the last step, where a stop came in between.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub after_step: Option<AfterStep>,
     /// Whether opacities were reset in this stage.
     pub opacities_were_reset: bool,
     /// Running mean PSNR of training views, dB.
@@ -68,6 +71,22 @@ pub(super) struct Progress {
     /// The scene whose Gaussians and deformation the run began with, where it began with one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub source: Option<Source>,
+}
+
+/// What follows a step, in order; each is done as a whole or not at all.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum AfterStep {
+    /// Densification; refreshed identities and resampling in the instance stage.
+    Changes,
+    /// Judgement of the optional outputs of the deformation.
+    Heads,
+    /// The test for Gaussians that stand still.
+    Still,
+    /// A point of the curve.
+    Curve,
+    /// Evaluation on held-out frames.
+    Evaluation,
 }
 
 /// A scene that a run began with, as recorded.
@@ -141,6 +160,7 @@ impl Progress {
             work: Work::default(),
             exposures: None,
             effects: None,
+            after_step: None,
             opacities_were_reset: false,
             psnr: None,
             warned_of_unsupported: false,

@@ -15,6 +15,7 @@ use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::Stage;
+use crate::stop::Start;
 
 /// Version of the state.
 const VERSION: u32 = 1;
@@ -159,16 +160,18 @@ impl Trainer {
     /// A run where a checkpoint with state left it; settings come from the checkpoint.
     ///
     /// # Errors
-    /// When the checkpoint has no training state, is damaged, or belongs to another capture; or when a frame
-    /// cannot be read.
-    pub fn resume(mut dataset: Dataset, checkpoint: Checkpoint) -> Result<Self, TrainError> {
+    /// When the checkpoint has no training state, is damaged, or belongs to another capture; when a frame cannot
+    /// be read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
+    pub fn resume(start: impl Into<Start>, checkpoint: Checkpoint) -> Result<Self, TrainError> {
+        let Start { mut dataset, stop } = start.into();
         let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
         let state = State::parse(json)?;
         state.config.validate()?;
         let yardstick = Yardstick::withhold(&mut dataset, &state.config);
         state.capture.check(&Capture::of(&dataset), &dataset)?;
+        let start = Start { dataset, stop };
         let mut trainer =
-            Self::assemble(dataset, yardstick, state.config, checkpoint.field, Some(state.progress))?;
+            Self::assemble(start, yardstick, state.config, checkpoint.field, Some(state.progress))?;
 
         let n = trainer.field.gaussians.len();
         restore(&mut trainer.optimiser, &mut tensors, &state.adam_steps)?;

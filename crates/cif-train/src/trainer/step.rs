@@ -11,6 +11,7 @@ use super::earned::leave_out_held_out;
 use super::frames::TrainFrame;
 use super::guard::{exposure_fault, gradient_fault};
 use super::optimiser::StepRates;
+use super::progress::AfterStep;
 use super::times::lap;
 use super::{InstancePass, Trainer};
 use crate::adam::PlaneWeights;
@@ -251,16 +252,58 @@ impl Trainer {
         self.progress.count_step();
         self.keep_in_range(stage);
         let mut since = Instant::now();
-        match stage {
-            Stage::Instance => self.instance_events(iteration, events)?,
-            _ => self.densify(stage, iteration, events)?,
-        }
-        self.judge_heads(stage, iteration, events)?;
-        self.settle(stage, iteration, events)?;
+        self.progress.after_step = Some(AfterStep::Changes);
+        self.finish_step(stage, events)?;
         lap(&mut self.times.rearrange, &mut since);
         self.times.total += start.elapsed();
         self.times.steps += 1;
         Ok(loss)
+    }
+
+    /// What changes the field behind a step, from where a stop cut it short.
+    pub(super) fn finish_step(
+        &mut self,
+        stage: Stage,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        let iteration = self.progress.iteration;
+        if self.progress.after_step == Some(AfterStep::Changes) {
+            match stage {
+                Stage::Instance => self.instance_events(iteration, events)?,
+                _ => self.densify(stage, iteration, events)?,
+            }
+            self.progress.after_step = Some(AfterStep::Heads);
+        }
+        if self.progress.after_step == Some(AfterStep::Heads) {
+            if self.judges_heads(stage, iteration) {
+                self.wholly(events, |trainer, events| trainer.judge_heads(stage, iteration, events))?;
+            }
+            self.progress.after_step = Some(AfterStep::Still);
+        }
+        if self.progress.after_step == Some(AfterStep::Still) {
+            if self.settles(stage, iteration) {
+                self.wholly(events, |trainer, events| trainer.settle(stage, iteration, events))?;
+            }
+            self.progress.after_step = None;
+        }
+        Ok(())
+    }
+
+    /// Does work that judges the field, or leaves everything as it was when that fails or is stopped.
+    fn wholly(
+        &mut self,
+        events: &mut Vec<TrainEvent>,
+        work: impl FnOnce(&mut Self, &mut Vec<TrainEvent>) -> Result<(), TrainError>,
+    ) -> Result<(), TrainError> {
+        let told = events.len();
+        let before = (self.field.clone(), self.optimiser.mlp.clone(), self.progress.still_rung);
+        let result = work(self, events);
+        if result.is_err() {
+            (self.field, self.optimiser.mlp, self.progress.still_rung) = before;
+            self.gradients = Gradients::zeros(&self.field);
+            events.truncate(told);
+        }
+        result
     }
 
     /// Tiles that a view of a step is learnt from; `None` for all.

@@ -1,0 +1,319 @@
+//! How a run goes through its stages, and where it may be stopped.
+
+use cif_render::Gradients;
+
+use super::optimiser::Optimiser;
+use super::progress::{AfterStep, Progress};
+use super::saving::Saving;
+use super::step::StepLoss;
+use super::{Trainer, initialize, provenance};
+use crate::curve::MIN_GAP;
+use crate::densify::DensifyStatistics;
+use crate::error::TrainError;
+use crate::events::{Control, Outcome, Stage, TrainEvent, TrainerView};
+use crate::schedule::falls_on;
+
+/// Observer of a run.
+type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
+
+/// Share of unsupported pixels from which the user is told (methods reference 4.4).
+const MANY_UNSUPPORTED: f64 = 0.01;
+
+/// What the observer asked for since it was last obeyed.
+#[derive(Default)]
+struct Requests {
+    save: bool,
+    stop: bool,
+}
+
+impl Requests {
+    fn add(&mut self, control: Control) {
+        match control {
+            Control::Continue => {}
+            Control::Save => self.save = true,
+            Control::Stop => self.stop = true,
+        }
+    }
+}
+
+impl Trainer {
+    /// Runs all stages that are left; `observer` sees every event and may stop the run, as may the
+    /// [`Stop`](crate::Stop) that it was begun with, which is asked between events too. Whatever stops it, the run can
+    /// be saved and resumed.
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or too many steps in a row leave the finite numbers; the field then still is
+    /// finite.
+    pub fn run(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
+        let result = match self.run_stages(observer) {
+            Err(TrainError::Stopped) => Ok(Outcome::Interrupted),
+            result => result,
+        };
+        self.field.provenance = self.provenance();
+        result
+    }
+
+    fn run_stages(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
+        let mut requests = Requests::default();
+        self.saving = Saving::begin(self.config.report.checkpoint_seconds, self.clock.now().wall_s);
+        for message in std::mem::take(&mut self.warnings) {
+            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+        }
+        loop {
+            let stage = self.progress.stage;
+            if stage == Stage::Done {
+                break;
+            }
+            let iterations = self.plan.iterations(&self.config, stage);
+            let started = TrainEvent::StageStarted {
+                stage,
+                iteration: self.progress.iteration,
+                iterations,
+                gaussians: self.field.gaussians.len(),
+            };
+            requests.add(self.emit(observer, &started));
+            if stage == Stage::Identity {
+                if requests.stop || self.stop.requested() {
+                    return Ok(Outcome::Interrupted);
+                }
+                let start = self.clock.now();
+                let event = self.estimate_identities(true)?;
+                self.progress.add_time(stage, self.clock.now() - start);
+                requests.add(self.emit(observer, &event));
+                if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
+                    && !empty_instances.is_empty()
+                {
+                    let message = format!(
+                        "no Gaussian is most probably of instance {empty_instances:?}: too small, or hidden \
+                         in the frames with masks"
+                    );
+                    requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+                }
+            } else {
+                let outcome = self.run_steps(stage, observer, &mut requests);
+                // Whatever ended the steps, the field is whole again.
+                let fetched = self.fetch_from_gpu();
+                #[cfg(feature = "wgpu")]
+                for event in self.arrived_events() {
+                    requests.add(self.emit(observer, &event));
+                }
+                if outcome? == Outcome::Interrupted {
+                    return fetched.map(|()| Outcome::Interrupted);
+                }
+                fetched?;
+            }
+            let next = self.plan.after(&self.config, stage);
+            let ends = stage == Stage::Identity || next == Stage::Done || self.progress.iteration >= MIN_GAP;
+            if ends {
+                match self.follow_curve(stage, true, observer, &mut requests) {
+                    // The rows are there: the run goes on behind them, without this point.
+                    Err(TrainError::Stopped) if stage == Stage::Identity => {}
+                    measured => measured?,
+                }
+            }
+            self.enter(next)?;
+            if next == Stage::Done {
+                continue;
+            }
+            if requests.stop || self.stop.requested() {
+                return Ok(Outcome::Interrupted);
+            }
+            if self.config.report.checkpoint_seconds > 0 {
+                self.request_checkpoint(observer, &mut requests);
+            }
+        }
+        if let Some(message) = self.missed_targets() {
+            self.emit(observer, &TrainEvent::Warning { message });
+        }
+        let finished = TrainEvent::Finished {
+            wall_s: self.progress.total_wall_s(),
+            iterations: self.progress.total_steps,
+            gaussians: self.field.gaussians.len(),
+            psnr: self.progress.psnr.unwrap_or(0.0),
+            peak_rss_mb: provenance::peak_rss_mb(),
+            rolled_back: self.progress.rollbacks.total,
+            work: self.progress.work,
+        };
+        self.emit(observer, &finished);
+        Ok(Outcome::Finished)
+    }
+
+    /// Steps of the current stage until its end or a stop.
+    fn run_steps(
+        &mut self,
+        stage: Stage,
+        observer: &mut Observer<'_>,
+        requests: &mut Requests,
+    ) -> Result<Outcome, TrainError> {
+        let mut events = Vec::new();
+        let (mut lap, mut lap_steps) = (0.0, 0);
+        self.pace_stage(stage);
+        // A budget or a target may change how many there are.
+        while self.progress.after_step.is_some()
+            || self.progress.iteration < self.plan.iterations(&self.config, stage)
+        {
+            if requests.stop || self.stop.requested() {
+                return Ok(Outcome::Interrupted);
+            }
+            let start = self.clock.now();
+            let resumed = self.progress.after_step;
+            let done = match resumed {
+                None => self.step(&mut events).map(Some),
+                Some(_) => self.finish_step(stage, &mut events).map(|()| None),
+            };
+            let spent = self.clock.now() - start;
+            self.progress.add_time(stage, spent);
+            (lap, lap_steps) = (lap + spent.wall_s, lap_steps + u32::from(resumed.is_none()));
+            for message in std::mem::take(&mut self.warnings) {
+                events.push(TrainEvent::Warning { message });
+            }
+            for event in events.drain(..) {
+                requests.add(self.emit(observer, &event));
+            }
+            let loss = done?;
+            let iteration = self.progress.iteration;
+            let iterations = self.plan.iterations(&self.config, stage);
+            if let Some(loss) = loss
+                && (falls_on(iteration, self.config.report.step_every) || iteration == iterations)
+            {
+                let rate = f64::from(lap_steps) / lap.max(1e-9);
+                let event = self.step_event(stage, iterations, &loss, rate);
+                requests.add(self.emit(observer, &event));
+                (lap, lap_steps) = (0.0, 0);
+            }
+            if let Some(share) =
+                loss.and_then(|loss| loss.unsupported).filter(|share| *share > MANY_UNSUPPORTED)
+                && !self.progress.warned_of_unsupported
+            {
+                self.progress.warned_of_unsupported = true;
+                let message = format!(
+                    "{:.1} % of the labelled pixels of step {iteration} are covered by no Gaussian of their \
+                     instance; more Gaussians or a longer fine stage may help",
+                    100.0 * share
+                );
+                requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+            }
+            if resumed != Some(AfterStep::Evaluation) {
+                self.progress.after_step = Some(AfterStep::Curve);
+                self.follow_curve(stage, false, observer, requests)?;
+                self.follow_budget(stage);
+            }
+            self.progress.after_step = Some(AfterStep::Evaluation);
+            let total = (self.progress.total_steps % u64::from(u32::MAX)) as u32;
+            if falls_on(total, self.config.report.evaluate_every) {
+                self.fetch_from_gpu()?;
+                let event = self.evaluate(stage)?;
+                requests.add(self.emit(observer, &event));
+            }
+            self.progress.after_step = None;
+            let report = &self.config.report;
+            if falls_on(total, report.checkpoint_every)
+                || self.saving.is_due(report.checkpoint_seconds, self.clock.now().wall_s)
+                || requests.save
+            {
+                requests.save = false;
+                self.fetch_from_gpu()?;
+                self.request_checkpoint(observer, requests);
+            }
+        }
+        Ok(Outcome::Finished)
+    }
+
+    /// Asks the observer to save the run as it stands.
+    fn request_checkpoint(&mut self, observer: &mut Observer<'_>, requests: &mut Requests) {
+        let start_s = self.clock.now().wall_s;
+        let Progress { stage, iteration, .. } = self.progress;
+        requests.add(self.emit(observer, &TrainEvent::CheckpointDue { stage, iteration }));
+        self.saving.saved(self.config.report.checkpoint_seconds, start_s, self.clock.now().wall_s);
+    }
+
+    /// [`TrainError::Stopped`] once a stop is requested. Work between two steps on a GPU is never left half way.
+    pub(super) fn check_stop(&self) -> Result<(), TrainError> {
+        #[cfg(feature = "wgpu")]
+        if self.device.is_some() {
+            return Ok(());
+        }
+        self.stop.check()
+    }
+
+    /// Measures a point of the curve where one is due, and acts on it.
+    fn follow_curve(
+        &mut self,
+        stage: Stage,
+        ends: bool,
+        observer: &mut Observer<'_>,
+        requests: &mut Requests,
+    ) -> Result<(), TrainError> {
+        let Some(event) = self.measure_curve(stage, ends)? else { return Ok(()) };
+        requests.add(self.emit(observer, &event));
+        if let TrainEvent::Measured { point, .. } = &event
+            && let Some(message) = self.follow_targets(point)
+        {
+            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+        }
+        Ok(())
+    }
+
+    fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, rate: f64) -> TrainEvent {
+        TrainEvent::Step {
+            stage,
+            iteration: self.progress.iteration,
+            iterations,
+            loss: loss.total,
+            color_loss: loss.color,
+            instance_loss: loss.instance,
+            unsupported_px: loss.unsupported,
+            gaussians: self.field.gaussians.len(),
+            psnr: self.progress.psnr.unwrap_or(0.0),
+            iterations_per_second: rate,
+            eta_s: self.steps_left() as f64 / rate,
+        }
+    }
+
+    fn emit(&self, observer: &mut Observer<'_>, event: &TrainEvent) -> Control {
+        observer(event, &TrainerView { trainer: self })
+    }
+
+    /// Brings the field and the optimiser up to date where steps run on a GPU.
+    pub(super) fn fetch_from_gpu(&mut self) -> Result<(), TrainError> {
+        #[cfg(feature = "wgpu")]
+        self.fetch_from_device()?;
+        Ok(())
+    }
+
+    /// Begins a stage. The run stays at the end of the stage before it when that fails or is stopped.
+    pub(super) fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
+        if stage == Stage::Fine {
+            let before = (self.field.clone(), self.guidance.clone(), self.optimiser.clone());
+            if let Err(error) = self.prepare_fine() {
+                (self.field, self.guidance, self.optimiser) = before;
+                self.gradients = Gradients::zeros(&self.field);
+                return Err(error);
+            }
+        }
+        self.begin(stage);
+        Ok(())
+    }
+
+    /// Gives the fine stage its deformation and a new optimiser (methods reference 1.3).
+    fn prepare_fine(&mut self) -> Result<(), TrainError> {
+        if self.plan.is_dynamic {
+            self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
+        }
+        self.start_guidance()?;
+        self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
+        self.gradients = Gradients::zeros(&self.field);
+        Ok(())
+    }
+
+    /// Stands at the start of a stage, with the field and the optimiser as they are.
+    pub(super) fn begin(&mut self, stage: Stage) {
+        self.progress.stage = stage;
+        self.progress.iteration = 0;
+        self.progress.sh_start = self.field.sh_degree;
+        self.progress.opacities_were_reset = false;
+        self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
+        #[cfg(feature = "wgpu")]
+        self.everything_changed();
+    }
+}
