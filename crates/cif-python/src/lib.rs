@@ -35,7 +35,7 @@ fn run(py: Python<'_>, arguments: Vec<OsString>) -> i32 {
 /// Ends this process without a word when whatever reads its output has seen enough.
 #[pyfunction]
 fn end_with_reader() {
-    cif::end_with_reader();
+    cif::own_process();
 }
 
 #[pymodule]

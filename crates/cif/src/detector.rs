@@ -11,12 +11,14 @@ use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use cif_dataset::Dataset;
 use cif_dataset::masks::{flat_name, found_masks};
 use tempfile::TempDir;
 
 use crate::error::Error;
+use crate::interrupt;
 use crate::mask_query::FoundMasks;
 use crate::output::{self, Outputs};
 use crate::pictures::{Picture, save_rgb};
@@ -31,6 +33,9 @@ pub struct Detected {
     pub masks: FoundMasks,
     _folder: TempDir,
 }
+
+/// Time between two looks whether the command has ended.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Runs a detector on frames of a capture.
 ///
@@ -113,19 +118,30 @@ fn fill(word: &str, values: &[(&str, &str)]) -> String {
 
 fn run(words: &[String], said: &Path) -> Result<(), Error> {
     let file = File::create(said).map_err(Error::io("write", said))?;
-    let status = Command::new(&words[0])
+    let mut child = Command::new(&words[0])
         .args(&words[1..])
         .stdin(Stdio::null())
         // What the command prints must not mix with what cif prints.
         .stdout(Stdio::null())
         .stderr(file)
-        .status()
+        .spawn()
         .map_err(|error| {
             Error::failed(
                 format!("the detector {} cannot be started: {error}", words[0]),
                 "give a program on the PATH, or its full path",
             )
         })?;
+    let failed = |error| Error::plain(format!("the detector {} was lost: {error}", words[0]));
+    let status = loop {
+        if let Some(status) = child.try_wait().map_err(failed)? {
+            break status;
+        }
+        if interrupt::requested() {
+            child.kill().and_then(|()| child.wait()).map_err(failed)?;
+            return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
+        }
+        std::thread::sleep(LOOK_EVERY);
+    };
     if status.success() {
         return Ok(());
     }

@@ -107,6 +107,15 @@ impl Error {
         }))
     }
 
+    /// The message with the advice behind it, where there is some.
+    #[must_use]
+    pub fn with_help(&self) -> String {
+        match Diagnostic::help(self) {
+            Some(help) => format!("{self}; {help}"),
+            None => self.to_string(),
+        }
+    }
+
     /// Exit code of the process.
     #[must_use]
     pub fn exit_code(&self) -> i32 {

@@ -1,16 +1,19 @@
-//! Ctrl-C and SIGTERM: a command that watches for them stops after its step, every other one ends at once, without
-//! leaving unfinished files behind.
+//! Requests to stop: Ctrl-C, SIGTERM and SIGHUP where the process is the command's own, else whatever the process asks
+//! through a [`Session`].
+//!
+//! Until a command has something to save, signals end the process, and remove what it has not finished writing.
 
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Mutex, OnceLock, PoisonError};
+use std::time::Duration;
 
-static REQUESTED: AtomicBool = AtomicBool::new(false);
-static INSTALLED: OnceLock<bool> = OnceLock::new();
+/// How long a command that saves nothing may take to end by itself.
+const GRACE: Duration = Duration::from_millis(1_500);
 
 /// Until [`watch`], signals end the process at once, and remove what it has not finished writing; those that it was
-/// started to ignore, as by `nohup`, stay ignored. For processes that are nothing but the command.
+/// started to ignore, as by `nohup`, stay ignored.
 #[cfg(unix)]
-pub fn end_cleanly() {
+fn end_cleanly() {
     use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
 
     let ignored = ignored_signals();
@@ -27,7 +30,7 @@ pub fn end_cleanly() {
 
 /// As on Unix, but what is not finished is removed at the next run.
 #[cfg(not(unix))]
-pub fn end_cleanly() {}
+fn end_cleanly() {}
 
 /// Bit k - 1 for signal k, as far as the system tells.
 #[cfg(unix)]
@@ -37,28 +40,138 @@ fn ignored_signals() -> u64 {
     mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0)
 }
 
-/// Starts to watch for Ctrl-C and SIGTERM; forgets an earlier one.
+static OWNED: AtomicBool = AtomicBool::new(false);
+static SAVES: AtomicBool = AtomicBool::new(false);
+static HANDLER: OnceLock<bool> = OnceLock::new();
+static REQUESTS: Requests = Requests::new();
+
+/// A request to stop, and the sessions that may be asked.
+#[derive(Debug)]
+struct Requests {
+    requested: AtomicBool,
+    sessions: Mutex<usize>,
+}
+
+impl Requests {
+    const fn new() -> Self {
+        Self { requested: AtomicBool::new(false), sessions: Mutex::new(0) }
+    }
+
+    /// A session begins without a request, unless others are open.
+    fn begin(&self) {
+        let mut open = self.sessions.lock().unwrap_or_else(PoisonError::into_inner);
+        if *open == 0 {
+            self.requested.store(false, Ordering::SeqCst);
+        }
+        *open += 1;
+    }
+
+    fn end(&self) {
+        *self.sessions.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
+    }
+
+    /// Whether a stop was requested before.
+    fn request(&self) -> bool {
+        self.requested.swap(true, Ordering::SeqCst)
+    }
+
+    fn requested(&self) -> bool {
+        self.requested.load(Ordering::SeqCst)
+    }
+}
+
+/// This process is nothing but the command, which may take its signals and end it.
+pub(crate) fn own_process() {
+    OWNED.store(true, Ordering::SeqCst);
+    end_cleanly();
+}
+
+/// From here on a signal asks the command to stop; the process ends 1.5 seconds later at the latest.
 pub fn watch() {
-    REQUESTED.store(false, Ordering::SeqCst);
-    INSTALLED.get_or_init(|| {
+    // Elsewhere signals belong to others.
+    if !OWNED.load(Ordering::SeqCst) {
+        return;
+    }
+    HANDLER.get_or_init(|| {
         ctrlc::set_handler(|| {
-            if REQUESTED.swap(true, Ordering::SeqCst) {
+            if REQUESTS.request() {
                 end();
             }
-            eprintln!("\nstopping after this step and saving; press Ctrl-C again to quit without saving");
+            if SAVES.load(Ordering::SeqCst) {
+                eprintln!("\nstopping and saving; press Ctrl-C again to quit without saving");
+            } else {
+                std::thread::sleep(GRACE);
+                eprintln!("interrupted");
+                end();
+            }
         })
         .is_ok()
     });
 }
 
-/// Whether Ctrl-C was pressed since [`watch`].
+/// From here on a signal asks the command to stop and to save what it has; a second one ends the process.
+pub fn watch_and_save() {
+    SAVES.store(true, Ordering::SeqCst);
+    watch();
+}
+
+/// Whether the command is asked to stop.
 #[must_use]
 pub fn requested() -> bool {
-    REQUESTED.load(Ordering::SeqCst)
+    REQUESTS.requested()
+}
+
+/// A command inside a process of others, which passes requests on. All commands that run at a time share them.
+#[derive(Debug)]
+pub struct Session(());
+
+impl Session {
+    /// Begins without a request, unless other sessions are open.
+    #[must_use]
+    pub fn begin() -> Self {
+        REQUESTS.begin();
+        Self(())
+    }
+
+    /// Asks the command to stop.
+    pub fn request(&self) {
+        REQUESTS.request();
+    }
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        REQUESTS.end();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn requests_last_as_long_as_the_sessions_they_are_meant_for() {
+        let requests = Requests::new();
+        requests.begin();
+        assert!(!requests.requested());
+        assert!(!requests.request() && requests.request(), "the second one is told from the first");
+        requests.begin();
+        assert!(requests.requested(), "one that is being stopped is not forgotten");
+        requests.end();
+        requests.end();
+        requests.begin();
+        assert!(!requests.requested());
+    }
+
+    #[test]
+    fn signals_of_a_process_of_others_are_left_alone() {
+        watch_and_save();
+        assert!(HANDLER.get().is_none());
+    }
 }
 
 /// Ends the process as interrupted, without unfinished files.
-fn end() {
+fn end() -> ! {
     cif_output::abandon();
     // No exit handlers: those of usd-core's libraries must not run while other threads are in them.
     signal_hook::low_level::exit(130);

@@ -1,16 +1,20 @@
 //! The `cif` command as a library: [`run`] is what both the binary and the Python package call, each after
-//! [`end_with_reader`] where the process is theirs.
+//! [`own_process`] where the process is theirs.
 //!
 //! | module | answers |
 //! |---|---|
 //! | [`accuracy`] | what accuracy costs, as a report |
 //! | [`commands`] | one file per subcommand |
 //! | [`settings`] | preset, file, flags: which value counts |
+//! | [`training`] | runs that save into a file |
+//! | [`destination`] | that file: saved into by one run, never over what others put there |
+//! | [`lock`] | who writes a file |
 //! | [`progress`] | bars, plain lines and JSON lines of a training run |
 //! | [`quality`] | renders that take shortcuts |
-//! | [`interrupt`] | what Ctrl-C does |
+//! | [`interrupt`] | what Ctrl-C and SIGTERM do |
 //! | [`output`] | files written whole, never over existing ones |
 //! | [`pictures`] | instance, depth and error colours, panels, PNG files |
+//! | `backend` | whether the processor or a GPU does the work, behind the feature `wgpu` |
 //! | [`camera_file`] | views that no capture has |
 //! | [`graph_file`] | scenes of any format as scene graphs |
 //! | [`mask_query`] | which objects 2D masks show |
@@ -20,20 +24,25 @@
 //! | [`error`] | what is reported, and the exit code |
 
 pub mod accuracy;
+#[cfg(feature = "wgpu")]
+pub mod backend;
 pub mod camera_file;
 pub mod commands;
+pub mod destination;
 pub mod detector;
 pub mod error;
 pub mod graph_file;
 pub mod ground_truth;
 pub mod hard_captures;
 pub mod interrupt;
+pub mod lock;
 pub mod mask_query;
 pub mod output;
 pub mod pictures;
 pub mod progress;
 pub mod quality;
 pub mod settings;
+pub mod training;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;
@@ -44,10 +53,11 @@ use miette::{GraphicalReportHandler, GraphicalTheme};
 pub use error::Error;
 
 /// From here on the process ends without a word when whatever reads its output has seen enough, as in
-/// `cif eval ... | head`, and signals end it without leaving unfinished files behind. For processes that are nothing but the command: others would end with it.
-pub fn end_with_reader() {
+/// `cif eval ... | head`, and signals stop the command. For processes that are nothing but the command: others would
+/// end with it, and lose their own handlers.
+pub fn own_process() {
     sigpipe::reset();
-    interrupt::end_cleanly();
+    interrupt::own_process();
 }
 
 /// Runs a command line, the first argument being the name of the program, and returns the exit code:

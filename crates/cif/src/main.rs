@@ -1,6 +1,6 @@
 //! The `cif` command.
 
 fn main() {
-    cif::end_with_reader();
+    cif::own_process();
     std::process::exit(cif::run(std::env::args_os().collect()));
 }

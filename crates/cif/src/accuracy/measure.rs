@@ -10,7 +10,9 @@ use cif_render::{Channels, RenderSettings, RenderedImage, reference};
 use cif_scene::{SceneOptions, Tolerance};
 use cif_train::metrics::image::psnr;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, Scores, evaluate, trained_settings};
-use cif_train::{Clock, Control, Outcome, Seconds, SystemClock, TrainConfig, Trainer};
+use cif_train::{
+    Clock, Control, Outcome, Seconds, Start, Stop, SystemClock, TrainConfig, TrainError, Trainer,
+};
 use half::f16;
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
@@ -55,11 +57,15 @@ pub fn train(
         true => Checkpoint::load(&partial).ok(),
         false => None,
     };
-    let resumed = begun.and_then(|checkpoint| Trainer::resume(training.dataset.clone(), checkpoint).ok());
+    let start = || Start { dataset: training.dataset.clone(), stop: Stop::when(interrupt::requested) };
+    let resumed = begun.and_then(|checkpoint| Trainer::resume(start(), checkpoint).ok());
     let mut trainer = match resumed {
         // Settings may have changed since.
         Some(trainer) if *trainer.config() == training.config => trainer,
-        _ => Trainer::new(training.dataset, training.config).map_err(Error::plain)?,
+        _ => match Trainer::new(start(), training.config) {
+            Err(TrainError::Stopped) => return Ok(None),
+            begun => begun.map_err(Error::plain)?,
+        },
     };
     let whole = trainer.steps_done() + trainer.steps_left();
     let before = trainer.steps_done();
@@ -73,7 +79,7 @@ pub fn train(
             stage.1 = *iteration;
             tell(before + u64::from(done + stage.1 - stage.0), whole);
         }
-        if interrupt::requested() { Control::Stop } else { Control::Continue }
+        Control::Continue
     });
     if outcome.map_err(Error::plain)? == Outcome::Interrupted {
         trainer.checkpoint(true).save(&partial).map_err(Error::plain)?;

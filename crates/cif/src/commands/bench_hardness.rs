@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use cif_dataset::{Dataset, Layout};
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
-use cif_train::{Control, Outcome, TrainConfig, TrainEvent, Trainer};
+use cif_train::{Control, Outcome, Start, Stop, TrainConfig, TrainEvent, Trainer};
 use clap::Args;
 use serde::Serialize;
 use serde_json::json;
@@ -239,13 +239,14 @@ fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(),
 }
 
 fn train_and_score(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(), String> {
-    let mut trainer = Trainer::new(dataset.clone(), config.clone()).map_err(|error| error.to_string())?;
+    let start = Start { dataset: dataset.clone(), stop: Stop::when(interrupt::requested) };
+    let mut trainer = Trainer::new(start, config.clone()).map_err(|error| error.to_string())?;
     let mut notes = Vec::new();
     let outcome = trainer.run(&mut |event, _| {
         if let TrainEvent::Warning { message } = event {
             notes.push(message.clone());
         }
-        if interrupt::requested() { Control::Stop } else { Control::Continue }
+        Control::Continue
     });
     row.rolled_back = trainer.rolled_back();
     row.notes.append(&mut notes);

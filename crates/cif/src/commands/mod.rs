@@ -1,7 +1,5 @@
 //! The subcommands, one file each.
 
-#[cfg(feature = "wgpu")]
-mod backend;
 mod bench;
 mod bench_accuracy;
 #[cfg(feature = "wgpu")]
@@ -34,6 +32,8 @@ use cif_render::cpu::SimdLevel;
 use clap::builder::{EnumValueParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand, ValueEnum};
 
+#[cfg(feature = "wgpu")]
+use crate::backend;
 use crate::error::Error;
 
 /// From captured images to an editable, segmented 3D scene.

@@ -6,17 +6,19 @@ use cif_dataset::{Dataset, Layout};
 use cif_field::Checkpoint;
 use cif_train::plan::Basis;
 use cif_train::{
-    Control, EffectChoice, EffectPlan, Outcome, Preset, TrainConfig, TrainError, TrainEvent, Trainer,
+    Control, EffectChoice, EffectPlan, Outcome, Preset, Start, Stop, TrainConfig, TrainError, TrainEvent,
+    Trainer,
 };
 use clap::{Args, ValueEnum};
 
 use super::train_budget::{Goals, Timing};
 use super::{CaptureOptions, Simd, command_line, print_warnings, scene};
+use crate::destination::{Destination, Existing};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::progress::Progress;
 use crate::settings::Layers;
-use crate::{interrupt, output};
+use crate::{interrupt, output, training};
 
 /// Train a scene on a capture
 #[derive(Debug, Args)]
@@ -47,7 +49,9 @@ As good as it gets in a minute and a half, or only as long as it has to:
 
 With --resume, a budget is for the rest. SCENE.train.toml then holds the settings that came of it.
 
-Ctrl-C saves and stops; the same command with --resume goes on as if nothing had happened.")]
+Ctrl-C and SIGTERM save and stop; the same command with --resume goes on as if nothing had happened. It does so
+after a power cut as well, from the state saved last: there is one every five minutes and at the end of each stage
+(--checkpoint-seconds). While a run lasts, its scene is locked: another one to the same file is refused.")]
 pub(super) struct Train {
     /// Folder of the capture
     capture: PathBuf,
@@ -154,9 +158,13 @@ struct Settings {
     /// Steps between evaluations on held-out frames; 0 for never
     #[arg(long, value_name = "N")]
     evaluate_every: Option<u32>,
-    /// Steps between saved states on the way; 0 for never
+    /// Steps between saved states on the way; 0 for never [default: 0]
     #[arg(long, value_name = "N")]
     checkpoint_every: Option<u32>,
+    /// Seconds between saved states on the way, of which there is one at the end of each stage as well; 0 for
+    /// neither [default: 300]
+    #[arg(long, value_name = "SECONDS")]
+    checkpoint_seconds: Option<u32>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
@@ -170,13 +178,13 @@ enum AblationName {
 pub(super) fn run(command: &Train) -> Result<(), Error> {
     let mut timing = Timing::start();
     // Everything that can be refused is refused before the first image is read.
-    let settings_path = command.output.with_extension("train.toml");
-    check_outputs(command, &settings_path)?;
+    check_outputs(command)?;
+    let existing = if command.force || command.resume { Existing::Replace } else { Existing::Keep };
+    let mut destination = Destination::open(&command.output, existing)?;
     let checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
     let source = command.from.as_deref().map(load_source).transpose()?;
     let base = source.as_ref().and_then(|source| cif_train::metrics::training_config(&source.field));
     if checkpoint.is_none() {
-        output::check_file(&settings_path, command.force)?;
         // Typing errors show before a long look at the capture; the layout only shifts preset values.
         resolve(command, base.as_ref(), Layout::HyperNerf, None)?;
     }
@@ -196,10 +204,11 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         eprintln!("note: the capture has no masks, so colour and motion are trained, but no instances");
     }
 
+    let stop = Stop::when(interrupt::requested);
     let mut trainer = match checkpoint {
-        Some(checkpoint) => {
-            Trainer::resume(dataset, checkpoint).map_err(|error| error.of_scene(&command.output))
-        }
+        Some(checkpoint) => Trainer::resume(Start { dataset, stop }, checkpoint)
+            .map_err(|error| error.of_scene(&command.output))
+            .inspect(|trainer| destination.resumes(trainer.config())),
         None => {
             let plan = match &source {
                 Some(_) => None,
@@ -212,17 +221,15 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
                 let (goals, options) = (&command.goals, &command.capture_options);
                 dataset = goals.fit(&mut timing, &mut config, &preset, dataset, options, command.quiet)?;
             }
-            let text = toml::to_string_pretty(&config).expect("settings serialise to TOML");
+            destination.check_settings(&config)?;
+            let start = Start { dataset, stop };
             let trainer = match (source, &command.from) {
                 (Some(source), Some(path)) => {
                     let name = path.file_name().unwrap_or_default().to_string_lossy();
-                    Trainer::from_scene(dataset, config, source, &name).map_err(|error| error.of_scene(path))
+                    Trainer::from_scene(start, config, source, &name).map_err(|error| error.of_scene(path))
                 }
-                _ => Trainer::new(dataset, config),
+                _ => Trainer::new(start, config),
             };
-            if trainer.is_ok() {
-                output::write_file(&settings_path, text.as_bytes())?;
-            }
             trainer.map(|mut trainer| {
                 if let Some(plan) = &plan {
                     trainer.record_effects(serde_json::json!(plan));
@@ -231,7 +238,12 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
             })
         }
     }
-    .map_err(Error::plain)?;
+    .map_err(|error| match error {
+        TrainError::Stopped => {
+            Error::Interrupted { message: "interrupted; nothing was saved".to_owned(), help: None }
+        }
+        error => Error::plain(error),
+    })?;
     trainer.set_simd(command.simd.into());
     trainer.set_debug_validation(command.debug_validation);
     command.goals.apply(&timing, &mut trainer)?;
@@ -239,20 +251,17 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     command.backend.apply(gpu.as_ref(), &mut trainer)?;
 
     let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
-    interrupt::watch();
-    let (outcome, failure) = train(&mut trainer, command, &mut progress);
+    interrupt::watch_and_save();
+    let mut steps_done = StepCount::default();
+    let outcome = training::run(&mut trainer, Some(&mut destination), &mut |event| {
+        progress.event(event);
+        let enough = command.stop_after.is_some_and(|limit| steps_done.after(event) >= limit);
+        if enough { Control::Stop } else { Control::Continue }
+    });
     let logged = progress.finish();
-    if let Some(failure) = failure {
-        return Err(failure);
-    }
-    let outcome = outcome.map_err(|error| stopped_by(&error, &trainer, &command.output))?;
-    save(&trainer.checkpoint(outcome == Outcome::Interrupted), &command.output)?;
-    if command.goals.changes_steps() {
-        let text = toml::to_string_pretty(trainer.config()).expect("settings serialise to TOML");
-        output::write_file(&settings_path, text.as_bytes())?;
-        if !command.quiet {
-            command.goals.report(&timing, &trainer);
-        }
+    let outcome = outcome?;
+    if command.goals.changes_steps() && !command.quiet {
+        command.goals.report(&timing, &trainer);
     }
     let saved = command.output.display();
     match outcome {
@@ -271,37 +280,16 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     logged
 }
 
-/// Checks what is written against what is there, and that no file is written twice or both read and written. Only the
-/// settings may be those of an earlier run, which are written again.
-fn check_outputs(command: &Train, settings_path: &Path) -> Result<(), Error> {
+/// Checks that no file is written twice or both read and written, but for the settings, which may be those of an earlier
+/// run. [`Destination`] looks at what is there.
+fn check_outputs(command: &Train) -> Result<(), Error> {
+    let settings_path = &command.output.with_extension("train.toml");
     let mut outputs = Outputs::new(command.force || command.resume);
     let config = command.config.as_deref().filter(|config| *config != settings_path);
     [config, command.from.as_deref()].into_iter().flatten().try_for_each(|input| outputs.reads(input))?;
-    outputs.file(&command.output)?;
+    outputs.add(&command.output)?;
     outputs.add(settings_path)?;
     command.log.as_deref().map_or(Ok(()), |log| outputs.text(log))
-}
-
-/// Runs to the end or to a request to stop. The second value is a state that could not be saved on the way.
-fn train(
-    trainer: &mut Trainer,
-    command: &Train,
-    progress: &mut Progress,
-) -> (Result<Outcome, TrainError>, Option<Error>) {
-    let mut failure = None;
-    let mut steps_done = StepCount::default();
-    let outcome = trainer.run(&mut |event, view| {
-        progress.event(event);
-        if matches!(event, TrainEvent::CheckpointDue { .. })
-            && let Err(error) = save(&view.checkpoint(true), &command.output)
-        {
-            failure = Some(error);
-            return Control::Stop;
-        }
-        let enough = command.stop_after.is_some_and(|limit| steps_done.after(event) >= limit);
-        if interrupt::requested() || enough { Control::Stop } else { Control::Continue }
-    });
-    (outcome, failure)
 }
 
 /// Optimiser steps done by this command, over all stages.
@@ -323,32 +311,6 @@ impl StepCount {
             _ => {}
         }
         self.earlier_stages + self.stage.1 - self.stage.0
-    }
-}
-
-/// Saves a scene; where its place refuses it, saves it in the folder for temporary files instead, because
-/// hours of training may be in it.
-fn save(checkpoint: &Checkpoint, path: &Path) -> Result<(), Error> {
-    let Err(error) = checkpoint.save(path) else { return Ok(()) };
-    let rescued = output::rescue_file(path).ok().filter(|rescue| checkpoint.save(rescue).is_ok());
-    Err(match rescued {
-        Some(rescue) => Error::failed(
-            error.to_string(),
-            format!("the scene was saved as {} instead; move it where there is space", rescue.display()),
-        ),
-        None => Error::failed(error.to_string(), "make space, then train again"),
-    })
-}
-
-/// What stopped the run. Its state is saved: everything up to the failed step is good, and hours may be in it.
-fn stopped_by(error: &TrainError, trainer: &Trainer, path: &Path) -> Error {
-    if trainer.steps_done() == 0 {
-        return Error::plain(error);
-    }
-    let name = path.display();
-    match save(&trainer.checkpoint(true), path) {
-        Ok(()) => Error::failed(error.to_string(), format!("{name} holds the state before that step")),
-        Err(unsaved) => Error::failed(error.to_string(), format!("its state could not be saved: {unsaved}")),
     }
 }
 
@@ -454,6 +416,7 @@ fn resolve(
         ("--sh-degree", "model.sh_degree", settings.sh_degree.map(u32::from)),
         ("--evaluate-every", "report.evaluate_every", settings.evaluate_every),
         ("--checkpoint-every", "report.checkpoint_every", settings.checkpoint_every),
+        ("--checkpoint-seconds", "report.checkpoint_seconds", settings.checkpoint_seconds),
         ("--downscale", "downscale", command.capture_options.downscale),
     ];
     for (flag, key, value) in integers {

@@ -1,4 +1,4 @@
-//! `--backend`: whether the processor or a GPU does the work.
+//! Backends: whether the processor or a GPU does the work.
 
 use cif_render::wgpu::{Gpu, SubgroupUse};
 use cif_train::{TrainError, Trainer};
@@ -8,7 +8,7 @@ use crate::error::Error;
 
 /// What does the work.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
-pub(super) enum Backend {
+pub enum Backend {
     /// A GPU where there is one that supports everything that is asked and is faster, which is measured for a
     /// second, else the processor
     Auto,
@@ -21,7 +21,8 @@ pub(super) enum Backend {
 
 impl Backend {
     /// As it is typed.
-    pub(super) fn name(self) -> &'static str {
+    #[must_use]
+    pub fn name(self) -> &'static str {
         match self {
             Self::Auto => "auto",
             Self::Cpu => "cpu",
@@ -29,8 +30,11 @@ impl Backend {
         }
     }
 
-    /// The GPU to use, if any; `auto` takes no software rasteriser for one.
-    pub(super) fn open(self) -> Result<Option<Gpu>, Error> {
+    /// The GPU to use, if any; `auto` takes no software rasteriser for one. Notes go to stderr.
+    ///
+    /// # Errors
+    /// When a GPU is asked for and there is none.
+    pub fn open(self) -> Result<Option<Gpu>, Error> {
         let gpu = match self {
             Self::Cpu => Ok(None),
             Self::Wgpu => Gpu::open().map(Some).map_err(Error::plain),
@@ -59,7 +63,10 @@ impl Backend {
 
     /// Makes a trainer's steps run on the GPU, and says so; `auto` tries steps on both for a second, takes what is
     /// faster, and stays on the processor where the GPU cannot hold the scene or fails.
-    pub(super) fn apply(self, gpu: Option<&Gpu>, trainer: &mut Trainer) -> Result<(), Error> {
+    ///
+    /// # Errors
+    /// When a GPU is asked for and cannot hold the scene.
+    pub fn apply(self, gpu: Option<&Gpu>, trainer: &mut Trainer) -> Result<(), Error> {
         let Some(gpu) = gpu else { return Ok(()) };
         let name = format!("{} ({})", gpu.facts().name, gpu.facts().interface);
         if self != Self::Auto {
