@@ -14,7 +14,9 @@ use crate::error::cif_error;
 /// A capture, understood.
 #[pyclass(frozen, module = "cif")]
 pub(crate) struct Dataset {
-    inner: cif_dataset::Dataset,
+    pub(crate) inner: cif_dataset::Dataset,
+    /// Reduction that it was opened with.
+    pub(crate) downscale: Option<u32>,
 }
 
 /// Opens a capture.
@@ -28,7 +30,7 @@ pub(crate) fn open_dataset(
 ) -> PyResult<Dataset> {
     let options = cif_dataset::OpenOptions { masks, downscale, ..cif_dataset::OpenOptions::default() };
     let inner = py.detach(|| cif_dataset::Dataset::open(&path, &options)).map_err(cif_error)?;
-    Ok(Dataset { inner })
+    Ok(Dataset { inner, downscale })
 }
 
 impl Dataset {

@@ -3,39 +3,51 @@
 //! | module | answers |
 //! |---|---|
 //! | `arrays` | numpy arrays in and out |
+//! | `beside` | long work, while the interpreter answers signals and callbacks |
 //! | `camera` | pinhole cameras |
 //! | `dataset` | captures |
 //! | `field` | trained scenes: arrays, rendering, queries |
 //! | `export` | scenes as USD, and stages by label |
 //! | `import` | files as scenes, edits coming home, differences |
+//! | `train` | training with a callback |
 //! | `error` | `cif.CifError` |
 //!
 //! Everything is documented for its users in `python/cif/_native.pyi`. Work in Rust runs without the lock of the
 //! interpreter; the USD writer takes it when it needs usd-core.
 
 mod arrays;
+mod beside;
 mod camera;
 mod dataset;
 mod error;
 mod export;
 mod field;
 mod import;
+mod train;
 
 use std::ffi::OsString;
 
 use pyo3::prelude::*;
 
-/// Runs the command line in this process and returns its exit code. `arguments` start with the name of the
-/// program.
+/// Runs the command line in this process, whose signals stay with it, and returns its exit code. `arguments` start
+/// with the name of the program.
 #[pyfunction]
-fn run(py: Python<'_>, arguments: Vec<OsString>) -> i32 {
-    py.detach(|| cif::run(arguments))
+fn run(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
+    let session = cif::interrupt::Session::begin();
+    // A command asks nothing; that it ends shows by the end of its questions.
+    let work = |questions: beside::Questions<(), ()>| {
+        let code = cif::run(arguments);
+        drop(questions);
+        code
+    };
+    beside::run(py, || session.request(), |()| Ok(()), work)
 }
 
-/// Ends this process without a word when whatever reads its output has seen enough.
+/// Runs the command line in a process that is nothing but the command, which takes its signals.
 #[pyfunction]
-fn end_with_reader() {
+fn main(py: Python<'_>, arguments: Vec<OsString>) -> i32 {
     cif::own_process();
+    py.detach(|| cif::run(arguments))
 }
 
 #[pymodule]
@@ -47,7 +59,8 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<field::Field>()?;
     module.add_class::<export::LabelPattern>()?;
     module.add_function(wrap_pyfunction!(run, module)?)?;
-    module.add_function(wrap_pyfunction!(end_with_reader, module)?)?;
+    module.add_function(wrap_pyfunction!(main, module)?)?;
+    module.add_function(wrap_pyfunction!(train::train, module)?)?;
     module.add_function(wrap_pyfunction!(dataset::open_dataset, module)?)?;
     module.add_function(wrap_pyfunction!(export::query_stage, module)?)?;
     module.add_function(wrap_pyfunction!(import::import_scene, module)?)?;

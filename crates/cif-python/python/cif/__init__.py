@@ -5,7 +5,7 @@ Captures, trained scenes and stages are also here as objects with numpy arrays::
 
     import cif
 
-    field = cif.Field.load("table.cif")
+    field = cif.train("captures/table", "table.cif", preset="draft", callback=print)
     name, time_index, camera = field.cameras[0]
     picture = field.render(camera, field.times[time_index])["color"]
     field.export("table.usdc")
@@ -29,6 +29,7 @@ from ._native import (
     import_scene,
     open_dataset,
     query_stage,
+    train,
     usd_version,
 )
 
@@ -43,6 +44,7 @@ __all__ = [
     "open_dataset",
     "query_stage",
     "run",
+    "train",
     "usd_version",
 ]
 
@@ -53,5 +55,8 @@ def run(arguments: Sequence[str | os.PathLike[str]]) -> int:
     """Run a command line such as ``["info", "captures/table"]`` and return its exit code.
 
     0 is success, 1 a failure that was explained on stderr, 2 a command line that was not understood.
+
+    Signals stay with this process. Ctrl-C stops the command: `train` saves first, so that it can go on with
+    ``--resume``, then KeyboardInterrupt is raised.
     """
     return _native.run(["cif", *map(os.fspath, arguments)])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 
-from . import _native, run
+from . import _native
 
 
 def main() -> int:
@@ -13,8 +13,7 @@ def main() -> int:
     # Python only notes Ctrl-C and acts on it between its own instructions, of which there are none while Rust
     # works. The system's default ends the process at once; commands that save first install their own handler.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-    _native.end_with_reader()
-    return run(sys.argv[1:])
+    return _native.main(["cif", *sys.argv[1:]])
 
 
 if __name__ == "__main__":

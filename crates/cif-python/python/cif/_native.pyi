@@ -190,11 +190,46 @@ class Field:
         replaced with force.
         """
 
-def end_with_reader() -> None:
-    """End this process without a word when whatever reads its output has seen enough."""
+def main(arguments: Sequence[str | os.PathLike[str]]) -> int:
+    """Run the command line in a process that is nothing but the command, which takes its signals."""
 
 def run(arguments: Sequence[str | os.PathLike[str]]) -> int:
-    """Run the command line; the first argument is the name of the program."""
+    """Run the command line; the first argument is the name of the program. Signals stay with the process."""
+
+def train(
+    dataset: Dataset | str | os.PathLike[str],
+    output: str | os.PathLike[str] | None = None,
+    *,
+    preset: Literal["draft", "standard", "paper"] | None = None,
+    effects: str | None = None,
+    settings: dict[str, Any] | None = None,
+    seed: int | None = None,
+    backend: Literal["cpu", "wgpu", "auto"] = "cpu",
+    callback: Callable[[dict[str, Any]], bool | None] | None = None,
+    resume: bool = False,
+    force: bool = False,
+) -> Field:
+    """Train a field on a capture, and return it.
+
+    dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five
+    minutes, at the end of each stage and in the end, its settings beside it; without, it is only returned.
+
+    preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as
+    the capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are
+    single settings by their keys in the settings file, dotted or as dictionaries: {"stages.fine": 500} or
+    {"stages": {"fine": 500}}. seed makes runs repeatable: same seed and settings, same field. backend is "cpu",
+    "wgpu" (a GPU) or "auto".
+
+    callback is called in this thread with a dictionary for each event of the run; its "event" is
+    "stage_started", "step" (every report.step_every steps: stage, iteration, iterations, loss, psnr, gaussians,
+    eta_s), "evaluated", "warning", "finished" and more. When it returns False the run stops and the field as it
+    is then is returned. An exception in it stops the run and is raised, as is KeyboardInterrupt on Ctrl-C. In
+    all three cases the run is saved to output first, and resume=True goes on with it, with the settings of the
+    file.
+
+    An output that exists is refused without force or resume. Raises CifError when the capture, a setting or the
+    output is not as it should be. Other Python threads run meanwhile.
+    """
 
 def open_dataset(
     path: str | os.PathLike[str],
