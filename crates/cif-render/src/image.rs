@@ -37,6 +37,35 @@ pub struct RenderedImage {
     pub instances: Option<InstanceImage>,
 }
 
+impl RenderedImage {
+    /// Adds rows of the same view below.
+    ///
+    /// # Panics
+    /// When they have another width or other outputs.
+    pub(crate) fn append(&mut self, below: Self) {
+        let outputs = |image: &Self| (image.depth.is_some(), image.instances.is_some());
+        assert_eq!(outputs(self), outputs(&below), "outputs of one view");
+        append(&mut self.color, below.color);
+        append(&mut self.alpha, below.alpha);
+        if let (Some(depth), Some(below)) = (&mut self.depth, below.depth) {
+            append(depth, below);
+        }
+        if let (Some(image), Some(below)) = (&mut self.instances, below.instances) {
+            append(&mut image.label, below.label);
+            append(&mut image.probability, below.probability);
+            append(&mut image.coverage, below.coverage);
+            append(&mut image.foreground, below.foreground);
+            append(&mut image.entropy, below.entropy);
+        }
+    }
+}
+
+fn append<T>(grid: &mut PixelGrid<T>, below: PixelGrid<T>) {
+    assert_eq!(grid.width, below.width, "rows of one view");
+    grid.height += below.height;
+    grid.pixels.extend(below.pixels);
+}
+
 /// Instance outputs of a view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct InstanceImage {
@@ -60,6 +89,15 @@ pub struct InstanceRanks {
     /// Most probable first: dense index + 1, or [`UNLABELLED`] where there are no more, and the rendered
     /// probability M of that instance. Ties go to the lowest index.
     pub ranks: Vec<(PixelGrid<u16>, PixelGrid<f32>)>,
+}
+
+impl InstanceRanks {
+    /// So many ranks without instances.
+    pub(crate) fn none(ranks: usize, width: u32, height: u32) -> Self {
+        let rank =
+            || (PixelGrid::filled(width, height, UNLABELLED), PixelGrid::filled(width, height, 0.0));
+        Self { ranks: (0..ranks).map(|_| rank()).collect() }
+    }
 }
 
 /// Foreground from which a pixel is taken to belong to its most probable instance.

@@ -1,5 +1,6 @@
 //! Depth order and tile lists. Source: methods reference 3.1 (sorting, exact tile test).
 
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use rayon::prelude::*;
@@ -42,23 +43,68 @@ impl TileEntry {
     }
 }
 
-/// Which splats each tile draws, front to back.
-///
-/// Pairs are stored by tile. Every splat also knows where its own pairs went, so that sums over a splat's
-/// pairs run in a fixed order whatever the number of threads.
-#[derive(Debug, Default)]
-pub(super) struct TileLists {
+/// A rectangle of an image's tiles.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct TileRegion {
+    pub(super) first_column: u32,
+    pub(super) first_row: u32,
     pub(super) columns: u32,
     pub(super) rows: u32,
+}
+
+impl TileRegion {
+    /// All tiles of an image of so many pixels.
+    pub(super) fn whole(width: u32, height: u32) -> Self {
+        Self { first_column: 0, first_row: 0, columns: width.div_ceil(TILE), rows: height.div_ceil(TILE) }
+    }
+
+    pub(super) fn tiles(&self) -> usize {
+        self.columns as usize * self.rows as usize
+    }
+
+    /// Columns and rows of the tiles that the rectangle around a splat's drawn ellipse reaches.
+    pub(super) fn reached(&self, splat: &Splat) -> [Range<u32>; 2] {
+        let range = |axis: usize, first: u32, count: u32| {
+            let tile = TILE as f32;
+            let low = ((splat.mean[axis] - splat.extent[axis]) / tile).floor();
+            let high = ((splat.mean[axis] + splat.extent[axis]) / tile).floor();
+            let end = first + count;
+            let low = low.max(first as f32).min(end as f32) as u32;
+            let high = (high + 1.0).max(first as f32).min(end as f32) as u32;
+            low..high.max(low)
+        };
+        [range(0, self.first_column, self.columns), range(1, self.first_row, self.rows)]
+    }
+
+    /// Most (tile, splat) pairs of splats: those of the rectangles around their drawn ellipses.
+    fn most_pairs(&self, splats: &[Splat]) -> usize {
+        let pairs = splats.iter().map(|splat| {
+            let [columns, rows] = self.reached(splat);
+            columns.len() * rows.len()
+        });
+        pairs.sum()
+    }
+}
+
+/// Which splats each tile of a region draws, front to back. Tiles are counted row by row within the region.
+///
+/// Pairs are stored by tile. Where asked for, every splat also knows where its own pairs went, so that sums over a
+/// splat's pairs run in a fixed order whatever the number of threads.
+#[derive(Debug, Default)]
+pub(super) struct TileLists {
+    pub(super) region: TileRegion,
     /// `[tiles + 1]` first pair of each tile.
     pub(super) tile_offsets: Vec<u32>,
     /// `[pairs]` the splats of the tiles.
     pub(super) entries: Vec<TileEntry>,
-    /// `[splats + 1]` first entry of each splat in `splat_pairs`.
+    /// `[splats + 1]` first entry of each splat in `splat_pairs`; empty where not asked for.
     pub(super) splat_offsets: Vec<u32>,
-    /// `[pairs]` position in `entries` of each of a splat's pairs.
+    /// `[pairs]` position in `entries` of each of a splat's pairs; empty where not asked for.
     pub(super) splat_pairs: Vec<u32>,
 }
+
+/// Bytes of a (tile, splat) pair while lists without the pairs of each splat are built.
+pub(super) const PAIR_BYTES: u64 = (size_of::<(u32, u8)>() + size_of::<TileEntry>()) as u64;
 
 /// Sorts splats front to back; ties keep the order of the Gaussians.
 pub(super) fn sort_by_depth(splats: &mut [Splat]) {
@@ -96,32 +142,25 @@ fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
     smallest
 }
 
-/// Calls `visit` with every tile of `drawn` (all without) that the splat reaches, in row order, and the passes
-/// that reach it, a bit each.
+/// Calls `visit` with every tile of the region, and of `drawn` (all without), that the splat reaches, in row order, and
+/// the passes that reach it, a bit each.
 fn visit_tiles(
     splat: &Splat,
-    columns: u32,
-    rows: u32,
+    region: &TileRegion,
     drawn: Option<&[bool]>,
     mut visit: impl FnMut(u32, u8),
 ) {
     let tile = TILE as f32;
-    // Pixel centres lie half a pixel inside the tile.
-    let range = |axis: usize, count: u32| {
-        let first = ((splat.mean[axis] - splat.extent[axis]) / tile).floor().max(0.0);
-        let last = ((splat.mean[axis] + splat.extent[axis]) / tile).floor().min(count as f32 - 1.0);
-        (first as u32, last as i64)
-    };
-    let (first_column, last_column) = range(0, columns);
-    let (first_row, last_row) = range(1, rows);
+    let [columns, rows] = region.reached(splat);
     // A hair more than the gate, so that rounding never drops a tile that holds a drawn pixel.
     let reaches = splat.reach.map(|reach| reach * 1.000_01 + 1e-5);
-    for row in i64::from(first_row)..=last_row {
-        for column in i64::from(first_column)..=last_column {
-            let tile_index = (row as u32) * columns + column as u32;
+    for row in rows {
+        for column in columns.clone() {
+            let tile_index = (row - region.first_row) * region.columns + (column - region.first_column);
             if drawn.is_some_and(|drawn| !drawn[tile_index as usize]) {
                 continue;
             }
+            // Pixel centres lie half a pixel inside the tile.
             let low = [column as f32 * tile + 0.5, row as f32 * tile + 0.5];
             let high = [low[0] + tile - 1.0, low[1] + tile - 1.0];
             let sigma = smallest_sigma(splat, low, high);
@@ -142,40 +181,47 @@ struct ReachedTiles {
 }
 
 impl TileLists {
-    /// Builds the lists for depth-sorted splats of an image; tiles that are not `drawn` stay empty.
+    /// Builds the lists of a region for depth-sorted splats; tiles of the region that are not `drawn` stay empty. The
+    /// pairs of each splat are listed `by_splat`.
     ///
     /// # Panics
     /// When there are too many pairs, before memory is.
-    pub(super) fn build(&mut self, splats: &[Splat], width: u32, height: u32, drawn: Option<&[bool]>) {
-        self.build_within(MAX_PAIRS, splats, width, height, drawn);
+    pub(super) fn build(
+        &mut self,
+        splats: &[Splat],
+        region: TileRegion,
+        drawn: Option<&[bool]>,
+        by_splat: bool,
+    ) {
+        self.build_within(MAX_PAIRS, splats, region, drawn, by_splat);
     }
 
     fn build_within(
         &mut self,
         limit: u64,
         splats: &[Splat],
-        width: u32,
-        height: u32,
+        region: TileRegion,
         drawn: Option<&[bool]>,
+        by_splat: bool,
     ) {
-        self.columns = width.div_ceil(TILE);
-        self.rows = height.div_ceil(TILE);
-        let (columns, rows) = (self.columns, self.rows);
-        let tiles = (columns * rows) as usize;
+        self.region = region;
+        let tiles = region.tiles();
 
         assert!(splats.len() < 1 << TileEntry::RANK_BITS, "more than 2^30 Gaussians are visible in one view");
 
         // Tiles of every splat, in chunks so that threads share the tests.
         const CHUNK: usize = 1024;
+        // Rectangles around long diagonal splats hold many more tiles than those reach.
+        const MAX_RESERVED: usize = 1 << 24;
         let pairs = AtomicU64::new(0);
         let chunks: Vec<ReachedTiles> = splats
             .par_chunks(CHUNK)
             .map(|chunk| {
-                let (mut counts, mut reached) =
-                    (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
+                let mut counts = Vec::with_capacity(chunk.len());
+                let mut reached = Vec::with_capacity(region.most_pairs(chunk).min(MAX_RESERVED));
                 for splat in chunk {
                     let before = reached.len();
-                    visit_tiles(splat, columns, rows, drawn, |tile, passes| reached.push((tile, passes)));
+                    visit_tiles(splat, &region, drawn, |tile, passes| reached.push((tile, passes)));
                     counts.push((reached.len() - before) as u32);
                 }
                 if pairs.fetch_add(reached.len() as u64, Ordering::Relaxed) + reached.len() as u64 > limit {
@@ -187,42 +233,44 @@ impl TileLists {
         let pairs = pairs.into_inner();
         assert!(
             pairs <= limit,
-            "{} visible Gaussians reach {pairs} (tile, Gaussian) pairs of {width} x {height} pixels, more than \
-             {limit}: render a smaller image, or fewer and smaller Gaussians",
-            splats.len()
+            "{} visible Gaussians reach {pairs} (tile, Gaussian) pairs of {} x {} tiles of {TILE} x {TILE} pixels, \
+             more than {limit}: render a smaller image, or fewer and smaller Gaussians",
+            splats.len(),
+            region.columns,
+            region.rows
         );
 
-        self.splat_offsets.clear();
-        self.splat_offsets.push(0);
         self.tile_offsets.clear();
         self.tile_offsets.resize(tiles + 1, 0);
-        let mut total = 0_u32;
-        for ReachedTiles { counts, reached } in &chunks {
-            for count in counts {
-                total = total.checked_add(*count).expect("the pairs were counted above");
-                self.splat_offsets.push(total);
-            }
-            for (tile, _) in reached {
-                self.tile_offsets[*tile as usize + 1] += 1;
-            }
+        for (tile, _) in chunks.iter().flat_map(|chunk| &chunk.reached) {
+            self.tile_offsets[*tile as usize + 1] += 1;
         }
         for tile in 0..tiles {
             self.tile_offsets[tile + 1] += self.tile_offsets[tile];
         }
         let mut next: Vec<u32> = self.tile_offsets[..tiles].to_vec();
         self.entries.clear();
-        self.entries.resize(total as usize, TileEntry::default());
+        self.entries.resize(pairs as usize, TileEntry::default());
+        self.splat_offsets.clear();
         self.splat_pairs.clear();
-        self.splat_pairs.reserve(total as usize);
+        if by_splat {
+            self.splat_offsets.push(0);
+            self.splat_pairs.reserve(pairs as usize);
+        }
         let mut rank = 0;
-        for ReachedTiles { counts, reached } in &chunks {
+        for ReachedTiles { counts, reached } in chunks {
             let mut reached = reached.iter();
             for count in counts {
-                for (tile, passes) in reached.by_ref().take(*count as usize) {
+                for (tile, passes) in reached.by_ref().take(count as usize) {
                     let position = next[*tile as usize];
                     next[*tile as usize] += 1;
                     self.entries[position as usize] = TileEntry::new(rank, *passes);
-                    self.splat_pairs.push(position);
+                    if by_splat {
+                        self.splat_pairs.push(position);
+                    }
+                }
+                if by_splat {
+                    self.splat_offsets.push(self.splat_pairs.len() as u32);
                 }
                 rank += 1;
             }
@@ -231,7 +279,7 @@ impl TileLists {
 
     /// Number of tiles.
     pub(super) fn tiles(&self) -> usize {
-        (self.columns * self.rows) as usize
+        self.region.tiles()
     }
 
     /// A tile's splats, front to back.
@@ -253,9 +301,11 @@ impl TileLists {
         &self.splat_pairs[self.splat_offsets[rank] as usize..self.splat_offsets[rank + 1] as usize]
     }
 
-    /// First pixel (x, y) of a tile.
+    /// First pixel (x, y) of a tile, in the image.
     pub(super) fn origin(&self, tile: usize) -> (u32, u32) {
-        ((tile as u32 % self.columns) * TILE, (tile as u32 / self.columns) * TILE)
+        let TileRegion { first_column, first_row, columns, .. } = self.region;
+        let (column, row) = (first_column + tile as u32 % columns, first_row + tile as u32 / columns);
+        (column * TILE, row * TILE)
     }
 }
 
@@ -285,14 +335,15 @@ mod tests {
         let splats: Vec<Splat> = (0..3000).map(filling).collect();
         let mut lists = TileLists::default();
         // 5 x 5 tiles.
-        lists.build_within(75_000, &splats, 80, 80, None);
+        let region = TileRegion::whole(80, 80);
+        lists.build_within(75_000, &splats, region, None, true);
         assert_eq!(lists.entries.len(), 75_000);
         let refused = std::panic::catch_unwind(|| {
-            TileLists::default().build_within(74_999, &splats, 80, 80, None);
+            TileLists::default().build_within(74_999, &splats, region, None, true);
         });
         let message = *refused.unwrap_err().downcast::<String>().unwrap();
         assert!(
-            message.contains("3000 visible Gaussians") && message.contains("80 x 80 pixels"),
+            message.contains("3000 visible Gaussians") && message.contains("5 x 5 tiles"),
             "{message}"
         );
     }

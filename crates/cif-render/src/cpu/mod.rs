@@ -5,6 +5,7 @@
 //! | `deform` | canonical Gaussians to the time of the view, and back |
 //! | `project` | Gaussians to splats, and back |
 //! | `bin` | depth order and tile lists |
+//! | `bands` | which tiles are drawn at once |
 //! | `tile` | how a splat falls on a tile's pixels and blends: the steps that all of these share: |
 //! | `rasterize`, `rasterize_backward` | pixels, and back |
 //! | `dense` | instance images |
@@ -15,6 +16,7 @@
 //! Results do not depend on the number of threads: every sum over pixels, tiles or Gaussians runs in an
 //! order fixed by the data.
 
+mod bands;
 mod bin;
 mod blend;
 mod channels;
@@ -36,5 +38,5 @@ mod vector;
 
 pub use counts::IdentityCounts;
 pub use level::SimdLevel;
-pub use renderer::{ForwardPass, NotFinite, Renderer, ViewStatistics};
+pub use renderer::{BandRequest, ForwardPass, NotFinite, RenderedBand, Renderer, ViewStatistics};
 pub use timing::StageTimes;

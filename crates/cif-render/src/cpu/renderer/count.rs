@@ -5,6 +5,7 @@ use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::dispatch;
 use rayon::prelude::*;
 
+use super::super::bin::TileRegion;
 use super::super::counts::{IdentityCounts, add_to};
 use super::super::identity::label_mass_tile;
 use super::super::labels::TileLabels;
@@ -28,7 +29,8 @@ impl Renderer {
         assert_eq!((labels.width, labels.height), (camera.width, camera.height), "label map size");
         assert_eq!(counts.gaussians(), field.gaussians.len(), "counts of other Gaussians");
         let settings = RenderSettings { instances: None, ..*settings };
-        self.prepare(field, camera, time, &settings, None);
+        self.project(field, camera, time, &settings);
+        self.bin(TileRegion::whole(camera.width, camera.height), None, true);
         self.rasterize(None, None, false);
         let (tape, level) = (&self.tape, self.level);
         let lists = &tape.lists;

@@ -1,24 +1,41 @@
-//! Pictures from blended tiles.
+//! Pictures of a view: whole, of values per Gaussian, and of instances.
+
+use std::convert::Infallible;
 
 use cif_field::{Field, Identities};
 use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::dispatch;
 use rayon::prelude::*;
 
-use super::super::bin::TileLists;
+use super::super::bands::bands;
+use super::super::bin::{TileLists, TileRegion};
 use super::super::blend::blend_tile;
 use super::super::dense::{InstanceTile, instance_tile};
 use super::super::labels::IdentityRows;
 use super::super::pixels::LANES;
-use super::super::rasterize::TileImage;
 use super::super::tile::{GROUPS, Pass, TilePixels, pixel_in_tile};
+use super::banded::BandRequest;
 use super::Renderer;
-use crate::constants::{MIN_COVERAGE, TILE};
-use crate::image::{InstanceImage, InstanceRanks};
+use crate::constants::TILE;
+use crate::image::InstanceRanks;
 use crate::{BlendingWeights, Channels, RenderSettings, RenderedImage};
 
+/// What the instance pass reads of identities.
+pub(super) struct DrawnIdentities<'a> {
+    identities: &'a Identities,
+    probabilities: Vec<f32>,
+    labelled_shares: Vec<f32>,
+}
+
+impl<'a> DrawnIdentities<'a> {
+    pub(super) fn new(identities: &'a Identities) -> Self {
+        let (probabilities, labelled_shares) = (identities.probabilities(), identities.labelled_shares());
+        Self { identities, probabilities, labelled_shares }
+    }
+}
+
 impl Renderer {
-    /// Renders a view for looking at or measuring.
+    /// Renders a view for looking at or measuring. Beside the image, memory is that of [`Self::render_bands`].
     pub fn render(
         &mut self,
         field: &Field,
@@ -27,43 +44,26 @@ impl Renderer {
         settings: &RenderSettings,
         channels: Channels,
     ) -> RenderedImage {
-        let settings = settings.for_outputs(field, channels);
-        self.prepare(field, camera, time, &settings, None);
-        self.rasterize(None, None, channels.depth);
-        let (width, height) = (camera.width, camera.height);
-        let alpha =
-            self.gather_image(width, height, |tile, group, lane| 1.0 - tile.transmittance[group][lane]);
-        let depth = channels.depth.then(|| {
-            self.gather_image(width, height, |tile, group, lane| {
-                let coverage = 1.0 - tile.transmittance[group][lane];
-                if coverage > MIN_COVERAGE { tile.depth[group][lane] / coverage } else { 0.0 }
-            })
+        let mut image: Option<RenderedImage> = None;
+        let request = BandRequest { channels, ..BandRequest::default() };
+        let Ok(()) = self.render_bands(field, camera, time, settings, &request, |band| {
+            match &mut image {
+                None => image = Some(band.image),
+                Some(image) => image.append(band.image),
+            }
+            Ok::<(), Infallible>(())
         });
-        let instances = match (&field.identities, settings.instances.is_some()) {
-            (Some(identities), true) => Some(self.render_instances(identities, width, height)),
-            _ => None,
-        };
-        let color = PixelGrid::from_pixels(width, height, std::mem::take(&mut self.tape.color));
-        RenderedImage { color, alpha, depth, instances }
+        image.expect("a view has a band")
     }
 
-    /// A row-major image from the blended tiles.
-    pub(super) fn gather_image<T: Copy + Default + Send>(
+    /// Blended identities of every tile, and so many of the most probable instances per pixel.
+    pub(super) fn instance_tiles(
         &self,
-        width: u32,
-        height: u32,
-        value: impl Fn(&TileImage, usize, usize) -> T + Sync,
-    ) -> PixelGrid<T> {
-        gather_tiles(&self.tape.lists, width, height, |tile, group, lane| {
-            value(&self.tape.tiles[tile], group, lane)
-        })
-    }
-
-    fn instance_tiles(&self, identities: &Identities, ranks: usize) -> Vec<InstanceTile> {
-        let probabilities = identities.probabilities();
-        let rows = IdentityRows::new(identities, &probabilities);
-        let labelled_shares = identities.labelled_shares();
-        let lists = &self.tape.lists;
+        lists: &TileLists,
+        drawn: &DrawnIdentities<'_>,
+        ranks: usize,
+    ) -> Vec<InstanceTile> {
+        let rows = IdentityRows::new(drawn.identities, &drawn.probabilities);
         let level = self.level;
         (0..lists.tiles())
             .into_par_iter()
@@ -72,12 +72,49 @@ impl Renderer {
                     ranks: vec![[[(0, 0.0); LANES]; GROUPS]; ranks],
                     ..InstanceTile::default()
                 };
-                let place = self.place(tile);
+                let place = self.place_in(lists, tile);
                 dispatch!(level, simd => instance_tile(
-                    simd, &self.tape.splats, lists.tile(tile), &place, rows, &labelled_shares, &mut image));
+                    simd, &self.tape.splats, lists.tile(tile), &place, rows, &drawn.labelled_shares, &mut image));
                 image
             })
             .collect()
+    }
+
+    /// Values per Gaussian blended over every tile.
+    pub(super) fn blended_tiles<const C: usize>(
+        &self,
+        lists: &TileLists,
+        values: &[[f32; C]],
+        pass: Pass,
+    ) -> Vec<[TilePixels; C]> {
+        let level = self.level;
+        (0..lists.tiles())
+            .into_par_iter()
+            .map(|tile| {
+                let mut blended = [[[0.0; LANES]; GROUPS]; C];
+                let place = self.place_in(lists, tile);
+                dispatch!(level, simd => blend_tile(
+                    simd, &self.tape.splats, lists.tile(tile), &place, pass, values, &mut blended));
+                blended
+            })
+            .collect()
+    }
+
+    /// Calls `each` with the tile lists of the view that was rendered last, all at once where they are still there,
+    /// else region by region.
+    fn each_region(&self, tile_bytes: usize, mut each: impl FnMut(&TileLists)) {
+        let (view, ..) = self.tape.view.expect("a view was rendered");
+        let whole = TileRegion::whole(view.width, view.height);
+        if self.tape.lists.region == whole {
+            return each(&self.tape.lists);
+        }
+        let mut lists = TileLists::default();
+        for band in bands(&self.tape.splats, whole, tile_bytes as u64, self.band_memory) {
+            for part in band.parts {
+                lists.build(&self.tape.splats, part, None, false);
+                each(&lists);
+            }
+        }
     }
 
     /// The most probable instances of every pixel of the view that was rendered last, with instances.
@@ -88,20 +125,14 @@ impl Renderer {
     pub fn instance_ranks(&self, identities: &Identities, ranks: usize) -> InstanceRanks {
         let (view, settings, _) = self.tape.view.expect("a view was rendered");
         assert!(settings.instances.is_some(), "the view was rendered with instances");
-        let tiles = self.instance_tiles(identities, ranks);
-        let gather = |rank: usize| {
-            gather_tiles(&self.tape.lists, view.width, view.height, |tile, group, lane| {
-                tiles[tile].ranks[rank][group][lane]
-            })
-        };
-        InstanceRanks {
-            ranks: (0..ranks)
-                .map(|rank| {
-                    let image = gather(rank);
-                    (image.map(|(label, _)| *label), image.map(|(_, probability)| *probability))
-                })
-                .collect(),
-        }
+        let drawn = DrawnIdentities::new(identities);
+        let mut found = InstanceRanks::none(ranks, view.width, view.height);
+        self.each_region(instance_tile_bytes(ranks), |lists| {
+            let tiles = self.instance_tiles(lists, &drawn, ranks);
+            let start = (lists.region.first_row * TILE) as usize * view.width as usize;
+            gather_ranks(lists, &tiles, start, &mut found);
+        });
+        found
     }
 
     /// Values per Gaussian (`[N]`, by row of the field) blended over the view that was rendered last, with the weights
@@ -123,75 +154,88 @@ impl Renderer {
             BlendingWeights::Instances => Pass::Instances,
         };
         assert!(pass == Pass::Color || settings.instances.is_some(), "the view was rendered with instances");
-        let lists = &self.tape.lists;
-        let level = self.level;
-        let tiles: Vec<[TilePixels; C]> = (0..lists.tiles())
-            .into_par_iter()
-            .map(|tile| {
-                let mut blended = [[[0.0; LANES]; GROUPS]; C];
-                let place = self.place(tile);
-                dispatch!(level, simd => blend_tile(
-                    simd, &self.tape.splats, lists.tile(tile), &place, pass, values, &mut blended));
-                blended
-            })
-            .collect();
         let mut image = PixelGrid::filled(view.width, view.height, [0.0; C]);
-        for channel in 0..C {
-            let plane = gather_tiles(lists, view.width, view.height, |tile, group, lane| {
-                tiles[tile][channel][group][lane]
-            });
-            for (pixel, value) in image.pixels.iter_mut().zip(&plane.pixels) {
-                pixel[channel] = *value;
-            }
-        }
+        self.each_region(size_of::<[TilePixels; C]>(), |lists| {
+            let tiles = self.blended_tiles(lists, values, pass);
+            let start = (lists.region.first_row * TILE) as usize * view.width as usize;
+            gather_values(lists, view.width, &tiles, &mut image.pixels[start..]);
+        });
         image
     }
 
-    fn render_instances(&self, identities: &Identities, width: u32, height: u32) -> InstanceImage {
-        let tiles = self.instance_tiles(identities, 0);
-        let lists = &self.tape.lists;
-        InstanceImage {
-            label: gather_tiles(lists, width, height, |tile, group, lane| tiles[tile].label[group][lane]),
-            probability: gather_tiles(lists, width, height, |tile, group, lane| {
-                tiles[tile].probability[group][lane]
-            }),
-            coverage: gather_tiles(lists, width, height, |tile, group, lane| {
-                tiles[tile].coverage[group][lane]
-            }),
-            foreground: gather_tiles(lists, width, height, |tile, group, lane| {
-                tiles[tile].foreground[group][lane]
-            }),
-            entropy: gather_tiles(lists, width, height, |tile, group, lane| tiles[tile].entropy[group][lane]),
-        }
+    /// Colours on the background of the tiles that were blended last, into the rows of the image that hold them.
+    pub(super) fn gather_color(&self, rows: &mut [[f32; 3]]) {
+        let (view, settings, _) = self.tape.view.expect("a view was rendered");
+        let background = settings.background;
+        gather_tiles(&self.tape.lists, view.width, rows, |tile, group, lane| {
+            let tile = &self.tape.tiles[tile];
+            let t = tile.transmittance[group][lane];
+            [0, 1, 2].map(|channel| tile.color[channel][group][lane] + t * background[channel])
+        });
     }
 }
 
-/// A row-major image from per-tile values.
-fn gather_tiles<T: Copy + Default + Send>(
+/// Bytes of a tile's blended identities.
+pub(super) fn instance_tile_bytes(ranks: usize) -> usize {
+    size_of::<InstanceTile>() + ranks * size_of::<[[(u16, f32); LANES]; GROUPS]>()
+}
+
+/// Writes the ranks of a region's tiles to rows of pixels that begin at `start` with those of the region.
+pub(super) fn gather_ranks(
+    lists: &TileLists,
+    tiles: &[InstanceTile],
+    start: usize,
+    found: &mut InstanceRanks,
+) {
+    for (rank, (labels, probabilities)) in found.ranks.iter_mut().enumerate() {
+        let width = labels.width;
+        gather_tiles(lists, width, &mut labels.pixels[start..], |tile, group, lane| {
+            tiles[tile].ranks[rank][group][lane].0
+        });
+        gather_tiles(lists, width, &mut probabilities.pixels[start..], |tile, group, lane| {
+            tiles[tile].ranks[rank][group][lane].1
+        });
+    }
+}
+
+/// Writes values blended over a region's tiles to the rows of pixels that hold them.
+pub(super) fn gather_values<const C: usize>(
     lists: &TileLists,
     width: u32,
-    height: u32,
+    tiles: &[[TilePixels; C]],
+    rows: &mut [[f32; C]],
+) {
+    gather_tiles(lists, width, rows, |tile, group, lane| {
+        std::array::from_fn(|channel| tiles[tile][channel][group][lane])
+    });
+}
+
+/// Writes per-tile values of a region to rows of pixels, so many wide, of which the first is the region's first.
+pub(super) fn gather_tiles<T: Send>(
+    lists: &TileLists,
+    width: u32,
+    rows: &mut [T],
     value: impl Fn(usize, usize, usize) -> T + Sync,
-) -> PixelGrid<T> {
-    let mut image = PixelGrid::filled(width, height, T::default());
-    let band = TILE as usize * width as usize;
-    if band > 0 {
-        image.pixels.par_chunks_mut(band).enumerate().for_each(|(tile_row, band)| {
-            for tile_column in 0..lists.columns as usize {
-                let tile = tile_row * lists.columns as usize + tile_column;
-                let (x0, _) = lists.origin(tile);
-                for group in 0..GROUPS {
-                    for lane in 0..LANES {
-                        let (column, row) = pixel_in_tile(group, lane);
-                        let x = (x0 + column) as usize;
-                        let pixel = row as usize * width as usize + x;
-                        if x < width as usize && pixel < band.len() {
-                            band[pixel] = value(tile, group, lane);
-                        }
+) {
+    let (width, columns) = (width as usize, lists.region.columns as usize);
+    let of_tile_row = TILE as usize * width;
+    if of_tile_row == 0 {
+        return;
+    }
+    let tile_rows = rows.par_chunks_mut(of_tile_row).take(lists.region.rows as usize);
+    tile_rows.enumerate().for_each(|(tile_row, rows)| {
+        for tile in tile_row * columns..(tile_row + 1) * columns {
+            let (x0, _) = lists.origin(tile);
+            for group in 0..GROUPS {
+                for lane in 0..LANES {
+                    let (column, row) = pixel_in_tile(group, lane);
+                    let x = (x0 + column) as usize;
+                    let pixel = row as usize * width + x;
+                    if x < width && pixel < rows.len() {
+                        rows[pixel] = value(tile, group, lane);
                     }
                 }
             }
-        });
-    }
-    image
+        }
+    });
 }

@@ -99,12 +99,21 @@ impl Renderer {
         }
     }
 
-    /// After blending.
-    pub(super) fn inspect_image(&mut self) {
+    /// After blending: rows of the image, of which so many pixels lie above.
+    pub(super) fn inspect_color(&mut self, color: &[[f32; 3]], above: usize) {
+        if self.inspection.on && self.inspection.found.is_none() {
+            self.inspection.look("rasterize", [("colour", color.as_flattened())]);
+            if let Some(found) = &mut self.inspection.found {
+                found.index += 3 * above;
+            }
+        }
+    }
+
+    /// After blending with labels.
+    pub(super) fn inspect_labelled_tiles(&mut self) {
         if !self.inspection.on {
             return;
         }
-        self.inspection.look("rasterize", [("colour", self.tape.color.as_flattened())]);
         let labels = self.tape.tiles.iter().zip(&self.tape.labels).filter(|(_, labels)| labels.is_some());
         for (tile, _) in labels {
             let arrays = [

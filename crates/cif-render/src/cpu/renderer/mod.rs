@@ -4,13 +4,15 @@
 //! |---|---|
 //! | this | forward |
 //! | `backward` | gradients of the last forward pass |
-//! | `images` | pictures from blended tiles, instance images |
+//! | `images` | pictures of a view and of values per Gaussian, instance images |
+//! | `banded` | the same band by band, within a budget of memory |
 //! | `count` | label mass for identity estimation |
 //! | `pose` | Gaussians at the time of the view |
 //! | `displace` | motion without pictures |
 //! | `inspect` | the first value that is not finite |
 
 mod backward;
+mod banded;
 mod count;
 mod displace;
 mod images;
@@ -22,9 +24,10 @@ use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
+pub use self::banded::{BandRequest, RenderedBand};
 pub use self::inspect::NotFinite;
 use self::pose::{PosedView, pose};
-use super::bin::{TileLists, sort_by_depth};
+use super::bin::{TileLists, TileRegion, sort_by_depth};
 use super::deform::PosedArrays;
 use super::labels::{IdentityRows, TileLabels};
 use super::level::SimdLevel;
@@ -99,6 +102,7 @@ pub struct Renderer {
     statistics: ViewStatistics,
     tape: Tape,
     inspection: inspect::Inspection,
+    band_memory: u64,
 }
 
 impl std::fmt::Debug for Renderer {
@@ -123,6 +127,7 @@ impl Renderer {
             statistics: ViewStatistics::default(),
             tape: Tape::default(),
             inspection: inspect::Inspection::default(),
+            band_memory: banded::BAND_MEMORY,
         }
     }
 
@@ -187,7 +192,8 @@ impl Renderer {
         if let Some(tiles) = tiles {
             tiles.check(camera.width, camera.height);
         }
-        self.prepare(field, camera, time, settings, tiles.map(|tiles| tiles.drawn));
+        self.project(field, camera, time, settings);
+        self.bin(TileRegion::whole(camera.width, camera.height), tiles.map(|tiles| tiles.drawn), true);
         let identities = labels.map(|labels| {
             (labels, field.identities.as_ref().expect("the instance pass needs estimated identities"))
         });
@@ -202,15 +208,8 @@ impl Renderer {
         }
     }
 
-    /// Deformation, projection, sorting and tile lists of a view.
-    fn prepare(
-        &mut self,
-        field: &Field,
-        camera: &PinholeCamera,
-        time: f64,
-        settings: &RenderSettings,
-        drawn: Option<&[bool]>,
-    ) {
+    /// Deformation, projection and depth order of a view.
+    fn project(&mut self, field: &Field, camera: &PinholeCamera, time: f64, settings: &RenderSettings) {
         let mut times = self.times;
         let level = self.level;
         let tape = &mut self.tape;
@@ -240,24 +239,32 @@ impl Renderer {
                 tape.splats.extend_from_slice(chunk);
             }
         });
-        timed(&mut times.bin, || {
-            sort_by_depth(&mut tape.splats);
-            tape.lists.build(&tape.splats, camera.width, camera.height, drawn);
-        });
-        self.statistics = ViewStatistics {
-            visible: tape.splats.len(),
-            tile_pairs: tape.lists.entries.len(),
-            deformed,
-            ..ViewStatistics::default()
-        };
+        timed(&mut times.bin, || sort_by_depth(&mut tape.splats));
+        // Of another view: nothing is differentiated before this one is drawn.
+        tape.color.clear();
+        self.statistics =
+            ViewStatistics { visible: tape.splats.len(), deformed, ..ViewStatistics::default() };
         self.times = times;
         self.inspect_posed();
         self.inspect_splats();
     }
 
+    /// Tile lists of a region of the projected view, with the pairs of each splat where they are asked for, as
+    /// gradients and counts read them.
+    fn bin(&mut self, region: TileRegion, drawn: Option<&[bool]>, by_splat: bool) {
+        let tape = &mut self.tape;
+        timed(&mut self.times.bin, || tape.lists.build(&tape.splats, region, drawn, by_splat));
+        self.statistics.tile_pairs += tape.lists.entries.len();
+    }
+
+    /// A tile of the region that was drawn last.
     fn place(&self, tile: usize) -> TilePlace {
-        let (view, ..) = self.tape.view.as_ref().expect("a view was prepared");
-        let (x, y) = self.tape.lists.origin(tile);
+        self.place_in(&self.tape.lists, tile)
+    }
+
+    fn place_in(&self, lists: &TileLists, tile: usize) -> TilePlace {
+        let (view, ..) = self.tape.view.as_ref().expect("a view was projected");
+        let (x, y) = lists.origin(tile);
         TilePlace { x, y, width: view.width, height: view.height }
     }
 
@@ -270,8 +277,29 @@ impl Renderer {
         rank_of
     }
 
-    /// Blends all tiles into the tape, with instances in those that are `labelled` (all without).
+    /// Blends all tiles of a view into the tape, and takes their colours together.
     fn rasterize(
+        &mut self,
+        labels: Option<(&PixelGrid<u16>, &Identities)>,
+        labelled: Option<&[bool]>,
+        depth: bool,
+    ) {
+        self.blend_tiles(labels, labelled, depth);
+        let mut times = self.times;
+        timed(&mut times.rasterize, || {
+            let (view, ..) = self.tape.view.expect("a view was projected");
+            let mut color = std::mem::take(&mut self.tape.color);
+            color.resize(view.width as usize * view.height as usize, [0.0; 3]);
+            self.gather_color(&mut color);
+            self.inspect_color(&color, 0);
+            self.tape.color = color;
+        });
+        self.times = times;
+        self.inspect_labelled_tiles();
+    }
+
+    /// Blends the tiles that are listed into the tape, with instances in those that are `labelled` (all without).
+    fn blend_tiles(
         &mut self,
         labels: Option<(&PixelGrid<u16>, &Identities)>,
         labelled: Option<&[bool]>,
@@ -318,21 +346,12 @@ impl Renderer {
                 });
             });
             self.tape.tiles = images;
-            self.statistics.evaluated_pairs = self.tape.tiles.iter().map(|tile| tile.evaluated).sum();
-            self.statistics.instance_pairs =
-                self.tape.tiles.iter().map(|tile| tile.evaluated_instances).sum();
-            self.statistics.labelled_tiles = self.tape.labels.iter().flatten().count();
-            let (view, settings, _) = self.tape.view.expect("a view was prepared");
-            let background = settings.background;
-            self.tape.color = self
-                .gather_image(view.width, view.height, |tile, group, lane| {
-                    let t = tile.transmittance[group][lane];
-                    [0, 1, 2].map(|channel| tile.color[channel][group][lane] + t * background[channel])
-                })
-                .pixels;
+            let (statistics, tape) = (&mut self.statistics, &self.tape);
+            statistics.evaluated_pairs += tape.tiles.iter().map(|tile| tile.evaluated).sum::<u64>();
+            statistics.instance_pairs += tape.tiles.iter().map(|tile| tile.evaluated_instances).sum::<u64>();
+            statistics.labelled_tiles += tape.labels.iter().flatten().count();
         });
         self.times = times;
-        self.inspect_image();
     }
 
     /// Mean loss over labelled pixels, and how many of them no covering Gaussian supports.

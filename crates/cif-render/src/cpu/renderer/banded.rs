@@ -1,0 +1,197 @@
+//! Views drawn in bands of rows, each within a budget of memory.
+
+use cif_field::Field;
+use cif_geometry::{PinholeCamera, PixelGrid};
+
+use super::super::bands::{Band, bands};
+use super::super::bin::TileRegion;
+use super::super::labels::TileLabels;
+use super::super::rasterize::TileImage;
+use super::super::tile::{Pass, TilePixels};
+use super::super::timing::timed;
+use super::Renderer;
+use super::images::{DrawnIdentities, gather_ranks, gather_tiles, gather_values, instance_tile_bytes};
+use crate::constants::{MIN_COVERAGE, TILE};
+use crate::image::{InstanceImage, InstanceRanks};
+use crate::{Channels, RenderSettings, RenderedImage};
+
+/// Bytes of a band, unless said otherwise: a view of 1920 x 1080 pixels with all channels fits.
+pub(super) const BAND_MEMORY: u64 = 256 << 20;
+
+/// What to draw of a view in bands.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct BandRequest<'a> {
+    /// Outputs of the image.
+    pub channels: Channels,
+    /// So many of the most probable instances of every pixel, where instances are drawn.
+    pub ranks: usize,
+    /// Two values per Gaussian, `[N]` by row of the field, blended with the weights of colour.
+    pub values: Option<&'a [[f32; 2]]>,
+}
+
+/// Rows of a view, over its full width.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RenderedBand {
+    /// Row of the view that is the first here; a multiple of [`TILE`].
+    pub first_row: u32,
+    /// The rows.
+    pub image: RenderedImage,
+    /// Most probable instances of every pixel; `None` where none were asked for or no instances drawn.
+    pub ranks: Option<InstanceRanks>,
+    /// Blended values, `sum_i T_i alpha_i v_i`.
+    pub blended: Option<PixelGrid<[f32; 2]>>,
+}
+
+impl BandRequest<'_> {
+    /// Bytes of a tile while its band is drawn, without its pairs: what is blended, and the pixels that come out.
+    fn tile_bytes(&self, instances: bool) -> u64 {
+        let if_drawn = |is_drawn: bool, bytes: usize| if is_drawn { bytes } else { 0 };
+        let ranks = if_drawn(instances, self.ranks);
+        let blended = size_of::<TileImage>()
+            + size_of::<Option<TileLabels>>()
+            + if_drawn(instances, instance_tile_bytes(ranks))
+            + if_drawn(self.values.is_some(), size_of::<[TilePixels; 2]>());
+        let pixel = size_of::<[f32; 4]>()
+            + if_drawn(self.channels.depth, size_of::<f32>())
+            + if_drawn(instances, size_of::<u16>() + size_of::<[f32; 4]>())
+            + ranks * (size_of::<u16>() + size_of::<f32>())
+            + if_drawn(self.values.is_some(), size_of::<[f32; 2]>());
+        (blended + pixel * (TILE * TILE) as usize) as u64
+    }
+}
+
+impl RenderedBand {
+    /// Rows that are still to be drawn.
+    fn blank(
+        first_row: u32,
+        (width, height): (u32, u32),
+        request: &BandRequest<'_>,
+        instances: bool,
+    ) -> Self {
+        let zeros = || PixelGrid::filled(width, height, 0.0);
+        let image = RenderedImage {
+            color: PixelGrid::filled(width, height, [0.0; 3]),
+            alpha: zeros(),
+            depth: request.channels.depth.then(zeros),
+            instances: instances.then(|| InstanceImage {
+                label: PixelGrid::filled(width, height, 0),
+                probability: zeros(),
+                coverage: zeros(),
+                foreground: zeros(),
+                entropy: zeros(),
+            }),
+        };
+        let ranks = (instances && request.ranks > 0).then(|| InstanceRanks::none(request.ranks, width, height));
+        let blended = request.values.map(|_| PixelGrid::filled(width, height, [0.0; 2]));
+        Self { first_row, image, ranks, blended }
+    }
+}
+
+impl Renderer {
+    /// Sets the memory that a band may take, in bytes, which decides how many rows are drawn at once. Pictures do not
+    /// depend on it. What the field and its projected Gaussians take, and a single tile of 16 x 16 pixels with all
+    /// Gaussians that reach it, come on top.
+    pub fn set_band_memory(&mut self, bytes: u64) {
+        self.band_memory = bytes;
+    }
+
+    /// Renders a view in bands of rows from top to bottom, and hands each to `take`: memory follows the band, not the
+    /// view.
+    ///
+    /// # Errors
+    /// The first of `take`, which is not called again then.
+    ///
+    /// # Panics
+    /// When there are fewer values than Gaussians.
+    pub fn render_bands<E>(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        request: &BandRequest<'_>,
+        mut take: impl FnMut(RenderedBand) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let settings = settings.for_outputs(field, request.channels);
+        self.project(field, camera, time, &settings);
+        let identities = field.identities.as_ref().filter(|_| settings.instances.is_some());
+        let identities = identities.map(DrawnIdentities::new);
+        let whole = TileRegion::whole(camera.width, camera.height);
+        let tile_bytes = request.tile_bytes(identities.is_some());
+        for band in bands(&self.tape.splats, whole, tile_bytes, self.band_memory) {
+            let band = self.draw_band(&band, (camera.width, camera.height), request, identities.as_ref());
+            self.inspect_color(&band.image.color.pixels, band.first_row as usize * camera.width as usize);
+            take(band)?;
+        }
+        Ok(())
+    }
+
+    fn draw_band(
+        &mut self,
+        band: &Band,
+        (width, height): (u32, u32),
+        request: &BandRequest<'_>,
+        identities: Option<&DrawnIdentities<'_>>,
+    ) -> RenderedBand {
+        let (first, rows) = band.rows();
+        let first_row = first * TILE;
+        let size = (width, (rows * TILE).min(height - first_row));
+        let mut drawn = RenderedBand::blank(first_row, size, request, identities.is_some());
+        for part in &band.parts {
+            self.bin(*part, None, false);
+            self.blend_tiles(None, None, request.channels.depth);
+            let mut times = self.times;
+            timed(&mut times.rasterize, || self.gather_part(request, identities, &mut drawn));
+            self.times = times;
+        }
+        drawn
+    }
+
+    /// Takes the tiles that were blended last into their band.
+    fn gather_part(
+        &self,
+        request: &BandRequest<'_>,
+        identities: Option<&DrawnIdentities<'_>>,
+        band: &mut RenderedBand,
+    ) {
+        let (lists, tiles) = (&self.tape.lists, &self.tape.tiles);
+        let width = band.image.color.width;
+        self.gather_color(&mut band.image.color.pixels);
+        gather_tiles(lists, width, &mut band.image.alpha.pixels, |tile, group, lane| {
+            1.0 - tiles[tile].transmittance[group][lane]
+        });
+        if let Some(depth) = &mut band.image.depth {
+            gather_tiles(lists, width, &mut depth.pixels, |tile, group, lane| {
+                let tile = &tiles[tile];
+                let coverage = 1.0 - tile.transmittance[group][lane];
+                if coverage > MIN_COVERAGE { tile.depth[group][lane] / coverage } else { 0.0 }
+            });
+        }
+        if let (Some(image), Some(identities)) = (&mut band.image.instances, identities) {
+            let ranks = band.ranks.as_ref().map_or(0, |ranks| ranks.ranks.len());
+            let tiles = self.instance_tiles(lists, identities, ranks);
+            gather_tiles(lists, width, &mut image.label.pixels, |tile, group, lane| {
+                tiles[tile].label[group][lane]
+            });
+            gather_tiles(lists, width, &mut image.probability.pixels, |tile, group, lane| {
+                tiles[tile].probability[group][lane]
+            });
+            gather_tiles(lists, width, &mut image.coverage.pixels, |tile, group, lane| {
+                tiles[tile].coverage[group][lane]
+            });
+            gather_tiles(lists, width, &mut image.foreground.pixels, |tile, group, lane| {
+                tiles[tile].foreground[group][lane]
+            });
+            gather_tiles(lists, width, &mut image.entropy.pixels, |tile, group, lane| {
+                tiles[tile].entropy[group][lane]
+            });
+            if let Some(found) = &mut band.ranks {
+                gather_ranks(lists, &tiles, 0, found);
+            }
+        }
+        if let (Some(blended), Some(values)) = (&mut band.blended, request.values) {
+            let tiles = self.blended_tiles(lists, values, Pass::Color);
+            gather_values(lists, width, &tiles, &mut blended.pixels);
+        }
+    }
+}
