@@ -5,6 +5,7 @@
 //! coverages add up to alpha, as those of a renderer of surfaces do.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use cif_dataset::cryptomatte::{BACKGROUND, id_as_float, object_id};
 use cif_geometry::PixelGrid;
@@ -35,20 +36,20 @@ pub fn manifest(objects: &[Object]) -> Result<String, ExrError> {
     Ok(format!("{{{}}}", entries.join(",")))
 }
 
-/// Ids (bits of a 32-bit integer) and coverages, most coverage first, [`RANKS`] of them.
+/// Ids (bits of a 32-bit integer) and coverages of some pixels, most coverage first, [`RANKS`] of them.
 #[must_use]
 pub fn planes(
     objects: &[Object],
     alpha: &PixelGrid<f32>,
     instances: &InstanceImage,
     ranks: &InstanceRanks,
+    pixels: Range<usize>,
 ) -> Vec<(Vec<f32>, Vec<f32>)> {
     let ids: Vec<f32> = objects.iter().map(|object| id_as_float(object_id(&object.name))).collect();
     let background = id_as_float(object_id(BACKGROUND));
-    let pixels = alpha.pixels.len();
-    let mut planes = vec![(vec![0.0; pixels], vec![0.0; pixels]); RANKS];
+    let mut planes = vec![(vec![0.0; pixels.len()], vec![0.0; pixels.len()]); RANKS];
     let mut found: Vec<(f32, f32)> = Vec::new();
-    for pixel in 0..pixels {
+    for (place, pixel) in pixels.enumerate() {
         found.clear();
         let whole = instances.coverage.pixels[pixel];
         let covered = alpha.pixels[pixel].clamp(0.0, 1.0);
@@ -69,7 +70,7 @@ pub fn planes(
         // Stable: instances come before the background where both cover the same.
         found.sort_by(|a, b| b.1.total_cmp(&a.1));
         for ((id_plane, coverage_plane), (id, coverage)) in planes.iter_mut().zip(&found) {
-            (id_plane[pixel], coverage_plane[pixel]) = (*id, *coverage);
+            (id_plane[place], coverage_plane[place]) = (*id, *coverage);
         }
     }
     planes

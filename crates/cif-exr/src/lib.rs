@@ -29,8 +29,8 @@ pub mod write;
 
 pub use color::ColorEncoding;
 pub use error::ExrError;
-pub use layers::{Frame, Motion, Object};
-pub use write::write;
+pub use layers::{Frame, Object, Rows};
+pub use write::{FrameWriter, write};
 
 #[cfg(test)]
 mod tests;

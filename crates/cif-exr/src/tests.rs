@@ -4,7 +4,7 @@ use cif_dataset::cryptomatte::{self as matte, ObjectIds, object_id};
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::synthetic::{SyntheticConfig, generate};
-use cif_render::{Channels, InstanceRanks, RenderSettings, RenderedImage};
+use cif_render::{Channels, InstanceImage, InstanceRanks, RenderSettings, RenderedImage};
 use exr::prelude::*;
 
 use super::*;
@@ -20,7 +20,8 @@ struct Rendered {
 }
 
 fn rendered(instances: usize) -> Rendered {
-    let scene = generate(&SyntheticConfig { gaussians: 40, instances, ..SyntheticConfig::default() });
+    let config = SyntheticConfig { gaussians: 40, instances, height: 40, ..SyntheticConfig::default() };
+    let scene = generate(&config);
     let settings = RenderSettings::of_field(&scene.field);
     let mut renderer = Renderer::new(SimdLevel::Portable);
     let channels = Channels { depth: true, instances: true };
@@ -35,22 +36,118 @@ fn rendered(instances: usize) -> Rendered {
 
 impl Rendered {
     fn write(&self, path: &Path, encoding: ColorEncoding) -> std::result::Result<(), ExrError> {
+        self.write_in_bands(path, encoding, u32::MAX)
+    }
+
+    /// Hands the file at most so many rows at once.
+    fn write_in_bands(
+        &self,
+        path: &Path,
+        encoding: ColorEncoding,
+        most: u32,
+    ) -> std::result::Result<(), ExrError> {
         let (width, height) = (self.image.alpha.width, self.image.alpha.height);
-        let motion =
-            Motion { vectors: PixelGrid::filled(width, height, [1.5, 2.0]), next: Some("000001".to_owned()) };
         let frame = Frame {
             name: "000000",
             time: 0.25,
-            image: &self.image,
+            width,
+            height,
             world_per_unit: WORLD_PER_UNIT,
             background: self.settings.background,
-            objects: &self.objects,
-            ranks: Some(&self.ranks),
-            motion: Some(&motion),
+            objects: Some(&self.objects),
+            next: Some("000001"),
             encoding,
         };
-        super::write(path, &frame)
+        super::write(path, &frame, |file| {
+            for first_row in (0..height).step_by(most as usize) {
+                let rows = first_row..(first_row + most.min(height - first_row));
+                let (image, ranks) = (image_rows(&self.image, &rows), ranks_rows(&self.ranks, &rows));
+                let motion = PixelGrid::filled(width, rows.end - rows.start, [1.5, 2.0]);
+                file.write(&Rows { first_row, image: &image, ranks: Some(&ranks), motion: &motion })?;
+            }
+            Ok(())
+        })
     }
+}
+
+fn grid_rows<T: Clone>(grid: &PixelGrid<T>, rows: &std::ops::Range<u32>) -> PixelGrid<T> {
+    let pixels = (rows.start * grid.width) as usize..(rows.end * grid.width) as usize;
+    PixelGrid::from_pixels(grid.width, rows.end - rows.start, grid.pixels[pixels].to_vec())
+}
+
+fn image_rows(image: &RenderedImage, rows: &std::ops::Range<u32>) -> RenderedImage {
+    RenderedImage {
+        color: grid_rows(&image.color, rows),
+        alpha: grid_rows(&image.alpha, rows),
+        depth: image.depth.as_ref().map(|depth| grid_rows(depth, rows)),
+        instances: image.instances.as_ref().map(|instances| InstanceImage {
+            label: grid_rows(&instances.label, rows),
+            probability: grid_rows(&instances.probability, rows),
+            coverage: grid_rows(&instances.coverage, rows),
+            foreground: grid_rows(&instances.foreground, rows),
+            entropy: grid_rows(&instances.entropy, rows),
+        }),
+    }
+}
+
+fn ranks_rows(ranks: &InstanceRanks, rows: &std::ops::Range<u32>) -> InstanceRanks {
+    let ranks = ranks.ranks.iter();
+    InstanceRanks { ranks: ranks.map(|(a, b)| (grid_rows(a, rows), grid_rows(b, rows))).collect() }
+}
+
+#[test]
+fn bands_of_rows_make_the_same_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.exr");
+    let rendered = rendered(3);
+    let file = |most: u32| {
+        rendered.write_in_bands(&path, ColorEncoding::Linear, most).unwrap();
+        let image = read().no_deep_data().largest_resolution_level().all_channels().first_valid_layer();
+        image.all_attributes().from_file(&path).unwrap().layer_data
+    };
+    let whole = file(u32::MAX);
+    assert_eq!((whole.size.area(), whole.channel_data.list.len()), (32 * 40, 24));
+    for most in [16, 32] {
+        let layer = file(most);
+        assert_eq!(layer.attributes, whole.attributes);
+        // Bits: ids of a Cryptomatte may be NaN.
+        let bits = |samples: &FlatSamples| match samples {
+            FlatSamples::F32(values) => values.iter().map(|value| value.to_bits()).collect::<Vec<u32>>(),
+            FlatSamples::U32(values) => values.clone(),
+            FlatSamples::F16(_) => panic!("all channels have 32 bits"),
+        };
+        for (a, b) in layer.channel_data.list.iter().zip(&whole.channel_data.list) {
+            assert_eq!(a.name, b.name);
+            assert!(bits(&a.sample_data) == bits(&b.sample_data), "{}, {most} rows at once", a.name);
+        }
+    }
+}
+
+#[test]
+fn a_file_without_all_rows_is_not_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.exr");
+    rendered(2).write(&path, ColorEncoding::Linear).unwrap();
+    let before = std::fs::read(&path).unwrap();
+    let frame = Frame {
+        name: "a",
+        time: 0.0,
+        width: 8,
+        height: 20,
+        world_per_unit: 1.0,
+        background: [0.0; 3],
+        objects: None,
+        next: None,
+        encoding: ColorEncoding::Linear,
+    };
+    let error = super::write(&path, &frame, |_| Ok::<(), ExrError>(())).unwrap_err();
+    assert!(error.to_string().contains("a.exr"), "{error}");
+    let refused = super::write(&path, &frame, |_| {
+        Err(ExrError::Encode { path: path.clone(), reason: "stopped".to_owned() })
+    });
+    assert!(refused.unwrap_err().to_string().contains("stopped"));
+    assert!(std::fs::read(&path).unwrap() == before, "the old file is kept");
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file is left");
 }
 
 #[test]

@@ -94,8 +94,7 @@ pub struct InstanceRanks {
 impl InstanceRanks {
     /// So many ranks without instances.
     pub(crate) fn none(ranks: usize, width: u32, height: u32) -> Self {
-        let rank =
-            || (PixelGrid::filled(width, height, UNLABELLED), PixelGrid::filled(width, height, 0.0));
+        let rank = || (PixelGrid::filled(width, height, UNLABELLED), PixelGrid::filled(width, height, 0.0));
         Self { ranks: (0..ranks).map(|_| rank()).collect() }
     }
 }
@@ -106,14 +105,18 @@ const FOREGROUND: f32 = 0.5;
 impl InstanceImage {
     /// The most probable instance where the pixel belongs to any, else [`UNLABELLED`]: what a compositor
     /// wants, while the metrics force every pixel to an instance (methods reference 9).
+    ///
+    /// # Panics
+    /// Without such a pixel.
+    #[must_use]
+    pub fn foreground_label_at(&self, pixel: usize) -> u16 {
+        if self.foreground.pixels[pixel] < FOREGROUND { UNLABELLED } else { self.label.pixels[pixel] }
+    }
+
+    /// [`Self::foreground_label_at`] every pixel.
     #[must_use]
     pub fn foreground_label(&self) -> PixelGrid<u16> {
-        let mut label = self.label.clone();
-        for (label, foreground) in label.pixels.iter_mut().zip(&self.foreground.pixels) {
-            if *foreground < FOREGROUND {
-                *label = UNLABELLED;
-            }
-        }
-        label
+        let labels = (0..self.label.pixels.len()).map(|pixel| self.foreground_label_at(pixel));
+        PixelGrid::from_pixels(self.label.width, self.label.height, labels.collect())
     }
 }

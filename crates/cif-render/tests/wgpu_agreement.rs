@@ -940,6 +940,36 @@ fn too_many_pairs_are_refused_with_the_arithmetic() {
     gpu.check().expect("the device is still fine");
 }
 
+#[test]
+fn views_drawn_in_bands_are_those_drawn_at_once() {
+    let Some(device) = device() else { return };
+    let scene = generate(&SyntheticConfig { width: 70, height: 83, ..config() });
+    let settings = RenderSettings::of_field(&scene.field);
+    let channels = CHANNELS;
+    for compact in [false, true] {
+        let make = if compact { GpuRenderer::compact } else { GpuRenderer::new };
+        let mut renderer = make(&device.0, &scene.field).unwrap();
+        let (field, camera) = (&scene.field, &scene.camera);
+        let whole = renderer.render(field, camera, scene.time, &settings, channels).unwrap();
+        assert!(whole.alpha.pixels.iter().filter(|alpha| **alpha > 0.5).count() > 500);
+        // One row of tiles at once, and two, of about 200 bytes a pixel.
+        for (memory, first_rows) in [(1, vec![0, 16, 32, 48, 64, 80]), (500_000, vec![0, 32, 64])] {
+            renderer.set_band_memory(memory);
+            let mut firsts = Vec::new();
+            let bands =
+                renderer.render_bands(field, camera, scene.time, &settings, channels, |first, band| {
+                    assert_eq!(band.alpha.width, 70);
+                    firsts.push(first);
+                    Ok::<(), GpuError>(())
+                });
+            bands.unwrap();
+            assert_eq!(firsts, first_rows, "{memory} bytes");
+            let image = renderer.render(field, camera, scene.time, &settings, channels).unwrap();
+            assert!(image == whole, "{memory} bytes, compact: {compact}");
+        }
+    }
+}
+
 /// Without a wait in between: what does not fit is not drawn, and the counts say so.
 #[test]
 fn a_view_that_does_not_fit_is_told_and_leaves_no_gradient() {

@@ -51,6 +51,19 @@ pub enum Error {
     },
 }
 
+#[cfg(feature = "wgpu")]
+impl From<cif_render::wgpu::GpuError> for Error {
+    fn from(error: cif_render::wgpu::GpuError) -> Self {
+        Self::plain(error)
+    }
+}
+
+impl From<cif_exr::ExrError> for Error {
+    fn from(error: cif_exr::ExrError) -> Self {
+        Self::plain(error)
+    }
+}
+
 /// What is wrong at a place in a text file.
 #[derive(Debug, thiserror::Error, Diagnostic)]
 #[error("{}:{line}: {message}", path.display())]

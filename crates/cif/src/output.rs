@@ -1,7 +1,7 @@
 //! Output files and folders: checked before the work starts, written whole or not at all.
 
 use std::collections::BTreeMap;
-use std::fs;
+use std::fs::{self, File};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -219,6 +219,34 @@ pub fn rescue_file(path: &Path) -> io::Result<PathBuf> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let file = tempfile::Builder::new().prefix("rescued-").suffix(&format!("-{name}")).tempfile()?;
     file.into_temp_path().keep().map_err(|error| error.error)
+}
+
+/// A file that is written piece by piece, to a temporary one in the same folder, which is removed when this is dropped.
+pub(crate) struct NewFile {
+    path: PathBuf,
+    new: cif_output::NewFile,
+}
+
+impl NewFile {
+    /// # Errors
+    /// When the file system refuses.
+    pub(crate) fn create(path: &Path) -> Result<Self, Error> {
+        let new = cif_output::NewFile::create(path).map_err(Error::io("write to the folder of", path))?;
+        Ok(Self { path: path.to_owned(), new })
+    }
+
+    /// The temporary file.
+    pub(crate) fn file(&self) -> &File {
+        self.new.file()
+    }
+
+    /// Puts the file in its place, where it replaces an older one.
+    ///
+    /// # Errors
+    /// When the file system refuses.
+    pub(crate) fn finish(self) -> Result<(), Error> {
+        self.new.finish().map_err(Error::io("write", &self.path))
+    }
 }
 
 fn probe(folder: &Path) -> Result<(), Error> {

@@ -49,6 +49,13 @@ impl Quality {
         Cow::Owned(field.gather(&kept))
     }
 
+    /// Settings of a render in this quality.
+    #[must_use]
+    pub fn settings(&self, settings: &RenderSettings) -> RenderSettings {
+        let sh_degree = self.sh_degree.map_or(settings.sh_degree, |degree| degree.min(settings.sh_degree));
+        RenderSettings { sh_degree, ..*settings }
+    }
+
     /// Renders a view of a field that [`Self::thin`] gave, in the size of the camera.
     pub fn render(
         &self,
@@ -59,8 +66,7 @@ impl Quality {
         settings: &RenderSettings,
         channels: Channels,
     ) -> RenderedImage {
-        let sh_degree = self.sh_degree.map_or(settings.sh_degree, |degree| degree.min(settings.sh_degree));
-        let settings = RenderSettings { sh_degree, ..*settings };
+        let settings = self.settings(settings);
         if self.reduction <= 1 {
             return renderer.render(field, camera, time, &settings, channels);
         }

@@ -144,12 +144,7 @@ fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
 
 /// Calls `visit` with every tile of the region, and of `drawn` (all without), that the splat reaches, in row order, and
 /// the passes that reach it, a bit each.
-fn visit_tiles(
-    splat: &Splat,
-    region: &TileRegion,
-    drawn: Option<&[bool]>,
-    mut visit: impl FnMut(u32, u8),
-) {
+fn visit_tiles(splat: &Splat, region: &TileRegion, drawn: Option<&[bool]>, mut visit: impl FnMut(u32, u8)) {
     let tile = TILE as f32;
     let [columns, rows] = region.reached(splat);
     // A hair more than the gate, so that rounding never drops a tile that holds a drawn pixel.
@@ -342,9 +337,6 @@ mod tests {
             TileLists::default().build_within(74_999, &splats, region, None, true);
         });
         let message = *refused.unwrap_err().downcast::<String>().unwrap();
-        assert!(
-            message.contains("3000 visible Gaussians") && message.contains("5 x 5 tiles"),
-            "{message}"
-        );
+        assert!(message.contains("3000 visible Gaussians") && message.contains("5 x 5 tiles"), "{message}");
     }
 }

@@ -101,7 +101,8 @@ const CHUNK: u32 = 16u;
 @compute @workgroup_size(64)
 fn dense(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
     let tile = workgroup.xy / 2u;
-    let origin = workgroup.xy * HALF_TILE;
+    let first_pixel = vec2u(0u, view.first_row * TILE);
+    let origin = first_pixel + workgroup.xy * HALF_TILE;
     let pixel = origin + vec2u(local % HALF_TILE, local / HALF_TILE);
     let inside = all(pixel < view.size);
     let centre = vec2f(pixel) + 0.5;
@@ -181,7 +182,7 @@ fn dense(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_inde
         }
     }
     if (inside) {
-        let position = pixel.y * view.size.x + pixel.x;
+        let position = (pixel.y - first_pixel.y) * view.size.x + pixel.x;
         var entropy = 0.0;
         if (coverage > 0.0) {
             entropy = max(log(coverage) - information / coverage, 0.0);

@@ -39,7 +39,7 @@ fn emit(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index
         for (var x = range.x; x < range.z; x += 1u) {
             let passes = passes_in_tile(splat, x, y);
             if (passes != 0u && pair < end) {
-                tile_keys[pair] = y * view.tiles.x + x;
+                tile_keys[pair] = (y - view.first_row) * view.tiles.x + x;
                 pair_indices[pair] = pair;
                 pairs[pair] = vec2u((passes << PASS_SHIFT) | row, slot);
                 pair += 1u;

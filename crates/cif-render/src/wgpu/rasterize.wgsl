@@ -86,7 +86,7 @@ fn blend(splat: Staged, passes: u32, identity: f32, p: ptr<function, Pixel>) {
 fn write(p: Pixel) {
     let at = vec2u(p.centre);
     if (all(at < view.size)) {
-        let position = at.y * view.size.x + at.x;
+        let position = (at.y - view.first_row * TILE) * view.size.x + at.x;
         colors[position] = vec4f(p.color + p.transmittance * view.background.xyz, p.transmittance);
         blended[position] = vec4f(p.depth, p.probability, p.instance_transmittance, 0.0);
     }
@@ -94,8 +94,8 @@ fn write(p: Pixel) {
 
 @compute @workgroup_size(64)
 fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    let tile = workgroup.xy;
-    let range = tile_ranges[tile.y * view.tiles.x + tile.x];
+    let tile = vec2u(workgroup.x, view.first_row + workgroup.y);
+    let range = tile_ranges[workgroup.y * view.tiles.x + workgroup.x];
     var p0 = pixel_of(tile, 0u, local);
     var p1 = pixel_of(tile, 1u, local);
     var p2 = pixel_of(tile, 2u, local);

@@ -49,6 +49,15 @@ impl<'a> From<&'a GpuGaussians> for PosedInput<'a> {
     }
 }
 
+/// Spherical harmonics at the time of a view.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Coefficients<'a> {
+    /// As in [`GpuGaussians::sh`].
+    Full(&'a GpuVec<[f32; SH_FLOATS]>),
+    /// As [`super::gaussians::packed_sh`] makes them.
+    Packed(&'a GpuVec<[u32; PACKED_SH_WORDS]>),
+}
+
 /// A view to be drawn.
 #[derive(Clone, Copy, Debug)]
 pub struct ViewInput<'a> {
@@ -259,29 +268,38 @@ impl Rasterizer {
         input: &ViewInput<'_>,
     ) -> Result<(), GpuError> {
         let PosedInput { geometry, sh } = gaussians;
-        self.project_from(gpu, commands, geometry, (sh.buffer(), false), identities, input)
+        self.project_from(gpu, commands, geometry, (sh.buffer(), false), identities, input, None)
     }
 
-    /// As [`Self::project`], with spherical harmonics as [`super::gaussians::packed_sh`] makes them; for pictures, as
-    /// [`Self::backward`] reads full ones.
+    /// As [`Self::project`], of some rows of tiles alone, from the first on so many; spherical harmonics are full, or
+    /// packed as [`super::gaussians::packed_sh`] makes them. For pictures: [`Self::backward`] reads whole views and full
+    /// spherical harmonics.
     ///
     /// # Errors
     /// As [`Self::project`].
     ///
     /// # Panics
-    /// As [`Self::project`].
-    pub fn project_packed(
+    /// As [`Self::project`], and when tiles are chosen too.
+    #[expect(clippy::too_many_arguments, reason = "as many parts has a view")]
+    pub(super) fn project_rows(
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         geometry: &GpuVec<[f32; GEOMETRY_FLOATS]>,
-        sh: &GpuVec<[u32; PACKED_SH_WORDS]>,
+        sh: Coefficients<'_>,
         identities: Option<&DeviceIdentities>,
         input: &ViewInput<'_>,
+        rows: [u32; 2],
     ) -> Result<(), GpuError> {
-        self.project_from(gpu, commands, geometry, (sh.buffer(), true), identities, input)
+        assert!(input.tiles.is_none(), "rows of a whole view");
+        let sh = match sh {
+            Coefficients::Full(sh) => (sh.buffer(), false),
+            Coefficients::Packed(sh) => (sh.buffer(), true),
+        };
+        self.project_from(gpu, commands, geometry, sh, identities, input, Some(rows))
     }
 
+    #[expect(clippy::too_many_arguments, reason = "as many parts has a view")]
     fn project_from(
         &mut self,
         gpu: &Gpu,
@@ -290,9 +308,13 @@ impl Rasterizer {
         (sh, packed): (&wgpu::Buffer, bool),
         identities: Option<&DeviceIdentities>,
         input: &ViewInput<'_>,
+        rows: Option<[u32; 2]>,
     ) -> Result<(), GpuError> {
         let n = geometry.len();
         let mut view = View::new(input.camera, input.settings, n);
+        if let Some([first, count]) = rows {
+            (view.first_row, view.tiles[1]) = (first, count);
+        }
         if let Some(identities) = identities {
             assert_eq!(identities.row_offsets.len(), n + 1, "a row of identities per Gaussian");
             view.instances = identities.instances as u32;

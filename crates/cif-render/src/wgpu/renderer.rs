@@ -10,8 +10,8 @@ use super::error::GpuError;
 use super::gaussians::{GpuGaussians, PACKED_SH_WORDS, geometry, packed_sh};
 use super::identities::DeviceIdentities;
 use super::kernel::Commands;
-use super::rasterizer::{PosedInput, Rasterizer, ViewInput};
-use crate::constants::MIN_COVERAGE;
+use super::rasterizer::{Coefficients, PosedInput, Rasterizer, ViewInput};
+use crate::constants::{MIN_COVERAGE, TILE};
 use crate::cpu::{Renderer, SimdLevel};
 use crate::image::InstanceImage;
 use crate::{Channels, RenderSettings, RenderedImage};
@@ -29,7 +29,11 @@ pub struct GpuRenderer {
     /// At the time of the view, where anything moves.
     posed: GpuGaussians,
     identities: Option<DeviceIdentities>,
+    band_memory: u64,
 }
+
+/// Bytes of the pixels of a band, unless said otherwise: a view of 1920 x 1080 pixels with all channels fits.
+const BAND_MEMORY: u64 = 512 << 20;
 
 impl GpuRenderer {
     /// Takes a field to the device.
@@ -79,6 +83,7 @@ impl GpuRenderer {
             deformation,
             posed: GpuGaussians::zeros(gpu, 0)?,
             identities,
+            band_memory: BAND_MEMORY,
             gpu: gpu.clone(),
         })
     }
@@ -87,6 +92,12 @@ impl GpuRenderer {
     #[must_use]
     pub fn is_compact(&self) -> bool {
         self.packed_sh.is_some()
+    }
+
+    /// Sets the memory that a band may take beside its (tile, Gaussian) pairs, in bytes, on the device and off it, which
+    /// decides how many rows are drawn at once. Pictures do not depend on it.
+    pub fn set_band_memory(&mut self, bytes: u64) {
+        self.band_memory = bytes;
     }
 
     /// Renders a view for looking at or measuring; `field` is the one that the renderer was made for.
@@ -101,11 +112,65 @@ impl GpuRenderer {
         settings: &RenderSettings,
         channels: Channels,
     ) -> Result<RenderedImage, GpuError> {
+        let mut image: Option<RenderedImage> = None;
+        self.render_bands(field, camera, time, settings, channels, |_, band| {
+            match &mut image {
+                None => image = Some(band),
+                Some(image) => image.append(band),
+            }
+            Ok::<(), GpuError>(())
+        })?;
+        Ok(image.expect("a view has a band"))
+    }
+
+    /// Renders a view in bands of rows from top to bottom, and hands each to `take`, with the row that is its first.
+    /// Bands whose (tile, Gaussian) pairs the device cannot hold are halved.
+    ///
+    /// # Errors
+    /// When a row of tiles exceeds what the device binds, with the arithmetic; when the device is out of memory or
+    /// lost; the first of `take`, which is not called again then.
+    pub fn render_bands<E: From<GpuError>>(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        channels: Channels,
+        mut take: impl FnMut(u32, RenderedImage) -> Result<(), E>,
+    ) -> Result<(), E> {
         let settings = settings.for_outputs(field, channels);
-        let input = ViewInput { camera, settings: &settings, labels: None, tiles: None };
+        let rows = camera.height.div_ceil(TILE);
+        let row_bytes = u64::from(camera.width * TILE) * pixel_bytes(channels);
+        let mut most = (self.band_memory / row_bytes.max(1)).clamp(1, u64::from(rows.max(1))) as u32;
+        let mut first = 0;
+        while first < rows {
+            let count = most.min(rows - first);
+            match self.draw_rows(field, camera, time, &settings, channels.depth, [first, count]) {
+                Err(GpuError::TooLarge { .. }) if count > 1 => most = count.div_ceil(2),
+                Err(error) => return Err(error.into()),
+                Ok(band) => {
+                    take(first * TILE, band)?;
+                    first += count;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Draws so many rows of tiles from the first on.
+    fn draw_rows(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        with_depth: bool,
+        rows: [u32; 2],
+    ) -> Result<RenderedImage, GpuError> {
+        let input = ViewInput { camera, settings, labels: None, tiles: None };
         let identities = self.identities.as_ref().filter(|_| settings.instances.is_some());
         let mut commands = Commands::new(&self.gpu, None);
-        let posed = if field.tracks.is_some() {
+        let posed: PosedInput<'_> = if field.tracks.is_some() {
             let poser = &mut self.poser;
             let moved = if settings.deform || field.deformation.is_none() {
                 poser.deform(field, time)
@@ -124,12 +189,19 @@ impl GpuRenderer {
             (&self.canonical).into()
         };
         let (gpu, rasterizer) = (&self.gpu, &mut self.rasterizer);
-        let Some(sh) = &self.packed_sh else {
-            return rasterizer.draw(gpu, commands, posed, identities, &input, channels.depth);
-        };
-        rasterizer.project_packed(gpu, &mut commands, posed.geometry, sh, identities, &input)?;
-        rasterizer.draw_projected(gpu, commands, identities, camera, channels.depth)
+        let sh = self.packed_sh.as_ref().map_or(Coefficients::Full(posed.sh), Coefficients::Packed);
+        rasterizer.project_rows(gpu, &mut commands, posed.geometry, sh, identities, &input, rows)?;
+        rasterizer.draw_projected(gpu, commands, identities, with_depth)
     }
+}
+
+/// Bytes of a pixel on the device, on the way back and in the image.
+fn pixel_bytes(channels: Channels) -> u64 {
+    let four = size_of::<[f32; 4]>();
+    let depth = if channels.depth { 2 * four + size_of::<f32>() } else { 0 };
+    let instances = if channels.instances { 4 * four + 4 * size_of::<f32>() } else { 0 };
+    // Colours and what is blended beside them, then colours on the way and in the image.
+    (2 * four + 3 * four + depth + instances) as u64
 }
 
 impl Rasterizer {
@@ -148,7 +220,7 @@ impl Rasterizer {
         with_depth: bool,
     ) -> Result<RenderedImage, GpuError> {
         self.project(gpu, &mut commands, posed, identities, input)?;
-        self.draw_projected(gpu, commands, identities, input.camera, with_depth)
+        self.draw_projected(gpu, commands, identities, with_depth)
     }
 
     /// As [`Self::draw`], of a view whose projection `commands` hold.
@@ -157,11 +229,10 @@ impl Rasterizer {
         gpu: &Gpu,
         commands: Commands<'_>,
         identities: Option<&DeviceIdentities>,
-        camera: &PinholeCamera,
         with_depth: bool,
     ) -> Result<RenderedImage, GpuError> {
-        let (width, height) = (camera.width, camera.height);
-        let pixels = width as usize * height as usize;
+        let (width, height) = (self.view().size[0], self.view().rows());
+        let pixels = self.view().pixels();
         self.measure(gpu, commands)?;
         let mut commands = Commands::new(gpu, None);
         self.rasterize(gpu, &mut commands, identities, None)?;

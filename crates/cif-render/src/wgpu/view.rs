@@ -77,7 +77,7 @@ crate::shared_struct! {
         pub ratio_high: [f32; 2],
         /// Width and height, pixels.
         pub size: [u32; 2],
-        /// Columns and rows of tiles.
+        /// Columns and rows of the tiles that are drawn.
         pub tiles: [u32; 2],
         /// Near plane, metres.
         pub near: f32,
@@ -111,6 +111,12 @@ crate::shared_struct! {
         pub mean_geometry: f32,
         /// 1 when some tiles alone are drawn.
         pub chooses_tiles: u32,
+        /// First row of tiles that is drawn; rows of tiles and of pixels that come out are counted from there.
+        pub first_row: u32,
+        /// Pads to 16 bytes.
+        pub unused: u32,
+        /// As above.
+        pub unused_too: [u32; 2],
     }
 }
 
@@ -205,13 +211,19 @@ impl View {
         }
     }
 
-    /// Pixels.
+    /// Rows of pixels that are drawn.
     #[must_use]
-    pub fn pixels(&self) -> usize {
-        self.size[0] as usize * self.size[1] as usize
+    pub fn rows(&self) -> u32 {
+        (self.tiles[1] * TILE).min(self.size[1] - self.first_row * TILE)
     }
 
-    /// Tiles.
+    /// Pixels that are drawn.
+    #[must_use]
+    pub fn pixels(&self) -> usize {
+        self.size[0] as usize * self.rows() as usize
+    }
+
+    /// Tiles that are drawn.
     #[must_use]
     pub fn tile_count(&self) -> usize {
         self.tiles[0] as usize * self.tiles[1] as usize

@@ -24,6 +24,7 @@ mod painter;
 mod plan;
 mod query;
 mod render;
+mod render_files;
 mod scene;
 mod train;
 mod train_budget;

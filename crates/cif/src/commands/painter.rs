@@ -4,6 +4,8 @@
 use cif_field::Field;
 #[cfg(feature = "wgpu")]
 use cif_geometry::PinholeCamera;
+#[cfg(feature = "wgpu")]
+use cif_render::cpu::BandRequest;
 use cif_render::cpu::{Renderer, SimdLevel};
 #[cfg(feature = "wgpu")]
 use cif_render::wgpu::{Gpu, GpuError, GpuRenderer};
@@ -61,7 +63,15 @@ impl Painter {
         }
         let mut processor = Renderer::new(simd);
         let start = std::time::Instant::now();
-        processor.render(sample.field, sample.camera, sample.time, sample.settings, sample.channels);
+        let request = BandRequest { channels: sample.channels, ..BandRequest::default() };
+        let Ok(()) = processor.render_bands(
+            sample.field,
+            sample.camera,
+            sample.time,
+            sample.settings,
+            &request,
+            |_| Ok::<(), std::convert::Infallible>(()),
+        );
         let on_processor = start.elapsed();
         match probe(&gpu, sample) {
             Ok((renderer, on_gpu)) if on_gpu < on_processor => {
@@ -85,7 +95,8 @@ impl Painter {
 fn probe(gpu: &Gpu, sample: &Sample<'_>) -> Result<(GpuRenderer, std::time::Duration), GpuError> {
     let mut renderer = sample.renderer(gpu)?;
     let view = |renderer: &mut GpuRenderer| {
-        renderer.render(sample.field, sample.camera, sample.time, sample.settings, sample.channels)
+        let Sample { field, camera, time, settings, channels, .. } = *sample;
+        renderer.render_bands(field, camera, time, settings, channels, |_, _| Ok::<(), GpuError>(()))
     };
     view(&mut renderer)?;
     let start = std::time::Instant::now();

@@ -1,19 +1,18 @@
 //! `cif render`: pictures of a scene from captured or new views.
 
 use std::collections::BTreeSet;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use cif_dataset::cryptomatte::BACKGROUND;
 use cif_exr::ColorEncoding;
 use cif_field::Field;
-use cif_geometry::PixelGrid;
+use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::constants::MIN_COVERAGE;
-use cif_render::cpu::Renderer;
-use cif_render::{BlendingWeights, Channels, RenderSettings, RenderedImage, screen_motion};
+use cif_render::cpu::{BandRequest, Renderer};
+use cif_render::{Channels, RenderSettings, RenderedImage, screen_motion};
 use cif_scene::files::folder_of;
 use cif_scene::naming::instance_name;
 use cif_train::metrics::image::psnr;
-use cif_train::metrics::mask_ids;
 use cif_train::{Clock, SystemClock};
 use clap::{ArgGroup, Args, ValueEnum};
 
@@ -21,11 +20,11 @@ use super::eval::SplitName;
 use super::painter::Painter;
 #[cfg(feature = "wgpu")]
 use super::painter::Sample;
+use super::render_files::ViewFiles;
 use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
 use crate::output::Outputs;
-use crate::pictures::{depth_picture, instance_picture, rgb_picture, save_grey, save_rgb};
 use crate::quality::{self, Quality};
 use crate::{interrupt, output};
 
@@ -83,7 +82,7 @@ pub(super) struct Render {
 
 /// Layers that can be written.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
-enum What {
+pub(super) enum What {
     /// Colour, 8-bit RGB
     Rgb,
     /// Mask id of the most probable instance, 16-bit grey, 0 = belongs to none
@@ -217,31 +216,42 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let channels = Channels { depth, instances };
     let mut painter = painter(command, &field, &views, &settings, channels)?;
     interrupt::watch();
+    let settings = quality.settings(&settings);
     for (index, Shot { view, .. }) in views.iter().enumerate() {
-        if interrupt::requested() {
-            return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
-        }
         let time = command.time.or(view.time).unwrap_or(0.0);
-        let image = match &mut painter {
+        let mut files = ViewFiles::create(&what, &field, &command.output, view)?;
+        match &mut painter {
+            Painter::Cpu(renderer) if command.exr => {
+                let place = Place { field: &field, views: &views, index, time: command.time };
+                write_exr(renderer, channels, &settings, &place, command, &mut files)?;
+            }
             Painter::Cpu(renderer) => {
-                quality.render(renderer, &field, &view.camera, time, &settings, channels)
+                let request = BandRequest { channels, ..BandRequest::default() };
+                renderer.render_bands(&field, &view.camera, time, &settings, &request, |band| {
+                    go_on()?;
+                    files.add(&band.image)
+                })?;
             }
             #[cfg(feature = "wgpu")]
             Painter::Gpu(renderer) => {
-                renderer.render(&field, &view.camera, time, &settings, channels).map_err(Error::plain)?
+                renderer.render_bands(&field, &view.camera, time, &settings, channels, |_, band| {
+                    go_on()?;
+                    files.add(&band)
+                })?;
             }
-        };
-        for what in &what {
-            write(*what, &field, &image, &command.output, &view.name)?;
         }
-        if command.exr
-            && let Painter::Cpu(renderer) = &mut painter
-        {
-            let place = Place { field: &field, views: &views, index, time: command.time };
-            write_exr(renderer, &image, &settings, &place, command)?;
-        }
+        files.finish()?;
     }
     eprintln!("rendered {} views into {}", views.len(), command.output.display());
+    Ok(())
+}
+
+/// # Errors
+/// After Ctrl-C.
+fn go_on() -> Result<(), Error> {
+    if interrupt::requested() {
+        return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
+    }
     Ok(())
 }
 
@@ -254,6 +264,14 @@ fn tell_draft(
     time: Option<f64>,
 ) {
     const MEASURED: usize = 3;
+    // Larger views are measured smaller: here whole images are kept and compared.
+    const MOST_PIXELS: f64 = 4e6;
+    let smaller = |camera: &PinholeCamera| {
+        let pixels = f64::from(camera.width) * f64::from(camera.height);
+        let share = (MOST_PIXELS / pixels).sqrt().min(1.0);
+        let side = |pixels: u32| ((f64::from(pixels) * share) as u32).max(1);
+        if share < 1.0 { camera.resized(side(camera.width), side(camera.height)) } else { *camera }
+    };
     let settings = RenderSettings { instances: None, ..*settings };
     let count = views.len().min(MEASURED);
     let thinned = quality::DRAFT.thin(field);
@@ -262,13 +280,13 @@ fn tell_draft(
     let (mut worst, mut mean) = (f64::INFINITY, 0.0);
     for k in 0..count {
         let view = &views[(2 * k + 1) * views.len() / (2 * count)].view;
-        let time = time.or(view.time).unwrap_or(0.0);
+        let (camera, time) = (smaller(&view.camera), time.or(view.time).unwrap_or(0.0));
         let mut render = |quality: Quality, field: &Field, seconds: &mut f64| {
             let channels = Channels::default();
             // Once before, so that memory is there for both.
-            quality.render(renderer, field, &view.camera, time, &settings, channels);
+            quality.render(renderer, field, &camera, time, &settings, channels);
             let start = clock.now();
-            let image = quality.render(renderer, field, &view.camera, time, &settings, channels);
+            let image = quality.render(renderer, field, &camera, time, &settings, channels);
             *seconds += (clock.now() - start).cpu_s;
             image.color
         };
@@ -392,52 +410,59 @@ impl Place<'_> {
     }
 }
 
-/// Writes the EXR file of a view; `image` is what `renderer` rendered last.
+/// Renders a view, and writes its EXR file beside the other `files`.
 fn write_exr(
     renderer: &mut Renderer,
-    image: &RenderedImage,
+    channels: Channels,
     settings: &RenderSettings,
     place: &Place<'_>,
     command: &Render,
+    files: &mut ViewFiles<'_>,
 ) -> Result<(), Error> {
     let (field, view) = (place.field, &place.views[place.index].view);
-    let ranks = field
-        .identities
-        .as_ref()
-        .map(|identities| renderer.instance_ranks(identities, cif_exr::cryptomatte::RANKS));
-    let motion = motion(renderer, image, place);
     let path = output::inside(&command.output.join(EXR_FOLDER), &view.name, "exr")?;
     let folder = folder_of(&path);
     std::fs::create_dir_all(&folder).map_err(Error::io("create the folder", &folder))?;
+    let next = place.next();
+    let moved = next.map(|next| {
+        let means = renderer.deform(field, place.time_of(view)).means;
+        let next_means = renderer.deform(field, place.time_of(next)).means;
+        screen_motion(&view.camera, &means, &next.camera, &next_means)
+    });
+    let objects = field.identities.as_ref().map(|_| objects(field));
     let frame = cif_exr::Frame {
         name: &view.name,
         time: place.time_of(view),
-        image,
+        width: view.camera.width,
+        height: view.camera.height,
         world_per_unit: 1.0 / scene::frame(field)?.scale,
         background: settings.background,
-        objects: &objects(field),
-        ranks: ranks.as_ref(),
-        motion: Some(&motion),
+        objects: objects.as_deref(),
+        next: next.map(|next| next.name.as_str()),
         encoding: command.exr_color.into(),
     };
-    cif_exr::write(&path, &frame).map_err(Error::plain)
+    let request = BandRequest { channels, ranks: cif_exr::cryptomatte::RANKS, values: moved.as_deref() };
+    cif_exr::write(&path, &frame, |file| {
+        renderer.render_bands(field, &view.camera, frame.time, settings, &request, |band| {
+            go_on()?;
+            let image = &band.image;
+            let motion = motion(band.blended, image);
+            let (first_row, ranks) = (band.first_row, band.ranks.as_ref());
+            file.write(&cif_exr::Rows { first_row, image, ranks, motion: &motion })?;
+            files.add(image)
+        })
+    })
 }
 
-/// Motion to the next view: that of the Gaussians, weighted as their colours are.
-fn motion(renderer: &mut Renderer, image: &RenderedImage, place: &Place<'_>) -> cif_exr::Motion {
-    let view = &place.views[place.index].view;
-    let (width, height) = (view.camera.width, view.camera.height);
-    let Some(next) = place.next() else {
-        return cif_exr::Motion { vectors: PixelGrid::filled(width, height, [0.0; 2]), next: None };
+/// Motion to the next view, where there is one: that of the Gaussians, weighted as their colours are.
+fn motion(blended: Option<PixelGrid<[f32; 2]>>, image: &RenderedImage) -> PixelGrid<[f32; 2]> {
+    let Some(mut vectors) = blended else {
+        return PixelGrid::filled(image.alpha.width, image.alpha.height, [0.0; 2]);
     };
-    let means = renderer.deform(place.field, place.time_of(view)).means;
-    let next_means = renderer.deform(place.field, place.time_of(next)).means;
-    let moved = screen_motion(&view.camera, &means, &next.camera, &next_means);
-    let mut vectors = renderer.blend(&moved, BlendingWeights::Color);
     for (vector, alpha) in vectors.pixels.iter_mut().zip(&image.alpha.pixels) {
         *vector = if *alpha > MIN_COVERAGE { vector.map(|sum| sum / alpha) } else { [0.0; 2] };
     }
-    cif_exr::Motion { vectors, next: Some(next.name.clone()) }
+    vectors
 }
 
 /// Instances with their names in a Cryptomatte: the label, or the name of the node where labels repeat.
@@ -454,29 +479,4 @@ fn objects(field: &Field) -> Vec<cif_exr::Object> {
         },
     });
     named.collect()
-}
-
-fn write(what: What, field: &Field, image: &RenderedImage, folder: &Path, name: &str) -> Result<(), Error> {
-    let path = output::inside(&folder.join(what.folder()), name, "png")?;
-    let unit = |values: &PixelGrid<f32>| scaled(values, 65_535.0);
-    match (what, &image.depth, &image.instances) {
-        (What::Rgb, ..) => save_rgb(&path, &rgb_picture(&image.color)),
-        (What::Alpha, ..) => save_grey(&path, &unit(&image.alpha)),
-        (What::Depth, Some(depth), _) => save_grey(&path, &scaled(depth, 1000.0)),
-        (What::DepthColor, Some(depth), _) => save_rgb(&path, &depth_picture(depth)),
-        (What::Instance, _, Some(layers)) => save_grey(&path, &mask_ids(field, &layers.foreground_label())),
-        (What::InstanceColor, _, Some(layers)) => {
-            save_rgb(&path, &instance_picture(&mask_ids(field, &layers.label), &layers.foreground))
-        }
-        (What::Foreground, _, Some(layers)) => save_grey(&path, &unit(&layers.foreground)),
-        (What::Coverage, _, Some(layers)) => save_grey(&path, &unit(&layers.coverage)),
-        (What::Probability, _, Some(layers)) => save_grey(&path, &unit(&layers.probability)),
-        (What::Entropy, _, Some(layers)) => save_grey(&path, &scaled(&layers.entropy, 1000.0)),
-        (_, None, _) | (_, _, None) => unreachable!("the layers asked for were rendered"),
-    }
-}
-
-/// Values times `factor`, rounded, kept within 16 bits.
-fn scaled(values: &PixelGrid<f32>, factor: f32) -> PixelGrid<u16> {
-    values.map(|value| (value * factor).round().clamp(0.0, 65_535.0) as u16)
 }

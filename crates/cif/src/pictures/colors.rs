@@ -77,19 +77,63 @@ pub fn error_picture(rendered: &PixelGrid<[f32; 3]>, truth: &Picture) -> Picture
 /// Depth, near bright and far dark, between the 2nd and 98th percentile of the picture; black without depth.
 #[must_use]
 pub fn depth_picture(depth: &PixelGrid<f32>) -> Picture {
-    let mut sorted: Vec<f32> = depth.pixels.iter().copied().filter(|z| *z > 0.0).collect();
-    sorted.sort_by(f32::total_cmp);
-    let percentile = |fraction: f32| {
-        sorted.get(((sorted.len().max(1) - 1) as f32 * fraction) as usize).copied().unwrap_or(0.0)
-    };
-    let (near, far) = (percentile(0.02), percentile(0.98));
-    depth.map(|&z| {
-        if z > 0.0 {
-            map_color(colorous::VIRIDIS, 1.0 - (z - near) / (far - near).max(f32::MIN_POSITIVE))
+    let range = DepthRange::of(&depth.pixels);
+    depth.map(|depth| range.color(*depth))
+}
+
+/// Depths that are shown brightest and darkest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DepthRange {
+    near: f32,
+    far: f32,
+}
+
+impl DepthRange {
+    /// The 2nd and 98th percentile of the depths above 0. Nothing is copied.
+    #[must_use]
+    pub fn of(depths: &[f32]) -> Self {
+        let count = depths.iter().filter(|depth| **depth > 0.0).count();
+        let percentile = |fraction: f32| {
+            let rank = (count.max(1) - 1) as f32 * fraction;
+            if count == 0 { 0.0 } else { by_rank(depths, rank as u64) }
+        };
+        Self { near: percentile(0.02), far: percentile(0.98) }
+    }
+
+    /// The colour of a depth; black for 0.
+    #[must_use]
+    pub fn color(&self, depth: f32) -> [u8; 3] {
+        if depth > 0.0 {
+            let distance = (depth - self.near) / (self.far - self.near).max(f32::MIN_POSITIVE);
+            map_color(colorous::VIRIDIS, 1.0 - distance)
         } else {
             NO_DEPTH
         }
-    })
+    }
+}
+
+/// The depth above 0 with so many others below it. Positive floats order like their bits: the upper half is found
+/// first, then the lower half among depths with that upper one.
+fn by_rank(depths: &[f32], rank: u64) -> f32 {
+    let bits = || depths.iter().filter(|depth| **depth > 0.0).map(|depth| depth.to_bits());
+    let (high, rank) = half_by_rank(bits().map(|bits| bits >> 16), rank);
+    let (low, _) = half_by_rank(bits().filter(|bits| bits >> 16 == high).map(|bits| bits & 0xffff), rank);
+    f32::from_bits(high << 16 | low)
+}
+
+/// Of 16-bit numbers: the one at a rank, and the rank among its equals.
+fn half_by_rank(halves: impl Iterator<Item = u32>, mut rank: u64) -> (u32, u64) {
+    let mut counts = vec![0_u64; 1 << 16];
+    for half in halves {
+        counts[half as usize] += 1;
+    }
+    for (half, count) in counts.iter().enumerate() {
+        if rank < *count {
+            return (half as u32, rank);
+        }
+        rank -= count;
+    }
+    (0, 0)
 }
 
 fn map_color(gradient: colorous::Gradient, position: f32) -> [u8; 3] {
@@ -127,6 +171,20 @@ mod tests {
         let picture = error_picture(&rendered, &truth);
         assert_eq!(picture.pixels[0], map_color(colorous::INFERNO, 0.0));
         assert_eq!(picture.pixels[1], map_color(colorous::INFERNO, 1.0));
+    }
+
+    #[test]
+    fn percentiles_are_those_of_the_sorted_depths() {
+        let mut depths: Vec<f32> = (0..5000_u32).map(|k| (k * 7919 % 5003) as f32 * 0.37 - 20.0).collect();
+        depths.extend([f32::NAN, f32::INFINITY, 0.0]);
+        let mut sorted: Vec<f32> = depths.iter().copied().filter(|depth| *depth > 0.0).collect();
+        sorted.sort_by(f32::total_cmp);
+        for rank in [0, 1, sorted.len() / 50, sorted.len() / 2, sorted.len() - 1] {
+            assert_eq!(by_rank(&depths, rank as u64), sorted[rank], "{rank}");
+        }
+        let rank = |fraction: f32| ((sorted.len() - 1) as f32 * fraction) as usize;
+        let range = DepthRange { near: sorted[rank(0.02)], far: sorted[rank(0.98)] };
+        assert_eq!(DepthRange::of(&depths), range);
     }
 
     #[test]

@@ -4,9 +4,9 @@ mod colors;
 mod panel;
 mod png_file;
 
-pub use colors::{depth_picture, error_picture, instance_color, instance_picture, rgb_picture};
+pub use colors::{DepthRange, depth_picture, error_picture, instance_color, instance_picture, rgb_picture};
 pub use panel::side_by_side;
-pub use png_file::{save_grey, save_rgb};
+pub use png_file::{PngFile, save_grey, save_rgb};
 
 /// An 8-bit display-referred picture.
 pub type Picture = cif_geometry::PixelGrid<[u8; 3]>;

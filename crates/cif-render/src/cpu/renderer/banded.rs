@@ -81,7 +81,8 @@ impl RenderedBand {
                 entropy: zeros(),
             }),
         };
-        let ranks = (instances && request.ranks > 0).then(|| InstanceRanks::none(request.ranks, width, height));
+        let ranks =
+            (instances && request.ranks > 0).then(|| InstanceRanks::none(request.ranks, width, height));
         let blended = request.values.map(|_| PixelGrid::filled(width, height, [0.0; 2]));
         Self { first_row, image, ranks, blended }
     }

@@ -1,10 +1,12 @@
 // Which tiles a splat may reach, and by which passes.
 
-// First column and row, and those after the last.
+// First column and row, and those after the last, of the tiles that are drawn.
 fn tile_range(splat: Splat) -> vec4u {
     let size = f32(TILE);
-    let first = clamp(floor((splat.mean - splat.extent) / size), vec2f(0.0), vec2f(view.tiles));
-    let last = clamp(floor((splat.mean + splat.extent) / size) + 1.0, vec2f(0.0), vec2f(view.tiles));
+    let low = vec2f(0.0, f32(view.first_row));
+    let high = low + vec2f(view.tiles);
+    let first = clamp(floor((splat.mean - splat.extent) / size), low, high);
+    let last = clamp(floor((splat.mean + splat.extent) / size) + 1.0, low, high);
     return vec4u(vec2u(first), vec2u(last));
 }
 

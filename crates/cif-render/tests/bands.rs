@@ -1,0 +1,224 @@
+//! Views drawn in bands are those drawn at once, bit for bit, and take the memory that they are given.
+
+use cif_field::{Field, Gaussians};
+use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_render::constants::TILE;
+use cif_render::cpu::{BandRequest, RenderedBand, Renderer, SimdLevel};
+use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
+use cif_render::{BlendingWeights, Channels, RenderSettings};
+
+const ALL: Channels = Channels { depth: true, instances: true };
+
+/// Partial tiles at both edges, and Gaussians larger than a tile.
+fn scene(width: u32, height: u32) -> SyntheticScene {
+    generate(&SyntheticConfig {
+        seed: 5,
+        gaussians: 300,
+        instances: 5,
+        width,
+        height,
+        heads: Some(ALL_HEADS),
+        screen_size: (0.01, 0.3),
+    })
+}
+
+fn values(field: &Field) -> Vec<[f32; 2]> {
+    field.gaussians.means.iter().map(|mean| [mean[0], 3.0 * mean[1]]).collect()
+}
+
+fn draw(scene: &SyntheticScene, memory: u64, request: &BandRequest<'_>) -> (Vec<RenderedBand>, Renderer) {
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    renderer.set_band_memory(memory);
+    let mut bands = Vec::new();
+    let settings = RenderSettings::of_field(&scene.field);
+    renderer
+        .render_bands(&scene.field, &scene.camera, scene.time, &settings, request, |band| {
+            bands.push(band);
+            Ok::<(), String>(())
+        })
+        .unwrap();
+    (bands, renderer)
+}
+
+/// Rows of a grid.
+fn rows<T: Clone>(grid: &PixelGrid<T>, first: u32, like: &PixelGrid<T>) -> PixelGrid<T> {
+    let start = (first * grid.width) as usize;
+    PixelGrid::from_pixels(grid.width, like.height, grid.pixels[start..start + like.pixels.len()].to_vec())
+}
+
+fn assert_rows(whole: &RenderedBand, band: &RenderedBand) {
+    let first = band.first_row;
+    assert_eq!(first % TILE, 0);
+    let (a, b) = (&whole.image, &band.image);
+    assert_eq!(rows(&a.color, first, &b.color), b.color);
+    assert_eq!(rows(&a.alpha, first, &b.alpha), b.alpha);
+    let (a_depth, b_depth) = (a.depth.as_ref().unwrap(), b.depth.as_ref().unwrap());
+    assert_eq!(&rows(a_depth, first, b_depth), b_depth);
+    let (a, b) = (a.instances.as_ref().unwrap(), b.instances.as_ref().unwrap());
+    assert_eq!(rows(&a.label, first, &b.label), b.label);
+    for (a, b) in [
+        (&a.probability, &b.probability),
+        (&a.coverage, &b.coverage),
+        (&a.foreground, &b.foreground),
+        (&a.entropy, &b.entropy),
+    ] {
+        assert_eq!(&rows(a, first, b), b);
+    }
+    let (a, b) = (whole.ranks.as_ref().unwrap(), band.ranks.as_ref().unwrap());
+    assert_eq!(a.ranks.len(), b.ranks.len());
+    for (a, b) in a.ranks.iter().zip(&b.ranks) {
+        assert_eq!((&rows(&a.0, first, &b.0), &rows(&a.1, first, &b.1)), (&b.0, &b.1));
+    }
+    let (a, b) = (whole.blended.as_ref().unwrap(), band.blended.as_ref().unwrap());
+    assert_eq!(&rows(a, first, b), b);
+}
+
+#[test]
+fn bands_of_every_height_are_the_rows_of_the_whole() {
+    let scene = scene(150, 203);
+    let values = values(&scene.field);
+    let request = BandRequest { channels: ALL, ranks: 3, values: Some(&values) };
+    let (whole, renderer) = draw(&scene, u64::MAX, &request);
+    assert_eq!(whole.len(), 1);
+    let statistics = renderer.statistics();
+    let covered = |band: &RenderedBand| band.image.alpha.pixels.iter().filter(|alpha| **alpha > 0.5).count();
+    assert!(covered(&whole[0]) > 5000, "{}", covered(&whole[0]));
+    let mut counts = Vec::new();
+    // From many rows of tiles to one, and with rows drawn tile by tile.
+    for memory in [4 << 20, 2 << 20, 1 << 20, 400_000, 20_000, 1] {
+        let (bands, renderer) = draw(&scene, memory, &request);
+        let mut next = 0;
+        for band in &bands {
+            assert_eq!(band.first_row, next);
+            next += band.image.alpha.height;
+            assert_rows(&whole[0], band);
+        }
+        assert_eq!(next, 203, "all rows");
+        let drawn = renderer.statistics();
+        assert_eq!(
+            (drawn.tile_pairs, drawn.evaluated_pairs),
+            (statistics.tile_pairs, statistics.evaluated_pairs)
+        );
+        counts.push(bands.len());
+    }
+    assert!(counts.is_sorted() && counts[0] < counts[2] && counts[5] == 13, "{counts:?}");
+}
+
+#[test]
+fn whole_images_do_not_depend_on_the_bands() {
+    let scene = scene(90, 75);
+    let settings = RenderSettings::of_field(&scene.field);
+    let (identities, values) = (scene.field.identities.as_ref().unwrap(), values(&scene.field));
+    let drawn = [u64::MAX, 200_000, 1].map(|memory| {
+        let mut renderer = Renderer::new(SimdLevel::Auto);
+        renderer.set_band_memory(memory);
+        let image = renderer.render(&scene.field, &scene.camera, scene.time, &settings, ALL);
+        let blended = [BlendingWeights::Color, BlendingWeights::Instances]
+            .map(|weights| renderer.blend(&values, weights));
+        (image, blended, renderer.instance_ranks(identities, 4))
+    });
+    assert_eq!((drawn[0].0.color.width, drawn[0].0.color.height), (90, 75));
+    assert!(drawn[0] == drawn[1] && drawn[0] == drawn[2]);
+}
+
+#[test]
+fn drawing_stops_at_the_first_error() {
+    let scene = scene(64, 64);
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    renderer.set_band_memory(1);
+    let mut taken = 0;
+    let settings = RenderSettings::of_field(&scene.field);
+    let request = BandRequest::default();
+    let result = renderer.render_bands(&scene.field, &scene.camera, 0.0, &settings, &request, |band| {
+        taken += 1;
+        if band.first_row == 16 { Err("full") } else { Ok(()) }
+    });
+    assert_eq!((result, taken), (Err("full"), 2));
+    // The next view is whole again.
+    let image = renderer.render(&scene.field, &scene.camera, 0.0, &settings, ALL);
+    renderer.set_band_memory(u64::MAX);
+    assert!(renderer.render(&scene.field, &scene.camera, 0.0, &settings, ALL) == image);
+}
+
+#[test]
+fn a_view_is_differentiated_after_one_drawn_in_bands() {
+    let scene = scene(64, 48);
+    let settings = RenderSettings::of_field(&scene.field);
+    let gradients = [false, true].map(|drawn_before| {
+        let mut renderer = Renderer::new(SimdLevel::Auto);
+        if drawn_before {
+            renderer.set_band_memory(1);
+            renderer.render(&scene.field, &scene.camera, scene.time, &settings, ALL);
+        }
+        let labels = Some(&scene.labels);
+        let pass = renderer.forward(&scene.field, &scene.camera, scene.time, &settings, labels);
+        let mut gradients = cif_render::Gradients::zeros(&scene.field);
+        renderer.backward(&scene.field, &pass.color, 0.5, &mut gradients);
+        gradients
+    });
+    assert_eq!(gradients[0].gaussians, gradients[1].gaussians);
+    assert!(gradients[0].gaussians.means.as_flattened().iter().any(|v| *v != 0.0));
+}
+
+/// Gaussians that each cover the whole image, barely visible, so that none hides another.
+fn veils(count: usize, size: u32) -> SyntheticScene {
+    let mut scene = scene(size, size);
+    let camera = PinholeCamera {
+        focal_px: glam::DVec2::splat(f64::from(size)),
+        principal_px: glam::DVec2::splat(f64::from(size) / 2.0),
+        ..scene.camera
+    };
+    let centre = camera.centre();
+    let forward = camera.camera_from_world.rotation.row(2);
+    let mut gaussians = Gaussians::default();
+    for k in 0..count {
+        let at = centre + forward * (2.0 + 0.001 * k as f64);
+        gaussians.means.push(at.as_vec3().to_array());
+        gaussians.log_scales.push([3.0; 3]);
+        gaussians.quaternions.push([1.0, 0.0, 0.0, 0.0]);
+        gaussians.opacity_logits.push(-4.6);
+        gaussians.occupancy_logits.push(-4.6);
+        gaussians.sh_coefficients.push([0.1; cif_field::gaussians::SH_FLOATS]);
+    }
+    (scene.field.gaussians, scene.field.deformation, scene.field.identities) = (gaussians, None, None);
+    scene.field.instances.clear();
+    scene.camera = camera;
+    scene
+}
+
+/// Peak of resident memory since the last reset, bytes.
+#[cfg(target_os = "linux")]
+fn peak() -> u64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find(|line| line.starts_with("VmHWM")).unwrap();
+    line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() * 1024
+}
+
+#[test]
+#[cfg(target_os = "linux")]
+fn large_splats_take_the_memory_of_a_band() {
+    const BAND: u64 = 8 << 20;
+    let scene = veils(2000, 512);
+    // A first view takes what threads and code take.
+    let small = veils(20, 64);
+    let request = BandRequest::default();
+    draw(&small, BAND, &request);
+    std::fs::write("/proc/self/clear_refs", "5").unwrap();
+    let before = peak();
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    renderer.set_band_memory(BAND);
+    let settings = RenderSettings { background: [0.0; 3], ..RenderSettings::of_field(&scene.field) };
+    let mut drawn = 0;
+    renderer
+        .render_bands(&scene.field, &scene.camera, 0.0, &settings, &request, |band| {
+            drawn += band.image.alpha.pixels.iter().filter(|alpha| **alpha > 0.9).count();
+            Ok::<(), String>(())
+        })
+        .unwrap();
+    let pairs = renderer.statistics().tile_pairs as u64;
+    assert_eq!((pairs, drawn), (2000 * 32 * 32, 512 * 512));
+    // Tile lists of the whole image alone would take 12 bytes a pair: 24 MiB.
+    let taken = peak() - before;
+    let splats = 2 * 2000 * 100;
+    assert!(taken < BAND + splats + (4 << 20), "{taken} bytes for bands of {BAND}");
+}
