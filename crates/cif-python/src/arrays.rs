@@ -41,21 +41,21 @@ pub(crate) fn matrix<'py, T: Element + Copy, const C: usize>(
     PyArray1::from_slice(py, rows.as_flattened()).reshape([rows.len(), C])
 }
 
-/// `[height, width]`.
-pub(crate) fn image<'py, T: Element + Copy>(
-    py: Python<'py>,
-    grid: &cif_geometry::PixelGrid<T>,
-) -> PyResult<Bound<'py, PyArray2<T>>> {
-    PyArray1::from_slice(py, &grid.pixels).reshape([grid.height as usize, grid.width as usize])
+/// `[height, width]`; nothing is copied.
+pub(crate) fn image<T: Element>(
+    py: Python<'_>,
+    grid: cif_geometry::PixelGrid<T>,
+) -> PyResult<Bound<'_, PyArray2<T>>> {
+    PyArray1::from_vec(py, grid.pixels).reshape([grid.height as usize, grid.width as usize])
 }
 
-/// `[height, width, C]`.
-pub(crate) fn color_image<'py, T: Element + Copy, const C: usize>(
-    py: Python<'py>,
-    grid: &cif_geometry::PixelGrid<[T; C]>,
-) -> PyResult<Bound<'py, PyArray3<T>>> {
+/// `[height, width, C]`; nothing is copied.
+pub(crate) fn color_image<T: Element, const C: usize>(
+    py: Python<'_>,
+    grid: cif_geometry::PixelGrid<[T; C]>,
+) -> PyResult<Bound<'_, PyArray3<T>>> {
     let shape = [grid.height as usize, grid.width as usize, C];
-    PyArray1::from_slice(py, grid.pixels.as_flattened()).reshape(shape)
+    PyArray1::from_vec(py, grid.pixels.into_flattened()).reshape(shape)
 }
 
 /// A value as Python lists and dictionaries.

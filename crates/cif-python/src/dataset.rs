@@ -105,8 +105,8 @@ impl Dataset {
         let background = [background.0, background.1, background.2];
         let data = py.detach(|| self.inner.load_frame(index, background)).map_err(cif_error)?;
         let out = PyDict::new(py);
-        out.set_item("image", arrays::color_image(py, &data.image)?)?;
-        out.set_item("mask", data.mask.as_ref().map(|mask| arrays::image(py, mask)).transpose()?)?;
+        out.set_item("image", arrays::color_image(py, data.image)?)?;
+        out.set_item("mask", data.mask.map(|mask| arrays::image(py, mask)).transpose()?)?;
         Ok(out)
     }
 

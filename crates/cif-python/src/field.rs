@@ -294,17 +294,17 @@ impl Field {
             Renderer::new(SimdLevel::Auto).render(&self.inner, &camera.inner, time, &settings, channels)
         });
         let out = PyDict::new(py);
-        out.set_item("color", arrays::color_image(py, &image.color)?)?;
-        out.set_item("alpha", arrays::image(py, &image.alpha)?)?;
-        if let Some(depth) = &image.depth {
+        out.set_item("color", arrays::color_image(py, image.color)?)?;
+        out.set_item("alpha", arrays::image(py, image.alpha)?)?;
+        if let Some(depth) = image.depth {
             out.set_item("depth", arrays::image(py, depth)?)?;
         }
-        if let Some(instances) = &image.instances {
-            out.set_item("label", arrays::image(py, &instances.label)?)?;
-            out.set_item("probability", arrays::image(py, &instances.probability)?)?;
-            out.set_item("coverage", arrays::image(py, &instances.coverage)?)?;
-            out.set_item("foreground", arrays::image(py, &instances.foreground)?)?;
-            out.set_item("entropy", arrays::image(py, &instances.entropy)?)?;
+        if let Some(instances) = image.instances {
+            out.set_item("label", arrays::image(py, instances.label)?)?;
+            out.set_item("probability", arrays::image(py, instances.probability)?)?;
+            out.set_item("coverage", arrays::image(py, instances.coverage)?)?;
+            out.set_item("foreground", arrays::image(py, instances.foreground)?)?;
+            out.set_item("entropy", arrays::image(py, instances.entropy)?)?;
         }
         Ok(out)
     }

@@ -1,7 +1,7 @@
-//! Views drawn in bands are those drawn at once, bit for bit, and take the memory that they are given.
+//! Views drawn in bands are those drawn at once, bit for bit.
 
-use cif_field::{Field, Gaussians};
-use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_field::Field;
+use cif_geometry::PixelGrid;
 use cif_render::constants::TILE;
 use cif_render::cpu::{BandRequest, RenderedBand, Renderer, SimdLevel};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
@@ -158,67 +158,4 @@ fn a_view_is_differentiated_after_one_drawn_in_bands() {
     });
     assert_eq!(gradients[0].gaussians, gradients[1].gaussians);
     assert!(gradients[0].gaussians.means.as_flattened().iter().any(|v| *v != 0.0));
-}
-
-/// Gaussians that each cover the whole image, barely visible, so that none hides another.
-fn veils(count: usize, size: u32) -> SyntheticScene {
-    let mut scene = scene(size, size);
-    let camera = PinholeCamera {
-        focal_px: glam::DVec2::splat(f64::from(size)),
-        principal_px: glam::DVec2::splat(f64::from(size) / 2.0),
-        ..scene.camera
-    };
-    let centre = camera.centre();
-    let forward = camera.camera_from_world.rotation.row(2);
-    let mut gaussians = Gaussians::default();
-    for k in 0..count {
-        let at = centre + forward * (2.0 + 0.001 * k as f64);
-        gaussians.means.push(at.as_vec3().to_array());
-        gaussians.log_scales.push([3.0; 3]);
-        gaussians.quaternions.push([1.0, 0.0, 0.0, 0.0]);
-        gaussians.opacity_logits.push(-4.6);
-        gaussians.occupancy_logits.push(-4.6);
-        gaussians.sh_coefficients.push([0.1; cif_field::gaussians::SH_FLOATS]);
-    }
-    (scene.field.gaussians, scene.field.deformation, scene.field.identities) = (gaussians, None, None);
-    scene.field.instances.clear();
-    scene.camera = camera;
-    scene
-}
-
-/// Peak of resident memory since the last reset, bytes.
-#[cfg(target_os = "linux")]
-fn peak() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find(|line| line.starts_with("VmHWM")).unwrap();
-    line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() * 1024
-}
-
-#[test]
-#[cfg(target_os = "linux")]
-fn large_splats_take_the_memory_of_a_band() {
-    const BAND: u64 = 8 << 20;
-    let scene = veils(2000, 512);
-    // A first view takes what threads and code take.
-    let small = veils(20, 64);
-    let request = BandRequest::default();
-    draw(&small, BAND, &request);
-    std::fs::write("/proc/self/clear_refs", "5").unwrap();
-    let before = peak();
-    let mut renderer = Renderer::new(SimdLevel::Auto);
-    renderer.set_band_memory(BAND);
-    let settings = RenderSettings { background: [0.0; 3], ..RenderSettings::of_field(&scene.field) };
-    let mut drawn = 0;
-    renderer
-        .render_bands(&scene.field, &scene.camera, 0.0, &settings, &request, |band| {
-            drawn += band.image.alpha.pixels.iter().filter(|alpha| **alpha > 0.9).count();
-            Ok::<(), String>(())
-        })
-        .unwrap();
-    let pairs = renderer.statistics().tile_pairs as u64;
-    assert_eq!((pairs, drawn), (2000 * 32 * 32, 512 * 512));
-    // Tile lists of the whole image alone would take 12 bytes a pair: 24 MiB.
-    let taken = peak() - before;
-    let splats = 2 * 2000 * 100;
-    assert!(taken < BAND + splats + (4 << 20), "{taken} bytes for bands of {BAND}");
 }
