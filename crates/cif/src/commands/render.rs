@@ -158,6 +158,8 @@ impl What {
 fn after_help() -> String {
     format!(
         "Values beyond what 16 bits hold are written as 65535.\n\n\
+         Views are drawn and written in bands of rows, so that their size takes no memory to speak of; only\n\
+         depth-color keeps 4 bytes per pixel.\n\n\
          EXR files hold 32-bit floats: colour multiplied by alpha without the background colour, Z (1e10\n\
          where nothing is), forward.u and .v (pixels to the next view of the same camera, u to the right,\n\
          v up; 0 in the last), the instance layers, and the Cryptomatte uCryptoObject, whose names are the\n\
