@@ -953,7 +953,7 @@ fn views_drawn_in_bands_are_those_drawn_at_once() {
         let whole = renderer.render(field, camera, scene.time, &settings, channels).unwrap();
         assert!(whole.alpha.pixels.iter().filter(|alpha| **alpha > 0.5).count() > 500);
         // One row of tiles at once, and two, of about 200 bytes a pixel.
-        for (memory, first_rows) in [(1, vec![0, 16, 32, 48, 64, 80]), (500_000, vec![0, 32, 64])] {
+        for (memory, first_rows) in [(1, vec![0_u32, 16, 32, 48, 64, 80]), (500_000, vec![0, 32, 64])] {
             renderer.set_band_memory(memory);
             let mut firsts = Vec::new();
             let bands =

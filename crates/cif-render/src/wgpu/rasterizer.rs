@@ -268,48 +268,32 @@ impl Rasterizer {
         input: &ViewInput<'_>,
     ) -> Result<(), GpuError> {
         let PosedInput { geometry, sh } = gaussians;
-        self.project_from(gpu, commands, geometry, (sh.buffer(), false), identities, input, None)
+        self.project_rows(gpu, commands, (geometry, Coefficients::Full(sh)), identities, input, None)
     }
 
-    /// As [`Self::project`], of some rows of tiles alone, from the first on so many; spherical harmonics are full, or
-    /// packed as [`super::gaussians::packed_sh`] makes them. For pictures: [`Self::backward`] reads whole views and full
-    /// spherical harmonics.
+    /// As [`Self::project`], of so many `rows` of tiles from the first on where they are given. For pictures:
+    /// [`Self::backward`] reads whole views and full spherical harmonics.
     ///
     /// # Errors
     /// As [`Self::project`].
     ///
     /// # Panics
-    /// As [`Self::project`], and when tiles are chosen too.
-    #[expect(clippy::too_many_arguments, reason = "as many parts has a view")]
+    /// As [`Self::project`], and when both rows and tiles are chosen.
     pub(super) fn project_rows(
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        geometry: &GpuVec<[f32; GEOMETRY_FLOATS]>,
-        sh: Coefficients<'_>,
-        identities: Option<&DeviceIdentities>,
-        input: &ViewInput<'_>,
-        rows: [u32; 2],
-    ) -> Result<(), GpuError> {
-        assert!(input.tiles.is_none(), "rows of a whole view");
-        let sh = match sh {
-            Coefficients::Full(sh) => (sh.buffer(), false),
-            Coefficients::Packed(sh) => (sh.buffer(), true),
-        };
-        self.project_from(gpu, commands, geometry, sh, identities, input, Some(rows))
-    }
-
-    #[expect(clippy::too_many_arguments, reason = "as many parts has a view")]
-    fn project_from(
-        &mut self,
-        gpu: &Gpu,
-        commands: &mut Commands<'_>,
-        geometry: &GpuVec<[f32; GEOMETRY_FLOATS]>,
-        (sh, packed): (&wgpu::Buffer, bool),
+        gaussians: (&GpuVec<[f32; GEOMETRY_FLOATS]>, Coefficients<'_>),
         identities: Option<&DeviceIdentities>,
         input: &ViewInput<'_>,
         rows: Option<[u32; 2]>,
     ) -> Result<(), GpuError> {
+        assert!(rows.is_none() || input.tiles.is_none(), "rows of a whole view");
+        let (geometry, sh) = gaussians;
+        let (sh, packed) = match sh {
+            Coefficients::Full(sh) => (sh.buffer(), false),
+            Coefficients::Packed(sh) => (sh.buffer(), true),
+        };
         let n = geometry.len();
         let mut view = View::new(input.camera, input.settings, n);
         if let Some([first, count]) = rows {

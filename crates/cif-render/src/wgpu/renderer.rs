@@ -190,7 +190,7 @@ impl GpuRenderer {
         };
         let (gpu, rasterizer) = (&self.gpu, &mut self.rasterizer);
         let sh = self.packed_sh.as_ref().map_or(Coefficients::Full(posed.sh), Coefficients::Packed);
-        rasterizer.project_rows(gpu, &mut commands, posed.geometry, sh, identities, &input, rows)?;
+        rasterizer.project_rows(gpu, &mut commands, (posed.geometry, sh), identities, &input, Some(rows))?;
         rasterizer.draw_projected(gpu, commands, identities, with_depth)
     }
 }
