@@ -75,15 +75,6 @@ impl TileRegion {
         };
         [range(0, self.first_column, self.columns), range(1, self.first_row, self.rows)]
     }
-
-    /// Most (tile, splat) pairs of splats: those of the rectangles around their drawn ellipses.
-    fn most_pairs(&self, splats: &[Splat]) -> usize {
-        let pairs = splats.iter().map(|splat| {
-            let [columns, rows] = self.reached(splat);
-            columns.len() * rows.len()
-        });
-        pairs.sum()
-    }
 }
 
 /// Which splats each tile of a region draws, front to back. Tiles are counted row by row within the region.
@@ -206,14 +197,12 @@ impl TileLists {
 
         // Tiles of every splat, in chunks so that threads share the tests.
         const CHUNK: usize = 1024;
-        // Rectangles around long diagonal splats hold many more tiles than those reach.
-        const MAX_RESERVED: usize = 1 << 24;
         let pairs = AtomicU64::new(0);
         let chunks: Vec<ReachedTiles> = splats
             .par_chunks(CHUNK)
             .map(|chunk| {
-                let mut counts = Vec::with_capacity(chunk.len());
-                let mut reached = Vec::with_capacity(region.most_pairs(chunk).min(MAX_RESERVED));
+                let (mut counts, mut reached) =
+                    (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
                 for splat in chunk {
                     let before = reached.len();
                     visit_tiles(splat, &region, drawn, |tile, passes| reached.push((tile, passes)));
