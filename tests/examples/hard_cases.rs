@@ -5,7 +5,7 @@ use std::io::BufRead;
 use std::path::Path;
 
 /// Columns of the table that are filled, by what was measured.
-const PATHS: [&str; 3] = ["f64", "f32", "fast"];
+const PATHS: [&str; 4] = ["f64", "f32", "fast", "gpu"];
 
 /// Largest errors of a cell: of a number on its own, forward, backward.
 type Cell = [Option<f64>; 3];
@@ -21,7 +21,7 @@ fn shown(cell: &Cell) -> String {
 }
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let mut worst: BTreeMap<u32, [Cell; 3]> = BTreeMap::new();
+    let mut worst: BTreeMap<u32, [Cell; PATHS.len()]> = BTreeMap::new();
     for line in std::io::stdin().lock().lines() {
         let line = line?;
         // Tests print side by side with others, so that a line may begin with something else.

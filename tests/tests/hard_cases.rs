@@ -25,7 +25,7 @@ fn every_row_names_tests_that_exist() {
             continue;
         };
         let cells: Vec<&str> = line.trim_matches('|').split('|').map(str::trim).collect();
-        assert_eq!(cells.len(), 7, "row {number} has seven columns: {line}");
+        assert_eq!(cells.len(), 8, "row {number} has eight columns: {line}");
         assert!(rows.insert(number, tests_of(line)).is_none(), "row {number} is there twice");
         for worst in &cells[4..] {
             let is_told = !worst.is_empty() && *worst != "?";

@@ -192,8 +192,7 @@ fn compare_screen(
         let Some(splat) = splat else { continue };
         let drawn = (0..forward.pixels.pixels.len() as u32).any(|position| {
             let pixel = [position % forward.pixels.width, position / forward.pixels.width];
-            footprint(splat, pixel)
-                .is_some_and(|f| weight(splat.opacity.max(splat.occupancy), f.peak).is_some())
+            weight(splat.opacity.max(splat.occupancy), footprint(splat, pixel).peak).is_some()
         });
         if drawn {
             let a = f64::from(actual.radii[index]);

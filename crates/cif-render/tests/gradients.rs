@@ -202,7 +202,7 @@ fn instance_loss_to_means_only() {
         let mut splats = forward.splats.clone();
         for (splat, frozen) in splats.iter_mut().zip(&case.forward.splats) {
             if let (Some(splat), Some(frozen)) = (splat, frozen) {
-                splat.conic = frozen.conic;
+                splat.factor = frozen.factor;
             }
         }
         let target = InstanceTarget {

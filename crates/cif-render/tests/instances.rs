@@ -20,7 +20,7 @@ use common::{Cotangents, Mismatches};
 fn splat_at(sigma: f64, occupancy: f64, depth: f64) -> Option<Splat2d<f64>> {
     Some(Splat2d {
         mean2d: [0.5 + (2.0 * sigma).sqrt(), 0.5],
-        conic: [1.0, 0.0, 1.0],
+        factor: [1.0, 0.0, 1.0],
         depth,
         sort_key: depth,
         color: [0.0; 3],
@@ -151,7 +151,7 @@ fn compare_with_dense(config: &SyntheticConfig, instances: InstanceSettings) {
             compare("mean2d", i, d.mean2d[axis], s.mean2d[axis]);
         }
         for entry in 0..3 {
-            compare("conic", i, d.conic[entry], s.conic[entry]);
+            compare("moments", i, d.moments[entry], s.moments[entry]);
         }
     }
     let from_dense = identities.softmax_backward(&dense.probabilities);

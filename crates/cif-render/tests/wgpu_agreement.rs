@@ -6,6 +6,8 @@
 #![cfg(feature = "wgpu")]
 
 mod common;
+#[path = "common/gpu.rs"]
+mod on_gpu;
 
 use std::collections::BTreeMap;
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
@@ -25,6 +27,7 @@ use cif_render::{
     TileChoice,
 };
 use common::{Cotangents, Mismatches, pixel_discontinuity, render};
+use on_gpu::{Outcome, device, gradient, run, run_tiles};
 
 /// Relative width of the boundary band: above the rounding of a weight in single precision.
 const BAND: f64 = 1e-3;
@@ -53,118 +56,6 @@ fn config() -> SyntheticConfig {
         screen_size: (0.01, 0.08),
         ..SyntheticConfig::default()
     }
-}
-
-/// The device and its kernels, compiled once; tests take turns, and each view meets the memory of the one before.
-fn device() -> Option<MutexGuard<'static, (Gpu, Rasterizer)>> {
-    static DEVICE: OnceLock<Option<Mutex<(Gpu, Rasterizer)>>> = OnceLock::new();
-    let device = DEVICE.get_or_init(|| {
-        let gpu = testing::gpu()?;
-        let rasterizer = Rasterizer::new(&gpu).expect("the kernels compile");
-        Some(Mutex::new((gpu, rasterizer)))
-    });
-    if device.is_none() {
-        eprintln!("skipped: no GPU");
-    }
-    device.as_ref().map(|device| device.lock().unwrap_or_else(PoisonError::into_inner))
-}
-
-/// Everything that comes back of a view.
-struct Outcome {
-    colors: Vec<[f32; 4]>,
-    blended: Vec<[f32; 4]>,
-    splats: Vec<Splat>,
-    order: Vec<u32>,
-    posed: Vec<[f32; 12]>,
-    sh: Vec<[f32; 48]>,
-    screen: Vec<[f32; 4]>,
-    calibrations: Vec<f32>,
-    statistics: GpuStatistics,
-    tile_ranges: Vec<[u32; 2]>,
-    entries: Vec<[u32; 4]>,
-}
-
-/// Renders a view forward and backward; `edit` may change the splats before they are blended.
-fn run(
-    device: &mut (Gpu, Rasterizer),
-    scene: &SyntheticScene,
-    settings: &RenderSettings,
-    cotangents: &Cotangents,
-    edit: impl FnOnce(&mut Vec<Splat>),
-) -> Result<Outcome, GpuError> {
-    run_tiles(device, scene, settings, cotangents, None, edit)
-}
-
-/// As [`run`], of some tiles.
-fn run_tiles(
-    device: &mut (Gpu, Rasterizer),
-    scene: &SyntheticScene,
-    settings: &RenderSettings,
-    cotangents: &Cotangents,
-    tiles: Option<TileChoice<'_>>,
-    edit: impl FnOnce(&mut Vec<Splat>),
-) -> Result<Outcome, GpuError> {
-    let (gpu, rasterizer) = (&device.0, &mut device.1);
-    let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians)?;
-    let k = scene.field.instances.len();
-    let identities = scene.field.identities.as_ref().filter(|_| settings.instances.is_some());
-    let identities = identities.map(|rows| DeviceIdentities::from_identities(gpu, rows, k)).transpose()?;
-    let label_map: Vec<u32> = scene.labels.pixels.iter().map(|label| u32::from(*label)).collect();
-    let labelled_pixels = label_map.iter().filter(|label| **label != 0).count();
-    let label_map = GpuVec::from_slice(gpu, "labels", &label_map)?;
-    let labels = identities.is_some().then_some(LabelInput {
-        labels: &label_map,
-        labelled_pixels,
-        weight: cotangents.instance_weight as f32,
-    });
-    let input = ViewInput { camera: &scene.camera, settings, labels, tiles };
-    let mut commands = Commands::new(gpu, None);
-    rasterizer.project(gpu, &mut commands, (&gaussians).into(), identities.as_ref(), &input)?;
-    rasterizer.measure(gpu, commands)?;
-    let mut splats = rasterizer.splats().read(gpu)?;
-    edit(&mut splats);
-    rasterizer.splats().write(gpu, 0, &splats);
-    let v_colors: Vec<[f32; 4]> =
-        cotangents.color.pixels.iter().map(|v| [v[0] as f32, v[1] as f32, v[2] as f32, f32::NAN]).collect();
-    let v_colors = GpuVec::from_slice(gpu, "cotangents", &v_colors)?;
-    let mut commands = Commands::new(gpu, None);
-    rasterizer.rasterize(gpu, &mut commands, identities.as_ref(), labels)?;
-    rasterizer.backward(gpu, &mut commands, (&gaussians).into(), identities.as_ref(), labels, &v_colors)?;
-    let counts = rasterizer.read_statistics(gpu, &mut commands);
-    commands.submit();
-    let statistics = GpuStatistics::of(&counts.start().wait(gpu)?);
-    let gradients = rasterizer.gradients();
-    Ok(Outcome {
-        colors: rasterizer.colors().read(gpu)?,
-        blended: rasterizer.blended().read(gpu)?,
-        splats,
-        order: rasterizer.depth_order().read(gpu)?,
-        posed: gradients.gaussians.geometry.read(gpu)?,
-        sh: gradients.gaussians.sh.read(gpu)?,
-        screen: gradients.screen.read(gpu)?,
-        calibrations: if labels.is_some() && labelled_pixels > 0 && cotangents.instance_weight != 0.0 {
-            gradients.calibrations.read(gpu)?
-        } else {
-            vec![0.0; identities.map_or(0, |rows| rows.entries.len())]
-        },
-        statistics,
-        tile_ranges: rasterizer.tile_ranges().read(gpu)?,
-        entries: rasterizer.entries().read_range(gpu, 0, statistics.pairs as usize)?,
-    })
-}
-
-/// Scalar `index` of a group of gradients.
-fn gradient(outcome: &Outcome, group: ParameterGroup, index: usize) -> f64 {
-    f64::from(match group {
-        ParameterGroup::Means => outcome.posed[index / 3][index % 3],
-        ParameterGroup::LogScales => outcome.posed[index / 3][4 + index % 3],
-        ParameterGroup::Quaternions => outcome.posed[index / 4][8 + index % 4],
-        ParameterGroup::OpacityLogits => outcome.posed[index][3],
-        ParameterGroup::OccupancyLogits => outcome.posed[index][7],
-        ParameterGroup::ShCoefficients => outcome.sh.as_flattened()[index],
-        ParameterGroup::LogCalibrations => *outcome.calibrations.get(index).unwrap_or(&0.0),
-        ParameterGroup::Planes | ParameterGroup::Mlp => unreachable!("posed Gaussians have no deformation"),
-    })
 }
 
 const GROUPS: [ParameterGroup; 7] = [
@@ -375,12 +266,12 @@ fn project_on_the_inputs_of_the_reference() {
                     compare("extent, relative", e.extents[axis], splat.extent[axis], 1e-3, 1e-4);
                 }
             }
-            let largest = e.conic.iter().fold(0.0_f64, |largest, v| largest.max(v.abs()));
+            let largest = e.factor.iter().fold(0.0_f64, |largest, v| largest.max(v.abs()));
             for k in 0..3 {
-                compare("conic, relative", e.conic[k], splat.conic[k], 2e-5, 2e-5 * largest);
+                compare("factor, relative", e.factor[k], splat.factor[k], 2e-5, 2e-5 * largest);
                 compare("colour, relative", e.color[k], splat.color[k], 1e-5, 1e-5);
             }
-            compare("opacity, relative", e.opacity, splat.conic[3], 2e-5, 0.0);
+            compare("opacity, relative", e.opacity, splat.factor[3], 2e-5, 0.0);
             compare("occupancy, relative", e.occupancy, splat.color[3], 1e-5, 0.0);
             compare("depth, relative", e.depth, splat.depth, 1e-6, 0.0);
             compare("radius, relative", e.radius, splat.radius, 1e-5, 0.0);
@@ -453,7 +344,7 @@ fn tile_lists_hold_every_drawn_pair_once_and_in_order() {
             let Some(splat) = splat else { continue };
             for y in 0..53 {
                 for x in 0..71 {
-                    let Some(at) = footprint(splat, [x, y]) else { continue };
+                    let at = footprint(splat, [x, y]);
                     for (strength, pass) in [(splat.opacity, 1_u32), (splat.occupancy, 2)] {
                         // A hair above the gate, so that rounding does not matter.
                         if weight(strength * 0.999, at.peak).is_none() {
@@ -479,7 +370,7 @@ fn rounded(forward: &Forward<f64>, splats: &mut [Splat]) {
         let (Some(e), true) = (e, splat.radius > 0.0) else { continue };
         let single = |v: f64| v as f32;
         splat.mean = e.mean2d.map(single);
-        splat.conic = [e.conic[0], e.conic[1], e.conic[2], e.opacity].map(single);
+        splat.factor = [e.factor[0], e.factor[1], e.factor[2], e.opacity].map(single);
         splat.color = [e.color[0], e.color[1], e.color[2], e.occupancy].map(single);
         splat.depth = single(e.depth);
     }
@@ -509,11 +400,11 @@ fn the_comparison_notices_small_mistakes() {
     let expected = expected("mistakes", &config(), &settings, |_| {});
     type Mistake = (&'static str, fn(&mut Vec<Splat>));
     let mistakes: [Mistake; 5] = [
-        ("a dropped splat", |splats| splats[3].conic[3] = 0.0),
+        ("a dropped splat", |splats| splats[3].factor[3] = 0.0),
         ("a mean half a hundredth of a pixel off", |splats| {
             splats.iter_mut().for_each(|s| s.mean[0] += 5e-3)
         }),
-        ("swapped axes", |splats| splats.iter_mut().for_each(|s| s.conic.swap(0, 2))),
+        ("swapped axes", |splats| splats.iter_mut().for_each(|s| s.factor.swap(0, 2))),
         ("red and blue swapped", |splats| splats.iter_mut().for_each(|s| s.color.swap(0, 2))),
         ("occupancy one part in a hundred off", |splats| splats.iter_mut().for_each(|s| s.color[3] *= 1.01)),
     ];

@@ -110,7 +110,7 @@ const MAX_PAIRS: u64 = u32::MAX as u64;
 
 /// Smallest sigma of a splat over a tile's pixel centres' bounding rectangle.
 fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
-    let [x00, x01, x11] = splat.conic;
+    let [l00, l01, l11] = splat.factor;
     // Rectangle relative to the mean.
     let (x_low, x_high) = (low[0] - splat.mean[0], high[0] - splat.mean[0]);
     let (y_low, y_high) = (low[1] - splat.mean[1], high[1] - splat.mean[1]);
@@ -122,13 +122,13 @@ fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
     let mut smallest = f32::INFINITY;
     if !inside_x {
         let x = if x_low > 0.0 { x_low } else { x_high };
-        let y = (-x01 * x / x11).clamp(y_low, y_high);
-        smallest = smallest.min(0.5 * (x00 * x * x + x11 * y * y) + x01 * x * y);
+        let y = (-l00 * l01 * x / (l01 * l01 + l11 * l11)).clamp(y_low, y_high);
+        smallest = smallest.min(splat.sigma(x, y));
     }
     if !inside_y {
         let y = if y_low > 0.0 { y_low } else { y_high };
-        let x = (-x01 * y / x00).clamp(x_low, x_high);
-        smallest = smallest.min(0.5 * (x00 * x * x + x11 * y * y) + x01 * x * y);
+        let x = (-l01 * y / l00).clamp(x_low, x_high);
+        smallest = smallest.min(splat.sigma(x, y));
     }
     smallest
 }
@@ -301,7 +301,7 @@ mod tests {
     fn filling(gaussian: u32) -> Splat {
         Splat {
             mean: [40.0, 40.0],
-            conic: [1e-8, 0.0, 1e-8],
+            factor: [1e-4, 0.0, 1e-4],
             color: [0.5; 3],
             opacity: 0.5,
             occupancy: 0.5,

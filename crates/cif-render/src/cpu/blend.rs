@@ -46,7 +46,7 @@ pub(super) fn blend_tile<S: Simd, const C: usize>(
         let value = values[s.gaussian as usize];
         for group in prepared.groups[pass as usize] {
             let at = prepared.footprint(simd, group);
-            let step = blending.step(simd, strength * at.peak, at.valid, &mut transmittance[group]);
+            let step = blending.step(simd, strength * at.peak, &mut transmittance[group]);
             for channel in 0..C {
                 let sum = &mut blended[channel][group];
                 step.weight.mul_add(splat(simd, value[channel]), load(simd, sum)).store_array(sum);

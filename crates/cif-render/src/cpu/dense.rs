@@ -86,7 +86,7 @@ pub(super) fn instance_tile<S: Simd>(
         let share = splat(simd, labelled_shares[s.gaussian as usize]);
         for group in in_color {
             let at = prepared.footprint(simd, group);
-            let blended = blending.step(simd, opacity * at.peak, at.valid, &mut color_transmittance[group]);
+            let blended = blending.step(simd, opacity * at.peak, &mut color_transmittance[group]);
             let foreground = &mut tile.foreground[group];
             blended.weight.mul_add(share, load(simd, foreground)).store_array(foreground);
             live_color.finish(group, blended.finished);
@@ -102,7 +102,7 @@ pub(super) fn instance_tile<S: Simd>(
         for group in in_instances {
             let at = prepared.footprint(simd, group);
             let transmittance = &mut instance_transmittance[group];
-            let blended = blending.step(simd, occupancy * at.peak, at.valid, transmittance);
+            let blended = blending.step(simd, occupancy * at.peak, transmittance);
             for (slot, probability) in &slots {
                 let mass = &mut masses[*slot][group];
                 blended.weight.mul_add(splat(simd, *probability), load(simd, mass)).store_array(mass);

@@ -48,7 +48,7 @@ pub(super) fn label_mass_tile<S: Simd>(
         let out = &mut mass[pair * columns..(pair + 1) * columns];
         for group in prepared.groups[0] {
             let at = prepared.footprint(simd, group);
-            let blended = blending.step(simd, opacity * at.peak, at.valid, &mut transmittance[group]);
+            let blended = blending.step(simd, opacity * at.peak, &mut transmittance[group]);
             live_color.finish(group, blended.finished);
             let weight = blended.weight * load(simd, &inverse_coverage[group]);
             out[columns - 1] += sum(simd, weight);

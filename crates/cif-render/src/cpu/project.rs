@@ -81,8 +81,8 @@ pub(super) struct Posed<'a> {
 pub(super) struct Splat {
     /// Projected centre, pixels.
     pub(super) mean: [f32; 2],
-    /// Conic X00, X01, X11, px^-2.
-    pub(super) conic: [f32; 3],
+    /// L00, L01, L11 of the conic `L^T L`, px^-1: sigma is half the squared norm of `L d`.
+    pub(super) factor: [f32; 3],
     /// Blended colour.
     pub(super) color: Vector,
     /// Opacity o after antialiasing.
@@ -105,20 +105,25 @@ pub(super) struct Splat {
 }
 
 impl Splat {
-    /// a, b, c of the footprint's exponent of two, `a dx^2 + b dx dy + c dy^2`.
+    /// The factor scaled so that the footprint is `2^-|u|^2` with `u` its product with an offset.
     #[inline(always)]
-    pub(super) fn exponent(&self) -> [f32; 3] {
-        let [x00, x01, x11] = self.conic;
-        let scale = -std::f32::consts::LOG2_E;
-        [0.5 * scale * x00, scale * x01, 0.5 * scale * x11]
+    pub(super) fn binary_factor(&self) -> [f32; 3] {
+        let scale = (0.5 * std::f32::consts::LOG2_E).sqrt();
+        self.factor.map(|entry| scale * entry)
+    }
+
+    /// sigma at an offset from the mean.
+    #[inline(always)]
+    pub(super) fn sigma(&self, x: f32, y: f32) -> f32 {
+        let [l00, l01, l11] = self.factor;
+        let (u0, u1) = (l00 * x + l01 * y, l11 * y);
+        0.5 * (u0 * u0 + u1 * u1)
     }
 }
 
 /// Intermediate values shared by both directions.
 struct Footprint {
     in_camera: Vector,
-    /// R diag(exp s), world.
-    spread: Matrix,
     scales: Vector,
     clamped_scale: [bool; 3],
     /// R_v R diag(exp s).
@@ -127,14 +132,14 @@ struct Footprint {
     ratio_clamped: [bool; 2],
     /// Clamped x and y of the Jacobian.
     clamped_xy: [f32; 2],
-    /// T = J R_v R diag(exp s).
+    /// Rows of T = J R_v R diag(exp s), and their cross product.
     image_spread: [Vector; 2],
-    /// Before the low pass: C0 00, 01, 11.
-    sharp: [f32; 3],
+    normal: Vector,
+    /// Determinant of C0 = T T^T.
     sharp_determinant: f32,
-    /// After it.
+    /// After the low pass: C 00, 01, 11.
     blurred: [f32; 3],
-    conic: [f32; 3],
+    factor: [f32; 3],
     /// Antialiasing factor rho, and whether it sits on its floor.
     compensation: f32,
     compensation_floored: bool,
@@ -144,9 +149,8 @@ fn dot(a: Vector, b: Vector) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-fn squared_area(a: Vector, b: Vector) -> f32 {
-    let cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-    dot(cross, cross)
+fn cross(a: Vector, b: Vector) -> Vector {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
 fn transform(m: &Matrix, v: Vector) -> Vector {
@@ -210,12 +214,14 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
     let [t0, t1] = image_spread;
     let sharp = [dot(t0, t0), dot(t0, t1), dot(t1, t1)];
     let blurred = [sharp[0] + LOW_PASS, sharp[1], sharp[2] + LOW_PASS];
-    let sharp_determinant = squared_area(t0, t1);
+    let normal = cross(t0, t1);
+    let sharp_determinant = dot(normal, normal);
     let det = sharp_determinant + LOW_PASS * (sharp[0] + sharp[2]) + LOW_PASS * LOW_PASS;
     if !det.is_finite() {
         return None;
     }
-    let conic = [blurred[2] / det, -blurred[1] / det, blurred[0] / det];
+    let l00 = (blurred[2] / det).sqrt();
+    let factor = [l00, -l00 * blurred[1] / blurred[2], 1.0 / blurred[2].sqrt()];
     let (compensation, compensation_floored) = if view.antialiased {
         let squared = sharp_determinant / det;
         let floor = MIN_ANTIALIASING * MIN_ANTIALIASING;
@@ -225,7 +231,6 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
     };
     Some(Footprint {
         in_camera,
-        spread,
         scales,
         clamped_scale,
         spread_in_camera: m,
@@ -233,10 +238,10 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
         ratio_clamped,
         clamped_xy,
         image_spread,
-        sharp,
+        normal,
         sharp_determinant,
         blurred,
-        conic,
+        factor,
         compensation,
         compensation_floored,
     })
@@ -303,7 +308,7 @@ pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) ->
     let color = color.map(|c| c.max(0.0));
     Some(Splat {
         mean,
-        conic: footprint.conic,
+        factor: footprint.factor,
         color,
         opacity,
         occupancy,
@@ -323,8 +328,8 @@ pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) ->
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub(super) struct SplatGradient {
     pub(super) mean: [f32; 2],
-    /// By X00, X01 (the single off-diagonal parameter), X11.
-    pub(super) conic: [f32; 3],
+    /// Sums M of `v_sigma u u^T` with `u = L d`, entries 00, 01, 11: the gradient by C is `-L^T M L / 2`.
+    pub(super) moments: [f32; 3],
     pub(super) color: Vector,
     pub(super) opacity: f32,
     /// Sum of weighted q_i (methods reference 4.2), so that `dL/dh = -(1 - pi) q`.
@@ -352,36 +357,44 @@ pub(super) fn project_backward(
     let Some(f) = footprint(view, posed) else { return PosedGradient::default() };
     let base_opacity = sigmoid(posed.opacity_logit);
 
-    // Steps 1 and 2: conic to blurred covariance, with the antialiasing term.
-    let [x00, x01, x11] = f.conic;
-    let (v00, v01, v11) = (v.conic[0], 0.5 * v.conic[1], v.conic[2]);
-    // X V_X X with symmetric factors.
-    let a00 = x00 * v00 + x01 * v01;
-    let a01 = x00 * v01 + x01 * v11;
-    let a10 = x01 * v00 + x11 * v01;
-    let a11 = x01 * v01 + x11 * v11;
-    let mut g = [-(a00 * x00 + a01 * x01), -(a00 * x01 + a01 * x11), -(a10 * x01 + a11 * x11)];
+    // Step 1: v_T = -L^T M W with W = L T, whose first row is L00 (t0 - C01 / C11 t1): the difference is
+    // (0.3 t0 + t1 x (t0 x t1)) / C11, in which nothing cancels for needles.
+    let [l00, l01, l11] = f.factor;
+    let [t0, t1] = f.image_spread;
+    let turned = cross(t1, f.normal);
+    let scale = l00 / f.blurred[2];
+    let w0 = [0, 1, 2].map(|c| scale * (LOW_PASS * t0[c] + turned[c]));
+    let w1 = t1.map(|entry| l11 * entry);
+    let mut m = v.moments;
+    let mut v_image_spread = [[0.0; 3]; 2];
     // With opacity as occupancy, -q / o is the instance loss by the blended opacity (dl / d log pi = -q).
     let v_blended = match view.occupancy {
         Some(OccupancySource::Opacity) => v.opacity - v.responsibility / splat.opacity,
         _ => v.opacity,
     };
     let v_opacity = v_blended * f.compensation;
+    // Step 2: d log rho / dT is C0^-1 T - C^-1 T, and C^-1 T = L^T W.
     if !f.compensation_floored {
-        let det = f.sharp_determinant;
-        let v_compensation = v_blended * base_opacity;
-        let factor = 0.5 * v_compensation * f.compensation;
-        g[0] += factor * (f.sharp[2] / det - x00);
-        g[1] += factor * (-f.sharp[1] / det - x01);
-        g[2] += factor * (f.sharp[0] / det - x11);
+        let slope = v_blended * base_opacity * f.compensation;
+        m[0] += slope;
+        m[2] += slope;
+        let inverse = slope / f.sharp_determinant;
+        v_image_spread = [turned, cross(f.normal, t0)].map(|row| row.map(|entry| inverse * entry));
     }
 
-    // Step 3: with C0 = T T^T, v_T / 2 = G T; T = J M gives v_J = v_T M^T and v_M = J^T v_T.
-    let [t0, t1] = f.image_spread;
-    let v_image_spread = [
-        [0, 1, 2].map(|c| 2.0 * (g[0] * t0[c] + g[1] * t1[c])),
-        [0, 1, 2].map(|c| 2.0 * (g[1] * t0[c] + g[2] * t1[c])),
-    ];
+    // Step 6: the log-scale of column c gets T_c . v_T_c = -W_c^T M W_c, again without cancellation.
+    let mut log_scale = [0.0; 3];
+    for c in 0..3 {
+        let moved = [m[0] * w0[c] + m[1] * w1[c], m[1] * w0[c] + m[2] * w1[c]];
+        if !f.clamped_scale[c] {
+            log_scale[c] = t0[c] * v_image_spread[0][c] + t1[c] * v_image_spread[1][c]
+                - (w0[c] * moved[0] + w1[c] * moved[1]);
+        }
+        v_image_spread[0][c] -= l00 * moved[0];
+        v_image_spread[1][c] -= l01 * moved[0] + l11 * moved[1];
+    }
+
+    // Step 3: T = J M gives v_J = v_T M^T and v_M = J^T v_T.
     let j = &f.jacobian;
     let v_j = v_image_spread.map(|row| [0, 1, 2].map(|c| dot(row, f.spread_in_camera[c])));
 
@@ -425,16 +438,7 @@ pub(super) fn project_backward(
         }
     }
 
-    // Steps 6 and 7: scales and rotation.
-    let log_scale = [0, 1, 2].map(|c| {
-        if f.clamped_scale[c] {
-            0.0
-        } else {
-            f.spread[0][c] * v_spread[0][c]
-                + f.spread[1][c] * v_spread[1][c]
-                + f.spread[2][c] * v_spread[2][c]
-        }
-    });
+    // Step 7: rotation.
     let mut v_rotation = v_spread;
     for row in &mut v_rotation {
         for (entry, scale) in row.iter_mut().zip(f.scales) {

@@ -23,6 +23,8 @@ pub(super) struct TileImage {
     pub(super) label_probability: TilePixels,
     /// Instance transmittance at the end.
     pub(super) instance_transmittance: TilePixels,
+    /// Of each group, one past the last entry that supports a label of it.
+    pub(super) supported: [u32; GROUPS],
     /// Evaluated (pixel, splat) pairs.
     pub(super) evaluated: u64,
     /// Those of them evaluated for identities.
@@ -38,6 +40,7 @@ impl Default for TileImage {
             transmittance: zero,
             label_probability: zero,
             instance_transmittance: zero,
+            supported: [0; GROUPS],
             evaluated: 0,
             evaluated_instances: 0,
         }
@@ -76,8 +79,7 @@ impl<S: Simd> Painted<'_, S> {
         group: usize,
         image: &mut TileImage,
     ) -> bool {
-        let blended =
-            self.blending.step(simd, self.opacity * at.peak, at.valid, &mut image.transmittance[group]);
+        let blended = self.blending.step(simd, self.opacity * at.peak, &mut image.transmittance[group]);
         for channel in 0..3 {
             let total = &mut image.color[channel][group];
             blended.weight.mul_add(self.color[channel], load(simd, total)).store_array(total);
@@ -95,15 +97,18 @@ impl<S: Simd> Painted<'_, S> {
         &self,
         simd: S,
         at: &Footprint<S>,
-        group: usize,
+        (pair, group): (usize, usize),
         labels: &TileLabels,
         image: &mut TileImage,
     ) -> bool {
         let transmittance = &mut image.instance_transmittance[group];
-        let blended = self.blending.step(simd, self.occupancy * at.peak, at.valid, transmittance);
+        let blended = self.blending.step(simd, self.occupancy * at.peak, transmittance);
         let identity = labels.gather(simd, group, self.probabilities);
         let total = &mut image.label_probability[group];
         blended.weight.mul_add(identity, load(simd, total)).store_array(total);
+        if identity.simd_gt(splat(simd, 0.0)).to_bitmask() != 0 {
+            image.supported[group] = pair as u32 + 1;
+        }
         blended.finished
     }
 }
@@ -130,12 +135,13 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
     let mut live_instances = Groups::default();
     if INSTANCES && let Some((tile_labels, _)) = labels {
         image.label_probability = [[0.0; LANES]; GROUPS];
+        image.supported = [0; GROUPS];
         image.instance_transmittance = labelled_transmittance(tile_labels);
         live_instances = live(&image.instance_transmittance);
         probabilities.resize(tile_labels.labels.len(), 0.0);
     }
 
-    for entry in entries {
+    for (pair, entry) in entries.iter().enumerate() {
         if live_color.union(live_instances).is_empty() {
             break;
         }
@@ -173,11 +179,13 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
             for group in in_color.both(in_instances) {
                 let at = prepared.footprint(simd, group);
                 live_color.finish(group, painted.paint_color::<DEPTH>(simd, &at, group, image));
-                live_instances.finish(group, painted.paint_labels(simd, &at, group, tile_labels, image));
+                live_instances
+                    .finish(group, painted.paint_labels(simd, &at, (pair, group), tile_labels, image));
             }
             for group in in_instances.without(in_color) {
                 let at = prepared.footprint(simd, group);
-                live_instances.finish(group, painted.paint_labels(simd, &at, group, tile_labels, image));
+                live_instances
+                    .finish(group, painted.paint_labels(simd, &at, (pair, group), tile_labels, image));
             }
         }
     }

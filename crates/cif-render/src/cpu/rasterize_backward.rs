@@ -19,8 +19,8 @@ use super::project::{Splat, SplatGradient};
 use super::tile::{Blending, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare};
 use crate::GeometryPath;
 
-/// Remainder 1 - c_i that is rounding: the sum of a few hundred responsibilities in single precision.
-const SETTLED: f32 = 1e-6;
+/// Undoes the scale of [`Splat::binary_factor`] in a product of two values that carry it.
+const FROM_BINARY: f32 = 2.0 * std::f32::consts::LN_2;
 
 /// What a tile's pixels ask of the splats.
 pub(super) struct TileCotangents {
@@ -39,6 +39,8 @@ pub(super) struct TileInstances<'a> {
     pub(super) weight: f32,
     /// 1 / M_y of each pixel, 0 where nothing flows.
     pub(super) inverse_probability: TilePixels,
+    /// Of each group, one past the last entry that supports a label of it.
+    pub(super) ends: [u32; GROUPS],
     /// Added to the remainder 1 - c_i under coverage normalisation: `S_end / A`.
     pub(super) coverage_ratio: Option<Box<TilePixels>>,
 }
@@ -87,48 +89,38 @@ struct Sums<S: Simd> {
     color: [f32x16<S>; 3],
     opacity: f32x16<S>,
     responsibility: f32x16<S>,
-    /// Moments of v_sigma: first for the mean, second for the conic.
-    x: f32x16<S>,
-    y: f32x16<S>,
-    xx: f32x16<S>,
-    xy: f32x16<S>,
-    yy: f32x16<S>,
+    /// Moments of v_sigma by u: first for the mean, second for the covariance.
+    first: [f32x16<S>; 2],
+    second: [f32x16<S>; 3],
 }
 
 impl<S: Simd> Sums<S> {
     #[inline(always)]
     fn zero(zero: f32x16<S>) -> Self {
-        Self {
-            color: [zero; 3],
-            opacity: zero,
-            responsibility: zero,
-            x: zero,
-            y: zero,
-            xx: zero,
-            xy: zero,
-            yy: zero,
-        }
+        Self { color: [zero; 3], opacity: zero, responsibility: zero, first: [zero; 2], second: [zero; 3] }
     }
 
-    /// Adds the moments of a group: `v_sigma` for the conic, `v_sigma_mean` for the mean.
+    /// Adds the moments of a group: `v_sigma` for the covariance, `v_sigma_mean` for the mean.
     #[inline(always)]
     fn add_moments(&mut self, at: &Footprint<S>, v_sigma: f32x16<S>, v_sigma_mean: f32x16<S>) {
-        let (first_x, first_y) = (v_sigma * at.dx, v_sigma * at.dy);
-        self.x = v_sigma_mean.mul_add(at.dx, self.x);
-        self.y = v_sigma_mean.mul_add(at.dy, self.y);
-        self.xx = first_x.mul_add(at.dx, self.xx);
-        self.xy = first_x.mul_add(at.dy, self.xy);
-        self.yy = first_y.mul_add(at.dy, self.yy);
+        let (v0, v1) = (v_sigma * at.u0, v_sigma * at.u1);
+        self.first[0] = v_sigma_mean.mul_add(at.u0, self.first[0]);
+        self.first[1] = v_sigma_mean.mul_add(at.u1, self.first[1]);
+        self.second[0] = v0.mul_add(at.u0, self.second[0]);
+        self.second[1] = v0.mul_add(at.u1, self.second[1]);
+        self.second[2] = v1.mul_add(at.u1, self.second[2]);
     }
 
     #[inline(always)]
-    fn finish(self, simd: S, [x00, x01, x11]: [f32; 3]) -> SplatGradient {
-        let [x, y, xx, xy] = sum_each(simd, [self.x, self.y, self.xx, self.xy]);
+    fn finish(self, simd: S, splat: &Splat) -> SplatGradient {
+        let [l00, l01, l11] = splat.binary_factor();
+        let [u0, u1, u00, u01] =
+            sum_each(simd, [self.first[0], self.first[1], self.second[0], self.second[1]]);
         let [red, green, blue, opacity] =
             sum_each(simd, [self.color[0], self.color[1], self.color[2], self.opacity]);
         SplatGradient {
-            mean: [x00 * x + x01 * y, x01 * x + x11 * y],
-            conic: [0.5 * xx, xy, 0.5 * sum(simd, self.yy)],
+            mean: [l00 * u0, l01 * u0 + l11 * u1].map(|v| FROM_BINARY * v),
+            moments: [u00, u01, sum(simd, self.second[2])].map(|v| FROM_BINARY * v),
             color: [red, green, blue],
             opacity,
             responsibility: sum(simd, self.responsibility),
@@ -149,7 +141,7 @@ impl<S: Simd> Seen<S> {
         sums: &mut Sums<S>,
     ) -> (f32x16<S>, bool) {
         let unclamped = self.opacity * at.peak;
-        let blended = self.blending.step(simd, unclamped, at.valid, &mut transmittance[group]);
+        let blended = self.blending.step(simd, unclamped, &mut transmittance[group]);
         let [red, green, blue] = &cotangents.color;
         let v_c = [load(simd, &red[group]), load(simd, &green[group]), load(simd, &blue[group])];
         let e = v_c[0].mul_add(self.color[0], v_c[1].mul_add(self.color[1], v_c[2] * self.color[2]));
@@ -171,14 +163,14 @@ impl<S: Simd> Seen<S> {
         &self,
         simd: S,
         at: &Footprint<S>,
-        group: usize,
+        (pair, group): (usize, usize),
         replay: &mut Replay<'_>,
         sums: &mut Sums<S>,
     ) -> (f32x16<S>, bool) {
         let instances = replay.instances;
         let labels = instances.labels;
         let unclamped = self.occupancy * at.peak;
-        let blended = self.blending.step(simd, unclamped, at.valid, &mut replay.transmittance[group]);
+        let blended = self.blending.step(simd, unclamped, &mut replay.transmittance[group]);
         let identity = labels.gather(simd, group, &replay.probabilities);
         let r = blended.weight * (identity * load(simd, &instances.inverse_probability[group]));
         // 1 - c_i, clamped against rounding at the tail.
@@ -186,11 +178,7 @@ impl<S: Simd> Seen<S> {
         remainder.store_array(&mut replay.remainder[group]);
         let (hidden, settled) = match &instances.coverage_ratio {
             Some(ratio) => (remainder + load(simd, &ratio[group]), blended.finished),
-            None => {
-                let open = load(simd, &replay.transmittance[group]).simd_gt(self.zero)
-                    & remainder.simd_gt(splat(simd, SETTLED));
-                (remainder, open.to_bitmask() == 0)
-            }
+            None => (remainder, blended.finished || pair + 1 >= instances.ends[group] as usize),
         };
         let q = r - blended.alpha * hidden / (self.one - blended.alpha);
         let flows = blended.drawn & self.blending.unclamped(unclamped);
@@ -283,14 +271,14 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
                 let (v_sigma, finished) =
                     seen.color_backward(simd, &at, group, &mut transmittance, cotangents, &mut sums);
                 live_color.finish(group, finished);
-                let (q, finished) = seen.instances_backward(simd, &at, group, replay, &mut sums);
+                let (q, finished) = seen.instances_backward(simd, &at, (pair, group), replay, &mut sums);
                 live_instances.finish(group, finished);
                 let v_sigma_mean = q.mul_add(seen.mean_geometry, v_sigma);
                 sums.add_moments(&at, q.mul_add(seen.full_geometry, v_sigma), v_sigma_mean);
             }
             for group in in_instances.without(in_color) {
                 let at = prepared.footprint(simd, group);
-                let (q, finished) = seen.instances_backward(simd, &at, group, replay, &mut sums);
+                let (q, finished) = seen.instances_backward(simd, &at, (pair, group), replay, &mut sums);
                 live_instances.finish(group, finished);
                 if moves_geometry {
                     sums.add_moments(&at, q * seen.full_geometry, q * seen.mean_geometry);
@@ -301,6 +289,6 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
                 *out = weight * sum(simd, load(simd, mass));
             }
         }
-        gradients[pair] = sums.finish(simd, s.conic);
+        gradients[pair] = sums.finish(simd, s);
     }
 }

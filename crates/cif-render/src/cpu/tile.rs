@@ -9,7 +9,7 @@
 use fearless_simd::prelude::*;
 use fearless_simd::{f32x16, mask32x16};
 
-use super::pixels::{LANES, Lanes, exp2, load, splat};
+use super::pixels::{LANES, Lanes, exp2_negative, load, splat};
 use super::project::Splat;
 use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE, TILE};
 
@@ -129,8 +129,8 @@ pub(super) fn live(transmittance: &TilePixels) -> Groups {
     Groups::where_(|group| transmittance[group].iter().any(|t| *t > 0.0))
 }
 
-/// First rows of the groups of a half tile.
-const PAIR_ROWS: [f32; PAIRS] = [0.0, 2.0, 4.0, 6.0, 8.0, 10.0, 12.0, 14.0];
+/// Minus the first rows of the groups of a half tile.
+const ROWS_BEFORE: [f32; PAIRS] = [0.0, -2.0, -4.0, -6.0, -8.0, -10.0, -12.0, -14.0];
 
 /// Column of each lane.
 const LANE_COLUMNS: Lanes = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0];
@@ -141,33 +141,31 @@ const LANE_ROWS: Lanes = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0,
 /// All rows of a tile.
 const ROWS: Lanes = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 15.0];
 
-/// A splat prepared for one tile. The exponent of two of its footprint is `a dx^2 + b dx dy + c dy^2`.
+/// A splat prepared for one tile, by `u = L d` with [`Splat::binary_factor`] and d the mean minus a pixel centre.
 #[derive(Clone, Copy)]
 pub(super) struct SplatInTile<S: Simd> {
-    /// mean.x minus pixel centre, per half.
-    dx: [f32x16<S>; 2],
-    /// mean.y minus pixel centre of the first pair of rows.
-    dy: f32x16<S>,
-    /// a dx^2, per half.
-    square: [f32x16<S>; 2],
-    /// b dx, per half.
-    cross: [f32x16<S>; 2],
-    c: f32x16<S>,
+    /// u0 in the first pair of rows, per half.
+    u0: [f32x16<S>; 2],
+    /// u1 in the first pair of rows.
+    u1: f32x16<S>,
+    /// What both lose per row.
+    l01: f32x16<S>,
+    l11: f32x16<S>,
     /// Groups that the drawn ellipse of each pass may touch, of those asked for.
     pub(super) groups: [Groups; 2],
 }
 
 /// The groups that the drawn ellipses of a splat may touch, of those `wanted` by each pass.
 ///
-/// The interval of x drawn in each row is found for all rows at once: sigma <= reach is a quadratic in dx. It
-/// is a hair wider than exact, so that rounding never hides a drawn pixel; the gate itself decides.
+/// The interval of x drawn in each row is found for all rows at once: `u0^2 <= 2 reach - u1^2`. It is a hair wider
+/// than exact, so that rounding never hides a drawn pixel; the gate itself decides.
 #[inline(always)]
 fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, wanted: [Groups; 2]) -> [Groups; 2] {
-    let [x00, x01, x11] = s.conic;
-    let inverse = 1.0 / x00;
-    let slope = x01 * inverse;
+    let [l00, l01, l11] = s.factor;
+    let inverse = 1.0 / l00;
+    let slope = l01 * inverse;
     let row_dy = splat(simd, dy) - load(simd, &ROWS);
-    let bend = row_dy * row_dy * splat(simd, -(x11 - x01 * slope));
+    let bend = row_dy * row_dy * splat(simd, -(l11 * l11));
     // Position of the drawn interval's centre, in pixels from the tile's first pixel centre.
     let centre = row_dy.mul_add(splat(simd, slope), splat(simd, first));
     let mut groups = [Groups::default(); 2];
@@ -176,9 +174,9 @@ fn touched<S: Simd>(simd: S, s: &Splat, first: f32, dy: f32, wanted: [Groups; 2]
             continue;
         }
         let reach = splat(simd, s.reach[pass] * 2.0 * 1.000_02 + 2e-5);
-        let discriminant = (bend + reach) * splat(simd, inverse);
-        let reaches = discriminant.simd_gt(splat(simd, 0.0));
-        let half_width = discriminant.max(splat(simd, 0.0)).sqrt() + splat(simd, 1e-3);
+        let left = bend + reach;
+        let reaches = left.simd_gt(splat(simd, 0.0));
+        let half_width = left.max(splat(simd, 0.0)).sqrt().mul_add(splat(simd, inverse), splat(simd, 1e-3));
         let (low, high) = (centre - half_width, centre + half_width);
         let mut rows = 0_u32;
         for half in 0..2 {
@@ -207,42 +205,33 @@ pub(super) fn prepare<S: Simd>(
     if groups[0].union(groups[1]).is_empty() {
         return None;
     }
-    let [a, b, c] = s.exponent();
+    let [l00, l01, l11] = s.binary_factor();
+    let (l00, l01, l11) = (splat(simd, l00), splat(simd, l01), splat(simd, l11));
     let columns = load(simd, &LANE_COLUMNS);
-    let dx = [splat(simd, first) - columns, splat(simd, first - COLUMNS as f32) - columns];
-    Some(SplatInTile {
-        dx,
-        dy: splat(simd, first_dy) - load(simd, &LANE_ROWS),
-        square: [dx[0] * dx[0] * splat(simd, a), dx[1] * dx[1] * splat(simd, a)],
-        cross: [dx[0] * splat(simd, b), dx[1] * splat(simd, b)],
-        c: splat(simd, c),
-        groups,
-    })
+    let dy = splat(simd, first_dy) - load(simd, &LANE_ROWS);
+    let sideways = l01 * dy;
+    let left = (splat(simd, first) - columns).mul_add(l00, sideways);
+    let right = (splat(simd, first - COLUMNS as f32) - columns).mul_add(l00, sideways);
+    Some(SplatInTile { u0: [left, right], u1: l11 * dy, l01, l11, groups })
 }
 
 /// A splat on the pixels of a group.
 #[derive(Clone, Copy)]
 pub(super) struct Footprint<S: Simd> {
-    pub(super) dx: f32x16<S>,
-    pub(super) dy: f32x16<S>,
+    /// L d with [`Splat::binary_factor`].
+    pub(super) u0: f32x16<S>,
+    pub(super) u1: f32x16<S>,
     /// Footprint P.
     pub(super) peak: f32x16<S>,
-    /// Pixels where P is valid (sigma >= 0).
-    pub(super) valid: mask32x16<S>,
 }
 
 impl<S: Simd> SplatInTile<S> {
     #[inline(always)]
     pub(super) fn footprint(&self, simd: S, group: usize) -> Footprint<S> {
-        let half = group / PAIRS;
-        let dy = self.dy - splat(simd, PAIR_ROWS[group % PAIRS]);
-        let exponent = self.c.mul_add(dy, self.cross[half]).mul_add(dy, self.square[half]);
-        Footprint {
-            dx: self.dx[half],
-            dy,
-            peak: exp2(simd, exponent),
-            valid: exponent.simd_le(splat(simd, 0.0)),
-        }
+        let row = splat(simd, ROWS_BEFORE[group % PAIRS]);
+        let u0 = self.l01.mul_add(row, self.u0[group / PAIRS]);
+        let u1 = self.l11.mul_add(row, self.u1);
+        Footprint { u0, u1, peak: exp2_negative(simd, u1.mul_add(u1, u0 * u0)) }
     }
 }
 
@@ -283,18 +272,12 @@ impl<S: Simd> Blending<S> {
 
     /// Blends a weight that is not clamped yet and steps the transmittance.
     #[inline(always)]
-    pub(super) fn step(
-        &self,
-        simd: S,
-        unclamped: f32x16<S>,
-        valid: mask32x16<S>,
-        transmittance: &mut Lanes,
-    ) -> Blended<S> {
+    pub(super) fn step(&self, simd: S, unclamped: f32x16<S>, transmittance: &mut Lanes) -> Blended<S> {
         let alpha = unclamped.min(self.max_alpha);
         let t = load(simd, transmittance);
         let weight = t * alpha;
         let next = t - weight;
-        let strong = valid & alpha.simd_ge(self.min_alpha);
+        let strong = alpha.simd_ge(self.min_alpha);
         // Negative for finished pixels, which are so neither drawn nor changed.
         let drawn = strong & next.simd_ge(self.min_transmittance);
         let after = drawn.select(next, strong.select(-t.abs(), t));
@@ -326,7 +309,7 @@ mod tests {
             for lane in 0..LANES {
                 let (column, row) = pixel_in_tile(group, lane);
                 assert_eq!(column % 8, LANE_COLUMNS[lane] as u32);
-                assert_eq!(row, PAIR_ROWS[group % PAIRS] as u32 + LANE_ROWS[lane] as u32);
+                assert_eq!(row, -ROWS_BEFORE[group % PAIRS] as u32 + LANE_ROWS[lane] as u32);
                 assert!(!std::mem::replace(&mut seen[row as usize][column as usize], true));
             }
         }

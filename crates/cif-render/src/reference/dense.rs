@@ -6,7 +6,7 @@ use cif_geometry::{PixelGrid, Real};
 use super::constant;
 use super::identity::IdentityProbabilities;
 use super::project::{Splat2d, SplatGradient};
-use super::rasterize::{conic_backward, footprint, mean_backward, weight};
+use super::rasterize::{covariance_backward, footprint, mean_backward, weight};
 use crate::constants::{MIN_LABEL_PROBABILITY, MIN_TRANSMITTANCE};
 use crate::image::{InstanceImage, InstanceRanks, UNLABELLED};
 use crate::settings::{GeometryPath, InstanceNormalisation};
@@ -55,7 +55,7 @@ pub fn rasterize_dense<R: Real>(
         let mut transmittance = R::one();
         for (rank, &index) in order.iter().enumerate() {
             let Some(splat) = &splats[index as usize] else { continue };
-            let Some(footprint) = footprint(splat, position) else { continue };
+            let footprint = footprint(splat, position);
             let Some(b) = weight(splat.occupancy, footprint.peak) else { continue };
             let next = transmittance * (R::one() - b.value);
             if next < constant(MIN_TRANSMITTANCE) {
@@ -73,7 +73,7 @@ pub fn rasterize_dense<R: Real>(
         let mut transmittance = R::one();
         for &index in order {
             let Some(splat) = &splats[index as usize] else { continue };
-            let Some(footprint) = footprint(splat, position) else { continue };
+            let footprint = footprint(splat, position);
             let Some(alpha) = weight(splat.opacity, footprint.peak) else { continue };
             let next = transmittance * (R::one() - alpha.value);
             if next < constant(MIN_TRANSMITTANCE) {
@@ -158,7 +158,7 @@ pub fn rasterize_dense_backward<R: Real>(
             .iter()
             .filter_map(|&index| {
                 let splat = splats[index as usize].as_ref()?;
-                let footprint = footprint(splat, position)?;
+                let footprint = footprint(splat, position);
                 Some((index as usize, splat, footprint, weight(splat.occupancy, footprint.peak)?))
             })
             .collect();
@@ -189,7 +189,7 @@ pub fn rasterize_dense_backward<R: Real>(
                     mean_backward(splat, footprint, v_sigma, v);
                 }
                 if geometry == GeometryPath::Full {
-                    conic_backward(footprint, v_sigma, v);
+                    covariance_backward(footprint, v_sigma, v);
                 }
             }
             transmittance *= R::one() - b.value;

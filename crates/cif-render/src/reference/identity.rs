@@ -131,7 +131,7 @@ pub fn count_label_mass<R: Real>(
         let mut transmittance = R::one();
         for &index in order {
             let Some(splat) = &splats[index as usize] else { continue };
-            let Some(footprint) = footprint(splat, pixel) else { continue };
+            let footprint = footprint(splat, pixel);
             let Some(alpha) = weight(splat.opacity, footprint.peak) else { continue };
             let next = transmittance * (R::one() - alpha.value);
             if next < constant(MIN_TRANSMITTANCE) {

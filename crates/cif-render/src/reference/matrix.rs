@@ -34,13 +34,13 @@ pub(super) fn difference_of_products<R: Real>(a: R, b: R, c: R, d: R) -> R {
     a.mul_add(b, -product) - error
 }
 
-/// Squared area of the parallelogram of two 3-vectors: `det(T T^T)` of the 2 x 3 matrix T with these rows, as
-/// a sum of squares (Lagrange's identity), so that needles do not cancel.
-pub(super) fn squared_area<R: Real>(a: [R; 3], b: [R; 3]) -> R {
-    let x = difference_of_products(a[1], b[2], a[2], b[1]);
-    let y = difference_of_products(a[2], b[0], a[0], b[2]);
-    let z = difference_of_products(a[0], b[1], a[1], b[0]);
-    x * x + y * y + z * z
+/// Cross product, each entry to within two units in the last place.
+pub(super) fn cross<R: Real>(a: [R; 3], b: [R; 3]) -> [R; 3] {
+    [
+        difference_of_products(a[1], b[2], a[2], b[1]),
+        difference_of_products(a[2], b[0], a[0], b[2]),
+        difference_of_products(a[0], b[1], a[1], b[0]),
+    ]
 }
 
 #[cfg(test)]
@@ -48,12 +48,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn squared_area_keeps_its_digits_for_needles() {
+    fn the_area_of_needles_keeps_its_digits() {
         // Rows that are parallel to 1 part in 1e4: products of about 1e6 cancel to about 1e2.
         let a = [812.3_f32, -301.7, 499.2];
         let b = [812.31_f32, -301.75, 499.3];
-        let exact = squared_area(a.map(f64::from), b.map(f64::from));
-        let relative = (f64::from(squared_area(a, b)) - exact).abs() / exact;
+        let normal = cross(a.map(f64::from), b.map(f64::from));
+        let exact = dot(normal, normal);
+        let normal = cross(a, b);
+        let relative = (f64::from(dot(normal, normal)) - exact).abs() / exact;
         assert!(relative < 1e-5, "{relative}");
         // The textbook form is useless here, which is why it is not used.
         let naive = dot(a, a) * dot(b, b) - dot(a, b) * dot(a, b);

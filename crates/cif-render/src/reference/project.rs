@@ -6,7 +6,7 @@ use cif_geometry::scalar::sigmoid;
 use cif_geometry::{PinholeCamera, Real, quaternion, spherical_harmonics};
 
 use super::constant;
-use super::matrix::{Matrix, apply, dot, multiply, scale_columns, squared_area, transpose};
+use super::matrix::{Matrix, apply, cross, dot, multiply, scale_columns, transpose};
 use super::scene::Gaussian;
 use crate::constants::{
     JACOBIAN_MARGIN, LOG_SCALE_RANGE, LOW_PASS, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
@@ -71,8 +71,9 @@ impl<R: Real> View<R> {
 pub struct Splat2d<R> {
     /// Projected centre, pixels.
     pub mean2d: [R; 2],
-    /// X00, X01, X11 of the inverse of the dilated covariance, px^-2.
-    pub conic: [R; 3],
+    /// L00, L01, L11 of the upper triangular factor of the conic: `X = L^T L` is the inverse of the dilated
+    /// covariance, so that sigma is half the squared norm of `L d`; px^-1.
+    pub factor: [R; 3],
     /// Camera z, metres.
     pub depth: R,
     /// What the blending order compares: z, or the distance to the camera centre, metres.
@@ -96,8 +97,10 @@ pub struct Splat2d<R> {
 pub struct SplatGradient<R> {
     /// By the projected centre.
     pub mean2d: [R; 2],
-    /// By X00, X01 (the single off-diagonal parameter), X11.
-    pub conic: [R; 3],
+    /// Sums M of `v_sigma u u^T` with `u = L d`, entries 00, 01, 11. The gradient by the dilated covariance is
+    /// `-L^T M L / 2`, which is never formed: along a needle it is smaller than across it by the square of how
+    /// many times longer the needle is than wide.
+    pub moments: [R; 3],
     /// By z (depth cotangents only).
     pub depth: R,
     /// By the clamped colour.
@@ -115,7 +118,7 @@ impl<R: Real> SplatGradient<R> {
         let zero = R::zero();
         Self {
             mean2d: [zero; 2],
-            conic: [zero; 3],
+            moments: [zero; 3],
             depth: zero,
             color: [zero; 3],
             opacity: zero,
@@ -128,20 +131,21 @@ impl<R: Real> SplatGradient<R> {
 struct Footprint<R> {
     /// Camera-space point t_c.
     point: [R; 3],
-    /// Rotation of the normalised quaternion.
-    rotation: Matrix<R>,
     /// exp of the clamped log-scales.
     scales: [R; 3],
     scale_clamped: [bool; 3],
-    /// Sigma in the camera frame.
-    covariance: Matrix<R>,
+    /// R_v B.
+    spread_in_camera: Matrix<R>,
     /// J, with the clamped tx, ty.
     jacobian: [[R; 3]; 2],
     clamped_xy: [R; 2],
     ratio_clamped: [bool; 2],
-    /// C0 and C as 00, 01, 11, and their determinants.
-    sharp: [R; 3],
+    /// Rows of T = J R_v B, and their cross product.
+    image_spread: [[R; 3]; 2],
+    normal: [R; 3],
+    /// det C0.
     sharp_determinant: R,
+    /// C as 00, 01, 11, and its determinant.
     dilated: [R; 3],
     determinant: R,
     /// rho, and whether it sits on its floor.
@@ -150,9 +154,24 @@ struct Footprint<R> {
 }
 
 impl<R: Real> Footprint<R> {
-    fn conic(&self) -> [R; 3] {
-        let [c00, c01, c11] = self.dilated;
-        [c11 / self.determinant, -c01 / self.determinant, c00 / self.determinant]
+    /// L of `C^-1 = L^T L`: nothing is subtracted.
+    fn factor(&self) -> [R; 3] {
+        let [_, c01, c11] = self.dilated;
+        let l00 = (c11 / self.determinant).sqrt();
+        [l00, -l00 * c01 / c11, c11.sqrt().recip()]
+    }
+
+    /// Rows of `W = L T`, with entries in [-1, 1]. The first is `L00 (t0 - C01 / C11 t1)`, whose difference is
+    /// `(0.3 t0 + t1 x (t0 x t1)) / C11`, without the cancellation for needles.
+    fn whitened_spread(&self) -> [[R; 3]; 2] {
+        let [l00, _, l11] = self.factor();
+        let [t0, t1] = self.image_spread;
+        let turned = cross(t1, self.normal);
+        let scale = l00 / self.dilated[2];
+        [
+            std::array::from_fn(|c| scale * (constant::<R>(LOW_PASS) * t0[c] + turned[c])),
+            t1.map(|entry| l11 * entry),
+        ]
     }
 }
 
@@ -173,9 +192,7 @@ fn measure<R: Real>(
     let scale_clamped = gaussian.log_scale.map(|s| s < low || s > high);
     let scales = gaussian.log_scale.map(|s| s.max(low).min(high).exp());
 
-    let spread = scale_columns(&rotation, scales);
-    let spread_in_camera = multiply(&view.rotation, &spread);
-    let covariance = multiply(&spread_in_camera, &transpose(&spread_in_camera));
+    let spread_in_camera = multiply(&view.rotation, &scale_columns(&rotation, scales));
 
     let mut clamped_xy = [R::zero(); 2];
     let mut ratio_clamped = [false; 2];
@@ -188,17 +205,19 @@ fn measure<R: Real>(
     let ([fx, fy], zero, r) = (view.focal, R::zero(), z.recip());
     let jacobian = [[fx * r, zero, -fx * clamped_xy[0] * r * r], [zero, fy * r, -fy * clamped_xy[1] * r * r]];
 
-    // C0 = J V J^T = T T^T with T = J R_v B. Taking the determinant from T instead of C0 keeps it a sum of
-    // non-negative terms: needles neither cancel nor turn it negative.
+    // C0 = J V J^T = T T^T with T = J R_v B. Its determinant is the squared area of the parallelogram of the
+    // rows of T (Lagrange's identity): needles neither cancel nor turn it negative.
     let columns = transpose(&spread_in_camera);
-    let mut rows: [[R; 3]; 2] = jacobian.map(|row| std::array::from_fn(|c| dot(row, columns[c])));
-    let largest = dot(rows[0], rows[0]).max(dot(rows[1], rows[1]));
+    let mut image_spread: [[R; 3]; 2] = jacobian.map(|row| std::array::from_fn(|c| dot(row, columns[c])));
+    let largest = dot(image_spread[0], image_spread[0]).max(dot(image_spread[1], image_spread[1]));
     if largest > constant(MAX_COVARIANCE) {
         let factor = (constant::<R>(MAX_COVARIANCE) / largest).sqrt();
-        rows = rows.map(|row| row.map(|value| value * factor));
+        image_spread = image_spread.map(|row| row.map(|value| value * factor));
     }
-    let sharp = [dot(rows[0], rows[0]), dot(rows[0], rows[1]), dot(rows[1], rows[1])];
-    let sharp_determinant = squared_area(rows[0], rows[1]);
+    let [t0, t1] = image_spread;
+    let sharp = [dot(t0, t0), dot(t0, t1), dot(t1, t1)];
+    let normal = cross(t0, t1);
+    let sharp_determinant = dot(normal, normal);
     let low_pass = constant::<R>(LOW_PASS);
     let dilated = [sharp[0] + low_pass, sharp[1], sharp[2] + low_pass];
     let determinant = sharp_determinant + low_pass * (sharp[0] + sharp[2]) + low_pass * low_pass;
@@ -210,14 +229,14 @@ fn measure<R: Real>(
     let antialiasing = if settings.antialiased { squared.max(floor).sqrt() } else { R::one() };
     Some(Footprint {
         point,
-        rotation,
         scales,
         scale_clamped,
-        covariance,
+        spread_in_camera,
         jacobian,
         clamped_xy,
         ratio_clamped,
-        sharp,
+        image_spread,
+        normal,
         sharp_determinant,
         dilated,
         determinant,
@@ -278,7 +297,7 @@ pub fn project<R: Real>(
     }
     Some(Splat2d {
         mean2d,
-        conic: footprint.conic(),
+        factor: footprint.factor(),
         depth: z,
         sort_key: match settings.sort_metric {
             SortMetric::Z => z,
@@ -313,7 +332,7 @@ pub fn project_backward<R: Real>(
 ) -> ProjectGradient<R> {
     let mut result = ProjectGradient { gaussian: Gaussian::zero(), clipped: false };
     let Some(footprint) = measure(gaussian, view, settings) else { return result };
-    let (half, one, two) = (R::of(0.5), R::one(), R::of(2.0));
+    let (one, two) = (R::one(), R::of(2.0));
 
     // Instance weight b = min(0.99, pi P): d log pi / dh = 1 - pi. With pi := o the same reaches the opacity.
     let mut v_opacity = v.opacity;
@@ -325,35 +344,41 @@ pub fn project_backward<R: Real>(
         Some(OccupancySource::Opacity) => v_opacity += v.log_occupancy / splat.opacity,
     }
 
-    // 1. Conic to dilated covariance: G = -X V_X X.
-    let [x00, x01, x11] = splat.conic;
-    let (v00, v01, v11) = (v.conic[0], half * v.conic[1], v.conic[2]);
-    let (a00, a01) = (x00 * v00 + x01 * v01, x00 * v01 + x01 * v11);
-    let (a10, a11) = (x01 * v00 + x11 * v01, x01 * v01 + x11 * v11);
-    let mut g = [-(a00 * x00 + a01 * x01), -(a00 * x01 + a01 * x11), -(a10 * x01 + a11 * x11)];
+    // 1. By T = J R_v B. With C = T T^T + 0.3 I and the gradient -L^T M L / 2 by C, v_T = -L^T M W, and the
+    // log-scale of column c gets T_c . v_T_c = -W_c^T M W_c: along a needle no large numbers cancel in that.
+    let [l00, l01, l11] = splat.factor;
+    let [w0, w1] = footprint.whitened_spread();
+    let mut m = v.moments;
+    let mut v_image_spread = [[R::zero(); 3]; 2];
 
-    // 2. Antialiasing factor, and 8. opacity.
+    // 2. Antialiasing factor, and 8. opacity: d log rho / dT is C0^-1 T - C^-1 T, and C^-1 T = L^T W.
     let base_opacity = sigmoid(gaussian.opacity_logit);
     let rho = footprint.antialiasing;
     if settings.antialiased && !footprint.antialiasing_floored {
-        let slope = base_opacity * v_opacity * rho * half;
-        let [c00, c01, c11] = footprint.sharp;
-        let determinant = footprint.sharp_determinant;
-        g[0] += slope * (c11 / determinant - x00);
-        g[1] += slope * (-c01 / determinant - x01);
-        g[2] += slope * (c00 / determinant - x11);
+        let slope = base_opacity * v_opacity * rho;
+        m[0] += slope;
+        m[2] += slope;
+        let [t0, t1] = footprint.image_spread;
+        let inverse = slope / footprint.sharp_determinant;
+        v_image_spread = [cross(t1, footprint.normal), cross(footprint.normal, t0)]
+            .map(|row| row.map(|value| inverse * value));
     }
     result.gaussian.opacity_logit = base_opacity * (one - base_opacity) * rho * v_opacity;
 
-    // 3. v_V = J^T G J, v_J = 2 G J V.
-    let j = &footprint.jacobian;
-    let gj: [[R; 3]; 2] = [
-        std::array::from_fn(|c| g[0] * j[0][c] + g[1] * j[1][c]),
-        std::array::from_fn(|c| g[1] * j[0][c] + g[2] * j[1][c]),
-    ];
-    let v_covariance: Matrix<R> =
-        std::array::from_fn(|r| std::array::from_fn(|c| j[0][r] * gj[0][c] + j[1][r] * gj[1][c]));
-    let v_j = gj.map(|row| apply(&footprint.covariance, row).map(|value| two * value));
+    // 6. Log-scales: no gradient where clamped.
+    let [t0, t1] = footprint.image_spread;
+    for c in 0..3 {
+        let moved = [m[0] * w0[c] + m[1] * w1[c], m[1] * w0[c] + m[2] * w1[c]];
+        if !footprint.scale_clamped[c] {
+            result.gaussian.log_scale[c] = t0[c] * v_image_spread[0][c] + t1[c] * v_image_spread[1][c]
+                - (w0[c] * moved[0] + w1[c] * moved[1]);
+        }
+        v_image_spread[0][c] -= l00 * moved[0];
+        v_image_spread[1][c] -= l01 * moved[0] + l11 * moved[1];
+    }
+
+    // 3. v_J = v_T (R_v B)^T.
+    let v_j = v_image_spread.map(|row| apply(&footprint.spread_in_camera, row));
 
     // 4. Camera-space point.
     let [x, y, z] = footprint.point;
@@ -377,20 +402,14 @@ pub fn project_backward<R: Real>(
         v_point = v_point.map(|value| value * (constant::<R>(MAX_POSITION_GRADIENT) / norm));
     }
 
-    // 5. To the world: v_x = R_v^T v_t, v_Sigma = R_v^T v_V R_v, v_B = 2 v_Sigma B.
+    // 5. To the world: v_x = R_v^T v_t, v_B = R_v^T J^T v_T.
     let world_from_camera = transpose(&view.rotation);
     result.gaussian.mean = apply(&world_from_camera, v_point);
-    let v_sigma = multiply(&multiply(&world_from_camera, &v_covariance), &view.rotation);
-    let spread = scale_columns(&footprint.rotation, footprint.scales);
-    let v_spread = multiply(&v_sigma, &spread).map(|row| row.map(|value| two * value));
-
-    // 6. Log-scales: no gradient where clamped.
-    let (spread_columns, v_spread_columns) = (transpose(&spread), transpose(&v_spread));
-    for c in 0..3 {
-        if !footprint.scale_clamped[c] {
-            result.gaussian.log_scale[c] = dot(spread_columns[c], v_spread_columns[c]);
-        }
-    }
+    let j = &footprint.jacobian;
+    let v_spread_in_camera: Matrix<R> = std::array::from_fn(|r| {
+        std::array::from_fn(|c| j[0][r] * v_image_spread[0][c] + j[1][r] * v_image_spread[1][c])
+    });
+    let v_spread = multiply(&world_from_camera, &v_spread_in_camera);
 
     // 7. Quaternion.
     let v_rotation = scale_columns(&v_spread, footprint.scales);

@@ -63,21 +63,21 @@ impl<R: Real> PixelState<R> {
 /// A splat evaluated at a pixel centre.
 #[derive(Clone, Copy, Debug)]
 pub struct Footprint<R> {
-    /// mean2d - pixel centre, pixels.
-    pub offset: [R; 2],
-    /// P = exp(-sigma), at most 1.
+    /// `u = L (mean2d - pixel centre)`, standard deviations.
+    pub whitened: [R; 2],
+    /// P = exp(-|u|^2 / 2), at most 1.
     pub peak: R,
 }
 
-/// Evaluates a splat at pixel (column, row); `None` when rounding makes sigma negative or it is not a number.
+/// Evaluates a splat at pixel (column, row). sigma is a sum of squares, which is never negative and cancels nothing.
 #[must_use]
-pub fn footprint<R: Real>(splat: &Splat2d<R>, pixel: [u32; 2]) -> Option<Footprint<R>> {
-    let offset: [R; 2] =
+pub fn footprint<R: Real>(splat: &Splat2d<R>, pixel: [u32; 2]) -> Footprint<R> {
+    let [dx, dy]: [R; 2] =
         std::array::from_fn(|axis| splat.mean2d[axis] - (R::of(f64::from(pixel[axis])) + R::of(0.5)));
-    let [dx, dy] = offset;
-    let [x00, x01, x11] = splat.conic;
-    let sigma = R::of(0.5) * (x00 * dx * dx + x11 * dy * dy) + x01 * dx * dy;
-    (sigma >= R::zero()).then(|| Footprint { offset, peak: (-sigma).exp() })
+    let [l00, l01, l11] = splat.factor;
+    let whitened = [l00 * dx + l01 * dy, l11 * dy];
+    let sigma = R::of(0.5) * (whitened[0] * whitened[0] + whitened[1] * whitened[1]);
+    Footprint { whitened, peak: (-sigma).exp() }
 }
 
 /// A blending weight.
@@ -134,7 +134,7 @@ pub fn blend<R: Real, const C: usize>(
         let mut transmittance = R::one();
         for &index in order {
             let Some(splat) = &splats[index as usize] else { continue };
-            let Some(footprint) = footprint(splat, pixel) else { continue };
+            let footprint = footprint(splat, pixel);
             let strength = match weights {
                 BlendingWeights::Color => splat.opacity,
                 BlendingWeights::Instances => splat.occupancy,
@@ -169,7 +169,7 @@ fn rasterize_pixel<R: Real>(
             break;
         }
         let Some(splat) = &splats[index as usize] else { continue };
-        let Some(footprint) = footprint(splat, pixel) else { continue };
+        let footprint = footprint(splat, pixel);
         if !color_done && let Some(alpha) = weight(splat.opacity, footprint.peak) {
             let next = state.transmittance * (one - alpha.value);
             if next < constant(MIN_TRANSMITTANCE) {
@@ -282,7 +282,7 @@ fn color_backward<R: Real>(
     let (mut transmittance, mut prefix) = (one, R::zero());
     for (position, &index) in order[..state.end].iter().enumerate() {
         let Some(splat) = &splats[index as usize] else { continue };
-        let Some(footprint) = footprint(splat, pixel) else { continue };
+        let footprint = footprint(splat, pixel);
         let Some(alpha) = weight(splat.opacity, footprint.peak) else { continue };
         let v = &mut gradients.splats[index as usize];
         let share = transmittance * alpha.value;
@@ -299,7 +299,7 @@ fn color_backward<R: Real>(
             v.opacity += footprint.peak * v_alpha;
             let v_sigma = -alpha.value * v_alpha;
             mean_backward(splat, &footprint, v_sigma, v);
-            conic_backward(&footprint, v_sigma, v);
+            covariance_backward(&footprint, v_sigma, v);
         }
         transmittance *= one - alpha.value;
     }
@@ -325,7 +325,7 @@ fn instance_backward<R: Real>(
     let (mut transmittance, mut running) = (one, R::zero());
     for (position, &index) in order[..state.instance_end].iter().enumerate() {
         let Some(splat) = &splats[index as usize] else { continue };
-        let Some(footprint) = footprint(splat, pixel) else { continue };
+        let footprint = footprint(splat, pixel);
         let Some(b) = weight(splat.occupancy, footprint.peak) else { continue };
         let v = &mut gradients.splats[index as usize];
         let share = transmittance * b.value;
@@ -348,7 +348,7 @@ fn instance_backward<R: Real>(
             match instances.geometry {
                 GeometryPath::Full => {
                     mean_backward(splat, &footprint, v_sigma, v);
-                    conic_backward(&footprint, v_sigma, v);
+                    covariance_backward(&footprint, v_sigma, v);
                 }
                 GeometryPath::MeansOnly => mean_backward(splat, &footprint, v_sigma, v),
                 GeometryPath::Off => {}
@@ -358,23 +358,23 @@ fn instance_backward<R: Real>(
     }
 }
 
-/// Adds `v_mean2d += v_sigma X d`.
+/// Adds `v_mean2d += v_sigma L^T u`.
 pub(super) fn mean_backward<R: Real>(
     splat: &Splat2d<R>,
     footprint: &Footprint<R>,
     v_sigma: R,
     v: &mut SplatGradient<R>,
 ) {
-    let [dx, dy] = footprint.offset;
-    let [x00, x01, x11] = splat.conic;
-    v.mean2d[0] += v_sigma * (x00 * dx + x01 * dy);
-    v.mean2d[1] += v_sigma * (x01 * dx + x11 * dy);
+    let [u0, u1] = footprint.whitened;
+    let [l00, l01, l11] = splat.factor;
+    v.mean2d[0] += v_sigma * (l00 * u0);
+    v.mean2d[1] += v_sigma * (l01 * u0 + l11 * u1);
 }
 
-/// Adds the gradient of the conic.
-pub(super) fn conic_backward<R: Real>(footprint: &Footprint<R>, v_sigma: R, v: &mut SplatGradient<R>) {
-    let ([dx, dy], half) = (footprint.offset, R::of(0.5));
-    v.conic[0] += half * v_sigma * dx * dx;
-    v.conic[1] += v_sigma * dx * dy;
-    v.conic[2] += half * v_sigma * dy * dy;
+/// Adds the second moments, which are the gradient of the dilated covariance in the frame of its factor.
+pub(super) fn covariance_backward<R: Real>(footprint: &Footprint<R>, v_sigma: R, v: &mut SplatGradient<R>) {
+    let [u0, u1] = footprint.whitened;
+    v.moments[0] += v_sigma * u0 * u0;
+    v.moments[1] += v_sigma * u0 * u1;
+    v.moments[2] += v_sigma * u1 * u1;
 }

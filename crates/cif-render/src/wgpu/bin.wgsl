@@ -19,16 +19,12 @@
 @group(0) @binding(8) var<storage, read> tile_choice: array<u32>;
 #import tiles
 
-fn sigma_at(conic: vec3f, x: f32, y: f32) -> f32 {
-    return 0.5 * (conic.x * x * x + conic.z * y * y) + conic.y * x * y;
-}
-
 // Whether the drawn ellipse holds a whole rectangle relative to the mean: it is convex, so its corners decide.
 fn covers(splat: Splat, first: vec2f, last: vec2f) -> bool {
-    let conic = splat.conic.xyz;
+    let factor = splat.factor.xyz;
     let furthest = max(
-        max(sigma_at(conic, first.x, first.y), sigma_at(conic, last.x, first.y)),
-        max(sigma_at(conic, first.x, last.y), sigma_at(conic, last.x, last.y)),
+        max(sigma_at(factor, first), sigma_at(factor, vec2f(last.x, first.y))),
+        max(sigma_at(factor, vec2f(first.x, last.y)), sigma_at(factor, last)),
     );
     return furthest <= max(splat.reach.x, splat.reach.y);
 }

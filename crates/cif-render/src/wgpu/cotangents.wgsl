@@ -1,6 +1,6 @@
 // What the backward pass reads of a pixel, from the forward images and the gradient of the loss by colour: v_C and
 // Q = v_C . C_out (background included); 1 / M_y where it carries a gradient, S_end / A under coverage normalisation,
-// and the label. Rust twin: cpu/renderer/backward.rs, `tile_cotangents` and `instance_cotangents`. Source: methods
+// the label, and the position after the last splat that supports it. Rust twin: cpu/renderer/backward.rs, `tile_cotangents` and `instance_cotangents`. Source: methods
 // reference 3.2 and 4.3.
 
 #import constants
@@ -24,16 +24,18 @@ fn cotangents_of_pixels(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_
     var inverse = 0.0;
     var ratio = 0.0;
     var label = 0u;
+    var supported = 0.0;
     if (view.label_slots != 0u) {
         label = labels[position];
         let probability = blended[position].y;
         if (label != 0u && probability >= MIN_LABEL_PROBABILITY) {
             inverse = 1.0 / probability;
+            supported = blended[position].w;
             if (view.coverage_normalised != 0u) {
                 let rest = blended[position].z;
                 ratio = rest / max(1.0 - rest, MIN_LABEL_PROBABILITY);
             }
         }
     }
-    cotangents[2u * position + 1u] = vec4f(inverse, ratio, f32(label), 0.0);
+    cotangents[2u * position + 1u] = vec4f(inverse, ratio, f32(label), supported);
 }

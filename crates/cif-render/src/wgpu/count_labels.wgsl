@@ -27,8 +27,8 @@ struct Staged {
     // One bit per quadrant.
     quadrants: u32,
     pair: u32,
-    // Conic and opacity.
-    conic: vec4f,
+    // Factor of the conic, and opacity.
+    factor: vec4f,
 }
 
 struct Pixel {
@@ -73,7 +73,7 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
 
 // Weight of a splat in a pixel over its coverage; steps the pixel.
 fn replay(splat: Staged, p: ptr<function, Pixel>) -> f32 {
-    let alpha = min(MAX_ALPHA, splat.conic.w * peak_at(splat.conic.xyz, splat.mean - (*p).centre));
+    let alpha = min(MAX_ALPHA, splat.factor.w * peak_at(splat.factor.xyz, splat.mean - (*p).centre));
     if (alpha < MIN_ALPHA) {
         return 0.0;
     }
@@ -134,7 +134,7 @@ fn count_labels(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocati
             var item: Staged;
             item.mean = splat.mean;
             item.pair = entry.x;
-            item.conic = splat.conic;
+            item.factor = splat.factor;
             if (((entry.y >> PASS_SHIFT) & COLOR_PASS) != 0u) {
                 for (var quadrant = 0u; quadrant < 4u; quadrant += 1u) {
                     let passes = passes_in_quadrant(splat, quadrant_origin(tile, quadrant));

@@ -23,8 +23,8 @@ struct Staged {
     depth: f32,
     // Passes that draw it, a bit each.
     passes: u32,
-    // Conic and opacity.
-    conic: vec4f,
+    // Factor of the conic, and opacity.
+    factor: vec4f,
     // Colour and occupancy.
     color: vec4f,
     row: u32,
@@ -57,7 +57,7 @@ fn stage(first: u32, end: u32, origin: vec2u, wanted: u32, local: u32) -> u32 {
         if (item.passes != 0u) {
             item.mean = splat.mean;
             item.depth = splat.depth;
-            item.conic = splat.conic;
+            item.factor = splat.factor;
             item.color = splat.color;
             if ((item.passes & INSTANCE_PASS) != 0u) {
                 item.row_first = row_offsets[item.row];
@@ -132,10 +132,10 @@ fn dense(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_inde
                 if (passes == 0u) {
                     continue;
                 }
-                let conic = staged[k].conic;
-                let peak = peak_at(conic.xyz, staged[k].mean - centre);
+                let factor = staged[k].factor;
+                let peak = peak_at(factor.xyz, staged[k].mean - centre);
                 if ((passes & COLOR_PASS) != 0u) {
-                    let alpha = min(MAX_ALPHA, conic.w * peak);
+                    let alpha = min(MAX_ALPHA, factor.w * peak);
                     if (alpha >= MIN_ALPHA) {
                         let weight = transmittance * alpha;
                         let next = transmittance - weight;

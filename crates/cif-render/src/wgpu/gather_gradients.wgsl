@@ -1,6 +1,6 @@
-// Sums the pairs of every splat, in the order in which they were emitted, and turns moments into gradients by mean,
-// conic, colour and opacity. Twelve numbers per Gaussian: mean 2, conic 3, colour 3, opacity, responsibility, whether it
-// is visible, 0. Rust twin: cpu/renderer/backward.rs, `project_backward`.
+// Sums the pairs of every splat, in the order in which they were emitted, and turns first moments into the gradient by
+// the mean. Twelve numbers per Gaussian: mean 2, second moments 3, colour 3, opacity, responsibility, whether it is
+// visible, 0. Rust twin: cpu/renderer/backward.rs, `project_backward`.
 
 #import constants
 #import numbers
@@ -36,15 +36,11 @@ fn gather_gradients(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
         }
     }
     let splat = splats[row];
-    let conic = splat.conic;
+    let factor = splat.factor;
     // v_sigma = -alpha v_alpha, alpha = o P and v_o = P v_alpha.
-    let v_opacity = select(0.0, -sums[8] / conic.w, conic.w > 0.0);
-    splat_gradients[3u * row] = vec4f(
-        conic.x * sums[0] + conic.y * sums[1],
-        conic.y * sums[0] + conic.z * sums[1],
-        0.5 * sums[2],
-        sums[3],
-    );
-    splat_gradients[3u * row + 1u] = vec4f(0.5 * sums[4], sums[5], sums[6], sums[7]);
+    let v_opacity = select(0.0, -sums[8] / factor.w, factor.w > 0.0);
+    splat_gradients[3u * row] =
+        vec4f(factor.x * sums[0], factor.y * sums[0] + factor.z * sums[1], sums[2], sums[3]);
+    splat_gradients[3u * row + 1u] = vec4f(sums[4], sums[5], sums[6], sums[7]);
     splat_gradients[3u * row + 2u] = vec4f(v_opacity, sums[9], select(0.0, 1.0, splat.radius > 0.0), 0.0);
 }

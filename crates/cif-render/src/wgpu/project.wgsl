@@ -1,5 +1,5 @@
-// Projects posed Gaussians to the image: centre, conic, colour from spherical harmonics, reach of both passes, depth
-// key. A Gaussian that draws nothing gets radius 0 and the last key. Rust twin: cpu/project.rs, `project`.
+// Projects posed Gaussians to the image: centre, factor of the conic, colour from spherical harmonics, reach of both
+// passes, depth key. A Gaussian that draws nothing gets radius 0 and the last key. Rust twin: cpu/project.rs, `project`.
 // Source: methods reference 3.1.
 
 #import constants
@@ -67,7 +67,7 @@ fn splat_of(row: u32) -> Splat {
     let spread = sqrt(0.25 * difference * difference + f.blurred.y * f.blurred.y);
     s.mean = mean;
     s.extent = extent;
-    s.conic = vec4f(f.conic, opacity);
+    s.factor = vec4f(f.factor, opacity);
     s.color = vec4f(max(color, vec3f(0.0)), occupancy);
     s.reach = reach;
     s.depth = f.in_camera.z;

@@ -63,36 +63,40 @@ fn project_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
         return;
     }
     let base_opacity = sigmoid(a.w);
-    let opacity = splat.conic.w;
+    let opacity = splat.factor.w;
     let occupancy = splat.color.w;
 
-    // Steps 1 and 2: conic to blurred covariance, with the antialiasing term.
-    let x00 = f.conic.x;
-    let x01 = f.conic.y;
-    let x11 = f.conic.z;
-    let v00 = g0.z;
-    let v01 = 0.5 * g0.w;
-    let v11 = g1.x;
-    let a00 = x00 * v00 + x01 * v01;
-    let a01 = x00 * v01 + x01 * v11;
-    let a10 = x01 * v00 + x11 * v01;
-    let a11 = x01 * v01 + x11 * v11;
-    var g = -vec3f(a00 * x00 + a01 * x01, a00 * x01 + a01 * x11, a10 * x01 + a11 * x11);
+    // Step 1: v_T = -L^T M W with W = L T, whose first row is L00 (t0 - C01 / C11 t1): the difference is
+    // (0.3 t0 + t1 x (t0 x t1)) / C11, in which nothing cancels for needles.
+    let turned = cross(f.image_1, f.normal);
+    let w0 = f.factor.x / f.blurred.z * (LOW_PASS * f.image_0 + turned);
+    let w1 = f.factor.z * f.image_1;
+    var m = vec3f(g0.zw, g1.x);
+    var v_image_0 = vec3f(0.0);
+    var v_image_1 = vec3f(0.0);
     // With opacity as occupancy, -q / o is the instance loss by the blended opacity.
     var v_blended = g2.x;
     if (view.occupancy == OCCUPANCY_OPACITY) {
         v_blended -= g2.y / opacity;
     }
     let v_opacity = v_blended * f.compensation;
+    // Step 2: d log rho / dT is C0^-1 T - C^-1 T, and C^-1 T = L^T W.
     if (!f.compensation_floored) {
-        let factor = 0.5 * v_blended * base_opacity * f.compensation;
-        let det = f.sharp_determinant;
-        g += factor * (vec3f(f.sharp.z, -f.sharp.y, f.sharp.x) / det - f.conic);
+        let slope = v_blended * base_opacity * f.compensation;
+        m += vec3f(slope, 0.0, slope);
+        v_image_0 = slope / f.sharp_determinant * turned;
+        v_image_1 = slope / f.sharp_determinant * cross(f.normal, f.image_0);
     }
 
-    // Step 3: with C0 = T T^T, v_T / 2 = G T; T = J M gives v_J = v_T M^T and v_M = J^T v_T.
-    let v_image_0 = 2.0 * (g.x * f.image_0 + g.y * f.image_1);
-    let v_image_1 = 2.0 * (g.y * f.image_0 + g.z * f.image_1);
+    // Step 6: the log-scale of column c gets T_c . v_T_c = -W_c^T M W_c, again without cancellation.
+    let moved_0 = m.x * w0 + m.y * w1;
+    let moved_1 = m.y * w0 + m.z * w1;
+    let v_log_scale = f.scale_flows
+        * (f.image_0 * v_image_0 + f.image_1 * v_image_1 - (w0 * moved_0 + w1 * moved_1));
+    v_image_0 -= f.factor.x * moved_0;
+    v_image_1 -= f.factor.y * moved_0 + f.factor.z * moved_1;
+
+    // Step 3: T = J M gives v_J = v_T M^T and v_M = J^T v_T.
     let v_j00 = dot(v_image_0, f.in_view_0);
     let v_j02 = dot(v_image_0, f.in_view_2);
     let v_j11 = dot(v_image_1, f.in_view_1);
@@ -129,9 +133,7 @@ fn project_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
     let v_spread_1 = r0.y * v_in_view_0 + r1.y * v_in_view_1 + r2v.y * v_in_view_2;
     let v_spread_2 = r0.z * v_in_view_0 + r1.z * v_in_view_1 + r2v.z * v_in_view_2;
 
-    // Steps 6 and 7: scales and rotation.
-    let v_log_scale =
-        f.scale_flows * (f.spread_0 * v_spread_0 + f.spread_1 * v_spread_1 + f.spread_2 * v_spread_2);
+    // Step 7: rotation.
     let v_quaternion = quaternion_backward(
         f.unit,
         f.norm,

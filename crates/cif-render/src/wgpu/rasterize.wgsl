@@ -1,7 +1,8 @@
 // Blends the splats of a tile into pixels, front to back, for colour and for the probability of each pixel's own label
 // at once. A workgroup is a tile, an invocation a pixel of each of its quadrants, so that what is read of a splat serves
-// four. Writes the composited colour with the transmittance, and depth D, label probability M_y and instance
-// transmittance S. Rust twin: cpu/rasterize.rs. Source: methods reference 3.1 (pixel loop) and 4.2.
+// four. Writes the composited colour with the transmittance, and depth D, label probability M_y, instance transmittance
+// S and the position in the list of the tile after the last splat that supports the label. Rust twin: cpu/rasterize.rs.
+// Source: methods reference 3.1 (pixel loop) and 4.2.
 
 #import constants
 #import variant
@@ -30,6 +31,8 @@ struct Pixel {
     transmittance: f32,
     probability: f32,
     instance_transmittance: f32,
+    // One past the last entry of the tile that supports the label.
+    supported: u32,
 }
 
 fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
@@ -47,15 +50,15 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
     return p;
 }
 
-// Adds a splat to a pixel.
-fn blend(splat: Staged, passes: u32, identity: f32, p: ptr<function, Pixel>) {
+// Adds a splat to a pixel; `behind` is the position after it in the list of the tile.
+fn blend(splat: Staged, passes: u32, identity: f32, behind: u32, p: ptr<function, Pixel>) {
     let open = passes & (*p).open;
     if (open == 0u) {
         return;
     }
-    let peak = peak_at(splat.conic.xyz, splat.mean - (*p).centre);
+    let peak = peak_at(splat.factor.xyz, splat.mean - (*p).centre);
     if ((open & COLOR_PASS) != 0u) {
-        let alpha = min(MAX_ALPHA, splat.conic.w * peak);
+        let alpha = min(MAX_ALPHA, splat.factor.w * peak);
         if (alpha >= MIN_ALPHA) {
             let weight = (*p).transmittance * alpha;
             let next = (*p).transmittance - weight;
@@ -77,6 +80,7 @@ fn blend(splat: Staged, passes: u32, identity: f32, p: ptr<function, Pixel>) {
                 (*p).open &= ~INSTANCE_PASS;
             } else {
                 (*p).probability += weight * identity;
+                (*p).supported = select((*p).supported, behind, identity > 0.0);
                 (*p).instance_transmittance = next;
             }
         }
@@ -88,7 +92,7 @@ fn write(p: Pixel) {
     if (all(at < view.size)) {
         let position = (at.y - view.first_row * TILE) * view.size.x + at.x;
         colors[position] = vec4f(p.color + p.transmittance * view.background.xyz, p.transmittance);
-        blended[position] = vec4f(p.depth, p.probability, p.instance_transmittance, 0.0);
+        blended[position] = vec4f(p.depth, p.probability, p.instance_transmittance, f32(p.supported));
     }
 }
 
@@ -112,22 +116,23 @@ fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_
         var k = 0u;
         loop {
             let splat = staged[k];
+            let behind = first - range.x + k + 1u;
             let passes = atomicLoad(&staged_passes[k]) & alive;
             var identity = vec4f(0.0);
             if (WITH_INSTANCES && (passes & INSTANCE_IN_TILE) != 0u) {
                 identity = probabilities_of(splat.row_first, splat.row_end, own_labels);
             }
             if ((passes & 3u) != 0u) {
-                blend(splat, passes & 3u, identity.x, &p0);
+                blend(splat, passes & 3u, identity.x, behind, &p0);
             }
             if ((passes & 12u) != 0u) {
-                blend(splat, (passes >> 2u) & 3u, identity.y, &p1);
+                blend(splat, (passes >> 2u) & 3u, identity.y, behind, &p1);
             }
             if ((passes & 48u) != 0u) {
-                blend(splat, (passes >> 4u) & 3u, identity.z, &p2);
+                blend(splat, (passes >> 4u) & 3u, identity.z, behind, &p2);
             }
             if ((passes & 192u) != 0u) {
-                blend(splat, (passes >> 6u) & 3u, identity.w, &p3);
+                blend(splat, (passes >> 6u) & 3u, identity.w, behind, &p3);
             }
             continuing {
                 k += 1u;

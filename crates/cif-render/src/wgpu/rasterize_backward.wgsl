@@ -4,8 +4,8 @@
 // fixed order: no atomics, one store per (tile, splat) pair and sum. Sums by subgroups would take ten instructions where
 // this takes a store and a load. Rust twin: cpu/rasterize_backward.rs. Source: methods reference 3.2, 4.2.
 //
-// A pair's ten sums: v_sigma dx, v_sigma dy (mean); v_sigma dx dx, dx dy, dy dy (conic); v_colour; v_sigma of colour;
-// weighted q. And per entry of its identity row the weighted responsibility for that label.
+// A pair's ten sums, with u = L d: v_sigma u0, v_sigma u1 (mean); v_sigma u0 u0, u0 u1, u1 u1 (covariance); v_colour;
+// v_sigma of colour; weighted q. And per entry of its identity row the weighted responsibility for that label.
 
 #import constants
 #import variant
@@ -48,12 +48,14 @@ struct Pixel {
     hidden: f32,
     inverse: f32,
     ratio: f32,
+    // Position in the list of the tile after the last splat that supports the label.
+    supported: u32,
 }
 
 struct Sums {
-    // Moments x, y, xx, xy.
+    // Moments 0, 1, 00, 01.
     first: vec4f,
-    // yy, v_colour.
+    // 11, v_colour.
     second: vec4f,
     // v_sigma of colour, weighted q.
     third: vec2f,
@@ -75,21 +77,30 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
         p.inverse = instance.x;
         p.ratio = instance.y;
         p.label = u32(instance.z);
+        p.supported = u32(instance.w);
         p.open = COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES && p.inverse > 0.0);
     }
     return p;
 }
 
-// What a splat does to a pixel: T alpha, v_sigma of colour, weighted q, weighted r; steps the pixel.
-fn replay(splat: Staged, passes: u32, identity: f32, p: ptr<function, Pixel>) -> vec4f {
+// What a splat does to a pixel at u: T alpha, v_sigma of colour, weighted q, weighted r; steps the pixel. `behind` is
+// the position after it in the list of the tile.
+fn replay(
+    splat: Staged,
+    passes: u32,
+    identity: f32,
+    behind: u32,
+    u: vec2f,
+    p: ptr<function, Pixel>,
+) -> vec4f {
     var shares_of_pixel = vec4f(0.0);
     let open = passes & (*p).open;
     if (open == 0u) {
         return shares_of_pixel;
     }
-    let peak = peak_at(splat.conic.xyz, splat.mean - (*p).centre);
+    let peak = exp(-0.5 * dot(u, u));
     if ((open & COLOR_PASS) != 0u) {
-        let unclamped = splat.conic.w * peak;
+        let unclamped = splat.factor.w * peak;
         let alpha = min(MAX_ALPHA, unclamped);
         if (alpha >= MIN_ALPHA) {
             let weight = (*p).transmittance * alpha;
@@ -127,7 +138,7 @@ fn replay(splat: Staged, passes: u32, identity: f32, p: ptr<function, Pixel>) ->
                 shares_of_pixel.w = r * view.pixel_weight;
                 (*p).instance_transmittance = next;
                 // Nothing behind supports the label.
-                if (view.coverage_normalised == 0u && (*p).hidden <= SETTLED) {
+                if (view.coverage_normalised == 0u && behind >= (*p).supported) {
                     (*p).open &= ~INSTANCE_PASS;
                 }
             }
@@ -141,15 +152,16 @@ fn add(
     splat: Staged,
     passes: u32,
     identity: f32,
+    behind: u32,
     p: ptr<function, Pixel>,
     sums: ptr<function, Sums>,
 ) -> f32 {
-    let share = replay(splat, passes, identity, p);
-    let d = splat.mean - (*p).centre;
+    let u = whitened(splat.factor.xyz, splat.mean - (*p).centre);
+    let share = replay(splat, passes, identity, behind, u, p);
     let v_mean = share.y + view.mean_geometry * share.z;
-    let v_conic = share.y + view.full_geometry * share.z;
-    (*sums).first += vec4f(v_mean * d, v_conic * d.x * d);
-    (*sums).second += vec4f(v_conic * d.y * d.y, share.x * (*p).v_color);
+    let v_covariance = share.y + view.full_geometry * share.z;
+    (*sums).first += vec4f(v_mean * u, v_covariance * u.x * u);
+    (*sums).second += vec4f(v_covariance * u.y * u.y, share.x * (*p).v_color);
     (*sums).third += share.yz;
     return share.w;
 }
@@ -260,6 +272,7 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
             var k = 0u;
             loop {
                 let splat = staged[batch + k];
+                let behind = first - range.x + batch + k + 1u;
                 let passes = atomicLoad(&staged_passes[batch + k]) & alive;
                 var identity = vec4f(0.0);
                 if (WITH_INSTANCES && (passes & INSTANCE_IN_TILE) != 0u) {
@@ -268,16 +281,16 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
                 var sums: Sums;
                 var responsibility = vec4f(0.0);
                 if ((passes & 3u) != 0u) {
-                    responsibility.x = add(splat, passes & 3u, identity.x, &p0, &sums);
+                    responsibility.x = add(splat, passes & 3u, identity.x, behind, &p0, &sums);
                 }
                 if ((passes & 12u) != 0u) {
-                    responsibility.y = add(splat, (passes >> 2u) & 3u, identity.y, &p1, &sums);
+                    responsibility.y = add(splat, (passes >> 2u) & 3u, identity.y, behind, &p1, &sums);
                 }
                 if ((passes & 48u) != 0u) {
-                    responsibility.z = add(splat, (passes >> 4u) & 3u, identity.z, &p2, &sums);
+                    responsibility.z = add(splat, (passes >> 4u) & 3u, identity.z, behind, &p2, &sums);
                 }
                 if ((passes & 192u) != 0u) {
-                    responsibility.w = add(splat, (passes >> 6u) & 3u, identity.w, &p3, &sums);
+                    responsibility.w = add(splat, (passes >> 6u) & 3u, identity.w, behind, &p3, &sums);
                 }
                 let at = k * GRADIENT_SUMS * 64u + local;
                 partial_sums[at] = sums.first.x;

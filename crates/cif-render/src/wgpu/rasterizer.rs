@@ -790,7 +790,8 @@ impl Rasterizer {
         &self.arrays.colors
     }
 
-    /// Per pixel: blended depth D, probability M_y of the pixel's label, final instance transmittance, 0.
+    /// Per pixel: blended depth D, probability M_y of the pixel's label, final instance transmittance, and the position
+    /// in the list of the tile after the last splat that supports the label.
     #[must_use]
     pub fn blended(&self) -> &GpuVec<[f32; 4]> {
         &self.arrays.blended

@@ -30,8 +30,6 @@ pub const COLOR_PASS: u32 = 1;
 pub const INSTANCE_PASS: u32 = 2;
 /// "The count comes with the parameters, not from the work counts."
 pub(crate) const NONE: u32 = u32::MAX;
-/// Remainder 1 - c_i that is rounding, as in `cpu/rasterize_backward.rs`.
-const SETTLED: f32 = 1e-6;
 
 const OCCUPANCY_NONE: u32 = 0;
 const OCCUPANCY_OWN: u32 = 1;
@@ -127,8 +125,8 @@ crate::shared_struct! {
         pub mean: [f32; 2],
         /// Half-widths of the drawn ellipse, pixels.
         pub extent: [f32; 2],
-        /// Conic X00, X01, X11, px^-2, and opacity after antialiasing.
-        pub conic: [f32; 4],
+        /// L00, L01, L11 of the conic `L^T L`, px^-1, and opacity after antialiasing.
+        pub factor: [f32; 4],
         /// Blended colour, and occupancy (or opacity when instances blend with it).
         pub color: [f32; 4],
         /// Largest sigma that the colour and the instance pass draw.
@@ -247,7 +245,6 @@ fn shared_constants() -> String {
         ("MIN_COVERAGE", Float(MIN_COVERAGE)),
         ("MAX_POSITION_GRADIENT", Float(MAX_POSITION_GRADIENT)),
         ("MIN_QUATERNION_NORM", single(quaternion::MIN_NORM)),
-        ("SETTLED", Float(SETTLED)),
         ("TILE", Unsigned(TILE)),
         ("HALF_TILE", Unsigned(TILE / 2)),
         ("SH_FLOATS", Unsigned(SH_FLOATS as u32)),

@@ -195,7 +195,7 @@ pub fn pixel_discontinuity(forward: &Forward<f64>, position: usize, margin: f64)
         let mut transmittance = 1.0;
         for &index in &forward.order {
             let Some(splat) = &forward.splats[index as usize] else { continue };
-            let Some(footprint) = footprint(splat, pixel) else { continue };
+            let footprint = footprint(splat, pixel);
             let strength = if instance { splat.occupancy } else { splat.opacity };
             if near(strength * footprint.peak, MIN_ALPHA) {
                 return Some("weight 1/255");

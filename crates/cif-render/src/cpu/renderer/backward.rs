@@ -161,6 +161,7 @@ impl Renderer {
                     geometry: settings.instances.unwrap_or_default().geometry,
                     weight: pixel_weight,
                     inverse_probability,
+                    ends: tape.tiles[tile].supported,
                     coverage_ratio,
                 }
             });
@@ -370,7 +371,7 @@ impl SplatGradient {
             self.mean[axis] += other.mean[axis];
         }
         for k in 0..3 {
-            self.conic[k] += other.conic[k];
+            self.moments[k] += other.moments[k];
             self.color[k] += other.color[k];
         }
         self.opacity += other.opacity;

@@ -92,8 +92,8 @@ impl Renderer {
     pub(super) fn inspect_splats(&mut self) {
         if self.inspection.on {
             let floats = |s: &Splat| {
-                let ([mx, my], [x00, x01, x11], [r, g, b]) = (s.mean, s.conic, s.color);
-                [mx, my, x00, x01, x11, r, g, b, s.opacity, s.occupancy, s.depth, s.order]
+                let ([mx, my], [l00, l01, l11], [r, g, b]) = (s.mean, s.factor, s.color);
+                [mx, my, l00, l01, l11, r, g, b, s.opacity, s.occupancy, s.depth, s.order]
             };
             self.inspection.look_at_rows("project", "splats", &self.tape.splats, floats);
         }
@@ -128,8 +128,8 @@ impl Renderer {
     pub(super) fn inspect_pairs(&mut self, pairs: &[SplatGradient], label_mass: &[f32]) {
         if self.inspection.on {
             let floats = |v: &SplatGradient| {
-                let ([mx, my], [x00, x01, x11], [r, g, b]) = (v.mean, v.conic, v.color);
-                [mx, my, x00, x01, x11, r, g, b, v.opacity, v.responsibility]
+                let ([mx, my], [m00, m01, m11], [r, g, b]) = (v.mean, v.moments, v.color);
+                [mx, my, m00, m01, m11, r, g, b, v.opacity, v.responsibility]
             };
             self.inspection.look_at_rows("rasterize backward", "splat gradients of tiles", pairs, floats);
             self.inspection.look("rasterize backward", [("label mass of tiles", label_mass)]);

@@ -1,4 +1,4 @@
-// What projection and its backward pass share of a Gaussian: camera-space point, spread on the image, conic.
+// What projection and its backward pass share of a Gaussian: camera-space point, spread on the image, factor.
 // Rust twin: cpu/project.rs, `footprint`. Source: methods reference 3.1.
 
 struct Footprint {
@@ -10,10 +10,6 @@ struct Footprint {
     scales: vec3f,
     // 1 where the log-scale is inside its range, so that a gradient flows.
     scale_flows: vec3f,
-    // Rows of R diag(exp s), world.
-    spread_0: vec3f,
-    spread_1: vec3f,
-    spread_2: vec3f,
     // Rows of R_v R diag(exp s).
     in_view_0: vec3f,
     in_view_1: vec3f,
@@ -23,15 +19,16 @@ struct Footprint {
     // x and y of the Jacobian, clamped, and where they are.
     clamped_xy: vec2f,
     ratio_clamped: vec2<bool>,
-    // Rows of T = J R_v R diag(exp s): C0 = T T^T.
+    // Rows of T = J R_v R diag(exp s), and their cross product.
     image_0: vec3f,
     image_1: vec3f,
-    // C0 00, 01, 11, and its determinant.
-    sharp: vec3f,
+    normal: vec3f,
+    // Determinant of C0 = T T^T.
     sharp_determinant: f32,
-    // After the low pass.
+    // After the low pass: C 00, 01, 11.
     blurred: vec3f,
-    conic: vec3f,
+    // L00, L01, L11 of C^-1 = L^T L.
+    factor: vec3f,
     // Antialiasing factor rho, and whether it sits on its floor (or is off).
     compensation: f32,
     compensation_floored: bool,
@@ -62,18 +59,18 @@ fn footprint_of(mean: vec3f, raw_log_scale: vec3f, quaternion: vec4f) -> Footpri
     let i = f.unit.y;
     let j = f.unit.z;
     let k = f.unit.w;
-    f.spread_0 =
+    let spread_0 =
         vec3f(1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j - w * k), 2.0 * (i * k + w * j)) * f.scales;
-    f.spread_1 =
+    let spread_1 =
         vec3f(2.0 * (i * j + w * k), 1.0 - 2.0 * (i * i + k * k), 2.0 * (j * k - w * i)) * f.scales;
-    f.spread_2 =
+    let spread_2 =
         vec3f(2.0 * (i * k - w * j), 2.0 * (j * k + w * i), 1.0 - 2.0 * (i * i + j * j)) * f.scales;
     let r0 = view.rotation[0].xyz;
     let r1 = view.rotation[1].xyz;
     let r2 = view.rotation[2].xyz;
-    f.in_view_0 = r0.x * f.spread_0 + r0.y * f.spread_1 + r0.z * f.spread_2;
-    f.in_view_1 = r1.x * f.spread_0 + r1.y * f.spread_1 + r1.z * f.spread_2;
-    f.in_view_2 = r2.x * f.spread_0 + r2.y * f.spread_1 + r2.z * f.spread_2;
+    f.in_view_0 = r0.x * spread_0 + r0.y * spread_1 + r0.z * spread_2;
+    f.in_view_1 = r1.x * spread_0 + r1.y * spread_1 + r1.z * spread_2;
+    f.in_view_2 = r2.x * spread_0 + r2.y * spread_1 + r2.z * spread_2;
     let ratio = p.xy / z;
     f.ratio_clamped = (ratio < view.ratio_low) | (ratio > view.ratio_high);
     f.clamped_xy = z * clamp(ratio, view.ratio_low, view.ratio_high);
@@ -92,16 +89,17 @@ fn footprint_of(mean: vec3f, raw_log_scale: vec3f, quaternion: vec4f) -> Footpri
         f.image_0 *= factor;
         f.image_1 *= factor;
     }
-    f.sharp = vec3f(dot(f.image_0, f.image_0), dot(f.image_0, f.image_1), dot(f.image_1, f.image_1));
+    let sharp = vec3f(dot(f.image_0, f.image_0), dot(f.image_0, f.image_1), dot(f.image_1, f.image_1));
     // |t0 x t1|^2: a sum of squares has nothing to cancel, however thin the Gaussian.
-    let area = cross(f.image_0, f.image_1);
-    f.sharp_determinant = dot(area, area);
-    f.blurred = f.sharp + vec3f(LOW_PASS, 0.0, LOW_PASS);
-    let determinant = f.sharp_determinant + LOW_PASS * (f.sharp.x + f.sharp.z) + LOW_PASS * LOW_PASS;
+    f.normal = cross(f.image_0, f.image_1);
+    f.sharp_determinant = dot(f.normal, f.normal);
+    f.blurred = sharp + vec3f(LOW_PASS, 0.0, LOW_PASS);
+    let determinant = f.sharp_determinant + LOW_PASS * (sharp.x + sharp.z) + LOW_PASS * LOW_PASS;
     if (!is_finite(determinant)) {
         return f;
     }
-    f.conic = vec3f(f.blurred.z, -f.blurred.y, f.blurred.x) / determinant;
+    let l00 = sqrt(f.blurred.z / determinant);
+    f.factor = vec3f(l00, -l00 * f.blurred.y / f.blurred.z, 1.0 / sqrt(f.blurred.z));
     f.compensation = 1.0;
     f.compensation_floored = true;
     if (view.antialiased != 0u) {

@@ -5,6 +5,17 @@ const PASS_SHIFT: u32 = 30u;
 const INDEX_MASK: u32 = 0x3fffffffu;
 const NO_SPLAT: u32 = 0xffffffffu;
 
+// u = L d: an offset in standard deviations. The factor L is upper triangular, 00, 01, 11, and L^T L the conic.
+fn whitened(factor: vec3f, d: vec2f) -> vec2f {
+    return vec2f(factor.x * d.x + factor.y * d.y, factor.z * d.y);
+}
+
+// Exponent of the footprint: a sum of squares, in which nothing cancels.
+fn sigma_at(factor: vec3f, d: vec2f) -> f32 {
+    let u = whitened(factor, d);
+    return 0.5 * dot(u, u);
+}
+
 // Smallest sigma over a rectangle of pixel centres.
 fn smallest_sigma(splat: Splat, first: vec2f, last: vec2f) -> f32 {
     let low = first - splat.mean;
@@ -13,19 +24,17 @@ fn smallest_sigma(splat: Splat, first: vec2f, last: vec2f) -> f32 {
     if (all(inside)) {
         return 0.0;
     }
-    let xx = splat.conic.x;
-    let xy = splat.conic.y;
-    let yy = splat.conic.z;
+    let factor = splat.factor.xyz;
     var smallest = 3.4e38;
     if (!inside.x) {
         let x = select(high.x, low.x, low.x > 0.0);
-        let y = clamp(-xy * x / yy, low.y, high.y);
-        smallest = min(smallest, 0.5 * (xx * x * x + yy * y * y) + xy * x * y);
+        let y = clamp(-factor.x * factor.y * x / dot(factor.yz, factor.yz), low.y, high.y);
+        smallest = min(smallest, sigma_at(factor, vec2f(x, y)));
     }
     if (!inside.y) {
         let y = select(high.y, low.y, low.y > 0.0);
-        let x = clamp(-xy * y / xx, low.x, high.x);
-        smallest = min(smallest, 0.5 * (xx * x * x + yy * y * y) + xy * x * y);
+        let x = clamp(-factor.y * y / factor.x, low.x, high.x);
+        smallest = min(smallest, sigma_at(factor, vec2f(x, y)));
     }
     return smallest;
 }
@@ -38,10 +47,9 @@ fn passes_in(splat: Splat, first: vec2f, last: vec2f) -> u32 {
     return select(0u, COLOR_PASS, sigma <= reach.x) | select(0u, INSTANCE_PASS, sigma <= reach.y);
 }
 
-// Footprint P at an offset from the mean; 0 where rounding makes sigma negative, which is then not drawn.
-fn peak_at(conic: vec3f, d: vec2f) -> f32 {
-    let sigma = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
-    return select(0.0, exp(-sigma), sigma >= 0.0);
+// Footprint P at an offset from the mean, at most 1.
+fn peak_at(factor: vec3f, d: vec2f) -> f32 {
+    return exp(-sigma_at(factor, d));
 }
 
 // First pixel of a quadrant of a tile: 0 and 1 above, 2 and 3 below.

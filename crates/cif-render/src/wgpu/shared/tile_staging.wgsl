@@ -10,8 +10,8 @@ struct Staged {
     depth: f32,
     // Of gradients alone.
     pair: u32,
-    // Conic and opacity.
-    conic: vec4f,
+    // Factor of the conic, and opacity.
+    factor: vec4f,
     // Colour and occupancy.
     color: vec4f,
     // First label slot, of gradients alone, and identity row.
@@ -54,7 +54,7 @@ fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32
             var item: Staged;
             item.mean = splat.mean;
             item.depth = splat.depth;
-            item.conic = splat.conic;
+            item.factor = splat.factor;
             item.color = splat.color;
             if (WITH_INSTANCES) {
                 item.row_first = row_offsets[row];
