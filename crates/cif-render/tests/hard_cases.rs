@@ -169,17 +169,27 @@ fn gpu_view(_: &SyntheticScene, _: &RenderSettings, _: &Cotangents) -> Option<(V
     None
 }
 
+/// What is measured of a view.
+#[derive(Clone, Copy, PartialEq, PartialOrd)]
+enum Scope {
+    /// The reference in single precision and the fast path.
+    Processor,
+    /// The GPU as well, where there is one.
+    Gpu,
+    /// The reference in double precision too, against central differences.
+    Differences,
+}
+
 /// Most Gaussians whose every parameter is moved for central differences.
 const FEW: usize = 8;
 
-/// Measures a view against the `f64` reference, with `others` also the GPU, and the reference itself against differences.
-/// Pixels at a threshold, where two may decide differently, take no part.
+/// Measures a view against the `f64` reference. Pixels at a threshold, where two may decide differently, take no part.
 fn errors(
     name: &str,
     field: &Field,
     settings: &RenderSettings,
     view: (&PinholeCamera, f64),
-    others: bool,
+    scope: Scope,
 ) -> Errors {
     let (camera, time) = view;
     let (width, height) = (camera.width, camera.height);
@@ -250,14 +260,14 @@ fn errors(
         });
         found.fast[1] = found.fast[1].max(backward);
     }
-    if others && field.deformation.is_none() {
+    if scope >= Scope::Gpu && field.deformation.is_none() {
         let (field, camera, labels) = (field.clone(), *camera, labels.clone());
         let scene = SyntheticScene { field, camera, labels, time };
         found.gpu = gpu_view(&scene, settings, &cotangents).map(|(color, at)| {
             [of_color(&color), of_gradients(&all, 0.0, &mut |group, index| at(group, index))]
         });
     }
-    if others && field.len() <= FEW {
+    if scope == Scope::Differences && field.len() <= FEW {
         let mut moved = scene.clone();
         let of_gaussians = all.into_iter().filter(|group| !matches!(group, Group::Planes | Group::Mlp));
         let of_gaussians: Vec<Group> = of_gaussians.collect();
@@ -286,7 +296,7 @@ fn agrees_there(row: u32, what: &str, scene: &SyntheticScene, settings: &RenderS
 }
 
 fn agrees_from(row: u32, what: &str, field: &Field, settings: &RenderSettings, view: (&PinholeCamera, f64)) {
-    let found = errors(what, field, settings, view, true);
+    let found = errors(what, field, settings, view, Scope::Differences);
     if let Some(differences) = found.differences {
         worst(row, Path::F64, Way::Backward, what, differences, 1e-5);
     }
@@ -477,9 +487,13 @@ fn row_14_huge_scales_are_clamped() {
         assert_eq!(gradients.parameters.gaussians[0].log_scale[..2], [0.0, 0.0]);
     }
     field.gaussians.log_scales[0] = [60.0, -60.0, 3.0];
-    let found = errors("a scale of e^60", &field, &settings(), (&plain_camera(16, 16, 20.0), 0.5), false);
+    let found =
+        errors("a scale of e^60", &field, &settings(), (&plain_camera(16, 16, 20.0), 0.5), Scope::Gpu);
     worst(14, Path::F32, Way::Forward, "a scale of e^60", found.single[0], 1e-5);
     worst(14, Path::Fast, Way::Forward, "a scale of e^60", found.fast[0], 1e-5);
+    if let Some([forward, _]) = found.gpu {
+        worst(14, Path::Gpu, Way::Forward, "a scale of e^60", forward, 1e-5);
+    }
     field.gaussians.log_scales[0] = [f32::INFINITY, 0.0, 0.0];
     assert!(finite("infinite", &field, &settings()).0.splats[0].is_none());
 }
@@ -657,7 +671,7 @@ fn row_22_lookup_at_the_last_node() {
     // On the box itself its slope ends, which precisions decide differently.
     scene.field.gaussians.means[0] = (bounds.high + 0.5).as_vec3().to_array();
     let what = "at the last node";
-    both_agree(22, what, &errors(what, &scene.field, &settings(), (&scene.camera, scene.time), false));
+    both_agree(22, what, &errors(what, &scene.field, &settings(), (&scene.camera, scene.time), Scope::Gpu));
 }
 
 #[test]
@@ -850,7 +864,7 @@ fn row_33_coincident_splats_blend_in_index_order_everywhere() {
     // Moving one changes the order: there are no differences to compare with.
     let camera = plain_camera(16, 16, 20.0);
     let what = "four coincident splats";
-    both_agree(33, what, &errors(what, &field, &settings(), (&camera, 0.5), false));
+    both_agree(33, what, &errors(what, &field, &settings(), (&camera, 0.5), Scope::Gpu));
     // The other order is another image, or this could not fail.
     let reversed = field.gather(&[3, 2, 1, 0]);
     let (other, _) = run::<f64>(&reversed, &settings());
@@ -1030,7 +1044,7 @@ proptest! {
         assert_finite("f32", &run::<f32>(&field, &settings));
         assert_finite("f64", &run::<f64>(&field, &settings));
         let camera = plain_camera(size.0, size.1, 20.0);
-        let found = errors("fuzz", &field, &settings, (&camera, 0.5), false);
+        let found = errors("fuzz", &field, &settings, (&camera, 0.5), Scope::Processor);
         prop_assert!(found.fast[0] < 2e-4, "colours differ by {}", found.fast[0]);
     }
 }

@@ -74,12 +74,18 @@ impl TileLabels {
         (0..LANES).filter(move |lane| labelled >> lane & 1 == 1)
     }
 
-    /// The value of each pixel's own label slot.
+    /// The value of each pixel's own label slot, and whether any is above 0.
     #[inline(always)]
-    pub(super) fn gather<S: Simd>(&self, simd: S, group: usize, values: &[f32]) -> f32x16<S> {
+    pub(super) fn gather<S: Simd>(&self, simd: S, group: usize, values: &[f32]) -> (f32x16<S>, bool) {
         match self.uniform[group] {
-            Some(slot) => splat(simd, values[slot as usize]),
-            None => f32x16::load_array(simd, self.slots[group].map(|slot| values[slot as usize])),
+            Some(slot) => {
+                let value = values[slot as usize];
+                (splat(simd, value), value > 0.0)
+            }
+            None => {
+                let found = f32x16::load_array(simd, self.slots[group].map(|slot| values[slot as usize]));
+                (found, found.simd_gt(splat(simd, 0.0)).to_bitmask() != 0)
+            }
         }
     }
 }

@@ -103,10 +103,10 @@ impl<S: Simd> Painted<'_, S> {
     ) -> bool {
         let transmittance = &mut image.instance_transmittance[group];
         let blended = self.blending.step(simd, self.occupancy * at.peak, transmittance);
-        let identity = labels.gather(simd, group, self.probabilities);
+        let (identity, supports) = labels.gather(simd, group, self.probabilities);
         let total = &mut image.label_probability[group];
         blended.weight.mul_add(identity, load(simd, total)).store_array(total);
-        if identity.simd_gt(splat(simd, 0.0)).to_bitmask() != 0 {
+        if supports {
             image.supported[group] = pair as u32 + 1;
         }
         blended.finished

@@ -171,7 +171,7 @@ impl<S: Simd> Seen<S> {
         let labels = instances.labels;
         let unclamped = self.occupancy * at.peak;
         let blended = self.blending.step(simd, unclamped, &mut replay.transmittance[group]);
-        let identity = labels.gather(simd, group, &replay.probabilities);
+        let (identity, _) = labels.gather(simd, group, &replay.probabilities);
         let r = blended.weight * (identity * load(simd, &instances.inverse_probability[group]));
         // 1 - c_i, clamped against rounding at the tail.
         let remainder = (load(simd, &replay.remainder[group]) - r).max(self.zero);
