@@ -159,7 +159,7 @@ fn gpu_view(
     v: &Cotangents,
 ) -> Option<(Vec<[f64; 3]>, GradientAt)> {
     let mut device = on_gpu::device()?;
-    let seen = on_gpu::run(&mut device, scene, settings, v, |_| {}).unwrap();
+    let seen = on_gpu::run(&mut device, scene, settings, v, |_| {}).expect("the view fits");
     let color = seen.colors.iter().map(|color| [0, 1, 2].map(|channel| f64::from(color[channel]))).collect();
     Some((color, Box::new(move |group, index| on_gpu::gradient(&seen, group, index))))
 }
@@ -746,7 +746,7 @@ fn row_12_flat_and_long_footprints_agree() {
     field.gaussians.log_scales[0] = [1.5, -9.0, -9.0];
     agrees(12, "a footprint 150 px long", &field, &settings());
     // Along an axis of the image, and a little off.
-    for turn in [0.0, 0.004, 0.7071] {
+    for turn in [0.0, 0.004, 0.6] {
         field.gaussians.quaternions[0] = [1.0, 0.0, 0.0, turn];
         agrees(12, &format!("a footprint 150 px long, turned by {turn}"), &field, &settings());
     }
@@ -904,7 +904,8 @@ fn row_43_fog_does_not_change_whose_a_gaussian_is() {
 /// A splat of a given shape and place.
 fn splat_of<R: Real>(factor: [R; 3], mean2d: [R; 2]) -> Splat2d<R> {
     let gaussian = &Scene::<R>::from_field(&one()).parameters.gaussians[0];
-    let splat = project(gaussian, &View::from_camera(&plain_camera(16, 16, 20.0)), &settings()).unwrap();
+    let view = View::from_camera(&plain_camera(16, 16, 20.0));
+    let splat = project(gaussian, &view, &settings()).expect("it is drawn");
     Splat2d { factor, mean2d, ..splat }
 }
 
