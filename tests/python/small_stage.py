@@ -47,7 +47,13 @@ def write_stage(path: Path, up_axis: str = "Z", meters_per_unit: float = 1.0) ->
     """
     codes = range(FRAMES)
     body = [
-        _object("red_mug_001", ["mug", "red mug"], 1, _pose((0.5, 0.0, 0.1), turned(0.3)), _splats(1)),
+        _object(
+            "red_mug_001",
+            ["mug", "red mug"],
+            1,
+            _pose((0.5, 0.0, 0.1), turned(0.3)),
+            _splats(1) + _proxy("/World/red_mug_001", 1),
+        ),
         _object(
             "toy_car_002",
             ["car", "toy car"],
@@ -182,6 +188,24 @@ float3[] radiance:sphericalHarmonicsCoefficients = {_array(harmonics.reshape(-1,
     elementSize = 4
     interpolation = "vertex"
 )
+}}
+"""
+
+
+def _proxy(parent: str, seed: int) -> str:
+    """Points at the centres of splats, to be drawn in their stead, in the form that `cif export` gives them."""
+    return f"""def PointInstancer "Proxy" {{
+uniform token purpose = "proxy"
+point3f[] positions = [(0, 0, 0)]
+int[] protoIndices = [0]
+rel prototypes = <{parent}/Proxy/Prototypes/Points>
+over "Prototypes" {{
+def Points "Points" {{
+point3f[] points = {_array(positions(seed))}
+float[] widths = {_array(np.full(COUNT, 0.04))} (interpolation = "vertex")
+color3f[] primvars:displayColor = {_array(np.full((COUNT, 3), (0.8, 0.2, 0.2)))} (interpolation = "vertex")
+}}
+}}
 }}
 """
 

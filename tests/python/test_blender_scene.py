@@ -1,6 +1,6 @@
 """The half of the Blender extension that needs Blender: objects from a stage, and edits from objects.
 
-Runs in an environment with the `bpy` wheel (`pip install bpy==5.0.1`; 4.5.15 passes too).
+Runs in environments with the `bpy` wheel, each Blender with its own Python: see tests/README.md.
 """
 
 from __future__ import annotations
@@ -8,12 +8,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from small_stage import COUNT, FRAMES, positions, turned, write_stage
 
-bpy = pytest.importorskip("bpy", reason="Blender is not installed here: pip install bpy==5.0.1")
+bpy = pytest.importorskip("bpy", reason="Blender is not installed here: see tests/README.md")
 bpy.utils.expose_bundled_modules()
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "plugin" / "blender"))
 
@@ -314,6 +315,27 @@ def test_a_tint_shows(objects: dict) -> None:
     np.testing.assert_allclose(drawn(mug, material.COLOR, 3), before * [0.5, 1.0, 0.25], atol=1e-6)
 
 
+def test_panel_shows_the_tint(objects: dict) -> None:
+    from cif_scene.blender import nodes
+
+    nodes.set_input(objects["red_mug_001"].modifiers["Splats"], nodes.TINT, (0.5, 1.0, 0.25, 1.0))
+    # A layout that keeps what it is to show: a struct and a path in it.
+    shown: list[tuple[bpy.types.bpy_struct, str]] = []
+    ignored = lambda *_, **__: SimpleNamespace()  # noqa: E731
+    layout = SimpleNamespace(prop=lambda owner, path, text: shown.append((owner, path)), operator=ignored)
+    layout.row, layout.box, layout.label = lambda **_: layout, lambda: layout, ignored
+    panel = SimpleNamespace(layout=layout, _button=ignored, _buttons=ignored)
+    interface.CifPanel.draw(panel, bpy.context)
+    tints = {owner.id_data.name: owner.path_resolve(path) for owner, path in shown if "name" not in path}
+    assert {name: tuple(tint) for name, tint in tints.items()} == {
+        "red_mug_001": (0.5, 1.0, 0.25, 1.0),
+        "toy_car_002": (1.0, 1.0, 1.0, 1.0),
+        "green_napkin_007": (1.0, 1.0, 1.0, 1.0),
+        "ball_008": (1.0, 1.0, 1.0, 1.0),
+        "background": (1.0, 1.0, 1.0, 1.0),
+    }
+
+
 def test_edits_survive_saving(objects: dict, path: Path, tmp_path: Path) -> None:
     objects["toy_car_002"].rotation_quaternion = turned(0.5)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
@@ -329,6 +351,24 @@ def test_moving_the_whole_import_is_no_edit(objects: dict, path: Path) -> None:
     objects["small"].location = (3, 2, 1)
     objects["small"].rotation_quaternion = turned(0.7)
     assert exporter.collect_edits(path) == []
+
+
+def test_blender_itself_imports_stand_ins(path: Path) -> None:
+    bpy.ops.wm.usd_import(filepath=str(path), import_proxy=True)
+    shown = [
+        (each.object.original, each.matrix_world.translation.copy())
+        for each in at_frame(0).object_instances
+        if each.is_instance and each.parent.name == "Proxy"
+    ]
+    assert [(cloud.type, cloud.name) for cloud, _ in shown] == [("POINTCLOUD", "Points")]
+    cloud, place = shown[0]
+    np.testing.assert_allclose(place, [0.5, 0, 0.1], atol=1e-6)
+    points = cloud.data.attributes
+    found = np.empty(3 * COUNT, np.float32)
+    points["position"].data.foreach_get("vector", found)
+    np.testing.assert_allclose(found.reshape(-1, 3), positions(1), atol=1e-6)
+    assert {point.value for point in points["radius"].data} == {np.float32(0.02)}
+    np.testing.assert_allclose(points["displayColor"].data[0].color[:3], [0.8, 0.2, 0.2], atol=1e-6)
 
 
 def test_scene_without_import_is_refused(path: Path) -> None:

@@ -261,6 +261,21 @@ def test_semantics_follow_a_new_name(path: Path) -> None:
     assert prim.GetAttribute("userProperties:label").Get() == "blue mug"
 
 
+def test_colours_go_over_splats_that_have_no_display_colours(path: Path) -> None:
+    from pxr import Usd
+
+    splats = "/World/red_mug_001/Splats"
+    green = edits.Colors(np.array([2]), np.array([[0.0, 1.0, 0.25]], np.float32))
+    out = edits.write_edits(
+        path, path.with_name("e.usda"), [Edit("/World/red_mug_001", colors={splats: green})]
+    )
+    stage = Usd.Stage.Open(str(out))
+    shown = np.array(stage.GetPrimAtPath(splats).GetAttribute("primvars:displayColor").Get())
+    np.testing.assert_allclose(shown[2], [0, 1, 0.25])
+    red = np.clip(0.5 + color.BAND_0 * np.array(RED_BAND_0), 0, None)
+    np.testing.assert_allclose(np.delete(shown, 2, 0), [red] * (COUNT - 1), atol=1e-6)
+
+
 def test_a_still_pose_hides_the_recorded_track(path: Path, small: scene.Scene) -> None:
     car = by_name(small)["toy_car_002"]
     still = tracks.Track(np.zeros(1), np.array([[1.0, 2, 3]]), np.array([[1.0, 0, 0, 0]]), np.ones((1, 3)))

@@ -225,7 +225,7 @@ class CifPanel(bpy.types.Panel):
                 if modifier is not None and modifier.node_group is not None:
                     tint = row.row()
                     tint.scale_x = 0.3
-                    tint.prop(modifier, f'["{nodes.input_of(modifier, nodes.TINT)}"]', text="")
+                    tint.prop(*nodes.input_of(modifier, nodes.TINT), text="")
                 self._buttons(row, is_hidden(obj), target=obj.name)
         layout.operator(ExportCifEdits.bl_idname, icon="EXPORT")
 

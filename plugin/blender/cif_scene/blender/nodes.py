@@ -93,13 +93,23 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
 
 def set_input(modifier: bpy.types.NodesModifier, name: str, value: float | bool | tuple[float, ...]) -> str:
     """Set an input of the modifier by name; its data path in the object, to be animated."""
-    identifier = input_of(modifier, name)
-    modifier[identifier] = value
-    return f'modifiers["{modifier.name}"]["{identifier}"]'
+    owner, path = input_of(modifier, name)
+    if owner != modifier:
+        owner.value = value
+        return owner.path_from_id(path)
+    modifier[_identifier(modifier, name)] = value
+    return modifier.path_from_id() + path
 
 
-def input_of(modifier: bpy.types.NodesModifier, name: str) -> str:
-    """Key of an input in the modifier."""
+def input_of(modifier: bpy.types.NodesModifier, name: str) -> tuple[bpy.types.bpy_struct, str]:
+    """Owner of an input's value and the path of the value there, as `UILayout.prop` takes them."""
+    identifier = _identifier(modifier, name)
+    if hasattr(modifier, "properties"):  # since Blender 5.2; custom properties of the modifier before
+        return getattr(modifier.properties.inputs, identifier), "value"
+    return modifier, f'["{identifier}"]'
+
+
+def _identifier(modifier: bpy.types.NodesModifier, name: str) -> str:
     items = modifier.node_group.interface.items_tree
     return next(item.identifier for item in items if item.name == name and item.in_out == "INPUT")
 

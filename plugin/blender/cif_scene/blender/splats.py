@@ -82,8 +82,8 @@ def tint(obj: bpy.types.Object) -> np.ndarray:
     modifier = obj.modifiers.get(MODIFIER)
     if modifier is None or modifier.node_group is None or modifier.node_group.name != nodes.NAME:
         return np.ones(3)
-    value = modifier.get(nodes.input_of(modifier, nodes.TINT))
-    return np.ones(3) if value is None else np.array(value[:3], np.float64)
+    owner, path = nodes.input_of(modifier, nodes.TINT)
+    return np.array(owner.path_resolve(path)[:3], np.float64)
 
 
 def store(mesh: bpy.types.Mesh, name: str, kind: str, values: np.ndarray) -> None:

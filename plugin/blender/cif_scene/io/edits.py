@@ -218,7 +218,8 @@ def _rename(spec: Sdf.PrimSpec, prim: Usd.Prim, edit: Edit) -> None:
 def _recolor(spec: Sdf.PrimSpec, splats: Usd.Prim, colors: Colors) -> None:
     """Display colours: cif takes those that differ from what it wrote as the colour of the splats."""
     primvar = UsdGeom.Primvar(splats.GetAttribute(DISPLAY_COLOR))
-    values = np.array(primvar.ComputeFlattened() if primvar else [], np.float32).reshape(-1, 3)
+    flattened = primvar.ComputeFlattened() if primvar else None
+    values = np.array([] if flattened is None else flattened, np.float32).reshape(-1, 3)
     count = len(splats.GetAttribute("positions").Get() or [])
     if len(values) != count:  # by others, who need not write it
         first = np.array(splats.GetAttribute(COEFFICIENTS).Get(), np.float32).reshape(count, -1, 3)[:, 0]
