@@ -14,6 +14,11 @@ PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
 
 .PHONY: help build demo plugin test test-rust test-python fuzz lint format clean
+# Tools that read what we write, each in an environment of its own: their versions of USD or Python differ from ours.
+MUJOCO := mujoco[usd]==4.0.0
+BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13
+
+.PHONY: help build demo plugin test test-rust test-python test-usd test-mujoco test-blender lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -21,6 +26,7 @@ help:
 	@echo "make plugin  the Blender extension, into out/"
 	@echo "make test    all tests, Rust and Python"
 	@echo "make fuzz    damaged files for every reader, MINUTES=60 long; READER= picks one"
+	@echo "make test-mujoco, make test-blender   tests with these tools, which are downloaded (75 MB, 1.1 GB)"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make format  put the formatting right"
 
@@ -82,6 +88,21 @@ READER ?=
 fuzz:
 	CIF_FUZZ_MINUTES=$(MINUTES) CIF_FUZZ_READER=$(READER) \
 	cargo test --locked --test fuzz_readers readers -- --nocapture
+test-mujoco: build
+	test -x $(VENV)/mujoco/bin/python || $(PYTHON) -m venv $(VENV)/mujoco
+	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check "$(MUJOCO)"
+	CIF_TEST_MUJOCO=$(VENV)/mujoco/bin/python $(BIN)/python -m pytest tests/python/test_mujoco.py
+
+# Versions of Blender whose Python is not there are skipped.
+test-blender:
+	@set -e; for each in $(BLENDERS); do \
+		wheel=$${each%/*}; python=$${each#*/}; folder=$(VENV)/$${wheel%%=*}-$${wheel##*=}; \
+		if ! $$python -c pass 2>/dev/null; then echo "$$wheel: skipped, because $$python is not installed"; continue; fi; \
+		echo "$$wheel"; \
+		test -x $$folder/bin/python || $$python -m venv $$folder; \
+		$$folder/bin/python -m pip install --quiet --disable-pip-version-check $$wheel $(PYTEST); \
+		$$folder/bin/python -m pytest --noconftest tests/python/test_blender_scene.py; \
+	done
 
 lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo fmt --all --check

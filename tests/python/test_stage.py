@@ -146,9 +146,16 @@ def test_extents_hold_every_ellipsoid(stage: Usd.Stage) -> None:
 
 
 def test_proxies_follow(stage: Usd.Stage) -> None:
-    proxy = UsdGeom.Points(stage.GetPrimAtPath("/World/green_napkin_007/Proxy"))
-    assert proxy.GetPurposeAttr().Get() == "proxy"
+    instancer = UsdGeom.PointInstancer(stage.GetPrimAtPath("/World/green_napkin_007/Proxy"))
+    assert instancer.GetPurposeAttr().Get() == "proxy"
+    assert np.abs(np.array(instancer.ComputeInstanceTransformsAtTime(0, 0)) - np.eye(4)).max() == 0
+    (target,) = instancer.GetPrototypesRel().GetTargets()
+    proxy = UsdGeom.Points(stage.GetPrimAtPath(target))
+    # No traversal for shapes finds them: simulators would make bodies of them.
+    assert not proxy.GetPrim().IsDefined()
+    assert not [prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Points)]
     for code in range(FRAMES):
+        assert instancer.GetExtentAttr().Get(code) == instancer.ComputeExtentAtTime(code, code)
         splats = np.array(splats_of(stage, "green_napkin_007").GetAttribute("positions").Get(code))
         points = np.array(proxy.GetPointsAttr().Get(code))
         assert np.abs(points - splats).max() == 0, "all of 80 splats are taken, in order"

@@ -135,6 +135,12 @@ impl<'l, 'p, 'py> Prim<'l, 'p, 'py> {
         Ok(())
     }
 
+    /// A new relationship to a prim of the layer.
+    pub(crate) fn relate(&self, name: &str, target: &str) -> PyResult<()> {
+        let spec = self.layer.pxr.sdf.getattr("RelationshipSpec")?.call1((&self.spec, name, false))?;
+        spec.getattr("targetPathList")?.setattr("explicitItems", [target])
+    }
+
     /// A new attribute of a type of `Sdf.ValueTypeNames`, with its default value.
     pub(crate) fn set(
         &self,

@@ -48,6 +48,8 @@ pub const PHYSICS_SCENE: &str = "/World/PhysicsScene";
 pub const SPLATS: &str = "Splats";
 /// Point proxy of a node or part.
 pub const PROXY: &str = "Proxy";
+/// The points below their proxy.
+pub const PROXY_POINTS: &str = "Prototypes/Points";
 /// Convex hull of a node or part; further ones are numbered.
 pub const COLLIDER: &str = "Collider";
 /// Ending of the folder of payloads: `out.usda` has `out.payloads`, `out.usdc` has `out.usdc.payloads`.

@@ -1,4 +1,8 @@
 //! Point proxies: stand-ins that every viewer can draw.
+//!
+//! A simulator that makes a shape of every geometric primitive, as MuJoCo does whatever its purpose, refuses a stage with
+//! bare `Points`. So the points are the prototype of a `PointInstancer` that draws them once, in the form that its
+//! documentation gives: traversals skip prototypes below an `over`, while viewers find them by relationship.
 
 use cif_scene::{Motion, Node};
 use pyo3::prelude::*;
@@ -36,17 +40,25 @@ fn points(
     let pick = |means: &[[f32; 3]]| -> Vec<[f32; 3]> {
         indices.iter().map(|&index| means[index as usize]).collect()
     };
-    let prim = layer.define(&child(place, tokens::PROXY), "Points")?;
-    prim.set("purpose", "Token", UNIFORM, tokens::PURPOSE_PROXY)?;
+    let instancer = layer.define(&child(place, tokens::PROXY), "PointInstancer")?;
+    instancer.set("purpose", "Token", UNIFORM, tokens::PURPOSE_PROXY)?;
+    instancer.set("positions", "Point3fArray", VARYING, pxr.vec3f_array(&[[0.0; 3]])?)?;
+    instancer.set("protoIndices", "IntArray", VARYING, pxr.int_array(&[0])?)?;
+    let prim = layer.define(&child(instancer.path(), tokens::PROXY_POINTS), "Points")?;
+    instancer.relate("prototypes", prim.path())?;
     let at_rest = pick(&node.splats.means);
-    let extents = pxr.vec3f_array(&points_box(&at_rest, widths))?;
-    let extents = prim.set("extent", "Float3Array", VARYING, extents)?;
     let attribute = prim.set("points", "Point3fArray", VARYING, pxr.vec3f_array(&at_rest)?)?;
+    let at_rest = pxr.vec3f_array(&points_box(&at_rest, widths))?;
+    let extents = [
+        instancer.set("extent", "Float3Array", VARYING, &at_rest)?,
+        prim.set("extent", "Float3Array", VARYING, &at_rest)?,
+    ];
     if let Motion::Dense(dense) = &node.motion {
         for sample in &dense.samples {
             let points = pick(&sample.means);
             attribute.sample(sample.time_code, pxr.vec3f_array(&points)?)?;
-            extents.sample(sample.time_code, pxr.vec3f_array(&points_box(&points, widths))?)?;
+            let corners = pxr.vec3f_array(&points_box(&points, widths))?;
+            extents.iter().try_for_each(|extent| extent.sample(sample.time_code, &corners))?;
         }
     }
     let widths = prim.set("widths", "FloatArray", VARYING, pxr.float_array(widths)?)?;

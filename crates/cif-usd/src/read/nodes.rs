@@ -367,6 +367,9 @@ fn proxy<'py>(
     }
     let mut all: Option<PointProxy> = None;
     for (prim, _, _) in children(owner, motion, tokens::PROXY).map_err(python)? {
+        // Below the instancer; earlier stages have the points in its place.
+        let inside = prim.call_method1("GetPrimAtPath", (tokens::PROXY_POINTS,)).map_err(python)?;
+        let prim = if inside.is_truthy().map_err(python)? { inside } else { prim };
         let prim = SplatPrim { path: super::values::path(&prim).map_err(python)?, prim };
         let Some((indices, widths, colors)) = prim.proxy(reading)? else { continue };
         let consistent = indices.len() == widths.len()

@@ -56,6 +56,23 @@ fn an_empty_layer_changes_nothing() {
 }
 
 #[test]
+fn stand_ins_of_earlier_stages_are_read() {
+    let _session = session();
+    // Points without an instancer around them.
+    let (before, after) = edited(
+        "
+for proxy in [prim for prim in stage.Traverse() if prim.GetTypeName() == 'PointInstancer']:
+    for attribute in proxy.GetPrimAtPath('Prototypes/Points').GetAuthoredAttributes():
+        attribute.FlattenTo(proxy)
+    stage.OverridePrim(proxy.GetPath().AppendChild('Prototypes')).SetActive(False)
+    proxy.SetTypeName('Points')
+",
+    );
+    assert!(before.nodes.iter().any(|node| node.proxy.is_some()));
+    assert_eq!(after.nodes, before.nodes);
+}
+
+#[test]
 fn edits_of_a_far_scene_are_seen_from_its_own_frame() {
     let _session = session();
     let frame = CaptureFrame { offset: [3.1e6, -2.7e5, 41.25], scale: 0.01 };
