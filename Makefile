@@ -13,12 +13,11 @@ MATURIN := maturin==1.16.0
 PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
 
-.PHONY: help build demo plugin test test-rust test-python fuzz lint format clean
 # Tools that read what we write, each in an environment of its own: their versions of USD or Python differ from ours.
 MUJOCO := mujoco[usd]==4.0.0
 BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13
 
-.PHONY: help build demo plugin test test-rust test-python test-usd test-mujoco test-blender lint format clean
+.PHONY: help build demo plugin test test-rust test-python test-usd test-mujoco test-blender fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -88,6 +87,7 @@ READER ?=
 fuzz:
 	CIF_FUZZ_MINUTES=$(MINUTES) CIF_FUZZ_READER=$(READER) \
 	cargo test --locked --test fuzz_readers readers -- --nocapture
+
 test-mujoco: build
 	test -x $(VENV)/mujoco/bin/python || $(PYTHON) -m venv $(VENV)/mujoco
 	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check "$(MUJOCO)"

@@ -97,10 +97,10 @@ impl Field {
         }
     }
 
-    /// Most probable instance of every Gaussian, `[N]`, as index into [`Field::instances`]; `None` without
-    /// identities.
+    /// Most probable instance of every Gaussian, `[N]`, as index into [`Field::instances`], `None` for one of no
+    /// instance; `None` without identities.
     #[must_use]
-    pub fn instance_of_gaussians(&self) -> Option<Vec<u16>> {
+    pub fn instance_of_gaussians(&self) -> Option<Vec<Option<u16>>> {
         self.identities.as_ref().map(Identities::argmax)
     }
 
@@ -110,7 +110,7 @@ impl Field {
     pub fn members(&self, instance: usize) -> Vec<u32> {
         let of_gaussians = self.instance_of_gaussians().unwrap_or_default();
         let rows = of_gaussians.iter().enumerate();
-        rows.filter(|(_, of)| usize::from(**of) == instance).map(|(row, _)| row as u32).collect()
+        rows.filter(|(_, of)| of.is_some_and(|of| usize::from(of) == instance)).map(|(row, _)| row as u32).collect()
     }
 
     /// Instances (indices into [`Field::instances`], ascending) whose label is `label`: those that match

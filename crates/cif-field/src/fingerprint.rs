@@ -53,6 +53,14 @@ impl Field {
                     hash.array(&dense.quaternions);
                     hash.array(dense.log_scales.as_deref().unwrap_or_default());
                 }
+                if let Some(opacities) = &group.opacities {
+                    hash.array(&opacities.times);
+                    hash.array(&opacities.values);
+                }
+                if let Some(colors) = &group.colors {
+                    hash.array(&colors.times);
+                    hash.array(colors.values.as_flattened());
+                }
             }
         }
         if let Some(identities) = &self.identities {
@@ -60,6 +68,9 @@ impl Field {
             hash.array(&identities.labels);
             hash.array(&identities.log_estimates);
             hash.array(&identities.log_calibrations);
+            if !identities.owners.is_empty() {
+                hash.array(&identities.owners.iter().map(|owner| owner.code()).collect::<Vec<i32>>());
+            }
         }
         for instance in &self.instances {
             hash.array(&[instance.id]);
@@ -101,7 +112,7 @@ mod tests {
     #[test]
     fn every_part_that_a_scene_is_made_from_counts() {
         type Change = fn(&mut Field);
-        let changes: [Change; 11] = [
+        let changes: [Change; 14] = [
             |field| field.gaussians.means[3][1] = field.gaussians.means[3][1].next_up(),
             |field| field.gaussians.sh_coefficients[0][47] += 0.25,
             |field| field.gaussians.means.swap(0, 1),
@@ -110,7 +121,10 @@ mod tests {
             |field| field.tracks = None,
             |field| field.tracks.as_mut().unwrap().groups[0].poses[0].translation.x += 1e-9,
             |field| field.tracks.as_mut().unwrap().groups[1].visibility[0].visible ^= true,
+            |field| field.tracks.as_mut().unwrap().groups[0].opacities.as_mut().unwrap().values[0] = 0.25,
+            |field| field.tracks.as_mut().unwrap().groups[2].colors.as_mut().unwrap().values[0][5] += 0.25,
             |field| field.identities.as_mut().unwrap().log_calibrations[0] += 0.5,
+            |field| field.identities.as_mut().unwrap().owners = vec![crate::Owner::Background; 30],
             |field| field.instances[1].label.push('s'),
             |field| field.timeline.times[1] += 1e-9,
         ];

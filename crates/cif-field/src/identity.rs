@@ -1,18 +1,45 @@
 //! Sparse identity distributions: `p_i^k = softmax_k(log phat_i^k + mu_i^k)` over the support of row i.
 //! Source: methods reference 5.2 and 5.3.
 
-/// Estimate of a row whose owner is told, not estimated: `ln 2`. Estimates are shares of an image, so a measured
-/// one is never above 0.
-pub const TOLD: f32 = std::f32::consts::LN_2;
+/// The object that a Gaussian is part of, where something else than its identity row decides.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Owner {
+    /// Decided by the identity row: the Gaussian was trained.
+    #[default]
+    Estimated,
+    /// Part of an instance (dense index), as in the file that it was imported from.
+    Instance(u16),
+    /// Part of no instance, as in the file that it was imported from.
+    Background,
+}
 
-/// Estimate of a row that is told to belong to no instance: its labelled share is 0. Measured estimates are
-/// shares above 1e-8.
-pub const TOLD_BACKGROUND: f32 = -104.0;
+impl Owner {
+    /// The number that stands for it in files: the dense index of an instance, -1 for none of them, -2 where the
+    /// identity row decides.
+    #[must_use]
+    pub fn code(self) -> i32 {
+        match self {
+            Self::Estimated => -2,
+            Self::Background => -1,
+            Self::Instance(index) => i32::from(index),
+        }
+    }
+
+    /// Inverse of [`Self::code`]; `None` for other numbers.
+    #[must_use]
+    pub fn from_code(code: i32) -> Option<Self> {
+        match code {
+            -2 => Some(Self::Estimated),
+            -1 => Some(Self::Background),
+            _ => u16::try_from(code).ok().map(Self::Instance),
+        }
+    }
+}
 
 /// Identity rows of N Gaussians in compressed sparse row form.
 ///
-/// Labels are dense indices into [`crate::Field::instances`] (not mask ids), ascending in a row. A row is
-/// never empty once estimated.
+/// Labels are dense indices into [`crate::Field::instances`] (not mask ids), ascending in a row. A row without
+/// entries adds to no label: pixels that only such Gaussians cover stay unlabelled. Estimated rows have entries.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Identities {
     /// `[N + 1]`: row i is `row_offsets[i]..row_offsets[i + 1]`.
@@ -23,6 +50,8 @@ pub struct Identities {
     pub log_estimates: Vec<f32>,
     /// Learnable log-calibration mu per entry.
     pub log_calibrations: Vec<f32>,
+    /// Owner of every row, `[N]`; empty where all rows are [`Owner::Estimated`].
+    pub owners: Vec<Owner>,
 }
 
 impl Identities {
@@ -73,20 +102,16 @@ impl Identities {
         }
     }
 
-    /// Most probable label of every row; the lowest one where several are. Rows must not be empty.
+    /// Most probable label of every row, the lowest one where several are; `None` for a row without entries.
     #[must_use]
-    pub fn argmax(&self) -> Vec<u16> {
+    pub fn argmax(&self) -> Vec<Option<u16>> {
         (0..self.len())
             .map(|row| {
                 let logit = |entry: usize| self.log_estimates[entry] + self.log_calibrations[entry];
-                let range = self.range(row);
-                let mut best = range.start;
-                for entry in range {
-                    if logit(entry) > logit(best) {
-                        best = entry;
-                    }
-                }
-                self.labels[best]
+                let best = self
+                    .range(row)
+                    .reduce(|best, entry| if logit(entry) > logit(best) { entry } else { best });
+                best.map(|entry| self.labels[entry])
             })
             .collect()
     }
@@ -123,42 +148,63 @@ impl Identities {
             labels: Vec::new(),
             log_estimates: Vec::new(),
             log_calibrations: Vec::new(),
+            owners: Vec::new(),
         }
     }
 
-    /// Adds a row at the end whose owner is told: an instance, or none of them.
-    pub fn push_told(&mut self, owner: Option<u16>) {
-        self.labels.push(owner.unwrap_or(0));
-        self.log_estimates.push(if owner.is_some() { TOLD } else { TOLD_BACKGROUND });
-        self.log_calibrations.push(0.0);
+    /// Adds a row at the end. `shares` are labels, ascending, with the share of the Gaussian's image that each has,
+    /// above 0: their sum is the labelled share.
+    pub fn push(&mut self, owner: Owner, shares: &[(u16, f32)]) {
+        self.push_entries(owner, shares.iter().map(|(label, share)| (*label, share.ln(), 0.0)));
+    }
+
+    /// Adds a row at the end from its entries: label, estimate and calibration, labels ascending.
+    pub fn push_entries(&mut self, owner: Owner, entries: impl IntoIterator<Item = (u16, f32, f32)>) {
+        if owner != Owner::Estimated || !self.owners.is_empty() {
+            self.owners.resize(self.len(), Owner::Estimated);
+            self.owners.push(owner);
+        }
+        for (label, estimate, calibration) in entries {
+            self.labels.push(label);
+            self.log_estimates.push(estimate);
+            self.log_calibrations.push(calibration);
+        }
         self.row_offsets.push(self.labels.len() as u32);
     }
 
-    /// Owner of a row that was told ([`Self::push_told`]): `Some(None)` for none of the instances, `None` for a
-    /// row that was estimated.
-    #[must_use]
-    pub fn told_owner(&self, row: usize) -> Option<Option<u16>> {
-        let range = self.range(row);
-        let [estimate] = self.log_estimates[range.clone()] else { return None };
-        if estimate == TOLD {
-            Some(Some(self.labels[range.start]))
-        } else {
-            (estimate <= TOLD_BACKGROUND).then_some(None)
+    /// Entries of a row: label, estimate and calibration.
+    pub fn entries(&self, row: usize) -> impl Iterator<Item = (u16, f32, f32)> {
+        self.range(row).map(|entry| (self.labels[entry], self.log_estimates[entry], self.log_calibrations[entry]))
+    }
+
+    /// Adds a row at the end that is certain of its owner: an instance, or none of them.
+    pub fn push_certain(&mut self, owner: Option<u16>) {
+        match owner {
+            Some(label) => self.push(Owner::Instance(label), &[(label, 1.0)]),
+            None => self.push(Owner::Background, &[]),
         }
+    }
+
+    /// Owner of a row.
+    #[must_use]
+    pub fn owner(&self, row: usize) -> Owner {
+        self.owners.get(row).copied().unwrap_or_default()
     }
 
     /// Rows `sources[0], sources[1], ...` as a new set; rows may repeat.
     #[must_use]
     pub fn gather(&self, sources: &[u32]) -> Self {
         let mut gathered = Self::empty();
-        for &source in sources {
-            let range = self.range(source as usize);
-            gathered.labels.extend_from_slice(&self.labels[range.clone()]);
-            gathered.log_estimates.extend_from_slice(&self.log_estimates[range.clone()]);
-            gathered.log_calibrations.extend_from_slice(&self.log_calibrations[range]);
-            gathered.row_offsets.push(gathered.labels.len() as u32);
-        }
+        sources.iter().for_each(|&source| gathered.append_row(self, source as usize));
         gathered
+    }
+
+    /// Adds a row of `other` at the end, with its owner.
+    ///
+    /// # Panics
+    /// When the row is out of range.
+    pub fn append_row(&mut self, other: &Self, row: usize) {
+        self.push_entries(other.owner(row), other.entries(row));
     }
 }
 
@@ -172,6 +218,7 @@ mod tests {
             labels: vec![0, 2, 5, 1, 2, 5],
             log_estimates: [0.2_f32, 0.5, 0.3, 1.0, 0.5, 0.5].map(f32::ln).to_vec(),
             log_calibrations: vec![0.0, -20.0, 0.1, 3.0, 0.0, 0.0],
+            owners: Vec::new(),
         }
     }
 
@@ -197,7 +244,7 @@ mod tests {
 
     #[test]
     fn argmax_prefers_the_lowest_of_equals() {
-        assert_eq!(identities().argmax(), [5, 1, 2]);
+        assert_eq!(identities().argmax(), [Some(5), Some(1), Some(2)]);
     }
 
     #[test]
@@ -208,16 +255,23 @@ mod tests {
     }
 
     #[test]
-    fn told_rows_are_told_apart_from_estimated_ones() {
+    fn owners_stand_beside_the_rows() {
         let mut rows = identities();
-        assert_eq!([0, 1, 2].map(|row| rows.told_owner(row)), [None; 3]);
-        rows.push_told(Some(5));
-        rows.push_told(None);
-        rows.validate(5, 6).unwrap();
-        assert_eq!([3, 4].map(|row| rows.told_owner(row)), [Some(Some(5)), Some(None)]);
-        assert_eq!(rows.argmax()[3], 5);
-        assert_eq!(rows.labelled_shares()[3..], [1.0, 0.0]);
-        assert_eq!(rows.gather(&[4]).told_owner(0), Some(None));
+        assert_eq!([0, 1, 2].map(|row| rows.owner(row)), [Owner::Estimated; 3]);
+        rows.push_certain(Some(5));
+        rows.push_certain(None);
+        rows.push(Owner::Background, &[(1, 0.125), (4, 0.25)]);
+        rows.push(Owner::Estimated, &[(0, 1.0)]);
+        rows.validate(7, 6).unwrap();
+        assert_eq!([2, 3, 4, 5].map(|row| rows.owner(row)), [
+            Owner::Estimated,
+            Owner::Instance(5),
+            Owner::Background,
+            Owner::Background
+        ]);
+        assert_eq!(rows.argmax()[3..], [Some(5), None, Some(4), Some(0)]);
+        assert_eq!(rows.labelled_shares()[3..], [1.0, 0.0, 0.375, 1.0]);
+        assert_eq!(rows.gather(&[4, 0]).owners, [Owner::Background, Owner::Estimated]);
     }
 
     #[test]

@@ -31,6 +31,7 @@
 //!         labels: vec![0],
 //!         log_estimates: vec![0.0],
 //!         log_calibrations: vec![0.0],
+//!         owners: Vec::new(),
 //!     }),
 //!     instances: vec![Instance { id: 7, label: "red mug".into(), category: "mug".into() }],
 //!     timeline: Timeline { times: vec![0.0], frames_per_second: 24.0 },
@@ -71,7 +72,7 @@ pub use checkpoint::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 pub use deformation::{Deformation, DeformationConfig, Heads, TimeEncoding};
 pub use field::{Field, SortMetric};
 pub use gaussians::Gaussians;
-pub use identity::Identities;
+pub use identity::{Identities, Owner};
 pub use instance::Instance;
 pub use query::{FieldAtTime, QueryResult};
 pub use timeline::{RecordedCamera, Timeline};

@@ -5,7 +5,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-use crate::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use crate::tracks::{DenseTrack, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use crate::{
     Deformation, DeformationConfig, Field, Gaussians, Heads, Identities, Instance, RecordedCamera,
     SortMetric, TimeEncoding, Timeline,
@@ -39,6 +39,7 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
         labels: Vec::new(),
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
+        owners: Vec::new(),
     };
     for row in 0..n {
         for label in 0..4_u16 {
@@ -90,11 +91,15 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
 }
 
 /// [`field`] with recorded motion: group 0 turns and travels, group 1 appears late and is dense, group 2 is
-/// exempt from the deformation; a quarter of the Gaussians have no group.
+/// exempt from the deformation; a quarter of the Gaussians have no group. Opacities of
+/// group 0 and colours of group 2 change.
 pub(crate) fn tracked_field(n: usize, seed: u64) -> Field {
     let mut field = field(n, seed);
     let group_of: Vec<u32> = (0..n as u32).map(|row| if row % 4 == 3 { NO_GROUP } else { row % 4 }).collect();
-    let members = group_of.iter().filter(|group| **group == 1).count();
+    let count = |wanted: u32| group_of.iter().filter(|group| **group == wanted).count();
+    let (turning, members, added) = (count(0), count(1), count(2));
+    let opacity = |k: usize| (k % 7) as f32 / 6.0;
+    let color = |k: usize| std::array::from_fn(|c| (k as f32 - c as f32) / 16.0);
     let mut rng = Pcg64::seed_from_u64(seed ^ 77);
     let mut row = || std::array::from_fn(|_| rng.random_range(-1.0_f32..1.0));
     let pose = |time: f64, angle: f64| TrackPose {
@@ -110,7 +115,11 @@ pub(crate) fn tracked_field(n: usize, seed: u64) -> Field {
     };
     let still = |name: &str| TrackGroup::still(name, DVec3::new(0.25, 0.5, -0.125));
     let groups = vec![
-        TrackGroup { poses: vec![pose(0.0, 0.0), pose(0.25, 0.9), pose(0.75, -0.6)], ..still("turning") },
+        TrackGroup {
+            poses: vec![pose(0.0, 0.0), pose(0.25, 0.9), pose(0.75, -0.6)],
+            opacities: Some(Samples { times: vec![0.25, 0.75], values: (0..2 * turning).map(opacity).collect() }),
+            ..still("turning")
+        },
         TrackGroup {
             visibility: vec![
                 VisibilityStep { time: 0.0, visible: false },
@@ -119,7 +128,12 @@ pub(crate) fn tracked_field(n: usize, seed: u64) -> Field {
             dense: Some(dense),
             ..still("late")
         },
-        TrackGroup { deformed: false, poses: vec![pose(0.5, 2.5)], ..still("added") },
+        TrackGroup {
+            deformed: false,
+            poses: vec![pose(0.5, 2.5)],
+            colors: Some(Samples { times: vec![0.0, 1.0], values: (0..2 * added).map(color).collect() }),
+            ..still("added")
+        },
     ];
     field.tracks = Some(Tracks { group_of, groups });
     field

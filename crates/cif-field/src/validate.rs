@@ -3,8 +3,9 @@
 use cif_geometry::Bounds;
 
 use crate::deformation::ConfigError;
-use crate::tracks::{NO_GROUP, TrackGroup, Tracks};
-use crate::{Deformation, Field, Gaussians, Identities, Instance, RecordedCamera, Timeline};
+use crate::gaussians::SH_FLOATS;
+use crate::tracks::{NO_GROUP, Samples, TrackGroup, Tracks};
+use crate::{Deformation, Field, Gaussians, Identities, Instance, Owner, RecordedCamera, Timeline};
 
 /// Largest deviation of a camera rotation from orthonormality.
 const MAX_ORTHONORMALITY_ERROR: f64 = 1e-3;
@@ -57,7 +58,7 @@ pub enum FieldError {
         /// Largest corner.
         high: [f64; 3],
     },
-    /// An identity row is empty, out of order, or not inside the entries.
+    /// An identity row is out of order, not inside the entries, or owned by nobody.
     #[error("identity row {row} {problem}")]
     IdentityRow {
         /// The row.
@@ -207,7 +208,7 @@ impl Deformation {
 
 impl Identities {
     /// Checks the rows against `gaussians` rows and labels below `instances`: offsets ascend from 0 to the
-    /// number of entries, rows are not empty, labels ascend strictly in a row, and values are finite.
+    /// number of entries, labels ascend strictly in a row, owners exist, and values are finite.
     ///
     /// # Errors
     /// The first broken rule.
@@ -219,6 +220,9 @@ impl Identities {
         same_length("identities.row_offsets", self.row_offsets.len(), gaussians + 1)?;
         same_length("identities.log_estimates", self.log_estimates.len(), entries)?;
         same_length("identities.log_calibrations", self.log_calibrations.len(), entries)?;
+        if !self.owners.is_empty() {
+            same_length("identities.owners", self.owners.len(), gaussians)?;
+        }
         let broken = |row, problem: String| Err(FieldError::IdentityRow { row, problem });
         if self.row_offsets[0] != 0 {
             return broken(0, format!("starts at entry {}, expected 0", self.row_offsets[0]));
@@ -228,16 +232,17 @@ impl Identities {
             if end > entries || start > end {
                 return broken(row, format!("spans entries {start} to {end} of {entries}"));
             }
-            if start == end {
-                return broken(row, "is empty".to_owned());
-            }
             let labels = &self.labels[start..end];
             if labels.windows(2).any(|pair| pair[0] >= pair[1]) {
                 return broken(row, "has labels that do not ascend".to_owned());
             }
-            let last = labels[labels.len() - 1];
-            if usize::from(last) >= instances {
+            if let Some(last) = labels.last().filter(|last| usize::from(**last) >= instances) {
                 return broken(row, format!("has the label {last}, but there are {instances} instances"));
+            }
+            if let Owner::Instance(owner) = self.owner(row)
+                && usize::from(owner) >= instances
+            {
+                return broken(row, format!("belongs to instance {owner}, but there are {instances}"));
             }
         }
         let used = self.row_offsets[gaussians] as usize;
@@ -282,18 +287,19 @@ impl Tracks {
     }
 }
 
-fn validate_group(group: &TrackGroup, members: usize) -> Result<(), String> {
-    fn ascending(what: &str, times: impl Iterator<Item = f64> + Clone) -> Result<(), String> {
-        if let Some(time) = times.clone().find(|time| !time.is_finite()) {
-            return Err(format!("has a {what} at the time {time}"));
-        }
-        match times.clone().zip(times.skip(1)).find(|(before, after)| before >= after) {
-            Some((before, after)) => {
-                Err(format!("has a {what} at {after} after one at {before}, but times must ascend"))
-            }
-            None => Ok(()),
-        }
+fn ascending(what: &str, times: impl Iterator<Item = f64> + Clone) -> Result<(), String> {
+    if let Some(time) = times.clone().find(|time| !time.is_finite()) {
+        return Err(format!("has a {what} at the time {time}"));
     }
+    match times.clone().zip(times.skip(1)).find(|(before, after)| before >= after) {
+        Some((before, after)) => {
+            Err(format!("has a {what} at {after} after one at {before}, but times must ascend"))
+        }
+        None => Ok(()),
+    }
+}
+
+fn validate_group(group: &TrackGroup, members: usize) -> Result<(), String> {
     if !group.pivot.is_finite() {
         return Err("has a pivot that is not finite".to_owned());
     }
@@ -306,6 +312,7 @@ fn validate_group(group: &TrackGroup, members: usize) -> Result<(), String> {
     if !group.poses.iter().all(|pose| (pose.rotation.length() - 1.0).abs() <= MAX_NORM_ERROR) {
         return Err("has a pose whose quaternion is not unit".to_owned());
     }
+    validate_appearance(group, members)?;
     let Some(dense) = &group.dense else { return Ok(()) };
     ascending("dense sample", dense.times.iter().copied())?;
     if dense.times.is_empty() {
@@ -328,6 +335,33 @@ fn validate_group(group: &TrackGroup, members: usize) -> Result<(), String> {
     finite("its quaternions", dense.quaternions.as_flattened(), 4).map_err(not_finite)?;
     finite("its log-scales", dense.log_scales.as_deref().unwrap_or_default().as_flattened(), 3)
         .map_err(not_finite)
+}
+
+fn validate_appearance(group: &TrackGroup, members: usize) -> Result<(), String> {
+    fn complete<V>(what: &str, samples: &Samples<V>, members: usize) -> Result<(), String> {
+        ascending(&format!("sample of {what}"), samples.times.iter().copied())?;
+        if samples.times.is_empty() {
+            return Err(format!("has {what} over time without samples"));
+        }
+        let (found, times) = (samples.values.len(), samples.times.len());
+        if times.checked_mul(members) != Some(found) {
+            return Err(format!("has {found} {what} for {times} samples of {members} Gaussians"));
+        }
+        Ok(())
+    }
+    if let Some(samples) = &group.opacities {
+        complete("opacities", samples, members)?;
+        // Written so that a NaN fails too.
+        if let Some(opacity) = samples.values.iter().find(|opacity| !(0.0..=1.0).contains(*opacity)) {
+            return Err(format!("has the opacity {opacity}, which is not between 0 and 1"));
+        }
+    }
+    if let Some(samples) = &group.colors {
+        complete("colours", samples, members)?;
+        let coefficients = samples.values.as_flattened();
+        finite("its colours", coefficients, SH_FLOATS).map_err(|error| error.to_string())?;
+    }
+    Ok(())
 }
 
 impl Timeline {

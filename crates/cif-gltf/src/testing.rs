@@ -211,6 +211,7 @@ fn node(
         motion,
         proxy: None,
         colliders: Vec::new(),
+        appearance: cif_scene::Appearance::default(),
         visibility,
         source_frames: (2, 9),
         mean_occupancy: numbers.between(0.0, 1.0) as f32,

@@ -346,6 +346,7 @@ fn scene(path: &Path, splats: Splats, left_out: usize) -> SceneGraph {
         source_frames: (0, 0),
         mean_occupancy: 1.0,
         report,
+        appearance: Default::default(),
     };
     let warnings = if left_out > 0 {
         vec![format!(

@@ -50,6 +50,7 @@ fn sparse_identities(probabilities: &PyReadonlyArrayDyn<'_, f32>, instances: usi
         labels: Vec::new(),
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
+        owners: Vec::new(),
     };
     for (index, row) in arrays::values(probabilities).chunks_exact(instances).enumerate() {
         if let Some(column) = row.iter().position(|value| !(value.is_finite() && *value >= 0.0)) {
@@ -61,7 +62,7 @@ fn sparse_identities(probabilities: &PyReadonlyArrayDyn<'_, f32>, instances: usi
         // What a row lacks of one belongs to no instance.
         let sum: f32 = row.iter().sum();
         if sum <= 0.0 {
-            identities.push_told(None);
+            identities.push_certain(None);
             continue;
         }
         for (label, &probability) in row.iter().enumerate() {

@@ -151,6 +151,7 @@ fn identities(config: &SyntheticConfig, random: &mut Pcg64Mcg) -> Identities {
         labels: Vec::new(),
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
+        owners: Vec::new(),
     };
     let mut all: Vec<u16> = (0..config.instances as u16).collect();
     for _ in 0..config.gaussians {

@@ -698,6 +698,7 @@ fn row_4_probabilities_sum_to_one_whatever_their_logarithms() {
         labels: Vec::new(),
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
+        owners: Vec::new(),
     };
     for start in 0..logs.len() {
         for support in 1..=4_u16 {

@@ -1,22 +1,29 @@
 //! Which node a Gaussian belongs to.
 //!
 //! 1. A Gaussian's instance is its most probable one (ties to the lowest index).
-//! 2. It is *background* when it was seen on labelled pixels for less than half of its image (see
-//!    [`cif_field::Identities::labelled_shares`]; a tiny instance may have less), or when its instance mass
-//!    gamma = pi p_max is below [`SceneOptions::background_threshold`], where one is asked for. Pixels without
-//!    a label give no loss, so Gaussians outside all masks have identity rows too (methods reference 4.4, 5.4
-//!    and A2).
+//! 2. It is *background* when the part of its image that was seen on labelled pixels (see
+//!    [`cif_field::Identities::labelled_shares`]) is below that at which the silhouette of its instance is best, or
+//!    when its instance mass gamma = pi p_max is below [`SceneOptions::background_threshold`], where one is asked for.
+//!    Pixels without a label give no loss, so Gaussians outside all masks have identity rows too (methods reference
+//!    4.4, 5.4 and A2).
+//!
+//!    The silhouette: with d the image of a Gaussian (opacity times area) and s its labelled share, the Gaussians O
+//!    that an instance owns cover sum_O d s of what its masks show and sum_O d (1 - s) beside it. The intersection
+//!    over union of both, sum_O d s / (sum d s + sum_O d (1 - s)) over all Gaussians of the instance, is largest where
+//!    O has those with s > v / (1 + v), v the largest value itself (Dinkelbach's method for ratios). So a compact
+//!    object takes what lies in its masks by about half, and a wire narrower than the Gaussians that draw it takes
+//!    softer ones too, without which it would not be seen.
 //! 3. Gaussians inside an object are hardly ever seen, so that they keep their first occupancy. One below the
 //!    threshold that lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of
 //!    that instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
 //!
-//! Rows whose owner was told ([`cif_field::Identities::told_owner`]: what came from a file that names its objects)
-//! belong to it, whatever their occupancy.
+//! Rows that have an owner ([`cif_field::Owner`]: they came from a file that names its objects) belong to it,
+//! whatever their occupancy.
 //!
 //! Where occupancy is the same for all Gaussians (never trained, or an ablation), opacity takes its place.
 //! Without identities everything is background.
 
-use cif_field::Field;
+use cif_field::{Field, Owner};
 use cif_geometry::Bounds;
 use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
@@ -32,13 +39,10 @@ const ENCLOSING: usize = 6;
 const ROUNDS: usize = 4;
 /// Occupancies that differ by less are the same.
 const SAME_OCCUPANCY: f32 = 1e-4;
-/// Share of its image on labelled pixels below which a Gaussian is background.
+/// Share of its image on labelled pixels from which a Gaussian may be enclosed by an instance.
 const LABELLED_SHARE: f32 = 0.5;
-/// Where no Gaussian of an instance reaches that share (an object of a few pixels, narrower than the Gaussians
-/// that draw it), those within this factor of its best one are the instance.
-const RELATIVE_SHARE: f32 = 0.75;
-/// Smallest share that may make an instance at all.
-const MIN_SHARE: f32 = 0.2;
+/// Rounds of Dinkelbach's method; it converges faster than linearly, and 8 agree to single precision.
+const RATIO_ROUNDS: usize = 8;
 
 /// Most probable instance of a Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -85,35 +89,68 @@ pub fn assign(
 ) -> Vec<Option<usize>> {
     let occupancy = occupancies(field, visible);
     let candidate = |position: usize| identities[visible[position] as usize];
-    // Candidates with enough instance mass, and the largest labelled share among those of each instance.
+    // Candidates with enough instance mass.
     let candidates: Vec<Option<Identity>> = (0..visible.len())
         .map(|position| {
             candidate(position)
                 .filter(|identity| occupancy[position] * identity.probability >= options.background_threshold)
         })
         .collect();
-    let mut best_shares = vec![0.0_f32; field.instances.len()];
-    for identity in candidates.iter().flatten() {
-        let best = &mut best_shares[identity.index];
-        *best = best.max(identity.labelled_share);
-    }
+    let needed = needed_shares(field, visible, &candidates);
     let mut owners: Vec<Option<usize>> = candidates
         .iter()
         .map(|identity| {
             let identity = (*identity)?;
-            let needed = LABELLED_SHARE.min((RELATIVE_SHARE * best_shares[identity.index]).max(MIN_SHARE));
-            (identity.labelled_share >= needed).then_some(identity.index)
+            (f64::from(identity.labelled_share) > needed[identity.index]).then_some(identity.index)
         })
         .collect();
-    let told = |position: usize| field.identities.as_ref()?.told_owner(visible[position] as usize);
+    let owner_of = |position: usize| match &field.identities {
+        Some(identities) => identities.owner(visible[position] as usize),
+        None => Owner::Estimated,
+    };
     for (position, owner) in owners.iter_mut().enumerate() {
-        if let Some(told) = told(position) {
-            *owner = told.map(usize::from);
+        match owner_of(position) {
+            Owner::Estimated => {}
+            Owner::Instance(index) => *owner = Some(usize::from(index)),
+            Owner::Background => *owner = None,
         }
     }
-    let open = |position: usize| candidate(position).filter(|_| told(position).is_none());
+    let open = |position: usize| candidate(position).filter(|_| owner_of(position) == Owner::Estimated);
     enclose(field, visible, &open, &mut owners);
     owners
+}
+
+/// Labelled share above which the Gaussians of every instance make the best silhouette of it.
+fn needed_shares(field: &Field, visible: &[u32], candidates: &[Option<Identity>]) -> Vec<f64> {
+    // Image and labelled share of the Gaussians of each instance.
+    let mut members: Vec<Vec<(f64, f64)>> = vec![Vec::new(); field.instances.len()];
+    for (&row, identity) in visible.iter().zip(candidates) {
+        let Some(identity) = identity else { continue };
+        let [x, y, z] = field.gaussians.log_scales[row as usize].map(f64::from);
+        let area = (x + y).max(y + z).max(x + z).exp();
+        let image = f64::from(field.gaussians.opacity(row as usize)) * area;
+        members[identity.index].push((image, f64::from(identity.labelled_share)));
+    }
+    members
+        .iter()
+        .map(|members| {
+            let labelled: f64 = members.iter().map(|(image, share)| image * share).sum();
+            let mut needed = 0.0;
+            for _ in 0..RATIO_ROUNDS {
+                let (mut inside, mut outside) = (0.0, 0.0);
+                for (image, share) in members.iter().filter(|(_, share)| *share > needed) {
+                    inside += image * share;
+                    outside += image * (1.0 - share);
+                }
+                let ratio = inside / (labelled + outside);
+                if ratio.is_nan() {
+                    break;
+                }
+                needed = ratio / (1.0 + ratio);
+            }
+            needed
+        })
+        .collect()
 }
 
 /// Occupancies of the visible rows, or opacities where occupancy tells nothing.

@@ -9,7 +9,7 @@ use crate::frames::{Frame, Frames};
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::motion::{MovingGroup, trimmed_box, vector};
 use crate::node::{self, Naming, NodeInput};
-use crate::opacities::{self, Opacities};
+use crate::appearance::{self, Opacities, Thinning};
 use crate::source::FieldMotion;
 use crate::{
     MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, naming, proxy,
@@ -53,7 +53,8 @@ pub fn build_from(
         });
     }
     let mut warnings = Vec::new();
-    let mut frames_of = Frames::new(motion, &time_codes.times, Frame::of(reference.clone()));
+    let recolors = motion.recolors();
+    let mut frames_of = Frames::new(motion, &time_codes.times, Frame::of(reference.clone(), recolors));
     let opacities = Opacities::of(&mut frames_of);
     let visible = visible_rows(&reference, &opacities.peak, options, &mut warnings)?;
     let identities = assignment::most_probable(field);
@@ -61,7 +62,6 @@ pub fn build_from(
     let (group_owners, mut groups) =
         moving_groups(field, &visible, &owners, &reference, &opacities.peak, options);
     let chosen = choose::choose(&mut groups, &mut frames_of, &time_codes.samples, options);
-    warn_of_unsampled_heads(field, &mut warnings);
 
     let input = NodeInput { field, reference: &reference, identities: &identities };
     let mut nodes: Vec<Node> = Vec::with_capacity(groups.len());
@@ -71,15 +71,20 @@ pub fn build_from(
         nodes.push(node::node(&input, naming, group, chosen));
     }
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
-    for node in &mut nodes {
+    for (node, group) in nodes.iter_mut().zip(&groups) {
         node.source_frames = (frames[0], frames[frames.len() - 1]);
         node.visibility = visibility::of_rows(field, &node.splats.rows);
+        let thinning = Thinning {
+            time_codes: &time_codes.samples,
+            weights: &node::weights(node, group),
+            tolerance: options.appearance_tolerance,
+            reduce: options.reduce_keys,
+        };
         if opacities.change {
-            let rows = &node.splats.rows;
-            let (shown, mean) =
-                opacities::over_time(&mut frames_of, rows, options.min_opacity, &time_codes.samples);
-            node.visibility = opacities::both(&node.visibility, &shown);
-            node.splats.opacities = mean;
+            appearance::fade(node, &mut frames_of, options.min_opacity, &thinning);
+        }
+        if frames_of.recolor() {
+            appearance::recolor(node, &mut frames_of, &thinning);
         }
         if options.proxy_points > 0 {
             node.proxy = Some(proxy::point_proxy(&node.splats, options.proxy_points));
@@ -274,17 +279,4 @@ fn moving_groups(
         groups.push(group);
     }
     (group_owners, groups)
-}
-
-fn warn_of_unsampled_heads(field: &Field, warnings: &mut Vec<String>) {
-    if let Some(deformation) = &field.deformation {
-        let heads = deformation.config.heads;
-        for (on, what, when) in
-            [(heads.opacity, "opacities", "as their mean"), (heads.sh, "colours", "as at the first frame")]
-        {
-            if on {
-                warnings.push(format!("{what} change over time in this field, but leave {when}"));
-            }
-        }
-    }
 }

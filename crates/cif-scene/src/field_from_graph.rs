@@ -3,19 +3,20 @@
 //! Every node becomes Gaussians at their place at the first sampled time, in world coordinates, and its motion
 //! a group of [`Tracks`] relative to there. Rigid tracks keep their keys; parts are sampled at the keys of both
 //! levels and at all sampled time codes; dense samples stay samples. Instances keep their ids, nodes without
-//! one get the next that is free, and every Gaussian is told its owner
-//! ([`cif_field::Identities::push_told`]).
+//! one get the next that is free, and every Gaussian belongs to its node ([`cif_field::Owner`]). Identity rows
+//! that the file has come back; without them Gaussians of instances are certain of theirs, and those of the background
+//! add to no label. Opacities and colours that change become samples of the groups.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
-use cif_field::gaussians::{INITIAL_OCCUPANCY, SH_FLOATS};
-use cif_field::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
-use cif_field::{Field, Gaussians, Identities, Instance, RecordedCamera, Timeline};
+use cif_field::gaussians::{INITIAL_OCCUPANCY, SH_FLOATS, saturated_logit};
+use cif_field::tracks::{DenseTrack, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use cif_field::{Field, Gaussians, Identities, Instance, Owner, RecordedCamera, Timeline};
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
-use crate::graph::{DenseMotion, Motion, Node, NodeKind, PoseSample, SceneGraph, pose_at};
+use crate::graph::{AppearanceSample, DenseMotion, Motion, Node, NodeKind, PoseSample, SceneGraph, pose_at};
 use crate::time_map::TimeMap;
 use crate::{CameraTrack, SceneError};
 
@@ -24,9 +25,6 @@ const NO_TURN: f64 = 1e-9;
 
 /// Poses that differ by less do not move: part of the size of coordinates, and radians.
 const STILL: f64 = 1e-9;
-
-/// Logit of an opacity of exactly 0 or 1: beyond that of the smallest positive number in single precision.
-const SATURATED_LOGIT: f64 = 104.0;
 
 /// Builds a field without learned motion that shows what the graph shows. `source` names the file in the
 /// field's provenance.
@@ -45,16 +43,27 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
     let mut gaussians = Gaussians::default();
     let mut tracks = Tracks::default();
     let mut identities = Identities::empty();
-    for node in &graph.nodes {
-        let mut rows = NodeRows::of(node, &times, &graph.time_codes.samples, reference)?;
-        let owner = match node.kind {
-            NodeKind::Instance { id, .. } => Some(instances.add(node, id)?),
-            NodeKind::Background => None,
-        };
-        if owner.is_none() && is_foreign && has_instances {
-            rows.gaussians.occupancy_logits.fill(logit(INITIAL_OCCUPANCY));
+    let owners = graph
+        .nodes
+        .iter()
+        .map(|node| match node.kind {
+            NodeKind::Instance { id, .. } => instances.add(node, id).map(Some),
+            NodeKind::Background => Ok(None),
+        })
+        .collect::<Result<Vec<Option<u16>>, SceneError>>()?;
+    // Identity rows name ids as the file has them; the first of several nodes with one id keeps it.
+    let mut index_of: BTreeMap<u16, u16> = BTreeMap::new();
+    for (node, owner) in graph.nodes.iter().zip(&owners) {
+        if let (NodeKind::Instance { id, .. }, Some(index)) = (node.kind, owner) {
+            index_of.entry(id).or_insert(*index);
         }
-        (0..rows.gaussians.len()).for_each(|_| identities.push_told(owner));
+    }
+    for (node, &owner) in graph.nodes.iter().zip(&owners) {
+        let mut rows = NodeRows::of(node, &times, &graph.time_codes.samples, reference)?;
+        if owner.is_none() && is_foreign && has_instances {
+            rows.gaussians.occupancy_logits.fill(saturated_logit(INITIAL_OCCUPANCY));
+        }
+        push_identities(&mut identities, node, owner, &index_of);
         rows.append_to(&mut gaussians, &mut tracks);
     }
     let cameras = cameras(&graph.cameras, &times);
@@ -90,6 +99,37 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
         .validate()
         .map_err(|error| SceneError::Import { object: source.to_owned(), what: error.to_string() })?;
     Ok(field)
+}
+
+/// Adds the identity rows of a node.
+fn push_identities(
+    identities: &mut Identities,
+    node: &Node,
+    owner: Option<u16>,
+    index_of: &BTreeMap<u16, u16>,
+) {
+    let own_id = match node.kind {
+        NodeKind::Instance { id, .. } => id,
+        NodeKind::Background => 0,
+    };
+    for splat in 0..node.splats.len() {
+        let shares = node.splats.identities.get(splat).copied().unwrap_or_default();
+        let mut entries: Vec<(u16, f32)> = shares
+            .iter()
+            .filter(|entry| entry.id != 0 && entry.share > 0.0)
+            .filter_map(|entry| {
+                let own = owner.filter(|_| entry.id == own_id);
+                own.or_else(|| index_of.get(&entry.id).copied()).map(|index| (index, entry.share))
+            })
+            .collect();
+        entries.sort_by_key(|(index, _)| *index);
+        entries.dedup_by_key(|(index, _)| *index);
+        match owner {
+            _ if entries.is_empty() => identities.push_certain(owner),
+            Some(index) => identities.push(Owner::Instance(index), &entries),
+            None => identities.push(Owner::Background, &entries),
+        }
+    }
 }
 
 /// Instances while they are collected.
@@ -159,7 +199,7 @@ impl NodeRows {
             }
         }
         rows.groups.retain(|(_, group)| {
-            !(group.poses.is_empty() && group.visibility.is_empty() && group.dense.is_none())
+            group.moves() || !(group.poses.is_empty() && group.visibility.is_empty() && group.dense.is_none())
         });
         Ok(rows)
     }
@@ -188,10 +228,23 @@ impl NodeRows {
         let visibility = steps
             .map(|step| VisibilityStep { time: times.time(step.time_code), visible: step.visible })
             .collect::<Vec<_>>();
+        let appearance = &node.appearance;
+        let opacities = samples(&appearance.opacities, &range, 1, times, |values| values[0]);
+        let stride = 3 * coefficient_count(node.splats.sh_degree);
+        let colors = samples(&appearance.colors, &range, stride, times, |values| {
+            let mut sh = [0.0; SH_FLOATS];
+            sh[..stride].copy_from_slice(values);
+            if let Some(turn) = &turn {
+                turn.rotate(&mut sh);
+            }
+            sh
+        });
         let always_visible = visibility.iter().all(|step| step.visible);
         let group = TrackGroup {
             poses: path.poses(times),
             visibility: if always_visible { Vec::new() } else { visibility },
+            opacities,
+            colors,
             ..TrackGroup::still(name, translation)
         };
         self.groups.push((range, group));
@@ -227,6 +280,24 @@ impl NodeRows {
             tracks.groups.push(group);
         }
     }
+}
+
+/// Samples of a range of splats; none where nothing changes.
+fn samples<V: Copy>(
+    of: &[AppearanceSample],
+    range: &std::ops::Range<usize>,
+    stride: usize,
+    times: &TimeMap,
+    value: impl Fn(&[f32]) -> V,
+) -> Option<Samples<V>> {
+    if of.is_empty() {
+        return None;
+    }
+    let own = range.start * stride..range.end * stride;
+    Some(Samples {
+        times: of.iter().map(|sample| times.time(sample.time_code)).collect(),
+        values: of.iter().flat_map(|sample| sample.values[own.clone()].chunks_exact(stride).map(&value)).collect(),
+    })
 }
 
 /// A path whose keys are joined by lines and arcs, with its pose at the reference time.
@@ -344,12 +415,9 @@ pub(crate) fn log_scale(scale: f32) -> f32 {
     f64::from(scale).ln() as f32
 }
 
-/// Raw logit of a probability; finite for 0 and 1 too, where the sigmoid of it is 0 and 1 again in single
-/// precision.
-pub(crate) fn logit(probability: impl Into<f64>) -> f32 {
-    let probability: f64 = probability.into();
-    let logit = (probability / (1.0 - probability)).ln();
-    logit.clamp(-SATURATED_LOGIT, SATURATED_LOGIT) as f32
+/// Raw logit of a probability in single precision.
+pub(crate) fn logit(probability: f32) -> f32 {
+    saturated_logit(f64::from(probability))
 }
 
 /// Raw Gaussians of a node in its local frame.
@@ -415,6 +483,24 @@ pub(crate) fn check(node: &Node) -> Result<(), SceneError> {
     };
     if !ascend(node.track()) {
         return wrong("its motion does not ascend in time, or is not finite".to_owned());
+    }
+    for (what, samples, expected) in [
+        ("opacities", &node.appearance.opacities, n),
+        ("colour coefficients", &node.appearance.colors, n * floats),
+    ] {
+        if let Some(sample) = samples.iter().find(|sample| sample.values.len() != expected) {
+            return wrong(format!(
+                "it has {n} centres, but {} {what} at time code {} instead of {expected}",
+                sample.values.len(),
+                sample.time_code
+            ));
+        }
+        if samples.windows(2).any(|pair| pair[0].time_code >= pair[1].time_code) {
+            return wrong(format!("its {what} do not ascend in time"));
+        }
+    }
+    if !node.appearance.opacities.iter().all(|sample| in_range(&sample.values)) {
+        return wrong("a sampled opacity is outside 0 to 1".to_owned());
     }
     match &node.motion {
         Motion::Parts(parts) => {

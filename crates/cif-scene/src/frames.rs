@@ -3,13 +3,16 @@
 use std::sync::Arc;
 
 use cif_field::Gaussians;
+use cif_field::gaussians::SH_FLOATS;
 
 use crate::MotionSource;
 
 /// Bytes of frames that are kept; what does not fit is deformed again when asked for.
 const KEPT_BYTES: usize = 512 << 20;
-/// Bytes of one Gaussian in a [`Frame`].
+/// Bytes of one Gaussian in a [`Frame`], without its colour.
 const GAUSSIAN_BYTES: usize = 44;
+/// Bytes of the colour.
+const COLOR_BYTES: usize = 4 * SH_FLOATS;
 
 /// What moves of all Gaussians, at one time; rows as in the field, raw form.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -22,17 +25,20 @@ pub struct Frame {
     pub quaternions: Vec<[f32; 4]>,
     /// Logits of the opacities.
     pub opacity_logits: Vec<f32>,
+    /// Spherical harmonics in the axes of the world; empty where colours do not change.
+    pub sh_coefficients: Vec<[f32; SH_FLOATS]>,
 }
 
 impl Frame {
-    /// The moving part of Gaussians.
+    /// The moving part of Gaussians; their colours where these change too.
     #[must_use]
-    pub fn of(gaussians: Gaussians) -> Self {
-        let Gaussians { means, log_scales, quaternions, opacity_logits, .. } = gaussians;
-        Self { means, log_scales, quaternions, opacity_logits }
+    pub fn of(gaussians: Gaussians, recolors: bool) -> Self {
+        let Gaussians { means, log_scales, quaternions, opacity_logits, sh_coefficients, .. } = gaussians;
+        let sh_coefficients = if recolors { sh_coefficients } else { Vec::new() };
+        Self { means, log_scales, quaternions, opacity_logits, sh_coefficients }
     }
 
-    /// Some rows, in their order.
+    /// Some rows, in their order, without colours.
     #[must_use]
     pub fn rows(&self, rows: &[u32]) -> Self {
         fn pick<T: Copy>(values: &[T], rows: &[u32]) -> Vec<T> {
@@ -43,6 +49,7 @@ impl Frame {
             log_scales: pick(&self.log_scales, rows),
             quaternions: pick(&self.quaternions, rows),
             opacity_logits: pick(&self.opacity_logits, rows),
+            sh_coefficients: Vec::new(),
         }
     }
 
@@ -58,6 +65,7 @@ impl Frame {
         keep(&mut self.means, &reference.means);
         keep(&mut self.log_scales, &reference.log_scales);
         keep(&mut self.quaternions, &reference.quaternions);
+        keep(&mut self.sh_coefficients, &reference.sh_coefficients);
         for (logit, reference) in self.opacity_logits.iter_mut().zip(&reference.opacity_logits) {
             if logit.is_nan() {
                 *logit = *reference;
@@ -79,7 +87,8 @@ impl<'a> Frames<'a> {
     /// Frames at `times`; `reference` is the one at the first.
     #[must_use]
     pub fn new(motion: &'a mut dyn MotionSource, times: &'a [f64], reference: Frame) -> Self {
-        let most_kept = KEPT_BYTES / (GAUSSIAN_BYTES * reference.means.len()).max(1);
+        let bytes = GAUSSIAN_BYTES + if motion.recolors() { COLOR_BYTES } else { 0 };
+        let most_kept = KEPT_BYTES / (bytes * reference.means.len()).max(1);
         let reference = Arc::new(reference);
         let mut kept = vec![None; times.len()];
         if let Some(first) = kept.first_mut() {
@@ -106,12 +115,19 @@ impl<'a> Frames<'a> {
         self.times.len() > 1 && self.motion.moves()
     }
 
+    /// True where colours change too.
+    #[must_use]
+    pub fn recolor(&self) -> bool {
+        self.moves() && self.motion.recolors()
+    }
+
     /// The frame of a sampled time.
     pub fn at(&mut self, step: usize) -> Arc<Frame> {
         if let Some(frame) = &self.kept[step] {
             return Arc::clone(frame);
         }
-        let mut frame = Frame::of(self.motion.gaussians_at(self.times[step]));
+        let recolors = self.motion.recolors();
+        let mut frame = Frame::of(self.motion.gaussians_at(self.times[step]), recolors);
         frame.keep_finite(&self.reference);
         let frame = Arc::new(frame);
         if step < self.most_kept {
@@ -143,7 +159,7 @@ mod tests {
             gaussians(time as f32)
         };
         let times = [0.0, 0.5, 1.0];
-        let mut frames = Frames::new(&mut source, &times, Frame::of(gaussians(0.0)));
+        let mut frames = Frames::new(&mut source, &times, Frame::of(gaussians(0.0), false));
         for step in [0, 1, 2, 1, 0, 2] {
             assert_eq!(frames.at(step).means[0], [times[step] as f32; 3]);
         }
@@ -160,7 +176,7 @@ mod tests {
             moved
         };
         let reference = gaussians(3.0);
-        let mut frames = Frames::new(&mut source, &[0.0, 1.0], Frame::of(reference));
+        let mut frames = Frames::new(&mut source, &[0.0, 1.0], Frame::of(reference, false));
         let frame = frames.at(1);
         assert_eq!(frame.means, [[3.0; 3], [1.0; 3]]);
         assert_eq!(frame.log_scales[1], [0.0; 3]);

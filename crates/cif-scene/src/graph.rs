@@ -106,6 +106,8 @@ pub struct Node {
     pub motion: Motion,
     /// Splats in the local frame.
     pub splats: Splats,
+    /// How opacities and colours of the splats change over time.
+    pub appearance: Appearance,
     /// Light stand-in for the splats; `None` when proxies were not asked for.
     pub proxy: Option<PointProxy>,
     /// Convex hulls of the opaque splats, for simulators; empty when not asked for, which for the background
@@ -256,6 +258,25 @@ pub struct DenseSample {
     pub extent: Bounds,
 }
 
+/// Opacities and colours over time; see [`crate::appearance`]. Where there are samples they stand for the values of
+/// [`Splats`] at all times, linear in between and held outside.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Appearance {
+    /// Opacities, one per splat; ascending time codes, empty where they stay as in [`Splats::opacities`].
+    pub opacities: Vec<AppearanceSample>,
+    /// Coefficients as in [`Splats::sh_coefficients`]; ascending time codes, empty where they stay.
+    pub colors: Vec<AppearanceSample>,
+}
+
+/// Values of all splats of a node at one time code.
+#[derive(Clone, Debug, PartialEq)]
+pub struct AppearanceSample {
+    /// Time code.
+    pub time_code: f64,
+    /// Values, splat-major.
+    pub values: Vec<f32>,
+}
+
 /// Splats in post-activation form; every array has one entry per splat.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Splats {
@@ -275,8 +296,26 @@ pub struct Splats {
     pub occupancies: Vec<f32>,
     /// Probability of the most probable instance; 0 without identities.
     pub identity_probabilities: Vec<f32>,
+    /// The instances that every splat may belong to, most probable first; empty without identities.
+    pub identities: Vec<IdentityShares>,
     /// Row of every splat in the field; [`Splats::NO_ROW`] for a splat that comes from elsewhere.
     pub rows: Vec<u32>,
+}
+
+/// Most instances that are kept of the identity row of a splat.
+pub const SHARES_PER_SPLAT: usize = 4;
+
+/// The most probable instances of a splat, with unused places at the end.
+pub type IdentityShares = [IdentityShare; SHARES_PER_SPLAT];
+
+/// An instance that a splat may belong to.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct IdentityShare {
+    /// Mask value of the instance; 0 for an unused place.
+    pub id: u16,
+    /// Probability of the instance times the share of the splat's image that was labelled at all: what is missing to 1
+    /// over all instances was seen outside of every mask.
+    pub share: f32,
 }
 
 impl Splats {

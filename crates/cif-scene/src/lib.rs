@@ -18,7 +18,7 @@
 //! | [`world`] | where a graph lies in the world of its capture |
 //! | [`level_of_detail`] | the most important splats of a node |
 //! | [`velocity`] | how fast a node moves |
-//! | [`opacities`] | opacities that change over time, and when a node is hidden by them |
+//! | [`appearance`] | opacities and colours that change over time, and when a node is hidden by them |
 //! | [`proxy`] | a light point cloud standing in for the splats |
 //! | [`camera_tracks`] | recorded cameras as tracks over time |
 //! | [`naming`] | names that every format accepts |
@@ -33,6 +33,7 @@
 //! splats live in its local frame, whose axes are the world's and whose origin is the node's pivot at the reference
 //! time, so that no rotation is baked into splats and their spherical harmonics are stored as trained.
 
+pub mod appearance;
 pub mod assignment;
 pub mod build;
 pub mod camera_tracks;
@@ -54,7 +55,6 @@ pub mod level_of_detail;
 pub mod motion;
 pub mod naming;
 mod node;
-pub mod opacities;
 pub mod options;
 pub mod parts;
 pub mod placement;
@@ -79,8 +79,8 @@ pub use edits::import_edits;
 pub use error::SceneError;
 pub use field_from_graph::field_from_graph;
 pub use graph::{
-    CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, Node, NodeKind,
-    Origin, Part, PartsMotion, PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
+    Appearance, AppearanceSample, CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample,
+    IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion, PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
 pub use label_pattern::LabelPattern;
 pub use level_of_detail::level_of_detail;

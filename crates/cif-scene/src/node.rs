@@ -1,6 +1,6 @@
 //! Nodes from groups of Gaussians and their chosen motion.
 
-use cif_field::{Field, Gaussians};
+use cif_field::{Field, Gaussians, Identities};
 use cif_geometry::RigidTransform;
 use glam::DVec3;
 
@@ -9,7 +9,10 @@ use crate::build::sigmoid;
 use crate::choose::{Chosen, DENSE_BYTES, POSE_BYTES};
 use crate::dense::positive_scales;
 use crate::frames::Frames;
-use crate::graph::{DenseMotion, DenseSample, Motion, Node, NodeKind, Part, PartsMotion, Splats};
+use crate::graph::{
+    Appearance, DenseMotion, DenseSample, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part,
+    PartsMotion, SHARES_PER_SPLAT, Splats,
+};
 use crate::motion::{MeanShape, MovingGroup, ResidualSum, add_turns_between, trimmed_box, vector};
 use crate::report::{MotionReport, ResidualStatistics};
 use crate::{MotionModel, extent, naming};
@@ -117,6 +120,7 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
         motion,
         mean_occupancy: mean_occupancy(&splats),
         splats,
+        appearance: Appearance::default(),
         proxy: None,
         colliders: Vec::new(),
         visibility: Vec::new(),
@@ -192,8 +196,35 @@ fn appearance(input: &NodeInput<'_>, is_instance: bool, rows: Vec<u32>) -> Splat
         let probability = input.identities[row].map_or(0.0, |identity| identity.probability);
         splats.identity_probabilities.push(if is_instance { probability } else { 0.0 });
     }
+    if let Some(identities) = &input.field.identities {
+        let ids: Vec<u16> = input.field.instances.iter().map(|instance| instance.id).collect();
+        splats.identities = rows.iter().map(|row| identity_shares(identities, *row as usize, &ids)).collect();
+    }
     splats.rows = rows;
     splats
+}
+
+/// Probability below which an instance is left out of what is kept of an identity row.
+const LEAST_PROBABILITY: f32 = 1e-3;
+
+/// The most probable instances of an identity row; what is left out goes to the others in proportion.
+fn identity_shares(identities: &Identities, row: usize, ids: &[u16]) -> IdentityShares {
+    let range = identities.range(row);
+    let mut probabilities = vec![0.0; range.len()];
+    identities.row_probabilities(row, &mut probabilities);
+    let mut entries: Vec<(usize, f32)> = range.clone().zip(probabilities).collect();
+    // Stable, so that ties go to the lower index.
+    entries.sort_by(|a, b| b.1.total_cmp(&a.1));
+    entries.truncate(SHARES_PER_SPLAT);
+    entries.retain(|(_, probability)| *probability >= LEAST_PROBABILITY);
+    let kept: f32 = entries.iter().map(|(_, probability)| probability).sum();
+    let labelled = identities.log_estimates[range].iter().map(|log| log.exp()).sum::<f32>().min(1.0);
+    let mut shares = IdentityShares::default();
+    for (place, (entry, probability)) in shares.iter_mut().zip(entries) {
+        let id = ids[usize::from(identities.labels[entry])];
+        *place = IdentityShare { id, share: probability / kept * labelled };
+    }
+    shares
 }
 
 /// Takes the residuals of nodes that move against the trained Gaussians at all sampled times, as the nodes are
@@ -207,19 +238,8 @@ pub(crate) fn measure(
     use rayon::prelude::*;
 
     let mut sums = vec![ResidualSum::default(); nodes.len()];
-    // Weights of the group, in the order of the node.
-    let weights: Vec<Vec<f64>> = nodes
-        .iter()
-        .zip(groups)
-        .map(|(node, group)| {
-            let position = |row: &u32| group.rows.binary_search(row).ok();
-            node.splats
-                .rows
-                .iter()
-                .map(|row| position(row).map_or(0.0, |position| group.weights[position]))
-                .collect()
-        })
-        .collect();
+    let weights: Vec<Vec<f64>> =
+        nodes.iter().zip(groups).map(|(node, group)| self::weights(node, group)).collect();
     let moving = |node: &Node| !matches!(node.motion, Motion::Static);
     if !nodes.iter().any(moving) {
         return;
@@ -247,6 +267,13 @@ pub(crate) fn measure(
             node.report.residual = sum.statistics();
         }
     }
+}
+
+/// Weights of a group, in the order of the node made from it.
+pub(crate) fn weights(node: &Node, group: &MovingGroup) -> Vec<f64> {
+    let position = |row: &u32| group.rows.binary_search(row).ok();
+    let rows = node.splats.rows.iter();
+    rows.map(|row| position(row).map_or(0.0, |position| group.weights[position])).collect()
 }
 
 fn motion_report(

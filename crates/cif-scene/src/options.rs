@@ -116,6 +116,9 @@ impl FromStr for FrameRange {
 pub struct SceneOptions {
     /// Largest residual of a simplified motion. Default 1 % of the instance size.
     pub tolerance: Tolerance,
+    /// Largest RMS error of opacities and colours that change over time, in units of opacity and of spherical-harmonics
+    /// coefficients; 0 keeps them at every sampled frame. Default 0.01.
+    pub appearance_tolerance: f64,
     /// The most expensive motion model that may be chosen; what is lost is only reported then. `rigid` keeps
     /// every instance a rigid body; `parts` is for formats that hold no dense motion. Default dense.
     pub most_expensive_motion: MotionModel,
@@ -153,6 +156,7 @@ impl Default for SceneOptions {
     fn default() -> Self {
         Self {
             tolerance: Tolerance::default(),
+            appearance_tolerance: 0.01,
             most_expensive_motion: MotionModel::Dense,
             min_opacity: 1.0 / 255.0,
             min_occupancy: 0.0,
@@ -188,6 +192,13 @@ impl SceneOptions {
             return Err(SceneError::Option {
                 option: "tolerance",
                 value: tolerance.to_string(),
+                expected: "0 or more",
+            });
+        }
+        if !(self.appearance_tolerance.is_finite() && self.appearance_tolerance >= 0.0) {
+            return Err(SceneError::Option {
+                option: "appearance tolerance",
+                value: self.appearance_tolerance.to_string(),
                 expected: "0 or more",
             });
         }
@@ -246,6 +257,7 @@ mod tests {
             SceneOptions { min_opacity: f32::NAN, ..SceneOptions::default() },
             SceneOptions { meters_per_unit: 0.0, ..SceneOptions::default() },
             SceneOptions { tolerance: Tolerance::Percent(-1.0), ..SceneOptions::default() },
+            SceneOptions { appearance_tolerance: f64::NAN, ..SceneOptions::default() },
         ];
         for options in bad {
             assert!(options.validate().is_err(), "{options:?}");

@@ -13,6 +13,11 @@ pub trait MotionSource {
     fn moves(&self) -> bool {
         true
     }
+
+    /// True where colours change over time, other than by turning with a track.
+    fn recolors(&self) -> bool {
+        false
+    }
 }
 
 impl<F: FnMut(f64) -> Gaussians> MotionSource for F {
@@ -47,5 +52,11 @@ impl MotionSource for FieldMotion<'_> {
 
     fn moves(&self) -> bool {
         self.field.moves()
+    }
+
+    fn recolors(&self) -> bool {
+        let learned = self.field.deformation.as_ref().is_some_and(|deformation| deformation.config.heads.sh);
+        let mut groups = self.field.tracks.iter().flat_map(|tracks| &tracks.groups);
+        learned || groups.any(|group| group.colors.is_some())
     }
 }

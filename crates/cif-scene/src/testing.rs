@@ -51,7 +51,7 @@ pub(crate) fn recorded_field(objects: usize, seed: u64) -> Field {
             gaussians
                 .sh_coefficients
                 .push(std::array::from_fn(|k| numbers.next() as f32 * if k < 3 { 1.0 } else { 0.2 }));
-            identities.push_told(owner);
+            identities.push_certain(owner);
         }
         if owner.is_none() {
             tracks.group_of.extend([NO_GROUP; MEMBERS]);

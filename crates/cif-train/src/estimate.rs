@@ -149,6 +149,7 @@ pub fn estimate(
         labels: Vec::new(),
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
+        owners: Vec::new(),
     };
     for (entries, share, _) in &rows {
         for (label, probability) in entries {

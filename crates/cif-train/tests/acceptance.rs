@@ -68,7 +68,7 @@ fn with_probe(field: &Field) -> Field {
     let log_p = |entry: usize, p: &[f32]| p[entry].max(1e-30).ln();
     let p = rows.probabilities();
     let mut probed =
-        Identities { row_offsets: vec![0], labels: vec![], log_estimates: vec![], log_calibrations: vec![] };
+        Identities { row_offsets: vec![0], labels: vec![], log_estimates: vec![], log_calibrations: vec![], owners: vec![] };
     for row in 0..rows.len() {
         for entry in rows.range(row) {
             probed.labels.push(rows.labels[entry]);
@@ -181,6 +181,7 @@ fn one_in_view(others: usize) -> (Field, PinholeCamera) {
             labels: vec![0; n],
             log_estimates: vec![0.0; n],
             log_calibrations: vec![0.0; n],
+            owners: Vec::new(),
         }),
         instances: vec![Instance { id: 1, label: "one".into(), category: "one".into() }],
         timeline: Timeline { times: vec![0.0], frames_per_second: 24.0 },

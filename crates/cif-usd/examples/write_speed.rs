@@ -45,6 +45,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
         means,
         orientations,
         scales,
+        identities: Vec::new(),
     };
     let codes: Vec<f64> = (0..samples).map(|index| index as f64).collect();
     let extent = bounds(&splats.means, &splats.orientations, &splats.scales);
@@ -88,6 +89,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
         source_frames: (0, samples - 1),
         mean_occupancy: 0.5,
         report,
+        appearance: Default::default(),
     };
     SceneGraph {
         up_axis: UpAxis::Z,

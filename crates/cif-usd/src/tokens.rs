@@ -196,6 +196,12 @@ pub const DISPLAY_COLOR: &str = "primvars:displayColor";
 pub const PRIMVAR_OCCUPANCY: &str = "primvars:cif:occupancy";
 /// Primvar of the probability of the instance.
 pub const PRIMVAR_IDENTITY: &str = "primvars:cif:identity";
+/// Primvar of the instances that every splat may belong to, as ids, most probable first; 0 for an unused place.
+/// `elementSize` of them per splat.
+pub const PRIMVAR_INSTANCE_IDS: &str = "primvars:cif:instanceIds";
+/// Primvar beside [`PRIMVAR_INSTANCE_IDS`]: probability of each instance times the share of the splat's image that was
+/// labelled. What is missing to 1 was seen outside of every mask.
+pub const PRIMVAR_INSTANCE_SHARES: &str = "primvars:cif:instanceShares";
 /// Primvar of the row of every splat in the field.
 pub const PRIMVAR_ROW: &str = "primvars:cif:row";
 /// Primvar of the splat that a proxy point sits on, counted over the node.

@@ -236,6 +236,7 @@ mod tests {
             splats: Splats::default(),
             proxy: None,
             colliders: Vec::new(),
+            appearance: cif_scene::Appearance::default(),
             visibility: Vec::new(),
             extent: Bounds::EMPTY,
             source_frames: (0, count - 1),

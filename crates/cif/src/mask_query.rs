@@ -194,7 +194,7 @@ fn rows(
     let owners = identities.argmax();
     (0..owners.len())
         .filter(|row| {
-            let of_instance = chosen.contains(&usize::from(owners[*row]));
+            let of_instance = owners[*row].is_some_and(|owner| chosen.contains(&usize::from(owner)));
             let (a, d) = (counts.label_mass(*row, 0), counts.total_mass(*row));
             let by_itself = d > 0.0 && a / d > INSIDE;
             match selection {

@@ -5,14 +5,20 @@ use serde::{Deserialize, Serialize};
 
 use glam::{DQuat, DVec3};
 
-use crate::tracks::{DenseTrack, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use crate::gaussians::SH_FLOATS;
+use crate::tracks::{DenseTrack, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Timeline};
 
 /// Newest version of the layout, which this crate writes where it is needed; it reads all up to it.
 ///
 /// 1 is the first; 2 adds recorded motion ([`crate::Tracks`]); 3 adds Gaussians that stand still
-/// ([`crate::Deformation::still`]). A field without these is written as 1 or 2, so that older software reads it.
-pub const FORMAT: u32 = 3;
+/// ([`crate::Deformation::still`]); 4 adds recorded opacities and colours ([`crate::TrackGroup::opacities`]), and
+/// identity rows without entries or with an owner ([`crate::Owner`]). A field without these is written as 1 to 3, so
+/// that older software reads it.
+pub const FORMAT: u32 = 4;
+
+/// The layout before recorded opacities, colours and owners.
+const FORMAT_WITH_STILL: u32 = 3;
 
 /// The layout before Gaussians could stand still.
 const FORMAT_WITH_TRACKS: u32 = 2;
@@ -22,13 +28,28 @@ const FORMAT_WITHOUT_TRACKS: u32 = 1;
 
 /// Oldest layout that holds a field.
 pub(super) fn format_of(field: &Field) -> u32 {
-    if stands_still(field) {
+    if has_appearance(field) || has_owners(field) {
         FORMAT
+    } else if stands_still(field) {
+        FORMAT_WITH_STILL
     } else if field.tracks.is_some() {
         FORMAT_WITH_TRACKS
     } else {
         FORMAT_WITHOUT_TRACKS
     }
+}
+
+/// True where opacities or colours are recorded.
+fn has_appearance(field: &Field) -> bool {
+    let groups = field.tracks.iter().flat_map(|tracks| &tracks.groups);
+    groups.into_iter().any(|group| group.opacities.is_some() || group.colors.is_some())
+}
+
+/// True where identity rows have owners, or no entries.
+fn has_owners(field: &Field) -> bool {
+    field.identities.as_ref().is_some_and(|rows| {
+        !rows.owners.is_empty() || rows.row_offsets.windows(2).any(|pair| pair[0] == pair[1])
+    })
 }
 
 /// Whether any Gaussian of a deformed field stands still.
@@ -40,6 +61,12 @@ fn stands_still(field: &Field) -> bool {
 pub(super) fn still_rows(field: &Field) -> Option<Vec<u8>> {
     let deformation = field.deformation.as_ref().filter(|_| stands_still(field))?;
     Some((0..field.len()).map(|row| u8::from(deformation.is_still(row))).collect())
+}
+
+/// [`crate::Owner::code`] of every row; nothing where all rows are estimated.
+pub(super) fn owner_codes(field: &Field) -> Option<Vec<i32>> {
+    let rows = field.identities.as_ref().filter(|rows| !rows.owners.is_empty())?;
+    Some(rows.owners.iter().map(|owner| owner.code()).collect())
 }
 
 /// Longest header, bytes; the limit of the safetensors format.
@@ -64,10 +91,13 @@ pub(super) const TRACK_POSES: &str = "tracks.poses";
 pub(super) const TRACK_MEANS: &str = "tracks.means";
 pub(super) const TRACK_QUATERNIONS: &str = "tracks.quaternions";
 pub(super) const TRACK_LOG_SCALES: &str = "tracks.log_scales";
+pub(super) const TRACK_OPACITIES: &str = "tracks.opacities";
+pub(super) const TRACK_COLORS: &str = "tracks.sh_coefficients";
 pub(super) const ROW_OFFSETS: &str = "identities.row_offsets";
 pub(super) const LABELS: &str = "identities.labels";
 pub(super) const LOG_ESTIMATES: &str = "identities.log_estimates";
 pub(super) const LOG_CALIBRATIONS: &str = "identities.log_calibrations";
+pub(super) const OWNERS: &str = "identities.owners";
 pub(super) const TRAINING_PREFIX: &str = "training.";
 
 /// The part of a field that is not a tensor.
@@ -78,6 +108,9 @@ pub(super) struct FieldJson {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(super) tracks: Option<Vec<TrackGroupJson>>,
     pub(super) has_identities: bool,
+    /// True where there is a tensor of owners.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub(super) has_owners: bool,
     pub(super) instances: Vec<Instance>,
     pub(super) timeline: Timeline,
     pub(super) cameras: Vec<RecordedCamera>,
@@ -111,6 +144,25 @@ pub(super) struct TrackGroupJson {
     /// Pairs of time and whether visible.
     visibility: Vec<(f64, bool)>,
     pub(super) dense: Option<DenseJson>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) opacities: Option<SamplesJson>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(super) colors: Option<SamplesJson>,
+}
+
+/// The part of [`Samples`] that is not a tensor.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct SamplesJson {
+    times: Vec<f64>,
+    /// Rows of the tensor.
+    pub(super) rows: usize,
+}
+
+impl SamplesJson {
+    fn of<V>(samples: &Samples<V>) -> Self {
+        Self { times: samples.times.clone(), rows: samples.values.len() }
+    }
 }
 
 /// The part of a [`DenseTrack`] that is not a tensor.
@@ -134,6 +186,8 @@ pub(super) struct TrackArrays {
     pub(super) means: Vec<[f32; 3]>,
     pub(super) quaternions: Vec<[f32; 4]>,
     pub(super) log_scales: Vec<[f32; 3]>,
+    pub(super) opacities: Vec<f32>,
+    pub(super) colors: Vec<[f32; SH_FLOATS]>,
 }
 
 impl TrackGroupJson {
@@ -149,6 +203,8 @@ impl TrackGroupJson {
                 rows: dense.means.len(),
                 log_scales: dense.log_scales.is_some(),
             }),
+            opacities: group.opacities.as_ref().map(SamplesJson::of),
+            colors: group.colors.as_ref().map(SamplesJson::of),
         }
     }
 
@@ -175,6 +231,10 @@ impl TrackGroupJson {
                 quaternions: arrays.quaternions,
                 log_scales: dense.log_scales.then_some(arrays.log_scales),
             }),
+            opacities: self
+                .opacities
+                .map(|samples| Samples { times: samples.times, values: arrays.opacities }),
+            colors: self.colors.map(|samples| Samples { times: samples.times, values: arrays.colors }),
         }
     }
 }
@@ -193,6 +253,8 @@ impl TrackArrays {
                 arrays.quaternions.extend_from_slice(&dense.quaternions);
                 arrays.log_scales.extend_from_slice(dense.log_scales.as_deref().unwrap_or_default());
             }
+            arrays.opacities.extend(group.opacities.iter().flat_map(|samples| &samples.values));
+            arrays.colors.extend(group.colors.iter().flat_map(|samples| &samples.values));
         }
         arrays
     }
@@ -211,6 +273,7 @@ impl FieldJson {
                 .as_ref()
                 .map(|tracks| tracks.groups.iter().map(TrackGroupJson::of).collect()),
             has_identities: field.identities.is_some(),
+            has_owners: field.identities.as_ref().is_some_and(|rows| !rows.owners.is_empty()),
             instances: field.instances.clone(),
             timeline: field.timeline.clone(),
             cameras: field.cameras.clone(),

@@ -23,9 +23,12 @@
 //! | `tracks.poses` | F64 | `[poses, 8]`: time, translation x y z, quaternion w x y z; group after group |
 //! | `tracks.means`, `tracks.log_scales` | F32 | `[rows, 3]`, dense samples, group after group |
 //! | `tracks.quaternions` | F32 | `[rows, 4]`, w x y z |
+//! | `tracks.opacities` | F32 | `[rows]`, in [0, 1], group after group; absent where none changes |
+//! | `tracks.sh_coefficients` | F32 | `[rows, 48]`, group after group; absent where no colour changes |
 //! | `identities.row_offsets` | U32 | `[N + 1]`; absent without identities, as the next two |
 //! | `identities.labels` | U16 | `[E]` |
 //! | `identities.log_estimates`, `identities.log_calibrations` | F32 | `[E]` |
+//! | `identities.owners` | I32 | `[N]`: an instance, -1 for none, -2 where the identity row decides; absent where all do |
 //! | `training.<name>` | F32, F64, U32 or U64 | `[length]` |
 //!
 //! Floats survive bit by bit, in tensors and in JSON; equal fields give equal bytes. A file is written beside

@@ -10,13 +10,13 @@ use safetensors::tensor::{Metadata, TensorInfo};
 
 use super::format::{
     FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES,
-    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS,
-    SH_COEFFICIENTS, STILL, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS,
+    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, OWNERS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS,
+    SH_COEFFICIENTS, STILL, SamplesJson, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS,
     TRAINING_KEY, TRAINING_PREFIX, TrackArrays, TrackGroupJson, VERSION_KEY,
 };
 use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 use crate::gaussians::SH_FLOATS;
-use crate::{Deformation, Field, Gaussians, Identities, Tracks};
+use crate::{Deformation, Field, Gaussians, Identities, Owner, Tracks};
 
 pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
     let checkpoint = load_unchecked(path, with_training)?;
@@ -120,7 +120,9 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
             labels: reader.values(LABELS, Dtype::U16, entries, &[])?,
             log_estimates: reader.values(LOG_ESTIMATES, Dtype::F32, entries, &[])?,
             log_calibrations: reader.values(LOG_CALIBRATIONS, Dtype::F32, entries, &[])?,
+            owners: if json.has_owners { read_owners(reader, n)? } else { Vec::new() },
         })
+        .map(of_older_files)
     } else {
         None
     };
@@ -148,6 +150,41 @@ fn read_still<S: Read + Seek>(reader: &mut Reader<'_, S>, n: usize) -> Result<Ve
     }
 }
 
+fn read_owners<S: Read + Seek>(reader: &mut Reader<'_, S>, n: usize) -> Result<Vec<Owner>, CheckpointError> {
+    let codes: Vec<i32> = reader.values(OWNERS, Dtype::I32, n, &[])?;
+    codes
+        .into_iter()
+        .map(|code| {
+            Owner::from_code(code)
+                .ok_or_else(|| reader.tensor_error(OWNERS, &format!("holds {code}, which is no owner")))
+        })
+        .collect()
+}
+
+/// Layouts before 4 had no owners: a row with the one estimate ln 2 belonged to its label, and one with the one
+/// estimate -104 to none. Measured estimates are never above 0 and never below -19.
+fn of_older_files(rows: Identities) -> Identities {
+    const OF_AN_INSTANCE: f32 = std::f32::consts::LN_2;
+    const OF_NONE: f32 = -104.0;
+    let owner = |row: usize| match rows.log_estimates.get(rows.range(row)) {
+        Some(&[OF_AN_INSTANCE]) => Some(Some(rows.labels[rows.range(row).start])),
+        Some(&[estimate]) if estimate <= OF_NONE => Some(None),
+        _ => None,
+    };
+    let ascend = rows.row_offsets.windows(2).all(|pair| pair[0] <= pair[1]);
+    if !rows.owners.is_empty() || !ascend || !(0..rows.len()).any(|row| owner(row).is_some()) {
+        return rows;
+    }
+    let mut owned = Identities::empty();
+    for row in 0..rows.len() {
+        match owner(row) {
+            Some(owner) => owned.push_certain(owner),
+            None => owned.append_row(&rows, row),
+        }
+    }
+    owned
+}
+
 fn read_tracks<S: Read + Seek>(
     reader: &mut Reader<'_, S>,
     groups: Vec<TrackGroupJson>,
@@ -162,24 +199,41 @@ fn read_tracks<S: Read + Seek>(
     let total = |count: &dyn Fn(&TrackGroupJson) -> usize| {
         groups.iter().try_fold(0_usize, |sum, group| sum.checked_add(count(group))).unwrap_or(usize::MAX)
     };
+    let rows_in = |samples: &Option<SamplesJson>| samples.as_ref().map_or(0, |samples| samples.rows);
+    let opacity_rows_of = |group: &TrackGroupJson| rows_in(&group.opacities);
+    let color_rows_of = |group: &TrackGroupJson| rows_in(&group.colors);
     let rows = total(&rows_of);
     let all = TrackArrays {
         poses: reader.values(TRACK_POSES, Dtype::F64, total(&|group| group.poses), &[POSE_FLOATS])?,
         means: reader.values(TRACK_MEANS, Dtype::F32, rows, &[3])?,
         quaternions: reader.values(TRACK_QUATERNIONS, Dtype::F32, rows, &[4])?,
         log_scales: reader.values(TRACK_LOG_SCALES, Dtype::F32, total(&scale_rows_of), &[3])?,
+        opacities: if groups.iter().any(|group| group.opacities.is_some()) {
+            reader.values(TRACK_OPACITIES, Dtype::F32, total(&opacity_rows_of), &[])?
+        } else {
+            Vec::new()
+        },
+        colors: if groups.iter().any(|group| group.colors.is_some()) {
+            reader.values(TRACK_COLORS, Dtype::F32, total(&color_rows_of), &[SH_FLOATS])?
+        } else {
+            Vec::new()
+        },
     };
     let (mut poses, mut means) = (all.poses.into_iter(), all.means.into_iter());
     let (mut quaternions, mut log_scales) = (all.quaternions.into_iter(), all.log_scales.into_iter());
+    let (mut opacities, mut colors) = (all.opacities.into_iter(), all.colors.into_iter());
     let groups = groups
         .into_iter()
         .map(|group| {
             let (rows, scale_rows) = (rows_of(&group), scale_rows_of(&group));
+            let (opacity_rows, color_rows) = (opacity_rows_of(&group), color_rows_of(&group));
             let own = TrackArrays {
                 poses: poses.by_ref().take(group.poses).collect(),
                 means: means.by_ref().take(rows).collect(),
                 quaternions: quaternions.by_ref().take(rows).collect(),
                 log_scales: log_scales.by_ref().take(scale_rows).collect(),
+                opacities: opacities.by_ref().take(opacity_rows).collect(),
+                colors: colors.by_ref().take(color_rows).collect(),
             };
             group.group(own)
         })

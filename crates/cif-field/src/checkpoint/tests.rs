@@ -9,7 +9,7 @@ use serde_json::json;
 
 use super::write::MAX_JSON_DEPTH;
 use super::*;
-use crate::{FieldError, testing};
+use crate::{FieldError, Identities, Owner, testing};
 
 /// Words of the message that a change must cause.
 type Change<T> = (&'static str, fn(&mut T));
@@ -281,10 +281,17 @@ fn recorded_motion_survives_and_raises_the_format() {
     assert_eq!(format(&bytes_of(&plain)), "1", "older software reads fields without tracks");
     let tracked = Checkpoint { field: testing::tracked_field(20, 4), training: None };
     let bytes = bytes_of(&tracked);
-    assert_eq!(format(&bytes), "2");
+    assert_eq!(format(&bytes), "4", "opacities and colours change over time");
     let loaded = read_bytes(&bytes).unwrap();
     assert_eq!(loaded, tracked);
     assert_eq!(bytes_of(&loaded), bytes);
+    let mut moving = tracked.clone();
+    for group in &mut moving.field.tracks.as_mut().unwrap().groups {
+        (group.opacities, group.colors) = (None, None);
+    }
+    let bytes = bytes_of(&moving);
+    assert_eq!(format(&bytes), "2", "older software reads motion without them");
+    assert_eq!(read_bytes(&bytes).unwrap(), moving);
     let empty = Checkpoint {
         field: Field { tracks: Some(Default::default()), ..testing::field(0, 1) },
         training: None,
@@ -298,13 +305,13 @@ fn what_stands_still_survives_and_raises_the_format() {
         let (_, header) = safetensors::SafeTensors::read_metadata(bytes).unwrap();
         header.metadata().clone().unwrap()["cif.format"].clone()
     };
-    for field in [testing::field(20, 4), testing::tracked_field(20, 4)] {
+    for (field, expected) in [(testing::field(20, 4), "3"), (testing::tracked_field(20, 4), "4")] {
         let mut partly = Checkpoint { field, training: None };
         let other = partly.field.fingerprint();
         partly.field.deformation.as_mut().unwrap().still = (0..20).map(|row| row % 3 == 1).collect();
         assert_ne!(partly.field.fingerprint(), other);
         let bytes = bytes_of(&partly);
-        assert_eq!(format(&bytes), "3");
+        assert_eq!(format(&bytes), expected);
         let loaded = read_bytes(&bytes).unwrap();
         assert_eq!(loaded, partly);
         assert_eq!(bytes_of(&loaded), bytes);
@@ -434,8 +441,8 @@ fn json_too_deep_to_be_read_back_is_not_saved() {
 
 #[test]
 fn broken_identity_rows_are_named() {
-    let breaks: [Change<crate::Identities>; 6] = [
-        ("identity row 1 is empty", |rows| rows.row_offsets[2] = rows.row_offsets[1]),
+    let breaks: [Change<Identities>; 6] = [
+        ("`identities.owners` has 3 entries, expected 9", |rows| rows.owners = vec![Owner::Background; 3]),
         ("identity row 0 spans", |rows| rows.row_offsets[1] = u32::MAX),
         ("identity row 0 starts", |rows| rows.row_offsets[0] = 1),
         ("do not ascend", |rows| {
@@ -454,6 +461,42 @@ fn broken_identity_rows_are_named() {
     let mut field = testing::field(9, 2);
     field.identities = field.identities.map(|rows| rows.gather(&[0, 1]));
     assert!(matches!(field.validate(), Err(FieldError::Length { array: "identities.row_offsets", .. })));
+}
+
+#[test]
+fn owners_survive_and_raise_the_format() {
+    let mut checkpoint = Checkpoint { field: testing::field(4, 2), training: None };
+    let mut rows = Identities::empty();
+    rows.push(Owner::Estimated, &[(0, 0.5), (2, 0.25)]);
+    rows.push_certain(Some(3));
+    rows.push_certain(None);
+    rows.push(Owner::Background, &[(1, 0.125)]);
+    checkpoint.field.identities = Some(rows);
+    let bytes = bytes_of(&checkpoint);
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+    assert_eq!(header.metadata().as_ref().unwrap()["cif.format"], "4");
+    let loaded = read_bytes(&bytes).unwrap();
+    assert_eq!(loaded, checkpoint);
+    assert_eq!(bytes_of(&loaded), bytes);
+    checkpoint.field.identities.as_mut().unwrap().owners[1] = Owner::Instance(4);
+    let refused = checkpoint.field.validate().unwrap_err().to_string();
+    assert!(refused.contains("identity row 1 belongs to instance 4, but there are 4"), "{refused}");
+}
+
+#[test]
+fn owners_of_older_layouts_are_understood() {
+    let mut field = testing::field(3, 2);
+    field.identities = Some(Identities {
+        row_offsets: vec![0, 1, 2, 3],
+        labels: vec![3, 0, 1],
+        log_estimates: vec![std::f32::consts::LN_2, -104.0, -0.5],
+        log_calibrations: vec![0.0; 3],
+        owners: Vec::new(),
+    });
+    let loaded = read_bytes(&bytes_of(&Checkpoint { field, training: None })).unwrap();
+    let rows = loaded.field.identities.unwrap();
+    assert_eq!(rows.owners, [Owner::Instance(3), Owner::Background, Owner::Estimated]);
+    assert_eq!((rows.labels, rows.row_offsets), (vec![3, 1], vec![0, 1, 1, 2]));
 }
 
 /// Takes some bytes and then fails as a full disk does.

@@ -11,12 +11,13 @@ use serde::Serialize;
 
 use super::format::{
     FIELD_KEY, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES, MAX_HEADER, MEANS,
-    MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS, SH_COEFFICIENTS,
-    STILL, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY,
-    TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of, still_rows,
+    MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, OWNERS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS, SH_COEFFICIENTS,
+    STILL, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY,
+    TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of, owner_codes, still_rows,
 };
 use super::{CheckpointError, StateTensor, TrainingState};
 use crate::Field;
+use crate::gaussians::SH_FLOATS;
 
 /// Deepest nesting of free-form JSON; the parser stops at 128, a few of which the file's own levels take.
 pub(super) const MAX_JSON_DEPTH: usize = 100;
@@ -85,6 +86,15 @@ pub(super) fn write(
     ]);
     let track_arrays = field.tracks.as_ref().map(TrackArrays::of);
     let mut tensors = field_tensors(field, track_arrays.as_ref());
+    let owners = owner_codes(field);
+    if let Some(codes) = &owners {
+        tensors.push(Tensor {
+            name: OWNERS.to_owned(),
+            dtype: Dtype::I32,
+            shape: vec![codes.len()],
+            bytes: bytemuck::cast_slice(codes),
+        });
+    }
     let still = still_rows(field);
     if let Some(rows) = &still {
         tensors.push(Tensor {
@@ -167,6 +177,12 @@ fn field_tensors<'a>(field: &'a Field, track_arrays: Option<&'a TrackArrays>) ->
         tensors.push(tensor(TRACK_MEANS, Dtype::F32, &arrays.means, &[3]));
         tensors.push(tensor(TRACK_QUATERNIONS, Dtype::F32, &arrays.quaternions, &[4]));
         tensors.push(tensor(TRACK_LOG_SCALES, Dtype::F32, &arrays.log_scales, &[3]));
+        if tracks.groups.iter().any(|group| group.opacities.is_some()) {
+            tensors.push(tensor(TRACK_OPACITIES, Dtype::F32, &arrays.opacities, &[]));
+        }
+        if tracks.groups.iter().any(|group| group.colors.is_some()) {
+            tensors.push(tensor(TRACK_COLORS, Dtype::F32, &arrays.colors, &[SH_FLOATS]));
+        }
     }
     if let Some(identities) = &field.identities {
         tensors.push(tensor(ROW_OFFSETS, Dtype::U32, &identities.row_offsets, &[]));

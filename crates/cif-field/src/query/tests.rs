@@ -77,6 +77,7 @@ fn single() -> Field {
         labels: vec![2],
         log_estimates: vec![0.0],
         log_calibrations: vec![0.0],
+        owners: Vec::new(),
     });
     field
 }

@@ -5,9 +5,9 @@ use cif_geometry::spherical_harmonics::HarmonicsRotation;
 use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
-use super::{DenseTrack, NO_GROUP, Tracks};
+use super::{DenseTrack, NO_GROUP, Samples, TrackGroup, Tracks};
 use crate::Gaussians;
-use crate::gaussians::SH_FLOATS;
+use crate::gaussians::{SH_FLOATS, saturated_logit};
 
 /// Opacity and occupancy logit of a hidden Gaussian: nothing in single precision is nearer to 0 and not 0.
 pub const HIDDEN_LOGIT: f32 = -104.0;
@@ -37,12 +37,66 @@ pub struct GroupAtTime<'a> {
     pub translation: DVec3,
     /// Dense samples around the time.
     pub dense: Option<DenseAtTime<'a>>,
+    /// Opacities around the time, in [0, 1].
+    pub opacities: Option<SamplesAtTime<'a, f32>>,
+    /// Spherical harmonics around the time, before the pose turns them.
+    pub colors: Option<SamplesAtTime<'a, [f32; SH_FLOATS]>>,
 }
 
 impl GroupAtTime<'_> {
     /// Whether nothing happens to the group.
     fn is_still(&self) -> bool {
-        self.deformed && self.visible && !self.moved && self.dense.is_none()
+        self.deformed
+            && self.visible
+            && !self.moved
+            && self.dense.is_none()
+            && self.opacities.is_none()
+            && self.colors.is_none()
+    }
+}
+
+/// The samples before and after a time.
+#[derive(Clone, Copy, Debug)]
+pub struct SamplesAtTime<'a, V> {
+    before: &'a [V],
+    after: &'a [V],
+    /// Share of the sample after.
+    pub fraction: f64,
+}
+
+impl<'a, V: Copy> SamplesAtTime<'a, V> {
+    fn new(samples: &'a Samples<V>, time: f64) -> Self {
+        let members = samples.members();
+        let around = Around::new(&samples.times, time);
+        let sample = |index: usize| &samples.values[index * members..(index + 1) * members];
+        Self { before: sample(around.before), after: sample(around.after), fraction: around.fraction }
+    }
+
+    /// Values of a member before and after.
+    #[must_use]
+    pub fn values(&self, member: usize) -> [V; 2] {
+        [self.before[member], self.after[member]]
+    }
+}
+
+/// Positions of the samples before and after a time, and the share of the one after; the nearest one twice outside
+/// of the samples.
+struct Around {
+    before: usize,
+    after: usize,
+    fraction: f64,
+}
+
+impl Around {
+    fn new(times: &[f64], time: f64) -> Self {
+        let after = times.partition_point(|sample| *sample <= time);
+        let last = times.len() - 1;
+        if after == 0 || after > last {
+            let at = if after == 0 { 0 } else { last };
+            return Self { before: at, after: at, fraction: 0.0 };
+        }
+        let (low, high) = (times[after - 1], times[after]);
+        Self { before: after - 1, after, fraction: (time - low) / (high - low) }
     }
 }
 
@@ -61,15 +115,8 @@ pub struct DenseAtTime<'a> {
 impl<'a> DenseAtTime<'a> {
     fn new(track: &'a DenseTrack, time: f64) -> Self {
         let stride = track.members();
-        let after = track.times.partition_point(|sample| *sample <= time);
-        let last = track.times.len() - 1;
-        if after == 0 || after > last {
-            let at = if after == 0 { 0 } else { last };
-            return Self { track, before: at * stride, after: at * stride, fraction: 0.0 };
-        }
-        let (low, high) = (track.times[after - 1], track.times[after]);
-        let fraction = (time - low) / (high - low);
-        Self { track, before: (after - 1) * stride, after: after * stride, fraction }
+        let Around { before, after, fraction } = Around::new(&track.times, time);
+        Self { track, before: before * stride, after: after * stride, fraction }
     }
 
     /// Centres of a member before and after.
@@ -98,7 +145,7 @@ pub struct TracksAtTime<'a> {
     group_of: &'a [u32],
     /// The groups, in the order of [`Tracks::groups`].
     pub groups: Vec<GroupAtTime<'a>>,
-    /// [`Tracks::members`]; empty where no group is dense.
+    /// [`Tracks::members`]; empty where no group has samples of its members.
     members: Vec<u32>,
 }
 
@@ -151,11 +198,13 @@ impl<'a> TracksAtTime<'a> {
                     pivot: group.pivot,
                     translation,
                     dense: group.dense.as_ref().map(|dense| DenseAtTime::new(dense, time)),
+                    opacities: group.opacities.as_ref().map(|samples| SamplesAtTime::new(samples, time)),
+                    colors: group.colors.as_ref().map(|samples| SamplesAtTime::new(samples, time)),
                 }
             })
             .collect();
-        let is_dense = groups.iter().any(|group| group.dense.is_some());
-        let members = if is_dense { tracks.members() } else { Vec::new() };
+        let is_sampled = tracks.groups.iter().any(TrackGroup::has_samples);
+        let members = if is_sampled { tracks.members() } else { Vec::new() };
         Self { group_of: &tracks.group_of, groups, members }
     }
 
@@ -166,7 +215,7 @@ impl<'a> TracksAtTime<'a> {
         self
     }
 
-    /// Group of a row, with the row's place among the members of a dense group.
+    /// Group of a row, with the row's place among the members of a group that has samples of them.
     #[must_use]
     pub fn group(&self, row: usize) -> Option<(&GroupAtTime<'a>, usize)> {
         let group = *self.group_of.get(row)?;
@@ -180,10 +229,10 @@ impl<'a> TracksAtTime<'a> {
         self.groups.iter().any(|group| !group.is_still())
     }
 
-    /// Whether colours turn, or learned colour changes are undone.
+    /// True where colours turn or are sampled, or learned colour changes are undone.
     #[must_use]
     pub fn changes_sh(&self) -> bool {
-        self.groups.iter().any(|group| group.turned || !group.deformed)
+        self.groups.iter().any(|group| group.turned || !group.deformed || group.colors.is_some())
     }
 
     /// Puts the tracks onto `posed`, the canonical Gaussians with the learned deformation at this time.
@@ -217,6 +266,10 @@ impl<'a> TracksAtTime<'a> {
                 if let Some(dense) = &group.dense {
                     dense.place(member, mean, log_scale, quaternion);
                 }
+                if let Some(opacities) = &group.opacities {
+                    let [before, after] = opacities.values(member).map(f64::from);
+                    *opacity_logit = saturated_logit(before + opacities.fraction * (after - before));
+                }
                 if group.moved {
                     let offset = DVec3::from_array(mean.map(f64::from)) - group.pivot;
                     let moved = group.rotation * offset + group.translation;
@@ -244,14 +297,14 @@ impl<'a> TracksAtTime<'a> {
             .map(|group| group.turned.then(|| harmonics_rotation(group.rotation)))
             .collect();
         sh_coefficients.par_iter_mut().with_min_len(CHUNK).enumerate().for_each(|(row, sh)| {
-            let group = self.group_of[row];
-            if group == NO_GROUP {
-                return;
-            }
-            if !self.groups[group as usize].deformed {
+            let Some((group, member)) = self.group(row) else { return };
+            if !group.deformed {
                 *sh = canonical.sh_coefficients[row];
             }
-            if let Some(turn) = &turns[group as usize] {
+            if let Some(colors) = &group.colors {
+                *sh = mix(colors.values(member), colors.fraction as f32);
+            }
+            if let Some(turn) = &turns[self.group_of[row] as usize] {
                 turn.rotate(sh);
             }
         });

@@ -5,19 +5,22 @@
 //!
 //! 1. its canonical parameters, with the learned deltas added unless the group is exempt
 //!    ([`TrackGroup::deformed`]),
-//! 2. replaced by the dense samples of the group, where it has some ([`DenseTrack`]),
+//! 2. replaced by the dense samples of the group, where it has some ([`DenseTrack`]), and given its sampled opacity
+//!    and colour ([`TrackGroup::opacities`], [`TrackGroup::colors`]),
 //! 3. carried by the rigid pose of the group, `x' = R(t) (x - pivot) + translation(t)`: the orientation turns
 //!    with it, and so does the view-dependent colour,
 //! 4. not drawn while the group is hidden.
 //!
-//! Between samples, translations and dense samples are linear and rotations spherical; outside the samples the
+//! Between samples, translations, dense samples, opacities and colours are linear and rotations spherical; outside the samples the
 //! nearest one holds. Times are normalised as in [`crate::Timeline`].
 
 mod apply;
 
 use glam::{DQuat, DVec3};
 
-pub use apply::{DenseAtTime, GaussiansMut, GroupAtTime, HIDDEN_LOGIT, TracksAtTime};
+use crate::gaussians::SH_FLOATS;
+
+pub use apply::{DenseAtTime, GaussiansMut, GroupAtTime, HIDDEN_LOGIT, SamplesAtTime, TracksAtTime};
 
 /// Entry of [`Tracks::group_of`] for a Gaussian without a group.
 pub const NO_GROUP: u32 = u32::MAX;
@@ -48,6 +51,35 @@ pub struct TrackGroup {
     pub visibility: Vec<VisibilityStep>,
     /// A path for every Gaussian of the group, before the pose; `None` where the pose says it all.
     pub dense: Option<DenseTrack>,
+    /// Opacities over time, in [0, 1] (not logits); `None` where they stay as in the canonical Gaussians.
+    pub opacities: Option<Samples<f32>>,
+    /// Spherical harmonics over time, before the pose turns them; `None` where they stay.
+    pub colors: Option<Samples<[f32; SH_FLOATS]>>,
+}
+
+/// Values of a group of M Gaussians over time, linear in between and held outside.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Samples<V> {
+    /// T normalised times, strictly ascending, at least one.
+    pub times: Vec<f64>,
+    /// Values `[T, M]`; members are the rows of the group in [`Tracks::group_of`] in ascending order.
+    pub values: Vec<V>,
+}
+
+impl<V: Copy> Samples<V> {
+    /// Gaussians per sample, M.
+    #[must_use]
+    pub fn members(&self) -> usize {
+        self.values.len() / self.times.len().max(1)
+    }
+
+    /// The samples of members `members[0], members[1], ...`, which may repeat.
+    fn gather(&self, members: &[usize]) -> Self {
+        let stride = self.members();
+        let picked = (0..self.times.len()).flat_map(|sample| members.iter().map(move |member| (sample, *member)));
+        let values = picked.map(|(sample, member)| self.values[sample * stride + member]).collect();
+        Self { times: self.times.clone(), values }
+    }
 }
 
 /// A pose at a time.
@@ -118,7 +150,28 @@ impl TrackGroup {
             poses: Vec::new(),
             visibility: Vec::new(),
             dense: None,
+            opacities: None,
+            colors: None,
         }
+    }
+
+    /// The same motion for members `members[0], members[1], ...` of the group, which may repeat.
+    fn gather(&self, members: &[usize]) -> Self {
+        Self {
+            name: self.name.clone(),
+            deformed: self.deformed,
+            pivot: self.pivot,
+            poses: self.poses.clone(),
+            visibility: self.visibility.clone(),
+            dense: self.dense.as_ref().map(|dense| dense.gather(members)),
+            opacities: self.opacities.as_ref().map(|opacities| opacities.gather(members)),
+            colors: self.colors.as_ref().map(|colors| colors.gather(members)),
+        }
+    }
+
+    /// True where members have samples of their own, so that their place in the group counts.
+    fn has_samples(&self) -> bool {
+        self.dense.is_some() || self.opacities.is_some() || self.colors.is_some()
     }
 
     /// Turn and place of the pivot at a time.
@@ -149,7 +202,10 @@ impl TrackGroup {
     /// Whether anything of the group changes over time, apart from its visibility.
     #[must_use]
     pub fn moves(&self) -> bool {
-        self.poses.len() > 1 || self.dense.as_ref().is_some_and(|dense| dense.times.len() > 1)
+        self.poses.len() > 1
+            || self.dense.as_ref().is_some_and(|dense| dense.times.len() > 1)
+            || self.opacities.as_ref().is_some_and(|opacities| opacities.times.len() > 1)
+            || self.colors.as_ref().is_some_and(|colors| colors.times.len() > 1)
     }
 }
 
@@ -203,20 +259,12 @@ impl Tracks {
                 kept[group as usize].push(members[row as usize] as usize);
             }
         }
-        let groups = self
-            .groups
-            .iter()
-            .zip(&kept)
-            .map(|(group, kept)| TrackGroup {
-                dense: group.dense.as_ref().map(|dense| dense.gather(kept)),
-                ..group.clone()
-            })
-            .collect();
+        let groups = self.groups.iter().zip(&kept).map(|(group, kept)| group.gather(kept)).collect();
         Self { group_of, groups }
     }
 
     /// Gives rows a motion of their own: `change` makes the new group from the old one (a still one called
-    /// `name` around `pivot` where there was none), once per old group. Dense samples go with their rows.
+    /// `name` around `pivot` where there was none), once per old group. Samples go with their rows.
     ///
     /// # Panics
     /// When a row is out of range or given twice.
@@ -228,6 +276,10 @@ impl Tracks {
         mut change: impl FnMut(TrackGroup) -> TrackGroup,
     ) {
         let members = self.members();
+        let mut sizes = vec![0_usize; self.groups.len()];
+        for &group in self.group_of.iter().filter(|group| **group != NO_GROUP) {
+            sizes[group as usize] += 1;
+        }
         let mut by_group: std::collections::BTreeMap<u32, Vec<u32>> = Default::default();
         for &row in rows {
             by_group.entry(self.group_of[row as usize]).or_default().push(row);
@@ -239,17 +291,13 @@ impl Tracks {
                 TrackGroup::still(name, pivot)
             } else {
                 let group = &mut self.groups[old as usize];
-                let dense = group.dense.take().map(|dense| {
-                    let taken: Vec<usize> = rows.iter().map(|&row| members[row as usize] as usize).collect();
-                    let mut is_taken = vec![false; dense.members()];
-                    taken.iter().for_each(|&member| is_taken[member] = true);
-                    let rest: Vec<usize> = (0..is_taken.len()).filter(|&member| !is_taken[member]).collect();
-                    (dense.gather(&taken), dense.gather(&rest))
-                });
-                let moving = group.clone();
-                let (taken, rest) = dense.unzip();
-                group.dense = rest;
-                TrackGroup { dense: taken, ..moving }
+                let taken: Vec<usize> = rows.iter().map(|&row| members[row as usize] as usize).collect();
+                let moving = group.gather(&taken);
+                let mut is_taken = vec![false; sizes[old as usize]];
+                taken.iter().for_each(|&member| is_taken[member] = true);
+                let rest: Vec<usize> = (0..is_taken.len()).filter(|&member| !is_taken[member]).collect();
+                *group = group.gather(&rest);
+                moving
             };
             let new = self.groups.len() as u32;
             self.groups.push(change(group));

@@ -44,13 +44,49 @@ fn a_pose_carries_places_turns_orientations_and_colours() {
                 assert!((before[channel] - after[channel]).abs() < 1e-5, "{before:?} {after:?}");
             }
         }
-        assert_eq!(posed.opacity_logits[row], plain.opacity_logits[row]);
     }
     // Without a group nothing changes.
     for row in (3..24).step_by(4) {
         assert_eq!(posed.means[row], plain.means[row]);
         assert_eq!(posed.sh_coefficients[row], plain.sh_coefficients[row]);
     }
+}
+
+#[test]
+fn opacities_and_colours_follow_their_samples() {
+    let mut field = testing::tracked_field(24, 3);
+    let tracks = field.tracks.as_mut().unwrap();
+    let samples = tracks.groups[0].opacities.as_mut().unwrap();
+    // Members 0 and 1 go from 0 to 1 and from 1 to 0.
+    (samples.values[0], samples.values[1]) = (0.0, 1.0);
+    (samples.values[6], samples.values[7]) = (1.0, 0.0);
+    for (time, first) in [(0.0, 0.0), (0.25, 0.0), (0.375, 0.25), (0.5, 0.5), (0.75, 1.0), (1.0, 1.0)] {
+        let posed = field.deformed(time);
+        assert!((posed.opacity(0) - first).abs() < 1e-6, "{time}: {}", posed.opacity(0));
+        assert!((posed.opacity(4) - (1.0 - first)).abs() < 1e-6);
+        assert!(posed.opacity_logits.iter().all(|logit| logit.is_finite()));
+    }
+    // Colours are sampled before the pose turns them: take the pose away, and they are as sampled.
+    let tracks = field.tracks.as_mut().unwrap();
+    tracks.groups[2].poses.clear();
+    let colors = tracks.groups[2].colors.clone().unwrap();
+    let posed = field.deformed(0.25);
+    for (member, row) in (2..24).step_by(4).enumerate() {
+        let expected: [f32; SH_FLOATS] =
+            std::array::from_fn(|k| 0.75 * colors.values[member][k] + 0.25 * colors.values[6 + member][k]);
+        assert!(close(&posed.sh_coefficients[row], &expected, 1e-6), "{row}");
+    }
+    assert!(field.moves());
+    // Rows take their samples along.
+    let some = field.tracks.as_ref().unwrap().gather(&[4, 0, 0]);
+    assert_eq!(some.groups[0].opacities.as_ref().unwrap().values, [1.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
+    let mut regrouped = field.tracks.clone().unwrap();
+    regrouped.regroup(&[4], "taken", DVec3::ZERO, |group| group);
+    assert_eq!(regrouped.groups[3].opacities.as_ref().unwrap().values, [1.0, 0.0]);
+    assert_eq!(regrouped.groups[0].opacities.as_ref().unwrap().members(), 5);
+    regrouped.validate(24).unwrap();
+    regrouped.groups[0].opacities.as_mut().unwrap().values[0] = 1.5;
+    assert!(regrouped.validate(24).unwrap_err().to_string().contains("opacity 1.5"));
 }
 
 #[test]

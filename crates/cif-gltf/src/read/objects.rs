@@ -372,6 +372,7 @@ impl Builder<'_> {
             mean_occupancy: named.mean_occupancy.unwrap_or_else(|| mean_occupancy(&splats)),
             report: if ours { report } else { MotionReport { gaussians: splats.len(), ..report } },
             splats,
+            appearance: Default::default(),
         }
     }
 }

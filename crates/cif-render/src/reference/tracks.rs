@@ -1,13 +1,14 @@
 //! Recorded motion of one Gaussian. See [`cif_field::tracks`].
 
+use cif_field::gaussians::saturated_logit;
 use cif_field::tracks::{GroupAtTime, HIDDEN_LOGIT};
 use cif_geometry::spherical_harmonics::HarmonicsRotation;
 use cif_geometry::{Real, quaternion};
 
 use super::scene::Gaussian;
 
-/// Moves `posed`, a Gaussian with the learned deformation, as its group moves; `member` is its place among the
-/// dense samples of the group.
+/// Moves `posed`, a Gaussian with the learned deformation, as its group moves; `member` is its place in a
+/// group whose members have samples.
 pub fn follow<R: Real>(
     group: &GroupAtTime<'_>,
     member: usize,
@@ -23,6 +24,14 @@ pub fn follow<R: Real>(
         if let Some(log_scales) = dense.log_scales(member) {
             posed.log_scale = mix(log_scales, dense.fraction);
         }
+    }
+    if let Some(opacities) = &group.opacities {
+        let [before, after] = opacities.values(member).map(f64::from);
+        let opacity = before + opacities.fraction * (after - before);
+        posed.opacity_logit = R::of(f64::from(saturated_logit(opacity)));
+    }
+    if let Some(colors) = &group.colors {
+        posed.sh = mix(colors.values(member), colors.fraction);
     }
     let turn = [group.rotation.w, group.rotation.x, group.rotation.y, group.rotation.z].map(R::of);
     let rotation = quaternion::to_rotation(turn);

@@ -73,9 +73,9 @@ pub(super) fn rebuild(
     for row in rows {
         match (*row, gathered) {
             (RowIdentity::Told(owner), _) => {
-                identities.push_told(owner.and_then(|owner| renumbered[usize::from(owner)]));
+                identities.push_certain(owner.and_then(|owner| renumbered[usize::from(owner)]));
             }
-            (RowIdentity::Kept(_), None) => identities.push_told(None),
+            (RowIdentity::Kept(_), None) => identities.push_certain(None),
             (RowIdentity::Kept(row), Some(gathered)) => {
                 let owned = is_owned[plan.sources[row as usize] as usize];
                 keep(&mut identities, gathered, row as usize, &renumbered, owned);
@@ -88,34 +88,39 @@ pub(super) fn rebuild(
 /// A row without the entries of removed instances. A row that belongs to one that stays keeps its labelled
 /// share, so that it goes on belonging to it; one of the background does not fall to its second best.
 fn keep(to: &mut Identities, from: &Identities, row: usize, renumbered: &[Owner], owned: bool) {
-    let range = from.range(row);
-    let share = |entries: &[f32]| entries.iter().map(|log| f64::from(*log).exp()).sum::<f64>();
-    let first = to.labels.len();
-    let score = |entry: usize| from.log_estimates[entry] + from.log_calibrations[entry];
-    let best = range.clone().max_by(|a, b| score(*a).total_cmp(&score(*b)));
-    if !owned && best.is_some_and(|entry| renumbered[usize::from(from.labels[entry])].is_none()) {
-        to.push_told(None);
-        return;
-    }
-    for entry in range.clone() {
-        if let Some(label) = renumbered[usize::from(from.labels[entry])] {
-            to.labels.push(label);
-            to.log_estimates.push(from.log_estimates[entry]);
-            to.log_calibrations.push(from.log_calibrations[entry]);
+    let new_label = |label: u16| renumbered[usize::from(label)];
+    let owner = match from.owner(row) {
+        cif_field::Owner::Instance(label) => {
+            new_label(label).map_or(cif_field::Owner::Background, cif_field::Owner::Instance)
         }
-    }
-    if to.labels.len() == first {
-        to.push_told(None);
+        other => other,
+    };
+    let score = |entry: &(u16, f32, f32)| entry.1 + entry.2;
+    let best = from.entries(row).max_by(|a, b| score(a).total_cmp(&score(b)));
+    if !owned && best.is_some_and(|(label, ..)| new_label(label).is_none()) {
+        to.push_certain(None);
         return;
     }
-    if owned && to.labels.len() - first < range.len() {
-        let (before, after) = (share(&from.log_estimates[range]), share(&to.log_estimates[first..]));
-        let factor = (before / after).ln() as f32;
+    let mut entries: Vec<(u16, f32, f32)> = from
+        .entries(row)
+        .filter_map(|(label, estimate, calibration)| {
+            new_label(label).map(|label| (label, estimate, calibration))
+        })
+        .collect();
+    match (entries.is_empty(), owner) {
+        (true, cif_field::Owner::Instance(label)) => return to.push_certain(Some(label)),
+        (true, _) => return to.push_certain(None),
+        (false, _) => {}
+    }
+    let share = |entries: &[(u16, f32, f32)]| entries.iter().map(|(_, log, _)| f64::from(*log).exp()).sum::<f64>();
+    let all: Vec<(u16, f32, f32)> = from.entries(row).collect();
+    if owned && entries.len() < all.len() {
+        let factor = (share(&all) / share(&entries)).ln() as f32;
         if factor.is_finite() {
-            to.log_estimates[first..].iter_mut().for_each(|log| *log += factor);
+            entries.iter_mut().for_each(|(_, log, _)| *log += factor);
         }
     }
-    to.row_offsets.push(to.labels.len() as u32);
+    to.push_entries(owner, entries);
 }
 
 #[cfg(test)]
@@ -134,9 +139,9 @@ mod tests {
             keep(&mut to, &from, 0, renumbered, owned);
             to
         };
-        assert_eq!(kept(&[None, Some(0)], false).told_owner(0), Some(None));
+        assert_eq!(kept(&[None, Some(0)], false).owners, [cif_field::Owner::Background]);
         let second = kept(&[Some(0), None], false);
-        assert_eq!((second.told_owner(0), second.labels), (None, vec![0]));
+        assert_eq!((second.owners, second.labels), (Vec::new(), vec![0]));
         let owned = kept(&[None, Some(0)], true);
         assert!((owned.labelled_shares()[0] - 0.4).abs() < 1e-6, "an owned row keeps its share");
     }

@@ -1,6 +1,6 @@
 //! Some of a node's splats as a node.
 
-use crate::graph::{DenseMotion, DenseSample, Motion, PartsMotion};
+use crate::graph::{Appearance, AppearanceSample, DenseMotion, DenseSample, Motion, PartsMotion};
 use crate::{Node, Part, Splats};
 
 /// The node with the splats at `positions` alone, which ascend; parts that lose all their splats go.
@@ -35,7 +35,12 @@ pub(super) fn subset(node: &Node, positions: &[usize]) -> Node {
         }),
         other => other.clone(),
     };
-    Node { motion, splats: some(&node.splats, positions), proxy: None, colliders: Vec::new(), ..node.clone() }
+    let per_splat = node.splats.sh_coefficients.len() / node.splats.len().max(1);
+    let appearance = Appearance {
+        opacities: samples(&node.appearance.opacities, 1, positions),
+        colors: samples(&node.appearance.colors, per_splat, positions),
+    };
+    Node { motion, splats: some(&node.splats, positions), appearance, proxy: None, colliders: Vec::new(), ..node.clone() }
 }
 
 fn some(splats: &Splats, positions: &[usize]) -> Splats {
@@ -57,8 +62,22 @@ fn some(splats: &Splats, positions: &[usize]) -> Splats {
             .collect(),
         occupancies: optional(&splats.occupancies, n, positions),
         identity_probabilities: optional(&splats.identity_probabilities, n, positions),
+        identities: optional(&splats.identities, n, positions),
         rows: optional(&splats.rows, n, positions),
     }
+}
+
+fn samples(of: &[AppearanceSample], stride: usize, positions: &[usize]) -> Vec<AppearanceSample> {
+    of.iter()
+        .map(|sample| AppearanceSample {
+            time_code: sample.time_code,
+            values: positions
+                .iter()
+                .flat_map(|at| &sample.values[at * stride..(at + 1) * stride])
+                .copied()
+                .collect(),
+        })
+        .collect()
 }
 
 fn pick<T: Copy>(values: &[T], positions: &[usize]) -> Vec<T> {

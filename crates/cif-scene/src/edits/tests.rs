@@ -358,7 +358,7 @@ fn splats_that_are_deleted_moved_or_added_within_an_object() {
         let own = &case.edited.nodes[node];
         let index = instance_of(own).unwrap();
         let owners = field.identities.as_ref().unwrap().argmax();
-        assert_eq!(owners[field.len() - 1], index as u16);
+        assert_eq!(owners[field.len() - 1], Some(index as u16));
         // The raised one is where the file has it, at every frame; new rows are at the end.
         for (frame, time) in TIMES.iter().enumerate() {
             let local = match &own.motion {

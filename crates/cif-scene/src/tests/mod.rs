@@ -19,6 +19,7 @@ fn field(objects: usize) -> Field {
         labels: Vec::new(),
         log_estimates: Vec::new(),
         log_calibrations: Vec::new(),
+        owners: Vec::new(),
     };
     let steps = DVec3::new(0.819_172_5, 0.671_043_6, 0.549_700_5);
     let mut push = |centre: DVec3, spread: f64, k: usize, occupancy: f32, owner: usize| {

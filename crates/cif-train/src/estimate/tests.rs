@@ -103,6 +103,7 @@ fn the_most_probable_label_counts_calibration_and_prefers_the_lowest() {
         labels: vec![3, 7],
         log_estimates: vec![-1.0, -1.0],
         log_calibrations: vec![0.0, 0.0],
+        owners: Vec::new(),
     };
     assert_eq!(most_probable(&rows, 0), 3);
     rows.log_calibrations[1] = 0.1;

@@ -26,6 +26,7 @@ fn field() -> Field {
                 .map(|k| if (k / 2) % 2 == k % 2 { 0.9_f32.ln() } else { 0.1_f32.ln() })
                 .collect(),
             log_calibrations: (0..2 * n).map(|k| k as f32 * 1e-3).collect(),
+            owners: Vec::new(),
         }),
         instances: vec![instance(3), instance(9)],
         timeline: Timeline { times: vec![0.0], frames_per_second: 24.0 },

@@ -198,6 +198,7 @@ mod tests {
             labels: vec![0, 1, 2, 1],
             log_estimates: vec![0.1, 0.2, 0.3, 0.4],
             log_calibrations: vec![1.0, 2.0, 3.0, 4.0],
+            owners: Vec::new(),
         };
         let origins = relabel(&mut rows, |label| [7, 2, 5][usize::from(label)]);
         assert_eq!(rows.labels, [2, 5, 7, 2]);

@@ -742,6 +742,7 @@ fn identities_are_a_softmax_over_the_support() {
         labels: vec![0, 2, 5, 1, 2, 5],
         log_estimates: [0.2_f32, 0.5, 0.3, 1.0, 0.5, 0.5].map(f32::ln).to_vec(),
         log_calibrations: vec![1000.0, -980.0, 1000.1, 3.0, 0.0, 0.0],
+        owners: Vec::new(),
     };
     let optimiser = GpuOptimiser::new(&gpu).unwrap();
     let offsets = GpuVec::from_slice(&gpu, "offsets", &rows.row_offsets).unwrap();

@@ -7,7 +7,7 @@
 use std::borrow::Cow;
 use std::ops::Range;
 
-use cif_scene::{DenseSample, Motion, Node, Splats};
+use cif_scene::{Appearance, DenseSample, Motion, Node, Splats};
 
 use super::instance;
 use crate::tokens::variants;
@@ -104,25 +104,29 @@ impl<'a> Selection<'a> {
         }
     }
 
-    /// The selected coefficients, cut to the degree.
-    pub(super) fn coefficients(&self) -> Cow<'a, [f32]> {
-        let splats = self.all();
+    /// How opacities and colours of the node change.
+    pub(super) fn appearance(&self) -> &'a Appearance {
+        &self.node.appearance
+    }
+
+    /// The selected of coefficients of the node, cut to the degree.
+    pub(super) fn coefficients<'v>(&self, of: &'v [f32]) -> Cow<'v, [f32]> {
         let floats = |degree| 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
-        let (stored, kept) = (floats(splats.sh_degree), floats(self.degree));
+        let (stored, kept) = (floats(self.all().sh_degree), floats(self.degree));
         match &self.picked {
             Picked::Range(range) if stored == kept => {
-                Cow::Borrowed(&splats.sh_coefficients[range.start * stored..range.end * stored])
+                Cow::Borrowed(&of[range.start * stored..range.end * stored])
             }
-            Picked::Range(range) => Cow::Owned(cut(splats, range.clone(), stored, kept)),
+            Picked::Range(range) => Cow::Owned(cut(of, range.clone(), stored, kept)),
             Picked::Indices(indices) => {
-                Cow::Owned(cut(splats, indices.iter().map(|&index| index as usize), stored, kept))
+                Cow::Owned(cut(of, indices.iter().map(|&index| index as usize), stored, kept))
             }
         }
     }
 }
 
 fn cut(
-    splats: &Splats,
+    of: &[f32],
     indices: impl ExactSizeIterator<Item = usize>,
     stored: usize,
     kept: usize,
@@ -130,7 +134,7 @@ fn cut(
     let mut coefficients = Vec::with_capacity(indices.len() * kept);
     for index in indices {
         let start = index * stored;
-        coefficients.extend_from_slice(&splats.sh_coefficients[start..start + kept]);
+        coefficients.extend_from_slice(&of[start..start + kept]);
     }
     coefficients
 }

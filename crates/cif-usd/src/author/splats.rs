@@ -2,7 +2,7 @@
 
 use cif_field::SortMetric;
 use cif_geometry::{Bounds, RigidTransform};
-use cif_scene::extent;
+use cif_scene::{IdentityShares, extent};
 use pyo3::prelude::*;
 
 use super::levels::Selection;
@@ -42,7 +42,10 @@ pub(super) fn author(
     let orientations = prim.set("orientations", "QuatfArray", VARYING, pxr.quatf_array(&turns)?)?;
     let scales = prim.set("scales", "Float3Array", VARYING, pxr.vec3f_array(&sizes)?)?;
     let opacities = pxr.float_array(&selection.of(&splats.opacities))?;
-    prim.set("opacities", "FloatArray", VARYING, opacities)?;
+    let opacities = prim.set("opacities", "FloatArray", VARYING, opacities)?;
+    for sample in &selection.appearance().opacities {
+        opacities.sample(sample.time_code, pxr.float_array(&selection.of(&sample.values))?)?;
+    }
     let whole = bounds(&means, &turns, &sizes);
     let extents = prim.set("extent", "Float3Array", VARYING, box_array(pxr, &whole)?)?;
     for sample in selection.samples() {
@@ -63,13 +66,25 @@ pub(super) fn author(
     }
     let degree = i32::from(selection.degree());
     prim.set(tokens::SH_DEGREE, "Int", UNIFORM, degree)?;
-    let coefficients = selection.coefficients();
+    let coefficients = selection.coefficients(&splats.sh_coefficients);
     let sh = pxr.vec3f_array_flat(&coefficients)?;
     let sh = prim.set(tokens::SH_COEFFICIENTS, "Float3Array", VARYING, sh)?;
     sh.info("elementSize", (degree + 1) * (degree + 1))?;
     sh.info("interpolation", tokens::VERTEX)?;
     let colors = primvars::base_colors(&coefficients, selection.degree());
-    display_color(pxr, &prim, &colors)?;
+    let changes = &selection.appearance().colors;
+    if changes.is_empty() {
+        display_color(pxr, &prim, &colors)?;
+    } else {
+        let display = prim.set(tokens::DISPLAY_COLOR, "Color3fArray", VARYING, pxr.vec3f_array(&colors)?)?;
+        display.info("interpolation", tokens::VERTEX)?;
+        for sample in changes {
+            let coefficients = selection.coefficients(&sample.values);
+            sh.sample(sample.time_code, pxr.vec3f_array_flat(&coefficients)?)?;
+            let colors = primvars::base_colors(&coefficients, selection.degree());
+            display.sample(sample.time_code, pxr.vec3f_array(&colors)?)?;
+        }
+    }
     prim.set_custom(tokens::COLOR_CHECKSUM, "String", primvars::checksum(&colors))?;
     prim.set("projectionModeHint", "Token", UNIFORM, tokens::PERSPECTIVE)?;
     prim.set("sortingModeHint", "Token", UNIFORM, sorting(scene.graph.sort_metric))?;
@@ -83,8 +98,27 @@ pub(super) fn author(
         attribute.info("interpolation", tokens::VERTEX)?;
         set_indices(pxr, &prim, name, indices)?;
     }
+    if !splats.identities.is_empty() {
+        instance_shares(pxr, &prim, &selection.of(&splats.identities))?;
+    }
     let rows = primvars::as_ints(&selection.of(&splats.rows));
     ints(pxr, &prim, tokens::PRIMVAR_ROW, &rows)
+}
+
+/// The instances that every splat may belong to, as many places per splat as any of them needs.
+fn instance_shares(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, identities: &[IdentityShares]) -> PyResult<()> {
+    let used = |shares: &IdentityShares| shares.iter().filter(|entry| entry.id != 0).count();
+    let places = identities.iter().map(used).max().unwrap_or(0).max(1);
+    let entries = || identities.iter().flat_map(|shares| &shares[..places]);
+    let ids: Vec<i32> = entries().map(|entry| i32::from(entry.id)).collect();
+    let shares: Vec<f32> = entries().map(|entry| entry.share).collect();
+    let ids = prim.set(tokens::PRIMVAR_INSTANCE_IDS, "IntArray", VARYING, pxr.int_array(&ids)?)?;
+    let shares = prim.set(tokens::PRIMVAR_INSTANCE_SHARES, "FloatArray", VARYING, pxr.float_array(&shares)?)?;
+    for attribute in [ids, shares] {
+        attribute.info("elementSize", places as i32)?;
+        attribute.info("interpolation", tokens::VERTEX)?;
+    }
+    Ok(())
 }
 
 /// A primvar of integers, one per point, without repetitions among them.

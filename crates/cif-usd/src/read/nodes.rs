@@ -2,8 +2,8 @@
 
 use cif_geometry::{Bounds, RigidTransform};
 use cif_scene::{
-    ConvexHull, DenseMotion, DenseSample, Motion, MotionModel, MotionReport, Node, NodeKind, Part,
-    PartsMotion, PointProxy, PoseSample, Splats, extent, naming,
+    Appearance, AppearanceSample, ConvexHull, DenseMotion, DenseSample, IdentityShares, Motion, MotionModel,
+    MotionReport, Node, NodeKind, Part, PartsMotion, PointProxy, PoseSample, Splats, extent, naming,
 };
 use glam::{DAffine3, DQuat, DVec3};
 use pyo3::prelude::*;
@@ -94,6 +94,7 @@ pub(super) fn read<'py>(
         }
     }
     let parts = !deforms && is_parts(recorded, &pieces);
+    let appearance = appearance(reading, owner, &pieces, parts)?;
     let (motion, splats) = if deforms {
         for piece in &pieces {
             times.extend(piece.placement.times());
@@ -134,6 +135,7 @@ pub(super) fn read<'py>(
         report: report(recorded, &motion, &splats),
         motion,
         splats,
+        appearance,
     };
     node.extent = node_extent(&node);
     Ok(node)
@@ -187,7 +189,12 @@ fn merge(sets: impl Iterator<Item = Splats>) -> Splats {
     let floats = |degree| 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
     let degree = sets.iter().map(|set| set.sh_degree).max().unwrap_or(0);
     let mut all = Splats { sh_degree: degree, ..Splats::default() };
-    for set in sets {
+    let tells = sets.iter().any(|set| !set.identities.is_empty());
+    for mut set in sets {
+        if tells {
+            set.identities.resize(set.means.len(), IdentityShares::default());
+            all.identities.append(&mut set.identities);
+        }
         for sh in set.sh_coefficients.chunks_exact(floats(set.sh_degree)) {
             all.sh_coefficients.extend_from_slice(sh);
             all.sh_coefficients.resize(all.sh_coefficients.len() + floats(degree) - sh.len(), 0.0);
@@ -201,6 +208,59 @@ fn merge(sets: impl Iterator<Item = Splats>) -> Splats {
         all.rows.extend(set.rows);
     }
     all
+}
+
+/// Opacities and colours of all pieces over time, these in the frame of the node or of its parts.
+fn appearance<'py>(
+    reading: &Reading<'_, 'py>,
+    owner: &Owner<'py>,
+    pieces: &[Piece],
+    parts: bool,
+) -> Result<Appearance, UsdError> {
+    let python = |error: PyErr| reading.python(&error);
+    let mut times = [Vec::new(), Vec::new()];
+    for prim in &owner.splats {
+        times[0].extend(prim.opacity_times().map_err(python)?);
+        times[1].extend(prim.color_times().map_err(python)?);
+    }
+    let [opacity_times, color_times] = times.map(|mut times| {
+        times.sort_by(f64::total_cmp);
+        times.dedup();
+        times
+    });
+    let mut appearance = Appearance::default();
+    for time_code in opacity_times {
+        let mut values = Vec::new();
+        for (prim, piece) in owner.splats.iter().zip(pieces) {
+            values.extend(prim.opacities_at(reading, time_code, piece.splats.len())?);
+        }
+        appearance.opacities.push(AppearanceSample { time_code, values });
+    }
+    let degree = pieces.iter().map(|piece| piece.splats.sh_degree).max().unwrap_or(0);
+    let floats = |degree| 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
+    for time_code in color_times {
+        let mut values = Vec::new();
+        for (prim, piece) in owner.splats.iter().zip(pieces) {
+            let (own, mut coefficients) = prim.harmonics_at(reading, time_code, piece.splats.len())?;
+            if own != piece.splats.sh_degree {
+                let problem = format!("coefficients of degree {own} at time code {time_code}");
+                return Err(reading.prim_error(&prim.path, problem, "keep one degree over time"));
+            }
+            let map = match &piece.placement {
+                Placement::Rigid { baked, .. } if parts => baked.unwrap_or(DAffine3::IDENTITY),
+                placement => placement.at(time_code),
+            };
+            if map != DAffine3::IDENTITY {
+                Bake::new(map).harmonics(&mut coefficients, own);
+            }
+            for sh in coefficients.chunks_exact(floats(own)) {
+                values.extend_from_slice(sh);
+                values.resize(values.len() + floats(degree) - sh.len(), 0.0);
+            }
+        }
+        appearance.colors.push(AppearanceSample { time_code, values });
+    }
+    Ok(appearance)
 }
 
 /// Every piece a part with its own track.

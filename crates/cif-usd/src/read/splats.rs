@@ -1,7 +1,7 @@
 //! Splats of one prim: single or half precision, checked.
 
 use cif_geometry::spherical_harmonics::{BAND_0, COEFFICIENTS, coefficient_count};
-use cif_scene::Splats;
+use cif_scene::{IdentityShare, IdentityShares, Splats};
 use pyo3::prelude::*;
 
 use super::arrays::ArrayError;
@@ -84,11 +84,26 @@ impl<'py> SplatPrim<'py> {
         Ok(self.source("positions")?.is_some())
     }
 
-    /// Times at which its shape is sampled. One sample is a value and no motion, except in what we wrote.
+    /// Times at which its shape is sampled.
     pub(super) fn times(&self) -> PyResult<Vec<f64>> {
+        self.times_of(&SHAPES)
+    }
+
+    /// Times at which its opacities are sampled.
+    pub(super) fn opacity_times(&self) -> PyResult<Vec<f64>> {
+        self.times_of(&["opacities"])
+    }
+
+    /// Times at which its coefficients are sampled.
+    pub(super) fn color_times(&self) -> PyResult<Vec<f64>> {
+        self.times_of(&[tokens::SH_COEFFICIENTS])
+    }
+
+    /// Times at which attributes are sampled. One sample is a value and no change, except in what we wrote.
+    fn times_of(&self, names: &[&str]) -> PyResult<Vec<f64>> {
         let ours = attribute(&self.prim, tokens::COLOR_CHECKSUM)?.is_some();
         let mut times = Vec::new();
-        for name in SHAPES {
+        for name in names {
             if let Some(attribute) = self.source(name)? {
                 let own = samples(&attribute)?;
                 if ours || own.len() > 1 {
@@ -206,16 +221,15 @@ impl<'py> SplatPrim<'py> {
                 Err(bad(format!("{n} positions, but {count} {name}"), "give every splat one value of each"))
             }
         };
-        let opacities = self
-            .read(reading, "opacities", &at, |value| arrays.scalars(value))?
-            .unwrap_or_else(|| vec![1.0; n]);
-        counted("opacities", opacities.len())?;
-        if let Some(index) = opacities.iter().position(|opacity| !(0.0..=1.0).contains(opacity)) {
-            return Err(bad(
-                format!("opacity {index} is {}", opacities[index]),
-                "opacities are probabilities from 0 to 1; sigmoid of logits",
-            ));
-        }
+        // Beside samples stands the opacity for readers of one time, where somebody wrote it.
+        let resting = match self.opacity_times().map_err(python)?.is_empty() {
+            true => None,
+            false => self.opacities(reading, &reading.pxr.time_code(None).map_err(python)?, n)?,
+        };
+        let opacities = match resting {
+            Some(opacities) => opacities,
+            None => self.opacities(reading, &at, n)?.unwrap_or_else(|| vec![1.0; n]),
+        };
         let (mut sh_degree, mut sh_coefficients) = self.harmonics(reading, &at, n)?;
         let rows = self.primvar_ints(reading, tokens::PRIMVAR_ROW, &at)?;
         let rows = match rows {
@@ -240,6 +254,7 @@ impl<'py> SplatPrim<'py> {
                 None => Ok(vec![otherwise; n]),
             }
         };
+        let identities = self.identities(reading, &at, n)?;
         let occupancies = per_splat(tokens::PRIMVAR_OCCUPANCY, 1.0)?;
         let identity_probabilities = per_splat(tokens::PRIMVAR_IDENTITY, 1.0)?;
         self.recolor(reading, &at, n, &mut sh_degree, &mut sh_coefficients)?;
@@ -252,8 +267,96 @@ impl<'py> SplatPrim<'py> {
             sh_coefficients,
             occupancies,
             identity_probabilities,
+            identities,
             rows,
         })
+    }
+
+    /// Opacities at a time, checked; `None` where there are none.
+    fn opacities(
+        &self,
+        reading: &Reading<'_, 'py>,
+        at: &Bound<'py, PyAny>,
+        n: usize,
+    ) -> Result<Option<Vec<f32>>, UsdError> {
+        let bad = |problem: String, fix| reading.prim_error(&self.path, problem, fix);
+        let read = self.read(reading, "opacities", at, |value| reading.arrays.scalars(value))?;
+        let Some(opacities) = read else { return Ok(None) };
+        if opacities.len() != n {
+            let problem = format!("{n} positions, but {} opacities", opacities.len());
+            return Err(bad(problem, "give every splat one value of each"));
+        }
+        match opacities.iter().position(|opacity| !(0.0..=1.0).contains(opacity)) {
+            Some(index) => Err(bad(
+                format!("opacity {index} is {}", opacities[index]),
+                "opacities are probabilities from 0 to 1; sigmoid of logits",
+            )),
+            None => Ok(Some(opacities)),
+        }
+    }
+
+    /// Opacities of `n` splats at a time code, checked; 1 where there are none.
+    pub(super) fn opacities_at(
+        &self,
+        reading: &Reading<'_, 'py>,
+        time: f64,
+        n: usize,
+    ) -> Result<Vec<f32>, UsdError> {
+        let at = reading.pxr.time_code(Some(time)).map_err(|error| reading.python(&error))?;
+        Ok(self.opacities(reading, &at, n)?.unwrap_or_else(|| vec![1.0; n]))
+    }
+
+    /// Degree and coefficients of `n` splats at a time code, checked.
+    pub(super) fn harmonics_at(
+        &self,
+        reading: &Reading<'_, 'py>,
+        time: f64,
+        n: usize,
+    ) -> Result<(u8, Vec<f32>), UsdError> {
+        let at = reading.pxr.time_code(Some(time)).map_err(|error| reading.python(&error))?;
+        self.harmonics(reading, &at, n)
+    }
+
+    /// The instances that every splat may belong to; empty where the prim does not tell.
+    fn identities(
+        &self,
+        reading: &Reading<'_, 'py>,
+        at: &Bound<'py, PyAny>,
+        n: usize,
+    ) -> Result<Vec<IdentityShares>, UsdError> {
+        let arrays = &reading.arrays;
+        let ids = self.primvar(reading, tokens::PRIMVAR_INSTANCE_IDS, at, |value| arrays.ints(value))?;
+        let shares = self.primvar(reading, tokens::PRIMVAR_INSTANCE_SHARES, at, |value| arrays.scalars(value))?;
+        let (Some(ids), Some(shares)) = (ids, shares) else { return Ok(Vec::new()) };
+        let bad = |problem: String| {
+            let fix = "write as many ids as shares for every splat, ids from 0 to 65535, shares from 0 to 1";
+            reading.prim_error(&self.path, problem, fix)
+        };
+        if n == 0 {
+            return Ok(Vec::new());
+        }
+        let places = ids.len() / n;
+        if places == 0 || ids.len() % n != 0 || shares.len() != ids.len() {
+            return Err(bad(format!(
+                "{n} positions, but {} values of {} and {} of {}",
+                ids.len(),
+                tokens::PRIMVAR_INSTANCE_IDS,
+                shares.len(),
+                tokens::PRIMVAR_INSTANCE_SHARES
+            )));
+        }
+        let mut identities = Vec::with_capacity(n);
+        for (ids, shares) in ids.chunks_exact(places).zip(shares.chunks_exact(places)) {
+            let mut entries = IdentityShares::default();
+            for (entry, (id, share)) in entries.iter_mut().zip(ids.iter().zip(shares)) {
+                let Some(id) = u16::try_from(*id).ok().filter(|_| (0.0..=1.0).contains(share)) else {
+                    return Err(bad(format!("an instance id is {id} with the share {share}")));
+                };
+                *entry = IdentityShare { id, share: *share };
+            }
+            identities.push(entries);
+        }
+        Ok(identities)
     }
 
     /// Degree and coefficients; none where the prim has none.

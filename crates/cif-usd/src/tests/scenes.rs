@@ -65,6 +65,7 @@ impl Maker {
                 .collect(),
             identity_probabilities: (0..count).map(|_| self.float(0.0, 1.0)).collect(),
             rows: (0..count as u32).map(|index| index * 7 + 3).collect(),
+            identities: Vec::new(),
         }
     }
 
@@ -223,6 +224,7 @@ impl Maker {
             source_frames: (0, 3 * (self.codes.len() - 1)),
             mean_occupancy: self.float(0.0, 1.0),
             report,
+            appearance: Default::default(),
         };
         if let Motion::Parts(motion) = &node.motion {
             let boxes = motion.parts.iter().map(|part| {
