@@ -5,7 +5,7 @@ use std::io::{self, Write};
 use std::ops::Range;
 
 use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
-use cif_scene::Splats;
+use cif_scene::{IdentityShares, Splats};
 
 use crate::conventions;
 
@@ -25,6 +25,10 @@ pub(crate) enum Array<'a> {
     Numbers(&'a [f32]),
     /// Rows of the field: low and high 16 bits, as unsigned integers of 32 bits are not allowed in attributes.
     Rows(&'a [u32]),
+    /// Ids of the instances that splats may belong to.
+    Ids(&'a [IdentityShares]),
+    /// Their shares.
+    Shares(&'a [IdentityShares]),
     /// Keys of animations.
     Keys(Vec<f32>),
 }
@@ -39,6 +43,8 @@ impl Array<'_> {
             Self::Coefficient(_, range, _) => (range.len(), 12),
             Self::Numbers(values) => (values.len(), 4),
             Self::Rows(values) => (values.len(), 4),
+            Self::Ids(values) => (values.len(), 8),
+            Self::Shares(values) => (values.len(), 16),
             Self::Keys(values) => (values.len(), 4),
         };
         count as u64 * size
@@ -54,6 +60,11 @@ impl Array<'_> {
             Self::Numbers(values) => blocks(out, values, |v| [v.to_le_bytes()]),
             Self::Keys(values) => blocks(out, values, |v| [v.to_le_bytes()]),
             Self::Rows(values) => blocks(out, values, |v| [v.to_le_bytes()]),
+            Self::Ids(values) => blocks(out, values, |v| {
+                let [a, b, c, d] = v.map(|entry| entry.id.to_le_bytes());
+                [[a[0], a[1], b[0], b[1]], [c[0], c[1], d[0], d[1]]]
+            }),
+            Self::Shares(values) => blocks(out, values, |v| v.map(|entry| entry.share.to_le_bytes())),
             Self::Coefficient(splats, range, index) => {
                 let stride = 3 * coefficient_count(splats.sh_degree);
                 let rows = &splats.sh_coefficients[range.start * stride..range.end * stride];

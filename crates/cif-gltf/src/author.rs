@@ -187,6 +187,12 @@ impl<'a> Author<'a> {
         float(crate::OCCUPANCY.to_owned(), occupancies, "SCALAR");
         let identities = Array::Numbers(&splats.identity_probabilities[range.clone()]);
         float(crate::IDENTITY.to_owned(), identities, "SCALAR");
+        if !splats.identities.is_empty() {
+            let identities = &splats.identities[range.clone()];
+            float(crate::INSTANCE_SHARES.to_owned(), Array::Shares(identities), "VEC4");
+            let ids = self.accessor(Array::Ids(identities), document::UNSIGNED_SHORT, "VEC4", count);
+            attributes.insert(crate::INSTANCE_IDS.to_owned(), ids);
+        }
         let rows = self.accessor(Array::Rows(&splats.rows[range]), document::UNSIGNED_SHORT, "VEC2", count);
         attributes.insert(crate::ROW.to_owned(), rows);
         let extension: Value = json!({ "kernel": "ellipse", "colorSpace": "srgb_rec709_display" });
@@ -520,6 +526,7 @@ fn check_splats(node: &Node) -> Result<(), GltfError> {
         splats.occupancies.len(),
         splats.identity_probabilities.len(),
         splats.rows.len(),
+        if splats.identities.is_empty() { n } else { splats.identities.len() },
         splats.sh_coefficients.len() / (3 * coefficient_count(splats.sh_degree)),
     ];
     if lengths.iter().any(|&length| length != n) {

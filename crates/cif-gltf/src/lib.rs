@@ -14,7 +14,7 @@
 //! Layout of a file: the node `World` brings our axes and units to those of glTF; below it stand one node per
 //! instance, one for the background, and `Cameras`. A rigid instance is a mesh of one point primitive with
 //! splats; one that moves in parts has a child node per part. One animation holds all motion. Splats carry the
-//! attributes [`ROW`], [`OCCUPANCY`] and [`IDENTITY`] besides those of the extension, so that an edited file can
+//! attributes [`ROW`], [`OCCUPANCY`], [`IDENTITY`], [`INSTANCE_IDS`] and [`INSTANCE_SHARES`] besides those of the extension, so that an edited file can
 //! be traced home.
 //!
 //! Proxies and colliders of the graph are not written: the points of the splats stand in where the extension is
@@ -55,6 +55,11 @@ pub const ROW: &str = "_CIF_ROW";
 pub const OCCUPANCY: &str = "_CIF_OCCUPANCY";
 /// Attribute with the probability of the most probable instance of every splat.
 pub const IDENTITY: &str = "_CIF_IDENTITY";
+/// Attribute of the instances that every splat may belong to, as ids, most probable first; 0 for an unused place.
+pub const INSTANCE_IDS: &str = "_CIF_INSTANCE_IDS";
+/// Attribute beside [`INSTANCE_IDS`]: probability of each instance times the share of the splat's image that was
+/// labelled.
+pub const INSTANCE_SHARES: &str = "_CIF_INSTANCE_SHARES";
 
 const GENERATOR: &str = concat!("cif ", env!("CARGO_PKG_VERSION"));
 const GENERATOR_PREFIX: &str = "cif ";
@@ -81,6 +86,8 @@ pub struct ExportSummary {
     pub splats: usize,
     /// Time samples of the timeline.
     pub samples: usize,
+    /// What the format does not hold of the scene, object by object.
+    pub not_held: Vec<String>,
 }
 
 /// Writes a scene to a `.glb`, or to a `.gltf` with a `.bin` beside it: to temporary files in the same folder,

@@ -134,6 +134,7 @@ pub(crate) fn export(
         nodes: graph.nodes.len(),
         splats: graph.nodes.iter().map(|node| node.splats.len()).sum(),
         samples: graph.time_codes.samples.len(),
+        not_held: graph.nodes.iter().flat_map(cif_scene::appearance::lost_without_samples).collect(),
     })
 }
 

@@ -9,11 +9,18 @@ use glam::{DQuat, DVec3};
 use std::ops::Range;
 
 /// The splats of a node at a time code, world frame: centres, orientations and spherical harmonics are turned with
-/// the node and its parts. Dense motion takes its nearest sample. Visibility does not count.
+/// the node and its parts, opacities and colours are those of the time. Dense motion takes its nearest sample. Visibility
+/// does not count.
 #[must_use]
 pub fn world_splats(node: &Node, time_code: f64) -> Splats {
     let pose = pose_at(node.track(), node.pivot, time_code);
     let mut splats = node.splats.clone();
+    if let Some(opacities) = node.appearance.opacities_at(time_code) {
+        splats.opacities = opacities;
+    }
+    if let Some(coefficients) = node.appearance.colors_at(time_code) {
+        splats.sh_coefficients = coefficients;
+    }
     let all = 0..splats.len();
     match &node.motion {
         Motion::Static | Motion::Rigid(_) => place(&mut splats, all, &pose),

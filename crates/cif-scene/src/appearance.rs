@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use crate::build::sigmoid;
 use crate::frames::Frames;
-use crate::graph::{AppearanceSample, Motion, is_visible_at, pose_at};
+use crate::graph::{Appearance, AppearanceSample, Motion, is_visible_at, pose_at};
 use crate::keys;
 use crate::{Node, VisibilitySample};
 
@@ -184,6 +184,62 @@ fn thinned(
     let mut kept = kept.into_iter().peekable();
     let samples = samples.into_iter().enumerate();
     samples.filter_map(|(index, sample)| kept.next_if_eq(&index).map(|_| sample)).collect()
+}
+
+impl Appearance {
+    /// Opacities at a time code; `None` where they stay as in [`crate::Splats::opacities`].
+    #[must_use]
+    pub fn opacities_at(&self, time_code: f64) -> Option<Vec<f32>> {
+        at(&self.opacities, time_code)
+    }
+
+    /// Coefficients at a time code; `None` where they stay as in [`crate::Splats::sh_coefficients`].
+    #[must_use]
+    pub fn colors_at(&self, time_code: f64) -> Option<Vec<f32>> {
+        at(&self.colors, time_code)
+    }
+}
+
+/// Values at a time code: linear between samples, held outside.
+fn at(samples: &[AppearanceSample], time_code: f64) -> Option<Vec<f32>> {
+    let (first, last) = samples.first().zip(samples.last())?;
+    let after = samples.partition_point(|sample| sample.time_code <= time_code);
+    if after == 0 || after == samples.len() {
+        return Some(if after == 0 { first } else { last }.values.clone());
+    }
+    let (a, b) = (&samples[after - 1], &samples[after]);
+    let fraction = ((time_code - a.time_code) / (b.time_code - a.time_code)) as f32;
+    Some(a.values.iter().zip(&b.values).map(|(a, b)| a + fraction * (b - a)).collect())
+}
+
+/// How a format that holds one opacity and one colour per splat shows a node: one sentence for each that changes, with
+/// the RMS difference over splats (by opacity) and time, and the largest one; empty where nothing changes.
+#[must_use]
+pub fn lost_without_samples(node: &Node) -> Vec<String> {
+    let splats = &node.splats;
+    let kinds = [
+        ("opacities", "their mean", &node.appearance.opacities, &splats.opacities),
+        ("colours", "those of the first frame", &node.appearance.colors, &splats.sh_coefficients),
+    ];
+    let told = kinds.into_iter().filter(|(_, _, samples, _)| !samples.is_empty());
+    told.map(|(what, instead, samples, constant)| {
+        let stride = (constant.len() / splats.len().max(1)).max(1);
+        let (mut squares, mut weights, mut largest) = (0.0_f64, 0.0_f64, 0.0_f32);
+        for sample in samples {
+            for (k, (value, constant)) in sample.values.iter().zip(constant).enumerate() {
+                let weight = f64::from(splats.opacities[k / stride]);
+                squares += weight * f64::from(value - constant).powi(2);
+                weights += weight;
+                largest = largest.max((value - constant).abs());
+            }
+        }
+        let rms = if weights > 0.0 { (squares / weights).sqrt() } else { 0.0 };
+        format!(
+            "{}: {what} change over time and leave as {instead} (off by {rms:.2} RMS, at most {largest:.2})",
+            node.name
+        )
+    })
+    .collect()
 }
 
 /// Changes of visibility of what is visible only while both are.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use cif_geometry::quaternion;
 use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
-use cif_scene::Splats;
+use cif_scene::{IdentityShare, IdentityShares, Splats};
 use gltf::json::accessor::ComponentType::{F32, I8, I16, U8, U16};
 use gltf::json::mesh::{Mode, Primitive, Semantic};
 use gltf::json::validation::Checked;
@@ -58,6 +58,7 @@ pub(crate) fn append(all: &mut Splats, mut more: Splats) {
     let degree = all.sh_degree.max(more.sh_degree);
     raise_degree(all, degree);
     raise_degree(&mut more, degree);
+    let before = all.means.len();
     all.means.append(&mut more.means);
     all.orientations.append(&mut more.orientations);
     all.scales.append(&mut more.scales);
@@ -66,6 +67,12 @@ pub(crate) fn append(all: &mut Splats, mut more: Splats) {
     all.occupancies.append(&mut more.occupancies);
     all.identity_probabilities.append(&mut more.identity_probabilities);
     all.rows.append(&mut more.rows);
+    // Some primitives may tell of instances where others do not.
+    if !(all.identities.is_empty() && more.identities.is_empty()) {
+        all.identities.resize(before, IdentityShares::default());
+        all.identities.append(&mut more.identities);
+        all.identities.resize(all.means.len(), IdentityShares::default());
+    }
 }
 
 fn raise_degree(splats: &mut Splats, degree: u8) {
@@ -155,6 +162,7 @@ impl Reader<'_> {
         };
         splats.occupancies = share(&crate::OCCUPANCY[1..])?;
         splats.identity_probabilities = share(&crate::IDENTITY[1..])?;
+        splats.identities = self.identities(n)?;
         splats.rows = match self.accessor(crate::ROW) {
             Some(index) => {
                 let halves: Vec<[f32; 2]> = self.attribute(crate::ROW, index, Some(n), &[(U16, false)])?;
@@ -163,6 +171,22 @@ impl Reader<'_> {
             None => vec![Splats::NO_ROW; n],
         };
         Ok(splats)
+    }
+
+    /// The instances that every splat may belong to; empty where the file does not tell.
+    fn identities(&self, n: usize) -> Result<Vec<IdentityShares>, GltfError> {
+        let accessors = (self.accessor(crate::INSTANCE_IDS), self.accessor(crate::INSTANCE_SHARES));
+        let (Some(ids), Some(shares)) = accessors else { return Ok(Vec::new()) };
+        let ids: Vec<[f32; 4]> = self.attribute(crate::INSTANCE_IDS, ids, Some(n), &[(U16, false)])?;
+        let shares: Vec<[f32; 4]> = self.attribute(crate::INSTANCE_SHARES, shares, Some(n), &[(F32, false)])?;
+        let outside = "is not between 0 and 1";
+        self.check(&crate::INSTANCE_SHARES[1..], &shares, outside, |v| (0.0..=1.0).contains(&v))?;
+        let entry = |(id, share): (f32, f32)| IdentityShare { id: id as u16, share };
+        Ok(ids
+            .into_iter()
+            .zip(shares)
+            .map(|(ids, shares)| std::array::from_fn(|place| entry((ids[place], shares[place]))))
+            .collect())
     }
 
     fn check_settings(&self, settings: &Value, warnings: &mut Vec<String>) -> Result<(), GltfError> {

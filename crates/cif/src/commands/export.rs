@@ -46,6 +46,9 @@ pub(super) struct Export {
     /// Largest error of a simplified motion: 1% of the object's size, or 0.002 in world units
     #[arg(long, default_value = "1%", value_name = "TOLERANCE")]
     tolerance: Tolerance,
+    /// Largest RMS error of opacities and colours that change over time; 0 keeps them at every frame
+    #[arg(long, default_value_t = 0.01, value_name = "ERROR")]
+    appearance_tolerance: f64,
     /// Frames to export, e.g. 0:71 [default: all]
     #[arg(long, value_name = "FIRST:LAST")]
     frames: Option<FrameRange>,
@@ -175,6 +178,7 @@ fn options(command: &Export, field: &Field) -> SceneOptions {
         field,
         SceneOptions {
             tolerance: command.tolerance,
+            appearance_tolerance: command.appearance_tolerance,
             frames: command.frames,
             frame_step: command.frame_step,
             up_axis: command.up_axis,

@@ -57,6 +57,9 @@ impl Gltf {
         let graph = rebuilt.as_ref().unwrap_or(graph);
         let written =
             cif_gltf::export(graph, path, cif_gltf::ExportOptions { force }).map_err(Error::plain)?;
+        for lost in &written.not_held {
+            eprintln!("warning: glTF does not hold everything of {lost}");
+        }
         eprintln!(
             "wrote {}: {} nodes, {} splats, {} time samples, {:.1} MB",
             written.path.display(),
