@@ -12,8 +12,8 @@ use crate::node::{self, Naming, NodeInput};
 use crate::appearance::{self, Opacities, Thinning};
 use crate::source::FieldMotion;
 use crate::{
-    MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, naming, proxy,
-    visibility, world,
+    MotionModel, MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, loose,
+    naming, proxy, visibility, world,
 };
 
 /// Share of an instance's weight that may be outliers when a motion model is chosen.
@@ -59,15 +59,17 @@ pub fn build_from(
     let visible = visible_rows(&reference, &opacities.peak, options, &mut warnings)?;
     let identities = assignment::most_probable(field);
     let owners = assignment::assign(field, &identities, &visible, options);
-    let (group_owners, mut groups) =
-        moving_groups(field, &visible, &owners, &reference, &opacities.peak, options);
+    let grouped = rows_of_nodes(field, &visible, &owners, &mut frames_of, options);
+    let (group_owners, mut groups) = moving_groups(grouped, &reference, &opacities.peak, options);
     let chosen = choose::choose(&mut groups, &mut frames_of, &time_codes.samples, options);
 
     let input = NodeInput { field, reference: &reference, identities: &identities };
     let mut nodes: Vec<Node> = Vec::with_capacity(groups.len());
     let mut names = naming::Names::default();
     for ((owner, group), chosen) in group_owners.iter().zip(&groups).zip(chosen) {
-        let naming = Naming::of(field, *owner, &mut names);
+        let stands = nodes.last().is_none_or(|node| node.kind != NodeKind::Background);
+        let background = if stands { naming::BACKGROUND } else { naming::MOVING_BACKGROUND };
+        let naming = Naming::of(field, *owner, background, &mut names);
         nodes.push(node::node(&input, naming, group, chosen));
     }
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
@@ -233,24 +235,54 @@ fn visible_rows(
     Ok(visible)
 }
 
-/// Groups of rows and whose they are: instances in the order of the table, then the background; empty ones
-/// left out.
-fn moving_groups(
+/// Rows of a node to be.
+struct NodeRows {
+    owner: Option<usize>,
+    rows: Vec<u32>,
+    /// True where all of them stand still as far as a picture shows.
+    stand_still: bool,
+}
+
+/// Rows of every node: instances in the order of the table, then of the background what stands still and what moves, if
+/// the motion may be dense; empty ones left out.
+fn rows_of_nodes(
     field: &Field,
     visible: &[u32],
     owners: &[Option<usize>],
-    reference: &Gaussians,
-    opacities: &[f32],
+    frames: &mut Frames<'_>,
     options: &SceneOptions,
-) -> (Vec<Option<usize>>, Vec<MovingGroup>) {
+) -> Vec<NodeRows> {
     let mut rows: Vec<Vec<u32>> = vec![Vec::new(); field.instances.len() + 1];
     for (&row, owner) in visible.iter().zip(owners) {
         rows[owner.unwrap_or(field.instances.len())].push(row);
     }
+    let background = rows.pop().unwrap_or_default();
+    let instances = rows.into_iter().enumerate();
+    let mut nodes: Vec<NodeRows> =
+        instances.map(|(index, rows)| NodeRows { owner: Some(index), rows, stand_still: false }).collect();
+    if options.most_expensive_motion == MotionModel::Dense {
+        let moves = loose::loose(frames, &background);
+        let (moving, still): (Vec<_>, Vec<_>) = background.iter().zip(moves).partition(|(_, moves)| *moves);
+        let rows = |of: Vec<(&u32, bool)>| of.into_iter().map(|(row, _)| *row).collect();
+        nodes.push(NodeRows { owner: None, rows: rows(still), stand_still: true });
+        nodes.push(NodeRows { owner: None, rows: rows(moving), stand_still: false });
+    } else {
+        nodes.push(NodeRows { owner: None, rows: background, stand_still: false });
+    }
+    nodes.retain(|node| !node.rows.is_empty());
+    nodes
+}
+
+/// Groups of rows that move together, and whose they are.
+fn moving_groups(
+    nodes: Vec<NodeRows>,
+    reference: &Gaussians,
+    opacities: &[f32],
+    options: &SceneOptions,
+) -> (Vec<Option<usize>>, Vec<MovingGroup>) {
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
-    for (position, rows) in rows.into_iter().enumerate().filter(|(_, rows)| !rows.is_empty()) {
-        let owner = (position < field.instances.len()).then_some(position);
+    for NodeRows { owner, rows, stand_still } in nodes {
         let weights: Vec<f64> = rows
             .iter()
             .map(|&row| {
@@ -273,8 +305,9 @@ fn moving_groups(
         let pivot = if owner.is_some() { (low + high) / 2.0 } else { DVec3::ZERO };
         let trim = if owner.is_some() { INSTANCE_TRIM } else { BACKGROUND_TRIM };
         let tolerance = options.tolerance.in_world_units(yardstick);
-        let group =
+        let mut group =
             MovingGroup::new(rows, weights, pivot, owner.is_some(), trim, tolerance, &reference.means);
+        group.stands_still = stand_still;
         group_owners.push(owner);
         groups.push(group);
     }

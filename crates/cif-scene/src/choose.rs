@@ -197,7 +197,7 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
 /// the report.
 fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptions) -> MotionModel {
     let limit = options.most_expensive_motion;
-    if inside(group, &group.static_residual) || limit == MotionModel::Static {
+    if group.stands_still || inside(group, &group.static_residual) || limit == MotionModel::Static {
         return MotionModel::Static;
     }
     if !group.is_body {

@@ -52,6 +52,7 @@ pub mod graph;
 pub mod keys;
 pub mod label_pattern;
 pub mod level_of_detail;
+mod loose;
 pub mod motion;
 pub mod naming;
 mod node;

@@ -33,6 +33,8 @@ pub struct MovingGroup {
     pub pivot: DVec3,
     /// Whether one rigid body may be fitted; the background is not one body.
     pub is_body: bool,
+    /// True where it is known to stand still as far as a picture shows.
+    pub stands_still: bool,
     /// Share of the weight that may be outliers.
     pub trim: f64,
     /// Largest decisive residual allowed, world units.
@@ -232,6 +234,7 @@ impl MovingGroup {
             weights,
             pivot,
             is_body,
+            stands_still: false,
             trim,
             tolerance,
             static_shape: MeanShape::default(),

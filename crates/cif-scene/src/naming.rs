@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 /// Name of the node that holds everything outside the instances.
 pub const BACKGROUND: &str = "background";
+/// Name of what moves of the background, where the rest stands still.
+pub const MOVING_BACKGROUND: &str = "background_moving";
 
 /// Name made from a label and an id: `red mug` and 1 give `red_mug_001`.
 ///

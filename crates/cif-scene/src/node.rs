@@ -26,7 +26,13 @@ pub(crate) struct Naming {
 }
 
 impl Naming {
-    pub(crate) fn of(field: &Field, owner: Option<usize>, names: &mut naming::Names) -> Self {
+    /// Names the node of an instance, or else `background`.
+    pub(crate) fn of(
+        field: &Field,
+        owner: Option<usize>,
+        background: &str,
+        names: &mut naming::Names,
+    ) -> Self {
         match owner {
             Some(index) => {
                 let instance = &field.instances[index];
@@ -40,7 +46,7 @@ impl Naming {
             }
             None => Self {
                 kind: NodeKind::Background,
-                name: names.take(naming::BACKGROUND.to_owned()),
+                name: names.take(background.to_owned()),
                 label: naming::BACKGROUND.to_owned(),
                 category: naming::BACKGROUND.to_owned(),
             },

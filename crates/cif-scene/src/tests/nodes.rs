@@ -1,6 +1,9 @@
 //! What nodes carry beside their motion: colliders, levels of detail, velocities, visibility.
 
 use super::*;
+use cif_field::tracks::{NO_GROUP, Samples, TrackGroup, TrackPose};
+use cif_field::{Owner, Tracks};
+
 use crate::convex_hull::HullMesh;
 
 /// A node of round splats at these places.
@@ -253,4 +256,136 @@ fn fading_nodes_hide_and_come_back() {
     assert!(
         (first.splats.opacities[0] - mean).abs() < 1e-6 && (first.splats.opacities[40] - 0.8).abs() < 1e-6
     );
+    // Samples stand beside the means, as few as a step needs.
+    let codes = |node: &Node| -> Vec<f64> {
+        node.appearance.opacities.iter().map(|sample| sample.time_code).collect()
+    };
+    assert_eq!((codes(first), codes(second)), (vec![0.0, 3.0, 4.0, 8.0], vec![0.0, 3.0, 4.0, 8.0]));
+    assert!(background.appearance.opacities.is_empty() && first.appearance.colors.is_empty());
+    for (code, expected) in [(0.0, 0.4), (3.0, 0.4), (3.5, 0.6), (4.0, 0.8), (9.0, 0.8)] {
+        let found = first.appearance.opacities_at(code).unwrap();
+        assert!((found[0] - expected).abs() < 1e-6 && (found[40] - 0.8).abs() < 1e-6, "{code}: {}", found[0]);
+    }
+    let loose = SceneOptions { appearance_tolerance: 0.3, ..SceneOptions::default() };
+    let graph = build_from(&field, &mut source, &loose).unwrap();
+    assert!(graph.nodes[0].appearance.opacities.is_empty(), "0.2 off in half of the splats");
+    let whole = SceneOptions { reduce_keys: false, ..SceneOptions::default() };
+    let graph = build_from(&field, &mut source, &whole).unwrap();
+    assert_eq!(graph.nodes[0].appearance.opacities.len(), FRAMES);
+    // What formats without samples are told.
+    let lost = crate::appearance::lost_without_samples(&graph.nodes[0]);
+    assert_eq!(lost.len(), 1);
+    assert!(lost[0].starts_with("red_mug_001: opacities change over time and leave as their mean"), "{lost:?}");
+    assert!(crate::appearance::lost_without_samples(background).is_empty());
+}
+
+#[test]
+fn what_changes_over_time_comes_back_from_the_graph() {
+    let mut field = field(2);
+    let n = field.gaussians.len();
+    let times = field.timeline.times.clone();
+    let mut opacities = vec![0.8; 60 * FRAMES];
+    let mut colors = vec![[0.25; 48]; 60 * FRAMES];
+    for step in 0..FRAMES {
+        for k in 0..60 {
+            opacities[60 * step + k] = if step < 4 { 0.2 } else { 0.9 };
+            colors[60 * step + k][1] = step as f32 / 8.0;
+            // Degree 2 is the highest of the field.
+            colors[60 * step + k][27..].fill(0.0);
+        }
+    }
+    let mut tracks = Tracks { group_of: vec![NO_GROUP; n], groups: Vec::new() };
+    tracks.group_of[..60].fill(0);
+    let turn = |time: f64| DQuat::from_rotation_z(1.5 * time);
+    tracks.groups.push(TrackGroup {
+        poses: times
+            .iter()
+            .map(|time| TrackPose { time: *time, translation: DVec3::X * *time, rotation: turn(*time) })
+            .collect(),
+        opacities: Some(Samples { times: times.clone(), values: opacities }),
+        colors: Some(Samples { times: times.clone(), values: colors }),
+        ..TrackGroup::still("changing", DVec3::ZERO)
+    });
+    field.tracks = Some(tracks);
+    field.validate().unwrap();
+    let options = SceneOptions { reduce_keys: false, appearance_tolerance: 0.0, ..SceneOptions::default() };
+    let graph = build(&field, &options).unwrap();
+    let node = &graph.nodes[0];
+    assert_eq!((node.model(), node.appearance.colors.len()), (MotionModel::Rigid, FRAMES));
+    let back = field_from_graph(&graph, "graph").unwrap();
+    for time in &times {
+        let (a, b) = (field.deformed(*time), back.deformed(*time));
+        for row in 0..n {
+            assert!((a.opacity(row) - b.opacity(row)).abs() < 1e-5, "row {row} at {time}");
+            for (x, y) in a.sh_coefficients[row].iter().zip(&b.sh_coefficients[row]).take(27) {
+                assert!((x - y).abs() < 1e-4, "row {row} at {time}: {x} {y}");
+            }
+        }
+    }
+}
+
+#[test]
+fn identity_rows_come_back_from_the_graph() {
+    let mut field = field(3);
+    let mut rows = Identities::empty();
+    for row in 0..field.len() {
+        let own = (row / 60).min(2) as u16;
+        let other = (own + 1) % 3;
+        let mut shares = if row < 180 { vec![(own, 0.6), (other, 0.2)] } else { vec![(own, 0.05)] };
+        shares.sort_by_key(|(label, _)| *label);
+        rows.push(Owner::Estimated, &shares);
+    }
+    field.identities = Some(rows);
+    let graph = build(&field, &SceneOptions::default()).unwrap();
+    assert_eq!(graph.nodes.len(), 4);
+    let back = field_from_graph(&graph, "graph").unwrap();
+    let (before, after) = (field.identities.unwrap(), back.identities.clone().unwrap());
+    let shares = |rows: &Identities, row| rows.entries(row).map(|(label, log, _)| (label, log.exp())).collect::<Vec<_>>();
+    for row in 0..180 {
+        for (a, b) in shares(&before, row).iter().zip(&shares(&after, row)) {
+            assert!(a.0 == b.0 && (a.1 - b.1).abs() < 1e-6, "{row}: {a:?} {b:?}");
+        }
+        assert_eq!(after.owner(row), Owner::Instance((row / 60) as u16));
+    }
+    assert!((180..220).all(|row| after.owner(row) == Owner::Background));
+    assert!((after.labelled_shares()[200] - 0.05).abs() < 1e-6);
+    // And again, with the same owners.
+    let again = build(&back, &SceneOptions::default()).unwrap();
+    let counts = |graph: &SceneGraph| graph.nodes.iter().map(|node| node.splats.len()).collect::<Vec<_>>();
+    assert_eq!(counts(&again), counts(&graph));
+    // A copy under another id takes the entries of its own id with it, and leaves the others.
+    let mut copied = graph.clone();
+    let mut copy = copied.nodes[0].clone();
+    copy.name = "copy".into();
+    copied.nodes.push(copy);
+    let back = field_from_graph(&copied, "graph").unwrap();
+    let index = back.instances.len() as u16 - 1;
+    let rows = back.identities.unwrap();
+    assert_eq!(shares(&rows, 220).iter().map(|(label, _)| *label).collect::<Vec<_>>(), [1, index]);
+    // Files without rows are certain of instances, and of nothing in the background.
+    let mut bare = graph.clone();
+    bare.nodes.iter_mut().for_each(|node| node.splats.identities.clear());
+    let rows = field_from_graph(&bare, "graph").unwrap().identities.unwrap();
+    assert_eq!((rows.entries(0).count(), rows.entries(200).count()), (1, 0), "no label but in objects");
+}
+
+#[test]
+fn thin_objects_own_the_soft_splats_that_draw_them() {
+    let mut field = field(2);
+    let mut rows = Identities::empty();
+    for row in 0..field.len() {
+        // A wire: its splats are wider than its mask. Those of the compact object lie in it, but for some at its edge.
+        let share = match row {
+            0..40 => 0.34,
+            40..60 => 0.1,
+            60..100 => 0.95,
+            100..120 => 0.34,
+            _ => 0.02,
+        };
+        rows.push(Owner::Estimated, &[((row / 60).min(1) as u16, share)]);
+    }
+    field.identities = Some(rows);
+    let graph = build(&field, &SceneOptions::default()).unwrap();
+    let counts: Vec<usize> = graph.nodes.iter().map(|node| node.splats.len()).collect();
+    assert_eq!(counts, [40, 40, 80], "the wire has its splats, and the compact object not those beside it");
 }

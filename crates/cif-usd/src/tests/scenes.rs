@@ -2,9 +2,9 @@
 
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform, spherical_harmonics};
 use cif_scene::{
-    CameraSample, CameraTrack, CaptureFrame, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel,
+    Appearance, AppearanceSample, CameraSample, CameraTrack, CaptureFrame, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel,
     MotionReport, Node, NodeKind, Origin, Part, PartsMotion, PointProxy, PoseSample, ResidualStatistics,
-    SceneGraph, SceneOptions, Splats, TimeCodes, UpAxis, VisibilitySample, extent,
+    IdentityShare, IdentityShares, SceneGraph, SceneOptions, Splats, TimeCodes, UpAxis, VisibilitySample, extent,
 };
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -65,8 +65,40 @@ impl Maker {
                 .collect(),
             identity_probabilities: (0..count).map(|_| self.float(0.0, 1.0)).collect(),
             rows: (0..count as u32).map(|index| index * 7 + 3).collect(),
-            identities: Vec::new(),
+            identities: (0..count).map(|_| self.identity()).collect(),
         }
+    }
+
+    /// No instance to as many as are kept.
+    fn identity(&mut self) -> IdentityShares {
+        let mut shares = IdentityShares::default();
+        let used = self.chance.random_range(0..=shares.len());
+        for (place, entry) in shares[..used].iter_mut().enumerate() {
+            *entry = IdentityShare { id: 1 + 1000 * place as u16, share: self.chance.random_range(0.0..0.25) };
+        }
+        shares
+    }
+
+    /// Half of the nodes fade, and half of them change their colours.
+    fn appearance(&mut self, splats: &mut Splats) -> Appearance {
+        let mut samples = |count: usize, low: f32, high: f32| -> Vec<AppearanceSample> {
+            if self.chance.random_bool(0.5) {
+                return Vec::new();
+            }
+            let codes = self.codes.clone().into_iter();
+            codes
+                .map(|time_code| {
+                    let values = (0..count).map(|_| self.chance.random_range(low..high)).collect();
+                    AppearanceSample { time_code, values }
+                })
+                .collect()
+        };
+        let opacities = samples(splats.len(), 0.0, 1.0);
+        let colors = samples(splats.sh_coefficients.len(), -3.0, 3.0);
+        if let Some(first) = colors.first() {
+            splats.sh_coefficients.clone_from(&first.values);
+        }
+        Appearance { opacities, colors }
     }
 
     pub(super) fn track(&mut self) -> Vec<PoseSample> {
@@ -168,6 +200,7 @@ impl Maker {
         let count = self.chance.random_range(5..12);
         let mut splats = self.splats(count, degree);
         let motion = self.motion(model, &mut splats);
+        let appearance = self.appearance(&mut splats);
         let pivot = self.vector();
         let (name, label, category) = match kind {
             NodeKind::Instance { id, .. } => {
@@ -224,7 +257,7 @@ impl Maker {
             source_frames: (0, 3 * (self.codes.len() - 1)),
             mean_occupancy: self.float(0.0, 1.0),
             report,
-            appearance: Default::default(),
+            appearance,
         };
         if let Motion::Parts(motion) = &node.motion {
             let boxes = motion.parts.iter().map(|part| {

@@ -1,8 +1,8 @@
 """Geometry Nodes that draw every vertex as a Gaussian.
 
 Attributes of the mesh: `rot` (quaternion), `scale` (standard deviations), `opacity`, `colour` (linear); `sh_0`
-to `sh_15` where the colour depends on the view; `position_K`, `rot_K`, `scale_K` where the splats deform, K
-counting the samples.
+to `sh_15` where the colour depends on the view; `position_K`, `rot_K`, `scale_K` where the splats deform, and
+`opacity_K` where they fade, K counting the samples.
 
 In the viewport each vertex carries an ellipsoid. Renders from the scene's camera draw what it sees of them:
 discs that are sorted by the depth of their centres, as in training, and crossed once by a ray instead of twice.
@@ -20,6 +20,8 @@ from .graph import Graph, Value
 NAME = "CIF splats"
 SAMPLE = "Sample"
 """Input that picks the sample of splats that deform; fractions blend two of them."""
+FADE = "Opacity Sample"
+"""Input that picks the sample of splats that fade; fractions blend two of them."""
 BLUR = "Pixel Angle"
 """Input with the angle of one recorded pixel, radians: training blurs splats by some pixels."""
 VIEW = "Half View"
@@ -49,6 +51,7 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
     for name, kind, value in (
         ("Geometry", "NodeSocketGeometry", None),
         (SAMPLE, "NodeSocketFloat", 0.0),
+        (FADE, "NodeSocketFloat", 0.0),
         (BLUR, "NodeSocketFloat", 0.0),
         (VIEW, "NodeSocketVector", (1.0, 1.0, 0.0)),
         (NEAR, "NodeSocketFloat", 0.0),
@@ -64,6 +67,7 @@ def splat_nodes() -> bpy.types.GeometryNodeTree:
     given = graph.add("NodeGroupInput").outputs
 
     points = _deformed(graph, given["Geometry"], given[SAMPLE])
+    points = _faded(graph, points, given[FADE])
     camera = shape_nodes.Camera(graph)
     lens = shape_nodes.Lens(given[BLUR], given[VIEW], given[NEAR])
     shape = shape_nodes.Shape(graph, camera, lens)
@@ -142,13 +146,20 @@ def _remove(graph: Graph, geometry: Value, pattern: str) -> bpy.types.NodeSocket
     return node.outputs[0]
 
 
-def _deformed(graph: Graph, geometry: Value, sample: Value) -> bpy.types.NodeSocket:
-    """The splats at a sample; as they are where they do not deform."""
-    lower = graph.math("FLOOR", sample)
-    fraction = graph.math("SUBTRACT", sample, lower)
-    upper = graph.math("CEIL", sample)
+class _Samples:
+    """Attributes `NAME_K` of a sample and the next, blended by the fraction of the sample's number."""
 
-    def named(prefix: str, number: Value) -> bpy.types.NodeSocket:
+    KINDS = {"QUATERNION": "ROTATION", "FLOAT_VECTOR": "VECTOR", "FLOAT": "FLOAT"}
+    """Kinds of attributes, and what nodes that mix and switch call them."""
+
+    def __init__(self, graph: Graph, sample: Value) -> None:
+        self.graph = graph
+        self.lower = graph.math("FLOOR", sample)
+        self.fraction = graph.math("SUBTRACT", sample, self.lower)
+        self.upper = graph.math("CEIL", sample)
+
+    def _named(self, prefix: str, number: Value) -> bpy.types.NodeSocket:
+        graph = self.graph
         text = graph.add("FunctionNodeValueToString", {0: number}).outputs[0]
         join = graph.add("GeometryNodeStringJoin", {"Delimiter": "_"})
         # The last link of a multi-input comes first.
@@ -158,24 +169,35 @@ def _deformed(graph: Graph, geometry: Value, sample: Value) -> bpy.types.NodeSoc
         )
         return join.outputs[0]
 
-    def blended(prefix: str, kind: str, rest: Value) -> bpy.types.NodeSocket:
-        a, exists = graph.attribute(named(prefix, lower), kind)
-        b, _ = graph.attribute(named(prefix, upper), kind)
-        rotation = kind == "QUATERNION"
-        mix = graph.add("ShaderNodeMix", data_type="ROTATION" if rotation else "VECTOR")
+    def blended(self, prefix: str, kind: str, rest: Value) -> bpy.types.NodeSocket:
+        """The value between two samples; `rest` where there are none."""
+        graph = self.graph
+        a, exists = graph.attribute(self._named(prefix, self.lower), kind)
+        b, _ = graph.attribute(self._named(prefix, self.upper), kind)
+        mix = graph.add("ShaderNodeMix", data_type=self.KINDS[kind])
         sockets = [socket for socket in mix.inputs if socket.enabled]
-        for socket, value in zip(sockets, (fraction, a, b), strict=True):
+        for socket, value in zip(sockets, (self.fraction, a, b), strict=True):
             graph.give(socket, value)
         result = next(socket for socket in mix.outputs if socket.enabled)
-        return graph.switch(exists, rest, result, "ROTATION" if rotation else "VECTOR")
+        return graph.switch(exists, rest, result, self.KINDS[kind])
 
+
+def _faded(graph: Graph, geometry: Value, sample: Value) -> bpy.types.NodeSocket:
+    """The splats with the opacities of a sample; as they are where they do not fade."""
+    opacity = _Samples(graph, sample).blended("opacity", "FLOAT", graph.attribute("opacity", "FLOAT")[0])
+    return _remove(graph, _store(graph, geometry, "opacity", "FLOAT", opacity), "opacity_*")
+
+
+def _deformed(graph: Graph, geometry: Value, sample: Value) -> bpy.types.NodeSocket:
+    """The splats at a sample; as they are where they do not deform."""
+    samples = _Samples(graph, sample)
     place = graph.add("GeometryNodeInputPosition").outputs[0]
     moved = graph.add(
         "GeometryNodeSetPosition",
-        {"Geometry": geometry, "Position": blended("position", "FLOAT_VECTOR", place)},
+        {"Geometry": geometry, "Position": samples.blended("position", "FLOAT_VECTOR", place)},
     ).outputs[0]
     for name, kind in (("rot", "QUATERNION"), ("scale", "FLOAT_VECTOR")):
-        moved = _store(graph, moved, name, kind, blended(name, kind, graph.attribute(name, kind)[0]))
+        moved = _store(graph, moved, name, kind, samples.blended(name, kind, graph.attribute(name, kind)[0]))
     for name in ("position", "rot", "scale"):
         moved = _remove(graph, moved, f"{name}_*")
     return moved

@@ -39,6 +39,9 @@ def splat_mesh(name: str, splats: Splats, harmonics: bool) -> bpy.types.Mesh:
             store(mesh, f"rot_{number}", "QUATERNION", samples.rotations[number])
             if samples.scales is not None:
                 store(mesh, f"scale_{number}", "FLOAT_VECTOR", samples.scales[number])
+    if splats.fade is not None:
+        for number, opacities in enumerate(splats.fade.opacities):
+            store(mesh, f"opacity_{number}", "FLOAT", opacities)
     mesh.color_attributes.active_color_name = "colour"
     mesh.update()
     return mesh
@@ -47,13 +50,15 @@ def splat_mesh(name: str, splats: Splats, harmonics: bool) -> bpy.types.Mesh:
 def add_modifier(
     obj: bpy.types.Object, splats: Splats, look: Mapping[str, float | bool | tuple[float, ...]]
 ) -> None:
-    """Draw the vertices as Gaussians with inputs of the nodes, and play the samples of splats that deform."""
+    """Draw the vertices as Gaussians with inputs of the nodes, and play the samples of splats that deform or fade."""
     modifier = obj.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = nodes.splat_nodes()
     for name, value in look.items():
         nodes.set_input(modifier, name, value)
-    if (samples := splats.samples) is not None:
-        path = nodes.set_input(modifier, nodes.SAMPLE, 0.0)
+    for name, samples in ((nodes.SAMPLE, splats.samples), (nodes.FADE, splats.fade)):
+        if samples is None:
+            continue
+        path = nodes.set_input(modifier, name, 0.0)
         numbers = np.arange(len(samples.codes), dtype=np.float64)
         steps = np.diff(samples.codes)
         if np.allclose(steps, steps[0]):

@@ -14,7 +14,7 @@ import numpy as np
 from pxr import Sdf, Usd, UsdGeom
 
 from . import tracks
-from .scene import Camera, Instance, Piece, Scene, Splats, SplatSamples, Visibility
+from .scene import Camera, Fade, Instance, Piece, Scene, Splats, SplatSamples, Visibility
 
 SPLAT_TYPE = "ParticleField3DGaussianSplat"
 COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
@@ -303,7 +303,22 @@ def _splats(prim: Usd.Prim, harmonics: bool) -> Splats:
         harmonics=_harmonics(prim, count, harmonics),
         occupancies=None if occupancies is None else sized(occupancies, "primvars:cif:occupancy"),
         samples=samples,
+        fade=_fade(prim, needed("opacities"), count),
     )
+
+
+def _fade(prim: Usd.Prim, attribute: Usd.Attribute, count: int) -> Fade | None:
+    """Opacities over time, where they change."""
+    codes = attribute.GetTimeSamples()
+    if len(codes) < 2:
+        return None
+    opacities = [_array(prim, attribute, 1, code) for code in codes]
+    for code, values in zip(codes, opacities, strict=True):
+        if len(values) != count:
+            raise StageError(
+                f"{prim.GetPath()}: opacities has {len(values)} values for {count} positions at time code {code:g}"
+            )
+    return Fade(np.array(codes, dtype=np.float64), opacities)
 
 
 def _hemispheres(rotations: list[np.ndarray]) -> list[np.ndarray]:
@@ -349,6 +364,7 @@ EMPTY = Splats(
     harmonics=np.zeros((0, 1, 3), np.float32),
     occupancies=None,
     samples=None,
+    fade=None,
 )
 """Stands for arrays that were not asked for."""
 

@@ -24,6 +24,16 @@ class SplatSamples:
 
 
 @dataclass(frozen=True)
+class Fade:
+    """Opacities of splats over time, linear in between."""
+
+    codes: np.ndarray
+    """Ascending time codes, [T]."""
+    opacities: list[np.ndarray]
+    """Opacities in [0, 1], T arrays of [N] float32."""
+
+
+@dataclass(frozen=True)
 class Splats:
     """Gaussians of one prim in the prim's own frame."""
 
@@ -41,6 +51,8 @@ class Splats:
     """Probability to be part of an instance's surface, [N] float32; `None` where the stage does not say."""
     samples: SplatSamples | None
     """The splats over time; `None` while they keep their places in the prim's frame."""
+    fade: Fade | None
+    """Opacities over time; `None` while they stay the same."""
 
     @property
     def count(self) -> int:

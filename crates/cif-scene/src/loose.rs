@@ -1,0 +1,68 @@
+//! Splats of the background that move or deform, told from those that stand still.
+//!
+//! Most of a background stands still, and the network only trembles there; but shadows, reflections and things without a
+//! mask do move, and a picture shows that. The two leave as nodes of their own: one constant, and one with a path for
+//! every splat, so that a few moving splats neither freeze nor make thousands of others move.
+
+use cif_geometry::quaternion;
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::frames::Frames;
+use crate::motion::{dot, vector};
+
+/// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the middle
+/// one of the three: flat splats are seen from their broad side), of its size in logarithms, and of its direction in
+/// radians, as far as it is not round. An image changes by about that share of the splat's contrast at most.
+const LEAST_CHANGE: f64 = 0.2;
+
+/// How far one splat has been from where it was first.
+#[derive(Clone, Copy, Default)]
+struct Change {
+    low: DVec3,
+    high: DVec3,
+    low_scale: DVec3,
+    high_scale: DVec3,
+    turn: f64,
+}
+
+/// For each of `rows`, true where it moves or deforms over the sampled times.
+pub(crate) fn loose(frames: &mut Frames<'_>, rows: &[u32]) -> Vec<bool> {
+    if !frames.moves() {
+        return vec![false; rows.len()];
+    }
+    let first = frames.at(0);
+    let mut changes: Vec<Change> = rows
+        .iter()
+        .map(|&row| {
+            let (mean, scale) = (vector(first.means[row as usize]), vector(first.log_scales[row as usize]));
+            Change { low: mean, high: mean, low_scale: scale, high_scale: scale, turn: 0.0 }
+        })
+        .collect();
+    for step in 1..frames.len() {
+        let frame = frames.at(step);
+        changes.par_iter_mut().zip(rows).with_min_len(4096).for_each(|(change, &row)| {
+            let row = row as usize;
+            let (mean, scale) = (vector(frame.means[row]), vector(frame.log_scales[row]));
+            (change.low, change.high) = (change.low.min(mean), change.high.max(mean));
+            change.low_scale = change.low_scale.min(scale);
+            change.high_scale = change.high_scale.max(scale);
+            let unit = |q: [f32; 4]| quaternion::try_normalize(q.map(f64::from));
+            if let (Some(a), Some(b)) = (unit(first.quaternions[row]), unit(frame.quaternions[row])) {
+                change.turn = change.turn.max(2.0 * dot(a, b).abs().min(1.0).acos());
+            }
+        });
+    }
+    changes.iter().map(Change::shows).collect()
+}
+
+impl Change {
+    fn shows(&self) -> bool {
+        let mut scales = ((self.low_scale + self.high_scale) / 2.0).exp().to_array();
+        scales.sort_by(f64::total_cmp);
+        let [least, middle, most] = scales;
+        (self.high - self.low).length() > LEAST_CHANGE * middle
+            || (self.high_scale - self.low_scale).max_element() > LEAST_CHANGE
+            || self.turn * (1.0 - least / most) > LEAST_CHANGE
+    }
+}
