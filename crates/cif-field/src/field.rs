@@ -110,7 +110,9 @@ impl Field {
     pub fn members(&self, instance: usize) -> Vec<u32> {
         let of_gaussians = self.instance_of_gaussians().unwrap_or_default();
         let rows = of_gaussians.iter().enumerate();
-        rows.filter(|(_, of)| of.is_some_and(|of| usize::from(of) == instance)).map(|(row, _)| row as u32).collect()
+        rows.filter(|(_, of)| of.is_some_and(|of| usize::from(of) == instance))
+            .map(|(row, _)| row as u32)
+            .collect()
     }
 
     /// Instances (indices into [`Field::instances`], ascending) whose label is `label`: those that match

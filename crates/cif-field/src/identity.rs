@@ -174,7 +174,8 @@ impl Identities {
 
     /// Entries of a row: label, estimate and calibration.
     pub fn entries(&self, row: usize) -> impl Iterator<Item = (u16, f32, f32)> {
-        self.range(row).map(|entry| (self.labels[entry], self.log_estimates[entry], self.log_calibrations[entry]))
+        self.range(row)
+            .map(|entry| (self.labels[entry], self.log_estimates[entry], self.log_calibrations[entry]))
     }
 
     /// Adds a row at the end that is certain of its owner: an instance, or none of them.
@@ -263,12 +264,10 @@ mod tests {
         rows.push(Owner::Background, &[(1, 0.125), (4, 0.25)]);
         rows.push(Owner::Estimated, &[(0, 1.0)]);
         rows.validate(7, 6).unwrap();
-        assert_eq!([2, 3, 4, 5].map(|row| rows.owner(row)), [
-            Owner::Estimated,
-            Owner::Instance(5),
-            Owner::Background,
-            Owner::Background
-        ]);
+        assert_eq!(
+            [2, 3, 4, 5].map(|row| rows.owner(row)),
+            [Owner::Estimated, Owner::Instance(5), Owner::Background, Owner::Background]
+        );
         assert_eq!(rows.argmax()[3..], [Some(5), None, Some(4), Some(0)]);
         assert_eq!(rows.labelled_shares()[3..], [1.0, 0.0, 0.375, 1.0]);
         assert_eq!(rows.gather(&[4, 0]).owners, [Owner::Background, Owner::Estimated]);

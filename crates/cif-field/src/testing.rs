@@ -117,7 +117,10 @@ pub(crate) fn tracked_field(n: usize, seed: u64) -> Field {
     let groups = vec![
         TrackGroup {
             poses: vec![pose(0.0, 0.0), pose(0.25, 0.9), pose(0.75, -0.6)],
-            opacities: Some(Samples { times: vec![0.25, 0.75], values: (0..2 * turning).map(opacity).collect() }),
+            opacities: Some(Samples {
+                times: vec![0.25, 0.75],
+                values: (0..2 * turning).map(opacity).collect(),
+            }),
             ..still("turning")
         },
         TrackGroup {

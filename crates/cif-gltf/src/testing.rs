@@ -3,9 +3,9 @@
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use cif_scene::{
-    CameraSample, CameraTrack, CaptureFrame, IdentityShare, Motion, MotionModel, MotionReport, Node, NodeKind, Origin, Part,
-    PartsMotion, PoseSample, ResidualStatistics, SceneGraph, SceneOptions, Splats, TimeCodes, UpAxis,
-    VisibilitySample, extent,
+    CameraSample, CameraTrack, CaptureFrame, IdentityShare, Motion, MotionModel, MotionReport, Node,
+    NodeKind, Origin, Part, PartsMotion, PoseSample, ResidualStatistics, SceneGraph, SceneOptions, Splats,
+    TimeCodes, UpAxis, VisibilitySample, extent,
 };
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use proptest::prelude::*;
@@ -58,7 +58,9 @@ impl Numbers {
             splats.occupancies.push(self.between(0.0, 1.0) as f32);
             splats.identity_probabilities.push(self.between(0.0, 1.0) as f32);
             splats.identities.push(std::array::from_fn(|place| match place as u32 <= first_row % 3 {
-                true => IdentityShare { id: (k + 300 * place) as u16 + 1, share: self.between(0.0, 0.25) as f32 },
+                true => {
+                    IdentityShare { id: (k + 300 * place) as u16 + 1, share: self.between(0.0, 0.25) as f32 }
+                }
                 false => IdentityShare::default(),
             }));
             splats.rows.push(first_row + 70_000 * k as u32);

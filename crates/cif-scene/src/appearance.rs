@@ -112,8 +112,9 @@ pub(crate) fn recolor(node: &mut Node, frames: &mut Frames<'_>, thinning: &Thinn
             let frame = frames.at(step);
             let mut values = vec![0.0; floats * node.splats.len()];
             for (range, rotation) in turns(node, time_code) {
-                let back = (rotation.xyz().length() > 1e-9)
-                    .then(|| HarmonicsRotation::<f32>::new(crate::field_from_graph::rows_of(rotation.conjugate())));
+                let back = (rotation.xyz().length() > 1e-9).then(|| {
+                    HarmonicsRotation::<f32>::new(crate::field_from_graph::rows_of(rotation.conjugate()))
+                });
                 let rows = &node.splats.rows[range.clone()];
                 let values = &mut values[range.start * floats..range.end * floats];
                 values.par_chunks_exact_mut(floats).zip(rows).for_each(|(values, row)| {
@@ -157,7 +158,8 @@ fn thinned(
     stride: usize,
     thinning: &Thinning<'_>,
 ) -> Vec<AppearanceSample> {
-    let allowed = thinning.tolerance * thinning.tolerance * thinning.weights.iter().sum::<f64>() * stride as f64;
+    let allowed =
+        thinning.tolerance * thinning.tolerance * thinning.weights.iter().sum::<f64>() * stride as f64;
     // Sum of the weighted squares between a sample and the interpolation of two others.
     let inside = |sample: &AppearanceSample, a: &[f32], b: &[f32], fraction: f64| {
         let mut sum = 0.0;

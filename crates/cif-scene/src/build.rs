@@ -4,12 +4,12 @@ use cif_field::{Field, Gaussians};
 use cif_geometry::quaternion;
 use glam::DVec3;
 
+use crate::appearance::{self, Opacities, Thinning};
 use crate::assignment::Identity;
 use crate::frames::{Frame, Frames};
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::motion::{MovingGroup, trimmed_box, vector};
 use crate::node::{self, Naming, NodeInput};
-use crate::appearance::{self, Opacities, Thinning};
 use crate::source::FieldMotion;
 use crate::{
     MotionModel, MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, loose,
@@ -239,8 +239,8 @@ fn visible_rows(
 struct NodeRows {
     owner: Option<usize>,
     rows: Vec<u32>,
-    /// True where all of them stand still as far as a picture shows.
-    stand_still: bool,
+    /// For each row, true where it moves as far as a picture shows.
+    moves: Vec<bool>,
 }
 
 /// Rows of every node: instances in the order of the table, then of the background what stands still and what moves, if
@@ -257,17 +257,21 @@ fn rows_of_nodes(
         rows[owner.unwrap_or(field.instances.len())].push(row);
     }
     let background = rows.pop().unwrap_or_default();
-    let instances = rows.into_iter().enumerate();
+    let mut node = |owner: Option<usize>, rows: Vec<u32>| {
+        let moves = loose::loose(frames, &rows);
+        NodeRows { owner, rows, moves }
+    };
     let mut nodes: Vec<NodeRows> =
-        instances.map(|(index, rows)| NodeRows { owner: Some(index), rows, stand_still: false }).collect();
+        rows.into_iter().enumerate().map(|(index, rows)| node(Some(index), rows)).collect();
+    let background = node(None, background);
     if options.most_expensive_motion == MotionModel::Dense {
-        let moves = loose::loose(frames, &background);
-        let (moving, still): (Vec<_>, Vec<_>) = background.iter().zip(moves).partition(|(_, moves)| *moves);
-        let rows = |of: Vec<(&u32, bool)>| of.into_iter().map(|(row, _)| *row).collect();
-        nodes.push(NodeRows { owner: None, rows: rows(still), stand_still: true });
-        nodes.push(NodeRows { owner: None, rows: rows(moving), stand_still: false });
+        for wanted in [false, true] {
+            let own = background.rows.iter().zip(&background.moves).filter(|(_, moves)| **moves == wanted);
+            let (rows, moves) = own.map(|(row, moves)| (*row, *moves)).unzip();
+            nodes.push(NodeRows { owner: None, rows, moves });
+        }
     } else {
-        nodes.push(NodeRows { owner: None, rows: background, stand_still: false });
+        nodes.push(background);
     }
     nodes.retain(|node| !node.rows.is_empty());
     nodes
@@ -282,7 +286,7 @@ fn moving_groups(
 ) -> (Vec<Option<usize>>, Vec<MovingGroup>) {
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
-    for NodeRows { owner, rows, stand_still } in nodes {
+    for NodeRows { owner, rows, moves } in nodes {
         let weights: Vec<f64> = rows
             .iter()
             .map(|&row| {
@@ -307,7 +311,9 @@ fn moving_groups(
         let tolerance = options.tolerance.in_world_units(yardstick);
         let mut group =
             MovingGroup::new(rows, weights, pivot, owner.is_some(), trim, tolerance, &reference.means);
-        group.stands_still = stand_still;
+        let moving: f64 =
+            group.weights.iter().zip(moves).filter(|(_, moves)| *moves).map(|(weight, _)| weight).sum();
+        group.stands_still = moving <= trim * group.weights.iter().sum::<f64>();
         group_owners.push(owner);
         groups.push(group);
     }

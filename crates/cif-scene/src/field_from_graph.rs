@@ -296,7 +296,10 @@ fn samples<V: Copy>(
     let own = range.start * stride..range.end * stride;
     Some(Samples {
         times: of.iter().map(|sample| times.time(sample.time_code)).collect(),
-        values: of.iter().flat_map(|sample| sample.values[own.clone()].chunks_exact(stride).map(&value)).collect(),
+        values: of
+            .iter()
+            .flat_map(|sample| sample.values[own.clone()].chunks_exact(stride).map(&value))
+            .collect(),
     })
 }
 

@@ -81,7 +81,8 @@ pub use error::SceneError;
 pub use field_from_graph::field_from_graph;
 pub use graph::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample,
-    IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion, PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
+    IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion,
+    PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
 pub use label_pattern::LabelPattern;
 pub use level_of_detail::level_of_detail;

@@ -1,8 +1,9 @@
-//! Splats of the background that move or deform, told from those that stand still.
+//! Splats that move or deform as far as a picture shows, told from those that stand still.
 //!
-//! Most of a background stands still, and the network only trembles there; but shadows, reflections and things without a
-//! mask do move, and a picture shows that. The two leave as nodes of their own: one constant, and one with a path for
-//! every splat, so that a few moving splats neither freeze nor make thousands of others move.
+//! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, however
+//! tight the tolerance of motion. Most of a background stands still too; but shadows, reflections and things without a
+//! mask do move. The two leave as nodes of their own: one constant, and one with a path for every splat, so that a few
+//! moving splats neither freeze nor make thousands of others move.
 
 use cif_geometry::quaternion;
 use glam::DVec3;

@@ -33,7 +33,7 @@ pub struct MovingGroup {
     pub pivot: DVec3,
     /// Whether one rigid body may be fitted; the background is not one body.
     pub is_body: bool,
-    /// True where it is known to stand still as far as a picture shows.
+    /// True where all but the outliers stand still as far as a picture shows ([`crate::loose`]).
     pub stands_still: bool,
     /// Share of the weight that may be outliers.
     pub trim: f64,

@@ -67,8 +67,13 @@ fn with_probe(field: &Field) -> Field {
     let rows = field.identities.as_ref().unwrap();
     let log_p = |entry: usize, p: &[f32]| p[entry].max(1e-30).ln();
     let p = rows.probabilities();
-    let mut probed =
-        Identities { row_offsets: vec![0], labels: vec![], log_estimates: vec![], log_calibrations: vec![], owners: vec![] };
+    let mut probed = Identities {
+        row_offsets: vec![0],
+        labels: vec![],
+        log_estimates: vec![],
+        log_calibrations: vec![],
+        owners: vec![],
+    };
     for row in 0..rows.len() {
         for entry in rows.range(row) {
             probed.labels.push(rows.labels[entry]);

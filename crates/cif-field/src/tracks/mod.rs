@@ -76,7 +76,8 @@ impl<V: Copy> Samples<V> {
     /// The samples of members `members[0], members[1], ...`, which may repeat.
     fn gather(&self, members: &[usize]) -> Self {
         let stride = self.members();
-        let picked = (0..self.times.len()).flat_map(|sample| members.iter().map(move |member| (sample, *member)));
+        let picked =
+            (0..self.times.len()).flat_map(|sample| members.iter().map(move |member| (sample, *member)));
         let values = picked.map(|(sample, member)| self.values[sample * stride + member]).collect();
         Self { times: self.times.clone(), values }
     }

@@ -178,7 +178,8 @@ impl Reader<'_> {
         let accessors = (self.accessor(crate::INSTANCE_IDS), self.accessor(crate::INSTANCE_SHARES));
         let (Some(ids), Some(shares)) = accessors else { return Ok(Vec::new()) };
         let ids: Vec<[f32; 4]> = self.attribute(crate::INSTANCE_IDS, ids, Some(n), &[(U16, false)])?;
-        let shares: Vec<[f32; 4]> = self.attribute(crate::INSTANCE_SHARES, shares, Some(n), &[(F32, false)])?;
+        let shares: Vec<[f32; 4]> =
+            self.attribute(crate::INSTANCE_SHARES, shares, Some(n), &[(F32, false)])?;
         let outside = "is not between 0 and 1";
         self.check(&crate::INSTANCE_SHARES[1..], &shares, outside, |v| (0.0..=1.0).contains(&v))?;
         let entry = |(id, share): (f32, f32)| IdentityShare { id: id as u16, share };

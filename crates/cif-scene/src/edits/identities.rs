@@ -112,7 +112,8 @@ fn keep(to: &mut Identities, from: &Identities, row: usize, renumbered: &[Owner]
         (true, _) => return to.push_certain(None),
         (false, _) => {}
     }
-    let share = |entries: &[(u16, f32, f32)]| entries.iter().map(|(_, log, _)| f64::from(*log).exp()).sum::<f64>();
+    let share =
+        |entries: &[(u16, f32, f32)]| entries.iter().map(|(_, log, _)| f64::from(*log).exp()).sum::<f64>();
     let all: Vec<(u16, f32, f32)> = from.entries(row).collect();
     if owned && entries.len() < all.len() {
         let factor = (share(&all) / share(&entries)).ln() as f32;

@@ -40,7 +40,14 @@ pub(super) fn subset(node: &Node, positions: &[usize]) -> Node {
         opacities: samples(&node.appearance.opacities, 1, positions),
         colors: samples(&node.appearance.colors, per_splat, positions),
     };
-    Node { motion, splats: some(&node.splats, positions), appearance, proxy: None, colliders: Vec::new(), ..node.clone() }
+    Node {
+        motion,
+        splats: some(&node.splats, positions),
+        appearance,
+        proxy: None,
+        colliders: Vec::new(),
+        ..node.clone()
+    }
 }
 
 fn some(splats: &Splats, positions: &[usize]) -> Splats {

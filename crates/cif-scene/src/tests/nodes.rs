@@ -275,7 +275,10 @@ fn fading_nodes_hide_and_come_back() {
     // What formats without samples are told.
     let lost = crate::appearance::lost_without_samples(&graph.nodes[0]);
     assert_eq!(lost.len(), 1);
-    assert!(lost[0].starts_with("red_mug_001: opacities change over time and leave as their mean"), "{lost:?}");
+    assert!(
+        lost[0].starts_with("red_mug_001: opacities change over time and leave as their mean"),
+        "{lost:?}"
+    );
     assert!(crate::appearance::lost_without_samples(background).is_empty());
 }
 
@@ -340,7 +343,9 @@ fn identity_rows_come_back_from_the_graph() {
     assert_eq!(graph.nodes.len(), 4);
     let back = field_from_graph(&graph, "graph").unwrap();
     let (before, after) = (field.identities.unwrap(), back.identities.clone().unwrap());
-    let shares = |rows: &Identities, row| rows.entries(row).map(|(label, log, _)| (label, log.exp())).collect::<Vec<_>>();
+    let shares = |rows: &Identities, row| {
+        rows.entries(row).map(|(label, log, _)| (label, log.exp())).collect::<Vec<_>>()
+    };
     for row in 0..180 {
         for (a, b) in shares(&before, row).iter().zip(&shares(&after, row)) {
             assert!(a.0 == b.0 && (a.1 - b.1).abs() < 1e-6, "{row}: {a:?} {b:?}");

@@ -125,12 +125,7 @@ impl<'a> Selection<'a> {
     }
 }
 
-fn cut(
-    of: &[f32],
-    indices: impl ExactSizeIterator<Item = usize>,
-    stored: usize,
-    kept: usize,
-) -> Vec<f32> {
+fn cut(of: &[f32], indices: impl ExactSizeIterator<Item = usize>, stored: usize, kept: usize) -> Vec<f32> {
     let mut coefficients = Vec::with_capacity(indices.len() * kept);
     for index in indices {
         let start = index * stored;

@@ -113,7 +113,8 @@ fn instance_shares(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, identities: &[Identit
     let ids: Vec<i32> = entries().map(|entry| i32::from(entry.id)).collect();
     let shares: Vec<f32> = entries().map(|entry| entry.share).collect();
     let ids = prim.set(tokens::PRIMVAR_INSTANCE_IDS, "IntArray", VARYING, pxr.int_array(&ids)?)?;
-    let shares = prim.set(tokens::PRIMVAR_INSTANCE_SHARES, "FloatArray", VARYING, pxr.float_array(&shares)?)?;
+    let shares =
+        prim.set(tokens::PRIMVAR_INSTANCE_SHARES, "FloatArray", VARYING, pxr.float_array(&shares)?)?;
     for attribute in [ids, shares] {
         attribute.info("elementSize", places as i32)?;
         attribute.info("interpolation", tokens::VERTEX)?;

@@ -326,7 +326,8 @@ impl<'py> SplatPrim<'py> {
     ) -> Result<Vec<IdentityShares>, UsdError> {
         let arrays = &reading.arrays;
         let ids = self.primvar(reading, tokens::PRIMVAR_INSTANCE_IDS, at, |value| arrays.ints(value))?;
-        let shares = self.primvar(reading, tokens::PRIMVAR_INSTANCE_SHARES, at, |value| arrays.scalars(value))?;
+        let shares =
+            self.primvar(reading, tokens::PRIMVAR_INSTANCE_SHARES, at, |value| arrays.scalars(value))?;
         let (Some(ids), Some(shares)) = (ids, shares) else { return Ok(Vec::new()) };
         let bad = |problem: String| {
             let fix = "write as many ids as shares for every splat, ids from 0 to 65535, shares from 0 to 1";

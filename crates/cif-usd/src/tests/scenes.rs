@@ -2,9 +2,10 @@
 
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform, spherical_harmonics};
 use cif_scene::{
-    Appearance, AppearanceSample, CameraSample, CameraTrack, CaptureFrame, ConvexHull, DenseMotion, DenseSample, Motion, MotionModel,
-    MotionReport, Node, NodeKind, Origin, Part, PartsMotion, PointProxy, PoseSample, ResidualStatistics,
-    IdentityShare, IdentityShares, SceneGraph, SceneOptions, Splats, TimeCodes, UpAxis, VisibilitySample, extent,
+    Appearance, AppearanceSample, CameraSample, CameraTrack, CaptureFrame, ConvexHull, DenseMotion,
+    DenseSample, IdentityShare, IdentityShares, Motion, MotionModel, MotionReport, Node, NodeKind, Origin,
+    Part, PartsMotion, PointProxy, PoseSample, ResidualStatistics, SceneGraph, SceneOptions, Splats,
+    TimeCodes, UpAxis, VisibilitySample, extent,
 };
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -74,7 +75,8 @@ impl Maker {
         let mut shares = IdentityShares::default();
         let used = self.chance.random_range(0..=shares.len());
         for (place, entry) in shares[..used].iter_mut().enumerate() {
-            *entry = IdentityShare { id: 1 + 1000 * place as u16, share: self.chance.random_range(0.0..0.25) };
+            *entry =
+                IdentityShare { id: 1 + 1000 * place as u16, share: self.chance.random_range(0.0..0.25) };
         }
         shares
     }
