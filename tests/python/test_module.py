@@ -91,7 +91,7 @@ def test_wrong_arrays_are_named(field: cif.Field) -> None:
     instances = [{"id": 1, "label": "mug"}, {"id": 2, "label": "car"}]
     for wrong in [-0.5, np.nan, np.inf]:
         identities = np.array([[0.5, 0.5], [1.0, wrong]], np.float32)
-        with pytest.raises(ValueError, match="identities hold .* at row 1, column 1"):
+        with pytest.raises(ValueError, match=r"identities hold .* at row 1, column 1"):
             cif.Field.from_arrays(**good, identities=identities, instances=instances)
     with pytest.raises(cif.CifError, match="NUL"):
         cif.Field.from_arrays(**good, instances=[{"id": 1, "label": "red\0mug"}])

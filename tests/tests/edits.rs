@@ -43,7 +43,7 @@ fn learned() -> Field {
         owner[row] = (place / 50) as u16;
     }
     let mut identities = Identities::empty();
-    owner.iter().for_each(|owner| identities.push_told(Some(*owner)));
+    owner.iter().for_each(|owner| identities.push_certain(Some(*owner)));
     field.identities = Some(identities);
     field.instances = ["red mug", "cereal box", "spoon"]
         .iter()

@@ -187,13 +187,16 @@ impl Background {
     fn start(folder: &Path, line: &str) -> Self {
         let mut command = Command::new(CIF);
         command.args(line.split_whitespace()).current_dir(folder).stderr(Stdio::null());
-        Self(command.spawn().unwrap())
+        Self(command.spawn().expect("the command starts"))
     }
 
     /// Waits until `what` holds, while the command runs.
     fn until(&mut self, what: impl Fn() -> bool) {
         while !what() {
-            assert!(self.0.try_wait().unwrap().is_none(), "it ended too early");
+            assert!(
+                self.0.try_wait().expect("the clock and the process can be asked").is_none(),
+                "it ended too early"
+            );
             sleep(Duration::from_millis(10));
         }
     }

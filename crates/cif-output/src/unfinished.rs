@@ -166,6 +166,24 @@ impl NewFile {
     }
 }
 
+impl NewFile {
+    /// As [`Self::finish`], unless something has the name by now: `false` then, and it keeps the name.
+    ///
+    /// # Errors
+    /// When the file system refuses.
+    pub fn finish_new(self) -> io::Result<bool> {
+        self.file().sync_all()?;
+        match fs::hard_link(&self.unfinished.path, &self.target) {
+            // The temporary name goes when this is dropped.
+            Ok(()) => Ok(true),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => Ok(false),
+            // Not every file system has links; what appears in this moment is lost there.
+            Err(_) if self.target.exists() => Ok(false),
+            Err(_) => self.finish().map(|()| true),
+        }
+    }
+}
+
 /// Finishes files that belong together: all are on the disk before the first is renamed, in their order.
 ///
 /// # Errors

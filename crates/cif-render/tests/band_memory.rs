@@ -34,14 +34,19 @@ fn veils(count: usize, size: u32) -> SyntheticScene {
 
 /// Peak of resident memory since the last reset, bytes.
 fn peak() -> u64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap();
-    let line = status.lines().find(|line| line.starts_with("VmHWM")).unwrap();
-    line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap() * 1024
+    let status = std::fs::read_to_string("/proc/self/status").expect("this holds in the test");
+    let line = status.lines().find(|line| line.starts_with("VmHWM")).expect("this holds in the test");
+    line.split_whitespace()
+        .nth(1)
+        .expect("this holds in the test")
+        .parse::<u64>()
+        .expect("this holds in the test")
+        * 1024
 }
 
 /// Bytes that a view takes, (tile, Gaussian) pairs, and covered pixels.
 fn draw(scene: &SyntheticScene, band_memory: u64) -> (u64, usize, usize) {
-    std::fs::write("/proc/self/clear_refs", "5").unwrap();
+    std::fs::write("/proc/self/clear_refs", "5").expect("this holds in the test");
     let before = peak();
     let mut renderer = Renderer::new(SimdLevel::Auto);
     renderer.set_band_memory(band_memory);
@@ -52,7 +57,7 @@ fn draw(scene: &SyntheticScene, band_memory: u64) -> (u64, usize, usize) {
         covered += band.image.alpha.pixels.iter().filter(|alpha| **alpha > 0.9).count();
         Ok::<(), String>(())
     });
-    drawn.unwrap();
+    drawn.expect("this holds in the test");
     (peak() - before, renderer.statistics().tile_pairs, covered)
 }
 

@@ -36,7 +36,7 @@ fn draw(scene: &SyntheticScene, memory: u64, request: &BandRequest<'_>) -> (Vec<
             bands.push(band);
             Ok::<(), String>(())
         })
-        .unwrap();
+        .expect("this holds in the test");
     (bands, renderer)
 }
 
@@ -52,9 +52,15 @@ fn assert_rows(whole: &RenderedBand, band: &RenderedBand) {
     let (a, b) = (&whole.image, &band.image);
     assert_eq!(rows(&a.color, first, &b.color), b.color);
     assert_eq!(rows(&a.alpha, first, &b.alpha), b.alpha);
-    let (a_depth, b_depth) = (a.depth.as_ref().unwrap(), b.depth.as_ref().unwrap());
+    let (a_depth, b_depth) = (
+        a.depth.as_ref().expect("this holds in the test"),
+        b.depth.as_ref().expect("this holds in the test"),
+    );
     assert_eq!(&rows(a_depth, first, b_depth), b_depth);
-    let (a, b) = (a.instances.as_ref().unwrap(), b.instances.as_ref().unwrap());
+    let (a, b) = (
+        a.instances.as_ref().expect("this holds in the test"),
+        b.instances.as_ref().expect("this holds in the test"),
+    );
     assert_eq!(rows(&a.label, first, &b.label), b.label);
     for (a, b) in [
         (&a.probability, &b.probability),
@@ -64,12 +70,18 @@ fn assert_rows(whole: &RenderedBand, band: &RenderedBand) {
     ] {
         assert_eq!(&rows(a, first, b), b);
     }
-    let (a, b) = (whole.ranks.as_ref().unwrap(), band.ranks.as_ref().unwrap());
+    let (a, b) = (
+        whole.ranks.as_ref().expect("this holds in the test"),
+        band.ranks.as_ref().expect("this holds in the test"),
+    );
     assert_eq!(a.ranks.len(), b.ranks.len());
     for (a, b) in a.ranks.iter().zip(&b.ranks) {
         assert_eq!((&rows(&a.0, first, &b.0), &rows(&a.1, first, &b.1)), (&b.0, &b.1));
     }
-    let (a, b) = (whole.blended.as_ref().unwrap(), band.blended.as_ref().unwrap());
+    let (a, b) = (
+        whole.blended.as_ref().expect("this holds in the test"),
+        band.blended.as_ref().expect("this holds in the test"),
+    );
     assert_eq!(&rows(a, first, b), b);
 }
 

@@ -10,7 +10,6 @@ mod common;
 mod on_gpu;
 
 use std::collections::BTreeMap;
-use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use cif_field::SortMetric;
 use cif_geometry::PixelGrid;
@@ -19,8 +18,8 @@ use cif_render::reference::rasterize::{footprint, weight};
 use cif_render::reference::{self, Forward, ParameterGroup, Scene, SceneGradients};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::wgpu::{
-    Commands, DeviceIdentities, Gpu, GpuError, GpuGaussians, GpuRenderer, GpuStatistics, GpuVec, LabelInput,
-    Rasterizer, Splat, ViewInput, testing,
+    Commands, Gpu, GpuError, GpuGaussians, GpuRenderer, GpuStatistics, GpuVec, Rasterizer, Splat, ViewInput,
+    testing,
 };
 use cif_render::{
     Channels, GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings,

@@ -41,6 +41,8 @@ const ROUNDS: usize = 4;
 const SAME_OCCUPANCY: f32 = 1e-4;
 /// Share of its image on labelled pixels from which a Gaussian may be enclosed by an instance.
 const LABELLED_SHARE: f32 = 0.5;
+/// Smallest share that may make an instance at all, however little of it there is.
+const LEAST_SHARE: f64 = 0.2;
 /// Rounds of Dinkelbach's method; it converges faster than linearly, and 8 agree to single precision.
 const RATIO_ROUNDS: usize = 8;
 
@@ -148,7 +150,7 @@ fn needed_shares(field: &Field, visible: &[u32], candidates: &[Option<Identity>]
                 }
                 needed = ratio / (1.0 + ratio);
             }
-            needed
+            needed.max(LEAST_SHARE)
         })
         .collect()
 }

@@ -6,7 +6,6 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 use cif_field::Checkpoint;
-use cif_scene::files::folder_of;
 use cif_train::TrainConfig;
 
 use crate::error::Error;
@@ -221,36 +220,22 @@ impl Contents {
 
 /// Saves a file where there is none; false when there is one after all.
 fn save_anew(checkpoint: &Checkpoint, path: &Path) -> Result<bool, Error> {
-    let temporary = || -> io::Result<_> {
-        let mut builder = tempfile::Builder::new();
-        builder.prefix(".cif-").suffix(".tmp");
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
-        builder.tempfile_in(folder_of(path))
-    };
-    let file = temporary().map_err(Error::io("write to the folder of", path))?;
-    let mut sink = BufWriter::with_capacity(1 << 20, file.as_file());
+    let new = cif_output::NewFile::create(path).map_err(Error::io("write to the folder of", path))?;
+    let mut sink = BufWriter::with_capacity(1 << 20, new.file());
     checkpoint.write(&mut sink, path).map_err(Error::plain)?;
-    sink.flush().and_then(|()| file.as_file().sync_all()).map_err(Error::io("write", path))?;
+    sink.flush().map_err(Error::io("write", path))?;
     drop(sink);
-    match file.persist_noclobber(path) {
-        Ok(_) => Ok(true),
-        Err(error) if error.error.kind() == io::ErrorKind::AlreadyExists => Ok(false),
-        // Not every file system can tell; what appears in this moment is told at the next state.
-        Err(_) => checkpoint.save(path).map(|()| true).map_err(Error::plain),
-    }
+    new.finish_new().map_err(Error::io("write", path))
 }
 
 /// Saves what its place refuses in the folder for temporary files.
 fn rescued(checkpoint: &Checkpoint, path: &Path, refused: &Error) -> Error {
-    let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let rescue = std::env::temp_dir().join(format!("rescued-{}-{name}", std::process::id()));
-    match checkpoint.save(&rescue) {
-        Ok(()) => Error::failed(
+    match output::rescue_file(path).ok().filter(|rescue| checkpoint.save(rescue).is_ok()) {
+        Some(rescue) => Error::failed(
             refused.to_string(),
             format!("the scene was saved as {} instead; move it where there is space", rescue.display()),
         ),
-        Err(_) => Error::failed(refused.to_string(), "make space, then train again"),
+        None => Error::failed(refused.to_string(), "make space, then train again"),
     }
 }
 
@@ -292,7 +277,9 @@ mod tests {
             assert_eq!(Checkpoint::load(folder.path().join("a-2.cif")).unwrap(), checkpoint(2));
             drop(destination);
             assert_eq!(listing(folder.path()), ["a-2.cif", "a.cif"]);
-            ["a-2.cif", "a.cif"].map(|name| fs::remove_file(folder.path().join(name)).unwrap());
+            for name in ["a-2.cif", "a.cif"] {
+                fs::remove_file(folder.path().join(name)).unwrap();
+            }
         }
     }
 

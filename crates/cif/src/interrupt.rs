@@ -145,6 +145,13 @@ impl Drop for Session {
     }
 }
 
+/// Ends the process as interrupted, without unfinished files.
+fn end() -> ! {
+    cif_output::abandon();
+    // No exit handlers: those of usd-core's libraries must not run while other threads are in them.
+    signal_hook::low_level::exit(130);
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -168,11 +175,4 @@ mod tests {
         watch_and_save();
         assert!(HANDLER.get().is_none());
     }
-}
-
-/// Ends the process as interrupted, without unfinished files.
-fn end() -> ! {
-    cif_output::abandon();
-    // No exit handlers: those of usd-core's libraries must not run while other threads are in them.
-    signal_hook::low_level::exit(130);
 }

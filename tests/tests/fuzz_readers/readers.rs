@@ -280,7 +280,7 @@ fn field() -> Field {
     gaussians.occupancy_logits.fill(2.0);
     let owner = |row: usize| [Some(0_u16), Some(1), None][row / 10];
     let mut identities = Identities::empty();
-    (0..30).for_each(|row| identities.push_told(owner(row)));
+    (0..30).for_each(|row| identities.push_certain(owner(row)));
     let config = DeformationConfig {
         spatial_resolution: [3, 2, 4],
         time_resolution: 3,

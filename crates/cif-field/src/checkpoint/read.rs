@@ -115,15 +115,14 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
             [entries] => entries,
             ref other => return Err(reader.shape_error(LABELS, other, "[E]")),
         };
-        Some(Identities {
+        Some(of_older_files(Identities {
             // n counts rows of 12 bytes in this file, so n + 1 cannot overflow.
             row_offsets: reader.values(ROW_OFFSETS, Dtype::U32, n + 1, &[])?,
             labels: reader.values(LABELS, Dtype::U16, entries, &[])?,
             log_estimates: reader.values(LOG_ESTIMATES, Dtype::F32, entries, &[])?,
             log_calibrations: reader.values(LOG_CALIBRATIONS, Dtype::F32, entries, &[])?,
             owners: if json.has_owners { read_owners(reader, n)? } else { Vec::new() },
-        })
-        .map(of_older_files)
+        }))
     } else {
         None
     };

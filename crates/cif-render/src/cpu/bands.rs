@@ -103,7 +103,7 @@ mod tests {
     fn splat(low: [f32; 2], high: [f32; 2]) -> Splat {
         Splat {
             mean: [0, 1].map(|axis| 0.5 * (low[axis] + high[axis])),
-            conic: [1.0, 0.0, 1.0],
+            factor: [1.0, 0.0, 1.0],
             color: [0.5; 3],
             opacity: 0.5,
             occupancy: 0.5,

@@ -149,7 +149,8 @@ fn noise_inside_the_tolerance_is_static_and_averaged() {
         }
         gaussians
     };
-    let graph = build_from(&field, &mut source, &SceneOptions::default()).unwrap();
+    let loose = SceneOptions { tolerance: Tolerance::Percent(1.0), ..SceneOptions::default() };
+    let graph = build_from(&field, &mut source, &loose).unwrap();
     assert_eq!(graph.nodes[0].model(), MotionModel::Static);
     let strict = SceneOptions { tolerance: Tolerance::Absolute(1e-4), ..SceneOptions::default() };
     let graph = build_from(&field, &mut source, &strict).unwrap();

@@ -18,7 +18,7 @@ use crate::error::Error;
 use crate::output::Outputs;
 use crate::progress::Progress;
 use crate::settings::Layers;
-use crate::{interrupt, output, training};
+use crate::{interrupt, training};
 
 /// Train a scene on a capture
 #[derive(Debug, Args)]

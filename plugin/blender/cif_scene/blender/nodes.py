@@ -146,11 +146,12 @@ def _remove(graph: Graph, geometry: Value, pattern: str) -> bpy.types.NodeSocket
     return node.outputs[0]
 
 
+_KINDS = {"QUATERNION": "ROTATION", "FLOAT_VECTOR": "VECTOR", "FLOAT": "FLOAT"}
+"""Kinds of attributes, and how nodes that mix and switch call them."""
+
+
 class _Samples:
     """Attributes `NAME_K` of a sample and the next, blended by the fraction of the sample's number."""
-
-    KINDS = {"QUATERNION": "ROTATION", "FLOAT_VECTOR": "VECTOR", "FLOAT": "FLOAT"}
-    """Kinds of attributes, and what nodes that mix and switch call them."""
 
     def __init__(self, graph: Graph, sample: Value) -> None:
         self.graph = graph
@@ -174,12 +175,12 @@ class _Samples:
         graph = self.graph
         a, exists = graph.attribute(self._named(prefix, self.lower), kind)
         b, _ = graph.attribute(self._named(prefix, self.upper), kind)
-        mix = graph.add("ShaderNodeMix", data_type=self.KINDS[kind])
+        mix = graph.add("ShaderNodeMix", data_type=_KINDS[kind])
         sockets = [socket for socket in mix.inputs if socket.enabled]
         for socket, value in zip(sockets, (self.fraction, a, b), strict=True):
             graph.give(socket, value)
         result = next(socket for socket in mix.outputs if socket.enabled)
-        return graph.switch(exists, rest, result, self.KINDS[kind])
+        return graph.switch(exists, rest, result, _KINDS[kind])
 
 
 def _faded(graph: Graph, geometry: Value, sample: Value) -> bpy.types.NodeSocket:

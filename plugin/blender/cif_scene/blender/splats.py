@@ -50,7 +50,7 @@ def splat_mesh(name: str, splats: Splats, harmonics: bool) -> bpy.types.Mesh:
 def add_modifier(
     obj: bpy.types.Object, splats: Splats, look: Mapping[str, float | bool | tuple[float, ...]]
 ) -> None:
-    """Draw the vertices as Gaussians with inputs of the nodes, and play the samples of splats that deform or fade."""
+    """Draw the vertices as Gaussians with inputs of the nodes, and play samples of what deforms or fades."""
     modifier = obj.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = nodes.splat_nodes()
     for name, value in look.items():

@@ -316,7 +316,7 @@ def _fade(prim: Usd.Prim, attribute: Usd.Attribute, count: int) -> Fade | None:
     for code, values in zip(codes, opacities, strict=True):
         if len(values) != count:
             raise StageError(
-                f"{prim.GetPath()}: opacities has {len(values)} values for {count} positions at time code {code:g}"
+                f"{prim.GetPath()}: {len(values)} opacities for {count} positions at time code {code:g}"
             )
     return Fade(np.array(codes, dtype=np.float64), opacities)
 
