@@ -67,8 +67,8 @@ def ellipsoids(obj: bpy.types.Object, frame: float) -> np.ndarray:
     return flat.reshape(-1, 4, 4).transpose(0, 2, 1)
 
 
-def drawn(obj: bpy.types.Object, name: str, size: int) -> np.ndarray:
-    evaluated = obj.evaluated_get(at_frame(0)).evaluated_geometry()  # owns what follows
+def drawn(obj: bpy.types.Object, name: str, size: int, frame: float = 0) -> np.ndarray:
+    evaluated = obj.evaluated_get(at_frame(frame)).evaluated_geometry()  # owns what follows
     cloud = evaluated.instances_pointcloud()
     attribute = cloud.attributes[name]
     flat = np.empty(len(attribute.data) * size, np.float32)
@@ -129,6 +129,24 @@ def test_deforming_splats_follow_their_samples(objects: dict) -> None:
         np.testing.assert_allclose(ellipsoids(napkin, frame)[:, :3, 3], positions(5, frame, 2.0), atol=1e-6)
     between = (positions(5, 3, 2.0) + positions(5, 4, 2.0)) / 2
     np.testing.assert_allclose(ellipsoids(napkin, 3.5)[:, :3, 3], between, atol=1e-6)
+
+
+def test_fading_splats_follow_their_samples(path: Path) -> None:
+    first, last = np.full(COUNT, 0.1), np.linspace(0.2, 0.9, COUNT)
+    samples = ", ".join(
+        f"{code}: [{', '.join(str(value) for value in values)}]" for code, values in ((2, first), (6, last))
+    )
+    text = path.read_text()
+    text = text.replace(
+        "float[] opacities", f"float[] opacities.timeSamples = {{ {samples} }}\nfloat[] opacities", 1
+    )
+    path.write_text(text)
+    objects = {obj.name: obj for obj in import_cif.import_stage(path)}
+    for frame, expected in ((0, first), (2, first), (5, 0.25 * first + 0.75 * last), (6, last), (8, last)):
+        opacity = drawn(objects["red_mug_001"], "splat_opacity", 1, frame)[:, 0]
+        np.testing.assert_allclose(opacity, expected, atol=1e-6)
+    others = drawn(objects["green_napkin_007"], "splat_opacity", 1, 5)
+    np.testing.assert_allclose(others, 0.8, atol=1e-6)
 
 
 def test_ellipsoids_are_the_gaussians(path: Path) -> None:

@@ -40,8 +40,8 @@ def find(
 
     ``label`` is a pattern (``*`` and ``?`` are wildcards; case does not matter) for any label of the prim:
     its class, its human label or its unique name; ``None`` takes every labelled prim. ``taxonomy`` lets only
-    labels of one taxonomy count, such as ``"class"`` or ``"instance"``. Labels are those at ``time``: a time code, a
-    ``(first, last)`` interval in which they hold at any time, or by default the default time. With
+    labels of one taxonomy count, such as ``"class"`` or ``"instance"``. Labels are those at ``time``: a time
+    code, a ``(first, last)`` interval in which they hold at any time, or by default the default time. With
     ``inherited`` the prims below a labelled prim count too.
 
     A stage given by path stays open, because prims do not outlive their stage; asked again, it is read again
