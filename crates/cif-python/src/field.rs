@@ -347,7 +347,7 @@ impl Field {
         export::find(py, self, label, time_code)
     }
 
-    #[pyo3(signature = (path, *, tolerance="0.3%", motion=None, most_expensive_motion="dense", frames=None,
+    #[pyo3(signature = (path, *, tolerance="0.2%", motion=None, most_expensive_motion="dense", frames=None,
                         frame_step=1, up_axis="z", background_threshold=None, proxy_points=None, max_parts=8,
                         reduce_keys=true, hulls=1, background_hulls=0, payloads="by-kind",
                         levels_of_detail=true, force=false))]

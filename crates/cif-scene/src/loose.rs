@@ -15,7 +15,7 @@ use crate::motion::{dot, vector};
 /// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the middle
 /// one of the three: flat splats are seen from their broad side), of its size in logarithms, and of its direction in
 /// radians, as far as it is not round. An image changes by about that share of the splat's contrast at most.
-const LEAST_CHANGE: f64 = 0.2;
+const LEAST_CHANGE: f64 = 0.3;
 
 /// How far one splat has been from where it was first.
 #[derive(Clone, Copy, Default)]

@@ -42,7 +42,7 @@ pub enum Tolerance {
 
 impl Default for Tolerance {
     fn default() -> Self {
-        Self::Percent(0.3)
+        Self::Percent(0.2)
     }
 }
 
@@ -114,7 +114,7 @@ impl FromStr for FrameRange {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SceneOptions {
-    /// Largest residual of a simplified motion. Default 0.3 % of the instance size.
+    /// Largest residual of a simplified motion. Default 0.2 % of the instance size.
     pub tolerance: Tolerance,
     /// Largest RMS error of opacities and colours that change over time, in units of opacity and of spherical-harmonics
     /// coefficients; 0 keeps them at every sampled frame. Default 0.01.

@@ -160,7 +160,7 @@ class Field:
         self,
         path: str | os.PathLike[str],
         *,
-        tolerance: str = "0.3%",
+        tolerance: str = "0.2%",
         motion: Callable[[float], tuple[NDArray[np.float32], NDArray[np.float32]]] | None = None,
         most_expensive_motion: str = "dense",
         frames: tuple[int, int] | None = None,

@@ -43,8 +43,8 @@ pub(super) struct Export {
     gltf: Gltf,
     #[command(flatten)]
     ply: Ply,
-    /// Largest error of a simplified motion: 1% of the object's size, or 0.002 in world units
-    #[arg(long, default_value = "0.3%", value_name = "TOLERANCE")]
+    /// Largest error of a simplified motion: 0.2% of the object's size, or 0.002 in world units
+    #[arg(long, default_value = "0.2%", value_name = "TOLERANCE")]
     tolerance: Tolerance,
     /// Largest RMS error of opacities and colours that change over time; 0 keeps them at every frame
     #[arg(long, default_value_t = 0.01, value_name = "ERROR")]
