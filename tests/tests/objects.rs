@@ -88,7 +88,7 @@ fn a_scene_shows_and_tells_its_objects() {
     // By place and time.
     let all = json(&cif(path, "query scene.cif --json").succeeds().stdout);
     let listed: Vec<&str> = all.as_array().unwrap().iter().filter_map(|one| one["label"].as_str()).collect();
-    assert_eq!(listed, ["red ball", "blue ball", "background"]);
+    assert_eq!(listed, ["red ball", "blue ball", "background", "moving background"]);
     // On average over the capture: a scene of seconds of training wavers from frame to frame.
     let line = "query scene.cif --label ball --taxonomy class --interval 0:1 --json";
     let moving = json(&cif(path, line).succeeds().stdout);

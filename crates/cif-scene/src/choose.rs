@@ -24,6 +24,8 @@ const WORTH: f64 = 0.98;
 /// Where the best parts miss the tolerance, those that move by less than this share of it rest: beside what the
 /// model misses, such motion would be made up.
 const UNSHOWN: f64 = 0.5;
+/// Tolerances within which what stands still in a picture is at rest.
+const RESTING: f64 = 5.0;
 /// Share of the tolerance within which rounding alone moves a part.
 const ROUNDING: f64 = 1e-6;
 /// Bytes of a pose: three doubles and a quaternion of floats.
@@ -193,11 +195,14 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
     FittedParts { order, parts, residual }
 }
 
-/// The cheapest model inside the tolerance, no more expensive than allowed. Parts that are not chosen stay for
+/// The cheapest model inside the tolerance, no more expensive than allowed; trembling that no picture shows may be some
+/// tolerances large. Parts that are not chosen stay for
 /// the report.
 fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptions) -> MotionModel {
     let limit = options.most_expensive_motion;
-    if group.stands_still || inside(group, &group.static_residual) || limit == MotionModel::Static {
+    let rests =
+        group.stands_still && group.static_residual.statistics().decisive <= RESTING * group.tolerance;
+    if rests || inside(group, &group.static_residual) || limit == MotionModel::Static {
         return MotionModel::Static;
     }
     if !group.is_body {

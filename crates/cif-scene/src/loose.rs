@@ -1,7 +1,7 @@
 //! Splats that move or deform as far as a picture shows, told from those that stand still.
 //!
-//! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, however
-//! tight the tolerance of motion. Most of a background stands still too; but shadows, reflections and things without a
+//! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, though
+//! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections and things without a
 //! mask do move. The two leave as nodes of their own: one constant, and one with a path for every splat, so that a few
 //! moving splats neither freeze nor make thousands of others move.
 

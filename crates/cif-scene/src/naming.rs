@@ -6,6 +6,8 @@ use std::collections::{BTreeMap, BTreeSet};
 pub const BACKGROUND: &str = "background";
 /// Name of what moves of the background, where the rest stands still.
 pub const MOVING_BACKGROUND: &str = "background_moving";
+/// Label of it.
+pub const MOVING_BACKGROUND_LABEL: &str = "moving background";
 
 /// Name made from a label and an id: `red mug` and 1 give `red_mug_001`.
 ///

@@ -47,7 +47,10 @@ impl Naming {
             None => Self {
                 kind: NodeKind::Background,
                 name: names.take(background.to_owned()),
-                label: naming::BACKGROUND.to_owned(),
+                label: match background == naming::MOVING_BACKGROUND {
+                    true => naming::MOVING_BACKGROUND_LABEL.to_owned(),
+                    false => naming::BACKGROUND.to_owned(),
+                },
                 category: naming::BACKGROUND.to_owned(),
             },
         }

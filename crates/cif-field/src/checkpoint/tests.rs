@@ -150,7 +150,7 @@ proptest! {
         }
         field.timeline.times = times.iter().map(|step| *step as f64 / (1_u64 << 53) as f64).collect();
         field.extent = extent;
-        field.instances[1].label.clone_from(&text);
+        field.instances[1].label = text.replace('\0', "");
         let finite = |values: &[f64]| values.iter().copied().filter(|value| value.is_finite()).collect::<Vec<_>>();
         field.provenance = json!({ "text": text, "doubles": finite(&doubles) });
         for (row, value) in floats.iter().filter(|value| value.is_finite()).take(n).enumerate() {
