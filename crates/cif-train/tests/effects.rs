@@ -30,6 +30,12 @@ fn still_config() -> TrainConfig {
     config
 }
 
+/// Mean score of two seeds: between seeds, runs of so few steps waver by half a decibel.
+fn mean_score(dataset: &Dataset, config: &TrainConfig) -> f64 {
+    let of = |seed| score(&train(dataset.clone(), TrainConfig { seed, ..config.clone() }));
+    (of(config.seed) + of(config.seed + 1)) / 2.0
+}
+
 #[test]
 fn a_static_capture_without_masks_trains_plain_splats_only() {
     let folder = tempfile::tempdir().unwrap();
@@ -107,7 +113,7 @@ fn what_stands_still_skips_the_network_and_what_moves_does_not() {
         Control::Continue
     });
     assert_eq!(outcome.unwrap(), Outcome::Finished);
-    let whole = train(dataset, small_config());
+    let whole = train(dataset.clone(), small_config());
     assert!(!settled.is_empty() && settled[settled.len() - 1] > 0, "{settled:?}");
 
     let (part, all) = (trainer.times(), whole.times());
@@ -121,7 +127,7 @@ fn what_stands_still_skips_the_network_and_what_moves_does_not() {
     };
     // The third ball moves, the others do not.
     assert!(share(2) < 0.3 && share(0) > 0.5, "{} {} {}", share(0), share(1), share(2));
-    let (with, without) = (score(&trainer), score(&whole));
+    let (with, without) = (mean_score(&dataset, &still_config()), mean_score(&dataset, &small_config()));
     assert!(with > without - 0.5, "{with} dB against {without} dB");
 }
 
@@ -249,7 +255,7 @@ fn exposures_are_learnt_where_cameras_disagree() {
     assert!(!config.effects.exposure);
     let forced = planned(&agree, &config, "auto,+exposure");
     assert!(forced.effects.exposure);
-    let (without, with) = (score(&train(agree.clone(), config)), score(&train(agree, forced)));
+    let (without, with) = (mean_score(&agree, &config), mean_score(&agree, &forced));
     println!("cameras agree: {with:.2} dB with exposures, {without:.2} dB without");
     assert!(without > with - 0.3, "{with} dB with exposures, {without} dB without");
 }
