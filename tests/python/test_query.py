@@ -170,8 +170,8 @@ def test_labels_are_edited_in_place(
     assert cif.run(["label", str(path), "--instance", "77", "x"]) == 1
     assert "/World/toy_car_002" in capfd.readouterr().err
     other = tmp_path / ("other.usda" if path.suffix == ".usdc" else "other.usdc")
-    assert cif.run(["label", str(path), "--instance", "1", "x", "-o", str(other)]) == 1
-    assert "another ending" in capfd.readouterr().err and not other.exists()
+    assert cif.run(["label", str(path), "--instance", "1", "x", "-o", str(other)]) == 2
+    assert "do not change what a file is" in capfd.readouterr().err and not other.exists()
 
 
 def test_labels_of_foreign_prims_and_of_layers_beside(
