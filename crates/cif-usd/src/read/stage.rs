@@ -308,9 +308,15 @@ fn survey<'py>(
         }
         let type_name = text(&prim.call_method0("GetTypeName")?)?;
         if type_name == "PointInstancer" {
-            reading.warn(format!(
-                "{path}: copies made by a point instancer are not read; turn them into prims with references"
-            ));
+            // Stand-ins of ours are one: their points carry the splats that they stand for.
+            let points = prim.call_method1("GetPrimAtPath", (tokens::PROXY_POINTS,))?;
+            let stands_in =
+                points.is_truthy()? && values::attribute(&points, tokens::PRIMVAR_SPLAT)?.is_some();
+            if !stands_in {
+                reading.warn(format!(
+                    "{path}: copies made by a point instancer are not read; turn them into prims with references"
+                ));
+            }
             instancer = Some(format!("{path}/"));
         } else if type_name == "Camera" {
             cameras.push(prim);
