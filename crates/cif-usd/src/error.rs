@@ -173,6 +173,14 @@ pub enum UsdError {
         /// What is wrong, and what would work.
         problem: String,
     },
+    /// usd-core refuses what a stage holds.
+    #[error("{path}: usd-core cannot use it: {reason}")]
+    Unusable {
+        /// The stage.
+        path: PathBuf,
+        /// What USD says.
+        reason: String,
+    },
     /// usd-core did something unexpected.
     #[error("usd-core failed: {reason}")]
     Python {

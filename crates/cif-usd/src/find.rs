@@ -21,7 +21,8 @@ pub(crate) fn search(
     let matcher = label_query.as_ref().map(LabelQuery::matcher);
     pxr::with(|pxr| {
         let stage = crate::read::open::open(pxr, path, options)?;
-        let python = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
+        let python =
+            |error: PyErr| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) };
         let search = Search::new(pxr, &stage, wanted).map_err(python)?;
         let (mut known, mut labelled, mut found) = (Vec::new(), false, Vec::new());
         let prims = stage.call_method0("Traverse").and_then(|prims| prims.try_iter()).map_err(python)?;

@@ -48,7 +48,8 @@ pub(crate) fn relabel(
     let copy = scratch.file(&extension);
     std::fs::copy(path, &copy).map_err(unwritable)?;
     let done = pxr::with(|pxr| {
-        let python = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
+        let python =
+            |error: PyErr| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) };
         crate::read::open::check_size(pxr, path)?;
         let stage = pxr
             .usd

@@ -19,7 +19,7 @@ pub(crate) fn query(
     pxr::with(|pxr| {
         let stage = open(pxr, path, options)?;
         let (found, known) = search(pxr, &stage, query, &matcher)
-            .map_err(|error| UsdError::Python { reason: reason(pxr.py, &error) })?;
+            .map_err(|error| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) })?;
         if found.is_empty() {
             return Err(query.unknown(&path.display().to_string(), known).into());
         }
@@ -46,7 +46,8 @@ pub(crate) fn time_code(path: &Path, time: f64) -> Result<f64, UsdError> {
             }
             Ok((vec![0.0, 1.0], vec![start, end]))
         };
-        let (times, codes) = range().map_err(|error| UsdError::Python { reason: reason(pxr.py, &error) })?;
+        let (times, codes) = range()
+            .map_err(|error| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) })?;
         Ok(interpolate(&times, &codes, time))
     })
 }

@@ -37,7 +37,7 @@ pub(super) struct Reading<'a, 'py> {
 
 impl Reading<'_, '_> {
     pub(super) fn python(&self, error: &PyErr) -> UsdError {
-        UsdError::Python { reason: reason(self.pxr.py, error) }
+        UsdError::Unusable { path: self.path.to_owned(), reason: reason(self.pxr.py, error) }
     }
 
     pub(super) fn prim_error(&self, prim: &str, problem: String, fix: &'static str) -> UsdError {
@@ -70,7 +70,8 @@ struct Mark {
 pub(crate) fn scene(path: &Path, options: ReadOptions) -> Result<SceneGraph, UsdError> {
     pxr::with(|pxr| {
         let (stage, bytes) = open::open_with_layers(pxr, path, options, Instances::Each)?;
-        let failed = |error: PyErr| UsdError::Python { reason: reason(pxr.py, &error) };
+        let failed =
+            |error: PyErr| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) };
         let mut mark = mark(&stage).map_err(failed)?;
         let expected = i64::from(tokens::LAYOUT_VERSION);
         if mark.ours && mark.layout != expected {

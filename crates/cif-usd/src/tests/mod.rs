@@ -5,6 +5,7 @@
 mod damaged;
 mod edited;
 mod foreign;
+mod fuzz;
 mod outputs;
 mod round_trip;
 mod scenes;
