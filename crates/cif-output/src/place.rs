@@ -68,7 +68,7 @@ fn not_regular() -> io::Error {
     io::Error::new(io::ErrorKind::InvalidInput, "it is not a regular file")
 }
 
-/// Whether a link stands for an open file of a process: what it points to may be anything, and has readers.
+/// True where a link stands for an open file of a process: what it points to may be anything, and has readers.
 fn is_descriptor(link: &Path) -> bool {
     fs::canonicalize(folder_of(link)).is_ok_and(|folder| {
         folder == Path::new("/dev/fd") || (folder.starts_with("/proc") && folder.ends_with("fd"))

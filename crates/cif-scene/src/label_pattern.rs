@@ -24,7 +24,7 @@ impl LabelPattern {
         Self { characters }
     }
 
-    /// Whether a label is spelled so.
+    /// True where a label is spelled so.
     #[must_use]
     pub fn matches(&self, label: &str) -> bool {
         let pattern = self.characters.as_slice();

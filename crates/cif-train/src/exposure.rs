@@ -97,7 +97,7 @@ impl Exposures {
         }
     }
 
-    /// Whether names ascend and every camera has finite values and moments: what was read may be anything.
+    /// True where names ascend and every camera has finite values and moments: what was read may be anything.
     pub(crate) fn are_whole(&self) -> bool {
         let fits = |values: &Vec<f32>| {
             values.len() == WIDTH * self.cameras.len() && values.iter().all(|value| value.is_finite())

@@ -18,7 +18,7 @@ impl Stop {
         Self(Some(Arc::new(requested)))
     }
 
-    /// Whether a stop is requested; never with the default.
+    /// True where a stop is requested; never with the default.
     #[must_use]
     pub fn requested(&self) -> bool {
         self.0.as_ref().is_some_and(|requested| requested())

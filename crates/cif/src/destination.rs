@@ -173,13 +173,13 @@ impl Destination {
         Error::failed(message, "this run could not be saved: a thousand names beside it are taken")
     }
 
-    /// Whether there are settings that are not to be replaced.
+    /// True where there are settings that are not to be replaced.
     fn settings_are_kept(&self) -> Result<bool, Error> {
         let exists = self.settings_path.try_exists().map_err(Error::io("look for", &self.settings_path))?;
         Ok(exists && self.existing == Existing::Keep)
     }
 
-    /// Whether the settings are as a run writes them, so that they may turn out to be its own.
+    /// True where the settings are as a run writes them, so that they may turn out to be its own.
     fn holds_canonical_settings(&self) -> bool {
         fs::read_to_string(&self.settings_path)
             .is_ok_and(|text| toml::from_str(&text).is_ok_and(|config: TrainConfig| text_of(&config) == text))
@@ -190,7 +190,7 @@ fn text_of(config: &TrainConfig) -> String {
     toml::to_string_pretty(config).expect("settings serialise to TOML")
 }
 
-/// Whether a file is a scene that a run can go on with.
+/// True where a file is a scene that a run can go on with.
 fn is_unfinished(path: &Path) -> bool {
     Checkpoint::load(path).is_ok_and(|checkpoint| checkpoint.training.is_some())
 }

@@ -70,7 +70,7 @@ impl Requests {
         *self.sessions.lock().unwrap_or_else(PoisonError::into_inner) -= 1;
     }
 
-    /// Whether a stop was requested before.
+    /// True where a stop was requested before.
     fn request(&self) -> bool {
         self.requested.swap(true, Ordering::SeqCst)
     }
@@ -115,7 +115,7 @@ pub fn watch_and_save() {
     watch();
 }
 
-/// Whether the command is asked to stop.
+/// True where the command is asked to stop.
 #[must_use]
 pub fn requested() -> bool {
     REQUESTS.requested()

@@ -122,7 +122,7 @@ fn real(path: &Path) -> PathBuf {
     }
 }
 
-/// Whether an output goes to the standard output, where nothing else is printed then.
+/// True where an output goes to the standard output, where nothing else is printed then.
 #[must_use]
 pub fn is_stdout(path: &Path) -> bool {
     ["-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"].iter().any(|name| path == Path::new(name))

@@ -80,7 +80,7 @@ impl Bench {
         Self { reader, folder, original, watched: Arc::clone(watched) }
     }
 
-    /// Whether an error names a file of the folder, or the one outside that damage had the reader open.
+    /// True where an error names a file of the folder, or the one outside that damage had the reader open.
     fn is_named(&self, error: &str) -> bool {
         error.contains(&*self.folder.to_string_lossy()) || error.starts_with(mutate::OUTSIDE)
     }

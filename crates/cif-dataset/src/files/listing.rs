@@ -47,7 +47,7 @@ pub(crate) fn count_images_below(folder: &Path) -> Result<usize, Error> {
     Ok(count)
 }
 
-/// Whether a file is there, if only one that its reader will refuse, such as a named pipe.
+/// True where a file is there, if only one that its reader will refuse, such as a named pipe.
 pub(crate) fn is_there(path: &Path) -> bool {
     path.exists() && !path.is_dir()
 }

@@ -179,7 +179,7 @@ fn other_instances(field: &Field, dataset: &Dataset, is_other_place: bool) -> Op
     })
 }
 
-/// Whether a label only repeats the id.
+/// True where a label only repeats the id.
 fn is_placeholder(label: &str, id: u16) -> bool {
     label.strip_prefix("instance_").is_some_and(|number| number.parse() == Ok(id))
 }

@@ -16,7 +16,7 @@ impl Saving {
         Self { next_s: now_s + f64::from(every) }
     }
 
-    /// Whether a state is due; never with `every` 0.
+    /// True where a state is due; never with `every` 0.
     pub(super) fn is_due(self, every: u32, now_s: f64) -> bool {
         every > 0 && now_s >= self.next_s
     }
