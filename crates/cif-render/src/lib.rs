@@ -5,7 +5,6 @@
 //! | [`constants`] | thresholds of the blending rule, each with its derivation |
 //! | [`settings`] | what a render may vary |
 //! | [`gradients`] | where gradients of all parameters are kept |
-//! | [`tile_choice`] | which tiles of a view are drawn |
 //! | [`image`] | what comes out per pixel |
 //! | [`motion`] | how far a Gaussian moves on screen between two views |
 //! | [`reference`] | the readable oracle, generic over `f32` and `f64` |
@@ -21,7 +20,6 @@ pub mod motion;
 pub mod reference;
 pub mod settings;
 pub mod synthetic;
-pub mod tile_choice;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
 
@@ -29,4 +27,3 @@ pub use gradients::Gradients;
 pub use image::{BlendingWeights, Channels, InstanceImage, InstanceRanks, RenderedImage, UNLABELLED};
 pub use motion::screen_motion;
 pub use settings::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};
-pub use tile_choice::TileChoice;

@@ -13,7 +13,6 @@ use std::collections::BTreeMap;
 
 use cif_field::SortMetric;
 use cif_geometry::PixelGrid;
-use cif_render::constants::TILE;
 use cif_render::reference::rasterize::{footprint, weight};
 use cif_render::reference::{self, Forward, ParameterGroup, Scene, SceneGradients};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
@@ -23,10 +22,9 @@ use cif_render::wgpu::{
 };
 use cif_render::{
     Channels, GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings,
-    TileChoice,
 };
 use common::{Cotangents, Mismatches, pixel_discontinuity, render};
-use on_gpu::{Outcome, device, gradient, run, run_tiles};
+use on_gpu::{Outcome, device, gradient, run};
 
 /// Relative width of the boundary band: above the rounding of a weight in single precision.
 const BAND: f64 = 1e-3;
@@ -429,64 +427,6 @@ fn colour_only() {
     check("colour only, identities unused", &config(), &settings, |_| {});
 }
 
-/// Gradients are those of a view whose other pixels have none; what is not drawn is background and leaves no pairs.
-#[test]
-fn some_tiles_are_drawn_as_in_the_view() {
-    let Some(mut device) = device() else { return };
-    let (config, settings) = (config(), settings());
-    let columns = config.width.div_ceil(TILE) as usize;
-    let tile_of = |position: usize| {
-        let (x, y) = (position % config.width as usize, position / config.width as usize);
-        y / TILE as usize * columns + x / TILE as usize
-    };
-    let drawn: Vec<bool> = (0..columns * config.height.div_ceil(TILE) as usize).map(|k| k % 3 != 1).collect();
-    let labelled: Vec<bool> = drawn.iter().enumerate().map(|(k, drawn)| *drawn && k % 2 == 0).collect();
-    let mut expected = expected("tiles", &config, &settings, |_| {});
-    let (scene, cotangents) = (expected.synthetic.clone(), expected.cotangents.clone());
-    let whole = run(&mut device, &scene, &settings, &cotangents, |_| {}).unwrap();
-    let choice = Some(TileChoice { drawn: &drawn, labelled: &labelled });
-    let actual = run_tiles(&mut device, &scene, &settings, &cotangents, choice, |_| {}).unwrap();
-
-    let count = |scene: &SyntheticScene| scene.labels.pixels.iter().filter(|label| **label != 0).count();
-    for position in 0..scene.labels.pixels.len() {
-        let tile = tile_of(position);
-        let (color, blended) = (actual.colors[position], actual.blended[position]);
-        if drawn[tile] {
-            assert_eq!(color, whole.colors[position], "pixel {position}");
-            assert_eq!(blended[0], whole.blended[position][0], "pixel {position}");
-        } else {
-            let [red, green, blue] = settings.background;
-            assert_eq!(color, [red, green, blue, 1.0], "pixel {position}");
-            expected.cotangents.color.pixels[position] = [0.0; 3];
-        }
-        if labelled[tile] {
-            assert_eq!(blended, whole.blended[position], "pixel {position}");
-        } else {
-            assert_eq!(blended[1..3], [0.0, 1.0], "pixel {position}");
-            expected.synthetic.labels.pixels[position] = 0;
-        }
-    }
-    // The mean still counts all labelled pixels.
-    let share = count(&expected.synthetic) as f64 / count(&scene) as f64;
-    assert!(share > 0.1 && share < 0.9, "{share} of the labels count");
-    expected.cotangents.instance_weight *= share;
-    let double = Scene::<f64>::from_field(&expected.synthetic.field);
-    expected.forward = render(&double, &expected.synthetic, &settings);
-    expected.gradients = expected.cotangents.backward(&double, &expected.forward);
-    let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
-    compare_gradients(&expected, &actual, USUAL.gradient, &mut mismatches, &mut worst);
-    worst.tell("tiles");
-    mismatches.finish("tiles");
-
-    assert!(actual.statistics.fits() && actual.statistics.pairs < whole.statistics.pairs);
-    for (tile, [first, end]) in actual.tile_ranges.iter().enumerate() {
-        assert!(drawn[tile] || first == end, "tile {tile} is not drawn, and has {} pairs", end - first);
-    }
-    // A view of all tiles that follows is whole again.
-    let again = run(&mut device, &scene, &settings, &cotangents, |_| {}).unwrap();
-    assert_eq!((again.colors, again.posed), (whole.colors, whole.posed));
-}
-
 #[test]
 fn every_image_setting() {
     check("antialiased", &config(), &RenderSettings { antialiased: true, ..settings() }, |_| {});
@@ -819,7 +759,7 @@ fn too_many_pairs_are_refused_with_the_arithmetic() {
     let (gpu, rasterizer) = &mut *device;
     let gpu: &Gpu = gpu;
     let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians).unwrap();
-    let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None, tiles: None };
+    let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None };
     let mut commands = Commands::new(gpu, None);
     let result = rasterizer.project(gpu, &mut commands, (&gaussians).into(), None, &input);
     let refused = result.and_then(|()| rasterizer.measure(gpu, commands)).unwrap_err();
@@ -869,7 +809,7 @@ fn a_view_that_does_not_fit_is_told_and_leaves_no_gradient() {
     let gpu = &device.0;
     let mut rasterizer = Rasterizer::new(gpu).unwrap();
     let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians).unwrap();
-    let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None, tiles: None };
+    let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None };
     let v_colors = GpuVec::from_slice(gpu, "v", &vec![[1.0_f32; 4]; 71 * 53]).unwrap();
     for room in [10, 100_000] {
         rasterizer.reserve(gpu, room, 0).unwrap();

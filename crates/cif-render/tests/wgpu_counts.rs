@@ -43,7 +43,7 @@ fn on_device(gpu: &Gpu, scene: &SyntheticScene, label_maps: &[&PixelGrid<u16>]) 
         let mut present = labels.pixels.clone();
         present.sort_unstable();
         present.dedup();
-        let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None, tiles: None };
+        let input = ViewInput { camera: &scene.camera, settings: &settings, labels: None };
         let mut commands = Commands::new(gpu, None);
         rasterizer.project(gpu, &mut commands, (&gaussians).into(), None, &input).unwrap();
         rasterizer.measure(gpu, commands).unwrap();

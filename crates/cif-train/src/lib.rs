@@ -57,7 +57,6 @@ mod random;
 pub mod resample;
 pub mod schedule;
 pub mod stop;
-pub mod tiles;
 pub mod tracks;
 pub mod trainer;
 #[cfg(feature = "wgpu")]

@@ -17,8 +17,6 @@ pub(crate) enum Purpose {
     Deformation = 4,
     /// Points inside travelling objects.
     Guidance = 5,
-    /// Tiles that a step learns from.
-    Tiles = 6,
     /// Gaussians that stand still and are looked at again.
     Still = 7,
 }

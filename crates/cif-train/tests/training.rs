@@ -434,33 +434,3 @@ fn far_points_do_not_fill_the_images() {
     let (alone, together) = (psnr(&near), psnr(&far));
     assert!(together > alone - 0.5, "{together} dB beside {alone} dB without far points");
 }
-
-#[test]
-fn some_tiles_of_every_view_are_enough_and_depend_on_the_seed_alone() {
-    let folder = tempfile::tempdir().unwrap();
-    let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
-    let mut config = small_config();
-    (config.stages.tile_share, config.stages.batch, config.loss.lambda_dssim) = (0.4, 2, 0.2);
-    (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 150, 60);
-    let on = |threads: usize| {
-        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
-        pool.install(|| train(dataset.clone(), config.clone()).into_field())
-    };
-    let whole = on(1);
-    assert_equal(&on(2), &whole);
-    let trainer = stopped_after(&dataset, &config, 101);
-    let path = folder.path().join("stopped.cif");
-    trainer.checkpoint(true).save(&path).unwrap();
-    let mut resumed = Trainer::resume(dataset.clone(), cif_field::Checkpoint::load(&path).unwrap()).unwrap();
-    assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
-    assert_equal(resumed.field(), &whole);
-    let psnr = |field: &Field| {
-        let options = EvaluationOptions::held_out(field);
-        let scores = evaluate::<EvaluationError>(field, &dataset, &options, |_| Ok(())).unwrap();
-        scores.overall.psnr.unwrap()
-    };
-    config.stages.tile_share = 1.0;
-    let all = train(dataset.clone(), config.clone()).into_field();
-    let (some, all) = (psnr(&whole), psnr(&all));
-    assert!(some > all - 1.5 && some > 17.0, "{some} dB with some tiles, {all} dB with all");
-}

@@ -75,12 +75,6 @@ fn steps_move_parameters_as_on_the_processor() {
     check_steps(|_| {});
 }
 
-/// The same random tiles are drawn on both.
-#[test]
-fn steps_on_some_tiles_move_parameters_as_on_the_processor() {
-    check_steps(|config| config.stages.tile_share = 0.4);
-}
-
 /// Six coarse and eight fine steps on both.
 fn check_steps(edit: impl Fn(&mut TrainConfig)) {
     let Some(gpu) = testing::gpu() else { return };

@@ -133,9 +133,9 @@ fn smallest_sigma(splat: &Splat, low: [f32; 2], high: [f32; 2]) -> f32 {
     smallest
 }
 
-/// Calls `visit` with every tile of the region, and of `drawn` (all without), that the splat reaches, in row order, and
+/// Calls `visit` with every tile of the region that the splat reaches, in row order, and
 /// the passes that reach it, a bit each.
-fn visit_tiles(splat: &Splat, region: &TileRegion, drawn: Option<&[bool]>, mut visit: impl FnMut(u32, u8)) {
+fn visit_tiles(splat: &Splat, region: &TileRegion, mut visit: impl FnMut(u32, u8)) {
     let tile = TILE as f32;
     let [columns, rows] = region.reached(splat);
     // A hair more than the gate, so that rounding never drops a tile that holds a drawn pixel.
@@ -143,9 +143,6 @@ fn visit_tiles(splat: &Splat, region: &TileRegion, drawn: Option<&[bool]>, mut v
     for row in rows {
         for column in columns.clone() {
             let tile_index = (row - region.first_row) * region.columns + (column - region.first_column);
-            if drawn.is_some_and(|drawn| !drawn[tile_index as usize]) {
-                continue;
-            }
             // Pixel centres lie half a pixel inside the tile.
             let low = [column as f32 * tile + 0.5, row as f32 * tile + 0.5];
             let high = [low[0] + tile - 1.0, low[1] + tile - 1.0];
@@ -167,29 +164,16 @@ struct ReachedTiles {
 }
 
 impl TileLists {
-    /// Builds the lists of a region for depth-sorted splats; tiles of the region that are not `drawn` stay empty. The
+    /// Builds the lists of a region for depth-sorted splats. The
     /// pairs of each splat are listed `by_splat`.
     ///
     /// # Panics
     /// When there are too many pairs, before memory is.
-    pub(super) fn build(
-        &mut self,
-        splats: &[Splat],
-        region: TileRegion,
-        drawn: Option<&[bool]>,
-        by_splat: bool,
-    ) {
-        self.build_within(MAX_PAIRS, splats, region, drawn, by_splat);
+    pub(super) fn build(&mut self, splats: &[Splat], region: TileRegion, by_splat: bool) {
+        self.build_within(MAX_PAIRS, splats, region, by_splat);
     }
 
-    fn build_within(
-        &mut self,
-        limit: u64,
-        splats: &[Splat],
-        region: TileRegion,
-        drawn: Option<&[bool]>,
-        by_splat: bool,
-    ) {
+    fn build_within(&mut self, limit: u64, splats: &[Splat], region: TileRegion, by_splat: bool) {
         self.region = region;
         let tiles = region.tiles();
 
@@ -205,7 +189,7 @@ impl TileLists {
                     (Vec::with_capacity(chunk.len()), Vec::with_capacity(chunk.len() * 3));
                 for splat in chunk {
                     let before = reached.len();
-                    visit_tiles(splat, &region, drawn, |tile, passes| reached.push((tile, passes)));
+                    visit_tiles(splat, &region, |tile, passes| reached.push((tile, passes)));
                     counts.push((reached.len() - before) as u32);
                 }
                 if pairs.fetch_add(reached.len() as u64, Ordering::Relaxed) + reached.len() as u64 > limit {
@@ -320,10 +304,10 @@ mod tests {
         let mut lists = TileLists::default();
         // 5 x 5 tiles.
         let region = TileRegion::whole(80, 80);
-        lists.build_within(75_000, &splats, region, None, true);
+        lists.build_within(75_000, &splats, region, true);
         assert_eq!(lists.entries.len(), 75_000);
         let refused = std::panic::catch_unwind(|| {
-            TileLists::default().build_within(74_999, &splats, region, None, true);
+            TileLists::default().build_within(74_999, &splats, region, true);
         });
         let message = *refused.unwrap_err().downcast::<String>().unwrap();
         assert!(message.contains("3000 visible Gaussians") && message.contains("5 x 5 tiles"), "{message}");

@@ -15,8 +15,6 @@
 @group(0) @binding(5) var<storage, read_write> pair_offsets: array<u32>;
 @group(0) @binding(6) var<storage, read_write> slot_offsets: array<u32>;
 @group(0) @binding(7) var<storage, read_write> work: array<atomic<u32>>;
-// Passes that draw each tile, where some tiles alone are drawn.
-@group(0) @binding(8) var<storage, read> tile_choice: array<u32>;
 #import tiles
 
 // Whether the drawn ellipse holds a whole rectangle relative to the mean: it is convex, so its corners decide.
@@ -41,7 +39,7 @@ fn count(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_inde
         let range = tile_range(splat);
         let first = vec2f(range.xy * TILE) + 0.5 - splat.mean;
         let last = vec2f(range.zw * TILE) - 0.5 - splat.mean;
-        if (view.chooses_tiles == 0u && covers(splat, first, last)) {
+        if (covers(splat, first, last)) {
             tiles = (range.z - range.x) * (range.w - range.y);
         }
         for (var y = select(range.y, range.w, tiles > 0u); y < range.w; y += 1u) {

@@ -15,8 +15,6 @@
 @group(0) @binding(5) var<storage, read_write> tile_keys: array<u32>;
 @group(0) @binding(6) var<storage, read_write> pair_indices: array<u32>;
 @group(0) @binding(7) var<storage, read_write> pairs: array<vec2u>;
-// Passes that draw each tile, where some tiles alone are drawn.
-@group(0) @binding(8) var<storage, read> tile_choice: array<u32>;
 #import tiles
 
 @compute @workgroup_size(64)

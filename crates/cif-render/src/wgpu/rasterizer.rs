@@ -20,8 +20,8 @@ use super::identities::DeviceIdentities;
 use super::kernel::{Commands, workgroups};
 use super::sort::{Count, RadixSort, Scan, SortArrays};
 use super::stages::{Kernels, PROJECT_PACKED, entries};
-use super::view::{COLOR_PASS, INSTANCE_PASS, PAIR_SUMS, Splat, View, work};
-use crate::{RenderSettings, TileChoice};
+use super::view::{PAIR_SUMS, Splat, View, work};
+use crate::RenderSettings;
 
 /// Labels of a view on the device.
 #[derive(Clone, Copy, Debug)]
@@ -67,8 +67,6 @@ pub struct ViewInput<'a> {
     pub settings: &'a RenderSettings,
     /// Labels, for the instance pass of training.
     pub labels: Option<LabelInput<'a>>,
-    /// Tiles that are drawn, `None` for all: others have the colour of the background and no gradient.
-    pub tiles: Option<TileChoice<'a>>,
 }
 
 /// Counts of a view.
@@ -128,7 +126,6 @@ struct Arrays {
     splats: GpuVec<Splat>,
     /// Keys are depths, values Gaussians.
     depth: SortArrays,
-    tile_choice: GpuVec<u32>,
     tile_counts: GpuVec<u32>,
     pair_offsets: GpuVec<u32>,
     slot_offsets: GpuVec<u32>,
@@ -156,7 +153,6 @@ impl Arrays {
         Ok(Self {
             splats: GpuVec::zeros(gpu, "splats", 0)?,
             depth: SortArrays::new(gpu, "depth order")?,
-            tile_choice: GpuVec::zeros(gpu, "chosen tiles", 0)?,
             tile_counts: GpuVec::zeros(gpu, "tile counts", 0)?,
             pair_offsets: GpuVec::zeros(gpu, "pair offsets", 0)?,
             slot_offsets: GpuVec::zeros(gpu, "label slot offsets", 0)?,
@@ -184,7 +180,7 @@ impl Arrays {
         uniform: &'a wgpu::Buffer,
         depth_result: usize,
         rows: &'a GpuVec<u32>,
-    ) -> [&'a wgpu::Buffer; 9] {
+    ) -> [&'a wgpu::Buffer; 8] {
         [
             uniform,
             self.splats.buffer(),
@@ -194,7 +190,6 @@ impl Arrays {
             self.pair_offsets.buffer(),
             self.slot_offsets.buffer(),
             self.work.buffer(),
-            self.tile_choice.buffer(),
         ]
     }
 }
@@ -278,7 +273,7 @@ impl Rasterizer {
     /// As [`Self::project`].
     ///
     /// # Panics
-    /// As [`Self::project`], and when both rows and tiles are chosen.
+    /// As [`Self::project`].
     pub(super) fn project_rows(
         &mut self,
         gpu: &Gpu,
@@ -288,7 +283,6 @@ impl Rasterizer {
         input: &ViewInput<'_>,
         rows: Option<[u32; 2]>,
     ) -> Result<(), GpuError> {
-        assert!(rows.is_none() || input.tiles.is_none(), "rows of a whole view");
         let (geometry, sh) = gaussians;
         let (sh, packed) = match sh {
             Coefficients::Full(sh) => (sh.buffer(), false),
@@ -312,16 +306,6 @@ impl Rasterizer {
             view.pixel_weight = labels.weight / labels.labelled_pixels.max(1) as f32;
         }
         let arrays = &mut self.arrays;
-        if let Some(tiles) = input.tiles {
-            tiles.check(input.camera.width, input.camera.height);
-            view.chooses_tiles = 1;
-            let passes = tiles.drawn.iter().zip(tiles.labelled).map(|passes| match passes {
-                (true, true) => COLOR_PASS | INSTANCE_PASS,
-                (true, false) => COLOR_PASS,
-                (false, _) => 0,
-            });
-            arrays.tile_choice.replace(gpu, &passes.collect::<Vec<_>>())?;
-        }
         arrays.splats.resize(gpu, n)?;
         arrays.depth.resize(gpu, n)?;
         arrays.tile_counts.resize(gpu, n)?;
@@ -498,7 +482,6 @@ impl Rasterizer {
                 arrays.tiles.keys[0].buffer(),
                 arrays.tiles.values[0].buffer(),
                 arrays.pairs.buffer(),
-                arrays.tile_choice.buffer(),
             ],
         );
         // One more than there are tiles: pairs of no tile go last.
@@ -795,12 +778,6 @@ impl Rasterizer {
     #[must_use]
     pub fn blended(&self) -> &GpuVec<[f32; 4]> {
         &self.arrays.blended
-    }
-
-    /// Passes that draw each tile, a bit each, row by row, of a view of which some tiles alone are drawn.
-    #[must_use]
-    pub fn tile_choice(&self) -> &GpuVec<u32> {
-        &self.arrays.tile_choice
     }
 
     /// Per pixel: most probable label (dense index + 1, 0 = none), its probability, coverage, entropy in nats.

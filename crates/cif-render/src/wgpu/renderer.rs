@@ -167,7 +167,7 @@ impl GpuRenderer {
         with_depth: bool,
         rows: [u32; 2],
     ) -> Result<RenderedImage, GpuError> {
-        let input = ViewInput { camera, settings, labels: None, tiles: None };
+        let input = ViewInput { camera, settings, labels: None };
         let identities = self.identities.as_ref().filter(|_| settings.instances.is_some());
         let mut commands = Commands::new(&self.gpu, None);
         let posed: PosedInput<'_> = if field.tracks.is_some() {

@@ -45,7 +45,7 @@ pub const BIN: Module = Module {
     name: "bin",
     text: include_str!("bin.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, TILES],
-    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read],
+    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["count", "gather", "plan"],
 };
 
@@ -54,7 +54,7 @@ pub const EMIT: Module = Module {
     name: "emit",
     text: include_str!("emit.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, TILES],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["emit"],
 };
 

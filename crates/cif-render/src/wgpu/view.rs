@@ -107,14 +107,10 @@ crate::shared_struct! {
         pub full_geometry: f32,
         /// Share that reaches means.
         pub mean_geometry: f32,
-        /// 1 when some tiles alone are drawn.
-        pub chooses_tiles: u32,
         /// First row of tiles that is drawn; rows of tiles and of pixels that come out are counted from there.
         pub first_row: u32,
         /// Pads to 16 bytes.
-        pub unused: u32,
-        /// As above.
-        pub unused_too: [u32; 2],
+        pub unused: [u32; 4],
     }
 }
 

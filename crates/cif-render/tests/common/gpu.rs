@@ -3,13 +3,13 @@
 
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
+use cif_render::RenderSettings;
 use cif_render::reference::ParameterGroup;
 use cif_render::synthetic::SyntheticScene;
 use cif_render::wgpu::{
     Commands, DeviceIdentities, Gpu, GpuError, GpuGaussians, GpuStatistics, GpuVec, LabelInput, Rasterizer,
     Splat, ViewInput, testing,
 };
-use cif_render::{RenderSettings, TileChoice};
 
 use super::common::Cotangents;
 
@@ -50,18 +50,6 @@ pub fn run(
     cotangents: &Cotangents,
     edit: impl FnOnce(&mut Vec<Splat>),
 ) -> Result<Outcome, GpuError> {
-    run_tiles(device, scene, settings, cotangents, None, edit)
-}
-
-/// As [`run`], of some tiles.
-pub fn run_tiles(
-    device: &mut (Gpu, Rasterizer),
-    scene: &SyntheticScene,
-    settings: &RenderSettings,
-    cotangents: &Cotangents,
-    tiles: Option<TileChoice<'_>>,
-    edit: impl FnOnce(&mut Vec<Splat>),
-) -> Result<Outcome, GpuError> {
     let (gpu, rasterizer) = (&device.0, &mut device.1);
     let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians)?;
     let k = scene.field.instances.len();
@@ -75,7 +63,7 @@ pub fn run_tiles(
         labelled_pixels,
         weight: cotangents.instance_weight as f32,
     });
-    let input = ViewInput { camera: &scene.camera, settings, labels, tiles };
+    let input = ViewInput { camera: &scene.camera, settings, labels };
     let mut commands = Commands::new(gpu, None);
     rasterizer.project(gpu, &mut commands, (&gaussians).into(), identities.as_ref(), &input)?;
     rasterizer.measure(gpu, commands)?;

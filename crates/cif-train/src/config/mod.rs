@@ -80,11 +80,6 @@ pub struct StagesConfig {
     pub instance: u32,
     /// Views per step, 1 to 1024, default 1 (A27: all stages alike).
     pub batch: u32,
-    /// Share of a view's tiles of 16 x 16 pixels, drawn anew for every view, that a step renders and learns from;
-    /// (0, 1], default 1: all. The gradient stays right on average, with more noise; only what pixels cost is saved,
-    /// little in small images: on the example capture half of the tiles take 6 % less time for 0.5 dB and 1.1 mIoU.
-    /// Less than 1 runs on the processor alone.
-    pub tile_share: f32,
 }
 
 /// Initial Gaussians and the deformation network.

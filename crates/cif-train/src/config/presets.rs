@@ -33,14 +33,8 @@ fn draft() -> TrainConfig {
 
 fn paper(layout: Layout) -> TrainConfig {
     let mut config = TrainConfig { preset: Preset::Paper, ..TrainConfig::default() };
-    config.stages = StagesConfig {
-        coarse: 3_000,
-        fine: 10_000,
-        fine_includes_coarse: false,
-        instance: 3_000,
-        batch: 1,
-        tile_share: 1.0,
-    };
+    config.stages =
+        StagesConfig { coarse: 3_000, fine: 10_000, fine_includes_coarse: false, instance: 3_000, batch: 1 };
     config.model = ModelConfig {
         max_initial_points: 40_000,
         spatial_resolution: [64; 3],
@@ -142,14 +136,7 @@ impl Default for TrainConfig {
 
 impl Default for StagesConfig {
     fn default() -> Self {
-        Self {
-            coarse: 300,
-            fine: 7_000,
-            fine_includes_coarse: false,
-            instance: 1_500,
-            batch: 1,
-            tile_share: 1.0,
-        }
+        Self { coarse: 300, fine: 7_000, fine_includes_coarse: false, instance: 1_500, batch: 1 }
     }
 }
 

@@ -44,12 +44,6 @@ impl TrainConfig {
             "expected 1 to 1024 views per step",
         )?;
         check(
-            stages.tile_share > 0.0 && stages.tile_share <= 1.0,
-            "stages.tile_share",
-            stages.tile_share,
-            "expected a number in (0, 1]",
-        )?;
-        check(
             stages.fine > 0 || stages.coarse > 0,
             "stages.fine",
             stages.fine,

@@ -8,8 +8,6 @@ use rayon::prelude::*;
 
 pub use ssim::SsimScratch;
 
-use crate::tiles::TileSample;
-
 /// Loss of a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct ColorLoss {
@@ -40,22 +38,6 @@ pub fn color_loss(
     v_color: &mut PixelGrid<[f32; 3]>,
     scratch: &mut SsimScratch,
 ) -> ColorLoss {
-    color_loss_of_tiles(rendered, target, lambda_dssim, weight, None, v_color, scratch)
-}
-
-/// [`color_loss`] as far as some tiles tell it: its expectation, and that of its gradient, are those of all tiles.
-///
-/// # Panics
-/// When the sizes of the images differ.
-pub fn color_loss_of_tiles(
-    rendered: &PixelGrid<[f32; 3]>,
-    target: &PixelGrid<[u8; 3]>,
-    lambda_dssim: f32,
-    weight: f32,
-    tiles: Option<&TileSample>,
-    v_color: &mut PixelGrid<[f32; 3]>,
-    scratch: &mut SsimScratch,
-) -> ColorLoss {
     assert_eq!(
         (rendered.width, rendered.height),
         (target.width, target.height),
@@ -65,8 +47,7 @@ pub fn color_loss_of_tiles(
     v_color.height = rendered.height;
     v_color.pixels.resize(rendered.pixels.len(), [0.0; 3]);
     let values = (rendered.pixels.len() * 3).max(1) as f64;
-    let of_pixel = tiles.map_or(1.0, TileSample::weight);
-    let v = ((f64::from(1.0 - lambda_dssim) * f64::from(weight) * of_pixel) / values) as f32;
+    let v = ((f64::from(1.0 - lambda_dssim) * f64::from(weight)) / values) as f32;
     let row = (rendered.width as usize).max(1);
     // Row sums are added in order, so that the value does not depend on threads.
     let sums: Vec<(f64, f64)> = v_color
@@ -74,15 +55,9 @@ pub fn color_loss_of_tiles(
         .par_chunks_mut(row)
         .zip(rendered.pixels.par_chunks(row))
         .zip(target.pixels.par_chunks(row))
-        .enumerate()
-        .map(|(y, ((v_color, rendered), target))| {
+        .map(|((v_color, rendered), target)| {
             let (mut absolute, mut squared) = (0.0_f64, 0.0_f64);
-            for (x, ((v_color, rendered), target)) in v_color.iter_mut().zip(rendered).zip(target).enumerate()
-            {
-                if tiles.is_some_and(|tiles| !tiles.counts(x, y)) {
-                    *v_color = [0.0; 3];
-                    continue;
-                }
+            for ((v_color, rendered), target) in v_color.iter_mut().zip(rendered).zip(target) {
                 for c in 0..3 {
                     let difference = rendered[c] - unit(target[c]);
                     v_color[c] = v * (f32::from(difference > 0.0) - f32::from(difference < 0.0));
@@ -94,12 +69,12 @@ pub fn color_loss_of_tiles(
         })
         .collect();
     let (absolute, squared) = sums.iter().fold((0.0, 0.0), |sum, row| (sum.0 + row.0, sum.1 + row.1));
-    let mut loss = f64::from(1.0 - lambda_dssim) * of_pixel * absolute / values;
+    let mut loss = f64::from(1.0 - lambda_dssim) * absolute / values;
     if lambda_dssim > 0.0 {
-        let ssim = scratch.add_gradient(rendered, target, -lambda_dssim * weight, tiles, v_color);
+        let ssim = scratch.add_gradient(rendered, target, -lambda_dssim * weight, v_color);
         loss += f64::from(lambda_dssim) * (1.0 - ssim);
     }
-    ColorLoss { loss, mean_squared_error: of_pixel * squared / values }
+    ColorLoss { loss, mean_squared_error: squared / values }
 }
 
 /// An 8-bit value in [0, 1].

@@ -4,7 +4,6 @@ use cif_geometry::PixelGrid;
 use rayon::prelude::*;
 
 use super::unit;
-use crate::tiles::TileSample;
 
 /// Half the window: 11 taps.
 pub(crate) const RADIUS: usize = 5;
@@ -68,14 +67,12 @@ fn blur(source: &[f32], row_pass: &mut [f32], target: &mut [f32], width: usize) 
 }
 
 impl SsimScratch {
-    /// Mean structural similarity over pixels and channels, as far as `tiles` tell it; adds its gradient times
-    /// `weight` to `v_color`.
+    /// Mean structural similarity over pixels and channels; adds its gradient times `weight` to `v_color`.
     pub(super) fn add_gradient(
         &mut self,
         rendered: &PixelGrid<[f32; 3]>,
         target: &PixelGrid<[u8; 3]>,
         weight: f32,
-        tiles: Option<&TileSample>,
         v_color: &mut PixelGrid<[f32; 3]>,
     ) -> f64 {
         let pixels = rendered.pixels.len();
@@ -87,8 +84,7 @@ impl SsimScratch {
             map.resize(pixels, 0.0);
         }
         let values = (pixels * 3).max(1) as f64;
-        let of_pixel = tiles.map_or(1.0, TileSample::weight);
-        let v = (f64::from(weight) * of_pixel / values) as f32;
+        let v = (f64::from(weight) / values) as f32;
         let mut sum = 0.0;
         for channel in 0..3 {
             for (x, pixel) in self.x.iter_mut().zip(&rendered.pixels) {
@@ -97,7 +93,7 @@ impl SsimScratch {
             for (y, pixel) in self.y.iter_mut().zip(&target.pixels) {
                 *y = unit(pixel[channel]);
             }
-            sum += of_pixel * self.channel(width, v, tiles);
+            sum += self.channel(width, v);
             let [d, e, f, ..] = &self.maps;
             for (k, v_color) in v_color.pixels.iter_mut().enumerate() {
                 v_color[channel] += d[k] + 2.0 * self.x[k] * e[k] + self.y[k] * f[k];
@@ -107,7 +103,7 @@ impl SsimScratch {
     }
 
     /// Sum of the similarity of one channel; leaves the blurred `v D`, `v E`, `v F` in the first three maps.
-    fn channel(&mut self, width: usize, v: f32, tiles: Option<&TileSample>) -> f64 {
+    fn channel(&mut self, width: usize, v: f32) -> f64 {
         let Self { x, y, product, row_pass, maps } = self;
         let multiply = |product: &mut [f32], a: &[f32], b: &[f32]| {
             for ((product, a), b) in product.iter_mut().zip(a).zip(b) {
@@ -125,10 +121,6 @@ impl SsimScratch {
         let [m1s, m2s, xx, yy, xy, spare] = maps;
         let mut sum = 0.0;
         for k in 0..x.len() {
-            if tiles.is_some_and(|tiles| !tiles.counts(k % width, k / width)) {
-                (xx[k], yy[k], xy[k]) = (0.0, 0.0, 0.0);
-                continue;
-            }
             let (m1, m2) = (m1s[k], m2s[k]);
             let (s1, s2, s12) = (xx[k] - m1 * m1, yy[k] - m2 * m2, xy[k] - m1 * m2);
             let (a, b) = (2.0 * m1 * m2 + C1, 2.0 * s12 + C2);

@@ -8,7 +8,6 @@ use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
 use rand::seq::SliceRandom;
 
 use super::earned::leave_out_held_out;
-use super::frames::TrainFrame;
 use super::guard::{exposure_fault, gradient_fault};
 use super::optimiser::StepRates;
 use super::progress::AfterStep;
@@ -20,11 +19,10 @@ use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, res
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::exposure::RATES;
-use crate::losses::{SsimScratch, color_loss_of_tiles};
+use crate::losses::{SsimScratch, color_loss};
 use crate::random::{Purpose, stream};
 use crate::resample::{ResampleContext, apply, plan};
 use crate::schedule::{falls_on, log_linear, schedule_steps};
-use crate::tiles::TileSample;
 
 /// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
 pub(super) const RENORMALISE_EVERY: u64 = 1_000;
@@ -132,7 +130,7 @@ impl Trainer {
         let pull = self.guidance_weight(stage, iteration);
         let (psnr_before, snapshot) = (self.progress.psnr, self.snapshot());
         let mut fault = self.fault_before_step();
-        for (position, (index, data)) in views.iter().enumerate() {
+        for (index, data) in &views {
             if fault.is_some() {
                 break;
             }
@@ -143,10 +141,7 @@ impl Trainer {
             let settings =
                 RenderSettings { instances: settings.instances.filter(|_| with_instances), ..settings };
             let labels = labels.filter(|_| with_instances);
-            let tiles = self.tiles_of_view(stage, iteration, position, data);
-            let choice = tiles.as_ref().map(TileSample::choice);
-            let pass =
-                self.renderer.forward_tiles(&self.field, &frame.camera, time, &settings, labels, choice);
+            let pass = self.renderer.forward(&self.field, &frame.camera, time, &settings, labels);
             let mut since = Instant::now();
             let exposure = self.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name));
             let recorded = exposure.map(|exposure| {
@@ -154,12 +149,11 @@ impl Trainer {
                 exposure.apply(&mut recorded);
                 recorded
             });
-            let color = color_loss_of_tiles(
+            let color = color_loss(
                 recorded.as_ref().unwrap_or(&pass.color),
                 &data.image,
                 self.config.loss.lambda_dssim,
                 weight,
-                tiles.as_ref(),
                 &mut self.scratch.v_color,
                 &mut self.scratch.ssim,
             );
@@ -181,10 +175,8 @@ impl Trainer {
             }
             // The mean is over the labelled pixels of all views of the step (A4).
             let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
-            let of_pixel = tiles.as_ref().map_or(1.0, TileSample::weight);
-            let share = of_pixel * share;
             instance_loss += share * pass.instance_loss;
-            unsupported += of_pixel * pass.unsupported_pixels as f64;
+            unsupported += pass.unsupported_pixels as f64;
             fault = self.fault_of_view(color.loss, pass.instance_loss);
             if fault.is_some() {
                 break;
@@ -304,24 +296,6 @@ impl Trainer {
             events.truncate(told);
         }
         result
-    }
-
-    /// Tiles that a view of a step is learnt from; `None` for all.
-    pub(super) fn tiles_of_view(
-        &self,
-        stage: Stage,
-        iteration: u32,
-        position: usize,
-        data: &TrainFrame,
-    ) -> Option<TileSample> {
-        let share = self.config.stages.tile_share;
-        if share >= 1.0 {
-            return None;
-        }
-        let step = u64::from(iteration) * u64::from(self.config.stages.batch) + position as u64;
-        let mut rng = stream(self.config.seed, Purpose::Tiles, (stage as u64) << 48 | step);
-        let windows = self.config.loss.lambda_dssim > 0.0;
-        TileSample::draw(data.image.width, data.image.height, share, windows, &mut rng)
     }
 
     fn not_finite(&mut self, tensor: &'static str) -> TrainError {

@@ -39,12 +39,12 @@ cif_render::shared_struct! {
         pub similarity_weight: f32,
         /// 1 when pixels of some labels train nothing, 2 when the pixels that are judged by train nothing.
         pub leaves_out: u32,
-        /// Tiles of a row when some tiles alone count, or 0.
-        pub tile_columns: u32,
         /// Rows of pixels.
         pub height: u32,
         /// Pads to 16 bytes.
-        pub unused: [u32; 2],
+        pub unused: u32,
+        /// As above.
+        pub unused_too: [u32; 2],
         /// Taps of the window of the similarity, from the centre outwards.
         pub window: [[f32; 4]; 2],
     }
@@ -294,16 +294,14 @@ const REARRANGEMENT: Snippet =
     Snippet { name: "rearrangement", text: || structures(&[Rearrangement::layout()]) };
 const JUDGEMENT: Snippet = Snippet { name: "judgement", text: || structures(&[Judgement::layout()]) };
 const MOTION: Snippet = Snippet { name: "motion", text: || structures(&[Motion::layout()]) };
-const COUNTED_TILES: Snippet =
-    Snippet { name: "counted_tiles", text: || include_str!("counted_tiles.wgsl").to_owned() };
 const ADAM: Snippet = Snippet { name: "adam", text: || include_str!("adam.wgsl").to_owned() };
 
 /// Colour loss, and the value of the instance loss.
 pub const LOSSES: Module = Module {
     name: "losses",
     text: include_str!("losses.wgsl"),
-    imports: &[CONSTANTS, LOSS_SETTINGS, COUNTED_TILES],
-    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
+    imports: &[CONSTANTS, LOSS_SETTINGS],
+    bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["losses", "total"],
 };
 
@@ -320,8 +318,8 @@ pub const LEAVE_OUT: Module = Module {
 pub const SSIM: Module = Module {
     name: "ssim",
     text: include_str!("ssim.wgsl"),
-    imports: &[CONSTANTS, LOSS_SETTINGS, COUNTED_TILES],
-    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read],
+    imports: &[CONSTANTS, LOSS_SETTINGS],
+    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["blur_rows", "compare", "blur_maps", "add_gradient"],
 };
 

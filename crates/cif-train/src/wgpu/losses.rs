@@ -1,7 +1,6 @@
 //! Losses of a view on the device.
 
 use cif_geometry::PixelGrid;
-use cif_render::constants::TILE;
 use cif_render::wgpu::{Commands, Gpu, GpuError, GpuVec, Kernel, Uniform, workgroups};
 
 use super::kernels::{LEAVE_OUT, LOSSES, LossSettings, SSIM, entries};
@@ -53,18 +52,9 @@ impl GpuTarget {
     }
 }
 
-/// Tiles whose pixels count.
-#[derive(Clone, Copy, Debug)]
-pub struct CountedTiles<'a> {
-    /// As [`cif_render::wgpu::Rasterizer::tile_choice`].
-    pub choice: &'a GpuVec<u32>,
-    /// How many times each counts.
-    pub weight: f64,
-}
-
 /// How a view is compared.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct LossWeights<'a> {
+pub struct LossWeights {
     /// Share of the structural dissimilarity.
     pub lambda_dssim: f32,
     /// Of the view in the step.
@@ -77,8 +67,6 @@ pub struct LossWeights<'a> {
     pub leaves_out: bool,
     /// Whether the pixels that effects are judged by are left out of the gradient.
     pub leaves_judged: bool,
-    /// Tiles that count, `None` for all.
-    pub tiles: Option<CountedTiles<'a>>,
 }
 
 /// Losses on the device.
@@ -93,8 +81,6 @@ pub struct GpuLosses {
     maps: GpuVec<[f32; 4]>,
     settings: Uniform<LossSettings>,
     left_out: GpuVec<u32>,
-    /// Stands in where all tiles count.
-    no_choice: GpuVec<u32>,
     losses: Kernel,
     total: Kernel,
     leave_out: Kernel,
@@ -117,7 +103,6 @@ impl GpuLosses {
             maps: GpuVec::zeros(gpu, "maps of the similarity", 0)?,
             settings: Uniform::new(gpu, "loss settings", &LossSettings::default()),
             left_out: GpuVec::zeros(gpu, "labels left out", 0)?,
-            no_choice: GpuVec::zeros(gpu, "no choice of tiles", 0)?,
             losses,
             total,
             leave_out,
@@ -155,7 +140,7 @@ impl GpuLosses {
         commands: &mut Commands<'_>,
         (colors, blended): (&GpuVec<[f32; 4]>, &GpuVec<[f32; 4]>),
         target: &GpuTarget,
-        weights: &LossWeights<'_>,
+        weights: &LossWeights,
         slot: usize,
     ) -> Result<(), GpuError> {
         assert!(slot < SLOTS, "{slot} is no slot");
@@ -171,8 +156,7 @@ impl GpuLosses {
         self.maps.resize(gpu, if with_similarity { 3 * pixels } else { 0 })?;
         // As on the CPU: in double precision up to the weight of a value.
         let values = (pixels * 3).max(1) as f64;
-        let of_pixel = weights.tiles.map_or(1.0, |tiles| tiles.weight);
-        let share = |weight: f64| (weight * f64::from(weights.view) * of_pixel / values) as f32;
+        let share = |weight: f64| (weight * f64::from(weights.view) / values) as f32;
         let taps = window();
         self.settings.write(
             gpu,
@@ -185,13 +169,12 @@ impl GpuLosses {
                 absolute_weight: share(f64::from(1.0 - weights.lambda_dssim)),
                 similarity_weight: share(-f64::from(weights.lambda_dssim)),
                 leaves_out,
-                tile_columns: weights.tiles.map_or(0, |_| width.div_ceil(TILE)),
                 height,
-                unused: [0; 2],
+                unused: 0,
+                unused_too: [0; 2],
                 window: [[taps[0], taps[1], taps[2], taps[3]], [taps[4], taps[5], 0.0, 0.0]],
             },
         );
-        let choice = weights.tiles.map_or(&self.no_choice, |tiles| tiles.choice);
         // Kernels of one file share its bindings.
         let bindings = [
             self.settings.binding(),
@@ -202,7 +185,6 @@ impl GpuLosses {
             self.v_colors.binding(),
             self.partial_sums.binding(),
             self.results.binding(),
-            choice.binding(),
         ];
         let losses = self.losses.bind(gpu, &bindings);
         let similarity = with_similarity.then(|| {
@@ -217,7 +199,6 @@ impl GpuLosses {
                     self.maps.binding(),
                     self.v_colors.binding(),
                     self.partial_sums.binding(),
-                    choice.binding(),
                 ],
             )
         });
@@ -260,15 +241,15 @@ pub struct ViewLoss {
 }
 
 impl ViewLoss {
-    /// From the two vectors of a slot, where every pixel that counts does so `of_pixel` times.
+    /// From the two vectors of a slot.
     #[must_use]
-    pub fn new([sums, similarity]: [[f32; 4]; 2], pixels: usize, lambda_dssim: f32, of_pixel: f64) -> Self {
+    pub fn new([sums, similarity]: [[f32; 4]; 2], pixels: usize, lambda_dssim: f32) -> Self {
         let values = (pixels * 3).max(1) as f64;
         let share = f64::from(lambda_dssim);
-        let [absolute, squared, instance, unsupported] = sums.map(|sum| of_pixel * f64::from(sum));
+        let [absolute, squared, instance, unsupported] = sums.map(f64::from);
         let mut loss = (1.0 - share) * absolute / values;
         if lambda_dssim > 0.0 {
-            loss += share * (1.0 - of_pixel * f64::from(similarity[0]) / values);
+            loss += share * (1.0 - f64::from(similarity[0]) / values);
         }
         Self {
             color: ColorLoss { loss, mean_squared_error: squared / values },

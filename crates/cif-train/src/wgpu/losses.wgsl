@@ -20,19 +20,12 @@
 @group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
 // As a workgroup's sums, for the view.
 @group(0) @binding(7) var<storage, read_write> results: array<vec4f>;
-// Passes that draw each tile, where some tiles alone count.
-@group(0) @binding(8) var<storage, read> tile_choice: array<u32>;
-#import counted_tiles
 
 const INVOCATIONS: u32 = 256u;
 #import workgroup
 
 // Sums of a pixel; leaves its gradient.
 fn compare(pixel: u32) -> vec4f {
-    if !counts(pixel) {
-        v_colors[pixel] = vec4f(0.0);
-        return vec4f(0.0);
-    }
     let difference = colors[pixel].xyz - unpack4x8unorm(targets[pixel]).xyz;
     v_colors[pixel] = vec4f(settings.absolute_weight * sign(difference), 0.0);
     let absolute = abs(difference);

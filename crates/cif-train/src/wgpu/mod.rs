@@ -4,7 +4,7 @@
 //! | file | stage |
 //! |---|---|
 //! | `losses.wgsl`, `ssim.wgsl` | colour loss with its gradient, value of the instance loss |
-//! | `leave_out.wgsl`, `counted_tiles.wgsl` | pixels that train nothing, tiles that count |
+//! | `leave_out.wgsl` | pixels that train nothing |
 //! | `exposure.wgsl` | what cameras make of colours, and its gradient |
 //! | `judge.wgsl` | whether a step may move anything |
 //! | `rearrange.wgsl` | rows after a change of the set of Gaussians |

@@ -14,9 +14,6 @@
 @group(0) @binding(4) var<storage, read_write> maps: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> v_colors: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> partial_sums: array<vec4f>;
-// Passes that draw each tile, where some tiles alone count.
-@group(0) @binding(7) var<storage, read> tile_choice: array<u32>;
-#import counted_tiles
 
 const INVOCATIONS: u32 = 256u;
 #import workgroup
@@ -85,11 +82,7 @@ fn compare(
     let workgroup = group.y * MAX_WORKGROUPS + group.x;
     let pixel = workgroup * 256u + local;
     var similarity = vec4f(0.0);
-    if pixel < settings.pixels && !counts(pixel) {
-        for (var image = 0u; image < 3u; image++) {
-            maps[image * settings.pixels + pixel] = vec4f(0.0);
-        }
-    } else if pixel < settings.pixels {
+    if pixel < settings.pixels {
         let m1 = blur_column(0u, pixel);
         let m2 = blur_column(1u, pixel);
         let s1 = blur_column(2u, pixel) - m1 * m1;

@@ -7,23 +7,19 @@ use cif_render::Gradients;
 use cif_render::wgpu::deform::{DeformationGradients, FIXED_UNITS, SPLITS, ZERO_SUM};
 use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::validation::validate;
-use cif_render::wgpu::view::{COLOR_PASS, INSTANCE_PASS};
 use cif_render::wgpu::{Commands, Gpu, GpuDeformation, GpuGaussians, GpuStatistics, GpuVec, Layout, testing};
-use rand::SeedableRng;
-use rand_pcg::Pcg64;
 
 use super::exposure::{CameraExposures, GpuExposure};
 use super::judge::GpuJudge;
 use super::kernels::{Judgement, LAYOUTS, MODULES, fault, fault_name};
-use super::losses::{CountedTiles, GpuLosses, GpuTarget, LossWeights, ViewLoss};
+use super::losses::{GpuLosses, GpuTarget, LossWeights, ViewLoss};
 use super::motion::GpuMotion;
 use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep};
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
 use crate::densify::DensifyStatistics;
 use crate::exposure::{Exposures, RATES, WIDTH};
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
-use crate::losses::{SsimScratch, color_loss, color_loss_of_tiles};
-use crate::tiles::TileSample;
+use crate::losses::{SsimScratch, color_loss};
 
 /// Relative to the largest value of its kind.
 const TOLERANCE: f64 = 3e-6;
@@ -107,7 +103,7 @@ fn colour_losses_on(gpu: Gpu) {
         losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, slot).unwrap();
         commands.submit();
         assert_eq!(losses.results().read(&gpu).unwrap(), slots, "sums repeat to the bit");
-        let found = ViewLoss::new([slots[2 * slot], slots[2 * slot + 1]], pixels, lambda_dssim, 1.0);
+        let found = ViewLoss::new([slots[2 * slot], slots[2 * slot + 1]], pixels, lambda_dssim);
         assert!((found.color.loss - expected.loss).abs() < 1e-6, "{found:?} {expected:?}");
         assert!((found.color.psnr() - expected.psnr()).abs() < 1e-4, "{found:?} {expected:?}");
         let found = flat(&losses.v_colors.read(&gpu).unwrap());
@@ -116,57 +112,6 @@ fn colour_losses_on(gpu: Gpu) {
         if lambda_dssim == 0.0 {
             assert_eq!(found[15..18], [0.0; 3], "equal colours have no gradient");
         }
-    }
-}
-
-/// With labels, so that the sums of both losses leave out what does not count.
-#[test]
-fn losses_of_some_tiles_are_those_of_the_cpu() {
-    testing::gpus().into_iter().for_each(losses_of_tiles_on);
-}
-
-fn losses_of_tiles_on(gpu: Gpu) {
-    let (rendered, target) = images();
-    let (width, pixels) = (target.width as usize, rendered.pixels.len());
-    let labels = PixelGrid::filled(target.width, target.height, 1_u16);
-    let mut losses = GpuLosses::new(&gpu).unwrap();
-    let on_device = GpuTarget::new(&gpu, &target, Some(&labels)).unwrap();
-    let colors = GpuVec::from_slice(&gpu, "colors", &four(&rendered.pixels)).unwrap();
-    let blended = vec![[0.0, 0.5, 0.25, 0.0]; pixels];
-    let blended = GpuVec::from_slice(&gpu, "blended", &blended).unwrap();
-    // 3 x 2 tiles.
-    let tiles =
-        TileSample::draw(target.width, target.height, 0.5, true, &mut Pcg64::seed_from_u64(2)).unwrap();
-    let passes: Vec<u32> = (0..6)
-        .map(|k| if tiles.counts(k % 3 * 16, k / 3 * 16) { COLOR_PASS | INSTANCE_PASS } else { COLOR_PASS })
-        .collect();
-    let choice = GpuVec::from_slice(&gpu, "tiles", &passes).unwrap();
-    for (slot, lambda_dssim) in [(3, 0.0), (4, 0.2)] {
-        let mut v = PixelGrid::filled(0, 0, [0.0; 3]);
-        let mut scratch = SsimScratch::default();
-        let expected =
-            color_loss_of_tiles(&rendered, &target, lambda_dssim, 0.5, Some(&tiles), &mut v, &mut scratch);
-        let weights = LossWeights {
-            lambda_dssim,
-            view: 0.5,
-            with_instances: true,
-            tiles: Some(CountedTiles { choice: &choice, weight: tiles.weight() }),
-            ..LossWeights::default()
-        };
-        let mut commands = Commands::new(&gpu, None);
-        losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, slot).unwrap();
-        commands.submit();
-        let slots = losses.results().read(&gpu).unwrap();
-        let sums = [slots[2 * slot], slots[2 * slot + 1]];
-        let found = ViewLoss::new(sums, pixels, lambda_dssim, tiles.weight());
-        assert!((found.color.loss - expected.loss).abs() < 1e-6, "{found:?} {expected:?}");
-        assert!((found.color.psnr() - expected.psnr()).abs() < 1e-4, "{found:?} {expected:?}");
-        let counted = (0..pixels).filter(|k| tiles.counts(k % width, k / width)).count();
-        let instance_sum = -tiles.weight() * counted as f64 * 0.5_f64.ln();
-        assert!((found.instance_sum / instance_sum - 1.0).abs() < 1e-6, "{found:?} {instance_sum}");
-        let tolerance = if lambda_dssim > 0.0 { 2e-5 } else { 1e-7 };
-        let found = flat(&losses.v_colors.read(&gpu).unwrap());
-        compare("gradient of the colours", &found, v.pixels.as_flattened(), tolerance);
     }
 }
 
@@ -194,7 +139,7 @@ fn instance_losses_on(gpu: Gpu) {
         losses.record(&gpu, &mut commands, (&colors, &blended), &on_device, &weights, 1).unwrap();
         commands.submit();
         let slots = losses.results().read(&gpu).unwrap();
-        let found = ViewLoss::new([slots[2], slots[3]], 300, 0.0, 1.0);
+        let found = ViewLoss::new([slots[2], slots[3]], 300, 0.0);
         let coverage = if by_coverage { 198.0 * 0.75_f64.ln() } else { 0.0 };
         let expected = -198.0 * 0.5_f64.ln() - 2.0 * 1e-8_f64.ln() + coverage;
         assert_eq!(found.unsupported, 2.0);
@@ -254,7 +199,7 @@ fn exposed_colours_and_their_gradients_are_those_of_the_cpu() {
         compare("recorded", &flat(&found), recorded.pixels.as_flattened(), 1e-6);
         assert!(found.iter().all(|pixel| pixel[3] == 0.5), "the transmittance stays");
         let slots = losses.results().read(&gpu).unwrap();
-        let found = ViewLoss::new([slots[4], slots[5]], pixels, lambda_dssim, 1.0);
+        let found = ViewLoss::new([slots[4], slots[5]], pixels, lambda_dssim);
         assert!((found.color.loss - loss.loss).abs() < 1e-6, "{found:?} {loss:?}");
         let found = flat(&losses.v_colors.read(&gpu).unwrap());
         let tolerance = if lambda_dssim > 0.0 { 2e-5 } else { 1e-6 };

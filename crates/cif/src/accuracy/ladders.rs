@@ -288,10 +288,6 @@ fn ladder(name: &'static str, base: &Base) -> Ladder {
                     one("geometry-full", "instances move geometry", "instance.geometry=full")
                 });
             }
-            if !quick {
-                rungs.push(one("speedup-tiles-quarter", "a quarter of the tiles", "stages.tile_share=0.25"));
-            }
-            rungs.push(one("speedup-tiles-half", "half of the tiles", "stages.tile_share=0.5"));
             rungs.push(one("speedup-visible", "only visible rows move", "adam.visible_rows_only=true"));
             rungs
         }),

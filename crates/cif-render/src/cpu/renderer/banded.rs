@@ -139,8 +139,8 @@ impl Renderer {
         let size = (width, (rows * TILE).min(height - first_row));
         let mut drawn = RenderedBand::blank(first_row, size, request, identities.is_some());
         for part in &band.parts {
-            self.bin(*part, None, false);
-            self.blend_tiles(None, None, request.channels.depth);
+            self.bin(*part, false);
+            self.blend_tiles(None, request.channels.depth);
             let mut times = self.times;
             timed(&mut times.rasterize, || self.gather_part(request, identities, &mut drawn));
             self.times = times;

@@ -30,8 +30,8 @@ impl Renderer {
         assert_eq!(counts.gaussians(), field.gaussians.len(), "counts of other Gaussians");
         let settings = RenderSettings { instances: None, ..*settings };
         self.project(field, camera, time, &settings);
-        self.bin(TileRegion::whole(camera.width, camera.height), None, true);
-        self.rasterize(None, None, false);
+        self.bin(TileRegion::whole(camera.width, camera.height), true);
+        self.rasterize(None);
         let (tape, level) = (&self.tape, self.level);
         let lists = &tape.lists;
         let tiles: Vec<(Vec<u16>, Vec<f32>)> = (0..lists.tiles())

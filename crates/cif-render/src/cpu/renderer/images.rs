@@ -111,7 +111,7 @@ impl Renderer {
         let mut lists = TileLists::default();
         for band in bands(&self.tape.splats, whole, tile_bytes as u64, self.band_memory) {
             for part in band.parts {
-                lists.build(&self.tape.splats, part, None, false);
+                lists.build(&self.tape.splats, part, false);
                 each(&lists);
             }
         }

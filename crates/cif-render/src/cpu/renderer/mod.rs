@@ -36,7 +36,7 @@ use super::rasterize::{TileImage, rasterize_tile};
 use super::tile::{GROUPS, TilePlace};
 use super::timing::{StageTimes, timed};
 use crate::constants::MIN_LABEL_PROBABILITY;
-use crate::{InstanceNormalisation, RenderSettings, TileChoice};
+use crate::{InstanceNormalisation, RenderSettings};
 
 /// Gaussians handled by one task.
 const CHUNK: usize = 512;
@@ -168,36 +168,16 @@ impl Renderer {
         settings: &RenderSettings,
         labels: Option<&PixelGrid<u16>>,
     ) -> ForwardPass {
-        self.forward_tiles(field, camera, time, settings, labels, None)
-    }
-
-    /// [`Self::forward`] of some tiles only: what is not drawn has the colour of the background and no gradient,
-    /// and the sums over labelled pixels are those of the labelled tiles (their means still count all pixels).
-    ///
-    /// # Panics
-    /// As [`Self::forward`], and when a choice has another number of tiles than the view.
-    pub fn forward_tiles(
-        &mut self,
-        field: &Field,
-        camera: &PinholeCamera,
-        time: f64,
-        settings: &RenderSettings,
-        labels: Option<&PixelGrid<u16>>,
-        tiles: Option<TileChoice<'_>>,
-    ) -> ForwardPass {
         let labels = labels.filter(|_| settings.instances.is_some());
         if let Some(labels) = labels {
             assert_eq!((labels.width, labels.height), (camera.width, camera.height), "label map size");
         }
-        if let Some(tiles) = tiles {
-            tiles.check(camera.width, camera.height);
-        }
         self.project(field, camera, time, settings);
-        self.bin(TileRegion::whole(camera.width, camera.height), tiles.map(|tiles| tiles.drawn), true);
+        self.bin(TileRegion::whole(camera.width, camera.height), true);
         let identities = labels.map(|labels| {
             (labels, field.identities.as_ref().expect("the instance pass needs estimated identities"))
         });
-        self.rasterize(identities, tiles.map(|tiles| tiles.labelled), false);
+        self.rasterize(identities);
         let (instance_loss, unsupported_pixels) = self.instance_loss(settings);
         ForwardPass {
             color: PixelGrid::from_pixels(camera.width, camera.height, self.tape.color.clone()),
@@ -251,9 +231,9 @@ impl Renderer {
 
     /// Tile lists of a region of the projected view, with the pairs of each splat where they are asked for, as
     /// gradients and counts read them.
-    fn bin(&mut self, region: TileRegion, drawn: Option<&[bool]>, by_splat: bool) {
+    fn bin(&mut self, region: TileRegion, by_splat: bool) {
         let tape = &mut self.tape;
-        timed(&mut self.times.bin, || tape.lists.build(&tape.splats, region, drawn, by_splat));
+        timed(&mut self.times.bin, || tape.lists.build(&tape.splats, region, by_splat));
         self.statistics.tile_pairs += tape.lists.entries.len();
     }
 
@@ -278,13 +258,8 @@ impl Renderer {
     }
 
     /// Blends all tiles of a view into the tape, and takes their colours together.
-    fn rasterize(
-        &mut self,
-        labels: Option<(&PixelGrid<u16>, &Identities)>,
-        labelled: Option<&[bool]>,
-        depth: bool,
-    ) {
-        self.blend_tiles(labels, labelled, depth);
+    fn rasterize(&mut self, labels: Option<(&PixelGrid<u16>, &Identities)>) {
+        self.blend_tiles(labels, false);
         let mut times = self.times;
         timed(&mut times.rasterize, || {
             let (view, ..) = self.tape.view.expect("a view was projected");
@@ -298,13 +273,8 @@ impl Renderer {
         self.inspect_labelled_tiles();
     }
 
-    /// Blends the tiles that are listed into the tape, with instances in those that are `labelled` (all without).
-    fn blend_tiles(
-        &mut self,
-        labels: Option<(&PixelGrid<u16>, &Identities)>,
-        labelled: Option<&[bool]>,
-        depth: bool,
-    ) {
+    /// Blends the tiles that are listed into the tape, with instances where there are labels.
+    fn blend_tiles(&mut self, labels: Option<(&PixelGrid<u16>, &Identities)>, depth: bool) {
         let mut times = self.times;
         timed(&mut times.rasterize, || {
             let level = self.level;
@@ -320,13 +290,9 @@ impl Renderer {
                 self.statistics.identity_rows = self.tape.splats.len();
             }
             self.tape.labels = match labels {
-                Some((map, _)) => (0..tiles)
-                    .into_par_iter()
-                    .map(|tile| {
-                        let is_asked = labelled.is_none_or(|labelled| labelled[tile]);
-                        if is_asked { TileLabels::new(map, &self.place(tile)) } else { None }
-                    })
-                    .collect(),
+                Some((map, _)) => {
+                    (0..tiles).into_par_iter().map(|tile| TileLabels::new(map, &self.place(tile))).collect()
+                }
                 None => vec![None; tiles],
             };
             self.tape.labelled_pixels =

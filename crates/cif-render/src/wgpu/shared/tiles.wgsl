@@ -13,9 +13,5 @@ fn tile_range(splat: Splat) -> vec4u {
 // Pixel centres lie half a pixel inside the tile.
 fn passes_in_tile(splat: Splat, column: u32, row: u32) -> u32 {
     let first = vec2f(f32(column * TILE) + 0.5, f32(row * TILE) + 0.5);
-    var passes = passes_in(splat, first, first + f32(TILE - 1u));
-    if (view.chooses_tiles != 0u) {
-        passes &= tile_choice[row * view.tiles.x + column];
-    }
-    return passes;
+    return passes_in(splat, first, first + f32(TILE - 1u));
 }

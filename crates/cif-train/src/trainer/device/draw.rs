@@ -57,7 +57,7 @@ impl Trainer {
         };
         for index in views.frames {
             let frame = &self.dataset.frames[*index];
-            let input = ViewInput { camera: &frame.camera, settings: &settings, labels: None, tiles: None };
+            let input = ViewInput { camera: &frame.camera, settings: &settings, labels: None };
             let mut commands = Commands::new(gpu, None);
             let posed = match &stand_in {
                 Some(stand_in) => {

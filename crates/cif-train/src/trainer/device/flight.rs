@@ -36,8 +36,6 @@ pub(super) struct AboutView {
     /// Labelled pixels, 0 without the instance pass.
     pub(super) labelled: usize,
     pub(super) lambda_dssim: f32,
-    /// How many times a pixel that counts does so.
-    pub(super) of_pixel: f64,
     pub(super) gaussians: usize,
 }
 
@@ -85,7 +83,7 @@ impl ViewRead {
         let number = |k: usize| f32::from_bits(losses[k]);
         let sums = [0, 4].map(|first| [0, 1, 2, 3].map(|k| number(first + k)));
         Some(ViewNews {
-            loss: ViewLoss::new(sums, about.pixels, about.lambda_dssim, about.of_pixel),
+            loss: ViewLoss::new(sums, about.pixels, about.lambda_dssim),
             counts: GpuStatistics::of(counts),
             faults: [found[0], found[1]],
             about,

@@ -53,7 +53,7 @@ impl Trainer {
             let frame = &self.dataset.frames[self.frames.index(view)];
             let mut commands = Commands::new(gpu, None);
             let posed = resident.pose(gpu, &mut commands, frame.time);
-            let input = ViewInput { camera: &frame.camera, settings: &settings, labels: None, tiles: None };
+            let input = ViewInput { camera: &frame.camera, settings: &settings, labels: None };
             rasterizer.project(gpu, &mut commands, posed, None, &input)?;
             // Between steps the host may wait for the room that a view needs.
             rasterizer.measure(gpu, commands)?;

@@ -19,7 +19,6 @@ use crate::adam::{Moments, PlaneWeights};
 use crate::config::Ablation;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
-use crate::tiles::TileSample;
 use crate::wgpu::kernels::fault;
 use crate::wgpu::optimiser::{GaussianStep, GroupStep};
 
@@ -33,8 +32,6 @@ pub(super) struct StepView {
     pub(super) leaves_judged: bool,
     /// Number of the camera among those whose exposures are learnt.
     pub(super) camera: Option<u32>,
-    /// Tiles that it is learnt from, `None` for all.
-    pub(super) tiles: Option<TileSample>,
 }
 
 /// A step, so that it can be recorded, and recorded again.
@@ -168,7 +165,6 @@ impl Trainer {
             views.push(StepView {
                 view,
                 index,
-                tiles: self.tiles_of_view(stage, iteration, k as usize, &frame),
                 frame,
                 leaves_judged: self.leaves_out_judged(stage, iteration, index),
                 camera: camera.map(|camera| camera as u32),

@@ -13,9 +13,8 @@ use super::resident::Resident;
 use super::step::{StepPlan, StepView};
 use crate::error::TrainError;
 use crate::events::Stage;
-use crate::tiles::TileSample;
 use crate::wgpu::kernels::{Judgement, fault};
-use crate::wgpu::losses::{CountedTiles, GpuTarget, LossWeights, SLOTS};
+use crate::wgpu::losses::{GpuTarget, LossWeights, SLOTS};
 
 /// What stops a step whatever moves.
 const ALWAYS: u32 = fault::NO_ROOM | fault::COLOR_LOSS | fault::INSTANCE_LOSS;
@@ -62,20 +61,13 @@ impl Trainer {
         let settings =
             RenderSettings { instances: plan.settings.instances.filter(|_| with_instances), ..plan.settings };
         let weight = 1.0 / self.config.stages.batch as f32;
-        let tiles = view.tiles.as_ref();
-        let of_pixel = tiles.map_or(1.0, TileSample::weight);
-        let share = of_pixel * view.frame.labelled as f64 / plan.labelled.max(1) as f64;
+        let share = view.frame.labelled as f64 / plan.labelled.max(1) as f64;
         let labels = with_instances.then(|| LabelInput {
             labels: &target.labels,
             labelled_pixels: view.frame.labelled,
             weight: (share * f64::from(self.config.loss.lambda_instance)) as f32,
         });
-        let input = ViewInput {
-            camera: &frame.camera,
-            settings: &settings,
-            labels,
-            tiles: tiles.map(TileSample::choice),
-        };
+        let input = ViewInput { camera: &frame.camera, settings: &settings, labels };
 
         let mut commands = Commands::new(gpu, timestamps.as_mut());
         if let Some(identities) = resident.identities.as_ref().filter(|_| first && with_instances) {
@@ -100,7 +92,6 @@ impl Trainer {
                 .is_some_and(|instances| instances.normalisation == InstanceNormalisation::Coverage),
             leaves_out: plan.stage == Stage::Coarse && self.travelling_labels().is_some(),
             leaves_judged: view.leaves_judged,
-            tiles: tiles.map(|_| CountedTiles { choice: rasterizer.tile_choice(), weight: of_pixel }),
         };
         let exposed = resident.exposures.as_ref().zip(view.camera);
         let colors = rasterizer.colors();
@@ -241,7 +232,6 @@ impl Trainer {
             weight: f64::from(weight),
             labelled: if with_instances { view.frame.labelled } else { 0 },
             lambda_dssim: self.config.loss.lambda_dssim,
-            of_pixel,
             gaussians: resident.canonical.len(),
         };
         Ok((ViewRead::new(letter, about), submission))
