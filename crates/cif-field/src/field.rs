@@ -2,7 +2,6 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::tracks::GaussiansMut;
 use crate::{Deformation, Gaussians, Identities, Instance, RecordedCamera, Timeline, Tracks};
 
 /// Order in which a view sorts its Gaussians.
@@ -67,7 +66,7 @@ impl Field {
             None => self.gaussians.clone(),
         };
         if let Some(tracks) = &self.tracks {
-            tracks.at(time).apply(&self.gaussians, GaussiansMut::of(&mut posed));
+            tracks.at(time).apply(&self.gaussians, posed.rows_mut());
         }
         posed
     }

@@ -17,20 +17,16 @@ impl Field {
     pub fn fingerprint(&self) -> String {
         let mut hash = Hash(Xxh3::new());
         hash.bytes(RULES.as_bytes());
-        let gaussians = &self.gaussians;
-        hash.array(&gaussians.means);
-        hash.array(&gaussians.log_scales);
-        hash.array(&gaussians.quaternions);
-        hash.array(&gaussians.opacity_logits);
-        hash.array(&gaussians.occupancy_logits);
-        hash.array(gaussians.sh_coefficients.as_flattened());
+        for (_, values) in self.gaussians.tensors() {
+            hash.array(values);
+        }
         if let Some(deformation) = &self.deformation {
             hash.json(&(&deformation.config, deformation.bounds));
             hash.array(&deformation.planes);
             hash.array(&deformation.mlp);
             if deformation.still.contains(&true) {
                 hash.array(
-                    &(0..gaussians.len()).map(|row| u8::from(deformation.is_still(row))).collect::<Vec<_>>(),
+                    &(0..self.len()).map(|row| u8::from(deformation.is_still(row))).collect::<Vec<_>>(),
                 );
             }
         }

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use crate::FieldError;
 use crate::neighbours::NearestNeighbours;
+use crate::parameters::{self, Parameter, Tensor, TensorMut};
 
 /// Floats of spherical harmonics per Gaussian: `[16, 3]`.
 pub const SH_FLOATS: usize = COEFFICIENTS * 3;
@@ -35,21 +36,209 @@ pub fn saturated_logit(probability: f64) -> f32 {
     logit(probability).clamp(-SATURATED_LOGIT, SATURATED_LOGIT) as f32
 }
 
-/// N Gaussians; every array has N entries (times its row length).
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Gaussians {
+/// A row of a parameter: one float, or an array of them.
+trait Row: Copy {
+    const ZERO: Self;
+    fn floats(rows: &[Self]) -> &[f32];
+    fn floats_mut(rows: &mut [Self]) -> &mut [f32];
+}
+
+impl Row for f32 {
+    const ZERO: Self = 0.0;
+    fn floats(rows: &[Self]) -> &[f32] {
+        rows
+    }
+    fn floats_mut(rows: &mut [Self]) -> &mut [f32] {
+        rows
+    }
+}
+
+impl<const WIDTH: usize> Row for [f32; WIDTH] {
+    const ZERO: Self = [0.0; WIDTH];
+    fn floats(rows: &[Self]) -> &[f32] {
+        rows.as_flattened()
+    }
+    fn floats_mut(rows: &mut [Self]) -> &mut [f32] {
+        rows.as_flattened_mut()
+    }
+}
+
+/// Makes the set of Gaussians, and what only carries it, from one list of parameters.
+macro_rules! gaussian_parameters {
+    ($($(#[$doc:meta])* $field:ident: $row:ty = $parameter:expr;)*) => {
+        /// N Gaussians; every array has N entries (times its row length). Arrays that nothing has to say about may
+        /// be empty where a function says so.
+        #[derive(Clone, Debug, Default, PartialEq)]
+        pub struct Gaussians {
+            $($(#[$doc])* pub $field: Vec<$row>,)*
+        }
+
+        /// Consecutive rows of [`Gaussians`], to be changed.
+        #[derive(Debug)]
+        pub struct GaussiansMut<'a> {
+            $($(#[$doc])* pub $field: &'a mut [$row],)*
+        }
+
+        impl Gaussians {
+            /// Number of parameters of a Gaussian.
+            pub const PARAMETERS: usize = [$(stringify!($field)),*].len();
+
+            /// Zeros.
+            #[must_use]
+            pub fn zeros(rows: usize) -> Self {
+                Self { $($field: vec![<$row as Row>::ZERO; rows],)* }
+            }
+
+            /// Every parameter with its values.
+            #[must_use]
+            pub fn tensors(&self) -> [Tensor<'_>; Self::PARAMETERS] {
+                [$(($parameter, Row::floats(&self.$field[..]))),*]
+            }
+
+            /// As [`Self::tensors`], to be changed.
+            pub fn tensors_mut(&mut self) -> [TensorMut<'_>; Self::PARAMETERS] {
+                self.rows_mut().into_tensors()
+            }
+
+            /// The values of one parameter.
+            ///
+            /// # Panics
+            /// When it is not one of a Gaussian.
+            #[must_use]
+            pub fn tensor(&self, parameter: &Parameter) -> &[f32] {
+                let mut tensors = self.tensors().into_iter();
+                tensors.find(|(other, _)| other == parameter).expect("a parameter of Gaussians").1
+            }
+
+            /// As [`Self::tensor`], to be changed.
+            ///
+            /// # Panics
+            /// As [`Self::tensor`].
+            pub fn tensor_mut(&mut self, parameter: &Parameter) -> &mut [f32] {
+                self.rows_mut().into_tensor(parameter)
+            }
+
+            /// A set whose arrays hold what `values` gives for each parameter.
+            ///
+            /// # Errors
+            /// The first error of `values`.
+            pub fn try_from_rows<E>(mut values: impl RowSource<E>) -> Result<Self, E> {
+                Ok(Self { $($field: values.rows::<$row>(&$parameter)?,)* })
+            }
+
+            /// All rows, to be changed.
+            pub fn rows_mut(&mut self) -> GaussiansMut<'_> {
+                GaussiansMut { $($field: &mut self.$field,)* }
+            }
+
+            /// Rows `sources[0], sources[1], ...` as a new set; rows may repeat.
+            ///
+            /// # Panics
+            /// When a source is out of range.
+            #[must_use]
+            pub fn gather(&self, sources: &[u32]) -> Self {
+                Self { $($field: sources.iter().map(|&row| self.$field[row as usize]).collect(),)* }
+            }
+
+            /// Makes row `to` a copy of row `from`.
+            ///
+            /// # Panics
+            /// When one is out of range.
+            pub fn copy_row(&mut self, to: usize, from: usize) {
+                $(self.$field[to] = self.$field[from];)*
+            }
+
+            /// Adds the rows of `other` at the end.
+            pub fn append(&mut self, other: &Self) {
+                $(self.$field.extend_from_slice(&other.$field);)*
+            }
+
+            /// Keeps the rows whose flag is set, in order and in place.
+            ///
+            /// # Panics
+            /// When there are not N flags.
+            pub fn retain(&mut self, keep: &[bool]) {
+                assert_eq!(keep.len(), self.len(), "one flag per Gaussian");
+                $({
+                    let mut flags = keep.iter();
+                    self.$field.retain(|_| *flags.next().expect("all arrays have N rows"));
+                })*
+            }
+
+            /// The set with the arrays that are empty taken from `other`.
+            #[must_use]
+            pub fn or(self, other: &Self) -> Self {
+                Self { $($field: if self.$field.is_empty() { other.$field.clone() } else { self.$field },)* }
+            }
+        }
+
+        impl<'a> GaussiansMut<'a> {
+            /// Every parameter with its values.
+            #[must_use]
+            pub fn into_tensors(self) -> [TensorMut<'a>; Gaussians::PARAMETERS] {
+                [$(($parameter, Row::floats_mut(self.$field))),*]
+            }
+
+            /// The values of one parameter.
+            ///
+            /// # Panics
+            /// When it is not one of a Gaussian.
+            #[must_use]
+            pub fn into_tensor(self, parameter: &Parameter) -> &'a mut [f32] {
+                let mut tensors = self.into_tensors().into_iter();
+                tensors.find(|(other, _)| other == parameter).expect("a parameter of Gaussians").1
+            }
+
+            /// The same rows, for a shorter time.
+            pub fn reborrow(&mut self) -> GaussiansMut<'_> {
+                GaussiansMut { $($field: &mut *self.$field,)* }
+            }
+
+            /// The first `rows` rows, and the others; arrays that have fewer stay whole.
+            #[must_use]
+            pub fn split_at(self, rows: usize) -> (Self, Self) {
+                $(let $field = self.$field.split_at_mut(rows.min(self.$field.len()));)*
+                (Self { $($field: $field.0,)* }, Self { $($field: $field.1,)* })
+            }
+
+            /// Consecutive groups of `rows` rows, the last one with what is left, of `count` in all.
+            #[must_use]
+            pub fn chunks(self, rows: usize, count: usize) -> Vec<Self> {
+                let mut rest = self;
+                let mut chunks = Vec::with_capacity(count.div_ceil(rows));
+                for _ in 0..count.div_ceil(rows) {
+                    let (chunk, others) = rest.split_at(rows);
+                    chunks.push(chunk);
+                    rest = others;
+                }
+                chunks
+            }
+        }
+    };
+}
+
+gaussian_parameters! {
     /// Centres x, world, metres.
-    pub means: Vec<[f32; 3]>,
+    means: [f32; 3] = parameters::MEANS;
     /// Raw log-scales s: the standard deviation along each axis is `exp(s)`, metres.
-    pub log_scales: Vec<[f32; 3]>,
+    log_scales: [f32; 3] = parameters::LOG_SCALES;
     /// Raw quaternions (w, x, y, z), not normalised.
-    pub quaternions: Vec<[f32; 4]>,
+    quaternions: [f32; 4] = parameters::QUATERNIONS;
     /// Raw opacity logits a.
-    pub opacity_logits: Vec<f32>,
+    opacity_logits: f32 = parameters::OPACITY_LOGITS;
     /// Raw occupancy logits h.
-    pub occupancy_logits: Vec<f32>,
+    occupancy_logits: f32 = parameters::OCCUPANCY_LOGITS;
     /// Spherical harmonics `[16, 3]`, coefficient-major, RGB inner; always degree 3 in storage.
-    pub sh_coefficients: Vec<[f32; SH_FLOATS]>,
+    sh_coefficients: [f32; SH_FLOATS] = parameters::SH_COEFFICIENTS;
+}
+
+/// Where [`Gaussians::try_from_rows`] takes values from.
+pub trait RowSource<E> {
+    /// The rows of a parameter.
+    ///
+    /// # Errors
+    /// When there are none.
+    fn rows<T: bytemuck::Pod>(&mut self, parameter: &Parameter) -> Result<Vec<T>, E>;
 }
 
 impl Gaussians {
@@ -63,25 +252,6 @@ impl Gaussians {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
-    }
-
-    /// Rows `sources[0], sources[1], ...` as a new set; rows may repeat.
-    ///
-    /// # Panics
-    /// When a source is out of range.
-    #[must_use]
-    pub fn gather(&self, sources: &[u32]) -> Self {
-        fn pick<T: Copy>(values: &[T], sources: &[u32]) -> Vec<T> {
-            sources.iter().map(|&row| values[row as usize]).collect()
-        }
-        Self {
-            means: pick(&self.means, sources),
-            log_scales: pick(&self.log_scales, sources),
-            quaternions: pick(&self.quaternions, sources),
-            opacity_logits: pick(&self.opacity_logits, sources),
-            occupancy_logits: pick(&self.occupancy_logits, sources),
-            sh_coefficients: pick(&self.sh_coefficients, sources),
-        }
     }
 
     /// Fresh isotropic Gaussians at `positions` (world, metres) with display-referred RGB `colors` in [0, 1]:
@@ -126,34 +296,6 @@ impl Gaussians {
             occupancy_logits: vec![logit(INITIAL_OCCUPANCY) as f32; n],
             sh_coefficients,
         })
-    }
-
-    /// Adds the rows of `other` at the end.
-    pub fn append(&mut self, other: &Self) {
-        self.means.extend_from_slice(&other.means);
-        self.log_scales.extend_from_slice(&other.log_scales);
-        self.quaternions.extend_from_slice(&other.quaternions);
-        self.opacity_logits.extend_from_slice(&other.opacity_logits);
-        self.occupancy_logits.extend_from_slice(&other.occupancy_logits);
-        self.sh_coefficients.extend_from_slice(&other.sh_coefficients);
-    }
-
-    /// Keeps the rows whose flag is set, in order and in place.
-    ///
-    /// # Panics
-    /// When there are not N flags.
-    pub fn retain(&mut self, keep: &[bool]) {
-        assert_eq!(keep.len(), self.len(), "one flag per Gaussian");
-        fn filter<T>(values: &mut Vec<T>, keep: &[bool]) {
-            let mut flags = keep.iter();
-            values.retain(|_| *flags.next().expect("all arrays have N rows"));
-        }
-        filter(&mut self.means, keep);
-        filter(&mut self.log_scales, keep);
-        filter(&mut self.quaternions, keep);
-        filter(&mut self.opacity_logits, keep);
-        filter(&mut self.occupancy_logits, keep);
-        filter(&mut self.sh_coefficients, keep);
     }
 
     /// Opacity of a row, in [0, 1].

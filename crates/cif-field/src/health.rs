@@ -15,6 +15,7 @@ use glam::DVec3;
 use serde::Serialize;
 
 use crate::gaussians::LOG_SCALE_RANGE;
+use crate::parameters::Activation;
 use crate::{Field, FieldError, Gaussians, Identities};
 
 /// Rows told per finding.
@@ -94,20 +95,13 @@ pub fn check(field: &Field, never_seen: Option<&[bool]>) -> Vec<Finding> {
     }
     check_finite(g, &mut found);
     check_shapes(g, &mut found);
-    found.rows(
-        "saturated",
-        Severity::Odd,
-        "opacity_logits",
-        (0..g.len()).filter(|row| g.opacity_logits[*row].abs() >= SATURATED),
-        "their opacity is 0 or 1 in single precision, so that training no longer changes it",
-    );
-    found.rows(
-        "saturated",
-        Severity::Odd,
-        "occupancy_logits",
-        (0..g.len()).filter(|row| g.occupancy_logits[*row].abs() >= SATURATED),
-        "their occupancy is 0 or 1 in single precision, so that training no longer changes it",
-    );
+    for (parameter, values) in g.tensors().into_iter().filter(|(p, _)| p.activation == Activation::Sigmoid) {
+        let saturated = (0..g.len()).filter(|row| values[*row].abs() >= SATURATED);
+        let what = parameter.name.trim_end_matches("_logits");
+        let meaning =
+            format!("their {what} is 0 or 1 in single precision, so that training no longer changes it");
+        found.rows("saturated", Severity::Odd, parameter.name, saturated, &meaning);
+    }
     found.rows(
         "duplicated",
         Severity::Odd,
@@ -249,33 +243,16 @@ impl Findings {
 }
 
 fn lengths_agree(g: &Gaussians) -> bool {
-    [
-        g.log_scales.len(),
-        g.quaternions.len(),
-        g.opacity_logits.len(),
-        g.occupancy_logits.len(),
-        g.sh_coefficients.len(),
-    ]
-    .iter()
-    .all(|length| *length == g.len())
+    g.tensors().iter().all(|(parameter, values)| values.len() == g.len() * parameter.width())
 }
 
 fn check_finite(g: &Gaussians, found: &mut Findings) {
-    fn bad<'a, const C: usize>(rows: &'a [[f32; C]]) -> impl Iterator<Item = usize> + use<'a, C> {
-        (0..rows.len()).filter(|row| rows[*row].iter().any(|value| !value.is_finite()))
-    }
     const MEANING: &str = "such Gaussians are not drawn, and a scene with them is not loaded";
-    let broken = Severity::Broken;
-    found.rows("not finite", broken, "means", bad(&g.means), MEANING);
-    found.rows("not finite", broken, "log_scales", bad(&g.log_scales), MEANING);
-    found.rows("not finite", broken, "quaternions", bad(&g.quaternions), MEANING);
-    let bad_scalars = |values: &[f32]| {
-        let rows: Vec<usize> = (0..values.len()).filter(|row| !values[*row].is_finite()).collect();
-        rows.into_iter()
-    };
-    found.rows("not finite", broken, "opacity_logits", bad_scalars(&g.opacity_logits), MEANING);
-    found.rows("not finite", broken, "occupancy_logits", bad_scalars(&g.occupancy_logits), MEANING);
-    found.rows("not finite", broken, "sh_coefficients", bad(&g.sh_coefficients), MEANING);
+    for (parameter, values) in g.tensors() {
+        let rows = values.chunks_exact(parameter.width()).enumerate();
+        let bad = rows.filter(|(_, row)| row.iter().any(|value| !value.is_finite()));
+        found.rows("not finite", Severity::Broken, parameter.name, bad.map(|(row, _)| row), MEANING);
+    }
 }
 
 fn check_shapes(g: &Gaussians, found: &mut Findings) {

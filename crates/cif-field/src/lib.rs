@@ -3,6 +3,7 @@
 //! | module | answers |
 //! |---|---|
 //! | [`gaussians`] | what is stored per Gaussian, and how fresh ones begin |
+//! | [`parameters`] | which tensors are learnt: the table that everything else loops over |
 //! | [`neighbours`] | which points are nearest, coincident ones included |
 //! | [`deformation`] | how Gaussians move: hexplane and MLP parameters, and their evaluation |
 //! | [`tracks`] | what moves by recorded poses rather than by learned deformation |
@@ -61,6 +62,7 @@ pub mod health;
 pub mod identity;
 pub mod instance;
 pub mod neighbours;
+pub mod parameters;
 pub mod query;
 #[cfg(test)]
 mod testing;
@@ -71,9 +73,10 @@ pub mod validate;
 pub use checkpoint::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 pub use deformation::{Deformation, DeformationConfig, Heads, TimeEncoding};
 pub use field::{Field, SortMetric};
-pub use gaussians::Gaussians;
+pub use gaussians::{Gaussians, GaussiansMut};
 pub use identity::{Identities, Owner};
 pub use instance::Instance;
+pub use parameters::Parameter;
 pub use query::{FieldAtTime, QueryResult};
 pub use timeline::{RecordedCamera, Timeline};
 pub use tracks::{TrackGroup, Tracks};

@@ -167,22 +167,12 @@ impl Gaussians {
         if u32::try_from(n).is_err() {
             return Err(FieldError::TooMany { array: "means", found: n });
         }
-        let lengths = [
-            ("log_scales", self.log_scales.len()),
-            ("quaternions", self.quaternions.len()),
-            ("opacity_logits", self.opacity_logits.len()),
-            ("occupancy_logits", self.occupancy_logits.len()),
-            ("sh_coefficients", self.sh_coefficients.len()),
-        ];
-        for (array, found) in lengths {
-            same_length(array, found, n)?;
+        for (parameter, values) in self.tensors() {
+            same_length(parameter.name, values.len() / parameter.width(), n)?;
         }
-        finite("means", self.means.as_flattened(), 3)?;
-        finite("log_scales", self.log_scales.as_flattened(), 3)?;
-        finite("quaternions", self.quaternions.as_flattened(), 4)?;
-        finite("opacity_logits", &self.opacity_logits, 1)?;
-        finite("occupancy_logits", &self.occupancy_logits, 1)?;
-        finite("sh_coefficients", self.sh_coefficients.as_flattened(), crate::gaussians::SH_FLOATS)
+        self.tensors()
+            .into_iter()
+            .try_for_each(|(parameter, values)| finite(parameter.name, values, parameter.width()))
     }
 }
 

@@ -1,5 +1,6 @@
 //! Gradients of every parameter, and what densification needs to know of a view.
 
+use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES, Tensor, TensorMut};
 use cif_field::{Field, Gaussians};
 
 /// Accumulated over the views of a step; zeroed with [`Gradients::reset`].
@@ -7,12 +8,12 @@ use cif_field::{Field, Gaussians};
 pub struct Gradients {
     /// Gradient of each array of [`Field::gaussians`], same shapes.
     pub gaussians: Gaussians,
-    /// Gradient of each entry of `Identities::log_calibrations`; empty without identities.
-    pub log_calibrations: Vec<f32>,
     /// Gradient of `Deformation::planes`; empty without deformation.
     pub planes: Vec<f32>,
     /// Gradient of `Deformation::mlp`; empty without deformation.
     pub mlp: Vec<f32>,
+    /// Gradient of each entry of `Identities::log_calibrations`; empty without identities.
+    pub log_calibrations: Vec<f32>,
     /// Gradient of the projected centre, scaled to normalised device coordinates: (W / 2 v_x, H / 2 v_y),
     /// summed over the views. `[N]`.
     pub screen: Vec<[f32; 2]>,
@@ -27,33 +28,39 @@ impl Gradients {
     pub fn zeros(field: &Field) -> Self {
         let n = field.gaussians.len();
         Self {
-            gaussians: Gaussians {
-                means: vec![[0.0; 3]; n],
-                log_scales: vec![[0.0; 3]; n],
-                quaternions: vec![[0.0; 4]; n],
-                opacity_logits: vec![0.0; n],
-                occupancy_logits: vec![0.0; n],
-                sh_coefficients: vec![[0.0; cif_field::gaussians::SH_FLOATS]; n],
-            },
-            log_calibrations: vec![0.0; field.identities.as_ref().map_or(0, |rows| rows.labels.len())],
+            gaussians: Gaussians::zeros(n),
             planes: vec![0.0; field.deformation.as_ref().map_or(0, |d| d.planes.len())],
             mlp: vec![0.0; field.deformation.as_ref().map_or(0, |d| d.mlp.len())],
+            log_calibrations: vec![0.0; field.identities.as_ref().map_or(0, |rows| rows.labels.len())],
             screen: vec![[0.0; 2]; n],
             radii: vec![0.0; n],
         }
     }
 
+    /// The gradient of every learnable tensor, in the order of [`Field::tensors`].
+    #[must_use]
+    pub fn tensors(&self) -> Vec<Tensor<'_>> {
+        let mut tensors = Vec::from(self.gaussians.tensors());
+        tensors.push((PLANES, &self.planes));
+        tensors.push((MLP, &self.mlp));
+        tensors.push((LOG_CALIBRATIONS, &self.log_calibrations));
+        tensors
+    }
+
+    /// As [`Self::tensors`], to be changed.
+    pub fn tensors_mut(&mut self) -> Vec<TensorMut<'_>> {
+        let mut tensors = Vec::from(self.gaussians.tensors_mut());
+        tensors.push((PLANES, &mut self.planes));
+        tensors.push((MLP, &mut self.mlp));
+        tensors.push((LOG_CALIBRATIONS, &mut self.log_calibrations));
+        tensors
+    }
+
     /// Sets everything to zero; the shape is kept.
     pub fn reset(&mut self) {
-        self.gaussians.means.fill([0.0; 3]);
-        self.gaussians.log_scales.fill([0.0; 3]);
-        self.gaussians.quaternions.fill([0.0; 4]);
-        self.gaussians.opacity_logits.fill(0.0);
-        self.gaussians.occupancy_logits.fill(0.0);
-        self.gaussians.sh_coefficients.fill([0.0; cif_field::gaussians::SH_FLOATS]);
-        self.log_calibrations.fill(0.0);
-        self.planes.fill(0.0);
-        self.mlp.fill(0.0);
+        for (_, values) in self.tensors_mut() {
+            values.fill(0.0);
+        }
         self.screen.fill([0.0; 2]);
         self.radii.fill(0.0);
     }

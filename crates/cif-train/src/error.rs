@@ -38,7 +38,7 @@ pub enum TrainError {
     },
     /// The optimisation left the finite numbers.
     #[error(
-        "{stage} stage, step {iteration}: {tensor} is not finite; the field of the last finite step is kept. \
+        "{stage} stage, step {iteration}: the gradient of {tensor} is not finite; the field of the last finite step is kept. \
          Try a smaller learning rate for it, or another seed"
     )]
     NotFinite {
@@ -46,7 +46,7 @@ pub enum TrainError {
         stage: Stage,
         /// Step, from 1.
         iteration: u32,
-        /// Loss or gradient, by name.
+        /// Parameter, by name.
         tensor: &'static str,
     },
     /// Step after step left the finite numbers.

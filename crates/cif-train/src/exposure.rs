@@ -188,7 +188,6 @@ impl Exposures {
         let mut moments = Moments {
             first: std::mem::take(&mut self.first),
             second: std::mem::take(&mut self.second),
-            births: Vec::new(),
             width: WIDTH,
             steps: self.steps,
         };

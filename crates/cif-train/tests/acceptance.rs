@@ -135,7 +135,7 @@ fn calibration_ends_at_the_shares_of_responsibility() {
     let (mut field, dataset) = estimated(folder.path());
     let views = views(&dataset);
     let entries = field.identities.as_ref().unwrap().labels.len();
-    let mut moments = Moments::zeros(entries, 1, false);
+    let mut moments = Moments::zeros(entries, 1);
     for step in 0..500 {
         let (mut gradients, _) = instance_gradients(&field, &views);
         let rate = cif_train::schedule::log_linear([0.1, 0.002], step, 500);

@@ -77,14 +77,6 @@ pub(super) const VERSION_KEY: &str = "cif.version";
 pub(super) const FIELD_KEY: &str = "cif.field";
 pub(super) const TRAINING_KEY: &str = "cif.training";
 
-pub(super) const MEANS: &str = "gaussians.means";
-pub(super) const LOG_SCALES: &str = "gaussians.log_scales";
-pub(super) const QUATERNIONS: &str = "gaussians.quaternions";
-pub(super) const OPACITY_LOGITS: &str = "gaussians.opacity_logits";
-pub(super) const OCCUPANCY_LOGITS: &str = "gaussians.occupancy_logits";
-pub(super) const SH_COEFFICIENTS: &str = "gaussians.sh_coefficients";
-pub(super) const PLANES: &str = "deformation.planes";
-pub(super) const MLP: &str = "deformation.mlp";
 pub(super) const STILL: &str = "deformation.still";
 pub(super) const TRACK_GROUPS: &str = "tracks.group_of";
 pub(super) const TRACK_POSES: &str = "tracks.poses";
@@ -96,7 +88,6 @@ pub(super) const TRACK_COLORS: &str = "tracks.sh_coefficients";
 pub(super) const ROW_OFFSETS: &str = "identities.row_offsets";
 pub(super) const LABELS: &str = "identities.labels";
 pub(super) const LOG_ESTIMATES: &str = "identities.log_estimates";
-pub(super) const LOG_CALIBRATIONS: &str = "identities.log_calibrations";
 pub(super) const OWNERS: &str = "identities.owners";
 pub(super) const TRAINING_PREFIX: &str = "training.";
 

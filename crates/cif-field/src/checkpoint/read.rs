@@ -9,15 +9,16 @@ use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 
 use super::format::{
-    FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES,
-    MAX_HEADER, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, OWNERS, PLANES, POSE_FLOATS, QUATERNIONS,
-    ROW_OFFSETS, SH_COEFFICIENTS, STILL, SamplesJson, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES,
-    TRACK_MEANS, TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays,
+    FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_ESTIMATES, MAX_HEADER, OWNERS, POSE_FLOATS,
+    ROW_OFFSETS, STILL, SamplesJson, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS,
+    TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays,
     TrackGroupJson, VERSION_KEY,
 };
 use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
+use crate::gaussians::RowSource;
 use crate::gaussians::SH_FLOATS;
-use crate::{Deformation, Field, Gaussians, Identities, Owner, Tracks};
+use crate::parameters::{LOG_CALIBRATIONS, MEANS, MLP, PLANES};
+use crate::{Deformation, Field, Gaussians, Identities, Owner, Parameter, Tracks};
 
 pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
     let checkpoint = load_unchecked(path, with_training)?;
@@ -78,18 +79,12 @@ fn read_unchecked<S: Read + Seek>(
 }
 
 fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Result<Field, CheckpointError> {
-    let n = match reader.info(MEANS, Dtype::F32)?.shape[..] {
+    let means = MEANS.file_name();
+    let n = match reader.info(&means, Dtype::F32)?.shape[..] {
         [n, 3] => n,
-        ref other => return Err(reader.shape_error(MEANS, other, "[N, 3]")),
+        ref other => return Err(reader.shape_error(&means, other, "[N, 3]")),
     };
-    let gaussians = Gaussians {
-        means: reader.values(MEANS, Dtype::F32, n, &[3])?,
-        log_scales: reader.values(LOG_SCALES, Dtype::F32, n, &[3])?,
-        quaternions: reader.values(QUATERNIONS, Dtype::F32, n, &[4])?,
-        opacity_logits: reader.values(OPACITY_LOGITS, Dtype::F32, n, &[])?,
-        occupancy_logits: reader.values(OCCUPANCY_LOGITS, Dtype::F32, n, &[])?,
-        sh_coefficients: reader.values::<[f32; SH_FLOATS]>(SH_COEFFICIENTS, Dtype::F32, n, &[16, 3])?,
-    };
+    let gaussians = Gaussians::try_from_rows(ParameterRows { reader: &mut *reader, rows: n })?;
     let deformation = match json.deformation {
         None => None,
         Some(shape) => {
@@ -101,8 +96,8 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
             let planes = shape.config.plane_layout().1;
             let mlp = shape.config.mlp_layout().len;
             Some(Deformation {
-                planes: reader.values(PLANES, Dtype::F32, planes, &[])?,
-                mlp: reader.values(MLP, Dtype::F32, mlp, &[])?,
+                planes: reader.values(&PLANES.file_name(), Dtype::F32, planes, &[])?,
+                mlp: reader.values(&MLP.file_name(), Dtype::F32, mlp, &[])?,
                 config: shape.config,
                 bounds: shape.bounds,
                 still: if shape.has_still { read_still(reader, n)? } else { Vec::new() },
@@ -120,7 +115,7 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
             row_offsets: reader.values(ROW_OFFSETS, Dtype::U32, n + 1, &[])?,
             labels: reader.values(LABELS, Dtype::U16, entries, &[])?,
             log_estimates: reader.values(LOG_ESTIMATES, Dtype::F32, entries, &[])?,
-            log_calibrations: reader.values(LOG_CALIBRATIONS, Dtype::F32, entries, &[])?,
+            log_calibrations: reader.values(&LOG_CALIBRATIONS.file_name(), Dtype::F32, entries, &[])?,
             owners: if json.has_owners { read_owners(reader, n)? } else { Vec::new() },
         }))
     } else {
@@ -140,6 +135,18 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
         extent: json.extent,
         provenance: json.provenance,
     })
+}
+
+/// Tensors of a file with `rows` rows, by parameter.
+struct ParameterRows<'r, 'a, S> {
+    reader: &'r mut Reader<'a, S>,
+    rows: usize,
+}
+
+impl<S: Read + Seek> RowSource<CheckpointError> for ParameterRows<'_, '_, S> {
+    fn rows<T: bytemuck::Pod>(&mut self, parameter: &Parameter) -> Result<Vec<T>, CheckpointError> {
+        self.reader.values(&parameter.file_name(), Dtype::F32, self.rows, parameter.shape)
+    }
 }
 
 fn read_still<S: Read + Seek>(reader: &mut Reader<'_, S>, n: usize) -> Result<Vec<bool>, CheckpointError> {

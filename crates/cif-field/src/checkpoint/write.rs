@@ -10,11 +10,10 @@ use safetensors::tensor::TensorInfo;
 use serde::Serialize;
 
 use super::format::{
-    FIELD_KEY, FORMAT_KEY, FieldJson, LABELS, LOG_CALIBRATIONS, LOG_ESTIMATES, LOG_SCALES, MAX_HEADER, MEANS,
-    MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, OWNERS, PLANES, POSE_FLOATS, QUATERNIONS, ROW_OFFSETS,
-    SH_COEFFICIENTS, STILL, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_OPACITIES,
-    TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of,
-    owner_codes, still_rows,
+    FIELD_KEY, FORMAT_KEY, FieldJson, LABELS, LOG_ESTIMATES, MAX_HEADER, OWNERS, POSE_FLOATS, ROW_OFFSETS,
+    STILL, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_OPACITIES, TRACK_POSES,
+    TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of, owner_codes,
+    still_rows,
 };
 use super::{CheckpointError, StateTensor, TrainingState};
 use crate::Field;
@@ -154,24 +153,20 @@ fn field_tensors<'a>(field: &'a Field, track_arrays: Option<&'a TrackArrays>) ->
         shape.extend_from_slice(row);
         Tensor { name: name.to_owned(), dtype, shape, bytes: bytemuck::cast_slice(values) }
     }
-    let gaussians = &field.gaussians;
-    let mut tensors = vec![
-        tensor(MEANS, Dtype::F32, &gaussians.means, &[3]),
-        tensor(LOG_SCALES, Dtype::F32, &gaussians.log_scales, &[3]),
-        tensor(QUATERNIONS, Dtype::F32, &gaussians.quaternions, &[4]),
-        tensor(OPACITY_LOGITS, Dtype::F32, &gaussians.opacity_logits, &[]),
-        tensor(OCCUPANCY_LOGITS, Dtype::F32, &gaussians.occupancy_logits, &[]),
-        Tensor {
-            name: SH_COEFFICIENTS.to_owned(),
-            dtype: Dtype::F32,
-            shape: vec![gaussians.len(), 16, 3],
-            bytes: bytemuck::cast_slice(gaussians.sh_coefficients.as_flattened()),
-        },
-    ];
-    if let Some(deformation) = &field.deformation {
-        tensors.push(tensor(PLANES, Dtype::F32, &deformation.planes, &[]));
-        tensors.push(tensor(MLP, Dtype::F32, &deformation.mlp, &[]));
-    }
+    let has_part = |part: &str| match part {
+        "deformation" => field.deformation.is_some(),
+        "identities" => field.identities.is_some(),
+        _ => true,
+    };
+    let learnt = field.tensors().into_iter().filter(|(parameter, _)| has_part(parameter.part));
+    let mut tensors: Vec<Tensor<'_>> = learnt
+        .map(|(parameter, values)| {
+            let mut shape = vec![values.len() / parameter.width()];
+            shape.extend_from_slice(parameter.shape);
+            let bytes = bytemuck::cast_slice(values);
+            Tensor { name: parameter.file_name(), dtype: Dtype::F32, shape, bytes }
+        })
+        .collect();
     if let Some((tracks, arrays)) = field.tracks.as_ref().zip(track_arrays) {
         tensors.push(tensor(TRACK_GROUPS, Dtype::U32, &tracks.group_of, &[]));
         tensors.push(tensor(TRACK_POSES, Dtype::F64, &arrays.poses, &[POSE_FLOATS]));
@@ -189,7 +184,6 @@ fn field_tensors<'a>(field: &'a Field, track_arrays: Option<&'a TrackArrays>) ->
         tensors.push(tensor(ROW_OFFSETS, Dtype::U32, &identities.row_offsets, &[]));
         tensors.push(tensor(LABELS, Dtype::U16, &identities.labels, &[]));
         tensors.push(tensor(LOG_ESTIMATES, Dtype::F32, &identities.log_estimates, &[]));
-        tensors.push(tensor(LOG_CALIBRATIONS, Dtype::F32, &identities.log_calibrations, &[]));
     }
     tensors
 }

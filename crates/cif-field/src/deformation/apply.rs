@@ -4,7 +4,7 @@
 use rayon::prelude::*;
 
 use super::evaluate::Deltas;
-use super::{Deformation, HeadKind, LinearLayout, MlpLayout, PLANES, PlaneLayout};
+use super::{Deformation, LinearLayout, MlpLayout, PLANES, PlaneLayout};
 use crate::Gaussians;
 
 /// Gaussians evaluated together.
@@ -20,13 +20,7 @@ impl Deformation {
         let rows: Vec<usize> = self.moving_rows(canonical.len()).map(|row| row as usize).collect();
         let positions: Vec<[f32; 3]> = rows.iter().map(|row| canonical.means[*row]).collect();
         for (row, deltas) in rows.into_iter().zip(&self.deltas_at(&positions, time)) {
-            add(&mut deformed.means[row], &deltas.position);
-            add(&mut deformed.log_scales[row], &deltas.scale);
-            add(&mut deformed.quaternions[row], &deltas.rotation);
-            deformed.opacity_logits[row] += deltas.opacity;
-            if self.config.heads.sh {
-                add(&mut deformed.sh_coefficients[row], &deltas.sh);
-            }
+            deltas.add_to(&mut deformed, row, 1.0);
         }
         deformed
     }
@@ -74,31 +68,17 @@ impl Deformation {
         }
         let mut trunk = linear(&mlp.trunk, &self.mlp, &features);
         rectify(&mut trunk);
-        let zero =
-            Deltas { position: [0.0; 3], scale: [0.0; 3], rotation: [0.0; 4], opacity: 0.0, sh: [0.0; 48] };
-        let mut deltas = vec![zero; LANES];
+        let mut deltas = vec![Deltas::zero(); LANES];
         for head in &mlp.heads {
             let mut hidden = linear(&head.hidden, &self.mlp, &trunk);
             rectify(&mut hidden);
             for (output, values) in linear(&head.output, &self.mlp, &hidden).iter().enumerate() {
                 for (deltas, value) in deltas.iter_mut().zip(values) {
-                    match head.kind {
-                        HeadKind::Position => deltas.position[output] = *value,
-                        HeadKind::Scale => deltas.scale[output] = *value,
-                        HeadKind::Rotation => deltas.rotation[output] = *value,
-                        HeadKind::Opacity => deltas.opacity = *value,
-                        HeadKind::Sh => deltas.sh[output] = *value,
-                    }
+                    deltas.output_mut(head.kind)[output] = *value;
                 }
             }
         }
         deltas
-    }
-}
-
-fn add<const LENGTH: usize>(values: &mut [f32; LENGTH], deltas: &[f32; LENGTH]) {
-    for (value, delta) in values.iter_mut().zip(deltas) {
-        *value += delta;
     }
 }
 

@@ -4,6 +4,7 @@
 use cif_geometry::Real;
 
 use super::{Deformation, HeadKind, LinearLayout, PLANE_AXES, PLANES, PlaneLayout};
+use crate::Gaussians;
 
 /// A bilinear tap: the four nodes around a position of one plane.
 #[derive(Clone, Copy, Debug)]
@@ -50,6 +51,54 @@ pub struct Deltas<R> {
     pub opacity: R,
     /// dSH.
     pub sh: [R; 48],
+}
+
+impl<R: Real> Deltas<R> {
+    /// No motion.
+    #[must_use]
+    pub fn zero() -> Self {
+        let zero = R::zero();
+        Self { position: [zero; 3], scale: [zero; 3], rotation: [zero; 4], opacity: zero, sh: [zero; 48] }
+    }
+
+    /// The floats that a head writes.
+    #[must_use]
+    pub fn output(&self, head: HeadKind) -> &[R] {
+        match head {
+            HeadKind::Position => &self.position,
+            HeadKind::Scale => &self.scale,
+            HeadKind::Rotation => &self.rotation,
+            HeadKind::Opacity => std::slice::from_ref(&self.opacity),
+            HeadKind::Sh => &self.sh,
+        }
+    }
+
+    /// As [`Self::output`], to be changed.
+    pub fn output_mut(&mut self, head: HeadKind) -> &mut [R] {
+        match head {
+            HeadKind::Position => &mut self.position,
+            HeadKind::Scale => &mut self.scale,
+            HeadKind::Rotation => &mut self.rotation,
+            HeadKind::Opacity => std::slice::from_mut(&mut self.opacity),
+            HeadKind::Sh => &mut self.sh,
+        }
+    }
+}
+
+impl Deltas<f32> {
+    /// Adds the deltas, times `sign`, to the raw parameters of a row.
+    ///
+    /// # Panics
+    /// When there is no such row.
+    pub fn add_to(&self, gaussians: &mut Gaussians, row: usize, sign: f32) {
+        for head in HeadKind::ALL {
+            let width = head.outputs();
+            let values = &mut gaussians.tensor_mut(&head.parameter())[row * width..(row + 1) * width];
+            for (value, delta) in values.iter_mut().zip(self.output(head)) {
+                *value += sign * delta;
+            }
+        }
+    }
 }
 
 /// Coordinate of a position along an axis, in nodes, clamped; and whether it was clamped.
@@ -160,22 +209,9 @@ impl Deformation {
 
     /// Deltas of a tape.
     pub fn deltas<R: Real>(&self, tape: &DeformationTape<R>) -> Deltas<R> {
-        let zero = R::zero();
-        let mut deltas = Deltas {
-            position: [zero; 3],
-            scale: [zero; 3],
-            rotation: [zero; 4],
-            opacity: zero,
-            sh: [zero; 48],
-        };
+        let mut deltas = Deltas::zero();
         for (head, output) in self.config.mlp_layout().heads.iter().zip(&tape.outputs) {
-            match head.kind {
-                HeadKind::Position => deltas.position.copy_from_slice(output),
-                HeadKind::Scale => deltas.scale.copy_from_slice(output),
-                HeadKind::Rotation => deltas.rotation.copy_from_slice(output),
-                HeadKind::Opacity => deltas.opacity = output[0],
-                HeadKind::Sh => deltas.sh.copy_from_slice(output),
-            }
+            deltas.output_mut(head.kind).copy_from_slice(output);
         }
         deltas
     }

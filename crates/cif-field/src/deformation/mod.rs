@@ -18,6 +18,8 @@ use std::ops::Range;
 use cif_geometry::Bounds;
 use serde::{Deserialize, Serialize};
 
+use crate::parameters::{self, Parameter};
+
 /// Which MLP heads exist.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -119,15 +121,25 @@ pub enum HeadKind {
 }
 
 impl HeadKind {
+    /// Every kind, in the order in which heads follow each other in the network.
+    pub const ALL: [Self; 5] = [Self::Position, Self::Scale, Self::Rotation, Self::Opacity, Self::Sh];
+
+    /// The parameter of a Gaussian that the head adds to.
+    #[must_use]
+    pub const fn parameter(self) -> Parameter {
+        match self {
+            Self::Position => parameters::MEANS,
+            Self::Scale => parameters::LOG_SCALES,
+            Self::Rotation => parameters::QUATERNIONS,
+            Self::Opacity => parameters::OPACITY_LOGITS,
+            Self::Sh => parameters::SH_COEFFICIENTS,
+        }
+    }
+
     /// Floats written per Gaussian.
     #[must_use]
-    pub const fn outputs(self) -> usize {
-        match self {
-            Self::Position | Self::Scale => 3,
-            Self::Rotation => 4,
-            Self::Opacity => 1,
-            Self::Sh => 48,
-        }
+    pub fn outputs(self) -> usize {
+        self.parameter().width()
     }
 }
 

@@ -6,8 +6,8 @@ use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::{DenseTrack, NO_GROUP, Samples, TrackGroup, Tracks};
-use crate::Gaussians;
 use crate::gaussians::{SH_FLOATS, saturated_logit};
+use crate::{Gaussians, GaussiansMut};
 
 /// Opacity and occupancy logit of a hidden Gaussian: nothing in single precision is nearer to 0 and not 0.
 pub const HIDDEN_LOGIT: f32 = -104.0;
@@ -147,38 +147,6 @@ pub struct TracksAtTime<'a> {
     pub groups: Vec<GroupAtTime<'a>>,
     /// [`Tracks::members`]; empty where no group has samples of its members.
     members: Vec<u32>,
-}
-
-/// Posed parameters, `[N]` each, that tracks are put onto; in raw form as in [`Gaussians`].
-#[derive(Debug)]
-pub struct GaussiansMut<'a> {
-    /// Centres.
-    pub means: &'a mut [[f32; 3]],
-    /// Log-scales.
-    pub log_scales: &'a mut [[f32; 3]],
-    /// Quaternions.
-    pub quaternions: &'a mut [[f32; 4]],
-    /// Opacity logits.
-    pub opacity_logits: &'a mut [f32],
-    /// Occupancy logits.
-    pub occupancy_logits: &'a mut [f32],
-    /// Spherical harmonics; may be empty when [`TracksAtTime::changes_sh`] says so.
-    pub sh_coefficients: &'a mut [[f32; SH_FLOATS]],
-}
-
-impl<'a> GaussiansMut<'a> {
-    /// Every array of a set.
-    #[must_use]
-    pub fn of(gaussians: &'a mut Gaussians) -> Self {
-        Self {
-            means: &mut gaussians.means,
-            log_scales: &mut gaussians.log_scales,
-            quaternions: &mut gaussians.quaternions,
-            opacity_logits: &mut gaussians.opacity_logits,
-            occupancy_logits: &mut gaussians.occupancy_logits,
-            sh_coefficients: &mut gaussians.sh_coefficients,
-        }
-    }
 }
 
 impl<'a> TracksAtTime<'a> {

@@ -20,7 +20,7 @@ use glam::{DQuat, DVec3};
 
 use crate::gaussians::SH_FLOATS;
 
-pub use apply::{DenseAtTime, GaussiansMut, GroupAtTime, HIDDEN_LOGIT, SamplesAtTime, TracksAtTime};
+pub use apply::{DenseAtTime, GroupAtTime, HIDDEN_LOGIT, SamplesAtTime, TracksAtTime};
 
 /// Entry of [`Tracks::group_of`] for a Gaussian without a group.
 pub const NO_GROUP: u32 = u32::MAX;

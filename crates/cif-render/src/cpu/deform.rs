@@ -6,7 +6,6 @@
 //! recomputes their activations, which is cheaper than keeping everyone's.
 
 use cif_field::deformation::{HeadKind, LinearLayout, MlpLayout, PLANES, PlaneLayout, is_time_plane};
-use cif_field::gaussians::SH_FLOATS;
 use cif_field::{Deformation, Gaussians};
 use fearless_simd::prelude::*;
 use fearless_simd::{Level, dispatch};
@@ -106,26 +105,18 @@ struct Activations {
     v_features: Vec<f32>,
 }
 
-/// Raw parameters at the time of a view; arrays that no head moves are left empty.
-#[derive(Clone, Debug, Default)]
-pub(super) struct PosedArrays {
-    pub(super) means: Vec<[f32; 3]>,
-    pub(super) log_scales: Vec<[f32; 3]>,
-    pub(super) quaternions: Vec<[f32; 4]>,
-    pub(super) opacity_logits: Vec<f32>,
-    /// Only tracks hide things.
-    pub(super) occupancy_logits: Vec<f32>,
-    pub(super) sh_coefficients: Vec<[f32; SH_FLOATS]>,
-}
-
-/// Gradients by the posed parameters, `[N]` each; `sh_coefficients` is empty without an SH head.
-#[derive(Clone, Debug, Default)]
-pub(super) struct PosedArrayGradients {
-    pub(super) means: Vec<[f32; 3]>,
-    pub(super) log_scales: Vec<[f32; 3]>,
-    pub(super) quaternions: Vec<[f32; 4]>,
-    pub(super) opacity_logits: Vec<f32>,
-    pub(super) sh_coefficients: Vec<[f32; SH_FLOATS]>,
+/// Fills `posed` with the canonical Gaussians: colours only where something `moves_sh`, occupancies not at all.
+pub(super) fn begin(canonical: &Gaussians, moves_sh: bool, posed: &mut Gaussians) {
+    posed.means.clone_from(&canonical.means);
+    posed.log_scales.clone_from(&canonical.log_scales);
+    posed.quaternions.clone_from(&canonical.quaternions);
+    posed.opacity_logits.clone_from(&canonical.opacity_logits);
+    posed.occupancy_logits.clear();
+    if moves_sh {
+        posed.sh_coefficients.clone_from(&canonical.sh_coefficients);
+    } else {
+        posed.sh_coefficients.clear();
+    }
 }
 
 impl<'a> DeformationAtTime<'a> {
@@ -238,37 +229,18 @@ impl<'a> DeformationAtTime<'a> {
     }
 
     /// Fills `posed` with raw parameters at the time, deltas added to the rows that do not stand still.
-    pub(super) fn forward(&self, level: Level, gaussians: &Gaussians, posed: &mut PosedArrays) {
-        posed.means.clone_from(&gaussians.means);
-        posed.log_scales.clone_from(&gaussians.log_scales);
-        posed.quaternions.clone_from(&gaussians.quaternions);
-        posed.opacity_logits.clone_from(&gaussians.opacity_logits);
-        let moves_sh = self.mlp.heads.iter().any(|head| head.kind == HeadKind::Sh);
-        if moves_sh {
-            posed.sh_coefficients.clone_from(&gaussians.sh_coefficients);
-        } else {
-            posed.sh_coefficients.clear();
-        }
+    pub(super) fn forward(&self, level: Level, gaussians: &Gaussians, posed: &mut Gaussians) {
+        begin(gaussians, self.mlp.heads.iter().any(|head| head.kind == HeadKind::Sh), posed);
         let n = gaussians.len();
         // Fewer rows of a chunk go through the network where many stand still.
         let stands = self.deformation.still.contains(&true);
         let chunk_rows = if stands { CHUNK } else { BLOCK };
-        let sh_chunks: Vec<&mut [[f32; SH_FLOATS]]> = if moves_sh {
-            posed.sh_coefficients.chunks_mut(chunk_rows).collect()
-        } else {
-            (0..n.div_ceil(chunk_rows)).map(|_| Default::default()).collect()
-        };
         gaussians
             .means
             .par_chunks(chunk_rows)
-            .zip(posed.means.par_chunks_mut(chunk_rows))
-            .zip(posed.log_scales.par_chunks_mut(chunk_rows))
-            .zip(posed.quaternions.par_chunks_mut(chunk_rows))
-            .zip(posed.opacity_logits.par_chunks_mut(chunk_rows))
-            .zip(sh_chunks)
+            .zip(posed.rows_mut().chunks(chunk_rows, n))
             .enumerate()
-            .for_each_init(Activations::default, |block, (chunk, arrays)| {
-                let (((((positions, means), log_scales), quaternions), opacities), sh) = arrays;
+            .for_each_init(Activations::default, |block, (chunk, (positions, mut posed))| {
                 let first = chunk * chunk_rows;
                 let rows: Vec<usize> =
                     (0..positions.len()).filter(|row| !self.deformation.is_still(first + row)).collect();
@@ -278,13 +250,7 @@ impl<'a> DeformationAtTime<'a> {
                     moving.extend(rows.iter().map(|row| positions[*row]));
                     self.forward_block(level, &moving, block);
                     for (head, output) in self.mlp.heads.iter().zip(&block.outputs) {
-                        let target = match head.kind {
-                            HeadKind::Position => means.as_flattened_mut(),
-                            HeadKind::Scale => log_scales.as_flattened_mut(),
-                            HeadKind::Rotation => quaternions.as_flattened_mut(),
-                            HeadKind::Opacity => &mut *opacities,
-                            HeadKind::Sh => sh.as_flattened_mut(),
-                        };
+                        let target = posed.reborrow().into_tensor(&head.kind.parameter());
                         let outputs = head.kind.outputs();
                         for (row, output) in rows.iter().zip(output.chunks_exact(padded(outputs))) {
                             let target = &mut target[row * outputs..(row + 1) * outputs];
@@ -304,7 +270,7 @@ impl<'a> DeformationAtTime<'a> {
         level: Level,
         gaussians: &Gaussians,
         active: &[u32],
-        v: &PosedArrayGradients,
+        v: &Gaussians,
         v_planes: &mut [f32],
         v_mlp: &mut [f32],
         v_means: &mut [[f32; 3]],
@@ -354,7 +320,7 @@ impl<'a> DeformationAtTime<'a> {
         &self,
         level: Level,
         rows: &[u32],
-        v: &PosedArrayGradients,
+        v: &Gaussians,
         block: &mut Activations,
         v_mlp: &mut [f32],
     ) {
@@ -365,15 +331,9 @@ impl<'a> DeformationAtTime<'a> {
         block.v_hidden.resize(count * width, 0.0);
         for (index, head) in self.mlp.heads.iter().enumerate() {
             block.v_output.clear();
-            for &row in rows {
-                let row = row as usize;
-                match head.kind {
-                    HeadKind::Position => block.v_output.extend_from_slice(&v.means[row]),
-                    HeadKind::Scale => block.v_output.extend_from_slice(&v.log_scales[row]),
-                    HeadKind::Rotation => block.v_output.extend_from_slice(&v.quaternions[row]),
-                    HeadKind::Opacity => block.v_output.push(v.opacity_logits[row]),
-                    HeadKind::Sh => block.v_output.extend_from_slice(&v.sh_coefficients[row]),
-                }
+            let (v, outputs) = (v.tensor(&head.kind.parameter()), head.output.outputs);
+            for row in rows.iter().map(|row| *row as usize) {
+                block.v_output.extend_from_slice(&v[row * outputs..(row + 1) * outputs]);
             }
             let hidden = &block.hidden[index];
             self.layer_backward(

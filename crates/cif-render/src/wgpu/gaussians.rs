@@ -5,8 +5,9 @@
 //! | `geometry` | centre and opacity logit, log-scales and occupancy logit, raw quaternion (w, x, y, z): 12 floats |
 //! | `sh` | spherical harmonics `[16, 3]`: 48 floats |
 
-use cif_field::Gaussians;
 use cif_field::gaussians::SH_FLOATS;
+use cif_field::parameters::{LOG_SCALES, MEANS, OCCUPANCY_LOGITS, OPACITY_LOGITS, QUATERNIONS};
+use cif_field::{Gaussians, Parameter};
 use half::f16;
 
 use super::{Gpu, GpuError, GpuVec};
@@ -79,31 +80,40 @@ impl GpuGaussians {
     }
 }
 
+/// First float of a parameter in [`GpuGaussians::geometry`]; `None` for those that lie elsewhere.
+#[must_use]
+pub fn geometry_column(parameter: &Parameter) -> Option<usize> {
+    COLUMNS.iter().find(|(other, _)| other == parameter).map(|(_, first)| *first)
+}
+
+/// Where parameters lie in [`GpuGaussians::geometry`], by their first float.
+pub const COLUMNS: [(Parameter, usize); 5] =
+    [(MEANS, 0), (OPACITY_LOGITS, 3), (LOG_SCALES, 4), (OCCUPANCY_LOGITS, 7), (QUATERNIONS, 8)];
+
 /// Rows in the layout of the device.
 #[must_use]
 pub fn geometry(gaussians: &Gaussians) -> Vec<[f32; GEOMETRY_FLOATS]> {
-    (0..gaussians.len())
-        .map(|row| {
-            let ([x, y, z], [s, t, u]) = (gaussians.means[row], gaussians.log_scales[row]);
-            let [w, i, j, k] = gaussians.quaternions[row];
-            [x, y, z, gaussians.opacity_logits[row], s, t, u, gaussians.occupancy_logits[row], w, i, j, k]
-        })
-        .collect()
+    let mut rows = vec![[0.0; GEOMETRY_FLOATS]; gaussians.len()];
+    for (parameter, first) in COLUMNS {
+        let width = parameter.width();
+        for (row, values) in rows.iter_mut().zip(gaussians.tensor(&parameter).chunks_exact(width)) {
+            row[first..first + width].copy_from_slice(values);
+        }
+    }
+    rows
 }
 
 /// Rows of the device as arrays.
 #[must_use]
 pub fn gaussians(geometry: &[[f32; GEOMETRY_FLOATS]], sh_coefficients: Vec<[f32; SH_FLOATS]>) -> Gaussians {
-    let part =
-        |first: usize| move |row: &[f32; GEOMETRY_FLOATS]| [row[first], row[first + 1], row[first + 2]];
-    Gaussians {
-        means: geometry.iter().map(part(0)).collect(),
-        log_scales: geometry.iter().map(part(4)).collect(),
-        quaternions: geometry.iter().map(|row| [row[8], row[9], row[10], row[11]]).collect(),
-        opacity_logits: geometry.iter().map(|row| row[3]).collect(),
-        occupancy_logits: geometry.iter().map(|row| row[7]).collect(),
-        sh_coefficients,
+    let mut gaussians = Gaussians::zeros(geometry.len());
+    for (parameter, first) in COLUMNS {
+        let width = parameter.width();
+        for (row, values) in geometry.iter().zip(gaussians.tensor_mut(&parameter).chunks_exact_mut(width)) {
+            values.copy_from_slice(&row[first..first + width]);
+        }
     }
+    Gaussians { sh_coefficients, ..gaussians }
 }
 
 /// Spherical harmonics with the bands above the constant one in 16-bit floats, two to a word: 104 bytes instead of 192.

@@ -38,9 +38,6 @@ pub struct Moments {
     pub first: Vec<f32>,
     /// Decaying mean of the squared gradient.
     pub second: Vec<f32>,
-    /// Step after which each row was made, for its own bias correction; empty when all rows share the
-    /// group's step count.
-    pub births: Vec<u32>,
     /// Floats per row.
     pub width: usize,
     /// Steps done.
@@ -48,7 +45,7 @@ pub struct Moments {
 }
 
 /// Rates inside a row.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub enum RowRates {
     /// One rate for all floats.
     Uniform(f32),
@@ -89,16 +86,10 @@ impl BiasCorrection {
 }
 
 impl Moments {
-    /// Zero moments of `rows * width` floats; `own_bias_correction` counts steps per row.
+    /// Zero moments of `rows * width` floats.
     #[must_use]
-    pub fn zeros(rows: usize, width: usize, own_bias_correction: bool) -> Self {
-        Self {
-            first: vec![0.0; rows * width],
-            second: vec![0.0; rows * width],
-            births: if own_bias_correction { vec![0; rows] } else { Vec::new() },
-            width,
-            steps: 0,
-        }
+    pub fn zeros(rows: usize, width: usize) -> Self {
+        Self { first: vec![0.0; rows * width], second: vec![0.0; rows * width], width, steps: 0 }
     }
 
     /// Number of rows.
@@ -125,10 +116,9 @@ impl Moments {
         assert_eq!(parameters.len(), self.first.len(), "parameters and moments differ in length");
         assert_eq!(gradients.len(), self.first.len(), "gradients and moments differ in length");
         self.steps += 1;
-        let shared = BiasCorrection::after(self.steps);
+        let bias = BiasCorrection::after(self.steps);
         let width = self.width.max(1);
         let chunk_rows = (CHUNK / width).max(1);
-        let (steps, births) = (self.steps, &self.births);
         parameters
             .par_chunks_mut(chunk_rows * width)
             .zip(gradients.par_chunks_mut(chunk_rows * width))
@@ -140,8 +130,8 @@ impl Moments {
                     return Err(NotFinite);
                 }
                 match rates {
-                    RowRates::Uniform(rate) if births.is_empty() && visible.is_none() => {
-                        update(p, g, m, v, rate, shared);
+                    RowRates::Uniform(rate) if visible.is_none() => {
+                        update(p, g, m, v, rate, bias);
                     }
                     _ => {
                         let pattern = rates.pattern();
@@ -155,9 +145,6 @@ impl Moments {
                             if visible.is_some_and(|visible| visible[row] <= 0.0) {
                                 continue;
                             }
-                            let bias = births
-                                .get(row)
-                                .map_or(shared, |birth| BiasCorrection::after(steps.saturating_sub(*birth)));
                             match rates {
                                 RowRates::Uniform(rate) => update(p, g, m, v, rate, bias),
                                 RowRates::Split { active, .. } => {
@@ -181,21 +168,23 @@ impl Moments {
             .reduce(|| Ok(()), Result::and)
     }
 
-    /// Zeroes the moments of a row, which then counts its steps anew.
+    /// Replaces both moments.
+    #[cfg(feature = "wgpu")]
+    pub(crate) fn set(&mut self, first: Vec<f32>, second: Vec<f32>) {
+        (self.first, self.second) = (first, second);
+    }
+
+    /// Zeroes the moments of a row.
     pub fn reset_row(&mut self, row: usize) {
         let range = row * self.width..(row + 1) * self.width;
         self.first[range.clone()].fill(0.0);
         self.second[range].fill(0.0);
-        if let Some(birth) = self.births.get_mut(row) {
-            *birth = self.steps;
-        }
     }
 
     /// Zeroes all moments; the step count stays.
     pub fn reset_all(&mut self) {
         self.first.fill(0.0);
         self.second.fill(0.0);
-        self.births.fill(self.steps);
     }
 
     /// Makes the rows those of `origins`: a row of the old group, or a fresh one.
@@ -212,19 +201,25 @@ impl Moments {
             picked
         };
         (self.first, self.second) = (pick(&self.first), pick(&self.second));
-        self.gather_births(origins);
-    }
-
-    /// The part of [`Self::gather`] that tells when rows were made.
-    pub(crate) fn gather_births(&mut self, origins: &[Option<u32>]) {
-        if !self.births.is_empty() {
-            self.births =
-                origins.iter().map(|o| o.map_or(self.steps, |row| self.births[row as usize])).collect();
-        }
     }
 }
 
 impl RowRates {
+    /// True when some float moves.
+    #[must_use]
+    pub fn move_anything(self) -> bool {
+        self.fastest() > 0.0
+    }
+
+    /// Largest rate; NaN only where all are.
+    #[must_use]
+    pub fn fastest(self) -> f32 {
+        match self {
+            Self::Uniform(rate) => rate,
+            Self::Split { base, rest, .. } => base.max(rest),
+        }
+    }
+
     fn pattern(self) -> [f32; MAX_SPLIT_WIDTH] {
         match self {
             Self::Uniform(rate) => [rate; MAX_SPLIT_WIDTH],

@@ -3,6 +3,7 @@
 //! "Default" below is the value of the `standard` preset; [`TrainConfig::preset`] gives the others. Codes
 //! such as A7 name the question of the methods reference (section 12) that a setting answers.
 
+mod older;
 mod options;
 mod presets;
 mod validate;
@@ -152,9 +153,6 @@ pub struct RatesConfig {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct AdamConfig {
-    /// Rows made after the start correct their bias from their own first step, default off: they share the
-    /// group's step count, and their first step is 3.16 times the rate (methods reference 7, row 26).
-    pub fresh_row_bias_correction: bool,
     /// Rows not visible in any view of a step keep still instead of moving by their momentum, default off.
     pub visible_rows_only: bool,
 }

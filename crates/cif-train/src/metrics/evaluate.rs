@@ -210,7 +210,7 @@ pub fn evaluate<E: From<EvaluationError>>(
 /// The settings that a field was trained with; `None` for a field of other origin.
 #[must_use]
 pub fn training_config(field: &Field) -> Option<TrainConfig> {
-    serde_json::from_value(field.provenance.get("config")?.clone()).ok()
+    TrainConfig::recorded(field.provenance.get("config")?.clone()).ok()
 }
 
 /// Render settings that repeat those of the training run: what the field itself says, plus near plane,

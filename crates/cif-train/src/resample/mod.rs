@@ -4,7 +4,7 @@
 mod conserve;
 mod draw;
 
-use cif_field::{Field, Gaussians, Identities};
+use cif_field::{Field, Identities};
 use cif_geometry::scalar::{logit, sigmoid};
 use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -195,7 +195,7 @@ pub fn apply(field: &mut Field, plan: &Plan, context: &ResampleContext<'_>, rng:
         plan.pairs.iter().map(|pair| replica_offset(field, pair.source as usize, context, rng)).collect();
     let gaussians = &mut field.gaussians;
     for (pair, offset) in plan.pairs.iter().zip(offsets) {
-        copy_row(gaussians, pair.source as usize, pair.weak as usize);
+        gaussians.copy_row(pair.weak as usize, pair.source as usize);
         for (value, offset) in gaussians.means[pair.weak as usize].iter_mut().zip(offset) {
             *value += offset;
         }
@@ -215,15 +215,6 @@ pub fn apply(field: &mut Field, plan: &Plan, context: &ResampleContext<'_>, rng:
         *identities = identities.gather(&rows);
     }
     relocated
-}
-
-fn copy_row(gaussians: &mut Gaussians, source: usize, target: usize) {
-    gaussians.means[target] = gaussians.means[source];
-    gaussians.log_scales[target] = gaussians.log_scales[source];
-    gaussians.quaternions[target] = gaussians.quaternions[source];
-    gaussians.opacity_logits[target] = gaussians.opacity_logits[source];
-    gaussians.occupancy_logits[target] = gaussians.occupancy_logits[source];
-    gaussians.sh_coefficients[target] = gaussians.sh_coefficients[source];
 }
 
 /// Times at which a replica must move like its source.

@@ -2,6 +2,8 @@ use cif_field::{Instance, SortMetric, Timeline};
 use rand::SeedableRng;
 use rand_pcg::Pcg64;
 
+use cif_field::Gaussians;
+
 use super::*;
 
 /// 40 Gaussians, even rows of instance 0, odd rows of instance 1; occupancy grows with the row.

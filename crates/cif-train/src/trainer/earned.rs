@@ -3,6 +3,7 @@
 //! have not learnt what they are worth, and later nothing is left to make good for what is taken back.
 
 use cif_field::deformation::HeadKind;
+use cif_field::parameters::MLP;
 use cif_field::{Deformation, Field};
 use cif_geometry::PixelGrid;
 use cif_geometry::spherical_harmonics::coefficient_count;
@@ -175,7 +176,7 @@ impl Trainer {
             let kept = gain_db >= gain_wanted;
             if !kept {
                 self.field = trial.field;
-                let mlp = &mut self.optimiser.mlp;
+                let mlp = self.optimiser.of(&MLP);
                 mlp.first.drain(trial.removed.clone());
                 mlp.second.drain(trial.removed.clone());
                 self.gradients.mlp.drain(trial.removed);
@@ -238,16 +239,9 @@ fn without_output(field: &Field, kind: HeadKind, times: &[f64]) -> Option<Trial>
     let gaussians = &mut field.gaussians;
     for (row, motion) in rows.iter().zip(&motions) {
         let row = *row as usize;
-        let (values, deltas): (&mut [f32], &[f32]) = match kind {
-            HeadKind::Position => (&mut gaussians.means[row], &motion.mean.position),
-            HeadKind::Scale => (&mut gaussians.log_scales[row], &motion.mean.scale),
-            HeadKind::Rotation => (&mut gaussians.quaternions[row], &motion.mean.rotation),
-            HeadKind::Opacity => {
-                (&mut gaussians.opacity_logits[row..=row], std::slice::from_ref(&motion.mean.opacity))
-            }
-            HeadKind::Sh => (&mut gaussians.sh_coefficients[row], &motion.mean.sh),
-        };
-        for (value, delta) in values.iter_mut().zip(deltas) {
+        let width = kind.outputs();
+        let values = &mut gaussians.tensor_mut(&kind.parameter())[row * width..(row + 1) * width];
+        for (value, delta) in values.iter_mut().zip(motion.mean.output(kind)) {
             *value += delta;
         }
     }

@@ -56,11 +56,7 @@ impl Trainer {
                 stage @ (Stage::Coarse | Stage::Fine) => {
                     return Err(TrainError::Unfinished { scene: name.to_owned(), stage });
                 }
-                // Moments are kept in a shape that this variant of the optimiser decides.
-                Stage::Identity
-                    if parsed.config.adam.fresh_row_bias_correction
-                        == config.adam.fresh_row_bias_correction =>
-                {
+                Stage::Identity => {
                     progress = parsed.progress;
                     state = Some((training.tensors, parsed.adam_steps));
                 }

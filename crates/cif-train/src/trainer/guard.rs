@@ -39,7 +39,7 @@ pub struct Fault {
     /// `deform backward`, `gradients` (any of the backward parts), `parameters`, `optimiser`.
     pub part: &'static str,
     /// Array, by name.
-    pub tensor: &'static str,
+    pub tensor: String,
     /// Position in the array, all its floats counted in their order.
     pub index: usize,
     /// The value, as text because JSON has no word for it.
@@ -97,78 +97,46 @@ fn first_beyond(values: &[f32], limit: f32) -> Option<usize> {
     })
 }
 
-fn fault(part: &'static str, tensor: &'static str, values: &[f32], limit: f32) -> Option<Fault> {
+fn fault(part: &'static str, tensor: &str, values: &[f32], limit: f32) -> Option<Fault> {
     let index = first_beyond(values, limit)?;
-    Some(Fault { part, tensor, index, value: values[index].to_string() })
+    Some(Fault { part, tensor: tensor.to_owned(), index, value: values[index].to_string() })
 }
 
 /// The first gradient that a group which moves cannot take, or rate that would leave the finite numbers.
 pub(super) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option<Fault> {
-    struct Group<'a> {
-        gradient: &'static str,
-        rate: &'static str,
-        values: &'a [f32],
-        at: f32,
-    }
-    macro_rules! group {
-        ($name:literal, $values:expr, $at:expr) => {
-            Group {
-                gradient: concat!("gradient of ", $name),
-                rate: concat!("learning rate of ", $name),
-                values: $values,
-                at: $at,
-            }
-        };
-    }
-    let g = &gradients.gaussians;
-    let groups = [
-        group!("means", g.means.as_flattened(), rates.means),
-        group!("log_scales", g.log_scales.as_flattened(), rates.log_scales),
-        group!("quaternions", g.quaternions.as_flattened(), rates.quaternions),
-        group!("opacity_logits", &g.opacity_logits, rates.opacity),
-        group!("occupancy_logits", &g.occupancy_logits, rates.occupancy),
-        group!("sh_coefficients", g.sh_coefficients.as_flattened(), rates.sh_base.max(rates.sh_rest)),
-        group!("log_calibrations", &gradients.log_calibrations, rates.calibration),
-        group!("planes", &gradients.planes, rates.planes),
-        group!("mlp", &gradients.mlp, rates.mlp),
-    ];
-    groups.into_iter().filter(|group| group.at != 0.0).find_map(|Group { gradient, rate, values, at }| {
-        if at.is_nan() || at.abs() > MAX_RATE {
-            return Some(Fault { part: "optimiser", tensor: rate, index: 0, value: at.to_string() });
+    gradients.tensors().into_iter().find_map(|(parameter, values)| {
+        let rate = rates.of(&parameter).fastest();
+        if rate == 0.0 {
+            return None;
         }
-        fault("gradients", gradient, values, MAX_GRADIENT)
+        if rate.is_nan() || rate.abs() > MAX_RATE {
+            let tensor = format!("learning rate of {}", parameter.name);
+            return Some(Fault { part: "optimiser", tensor, index: 0, value: rate.to_string() });
+        }
+        fault("gradients", &format!("gradient of {}", parameter.name), values, MAX_GRADIENT)
     })
 }
 
 /// The first gradient of an exposure that no optimiser may take.
 pub(super) fn exposure_fault(exposures: Option<&Exposures>) -> Option<Fault> {
     let (index, value) = exposures?.gradient_beyond(MAX_GRADIENT)?;
-    Some(Fault { part: "gradients", tensor: "gradient of exposures", index, value: value.to_string() })
+    Some(Fault {
+        part: "gradients",
+        tensor: "gradient of exposures".to_owned(),
+        index,
+        value: value.to_string(),
+    })
 }
 
 /// The first parameter that is not finite.
 fn parameter_fault(part: &'static str, field: &Field) -> Option<Fault> {
-    let g = &field.gaussians;
-    let calibrations = field.identities.as_ref().map_or(&[][..], |rows| &rows.log_calibrations);
-    let (planes, mlp) = field.deformation.as_ref().map_or((&[][..], &[][..]), |d| (&d.planes, &d.mlp));
-    [
-        ("means", g.means.as_flattened()),
-        ("log_scales", g.log_scales.as_flattened()),
-        ("quaternions", g.quaternions.as_flattened()),
-        ("opacity_logits", &g.opacity_logits),
-        ("occupancy_logits", &g.occupancy_logits),
-        ("sh_coefficients", g.sh_coefficients.as_flattened()),
-        ("log_calibrations", calibrations),
-        ("planes", planes),
-        ("mlp", mlp),
-    ]
-    .into_iter()
-    .find_map(|(tensor, values)| fault(part, tensor, values, f32::MAX))
+    let mut tensors = field.tensors().into_iter();
+    tensors.find_map(|(parameter, values)| fault(part, parameter.name, values, f32::MAX))
 }
 
 /// The first moment that is not finite.
 fn moment_fault(optimiser: &Optimiser) -> Option<Fault> {
-    optimiser.groups().into_iter().find_map(|(_, moments)| {
+    optimiser.groups().iter().find_map(|(_, moments)| {
         fault("optimiser", "first moments", &moments.first, f32::MAX)
             .or_else(|| fault("optimiser", "second moments", &moments.second, f32::MAX))
     })
@@ -208,7 +176,10 @@ impl Trainer {
         [("colour loss", color_loss), ("instance loss", instance_loss)]
             .into_iter()
             .find(|(_, value)| !value.is_finite())
-            .map(|(tensor, value)| Fault { part: "losses", tensor, index: 0, value: value.to_string() })
+            .map(|(tensor, value)| {
+                let (tensor, value) = (tensor.to_owned(), value.to_string());
+                Fault { part: "losses", tensor, index: 0, value }
+            })
             .or_else(|| {
                 let v_color = self.scratch.v_color.pixels.as_flattened();
                 self.debug_validation.then(|| fault("losses", "gradient of colour", v_color, f32::MAX))?
@@ -311,7 +282,8 @@ mod tests {
 
     #[test]
     fn faults_read_well() {
-        let fault = Fault { part: "project", tensor: "splats", index: 17, value: f32::NAN.to_string() };
+        let fault =
+            Fault { part: "project", tensor: "splats".to_owned(), index: 17, value: f32::NAN.to_string() };
         assert_eq!(fault.to_string(), "project: splats[17] is NaN");
     }
 }

@@ -4,6 +4,7 @@
 pub(super) mod support;
 
 use cif_field::Field;
+use cif_field::parameters::OPACITY_LOGITS;
 use tempfile::TempDir;
 
 use self::support::{Scene, capture, small_config};
@@ -48,7 +49,7 @@ fn a_bad_gradient_of_an_exposure_moves_neither_exposures_nor_field() {
     let (result, events) = step(&mut trainer);
     result.unwrap();
     let [TrainEvent::RolledBack { fault, .. }] = &events[..] else { panic!("{events:?}") };
-    assert_eq!((fault.part, fault.tensor, fault.index), ("gradients", "gradient of exposures", 8));
+    assert_eq!((fault.part, fault.tensor.as_str(), fault.index), ("gradients", "gradient of exposures", 8));
     assert!(arrays(&trainer) == before);
     step(&mut trainer).0.unwrap();
     assert!(arrays(&trainer) != before, "the next step moves them");
@@ -73,7 +74,7 @@ fn a_bad_gradient_is_rolled_back_told_and_counted() {
         else {
             panic!("{events:?}")
         };
-        assert_eq!((*at, fault.tensor, fault.index), (iteration + 1, "gradient of means", 10));
+        assert_eq!((*at, fault.tensor.as_str(), fault.index), (iteration + 1, "gradient of means", 10));
         assert_eq!(fault.value, "NaN");
         // The next step is as good as any.
         let (result, events) = step(&mut trainer);
@@ -184,7 +185,7 @@ fn debug_validation_names_the_part_where_it_begins() {
     assert!(overflow.starts_with("gradients: gradient of means["), "{overflow}");
     let losses = sound.fault_of_view(f64::NAN, 0.0).unwrap().to_string();
     assert_eq!(losses, "losses: colour loss[0] is NaN");
-    let moments = fault_of(&|trainer| trainer.optimiser.opacity.second[1] = f32::INFINITY);
+    let moments = fault_of(&|trainer| trainer.optimiser.of(&OPACITY_LOGITS).second[1] = f32::INFINITY);
     assert_eq!(moments, "optimiser: second moments[1] is inf");
     let gradients = fault_of(&|trainer| trainer.gradients.gaussians.sh_coefficients[1][2] = f32::INFINITY);
     assert_eq!(gradients, "project backward: gradient of sh_coefficients[50] is inf");

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_field::checkpoint::StateTensor;
+use cif_field::parameters::{MLP, PLANES};
 use cif_field::{Field, Gaussians};
 use cif_geometry::PixelGrid;
 use cif_geometry::scalar::logit;
@@ -294,27 +295,20 @@ impl Trainer {
         let mut fresh = Gaussians::from_points(&positions, &colors)?;
         fresh.opacity_logits.fill(logit(OPACITY));
         fresh.occupancy_logits.fill(logit(self.config.instance.occupancy));
-        let g = &mut self.field.gaussians;
-        g.means.extend(fresh.means);
-        g.log_scales.extend(fresh.log_scales);
-        g.quaternions.extend(fresh.quaternions);
-        g.opacity_logits.extend(fresh.opacity_logits);
-        g.occupancy_logits.extend(fresh.occupancy_logits);
-        g.sh_coefficients.extend(fresh.sh_coefficients);
+        self.field.gaussians.append(&fresh);
         self.guidance.guides.push(Guide { track, reference });
-        self.guidance.guide_of.resize(g.means.len(), self.guidance.guides.len() as u16);
+        self.guidance.guide_of.resize(self.field.len(), self.guidance.guides.len() as u16);
         Ok(())
     }
 
     /// Teaches the deformation the paths before it sees an image.
     fn rehearse(&mut self) -> Result<(), TrainError> {
-        self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
+        self.optimiser = Optimiser::new(&self.field);
         self.gradients = Gradients::zeros(&self.field);
         if self.guidance.guides.is_empty() {
             return Ok(());
         }
-        let rates = StepRates::at(&self.config, Stage::Fine, 1, self.field.extent);
-        let rates = StepRates { planes: rates.planes, mlp: rates.mlp, ..StepRates::default() };
+        let rates = StepRates::at(&self.config, Stage::Fine, 1, &self.field).only(&[PLANES, MLP]);
         let weights = PlaneWeights {
             smoothness: self.config.loss.plane_smoothness,
             time_smoothness: self.config.loss.time_smoothness,
@@ -333,7 +327,10 @@ impl Trainer {
             self.renderer.displace_backward(&self.field, time, v, &mut self.gradients);
             self.optimiser
                 .step(&mut self.field, &mut self.gradients, &rates, &weights, false, &mut self.times)
-                .map_err(|tensor| TrainError::NotFinite { stage: Stage::Fine, iteration: 0, tensor })?;
+                .map_err(|parameter| {
+                    let tensor = parameter.name;
+                    TrainError::NotFinite { stage: Stage::Fine, iteration: 0, tensor }
+                })?;
         }
         Ok(())
     }

@@ -1,5 +1,6 @@
 //! The identity stage: counts label mass over the training frames and makes identity rows of it.
 
+use cif_field::parameters::OCCUPANCY_LOGITS;
 use cif_geometry::PixelGrid;
 use cif_geometry::scalar::{logit, sigmoid};
 use cif_render::cpu::IdentityCounts;
@@ -41,7 +42,7 @@ impl Trainer {
         };
         self.unseen = estimated.sources.iter().map(|source| *source != RowSource::Counted).collect();
         self.field.identities = Some(estimated.identities);
-        self.optimiser.start_identities(&self.field, self.config.adam.fresh_row_bias_correction);
+        self.optimiser.start_identities(&self.field);
         self.gradients = Gradients::zeros(&self.field);
         #[cfg(feature = "wgpu")]
         self.identities_changed();
@@ -101,8 +102,8 @@ impl Trainer {
                 (OccupancyStart::Constant, _) => logit(settings.occupancy),
             };
         }
-        self.optimiser.occupancy.reset_all();
-        self.optimiser.occupancy.steps = 0;
-        self.optimiser.occupancy.births.fill(0);
+        let moments = self.optimiser.of(&OCCUPANCY_LOGITS);
+        moments.reset_all();
+        moments.steps = 0;
     }
 }

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use cif_dataset::Dataset;
+use cif_field::parameters::LOG_CALIBRATIONS;
 use cif_field::{Field, Identities, Instance};
 use cif_render::UNLABELLED;
 
@@ -121,7 +122,7 @@ impl Trainer {
         self.field.instances = table.into_iter().map(|(_, instance)| instance).collect();
         if let Some(rows) = &mut self.field.identities {
             let origins = relabel(rows, new_label);
-            self.optimiser.calibration.gather(&origins);
+            self.optimiser.of(&LOG_CALIBRATIONS).gather(&origins);
         }
         if !self.label_pixels.is_empty() {
             let mut pixels = vec![0.0; count];

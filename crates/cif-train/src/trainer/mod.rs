@@ -206,7 +206,7 @@ impl Trainer {
         Ok(Self {
             plan: Plan { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
             progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
-            optimiser: Optimiser::new(&field, config.adam.fresh_row_bias_correction),
+            optimiser: Optimiser::new(&field),
             statistics: DensifyStatistics::zeros(n),
             unseen: Vec::new(),
             label_pixels: Vec::new(),

@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use cif_field::deformation::Deformation;
 use cif_field::deformation::evaluate::Deltas;
+use cif_field::deformation::{Deformation, HeadKind};
 use cif_field::{Field, Gaussians};
 
 /// Times at which the network is probed.
@@ -113,7 +113,7 @@ fn set_still(field: &mut Field, motions: &[Motion], to: bool, wanted: impl Fn(us
     let mut changed = 0;
     for (row, motion) in motions.iter().enumerate() {
         if deformation.still[row] != to && wanted(row) {
-            add(&mut field.gaussians, row, &motion.mean, if to { 1.0 } else { -1.0 });
+            motion.mean.add_to(&mut field.gaussians, row, if to { 1.0 } else { -1.0 });
             deformation.still[row] = to;
             changed += 1;
         }
@@ -147,14 +147,11 @@ pub(super) fn probe(
 
 fn motion(deltas: &[&Deltas<f32>], quaternion_norm: f32) -> Motion {
     let share = 1.0 / deltas.len() as f32;
-    let mut mean =
-        Deltas { position: [0.0; 3], scale: [0.0; 3], rotation: [0.0; 4], opacity: 0.0, sh: [0.0; 48] };
-    for delta in deltas {
-        accumulate(&mut mean.position, &delta.position, share);
-        accumulate(&mut mean.scale, &delta.scale, share);
-        accumulate(&mut mean.rotation, &delta.rotation, share);
-        mean.opacity += share * delta.opacity;
-        accumulate(&mut mean.sh, &delta.sh, share);
+    let mut mean = Deltas::zero();
+    for (head, delta) in
+        HeadKind::ALL.into_iter().flat_map(|head| deltas.iter().map(move |delta| (head, delta)))
+    {
+        accumulate(mean.output_mut(head), delta.output(head), share);
     }
     let (mut displacement, mut shape) = (0.0_f32, 0.0_f32);
     for delta in deltas {
@@ -168,21 +165,8 @@ fn motion(deltas: &[&Deltas<f32>], quaternion_norm: f32) -> Motion {
     Motion { mean, displacement, shape }
 }
 
-/// Adds deltas to the canonical parameters of a row.
-fn add(gaussians: &mut Gaussians, row: usize, deltas: &Deltas<f32>, sign: f32) {
-    accumulate(&mut gaussians.means[row], &deltas.position, sign);
-    accumulate(&mut gaussians.log_scales[row], &deltas.scale, sign);
-    accumulate(&mut gaussians.quaternions[row], &deltas.rotation, sign);
-    gaussians.opacity_logits[row] += sign * deltas.opacity;
-    accumulate(&mut gaussians.sh_coefficients[row], &deltas.sh, sign);
-}
-
 /// Adds values, weighted, to totals.
-pub(super) fn accumulate<const LENGTH: usize>(
-    totals: &mut [f32; LENGTH],
-    values: &[f32; LENGTH],
-    weight: f32,
-) {
+pub(super) fn accumulate(totals: &mut [f32], values: &[f32], weight: f32) {
     for (total, value) in totals.iter_mut().zip(values) {
         *total += weight * value;
     }

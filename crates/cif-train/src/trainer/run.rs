@@ -301,7 +301,7 @@ impl Trainer {
             self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
         }
         self.start_guidance()?;
-        self.optimiser = Optimiser::new(&self.field, self.config.adam.fresh_row_bias_correction);
+        self.optimiser = Optimiser::new(&self.field);
         self.gradients = Gradients::zeros(&self.field);
         Ok(())
     }

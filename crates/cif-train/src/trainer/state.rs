@@ -5,7 +5,9 @@ use std::collections::BTreeMap;
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
 use cif_field::checkpoint::{Checkpoint, StateTensor, TrainingState};
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::Value;
 
 use super::Trainer;
 use super::evaluate::Yardstick;
@@ -25,6 +27,7 @@ const VERSION: u32 = 1;
 #[serde(deny_unknown_fields)]
 pub(super) struct State {
     version: u32,
+    #[serde(deserialize_with = "recorded")]
     pub(super) config: TrainConfig,
     pub(super) progress: Progress,
     capture: Capture,
@@ -41,6 +44,10 @@ pub(super) struct Capture {
     times: usize,
     image_size: [u32; 2],
     instance_ids: Vec<u16>,
+}
+
+fn recorded<'de, D: Deserializer<'de>>(settings: D) -> Result<TrainConfig, D::Error> {
+    TrainConfig::recorded(Value::deserialize(settings)?).map_err(D::Error::custom)
 }
 
 impl State {
@@ -130,10 +137,10 @@ impl Trainer {
     fn training_state(&self) -> TrainingState {
         let mut tensors = BTreeMap::new();
         let mut adam_steps = BTreeMap::new();
-        for (name, moments) in self.optimiser.groups() {
+        for (parameter, moments) in self.optimiser.groups() {
+            let name = parameter.rate;
             tensors.insert(format!("adam.{name}.first"), StateTensor::F32(moments.first.clone()));
             tensors.insert(format!("adam.{name}.second"), StateTensor::F32(moments.second.clone()));
-            tensors.insert(format!("adam.{name}.births"), StateTensor::U32(moments.births.clone()));
             adam_steps.insert(name.to_owned(), moments.steps);
         }
         let statistics = &self.statistics;
@@ -202,11 +209,11 @@ pub(super) fn restore(
     tensors: &mut BTreeMap<String, StateTensor>,
     steps: &BTreeMap<String, u32>,
 ) -> Result<(), TrainError> {
-    for (name, moments) in optimiser.groups_mut() {
+    for (parameter, moments) in optimiser.groups_mut() {
+        let name = parameter.rate;
         let len = moments.first.len();
         moments.first = floats(tensors, &format!("adam.{name}.first"), len)?;
         moments.second = floats(tensors, &format!("adam.{name}.second"), len)?;
-        moments.births = counters(tensors, &format!("adam.{name}.births"), moments.births.len())?;
         moments.steps =
             *steps.get(name).ok_or_else(|| unusable(format!("the step count of {name} is missing")))?;
     }

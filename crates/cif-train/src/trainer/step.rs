@@ -2,6 +2,7 @@
 
 use std::time::Instant;
 
+use cif_field::parameters::{MLP, OPACITY_LOGITS};
 use cif_geometry::scalar::logit;
 use cif_geometry::{PixelGrid, quaternion};
 use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
@@ -202,7 +203,7 @@ impl Trainer {
             loss.unsupported = Some(unsupported / labelled as f64);
             loss.total += f64::from(self.config.loss.lambda_instance) * instance_loss;
         }
-        let rates = StepRates::at(&self.config, stage, iteration, self.field.extent);
+        let rates = StepRates::at(&self.config, stage, iteration, &self.field);
         let weights = PlaneWeights {
             smoothness: self.config.loss.plane_smoothness,
             time_smoothness: self.config.loss.time_smoothness,
@@ -224,7 +225,7 @@ impl Trainer {
                     self.config.adam.visible_rows_only,
                     &mut self.times,
                 )
-                .map_err(|tensor| self.not_finite(tensor))?;
+                .map_err(|parameter| self.not_finite(parameter.name))?;
             fault = self.fault_after_step();
         }
         if let Some(exposures) = &mut self.progress.exposures {
@@ -288,10 +289,10 @@ impl Trainer {
         work: impl FnOnce(&mut Self, &mut Vec<TrainEvent>) -> Result<(), TrainError>,
     ) -> Result<(), TrainError> {
         let told = events.len();
-        let before = (self.field.clone(), self.optimiser.mlp.clone(), self.progress.still_rung);
+        let before = (self.field.clone(), self.optimiser.of(&MLP).clone(), self.progress.still_rung);
         let result = work(self, events);
         if result.is_err() {
-            (self.field, self.optimiser.mlp, self.progress.still_rung) = before;
+            (self.field, *self.optimiser.of(&MLP), self.progress.still_rung) = before;
             self.gradients = Gradients::zeros(&self.field);
             events.truncate(told);
         }
@@ -363,7 +364,7 @@ impl Trainer {
         }
         if falls_on(iteration, config.opacity_reset_every) {
             reset_opacities(&mut self.field.gaussians, config.opacity_reset_to);
-            self.optimiser.opacity.reset_all();
+            self.optimiser.of(&OPACITY_LOGITS).reset_all();
             self.progress.opacities_were_reset = true;
         }
         if cloned + split + pruned > 0 {
@@ -381,7 +382,7 @@ impl Trainer {
         let follows = false;
         if follows {
             #[cfg(feature = "wgpu")]
-            self.optimiser.gather_births(&change.origins);
+            self.optimiser.resize(change.origins.len());
         } else {
             self.optimiser.gather(&change.origins);
         }

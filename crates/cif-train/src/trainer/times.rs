@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use cif_field::parameters::{MLP, PLANES, Parameter};
 use cif_render::cpu::{StageTimes, ViewStatistics};
 use serde::{Deserialize, Serialize};
 
@@ -97,6 +98,15 @@ impl StepTimes {
         let known: Duration = rows.iter().map(|(_, time)| *time).sum();
         rows.push(("other", self.total.saturating_sub(known)));
         rows
+    }
+
+    /// Time of the optimiser's step of a parameter.
+    pub(super) fn optimiser(&mut self, parameter: &Parameter) -> &mut Duration {
+        match *parameter {
+            PLANES => &mut self.optimiser_planes,
+            MLP => &mut self.optimiser_mlp,
+            _ => &mut self.optimiser_gaussians,
+        }
     }
 
     /// Adds the renderer's times of a step.

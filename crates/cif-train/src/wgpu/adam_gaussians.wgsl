@@ -14,36 +14,12 @@
 @group(0) @binding(5) var<storage, read> screen: array<vec4f>;
 // The second is not 0 while steps wait for the host.
 @group(0) @binding(6) var<storage, read_write> faults: array<atomic<u32>>;
-// Steps after which rows were made: centres, log-scales, quaternions, opacity, occupancy, coefficients.
-@group(0) @binding(7) var<storage, read> births: array<u32>;
-// Corrections of the first and second moment by age.
-@group(0) @binding(8) var<storage, read> corrections: array<vec2f>;
 
 #import adam
 
 // Whether a Gaussian takes part at all.
 fn takes_part(row: u32) -> bool {
     return atomicLoad(&faults[1]) == 0u && (rates.visible_only == 0u || screen[row].w > 0.0);
-}
-
-// What the rates of a row lack, where rows have their own corrections.
-fn correction(row: u32, group: u32, steps: u32) -> vec2f {
-    if rates.own_corrections == 0u {
-        return vec2f(1.0);
-    }
-    let age = steps - min(births[row * BIRTH_GROUPS + group], steps);
-    return corrections[min(age, arrayLength(&corrections) - 1u)];
-}
-
-// Group of a float of the geometry.
-fn group_of(component: u32) -> u32 {
-    if component < 3u {
-        return 0u;
-    }
-    if component < 8u {
-        return select(select(1u, 4u, component == 7u), 3u, component == 3u);
-    }
-    return 2u;
 }
 
 // Moves a float.
@@ -66,26 +42,24 @@ fn adam_geometry(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_
     if row >= rates.gaussians {
         return;
     }
-    let base = row * 12u;
+    let base = row * GEOMETRY_FLOATS;
     let taking_part = takes_part(row);
-    for (var k = 0u; k < 12u; k++) {
-        let bias = correction(row, group_of(k), rates.geometry_steps[k / 4u][k % 4u]);
-        step(
-            base + k,
-            select(0.0, rates.geometry[k / 4u][k % 4u] * bias.x, taking_part),
-            rates.geometry_second[k / 4u][k % 4u] * bias.y,
-        );
+    for (var k = 0u; k < GEOMETRY_FLOATS; k++) {
+        let rate = select(0.0, rates.geometry[k / 4u][k % 4u], taking_part);
+        step(base + k, rate, rates.geometry_second[k / 4u][k % 4u]);
     }
     if atomicLoad(&faults[1]) != 0u {
         return;
     }
-    parameters[base + 7u] = clamp(parameters[base + 7u], rates.lowest_occupancy, rates.highest_occupancy);
+    let occupancy = base + OCCUPANCY_COLUMN;
+    parameters[occupancy] = clamp(parameters[occupancy], rates.lowest_occupancy, rates.highest_occupancy);
     if rates.renormalise != 0u {
-        let q = vec4f(parameters[base + 8u], parameters[base + 9u], parameters[base + 10u], parameters[base + 11u]);
+        let first = base + QUATERNION_COLUMN;
+        let q = vec4f(parameters[first], parameters[first + 1u], parameters[first + 2u], parameters[first + 3u]);
         let norm = sqrt(dot(q, q));
         if norm >= MIN_NORM && is_finite(norm) {
             for (var k = 0u; k < 4u; k++) {
-                parameters[base + 8u + k] = q[k] / norm;
+                parameters[first + k] = q[k] / norm;
             }
         }
     }
@@ -101,6 +75,5 @@ fn adam_sh(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_index)
     let k = at % SH_FLOATS;
     let rate = select(rates.sh_rest, rates.sh_base, k < 3u);
     let moves = k < rates.sh_active && takes_part(at / SH_FLOATS);
-    let bias = correction(at / SH_FLOATS, BIRTH_GROUPS - 1u, rates.sh_steps);
-    step(at, select(0.0, rate * bias.x, moves), rates.sh_second * bias.y);
+    step(at, select(0.0, rate, moves), rates.sh_second);
 }

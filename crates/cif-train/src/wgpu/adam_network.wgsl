@@ -13,10 +13,6 @@
 @group(0) @binding(4) var<storage, read_write> second_moments: array<f32>;
 // The second is not 0 while steps wait for the host.
 @group(0) @binding(5) var<storage, read_write> faults: array<atomic<u32>>;
-// Steps after which floats were made, where they have their own corrections.
-@group(0) @binding(6) var<storage, read> births: array<u32>;
-// Corrections of the first and second moment by age.
-@group(0) @binding(7) var<storage, read> corrections: array<vec2f>;
 
 #import adam
 
@@ -34,15 +30,7 @@ fn adam_network(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_i
     if rates.rate <= 0.0 || atomicLoad(&faults[1]) != 0u {
         return;
     }
-    var rate = rates.rate;
-    var second = rates.second;
-    if rates.own_corrections != 0u {
-        let age = rates.steps - min(births[at], rates.steps);
-        let bias = corrections[min(age, arrayLength(&corrections) - 1u)];
-        rate *= bias.x;
-        second *= bias.y;
-    }
-    let moved = move_by(parameters[at], g, first_moments[at], second_moments[at], rate, second);
+    let moved = move_by(parameters[at], g, first_moments[at], second_moments[at], rates.rate, rates.second);
     parameters[at] = clamp(moved.parameter, -rates.limit, rates.limit);
     first_moments[at] = moved.first;
     second_moments[at] = moved.second;

@@ -1,11 +1,13 @@
 //! The WGSL files of training: their bindings and entry points, and what they share with Rust.
 
 use cif_field::gaussians::SH_FLOATS;
+use cif_field::parameters::{OCCUPANCY_LOGITS, PLANES, Parameter, QUATERNIONS, TABLE};
 use cif_geometry::quaternion::MIN_NORM;
 use cif_render::constants::{MIN_LABEL_PROBABILITY, TILE};
 use cif_render::wgpu::Access::{Read, ReadWrite, Uniform};
-use cif_render::wgpu::deform::{FIXED_POINT, PLANES_FAULT};
+use cif_render::wgpu::deform::FIXED_POINT;
 use cif_render::wgpu::faults::FAULTS;
+use cif_render::wgpu::gaussians::{GEOMETRY_FLOATS, geometry_column};
 use cif_render::wgpu::view::INSTANCE_PASS;
 use cif_render::wgpu::{
     Constant, Gpu, GpuError, GpuStatistics, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet,
@@ -75,14 +77,10 @@ cif_render::shared_struct! {
         pub lowest_occupancy: f32,
         /// As above.
         pub highest_occupancy: f32,
-        /// 1 when rows have corrections of their own age, which rates then lack.
-        pub own_corrections: u32,
-        /// Steps done of the coefficients, this one included.
-        pub sh_steps: u32,
         /// Pads to 16 bytes.
         pub unused: u32,
-        /// Steps done of the geometry, this one included.
-        pub geometry_steps: [[u32; 4]; 3],
+        /// As above.
+        pub unused_too: [u32; 2],
     }
 }
 
@@ -99,12 +97,10 @@ cif_render::shared_struct! {
         pub second: f32,
         /// Parameters stay within plus and minus this.
         pub limit: f32,
-        /// 1 when floats have corrections of their own age, which the rate then lacks.
-        pub own_corrections: u32,
-        /// Steps done, this one included.
-        pub steps: u32,
         /// Pads to 16 bytes.
         pub unused: u32,
+        /// As above.
+        pub unused_too: [u32; 2],
     }
 }
 
@@ -186,10 +182,6 @@ cif_render::shared_struct! {
     }
 }
 
-/// Groups of a Gaussian whose rows remember when they were made: centres, log-scales, quaternions, opacity, occupancy,
-/// coefficients.
-pub const BIRTH_GROUPS: usize = 6;
-
 /// Bit of an origin that marks a fresh row.
 pub const FRESH: u32 = 1 << 31;
 
@@ -226,25 +218,25 @@ cif_render::shared_struct! {
     }
 }
 
-/// What the lowest bit of a fault word stands for: the part of the step and the name that the CPU has for it.
+/// Part of the step and name, as the CPU has them, of the lowest bit of a fault word.
 #[must_use]
-pub fn fault_name(found: u32) -> (&'static str, &'static str) {
-    let tensor = match 1 << found.trailing_zeros().min(31) {
-        fault::PLANES => "gradient of planes",
-        fault::MEANS => "gradient of means",
-        fault::LOG_SCALES => "gradient of log_scales",
-        fault::QUATERNIONS => "gradient of quaternions",
-        fault::OPACITY => "gradient of opacity_logits",
-        fault::OCCUPANCY => "gradient of occupancy_logits",
-        fault::SH => "gradient of sh_coefficients",
-        fault::CALIBRATIONS => "gradient of log_calibrations",
-        fault::MLP => "gradient of mlp",
-        fault::EXPOSURES => "gradient of exposures",
-        fault::COLOR_LOSS => return ("losses", "colour loss"),
-        fault::INSTANCE_LOSS => return ("losses", "instance loss"),
-        _ => return ("optimiser", "learning rate"),
+pub fn fault_name(found: u32) -> (&'static str, String) {
+    let lowest = found.trailing_zeros();
+    if let Some(parameter) = TABLE.get(lowest as usize) {
+        return ("gradients", format!("gradient of {}", parameter.name));
+    }
+    let (part, name) = match 1_u32.checked_shl(lowest) {
+        Some(fault::EXPOSURES) => ("gradients", "gradient of exposures"),
+        Some(fault::COLOR_LOSS) => ("losses", "colour loss"),
+        Some(fault::INSTANCE_LOSS) => ("losses", "instance loss"),
+        _ => ("optimiser", "learning rate"),
     };
-    ("gradients", tensor)
+    (part, name.to_owned())
+}
+
+/// First float of a parameter in the geometry of a Gaussian.
+fn column(parameter: &Parameter) -> Constant {
+    Constant::Unsigned(geometry_column(parameter).expect("a parameter of the geometry") as u32)
 }
 
 const CONSTANTS: Snippet = Snippet {
@@ -263,7 +255,9 @@ const CONSTANTS: Snippet = Snippet {
             ("SSIM_C2", Constant::Float(C2)),
             ("NO_ROTATION", Constant::Float(NO_ROTATION as f32)),
             ("SH_FLOATS", Constant::Unsigned(SH_FLOATS as u32)),
-            ("BIRTH_GROUPS", Constant::Unsigned(BIRTH_GROUPS as u32)),
+            ("GEOMETRY_FLOATS", Constant::Unsigned(GEOMETRY_FLOATS as u32)),
+            ("OCCUPANCY_COLUMN", column(&OCCUPANCY_LOGITS)),
+            ("QUATERNION_COLUMN", column(&QUATERNIONS)),
             ("FRESH", Constant::Unsigned(FRESH)),
             ("RESTARTED", Constant::Unsigned(RESTARTED)),
             ("EXPOSURE_FLOATS", Constant::Unsigned(EXPOSURE_FLOATS as u32)),
@@ -272,7 +266,7 @@ const CONSTANTS: Snippet = Snippet {
             ("JUDGED_SPACING", Constant::Unsigned(JUDGED_SPACING)),
             ("JUDGED_COLUMN", Constant::Unsigned(FIRST_JUDGED.0)),
             ("JUDGED_ROW", Constant::Unsigned(FIRST_JUDGED.1)),
-            ("PLANES_FAULT", Constant::Unsigned(PLANES_FAULT)),
+            ("PLANES_FAULT", Constant::Unsigned(fault::bit(&PLANES))),
             ("MAX_WORKGROUPS", Constant::Unsigned(MAX_WORKGROUPS)),
         ])
     },
@@ -346,7 +340,7 @@ pub const ADAM_GAUSSIANS: Module = Module {
     name: "adam_gaussians",
     text: include_str!("adam_gaussians.wgsl"),
     imports: &[CONSTANTS, GAUSSIAN_RATES, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, ReadWrite, Read, Read],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, ReadWrite],
     entries: &["adam_geometry", "adam_sh"],
 };
 
@@ -355,7 +349,7 @@ pub const ADAM_NETWORK: Module = Module {
     name: "adam_network",
     text: include_str!("adam_network.wgsl"),
     imports: &[CONSTANTS, GROUP_RATES, ADAM],
-    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read, Read],
+    bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["adam_network"],
 };
 

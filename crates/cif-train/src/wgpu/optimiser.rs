@@ -2,7 +2,9 @@
 
 use cif_field::DeformationConfig;
 use cif_field::gaussians::SH_FLOATS;
+use cif_field::parameters::{LOG_CALIBRATIONS, Parameter, SH_COEFFICIENTS};
 use cif_render::wgpu::deform::{DeformationGradients, SPLITS};
+use cif_render::wgpu::gaussians::COLUMNS;
 use cif_render::wgpu::{
     Commands, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuVec, Kernel, Uniform, workgroups,
 };
@@ -11,98 +13,96 @@ use super::kernels::{
     ACCUMULATE, ADAM_GAUSSIANS, ADAM_NETWORK, ADAM_PLANES, Accumulation, GaussianRates, GroupRates, IDENTITY,
     PlaneRates, entries, fault,
 };
-use crate::adam::{BiasCorrection, PlaneWeights, factors};
+use crate::adam::{BiasCorrection, PlaneWeights, RowRates, factors};
 
-/// Ages with corrections of their own; older ones have none left in single precision.
-const AGES: usize = 1 << 15;
-
-/// Rate of a group and the steps that it has done with this one.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
+/// Learning rates of a parameter, and the steps that it has done with this one.
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct GroupStep {
-    /// Learning rate; 0 keeps still.
-    pub rate: f32,
+    /// Learning rates; 0 keeps still.
+    pub rates: RowRates,
     /// Steps done, this one included.
     pub steps: u32,
 }
 
-impl GroupStep {
-    /// Rate and correction of the first moment together, and correction of the second.
-    pub(super) fn corrected(self) -> (f32, f32) {
-        self.corrected_unless(false)
-    }
-
-    /// The same, but no corrections where rows have their `own`.
-    fn corrected_unless(self, own: bool) -> (f32, f32) {
-        if own {
-            return (self.rate, 1.0);
-        }
-        let bias = BiasCorrection::after(self.steps.max(1));
-        (self.rate * bias.first, bias.second)
+impl Default for GroupStep {
+    fn default() -> Self {
+        Self::uniform(0.0, 0)
     }
 }
 
-/// The step of everything that Gaussians have.
+impl GroupStep {
+    /// One rate for all floats.
+    #[must_use]
+    pub fn uniform(rate: f32, steps: u32) -> Self {
+        Self { rates: RowRates::Uniform(rate), steps }
+    }
+
+    /// Rate of the first floats with the correction of the first moment, and correction of the second.
+    pub(super) fn corrected(self) -> (f32, f32) {
+        let bias = BiasCorrection::after(self.steps.max(1));
+        let (RowRates::Uniform(rate) | RowRates::Split { base: rate, .. }) = self.rates;
+        (rate * bias.first, bias.second)
+    }
+}
+
+/// The step of every parameter that moves.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct GroupSteps(pub Vec<(Parameter, GroupStep)>);
+
+impl GroupSteps {
+    /// Step of a parameter; it keeps still where it is not listed.
+    #[must_use]
+    pub fn of(&self, parameter: &Parameter) -> GroupStep {
+        let listed = self.0.iter().find(|(other, _)| other == parameter);
+        listed.map(|(_, step)| *step).unwrap_or_default()
+    }
+
+    /// Counts one step less of the parameters whose bits of the fault word are set.
+    pub fn uncount(&mut self, bits: u32) {
+        for (parameter, step) in &mut self.0 {
+            step.steps -= u32::from(bits & fault::bit(parameter) != 0);
+        }
+    }
+}
+
+/// What the step of the Gaussians depends on beside their rates.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct GaussianStep {
-    /// Centres.
-    pub means: GroupStep,
-    /// Log-scales.
-    pub log_scales: GroupStep,
-    /// Quaternions.
-    pub quaternions: GroupStep,
-    /// Opacity logits.
-    pub opacity: GroupStep,
-    /// Occupancy logits.
-    pub occupancy: GroupStep,
-    /// Spherical harmonics, band 0.
-    pub sh: GroupStep,
-    /// Rate of the other bands.
-    pub sh_rest: f32,
-    /// Coefficients that move, times three.
-    pub sh_active: usize,
     /// Only visible rows move.
     pub visible_only: bool,
     /// Raw quaternions become unit ones.
     pub renormalise: bool,
     /// Limits of the occupancy logit.
     pub occupancy_limits: Option<[f32; 2]>,
-    /// Rows correct their bias from when they were made.
-    pub own_corrections: bool,
 }
 
 impl GaussianStep {
-    fn rates(&self, gaussians: usize) -> GaussianRates {
-        let groups = [
-            (self.means, 0..3),
-            (self.opacity, 3..4),
-            (self.log_scales, 4..7),
-            (self.occupancy, 7..8),
-            (self.quaternions, 8..12),
-        ];
+    fn rates(&self, groups: &GroupSteps, gaussians: usize) -> GaussianRates {
         let mut rates = GaussianRates::default();
-        let own = self.own_corrections;
-        for (group, components) in groups {
-            let (rate, second) = group.corrected_unless(own);
-            for k in components {
-                rates.geometry_steps[k / 4][k % 4] = group.steps;
+        for (parameter, first) in COLUMNS {
+            let (rate, second) = groups.of(&parameter).corrected();
+            for k in first..first + parameter.width() {
                 rates.geometry[k / 4][k % 4] = rate;
                 rates.geometry_second[k / 4][k % 4] = second;
             }
         }
-        let (sh_base, sh_second) = self.sh.corrected_unless(own);
+        let sh = groups.of(&SH_COEFFICIENTS);
+        let (sh_base, sh_second) = sh.corrected();
+        let (rest, sh_active) = match sh.rates {
+            RowRates::Uniform(rate) => (rate, SH_FLOATS),
+            RowRates::Split { rest, active, .. } => (rest, active),
+        };
         let [low, high] = self.occupancy_limits.unwrap_or([f32::MIN, f32::MAX]);
         GaussianRates {
             gaussians: gaussians as u32,
             visible_only: u32::from(self.visible_only),
             renormalise: u32::from(self.renormalise),
-            sh_active: self.sh_active as u32,
+            sh_active: sh_active as u32,
             sh_base,
-            sh_rest: GroupStep { rate: self.sh_rest, ..self.sh }.corrected_unless(own).0,
+            sh_rest: GroupStep { rates: RowRates::Uniform(rest), ..sh }.corrected().0,
             sh_second,
             lowest_occupancy: low,
             highest_occupancy: high,
-            own_corrections: u32::from(own),
-            sh_steps: self.sh.steps,
             ..rates
         }
     }
@@ -138,10 +138,6 @@ pub struct GpuOptimiser {
     calibration_rates: Uniform<GroupRates>,
     plane_rates: Uniform<PlaneRates>,
     plane_places: GpuVec<[u32; 4]>,
-    /// By age, where any row has its own.
-    corrections: GpuVec<[f32; 2]>,
-    /// Of what has no rows of its own.
-    no_births: GpuVec<u32>,
     counts: [Uniform<Accumulation>; 6],
     geometry: Kernel,
     sh: Kernel,
@@ -179,8 +175,6 @@ impl GpuOptimiser {
             calibration_rates: Uniform::new(gpu, "rates of the calibrations", &GroupRates::default()),
             plane_rates: Uniform::new(gpu, "rates of the planes", &PlaneRates::default()),
             plane_places: GpuVec::zeros(gpu, "places of the planes", 0)?,
-            corrections: GpuVec::zeros(gpu, "corrections by age", 0)?,
-            no_births: GpuVec::zeros(gpu, "no births", 0)?,
             counts: std::array::from_fn(|_| Uniform::new(gpu, "count", &Accumulation::default())),
             geometry,
             sh,
@@ -193,23 +187,11 @@ impl GpuOptimiser {
         })
     }
 
-    /// Gets ready for rows that correct their bias from when they were made.
-    ///
-    /// # Errors
-    /// When the device is out of memory.
-    pub fn allow_own_corrections(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
-        // Nothing has an age of 0 when it moves.
-        let bias = |age: usize| BiasCorrection::after(age.max(1) as u32);
-        let by_age: Vec<[f32; 2]> = (0..AGES).map(bias).map(|bias| [bias.first, bias.second]).collect();
-        self.corrections.replace(gpu, &by_age)?;
-        Ok(())
-    }
-
     fn count(&self, gpu: &Gpu, count: Count, value: usize) -> &Uniform<Accumulation> {
         let uniform = &self.counts[count as usize];
         let fault = match count {
-            Count::Sh => fault::SH,
-            Count::Calibrations => fault::CALIBRATIONS,
+            Count::Sh => fault::bit(&SH_COEFFICIENTS),
+            Count::Calibrations => fault::bit(&LOG_CALIBRATIONS),
             _ => 0,
         };
         let is_geometry = u32::from(matches!(count, Count::Geometry));
@@ -312,20 +294,19 @@ impl GpuOptimiser {
     }
 
     /// Records the step of all Gaussians; gradients become zero. While the second word of `faults` makes steps wait,
-    /// nothing moves here and in the steps of the other groups. `moments` are the first and the second, `births` the
-    /// steps after which rows were made, `[N, BIRTH_GROUPS]`, or nothing.
+    /// nothing moves here and in the steps of the other groups. `moments` are the first and the second.
     pub fn step_gaussians(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
-        step: &GaussianStep,
+        (step, groups): (&GaussianStep, &GroupSteps),
         (parameters, gradients): (&GpuGaussians, &GpuGaussians),
-        (moments, births): (&[GpuGaussians; 2], &GpuVec<u32>),
+        moments: &[GpuGaussians; 2],
         screen: &GpuVec<[f32; 4]>,
         faults: &GpuVec<u32>,
     ) {
         let n = parameters.len();
-        self.gaussian_rates.write(gpu, &step.rates(n));
+        self.gaussian_rates.write(gpu, &step.rates(groups, n));
         let [first, second] = moments;
         let geometry = self.geometry.bind(
             gpu,
@@ -337,8 +318,6 @@ impl GpuOptimiser {
                 second.geometry.binding(),
                 screen.binding(),
                 faults.binding(),
-                births.binding(),
-                self.corrections.binding(),
             ],
         );
         let sh = self.sh.bind(
@@ -351,8 +330,6 @@ impl GpuOptimiser {
                 second.sh.binding(),
                 screen.binding(),
                 faults.binding(),
-                births.binding(),
-                self.corrections.binding(),
             ],
         );
         commands.stage("optimiser: Gaussians", |stage| {
@@ -361,32 +338,21 @@ impl GpuOptimiser {
         });
     }
 
-    /// Records the step of the calibrations, which stay within plus and minus `limit`; they correct their bias from
-    /// when they were made where `births` are given.
+    /// Records the step of the calibrations, which stay within plus and minus `limit`.
     pub fn step_calibrations(
         &self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         (step, limit): (GroupStep, f32),
         (parameters, gradients): (&GpuVec<f32>, &GpuVec<f32>),
-        (moments, births): (&GpuMoments, &GpuVec<u32>),
+        moments: &GpuMoments,
         faults: &GpuVec<u32>,
     ) {
-        let own = !births.is_empty();
-        let (rate, second) = step.corrected_unless(own);
+        let (rate, second) = step.corrected();
         let floats = parameters.len();
         self.calibration_rates.write(
             gpu,
-            &GroupRates {
-                floats: floats as u32,
-                parts: 1,
-                rate,
-                second,
-                limit,
-                own_corrections: u32::from(own),
-                steps: step.steps,
-                ..GroupRates::default()
-            },
+            &GroupRates { floats: floats as u32, parts: 1, rate, second, limit, ..GroupRates::default() },
         );
         let group = self.network.bind(
             gpu,
@@ -397,8 +363,6 @@ impl GpuOptimiser {
                 moments.first.binding(),
                 moments.second.binding(),
                 faults.binding(),
-                births.binding(),
-                self.corrections.binding(),
             ],
         );
         commands.stage("optimiser: Gaussians", |s| s.dispatch(&self.network, &group, workgroups(floats, 64)));
@@ -456,8 +420,6 @@ impl GpuOptimiser {
                 of_network.first.binding(),
                 of_network.second.binding(),
                 faults.binding(),
-                self.no_births.binding(),
-                self.corrections.binding(),
             ],
         );
         commands.stage("optimiser: planes", |stage| {

@@ -11,10 +11,16 @@ use cif_render::wgpu::{Commands, Gpu, GpuDeformation, GpuGaussians, GpuStatistic
 
 use super::exposure::{CameraExposures, GpuExposure};
 use super::judge::GpuJudge;
+use cif_field::parameters::{
+    LOG_CALIBRATIONS, LOG_SCALES, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, Parameter,
+    QUATERNIONS, SH_COEFFICIENTS,
+};
+use cif_render::wgpu::faults::bit;
+
 use super::kernels::{Judgement, LAYOUTS, MODULES, fault, fault_name};
 use super::losses::{GpuLosses, GpuTarget, LossWeights, ViewLoss};
 use super::motion::GpuMotion;
-use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep};
+use super::optimiser::{GaussianStep, GpuMoments, GpuOptimiser, GroupStep, GroupSteps};
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
 use crate::densify::DensifyStatistics;
 use crate::exposure::{Exposures, RATES, WIDTH};
@@ -49,10 +55,13 @@ fn every_file_is_valid_and_lies_as_in_rust() {
 
 #[test]
 fn faults_have_the_names_of_the_cpu() {
-    assert_eq!(fault_name(fault::SH | fault::MLP), ("gradients", "gradient of sh_coefficients"));
-    assert_eq!(fault_name(fault::EXPOSURES), ("gradients", "gradient of exposures"));
-    assert_eq!(fault_name(1), ("gradients", "gradient of planes"));
-    assert_eq!(fault_name(fault::INSTANCE_LOSS), ("losses", "instance loss"));
+    assert_eq!(
+        fault_name(bit(&SH_COEFFICIENTS) | bit(&MLP)),
+        ("gradients", "gradient of sh_coefficients".to_owned())
+    );
+    assert_eq!(fault_name(fault::EXPOSURES), ("gradients", "gradient of exposures".to_owned()));
+    assert_eq!(fault_name(bit(&PLANES)), ("gradients", "gradient of planes".to_owned()));
+    assert_eq!(fault_name(fault::INSTANCE_LOSS), ("losses", "instance loss".to_owned()));
     assert_eq!(fault::MAX_GRADIENT, crate::trainer::MAX_GRADIENT, "both backends refuse the same gradients");
 }
 
@@ -269,20 +278,11 @@ fn some_gaussians(n: usize, s: f32, size: f32) -> Gaussians {
 }
 
 fn step_of(rate: f32, steps: u32) -> GroupStep {
-    GroupStep { rate, steps }
+    GroupStep::uniform(rate, steps)
 }
 
 #[test]
 fn gaussians_move_as_on_the_cpu() {
-    gaussians_move(false);
-}
-
-#[test]
-fn rows_made_later_correct_their_bias_as_on_the_cpu() {
-    gaussians_move(true);
-}
-
-fn gaussians_move(own_corrections: bool) {
     let Some(gpu) = testing::gpu() else { return };
     let n = 150;
     let start = some_gaussians(n, 0.31, 1.0);
@@ -292,100 +292,53 @@ fn gaussians_move(own_corrections: bool) {
     let screen: Vec<[f32; 4]> = (0..n).map(|r| [0.0, 0.0, 1.0, f32::from(r % 4 != 1)]).collect();
     let on_device = GpuVec::from_slice(&gpu, "screen", &screen).unwrap();
     let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
-    let mut optimiser = GpuOptimiser::new(&gpu).unwrap();
-    let mut births = GpuVec::<u32>::zeros(&gpu, "births", 0).unwrap();
-    if own_corrections {
-        optimiser.allow_own_corrections(&gpu).unwrap();
-    }
+    let optimiser = GpuOptimiser::new(&gpu).unwrap();
     let visible: Vec<f32> = screen.iter().map(|row| row[3]).collect();
 
     let mut cpu = start.clone();
-    let group = |width| Moments::zeros(n, width, own_corrections);
-    let mut m = [group(3), group(3), group(4), group(1), group(1), group(SH_FLOATS)];
+    let mut on_cpu = cpu.tensors().map(|(parameter, _)| Moments::zeros(n, parameter.width()));
     for t in 1..=6_u32 {
         let (visible_only, occupancy) = (t > 3, if t > 2 { 1e-2 } else { 0.0 });
         // From normal to vanishing: row 25 of the hard cases.
         let mut g = some_gaussians(n, 0.17 + t as f32 * 0.05, if t == 2 { 1e-22 } else { 1e-3 });
         gradients.geometry.write(&gpu, 0, &geometry(&g));
         gradients.sh.write(&gpu, 0, &g.sh_coefficients);
-        if own_corrections && t > 1 {
-            // Some rows are made anew after every step, and the opacity of all after the fourth.
-            for (group, moments) in m.iter_mut().enumerate() {
-                let steps = moments.steps;
-                for row in 0..n {
-                    if row % 7 == t as usize || (group == 3 && t == 5) {
-                        moments.births[row] = steps;
-                    }
-                }
-            }
-        }
-        let born: Vec<Vec<u32>> = m.iter().map(|moments| moments.births.clone()).collect();
-        let visible = visible_only.then_some(&visible[..]);
-        let uniform = RowRates::Uniform;
-        m[0].step(cpu.means.as_flattened_mut(), g.means.as_flattened_mut(), uniform(2e-3), visible).unwrap();
-        m[1].step(cpu.log_scales.as_flattened_mut(), g.log_scales.as_flattened_mut(), uniform(5e-3), visible)
-            .unwrap();
-        m[2].step(
-            cpu.quaternions.as_flattened_mut(),
-            g.quaternions.as_flattened_mut(),
-            uniform(1e-3),
-            visible,
-        )
-        .unwrap();
-        m[3].step(&mut cpu.opacity_logits, &mut g.opacity_logits, uniform(5e-2), visible).unwrap();
-        if occupancy > 0.0 {
-            m[4].step(&mut cpu.occupancy_logits, &mut g.occupancy_logits, uniform(occupancy), visible)
-                .unwrap();
-        }
-        let split = RowRates::Split { base: 2.5e-3, rest: 1.25e-4, split: 3, active: 27 };
-        m[5].step(
-            cpu.sh_coefficients.as_flattened_mut(),
-            g.sh_coefficients.as_flattened_mut(),
-            split,
-            visible,
-        )
-        .unwrap();
-        if own_corrections {
-            let of_row = |row: usize| std::array::from_fn::<u32, 6, _>(|group| born[group][row]);
-            births.replace(&gpu, &(0..n).flat_map(of_row).collect::<Vec<u32>>()).unwrap();
-        }
-        let step = GaussianStep {
-            means: step_of(2e-3, t),
-            log_scales: step_of(5e-3, t),
-            quaternions: step_of(1e-3, t),
-            opacity: step_of(5e-2, t),
-            occupancy: step_of(occupancy, t.saturating_sub(2)),
-            sh: step_of(2.5e-3, t),
-            sh_rest: 1.25e-4,
-            sh_active: 27,
-            visible_only,
-            own_corrections,
-            ..GaussianStep::default()
+        let rates = |parameter: &Parameter| match *parameter {
+            SH_COEFFICIENTS => RowRates::Split { base: 2.5e-3, rest: 1.25e-4, split: 3, active: 27 },
+            OCCUPANCY_LOGITS => RowRates::Uniform(occupancy),
+            MEANS => RowRates::Uniform(2e-3),
+            OPACITY_LOGITS => RowRates::Uniform(5e-2),
+            _ => RowRates::Uniform(5e-3),
         };
+        let mut groups = GroupSteps::default();
+        let tensors = cpu.tensors_mut().into_iter().zip(g.tensors_mut()).zip(&mut on_cpu);
+        for (((parameter, values), (_, gradient)), moments) in tensors {
+            let rates = rates(&parameter);
+            if rates.move_anything() {
+                moments.step(values, gradient, rates, visible_only.then_some(&visible[..])).unwrap();
+            }
+            groups.0.push((parameter, GroupStep { rates, steps: moments.steps }));
+        }
+        let step = GaussianStep { visible_only, ..GaussianStep::default() };
         let mut commands = Commands::new(&gpu, None);
         optimiser.step_gaussians(
             &gpu,
             &mut commands,
-            &step,
+            (&step, &groups),
             (&parameters, &gradients),
-            (&moments, &births),
+            &moments,
             &on_device,
             &faults,
         );
         commands.submit();
     }
-    let found = parameters.download(&gpu).unwrap();
-    compare("means", found.means.as_flattened(), cpu.means.as_flattened(), TOLERANCE);
-    compare("log-scales", found.log_scales.as_flattened(), cpu.log_scales.as_flattened(), TOLERANCE);
-    compare("quaternions", found.quaternions.as_flattened(), cpu.quaternions.as_flattened(), TOLERANCE);
-    compare("opacity", &found.opacity_logits, &cpu.opacity_logits, TOLERANCE);
-    compare("occupancy", &found.occupancy_logits, &cpu.occupancy_logits, TOLERANCE);
-    compare("sh", found.sh_coefficients.as_flattened(), cpu.sh_coefficients.as_flattened(), TOLERANCE);
-    let first = moments[0].download(&gpu).unwrap();
-    compare("first moments", first.means.as_flattened(), &m[0].first, TOLERANCE);
-    compare("first moments of sh", first.sh_coefficients.as_flattened(), &m[5].first, TOLERANCE);
-    let second = moments[1].download(&gpu).unwrap();
-    compare("second moments", &second.opacity_logits, &m[3].second, TOLERANCE);
+    let all = [&parameters, &moments[0], &moments[1]].map(|rows| rows.download(&gpu).unwrap());
+    let [found, first, second] = all.each_ref().map(Gaussians::tensors);
+    for (k, (parameter, values)) in cpu.tensors().into_iter().enumerate() {
+        compare(parameter.name, found[k].1, values, TOLERANCE);
+        compare(&format!("first moments of {}", parameter.name), first[k].1, &on_cpu[k].first, TOLERANCE);
+        compare(&format!("second moments of {}", parameter.name), second[k].1, &on_cpu[k].second, TOLERANCE);
+    }
     assert_eq!(
         gradients.download(&gpu).unwrap(),
         GpuGaussians::zeros(&gpu, n).unwrap().download(&gpu).unwrap()
@@ -402,26 +355,21 @@ fn limits_and_unit_quaternions() {
     let parameters = GpuGaussians::upload(&gpu, &start).unwrap();
     let moments = [GpuGaussians::zeros(&gpu, 3).unwrap(), GpuGaussians::zeros(&gpu, 3).unwrap()];
     let screen = GpuVec::<[f32; 4]>::zeros(&gpu, "screen", 3).unwrap();
-    let no_births = GpuVec::<u32>::zeros(&gpu, "births", 0).unwrap();
     let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
     let optimiser = GpuOptimiser::new(&gpu).unwrap();
     let gradients = GpuGaussians::upload(&gpu, &some_gaussians(3, 0.2, 1e-3)).unwrap();
-    let step = GaussianStep {
-        log_scales: step_of(1e-2, 1),
-        sh: step_of(1e-2, 1),
-        sh_active: 48,
-        sh_rest: 1e-3,
-        renormalise: true,
-        occupancy_limits: Some([-5.0, 5.0]),
-        ..GaussianStep::default()
-    };
+    let step =
+        GaussianStep { renormalise: true, occupancy_limits: Some([-5.0, 5.0]), ..GaussianStep::default() };
+    let sh = RowRates::Split { base: 1e-2, rest: 1e-3, split: 3, active: 48 };
+    let sh = GroupStep { rates: sh, steps: 1 };
+    let groups = GroupSteps(vec![(LOG_SCALES, step_of(1e-2, 1)), (SH_COEFFICIENTS, sh)]);
     let mut commands = Commands::new(&gpu, None);
     optimiser.step_gaussians(
         &gpu,
         &mut commands,
-        &step,
+        (&step, &groups),
         (&parameters, &gradients),
-        (&moments, &no_births),
+        &moments,
         &screen,
         &faults,
     );
@@ -440,9 +388,9 @@ fn limits_and_unit_quaternions() {
     optimiser.step_gaussians(
         &gpu,
         &mut commands,
-        &step,
+        (&step, &groups),
         (&parameters, &gradients),
-        (&moments, &no_births),
+        &moments,
         &screen,
         &faults,
     );
@@ -462,13 +410,15 @@ fn sums_that_no_optimiser_may_take_are_told_by_group() {
         damage(&mut gaussians);
         bad.push((bit, gaussians));
     };
-    with(fault::MEANS, |g| g.means[3][2] = f32::NAN);
-    with(fault::OPACITY, |g| g.opacity_logits[0] = f32::INFINITY);
-    with(fault::LOG_SCALES, |g| g.log_scales[4][0] = -2e18);
-    with(fault::OCCUPANCY, |g| g.occupancy_logits[2] = f32::NEG_INFINITY);
-    with(fault::QUATERNIONS, |g| g.quaternions[1][3] = 1.5e18);
-    with(fault::SH, |g| g.sh_coefficients[4][47] = f32::NAN);
-    with(fault::SH | fault::MEANS, |g| (g.sh_coefficients[0][0], g.means[0][0]) = (f32::NAN, f32::NAN));
+    with(bit(&MEANS), |g| g.means[3][2] = f32::NAN);
+    with(bit(&OPACITY_LOGITS), |g| g.opacity_logits[0] = f32::INFINITY);
+    with(bit(&LOG_SCALES), |g| g.log_scales[4][0] = -2e18);
+    with(bit(&OCCUPANCY_LOGITS), |g| g.occupancy_logits[2] = f32::NEG_INFINITY);
+    with(bit(&QUATERNIONS), |g| g.quaternions[1][3] = 1.5e18);
+    with(bit(&SH_COEFFICIENTS), |g| g.sh_coefficients[4][47] = f32::NAN);
+    with(bit(&SH_COEFFICIENTS) | bit(&MEANS), |g| {
+        (g.sh_coefficients[0][0], g.means[0][0]) = (f32::NAN, f32::NAN)
+    });
     with(0, |g| g.quaternions[1][3] = 0.9e18);
     for (bits, view) in bad {
         let faults = GpuVec::<u32>::zeros(&gpu, "faults", fault::WORDS).unwrap();
@@ -485,7 +435,7 @@ fn sums_that_no_optimiser_may_take_are_told_by_group() {
     let mut commands = Commands::new(&gpu, None);
     optimiser.add_calibrations(&gpu, &mut commands, (&view, &total), &faults);
     commands.submit();
-    assert_eq!(faults.read(&gpu).unwrap()[0], fault::CALIBRATIONS);
+    assert_eq!(faults.read(&gpu).unwrap()[0], bit(&LOG_CALIBRATIONS));
 }
 
 #[test]
@@ -502,8 +452,8 @@ fn steps_wait_after_what_counts_and_only_then() {
         (([0.0, 0.0, f32::NAN, 0.0], [0.0; 4]), fits, 0, u32::MAX, 1, fault::INSTANCE_LOSS, 1),
         (good, [7, 0], 0, fault::NO_ROOM, 1, fault::NO_ROOM, 1),
         (good, [7, 0], 0, fault::NO_ROOM, 0, fault::NO_ROOM, 0),
-        (good, fits, fault::MEANS, fault::MEANS | fault::SH, 1, fault::MEANS, 1),
-        (good, fits, fault::MEANS, fault::SH, 1, fault::MEANS, 0),
+        (good, fits, bit(&MEANS), bit(&MEANS) | bit(&SH_COEFFICIENTS), 1, bit(&MEANS), 1),
+        (good, fits, bit(&MEANS), bit(&SH_COEFFICIENTS), 1, bit(&MEANS), 0),
     ];
     for (at, ((sums, similarity), [wanted, drawn], before, counts, is_last, bits, waits)) in
         cases.into_iter().enumerate()
@@ -543,19 +493,13 @@ fn planes_network_and_calibrations_move_as_on_the_cpu() {
         let zeros = |label, n: usize| GpuMoments::upload(&gpu, label, &vec![0.0; n], &vec![0.0; n]).unwrap();
         let moments = [zeros("planes", planes), zeros("mlp", mlp)];
         let faults = GpuVec::<u32>::zeros(&gpu, "faults", 4).unwrap();
-        let mut births = GpuVec::<u32>::zeros(&gpu, "births", 0).unwrap();
-        // Entries correct their bias from when they were made, in one of the cases.
-        let own_corrections = encoding == TimeEncoding::Compat;
-        if own_corrections {
-            optimiser.allow_own_corrections(&gpu).unwrap();
-        }
         let weights = PlaneWeights { smoothness: 1e-2, time_smoothness: 2e-2, time_sparsity: 1e-2 };
         let calibrations = GpuVec::from_slice(&gpu, "calibrations", &[0.0_f32, 9.99, -9.99, 1.0]).unwrap();
         let of_calibrations = zeros("calibrations", 4);
 
         let mut cpu = field.clone();
-        let (mut p, mut w) = (Moments::zeros(planes, 1, false), Moments::zeros(mlp, 1, false));
-        let (mut c, mut mu) = (Moments::zeros(4, 1, own_corrections), [0.0_f32, 9.99, -9.99, 1.0]);
+        let (mut p, mut w) = (Moments::zeros(planes, 1), Moments::zeros(mlp, 1));
+        let (mut c, mut mu) = (Moments::zeros(4, 1), [0.0_f32, 9.99, -9.99, 1.0]);
         for t in 1..=5_u32 {
             let mut g: Vec<f32> = (0..planes).map(|k| 1e-4 * wave(k, 0.3 + t as f32)).collect();
             let mut h: Vec<f32> = (0..mlp).map(|k| 1e-3 * wave(k, 0.7 + t as f32)).collect();
@@ -575,10 +519,6 @@ fn planes_network_and_calibrations_move_as_on_the_cpu() {
             let v_mu = GpuVec::from_slice(&gpu, "v_mu", &[1e-3_f32, -1.0, 1.0, 0.0]).unwrap();
             step_planes(&mut p, &mut cpu.planes, &mut g, &config, &weights, 1e-2, &mut Vec::new()).unwrap();
             w.step(&mut cpu.mlp, &mut h, RowRates::Uniform(2e-3), None).unwrap();
-            if own_corrections && t == 3 {
-                c.births[0] = 2;
-            }
-            births.replace(&gpu, &c.births).unwrap();
             c.step(&mut mu, &mut [1e-3, -1.0, 1.0, 0.0], RowRates::Uniform(1e-2), None).unwrap();
             mu.iter_mut().for_each(|v| *v = v.clamp(-10.0, 10.0));
             let mut commands = Commands::new(&gpu, None);
@@ -598,7 +538,7 @@ fn planes_network_and_calibrations_move_as_on_the_cpu() {
                 &mut commands,
                 (step_of(1e-2, t), 10.0),
                 (&calibrations, &v_mu),
-                (&of_calibrations, &births),
+                &of_calibrations,
                 &faults,
             );
             commands.submit();

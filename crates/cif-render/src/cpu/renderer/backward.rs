@@ -1,11 +1,11 @@
 //! Gradients of the last forward pass.
 
-use cif_field::Field;
+use cif_field::{Field, Gaussians};
 use cif_geometry::PixelGrid;
 use fearless_simd::dispatch;
 use rayon::prelude::*;
 
-use super::super::deform::{DeformationAtTime, PosedArrayGradients};
+use super::super::deform::DeformationAtTime;
 use super::super::labels::{IdentityRows, TileLabels};
 use super::super::pixels::LANES;
 use super::super::project::{PosedGradient, SplatGradient, ViewConstants, project_backward};
@@ -68,7 +68,7 @@ impl Renderer {
         let n = field.gaussians.len();
         let deformation =
             field.deformation.as_ref().filter(|_| settings.deform).map(|d| DeformationAtTime::new(d, time));
-        let mut v_posed = PosedArrayGradients::default();
+        let mut v_posed = Gaussians::default();
         timed(&mut times.project_backward, || {
             self.project_backward(field, &view, &pairs, gradients, &mut v_posed);
             self.calibration_backward(field, &label_mass, gradients);
@@ -81,19 +81,16 @@ impl Renderer {
                 {
                     *total += v;
                 }
-                let active: Vec<u32> = (0..n as u32)
-                    .filter(|&row| {
-                        let row = row as usize;
-                        let has_gradient = v_posed.means[row] != [0.0; 3]
-                            || v_posed.log_scales[row] != [0.0; 3]
-                            || v_posed.quaternions[row] != [0.0; 4]
-                            || v_posed.opacity_logits[row] != 0.0
-                            || v_posed
-                                .sh_coefficients
-                                .get(row)
-                                .is_some_and(|sh| sh.iter().any(|v| *v != 0.0));
-                        has_gradient && deformation.moves(row)
+                let tensors = v_posed.tensors().map(|(parameter, values)| (parameter.width(), values));
+                let has_gradient = |row: usize| {
+                    tensors.iter().any(|(width, values)| {
+                        values
+                            .get(row * width..(row + 1) * width)
+                            .is_some_and(|v| v.iter().any(|v| *v != 0.0))
                     })
+                };
+                let active: Vec<u32> = (0..n as u32)
+                    .filter(|&row| deformation.moves(row as usize) && has_gradient(row as usize))
                     .collect();
                 self.statistics.deformed_backward = active.len();
                 deformation.backward(
@@ -183,52 +180,28 @@ impl Renderer {
         view: &ViewConstants,
         pairs: &[SplatGradient],
         gradients: &mut Gradients,
-        v_posed: &mut PosedArrayGradients,
+        v_posed: &mut Gaussians,
     ) {
         let tape = &self.tape;
         let n = field.gaussians.len();
         let rank_of = self.ranks(n);
         let posed = PosedView::new(&field.gaussians, &tape.posed);
         let moves_sh = !tape.posed.sh_coefficients.is_empty();
-        v_posed.means = vec![[0.0; 3]; n];
-        v_posed.log_scales = vec![[0.0; 3]; n];
-        v_posed.quaternions = vec![[0.0; 4]; n];
-        v_posed.opacity_logits = vec![0.0; n];
-        let mut v_sh = Vec::new();
-        if moves_sh {
-            v_sh = vec![[0.0; cif_field::gaussians::SH_FLOATS]; n];
+        *v_posed = Gaussians::zeros(n);
+        v_posed.occupancy_logits = Vec::new();
+        if !moves_sh {
+            v_posed.sh_coefficients = Vec::new();
         }
         let half = [view.width as f32 / 2.0, view.height as f32 / 2.0];
-        let out = &mut gradients.gaussians;
-        let sh = if moves_sh { &mut v_sh } else { &mut out.sh_coefficients };
         let level = self.level;
-        out.means
-            .par_chunks_mut(CHUNK)
-            .zip(out.log_scales.par_chunks_mut(CHUNK))
-            .zip(out.quaternions.par_chunks_mut(CHUNK))
-            .zip(out.opacity_logits.par_chunks_mut(CHUNK))
-            .zip(out.occupancy_logits.par_chunks_mut(CHUNK))
-            .zip(sh.par_chunks_mut(CHUNK))
+        let rows = gradients.gaussians.rows_mut().chunks(CHUNK, n).into_par_iter();
+        rows.zip(v_posed.rows_mut().chunks(CHUNK, n))
             .zip(gradients.screen.par_chunks_mut(CHUNK))
             .zip(gradients.radii.par_chunks_mut(CHUNK))
-            .zip(v_posed.means.par_chunks_mut(CHUNK))
-            .zip(v_posed.log_scales.par_chunks_mut(CHUNK))
-            .zip(v_posed.quaternions.par_chunks_mut(CHUNK))
-            .zip(v_posed.opacity_logits.par_chunks_mut(CHUNK))
             .enumerate()
-            .for_each(|(chunk, rows)| {
-                let (rows, v_opacities) = rows;
-                let (rows, v_quaternions) = rows;
-                let (rows, v_log_scales) = rows;
-                let (rows, v_means) = rows;
-                let (rows, radii) = rows;
-                let (rows, screen) = rows;
-                let (rows, sh) = rows;
-                let (rows, occupancies) = rows;
-                let (rows, opacities) = rows;
-                let (rows, quaternions) = rows;
-                let (means, log_scales) = rows;
-                dispatch!(level, _simd => for row in 0..means.len() {
+            .for_each(|(chunk, (((total, of_view), screen), radii))| {
+                let sh = if moves_sh { of_view.sh_coefficients } else { total.sh_coefficients };
+                dispatch!(level, _simd => for row in 0..radii.len() {
                     let gaussian = chunk * CHUNK + row;
                     let rank = rank_of[gaussian];
                     if rank == NOT_VISIBLE {
@@ -249,25 +222,25 @@ impl Renderer {
                         screen[row][axis] += half[axis] * v.mean[axis];
                     }
                     for axis in 0..3 {
-                        means[row][axis] += mean[axis];
-                        log_scales[row][axis] += log_scale[axis];
+                        total.means[row][axis] += mean[axis];
+                        total.log_scales[row][axis] += log_scale[axis];
                     }
                     for axis in 0..4 {
-                        quaternions[row][axis] += quaternion[axis];
+                        total.quaternions[row][axis] += quaternion[axis];
                     }
-                    opacities[row] += opacity_logit;
-                    occupancies[row] += occupancy_logit;
-                    v_means[row] = mean;
-                    v_log_scales[row] = log_scale;
-                    v_quaternions[row] = quaternion;
-                    v_opacities[row] = opacity_logit;
+                    total.opacity_logits[row] += opacity_logit;
+                    total.occupancy_logits[row] += occupancy_logit;
+                    of_view.means[row] = mean;
+                    of_view.log_scales[row] = log_scale;
+                    of_view.quaternions[row] = quaternion;
+                    of_view.opacity_logits[row] = opacity_logit;
                 });
             });
         if moves_sh {
-            for (total, v) in out.sh_coefficients.as_flattened_mut().iter_mut().zip(v_sh.as_flattened()) {
+            let total = gradients.gaussians.sh_coefficients.as_flattened_mut();
+            for (total, v) in total.iter_mut().zip(v_posed.sh_coefficients.as_flattened()) {
                 *total += v;
             }
-            v_posed.sh_coefficients = v_sh;
         }
     }
 

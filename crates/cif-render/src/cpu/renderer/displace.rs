@@ -1,9 +1,8 @@
 //! Motion without pictures: where the deformation puts the centres, and its gradients by that alone.
 
-use cif_field::Field;
-use cif_field::gaussians::SH_FLOATS;
+use cif_field::{Field, Gaussians};
 
-use super::super::deform::{DeformationAtTime, PosedArrayGradients};
+use super::super::deform::DeformationAtTime;
 use super::Renderer;
 use crate::Gradients;
 
@@ -34,13 +33,7 @@ impl Renderer {
         let n = v_displacements.len();
         let active: Vec<u32> =
             deformation.moving_rows(n).filter(|row| v_displacements[*row as usize] != [0.0; 3]).collect();
-        let v_posed = PosedArrayGradients {
-            means: v_displacements,
-            log_scales: vec![[0.0; 3]; n],
-            quaternions: vec![[0.0; 4]; n],
-            opacity_logits: vec![0.0; n],
-            sh_coefficients: if deformation.config.heads.sh { vec![[0.0; SH_FLOATS]; n] } else { Vec::new() },
-        };
+        let v_posed = Gaussians { means: v_displacements, ..Gaussians::zeros(n) };
         DeformationAtTime::new(deformation, time).backward(
             self.level,
             &field.gaussians,

@@ -1,17 +1,19 @@
 //! Looks for the first value of a view that is not finite, on request: it reads every intermediate array.
 
-use super::super::deform::{PosedArrayGradients, PosedArrays};
+use cif_field::Gaussians;
+use cif_field::parameters::{MEANS, MLP, PLANES, Tensor};
+
 use super::super::project::{Splat, SplatGradient};
 use super::Renderer;
 use crate::Gradients;
 
 /// A value that is not finite, where it was first met.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct NotFinite {
     /// Part of the view's work, as in the rows of [`StageTimes`](crate::cpu::StageTimes).
     pub part: &'static str,
     /// Array, by name.
-    pub tensor: &'static str,
+    pub tensor: String,
     /// Position in the array, all its floats counted in their order.
     pub index: usize,
     /// The value.
@@ -27,14 +29,21 @@ pub(super) struct Inspection {
 
 impl Inspection {
     /// Looks at arrays of a part, in their order, unless something was found before.
-    fn look<'a>(&mut self, part: &'static str, arrays: impl IntoIterator<Item = (&'static str, &'a [f32])>) {
+    fn look<'a>(&mut self, part: &'static str, arrays: impl IntoIterator<Item = (&'a str, &'a [f32])>) {
         if self.found.is_some() {
             return;
         }
         self.found = arrays.into_iter().find_map(|(tensor, values)| {
             let index = values.iter().position(|value| !value.is_finite())?;
-            Some(NotFinite { part, tensor, index, value: values[index] })
+            Some(NotFinite { part, tensor: tensor.to_owned(), index, value: values[index] })
         });
+    }
+
+    /// Looks at parameters, or something as large, called by `prefix` and the name of each.
+    fn look_at_tensors(&mut self, part: &'static str, prefix: &str, tensors: &[Tensor<'_>]) {
+        let names: Vec<String> =
+            tensors.iter().map(|(parameter, _)| format!("{prefix}{}", parameter.name)).collect();
+        self.look(part, names.iter().zip(tensors).map(|(name, (_, values))| (name.as_str(), *values)));
     }
 
     /// Looks at one record per row.
@@ -51,7 +60,12 @@ impl Inspection {
         self.found = rows.iter().enumerate().find_map(|(row, record)| {
             let floats = floats(record);
             let column = floats.iter().position(|value| !value.is_finite())?;
-            Some(NotFinite { part, tensor, index: row * C + column, value: floats[column] })
+            Some(NotFinite {
+                part,
+                tensor: tensor.to_owned(),
+                index: row * C + column,
+                value: floats[column],
+            })
         });
     }
 }
@@ -73,19 +87,7 @@ impl Renderer {
         if !self.inspection.on {
             return;
         }
-        let PosedArrays { means, log_scales, quaternions, opacity_logits, occupancy_logits, sh_coefficients } =
-            &self.tape.posed;
-        self.inspection.look(
-            "deform",
-            [
-                ("posed means", means.as_flattened()),
-                ("posed log_scales", log_scales.as_flattened()),
-                ("posed quaternions", quaternions.as_flattened()),
-                ("posed opacity_logits", opacity_logits),
-                ("posed occupancy_logits", occupancy_logits),
-                ("posed sh_coefficients", sh_coefficients.as_flattened()),
-            ],
-        );
+        self.inspection.look_at_tensors("deform", "posed ", &self.tape.posed.tensors());
     }
 
     /// After projection.
@@ -137,35 +139,25 @@ impl Renderer {
     }
 
     /// After the gradients of the moved Gaussians.
-    pub(super) fn inspect_posed_gradients(&mut self, v_posed: &PosedArrayGradients, gradients: &Gradients) {
+    pub(super) fn inspect_posed_gradients(&mut self, v_posed: &Gaussians, gradients: &Gradients) {
         if !self.inspection.on {
             return;
         }
-        self.inspection.look(
-            "project backward",
-            [
-                ("gradient of posed means", v_posed.means.as_flattened()),
-                ("gradient of posed log_scales", v_posed.log_scales.as_flattened()),
-                ("gradient of posed quaternions", v_posed.quaternions.as_flattened()),
-                ("gradient of posed opacity_logits", &v_posed.opacity_logits),
-                ("gradient of posed sh_coefficients", v_posed.sh_coefficients.as_flattened()),
-                ("gradient of occupancy_logits", &gradients.gaussians.occupancy_logits),
-                ("gradient of sh_coefficients", gradients.gaussians.sh_coefficients.as_flattened()),
-                ("gradient of log_calibrations", &gradients.log_calibrations),
-                ("screen gradient", gradients.screen.as_flattened()),
-            ],
-        );
+        self.inspection.look_at_tensors("project backward", "gradient of posed ", &v_posed.tensors());
+        // Centres, planes and network get more from the deformation.
+        let whole = |(parameter, _): &Tensor<'_>| ![MEANS, PLANES, MLP].contains(parameter);
+        let tensors: Vec<Tensor<'_>> = gradients.tensors().into_iter().filter(whole).collect();
+        self.inspection.look_at_tensors("project backward", "gradient of ", &tensors);
+        self.inspection.look("project backward", [("screen gradient", gradients.screen.as_flattened())]);
     }
 
     /// After the gradients of the deformation.
     pub(super) fn inspect_deformation_gradients(&mut self, gradients: &Gradients) {
         if self.inspection.on {
-            let arrays = [
-                ("gradient of planes", &gradients.planes[..]),
-                ("gradient of mlp", &gradients.mlp),
-                ("gradient of means", gradients.gaussians.means.as_flattened()),
-            ];
-            self.inspection.look("deform backward", arrays);
+            let moved = [PLANES, MLP, MEANS];
+            let of = |wanted| gradients.tensors().into_iter().find(|(parameter, _)| *parameter == wanted);
+            let tensors: Vec<Tensor<'_>> = moved.into_iter().filter_map(of).collect();
+            self.inspection.look_at_tensors("deform backward", "gradient of ", &tensors);
         }
     }
 }

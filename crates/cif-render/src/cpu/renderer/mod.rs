@@ -19,7 +19,7 @@ mod images;
 mod inspect;
 mod pose;
 
-use cif_field::{Field, Identities};
+use cif_field::{Field, Gaussians, Identities};
 use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
@@ -28,7 +28,6 @@ pub use self::banded::{BandRequest, RenderedBand};
 pub use self::inspect::NotFinite;
 use self::pose::{PosedView, pose};
 use super::bin::{TileLists, TileRegion, sort_by_depth};
-use super::deform::PosedArrays;
 use super::labels::{IdentityRows, TileLabels};
 use super::level::SimdLevel;
 use super::project::{Splat, ViewConstants, project};
@@ -85,7 +84,7 @@ pub struct ForwardPass {
 #[derive(Default)]
 struct Tape {
     view: Option<(ViewConstants, RenderSettings, f64)>,
-    posed: PosedArrays,
+    posed: Gaussians,
     splats: Vec<Splat>,
     lists: TileLists,
     tiles: Vec<TileImage>,

@@ -1,10 +1,10 @@
 //! Gaussians at the time of the view.
 
-use cif_field::tracks::{GaussiansMut, TracksAtTime};
+use cif_field::tracks::TracksAtTime;
 use cif_field::{Deformation, Field, Gaussians};
 use fearless_simd::Level;
 
-use super::super::deform::{DeformationAtTime, PosedArrays};
+use super::super::deform::{DeformationAtTime, begin};
 use super::super::project::Posed;
 use super::Renderer;
 
@@ -22,20 +22,9 @@ impl Renderer {
     }
 
     fn posed_gaussians(&mut self, field: &Field, tracks: Option<TracksAtTime<'_>>, time: f64) -> Gaussians {
-        let mut posed = PosedArrays::default();
+        let mut posed = Gaussians::default();
         pose(self.level, field, field.deformation.as_ref(), tracks, time, &mut posed);
-        let canonical = &field.gaussians;
-        fn or<T: Clone>(moved: Vec<T>, canonical: &[T]) -> Vec<T> {
-            if moved.is_empty() { canonical.to_vec() } else { moved }
-        }
-        Gaussians {
-            means: or(posed.means, &canonical.means),
-            log_scales: or(posed.log_scales, &canonical.log_scales),
-            quaternions: or(posed.quaternions, &canonical.quaternions),
-            opacity_logits: or(posed.opacity_logits, &canonical.opacity_logits),
-            occupancy_logits: or(posed.occupancy_logits, &canonical.occupancy_logits),
-            sh_coefficients: or(posed.sh_coefficients, &canonical.sh_coefficients),
-        }
+        posed.or(&field.gaussians)
     }
 }
 
@@ -47,44 +36,32 @@ pub(super) fn pose(
     deformation: Option<&Deformation>,
     tracks: Option<TracksAtTime<'_>>,
     time: f64,
-    posed: &mut PosedArrays,
+    posed: &mut Gaussians,
 ) {
     let canonical = &field.gaussians;
     match deformation {
         Some(deformation) => DeformationAtTime::new(deformation, time).forward(level, canonical, posed),
-        None => *posed = PosedArrays::default(),
+        None => *posed = Gaussians::default(),
     }
-    posed.occupancy_logits.clear();
     let Some(tracks) = tracks.filter(TracksAtTime::changes_anything) else { return };
     if deformation.is_none() {
-        posed.means.clone_from(&canonical.means);
-        posed.log_scales.clone_from(&canonical.log_scales);
-        posed.quaternions.clone_from(&canonical.quaternions);
-        posed.opacity_logits.clone_from(&canonical.opacity_logits);
+        begin(canonical, false, posed);
     }
     posed.occupancy_logits.clone_from(&canonical.occupancy_logits);
     if posed.sh_coefficients.is_empty() && tracks.changes_sh() {
         posed.sh_coefficients.clone_from(&canonical.sh_coefficients);
     }
-    let moved = GaussiansMut {
-        means: &mut posed.means,
-        log_scales: &mut posed.log_scales,
-        quaternions: &mut posed.quaternions,
-        opacity_logits: &mut posed.opacity_logits,
-        occupancy_logits: &mut posed.occupancy_logits,
-        sh_coefficients: &mut posed.sh_coefficients,
-    };
-    tracks.apply(canonical, moved);
+    tracks.apply(canonical, posed.rows_mut());
 }
 
 /// Posed parameters by row, falling back to the canonical ones where nothing moves.
 pub(super) struct PosedView<'a> {
     canonical: &'a Gaussians,
-    moved: &'a PosedArrays,
+    moved: &'a Gaussians,
 }
 
 impl<'a> PosedView<'a> {
-    pub(super) fn new(canonical: &'a Gaussians, moved: &'a PosedArrays) -> Self {
+    pub(super) fn new(canonical: &'a Gaussians, moved: &'a Gaussians) -> Self {
         Self { canonical, moved }
     }
 

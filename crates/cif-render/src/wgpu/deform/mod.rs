@@ -20,7 +20,7 @@ mod shape;
 use cif_field::Deformation as FieldDeformation;
 
 use self::moving::MovingRows;
-use super::faults::{self, FAULTS};
+use super::faults::FAULTS;
 use super::gaussians::GpuGaussians;
 use super::rasterizer::PosedInput;
 use super::{
@@ -29,9 +29,6 @@ use super::{
 };
 pub use moving::Moving;
 pub use shape::{Deformation, Layers, Moment, SPLITS, Shape};
-
-/// Bit of the fault word: a gradient of the planes is not finite, or beyond what fixed point holds.
-pub const PLANES_FAULT: u32 = faults::PLANES;
 
 const DEFORMATION: Snippet = Snippet { name: "deformation", text: || structures(&[Deformation::layout()]) };
 const MOMENT: Snippet = Snippet { name: "moment", text: || structures(&[Moment::layout()]) };

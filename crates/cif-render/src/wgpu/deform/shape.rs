@@ -2,7 +2,10 @@
 
 use cif_field::Deformation as FieldDeformation;
 use cif_field::deformation::{HeadKind, HeadLayout, LinearLayout, MlpLayout, PLANES, PlaneLayout};
+use cif_field::parameters;
 
+use crate::wgpu::faults::bit;
+use crate::wgpu::gaussians::geometry_column;
 use crate::wgpu::{Constant, GpuError, constants};
 
 crate::shared_struct! {
@@ -153,13 +156,7 @@ impl WeightTable {
 
 /// First component of what a head writes.
 fn component(head: &HeadLayout) -> u32 {
-    match head.kind {
-        HeadKind::Position => 0,
-        HeadKind::Opacity => 3,
-        HeadKind::Scale => 4,
-        HeadKind::Rotation => 8,
-        HeadKind::Sh => SH_COMPONENT,
-    }
+    geometry_column(&head.kind.parameter()).map_or(SH_COMPONENT, |column| column as u32)
 }
 
 /// Most Gaussians whose `columns` of activations fit a workgroup.
@@ -280,7 +277,7 @@ impl Shape {
             ("WEIGHT_FLOATS", self.weight_sources.len() as u32),
             ("PLANE_FLOATS", self.plane_floats),
             ("MLP_FLOATS", self.mlp_floats),
-            ("PLANES_FAULT", super::PLANES_FAULT),
+            ("PLANES_FAULT", bit(&parameters::PLANES)),
         ]
         .map(|(name, value)| (name, Constant::Unsigned(value)));
         format!("{}const MOVES_SH: bool = {};\n", constants(&unsigned), self.moves_sh)

@@ -1,11 +1,12 @@
 //! Each stage of the deformation against the double-precision reference, on the reference's own inputs.
 
-use cif_field::Heads;
 use cif_field::gaussians::SH_FLOATS;
+use cif_field::{Heads, parameters};
 
 use super::*;
 use crate::reference::{self, Gaussian, Scene};
 use crate::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
+use crate::wgpu::faults::bit;
 use crate::wgpu::gaussians::{gaussians, geometry};
 use crate::wgpu::testing;
 use crate::wgpu::validation::validate_with;
@@ -336,7 +337,7 @@ fn gradients_that_are_not_finite_are_told() {
             &faults,
         );
         commands.submit();
-        let told = PLANES_FAULT | faults::MEANS;
+        let told = bit(&parameters::PLANES) | bit(&parameters::MEANS);
         assert_eq!(faults.read(&gpu).unwrap()[0] & told, told, "{bad}");
     }
 }

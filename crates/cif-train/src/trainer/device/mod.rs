@@ -119,15 +119,11 @@ impl Trainer {
     /// When the scene may grow beyond what the device holds, with the arithmetic; when the driver rejects a kernel.
     pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
         self.refuse_too_large(gpu)?;
-        let mut optimiser = GpuOptimiser::new(gpu)?;
-        if self.config.adam.fresh_row_bias_correction {
-            optimiser.allow_own_corrections(gpu)?;
-        }
         self.device = Some(Box::new(DeviceTraining {
             rasterizer: Rasterizer::new(gpu)?,
             losses: GpuLosses::new(gpu)?,
             exposure: GpuExposure::new(gpu)?,
-            optimiser,
+            optimiser: GpuOptimiser::new(gpu)?,
             motion: GpuMotion::new(gpu)?,
             judge: GpuJudge::new(gpu)?,
             rearranger: GpuRearranger::new(gpu)?,
@@ -246,7 +242,7 @@ impl Trainer {
         Fetched {
             progress: self.progress.clone(),
             sh_degree: self.field.sh_degree,
-            adam_steps: self.optimiser.groups().map(|(_, moments)| moments.steps).into(),
+            adam_steps: self.optimiser.groups().iter().map(|(_, moments)| moments.steps).collect(),
             statistics: self.statistics.clone(),
             kept: None,
         }
@@ -285,7 +281,7 @@ impl Trainer {
             self.progress = fetched.progress;
             self.field.sh_degree = fetched.sh_degree;
             self.statistics = fetched.statistics;
-            for ((_, moments), steps) in self.optimiser.groups_mut().into_iter().zip(fetched.adam_steps) {
+            for ((_, moments), steps) in self.optimiser.groups_mut().iter_mut().zip(fetched.adam_steps) {
                 moments.steps = steps;
             }
         }

@@ -2,7 +2,8 @@
 //! does for itself, from geometry and statistics, 64 bytes of each Gaussian, and for relocations from the deformation and
 //! the calibrations, too; harmonics and moments, 672 bytes, are moved there.
 
-use cif_render::wgpu::gaussians::{gaussians, geometry};
+use cif_field::parameters::{LOG_CALIBRATIONS, OPACITY_LOGITS, OnCopy};
+use cif_render::wgpu::gaussians::{COLUMNS, gaussians, geometry, geometry_column};
 use cif_render::wgpu::{Commands, Gpu, GpuError, GpuGaussians, GpuVec};
 
 use super::super::Trainer;
@@ -14,10 +15,6 @@ use crate::resample::Pair;
 use crate::schedule::falls_on;
 use crate::wgpu::kernels::{FRESH, RESTARTED};
 use crate::wgpu::rearrange::{GpuRearranger, RowRule, compose};
-
-/// Float of the opacity logit in the geometry of a Gaussian, and of the occupancy logit.
-const OPACITY_COLUMN: u32 = 3;
-const OCCUPANCY_COLUMN: u32 = 7;
 
 /// What the host decides from.
 struct Basis {
@@ -72,7 +69,6 @@ impl Trainer {
             (Ok(()), Some(origins), Some(resident)) => {
                 let moved = resident.rearrange(&device.gpu, &device.rearranger, &origins, resets);
                 moved.and_then(|()| {
-                    resident.births.replace(&device.gpu, &self.optimiser.births())?;
                     let rows = geometry(&self.field.gaussians);
                     resident.canonical.geometry.replace(&device.gpu, &rows)?;
                     resident.statistics.replace(&device.gpu, &statistic_rows(&self.statistics))?;
@@ -83,7 +79,8 @@ impl Trainer {
                     }
                     if relocates && let Some(rows) = &self.field.identities {
                         let instances = self.field.instances.len();
-                        let sent = ResidentIdentities::send(&device.gpu, rows, instances, &self.optimiser)?;
+                        let optimiser = &mut self.optimiser;
+                        let sent = ResidentIdentities::send(&device.gpu, rows, instances, optimiser)?;
                         resident.identities = Some(sent);
                     }
                     device.motion.send(&device.gpu, self.guide_of())
@@ -108,8 +105,7 @@ impl Trainer {
             (&mut self.field.identities, basis.calibrations)
         {
             target.log_calibrations = values;
-            let moments = &mut self.optimiser.calibration;
-            (moments.first, moments.second) = (first, second);
+            self.optimiser.of(&LOG_CALIBRATIONS).set(first, second);
         }
     }
 
@@ -175,9 +171,12 @@ impl Resident {
         let copies = RowRule::default();
         rearranger.record(gpu, &mut commands, &origins, &mut self.canonical.sh, copies)?;
         let of_sh = RowRule { fresh_are_zero: true, ..RowRule::default() };
+        let divided = COLUMNS.iter().filter(|(parameter, _)| parameter.on_copy == OnCopy::Divided);
         let of_geometry = RowRule {
-            zero_column: resets_opacities.then_some(OPACITY_COLUMN),
-            restarted_columns: 1 << OPACITY_COLUMN | 1 << OCCUPANCY_COLUMN,
+            zero_column: geometry_column(&OPACITY_LOGITS)
+                .filter(|_| resets_opacities)
+                .map(|column| column as u32),
+            restarted_columns: divided.map(|(_, column)| 1 << column).sum(),
             ..of_sh
         };
         for moments in &mut self.moments {

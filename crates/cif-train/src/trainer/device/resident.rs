@@ -1,6 +1,7 @@
 //! What lies on the device: the field, its moments and gradients.
 
-use cif_field::{Field, Identities};
+use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES};
+use cif_field::{Field, Gaussians, Identities};
 use cif_render::wgpu::deform::DeformationGradients;
 use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::{
@@ -42,8 +43,6 @@ pub(super) struct ResidentIdentities {
     pub(super) log_calibrations: GpuVec<f32>,
     pub(super) gradients: GpuVec<f32>,
     pub(super) moments: GpuMoments,
-    /// As those of the Gaussians.
-    pub(super) births: GpuVec<u32>,
 }
 
 /// Everything of a run that stays on the device.
@@ -51,8 +50,6 @@ pub(super) struct Resident {
     pub(super) canonical: GpuGaussians,
     /// First and second moments, in the layout of the parameters.
     pub(super) moments: [GpuGaussians; 2],
-    /// Steps after which rows were made, `[N, BIRTH_GROUPS]`, where they correct their bias from there.
-    pub(super) births: GpuVec<u32>,
     pub(super) gradients: GpuGaussians,
     /// At the time of a view.
     pub(super) posed: GpuGaussians,
@@ -65,35 +62,22 @@ pub(super) struct Resident {
     pub(super) exposures: Option<CameraExposures>,
 }
 
-/// Moments of the Gaussians in the layout of the device: first or second.
-fn moment_rows(optimiser: &Optimiser, second: bool) -> cif_field::Gaussians {
-    let of = |moments: &crate::adam::Moments| {
-        if second { moments.second.clone() } else { moments.first.clone() }
-    };
-    fn rows<const W: usize>(values: &[f32]) -> Vec<[f32; W]> {
-        values.as_chunks::<W>().0.to_vec()
+/// First or `second` moments of the Gaussians.
+fn moment_rows(optimiser: &mut Optimiser, second: bool, gaussians: usize) -> Gaussians {
+    let mut rows = Gaussians::zeros(gaussians);
+    for (parameter, values) in rows.tensors_mut() {
+        let moments = optimiser.of(&parameter);
+        values.copy_from_slice(if second { &moments.second } else { &moments.first });
     }
-    cif_field::Gaussians {
-        means: rows(&of(&optimiser.means)),
-        log_scales: rows(&of(&optimiser.log_scales)),
-        quaternions: rows(&of(&optimiser.quaternions)),
-        opacity_logits: of(&optimiser.opacity),
-        occupancy_logits: of(&optimiser.occupancy),
-        sh_coefficients: rows(&of(&optimiser.sh)),
-    }
+    rows
 }
 
 /// The other way.
-fn set_moment_rows(optimiser: &mut Optimiser, second: bool, rows: cif_field::Gaussians) {
-    let set = |moments: &mut crate::adam::Moments, values: Vec<f32>| {
-        *(if second { &mut moments.second } else { &mut moments.first }) = values;
-    };
-    set(&mut optimiser.means, rows.means.into_flattened());
-    set(&mut optimiser.log_scales, rows.log_scales.into_flattened());
-    set(&mut optimiser.quaternions, rows.quaternions.into_flattened());
-    set(&mut optimiser.opacity, rows.opacity_logits);
-    set(&mut optimiser.occupancy, rows.occupancy_logits);
-    set(&mut optimiser.sh, rows.sh_coefficients.into_flattened());
+fn set_moment_rows(optimiser: &mut Optimiser, second: bool, rows: &Gaussians) {
+    for (parameter, values) in rows.tensors() {
+        let moments = optimiser.of(&parameter);
+        *(if second { &mut moments.second } else { &mut moments.first }) = values.to_vec();
+    }
 }
 
 /// Statistics in the layout of the device.
@@ -116,16 +100,15 @@ impl ResidentIdentities {
         gpu: &Gpu,
         rows: &Identities,
         instances: usize,
-        optimiser: &Optimiser,
+        optimiser: &mut Optimiser,
     ) -> Result<Self, GpuError> {
-        let moments = &optimiser.calibration;
+        let moments = optimiser.of(&LOG_CALIBRATIONS);
         Ok(Self {
             rows: DeviceIdentities::from_identities(gpu, rows, instances)?,
             log_estimates: GpuVec::from_slice(gpu, "identity estimates", &rows.log_estimates)?,
             log_calibrations: GpuVec::from_slice(gpu, "calibrations", &rows.log_calibrations)?,
             gradients: GpuVec::zeros(gpu, "gradients of the calibrations", rows.labels.len())?,
             moments: GpuMoments::upload(gpu, "moments of the calibrations", &moments.first, &moments.second)?,
-            births: GpuVec::from_slice(gpu, "births of the calibrations", &moments.births)?,
         })
     }
 }
@@ -143,7 +126,6 @@ impl Resident {
         Ok(Self {
             canonical: none()?,
             moments: [none()?, none()?],
-            births: GpuVec::zeros(gpu, "births", 0)?,
             gradients: none()?,
             posed: none()?,
             screen: GpuVec::zeros(gpu, "screen gradients", 0)?,
@@ -160,7 +142,7 @@ impl Resident {
         gpu: &Gpu,
         stale: Stale,
         field: &Field,
-        optimiser: &Optimiser,
+        optimiser: &mut Optimiser,
         statistics: &DensifyStatistics,
         exposures: Option<&Exposures>,
     ) -> Result<(), GpuError> {
@@ -168,9 +150,8 @@ impl Resident {
             let n = field.gaussians.len();
             self.canonical.replace(gpu, &field.gaussians)?;
             for (second, moments) in [false, true].into_iter().zip(&mut self.moments) {
-                moments.replace(gpu, &moment_rows(optimiser, second))?;
+                moments.replace(gpu, &moment_rows(optimiser, second, n))?;
             }
-            self.births.replace(gpu, &optimiser.births())?;
             self.gradients = GpuGaussians::zeros(gpu, n)?;
             self.posed.geometry.resize(gpu, n)?;
             let moves_sh = field.deformation.as_ref().is_some_and(|d| d.config.heads.sh);
@@ -188,17 +169,15 @@ impl Resident {
                 None => None,
                 Some(deformation) => {
                     let parameters = GpuDeformation::new(gpu, deformation)?;
-                    let (planes, mlp) = (&optimiser.planes, &optimiser.mlp);
+                    let mut moments = |label, parameter| {
+                        let moments = optimiser.of(parameter);
+                        GpuMoments::upload(gpu, label, &moments.first, &moments.second)
+                    };
                     Some(ResidentDeformation {
                         gradients: DeformationGradients::zeros(gpu, &parameters)?,
                         moments: [
-                            GpuMoments::upload(
-                                gpu,
-                                "moments of the hexplanes",
-                                &planes.first,
-                                &planes.second,
-                            )?,
-                            GpuMoments::upload(gpu, "moments of the network", &mlp.first, &mlp.second)?,
+                            moments("moments of the hexplanes", &PLANES)?,
+                            moments("moments of the network", &MLP)?,
                         ],
                         parameters,
                     })
@@ -260,7 +239,7 @@ impl Resident {
         debug_assert_eq!(geometry(&field.gaussians).len(), parameters.0.len(), "the set changes on the host");
         field.gaussians = gaussians(&parameters.0, parameters.1);
         for (second, rows) in [false, true].into_iter().zip(moments) {
-            set_moment_rows(optimiser, second, rows);
+            set_moment_rows(optimiser, second, &rows);
         }
         *statistics = statistics_of(&rows);
         if let (Some(target), Some(arrays)) = (exposures, of_cameras) {
@@ -270,12 +249,12 @@ impl Resident {
             (&mut field.deformation, deformation)
         {
             (target.planes, target.mlp) = (planes, mlp);
-            (optimiser.planes.first, optimiser.planes.second) = (first, second);
-            (optimiser.mlp.first, optimiser.mlp.second) = (mlp_first, mlp_second);
+            optimiser.of(&PLANES).set(first, second);
+            optimiser.of(&MLP).set(mlp_first, mlp_second);
         }
         if let (Some(target), Some([values, first, second])) = (&mut field.identities, calibrations) {
             target.log_calibrations = values;
-            (optimiser.calibration.first, optimiser.calibration.second) = (first, second);
+            optimiser.of(&LOG_CALIBRATIONS).set(first, second);
         }
         Ok(())
     }

@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use cif_geometry::scalar::logit;
-use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_render::RenderSettings;
 
 use super::super::frames::TrainFrame;
@@ -15,12 +14,12 @@ use super::super::{InstancePass, Trainer};
 use super::DeviceTraining;
 use super::flight::Flight;
 use super::resident::{Resident, Stale};
-use crate::adam::{Moments, PlaneWeights};
+use crate::adam::PlaneWeights;
 use crate::config::Ablation;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::wgpu::kernels::fault;
-use crate::wgpu::optimiser::{GaussianStep, GroupStep};
+use crate::wgpu::optimiser::{GaussianStep, GroupStep, GroupSteps};
 
 /// A view of a step.
 pub(super) struct StepView {
@@ -44,9 +43,7 @@ pub(super) struct StepPlan {
     pub(super) labelled: usize,
     pub(super) weights: PlaneWeights,
     pub(super) step: GaussianStep,
-    pub(super) calibration: GroupStep,
-    pub(super) planes: GroupStep,
-    pub(super) mlp: GroupStep,
+    pub(super) groups: GroupSteps,
     pub(super) exposures: GroupStep,
     /// Groups that move, as bits of the fault word.
     pub(super) moving: u32,
@@ -59,22 +56,8 @@ pub(super) struct StepPlan {
 impl StepPlan {
     /// One step less of some groups before this one.
     pub(super) fn uncount(&mut self, groups: u32) {
-        let step = &mut self.step;
-        let counted = [
-            (fault::MEANS, &mut step.means),
-            (fault::LOG_SCALES, &mut step.log_scales),
-            (fault::QUATERNIONS, &mut step.quaternions),
-            (fault::OPACITY, &mut step.opacity),
-            (fault::OCCUPANCY, &mut step.occupancy),
-            (fault::SH, &mut step.sh),
-            (fault::CALIBRATIONS, &mut self.calibration),
-            (fault::PLANES, &mut self.planes),
-            (fault::MLP, &mut self.mlp),
-            (fault::EXPOSURES, &mut self.exposures),
-        ];
-        for (bit, group) in counted {
-            group.steps -= u32::from(groups & bit != 0);
-        }
+        self.groups.uncount(groups);
+        self.exposures.steps -= u32::from(groups & fault::EXPOSURES != 0);
     }
 }
 
@@ -142,7 +125,7 @@ impl Trainer {
         }
         let Some(resident) = &mut device.resident else { return Ok(()) };
         let exposures = self.progress.exposures.as_ref();
-        let (field, optimiser) = (&self.field, &self.optimiser);
+        let (field, optimiser) = (&self.field, &mut self.optimiser);
         resident.send(&device.gpu, device.stale, field, optimiser, &self.statistics, exposures)?;
         if device.stale.gaussians {
             device.motion.send(&device.gpu, self.guide_of())?;
@@ -175,63 +158,37 @@ impl Trainer {
                 .then(|| self.instance_settings()),
             ..self.color_settings()
         };
-        let rates = StepRates::at(&self.config, stage, iteration, self.field.extent);
-        let mut moving = 0;
-        let mut known = 0;
-        let mut group = |moments: &mut Moments, bit: u32, rate: f32, fastest: f32| {
+        let rates = StepRates::at(&self.config, stage, iteration, &self.field);
+        let (mut moving, mut known) = (0, 0);
+        let mut groups = GroupSteps::default();
+        let has_values: Vec<bool> =
+            self.field.tensors().iter().map(|(_, values)| !values.is_empty()).collect();
+        let groups_of_field = self.optimiser.groups_mut().iter_mut().zip(has_values);
+        for ((parameter, moments), _) in groups_of_field.filter(|(_, has_values)| *has_values) {
+            let rates = rates.of(parameter);
+            let fastest = rates.fastest();
             if fastest.is_nan() || fastest.abs() > MAX_RATE {
-                known |= bit;
+                known |= fault::bit(parameter);
             }
             if fastest != 0.0 {
                 moments.steps += 1;
-                moving |= bit;
+                moving |= fault::bit(parameter);
             }
-            GroupStep { rate, steps: moments.steps }
-        };
-        let optimiser = &mut self.optimiser;
-        let fastest_sh = rates.sh_base.max(rates.sh_rest);
+            groups.0.push((*parameter, GroupStep { rates, steps: moments.steps }));
+        }
         let step = GaussianStep {
-            means: group(&mut optimiser.means, fault::MEANS, rates.means, rates.means),
-            log_scales: group(
-                &mut optimiser.log_scales,
-                fault::LOG_SCALES,
-                rates.log_scales,
-                rates.log_scales,
-            ),
-            quaternions: group(
-                &mut optimiser.quaternions,
-                fault::QUATERNIONS,
-                rates.quaternions,
-                rates.quaternions,
-            ),
-            opacity: group(&mut optimiser.opacity, fault::OPACITY, rates.opacity, rates.opacity),
-            occupancy: group(&mut optimiser.occupancy, fault::OCCUPANCY, rates.occupancy, rates.occupancy),
-            sh: group(&mut optimiser.sh, fault::SH, rates.sh_base, fastest_sh),
-            sh_rest: rates.sh_rest,
-            sh_active: 3 * coefficient_count(self.field.sh_degree),
             visible_only: self.config.adam.visible_rows_only,
-            own_corrections: self.config.adam.fresh_row_bias_correction,
             renormalise: (self.progress.total_steps + 1).is_multiple_of(RENORMALISE_EVERY),
             occupancy_limits: (stage == Stage::Instance && !self.config.ablates(Ablation::ConstantOccupancy))
                 .then(|| self.config.instance.occupancy_limits.map(logit)),
         };
-        let mut calibration = GroupStep::default();
-        if self.field.identities.is_some() {
-            let rate = rates.calibration;
-            calibration = group(&mut optimiser.calibration, fault::CALIBRATIONS, rate, rate);
-        }
-        let (mut planes, mut mlp) = (GroupStep::default(), GroupStep::default());
-        if self.field.deformation.is_some() {
-            planes = group(&mut optimiser.planes, fault::PLANES, rates.planes, rates.planes);
-            mlp = group(&mut optimiser.mlp, fault::MLP, rates.mlp, rates.mlp);
-        }
         let mut exposures = GroupStep::default();
         if let Some(all) = &mut self.progress.exposures {
             let steps = all.steps_mut();
             *steps += 1;
             moving |= fault::EXPOSURES;
-            exposures =
-                GroupStep { rate: exposure_rate(&self.config, self.progress.total_steps), steps: *steps };
+            let rate = exposure_rate(&self.config, self.progress.total_steps);
+            exposures = GroupStep::uniform(rate, *steps);
         }
         Ok(StepPlan {
             labelled: views.iter().map(|view| view.frame.labelled).sum(),
@@ -245,9 +202,7 @@ impl Trainer {
                 time_sparsity: self.config.loss.time_sparsity,
             },
             step,
-            calibration,
-            planes,
-            mlp,
+            groups,
             exposures,
             moving,
             known,
@@ -257,20 +212,8 @@ impl Trainer {
 
     /// Takes back a step of some groups.
     pub(super) fn uncount(&mut self, groups: u32) {
-        let optimiser = &mut self.optimiser;
-        let counted = [
-            (fault::MEANS, &mut optimiser.means),
-            (fault::LOG_SCALES, &mut optimiser.log_scales),
-            (fault::QUATERNIONS, &mut optimiser.quaternions),
-            (fault::OPACITY, &mut optimiser.opacity),
-            (fault::OCCUPANCY, &mut optimiser.occupancy),
-            (fault::SH, &mut optimiser.sh),
-            (fault::CALIBRATIONS, &mut optimiser.calibration),
-            (fault::PLANES, &mut optimiser.planes),
-            (fault::MLP, &mut optimiser.mlp),
-        ];
-        for (bit, moments) in counted {
-            moments.steps -= u32::from(groups & bit != 0);
+        for (parameter, moments) in self.optimiser.groups_mut() {
+            moments.steps -= u32::from(groups & fault::bit(parameter) != 0);
         }
         if let Some(exposures) = &mut self.progress.exposures {
             *exposures.steps_mut() -= u32::from(groups & fault::EXPOSURES != 0);

@@ -1,6 +1,7 @@
 //! Steps on a GPU that go wrong, or that have no room, on a real capture. `CIF_TEST_GPU=off|auto|require`.
 
 use cif_field::Field;
+use cif_field::parameters::OPACITY_LOGITS;
 use cif_render::wgpu::{Gpu, GpuError, testing};
 use tempfile::TempDir;
 
@@ -82,7 +83,7 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
         let (mut trainer, _folder) = trainer(Some(&gpu));
         step(&mut trainer).0.unwrap();
         let before = state(&mut trainer);
-        let (iteration, counters) = (trainer.iteration(), before.1.groups().map(|(_, m)| m.steps));
+        let (iteration, counters) = (trainer.iteration(), before.1.clone());
         damage(&mut trainer, column, value);
         let mut told = Vec::new();
         for _ in 0..4 {
@@ -97,17 +98,15 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
         else {
             panic!("{told:?}")
         };
-        assert_eq!((*at, fault.part, fault.tensor), (iteration + 1, "gradients", tensor));
+        assert_eq!((*at, fault.part, fault.tensor.as_str()), (iteration + 1, "gradients", tensor));
         assert!(fault.value.contains("on the GPU alone"), "{fault}");
         assert_eq!((trainer.iteration(), trainer.rolled_back()), (iteration + 4, 1));
         assert_eq!(trainer.progress.rollbacks.in_a_row, 0);
-        let steps = trainer.optimiser.groups().map(|(_, moments)| moments.steps);
-        for (name, ((now, then), (_, moments))) in ["means", "log_scales", "quaternions", "opacity"]
-            .iter()
-            .zip(steps.iter().zip(&counters).zip(trainer.optimiser.groups()))
+        // Centres, log-scales, quaternions, opacities.
+        for ((parameter, now), (_, then)) in trainer.optimiser.groups().iter().zip(counters.groups()).take(4)
         {
-            assert_eq!(*now, then + 3, "{name}");
-            assert!(moments.first.iter().all(|v| v.is_finite()));
+            assert_eq!(now.steps, then.steps + 3, "{}", parameter.name);
+            assert!(now.first.iter().all(|v| v.is_finite()));
         }
         let mut exposures = trainer.progress.exposures.clone().unwrap();
         assert_eq!(*exposures.steps_mut(), *before.3.clone().steps_mut() + 3);
@@ -210,10 +209,8 @@ fn views_without_room_are_drawn_again_and_no_bit_differs() {
 #[test]
 fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
     let Some(gpu) = testing::gpu() else { return };
-    let run = |fetches: bool, own_corrections: bool| {
-        let (mut trainer, _folder) = trainer_with(Some(&gpu), |config| {
-            config.adam.fresh_row_bias_correction = own_corrections;
-        });
+    let run = |fetches: bool| {
+        let (mut trainer, _folder) = trainer(Some(&gpu));
         // Half of them are large; opacities that fall, from 0.1 or where they are reset to, go.
         let mut sizes: Vec<f32> =
             trainer.field.gaussians.log_scales.iter().map(|s| s[0].max(s[1]).max(s[2]).exp()).collect();
@@ -245,26 +242,19 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
         }
         (state(&mut trainer), result, kinds)
     };
-    let mut ends = Vec::new();
-    for own_corrections in [false, true] {
-        let (on_device, on_host) = (run(false, own_corrections), run(true, own_corrections));
-        assert!(on_device.2.iter().all(|count| *count > 0), "cloned, split, pruned: {:?}", on_device.2);
-        assert_eq!(on_device.1, on_host.1, "Gaussians after every step");
-        assert!(on_device.0.0.gaussians == on_host.0.0.gaussians, "parameters");
-        assert!(on_device.0.1 == on_host.0.1, "moments");
-        assert!(on_device.0.2 == on_host.0.2, "statistics");
-        assert_eq!(on_device.0.1.births().iter().any(|birth| *birth > 0), own_corrections);
-        ends.push(on_device.0.0.gaussians.means);
-    }
-    assert!(ends[0] != ends[1], "rows made later move otherwise");
+    let (on_device, on_host) = (run(false), run(true));
+    assert!(on_device.2.iter().all(|count| *count > 0), "cloned, split, pruned: {:?}", on_device.2);
+    assert_eq!(on_device.1, on_host.1, "Gaussians after every step");
+    assert!(on_device.0.0.gaussians == on_host.0.0.gaussians, "parameters");
+    assert!(on_device.0.1 == on_host.0.1, "moments");
+    assert!(on_device.0.2 == on_host.0.2, "statistics");
 }
 
 #[test]
 fn rows_relocated_on_the_device_end_as_those_that_the_host_relocates() {
     let Some(gpu) = testing::gpu() else { return };
-    let run = |fetches: bool, own_corrections: bool| {
+    let run = |fetches: bool| {
         let (mut trainer, _folder) = trainer_with(Some(&gpu), |config| {
-            config.adam.fresh_row_bias_correction = own_corrections;
             (config.resample.from, config.resample.every, config.resample.until) = (1, 3, 100);
             config.stages.instance = 12;
         });
@@ -292,14 +282,12 @@ fn rows_relocated_on_the_device_end_as_those_that_the_host_relocates() {
         }
         (state(&mut trainer), relocated)
     };
-    for own_corrections in [false, true] {
-        let (on_device, on_host) = (run(false, own_corrections), run(true, own_corrections));
-        assert!(on_device.1.len() == 3 && on_device.1[0].1 > 0, "{:?}", on_device.1);
-        assert_eq!(on_device.1, on_host.1);
-        assert!(on_device.0.0.identities == on_host.0.0.identities, "identities");
-        assert!(on_device.0.0 == on_host.0.0, "parameters");
-        assert!(on_device.0.1 == on_host.0.1, "moments");
-    }
+    let (on_device, on_host) = (run(false), run(true));
+    assert!(on_device.1.len() == 3 && on_device.1[0].1 > 0, "{:?}", on_device.1);
+    assert_eq!(on_device.1, on_host.1);
+    assert!(on_device.0.0.identities == on_host.0.0.identities, "identities");
+    assert!(on_device.0.0 == on_host.0.0, "parameters");
+    assert!(on_device.0.1 == on_host.0.1, "moments");
 }
 
 #[test]
@@ -352,7 +340,7 @@ fn debug_validation_names_the_part_and_changes_no_bit() {
     };
     let parameters = fault_of(&|trainer| trainer.field.gaussians.means[1][2] = f32::NAN);
     assert_eq!(parameters, "parameters: means[5] is NaN");
-    let moments = fault_of(&|trainer| trainer.optimiser.opacity.second[1] = f32::INFINITY);
+    let moments = fault_of(&|trainer| trainer.optimiser.of(&OPACITY_LOGITS).second[1] = f32::INFINITY);
     assert_eq!(moments, "optimiser: second moments[1] is inf");
 }
 

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES};
 use cif_render::wgpu::{Commands, GpuError, GpuStatistics, LabelInput, Submission, ViewInput, faults};
 use cif_render::{InstanceNormalisation, RenderSettings};
 
@@ -175,9 +176,9 @@ impl Trainer {
             optimiser.step_gaussians(
                 gpu,
                 &mut commands,
-                &plan.step,
+                (&plan.step, &plan.groups),
                 (&resident.canonical, &resident.gradients),
-                (&resident.moments, &resident.births),
+                &resident.moments,
                 &resident.screen,
                 faults,
             );
@@ -186,9 +187,9 @@ impl Trainer {
                 optimiser.step_calibrations(
                     gpu,
                     &mut commands,
-                    (plan.calibration, self.config.instance.calibration_limit),
+                    (plan.groups.of(&LOG_CALIBRATIONS), self.config.instance.calibration_limit),
                     (&identities.log_calibrations, &identities.gradients),
-                    (&identities.moments, &identities.births),
+                    &identities.moments,
                     faults,
                 );
             }
@@ -199,7 +200,7 @@ impl Trainer {
                 optimiser.step_deformation(
                     gpu,
                     &mut commands,
-                    (plan.planes, plan.mlp),
+                    (plan.groups.of(&PLANES), plan.groups.of(&MLP)),
                     &plan.weights,
                     (&deformation.parameters, &deformation.gradients),
                     &deformation.moments,
