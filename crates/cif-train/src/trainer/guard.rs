@@ -205,7 +205,6 @@ impl Trainer {
         &mut self,
         fault: Fault,
         snapshot: Option<Snapshot>,
-        psnr_before: Option<f64>,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         if let Some(Snapshot { field, optimiser }) = snapshot {
@@ -213,7 +212,6 @@ impl Trainer {
         }
         // Leftovers of the failed step must not reach another one.
         self.gradients.reset();
-        self.progress.psnr = psnr_before;
         let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
         events.push(self.count_bad_step(stage, iteration, fault)?);
         Ok(())

@@ -14,7 +14,7 @@ use rand::RngExt;
 use super::Trainer;
 use super::frames::TrainFrame;
 use super::optimiser::{Optimiser, StepRates};
-use crate::adam::PlaneWeights;
+use super::step_plan::plane_weights;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::losses::displacement::{Pose, Pull, displacement_loss, rotations};
@@ -309,11 +309,7 @@ impl Trainer {
             return Ok(());
         }
         let rates = StepRates::at(&self.config, Stage::Fine, 1, &self.field).only(&[PLANES, MLP]);
-        let weights = PlaneWeights {
-            smoothness: self.config.loss.plane_smoothness,
-            time_smoothness: self.config.loss.time_smoothness,
-            time_sparsity: self.config.loss.time_sparsity,
-        };
+        let weights = plane_weights(&self.config);
         let times = self.dataset.times.clone();
         let mut rng = stream(self.config.seed, Purpose::Guidance, 0);
         for _ in 0..self.config.motion.rehearsal {

@@ -50,6 +50,7 @@ mod run;
 mod saving;
 mod state;
 mod step;
+mod step_plan;
 mod still;
 mod times;
 

@@ -1,38 +1,26 @@
-//! One optimiser step.
+//! One optimiser step, and what changes the field behind it.
 
 use std::time::Instant;
 
 use cif_field::parameters::{MLP, OPACITY_LOGITS};
-use cif_geometry::scalar::logit;
 use cif_geometry::{PixelGrid, quaternion};
 use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
 use rand::seq::SliceRandom;
 
+use super::Trainer;
 use super::earned::leave_out_held_out;
-use super::guard::{exposure_fault, gradient_fault};
-use super::optimiser::StepRates;
+use super::guard::{Fault, exposure_fault, gradient_fault};
 use super::progress::AfterStep;
+use super::step_plan::{StepPlan, StepView};
 use super::times::lap;
-use super::{InstancePass, Trainer};
-use crate::adam::PlaneWeights;
-use crate::config::{Ablation, TrainConfig};
+use crate::config::Ablation;
 use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, reset_opacities};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
-use crate::exposure::RATES;
 use crate::losses::{SsimScratch, color_loss};
 use crate::random::{Purpose, stream};
 use crate::resample::{ResampleContext, apply, plan};
-use crate::schedule::{falls_on, log_linear, schedule_steps};
-
-/// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
-pub(super) const RENORMALISE_EVERY: u64 = 1_000;
-
-/// Learning rate of exposures after so many steps of all stages.
-pub(super) fn exposure_rate(config: &TrainConfig, total_steps: u64) -> f32 {
-    let done = u32::try_from(total_steps).unwrap_or(u32::MAX);
-    log_linear(RATES, done, schedule_steps(config))
-}
+use crate::schedule::Due;
 
 /// Memory kept between steps.
 pub(super) struct Scratch {
@@ -48,13 +36,47 @@ impl Scratch {
     }
 }
 
-/// What a step measured.
+/// Losses of a step.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct StepLoss {
+    /// Mean over the views.
     pub color: f64,
+    /// Mean over the labelled pixels of all views.
     pub instance: Option<f64>,
+    /// Share of them that no covering Gaussian supports.
     pub unsupported: Option<f64>,
+    /// What is minimised.
     pub total: f64,
+}
+
+/// Measurements of a view of a step.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ViewReport {
+    /// Of the picture.
+    pub psnr: f64,
+    /// Mean over the pixels of the view.
+    pub color_loss: f64,
+    /// Summed over its labelled pixels.
+    pub instance_loss: f64,
+    /// Labelled pixels that no covering Gaussian supports.
+    pub unsupported: f64,
+}
+
+impl StepLoss {
+    /// Of the views of a step; `lambda_instance` weighs the instance loss.
+    pub(super) fn new(plan: &StepPlan, views: &[ViewReport], lambda_instance: f32) -> Self {
+        let sum = |of: fn(&ViewReport) -> f64| views.iter().map(of).sum::<f64>();
+        let is_labelled = plan.stage == Stage::Instance && plan.labelled > 0;
+        let of_labelled = |sum: f64| is_labelled.then(|| sum / plan.labelled as f64);
+        let color = sum(|view| view.color_loss) * f64::from(plan.view_weight());
+        let instance = of_labelled(sum(|view| view.instance_loss));
+        Self {
+            color,
+            instance,
+            unsupported: of_labelled(sum(|view| view.unsupported)),
+            total: color + f64::from(lambda_instance) * instance.unwrap_or(0.0),
+        }
+    }
 }
 
 impl Trainer {
@@ -98,152 +120,43 @@ impl Trainer {
         order[(position % count) as usize] as usize
     }
 
-    /// Renders the step's views forward and backward, then moves the parameters.
+    /// A step, and what the schedule has behind it. Where steps run ahead on a GPU, the loss is that of the last step
+    /// that has arrived.
     pub(super) fn step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
+        let result = self.try_step(events);
         #[cfg(feature = "wgpu")]
-        if self.device.is_some() {
-            return self.device_step(events);
+        {
+            events.append(&mut self.arrived);
+            result.map_err(|error| self.device_failed(error))
         }
+        #[cfg(not(feature = "wgpu"))]
+        result
+    }
+
+    fn try_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
         let start = Instant::now();
-        let stage = self.progress.stage;
-        let iteration = self.progress.iteration + 1;
-        let batch = self.config.stages.batch;
-        if matches!(stage, Stage::Coarse | Stage::Fine) {
+        let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
+        if self.judges_sh(stage, iteration) {
+            self.fetch_from_gpu()?;
             self.judge_sh(stage, iteration, events)?;
+        }
+        if matches!(stage, Stage::Coarse | Stage::Fine) {
             self.field.sh_degree = self.degree_at(iteration);
         }
-        let mut views = Vec::with_capacity(batch as usize);
-        for k in 0..batch {
-            let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));
-            views.push((self.frames.index(view), self.frames.get(&self.dataset, view)?));
-        }
-        let settings = RenderSettings {
-            instances: (stage == Stage::Instance && self.instance_pass == InstancePass::On)
-                .then(|| self.instance_settings()),
-            ..self.color_settings()
+        #[cfg(feature = "wgpu")]
+        let on_device = self.step_on_device(events)?;
+        #[cfg(not(feature = "wgpu"))]
+        let on_device = None;
+        let loss = match on_device {
+            Some(loss) => loss,
+            None => {
+                let plan = self.plan_step(stage, iteration)?;
+                let loss = self.step_on_processor(&plan, events)?;
+                self.progress.count_step();
+                self.keep_in_range(&plan);
+                loss
+            }
         };
-        // Rendering between steps, for scores and identities, is no part of them.
-        self.renderer.reset_times();
-        let labelled: usize = views.iter().map(|(_, frame)| frame.labelled).sum();
-        let weight = 1.0 / batch as f32;
-        let mut loss = StepLoss::default();
-        let (mut instance_loss, mut unsupported) = (0.0, 0.0);
-        let pull = self.guidance_weight(stage, iteration);
-        let (psnr_before, snapshot) = (self.progress.psnr, self.snapshot());
-        let mut fault = self.fault_before_step();
-        for (index, data) in &views {
-            if fault.is_some() {
-                break;
-            }
-            let frame = &self.dataset.frames[*index];
-            let time = frame.time;
-            let labels = data.labels.as_ref().filter(|_| data.labelled > 0);
-            let with_instances = settings.instances.is_some() && labels.is_some();
-            let settings =
-                RenderSettings { instances: settings.instances.filter(|_| with_instances), ..settings };
-            let labels = labels.filter(|_| with_instances);
-            let pass = self.renderer.forward(&self.field, &frame.camera, time, &settings, labels);
-            let mut since = Instant::now();
-            let exposure = self.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name));
-            let recorded = exposure.map(|exposure| {
-                let mut recorded = pass.color.clone();
-                exposure.apply(&mut recorded);
-                recorded
-            });
-            let color = color_loss(
-                recorded.as_ref().unwrap_or(&pass.color),
-                &data.image,
-                self.config.loss.lambda_dssim,
-                weight,
-                &mut self.scratch.v_color,
-                &mut self.scratch.ssim,
-            );
-            lap(&mut self.times.losses, &mut since);
-            loss.color += color.loss * f64::from(weight);
-            self.progress.add_psnr(color.psnr());
-            if stage == Stage::Instance && !self.config.instance.color_loss {
-                self.scratch.v_color.pixels.fill([0.0; 3]);
-            }
-            if stage == Stage::Coarse {
-                self.leave_out_travelling(data);
-            }
-            if self.leaves_out_judged(stage, iteration, *index) {
-                leave_out_held_out(&mut self.scratch.v_color);
-            }
-            if let (Some(exposure), Some(all)) = (exposure, &mut self.progress.exposures) {
-                let gradient = exposure.pull_back(&pass.color, &mut self.scratch.v_color);
-                all.add(&self.dataset.frames[*index].camera_name, &gradient);
-            }
-            // The mean is over the labelled pixels of all views of the step (A4).
-            let share = if with_instances { data.labelled as f64 / labelled as f64 } else { 0.0 };
-            instance_loss += share * pass.instance_loss;
-            unsupported += pass.unsupported_pixels as f64;
-            fault = self.fault_of_view(color.loss, pass.instance_loss);
-            if fault.is_some() {
-                break;
-            }
-            let instance_weight = (share * f64::from(self.config.loss.lambda_instance)) as f32;
-            let v_displacements = self.displacement_gradients(time, pull);
-            self.renderer.backward_displaced(
-                &self.field,
-                &self.scratch.v_color,
-                instance_weight,
-                &v_displacements,
-                &mut self.gradients,
-            );
-            fault = self.fault_of_backward();
-            let statistics = self.renderer.statistics();
-            self.times.add_view(self.field.gaussians.len(), &statistics);
-            self.progress.work.add_view(self.field.gaussians.len(), &statistics);
-        }
-        self.times.add_render(&self.renderer.times());
-        loss.total = loss.color;
-        if stage == Stage::Instance && labelled > 0 {
-            loss.instance = Some(instance_loss);
-            loss.unsupported = Some(unsupported / labelled as f64);
-            loss.total += f64::from(self.config.loss.lambda_instance) * instance_loss;
-        }
-        let rates = StepRates::at(&self.config, stage, iteration, &self.field);
-        let weights = PlaneWeights {
-            smoothness: self.config.loss.plane_smoothness,
-            time_smoothness: self.config.loss.time_smoothness,
-            time_sparsity: self.config.loss.time_sparsity,
-        };
-        fault = fault
-            .or_else(|| gradient_fault(&self.gradients, &rates))
-            .or_else(|| exposure_fault(self.progress.exposures.as_ref()));
-        if fault.is_none() {
-            if matches!(stage, Stage::Coarse | Stage::Fine) && iteration < self.config.densify.until {
-                self.statistics.add(&self.gradients);
-            }
-            self.optimiser
-                .step(
-                    &mut self.field,
-                    &mut self.gradients,
-                    &rates,
-                    &weights,
-                    self.config.adam.visible_rows_only,
-                    &mut self.times,
-                )
-                .map_err(|parameter| self.not_finite(parameter.name))?;
-            fault = self.fault_after_step();
-        }
-        if let Some(exposures) = &mut self.progress.exposures {
-            if fault.is_none() {
-                exposures.step(exposure_rate(&self.config, self.progress.total_steps));
-            } else {
-                exposures.reset();
-            }
-        }
-        match fault {
-            Some(fault) => self.roll_back(fault, snapshot, psnr_before, events)?,
-            None => self.progress.rollbacks.in_a_row = 0,
-        }
-        self.gradients.screen.fill([0.0; 2]);
-        self.gradients.radii.fill(0.0);
-
-        self.progress.count_step();
-        self.keep_in_range(stage);
         let mut since = Instant::now();
         self.progress.after_step = Some(AfterStep::Changes);
         self.finish_step(stage, events)?;
@@ -253,6 +166,141 @@ impl Trainer {
         Ok(loss)
     }
 
+    /// Renders the views of a step forward and backward, then moves the parameters.
+    fn step_on_processor(
+        &mut self,
+        plan: &StepPlan,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<StepLoss, TrainError> {
+        // Rendering between steps, for scores and identities, is no part of them.
+        self.renderer.reset_times();
+        let snapshot = self.snapshot();
+        let mut reports = Vec::with_capacity(plan.views.len());
+        let fault = self.attempt(plan, &mut reports)?;
+        let loss = StepLoss::new(plan, &reports, self.config.loss.lambda_instance);
+        match fault {
+            Some(fault) => self.roll_back(fault, snapshot, events)?,
+            None => self.take_in(&reports),
+        }
+        Ok(loss)
+    }
+
+    /// Takes in the views of a step that was taken.
+    pub(super) fn take_in(&mut self, views: &[ViewReport]) {
+        views.iter().for_each(|view| self.progress.add_psnr(view.psnr));
+        self.progress.rollbacks.in_a_row = 0;
+    }
+
+    /// The step itself, which moves nothing when it meets a fault, or is undone by the caller when that shows late.
+    pub(super) fn attempt(
+        &mut self,
+        plan: &StepPlan,
+        reports: &mut Vec<ViewReport>,
+    ) -> Result<Option<Fault>, TrainError> {
+        let mut fault = self.fault_before_step();
+        for view in &plan.views {
+            if fault.is_some() {
+                break;
+            }
+            fault = self.view(plan, view, reports);
+        }
+        self.times.add_render(&self.renderer.times());
+        fault = fault
+            .or_else(|| gradient_fault(&self.gradients, &plan.rates))
+            .or_else(|| exposure_fault(self.progress.exposures.as_ref()));
+        if fault.is_none() {
+            if plan.counts_statistics {
+                self.statistics.add(&self.gradients);
+            }
+            self.optimiser
+                .step(
+                    &mut self.field,
+                    &mut self.gradients,
+                    &plan.rates,
+                    &plan.weights,
+                    plan.visible_rows_only,
+                    &mut self.times,
+                )
+                .map_err(|parameter| self.not_finite(parameter.name))?;
+            fault = self.fault_after_step();
+        }
+        if let Some(exposures) = &mut self.progress.exposures {
+            match plan.exposure_rate.filter(|_| fault.is_none()) {
+                Some(rate) => exposures.step(rate),
+                None => exposures.reset(),
+            }
+        }
+        self.gradients.screen.fill([0.0; 2]);
+        self.gradients.radii.fill(0.0);
+        Ok(fault)
+    }
+
+    /// A view of a step, forward and backward.
+    fn view(&mut self, plan: &StepPlan, view: &StepView, reports: &mut Vec<ViewReport>) -> Option<Fault> {
+        let frame = &self.dataset.frames[view.index];
+        let (time, data) = (frame.time, &*view.frame);
+        let with_instances = plan.settings.instances.is_some() && data.labelled > 0;
+        let labels = data.labels.as_ref().filter(|_| with_instances);
+        let with_instances = labels.is_some();
+        let settings =
+            RenderSettings { instances: plan.settings.instances.filter(|_| with_instances), ..plan.settings };
+        let pass = self.renderer.forward(&self.field, &frame.camera, time, &settings, labels);
+        let mut since = Instant::now();
+        let exposure = self.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name));
+        let recorded = exposure.map(|exposure| {
+            let mut recorded = pass.color.clone();
+            exposure.apply(&mut recorded);
+            recorded
+        });
+        let color = color_loss(
+            recorded.as_ref().unwrap_or(&pass.color),
+            &data.image,
+            self.config.loss.lambda_dssim,
+            plan.view_weight(),
+            &mut self.scratch.v_color,
+            &mut self.scratch.ssim,
+        );
+        lap(&mut self.times.losses, &mut since);
+        let labelled = if with_instances { data.labelled as f64 } else { 0.0 };
+        reports.push(ViewReport {
+            psnr: color.psnr(),
+            color_loss: color.loss,
+            instance_loss: labelled * pass.instance_loss,
+            unsupported: pass.unsupported_pixels as f64,
+        });
+        if !plan.trains_colors {
+            self.scratch.v_color.pixels.fill([0.0; 3]);
+        }
+        if plan.stage == Stage::Coarse {
+            self.leave_out_travelling(data);
+        }
+        if view.leaves_judged {
+            leave_out_held_out(&mut self.scratch.v_color);
+        }
+        if let (Some(exposure), Some(all)) = (exposure, &mut self.progress.exposures) {
+            let gradient = exposure.pull_back(&pass.color, &mut self.scratch.v_color);
+            all.add(&self.dataset.frames[view.index].camera_name, &gradient);
+        }
+        if let Some(fault) = self.fault_of_view(color.loss, pass.instance_loss) {
+            return Some(fault);
+        }
+        let share = if with_instances { plan.label_share(view) } else { 0.0 };
+        let instance_weight = (share * f64::from(self.config.loss.lambda_instance)) as f32;
+        let v_displacements = self.displacement_gradients(time, plan.pulls);
+        self.renderer.backward_displaced(
+            &self.field,
+            &self.scratch.v_color,
+            instance_weight,
+            &v_displacements,
+            &mut self.gradients,
+        );
+        let fault = self.fault_of_backward();
+        let statistics = self.renderer.statistics();
+        self.times.add_view(self.field.gaussians.len(), &statistics);
+        self.progress.work.add_view(self.field.gaussians.len(), &statistics);
+        fault
+    }
+
     /// What changes the field behind a step, from where a stop cut it short.
     pub(super) fn finish_step(
         &mut self,
@@ -260,26 +308,63 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let iteration = self.progress.iteration;
+        let due = Due::after(&self.config, stage, iteration, self.plan.iterations(&self.config, stage));
+        let judges = [self.judges_heads(stage, iteration), self.settles(stage, iteration)];
+        #[cfg(feature = "wgpu")]
+        if judges.contains(&true) || due.estimates_identities || self.device_is_far_ahead() {
+            self.fetch_from_device()?;
+        }
         if self.progress.after_step == Some(AfterStep::Changes) {
-            match stage {
-                Stage::Instance => self.instance_events(iteration, events)?,
-                _ => self.densify(stage, iteration, events)?,
+            if due.changes_gaussians() {
+                self.change_gaussians(stage, iteration, &due, events)?;
             }
             self.progress.after_step = Some(AfterStep::Heads);
         }
         if self.progress.after_step == Some(AfterStep::Heads) {
-            if self.judges_heads(stage, iteration) {
+            if judges[0] {
                 self.wholly(events, |trainer, events| trainer.judge_heads(stage, iteration, events))?;
             }
             self.progress.after_step = Some(AfterStep::Still);
         }
         if self.progress.after_step == Some(AfterStep::Still) {
-            if self.settles(stage, iteration) {
+            if judges[1] {
                 self.wholly(events, |trainer, events| trainer.settle(stage, iteration, events))?;
             }
             self.progress.after_step = None;
         }
         Ok(())
+    }
+
+    /// Changes of the set of Gaussians, or of whose they are, behind a step.
+    fn change_gaussians(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        due: &Due,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        #[cfg(feature = "wgpu")]
+        if self.device_is_ahead() {
+            return self.change_gaussians_on_device(stage, iteration, due, events);
+        }
+        self.change_gaussians_here(stage, iteration, due, events)?;
+        #[cfg(feature = "wgpu")]
+        self.identities_changed();
+        Ok(())
+    }
+
+    /// The same from the host's own state.
+    pub(super) fn change_gaussians_here(
+        &mut self,
+        stage: Stage,
+        iteration: u32,
+        due: &Due,
+        events: &mut Vec<TrainEvent>,
+    ) -> Result<(), TrainError> {
+        match stage {
+            Stage::Instance => self.instance_events(iteration, due, events),
+            _ => self.densify(stage, iteration, due, events),
+        }
     }
 
     /// Does work that judges the field, or leaves everything as it was when that fails or is stopped.
@@ -305,23 +390,19 @@ impl Trainer {
         TrainError::NotFinite { stage: self.progress.stage, iteration: self.progress.iteration + 1, tensor }
     }
 
-    /// Limits of occupancy (row 42) and calibration (5.3), and unit quaternions now and then (row 18).
-    fn keep_in_range(&mut self, stage: Stage) {
-        if stage == Stage::Instance {
-            let [low, high] = self.config.instance.occupancy_limits.map(logit);
-            if !self.config.ablates(Ablation::ConstantOccupancy) {
-                for value in &mut self.field.gaussians.occupancy_logits {
-                    *value = value.clamp(low, high);
-                }
-            }
-            let limit = self.config.instance.calibration_limit;
-            if let Some(identities) = &mut self.field.identities {
-                for value in &mut identities.log_calibrations {
-                    *value = value.clamp(-limit, limit);
-                }
+    /// Limits of occupancies and calibrations, and unit quaternions now and then.
+    fn keep_in_range(&mut self, plan: &StepPlan) {
+        if let Some([low, high]) = plan.occupancy_limits {
+            for value in &mut self.field.gaussians.occupancy_logits {
+                *value = value.clamp(low, high);
             }
         }
-        if self.progress.total_steps.is_multiple_of(RENORMALISE_EVERY) {
+        if let (Some(limit), Some(identities)) = (plan.calibration_limit, &mut self.field.identities) {
+            for value in &mut identities.log_calibrations {
+                *value = value.clamp(-limit, limit);
+            }
+        }
+        if plan.renormalises {
             for raw in &mut self.field.gaussians.quaternions {
                 if let Some(unit) = quaternion::try_normalize(*raw) {
                     *raw = unit;
@@ -331,19 +412,17 @@ impl Trainer {
     }
 
     /// Pruning, additions and opacity resets that fall on this step.
-    pub(super) fn densify(
+    fn densify(
         &mut self,
         stage: Stage,
         iteration: u32,
+        due: &Due,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let config = self.config.densify.clone();
-        if iteration >= config.until {
-            return Ok(());
-        }
         let extent = self.field.extent;
         let (mut cloned, mut split, mut pruned) = (0, 0, 0);
-        if iteration > config.from && falls_on(iteration, config.prune_every) {
+        if due.prunes {
             let reset = self.progress.opacities_were_reset;
             if let Some(change) = prune(&self.field.gaussians, &self.statistics, &config, extent, reset) {
                 if change.gaussians.is_empty() {
@@ -353,7 +432,7 @@ impl Trainer {
                 self.rearrange(change);
             }
         }
-        if iteration > config.from && falls_on(iteration, config.every) {
+        if due.adds {
             let mut rng = stream(self.config.seed, Purpose::Split, self.progress.total_steps);
             let change = add_gaussians(&self.field.gaussians, &self.statistics, &config, extent, &mut rng);
             if let Some(change) = change {
@@ -362,7 +441,7 @@ impl Trainer {
             }
             self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
         }
-        if falls_on(iteration, config.opacity_reset_every) {
+        if due.resets_opacities {
             reset_opacities(&mut self.field.gaussians, config.opacity_reset_to);
             self.optimiser.of(&OPACITY_LOGITS).reset_all();
             self.progress.opacities_were_reset = true;
@@ -394,23 +473,21 @@ impl Trainer {
     }
 
     /// Refreshed estimates and relocations that fall on this step.
-    pub(super) fn instance_events(
+    fn instance_events(
         &mut self,
         iteration: u32,
+        due: &Due,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let last = self.plan.iterations(&self.config, Stage::Instance);
-        if falls_on(iteration, self.config.identity.refresh_every) && iteration < last {
+        if due.estimates_identities {
             let event = self.estimate_identities(false)?;
             events.push(event);
         }
-        let config = &self.config.resample;
-        let falls = falls_on(iteration, config.every) && (config.from..=config.until).contains(&iteration);
-        if !falls || iteration >= last || self.config.ablates(Ablation::NoResampling) {
+        if !due.resamples {
             return Ok(());
         }
         let context = ResampleContext {
-            config,
+            config: &self.config.resample,
             unseen: &self.unseen,
             label_pixels: &self.label_pixels,
             opacity_is_occupancy: self.config.ablates(Ablation::OpacityOccupancy),

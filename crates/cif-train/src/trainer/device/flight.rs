@@ -10,10 +10,11 @@ use std::collections::VecDeque;
 
 use cif_render::wgpu::{Gpu, GpuError, GpuStatistics, Letter, Mailbox, Submission, faults};
 
+use super::super::step::{StepLoss, ViewReport};
+use super::super::step_plan::StepPlan;
 use super::DeviceTraining;
-use super::step::StepPlan;
+use super::step::Recording;
 use crate::error::TrainError;
-use crate::events::Stage;
 use crate::trainer::Trainer;
 use crate::wgpu::kernels::fault;
 use crate::wgpu::losses::ViewLoss;
@@ -31,8 +32,6 @@ pub(super) const LOSS_WORDS: usize = 8;
 #[derive(Clone, Copy)]
 pub(super) struct AboutView {
     pub(super) pixels: usize,
-    /// Share of the colour loss of the step.
-    pub(super) weight: f64,
     /// Labelled pixels, 0 without the instance pass.
     pub(super) labelled: usize,
     pub(super) lambda_dssim: f32,
@@ -93,7 +92,7 @@ impl ViewRead {
 
 /// A step on its way.
 pub(super) struct Flight {
-    pub(super) plan: StepPlan,
+    pub(super) recording: Recording,
     pub(super) reads: Vec<ViewRead>,
     /// That of its last view.
     pub(super) submission: Submission,
@@ -117,7 +116,7 @@ impl Flights {
         gpu: &Gpu,
         mailbox: &mut Mailbox,
         all: bool,
-    ) -> Result<Option<(StepPlan, Vec<ViewNews>)>, GpuError> {
+    ) -> Result<Option<(Recording, Vec<ViewNews>)>, GpuError> {
         let Some(mut front) = self.waiting.pop_front() else { return Ok(None) };
         if all || self.waiting.len() >= AHEAD {
             gpu.wait_for(front.submission.clone())?;
@@ -131,30 +130,35 @@ impl Flights {
             self.waiting.push_front(front);
             return Ok(None);
         }
-        Ok(Some((front.plan, reads.into_iter().filter_map(ViewRead::news).collect())))
+        Ok(Some((front.recording, reads.into_iter().filter_map(ViewRead::news).collect())))
     }
 }
 
 impl Trainer {
     /// Takes in the steps that have arrived; `all` waits for every one that was recorded.
     pub(super) fn receive(&mut self, device: &mut DeviceTraining, all: bool) -> Result<(), TrainError> {
-        while let Some((plan, news)) = device.flights.next(&device.gpu, &mut device.mailbox, all)? {
+        while let Some((recording, news)) = device.flights.next(&device.gpu, &mut device.mailbox, all)? {
             for view in &news {
                 device.learn(&view.counts);
             }
             let [found, waits] = news.last().map_or([0; 2], |view| view.faults);
             if waits == 0 {
-                self.take_in(&plan, &news);
-                device.make_room(plan.gaussians)?;
+                self.take_in_news(&recording.plan, &news);
+                device.make_room(recording.plan.gaussians)?;
                 continue;
             }
-            self.answer(device, plan, found)?;
+            self.answer(device, recording, found)?;
         }
         Ok(())
     }
 
     /// Answers a step that must not be taken, and records those after it again.
-    fn answer(&mut self, device: &mut DeviceTraining, plan: StepPlan, found: u32) -> Result<(), TrainError> {
+    fn answer(
+        &mut self,
+        device: &mut DeviceTraining,
+        recording: Recording,
+        found: u32,
+    ) -> Result<(), TrainError> {
         let mut again = Vec::new();
         while let Some((later, news)) = device.flights.next(&device.gpu, &mut device.mailbox, true)? {
             for view in &news {
@@ -165,15 +169,15 @@ impl Trainer {
         // Sums of these steps are empty: their own optimiser took them, and moved nothing.
         device.faults.write(&device.gpu, 0, &[0; faults::WORDS]);
         if found & fault::NO_ROOM != 0 {
-            device.make_room(plan.gaussians)?;
-            again.insert(0, plan);
+            device.make_room(recording.plan.gaussians)?;
+            again.insert(0, recording);
         } else {
-            let fault = self.diagnose(device, &plan, found)?;
-            self.uncount(plan.moving);
+            let fault = self.diagnose(device, &recording, found)?;
+            self.uncount(recording.moving);
             for later in &mut again {
-                later.uncount(plan.moving);
+                later.uncount(recording.moving);
             }
-            match self.count_bad_step(plan.stage, plan.iteration, fault) {
+            match self.count_bad_step(recording.plan.stage, recording.plan.iteration, fault) {
                 Ok(event) => self.arrived.push(event),
                 Err(error) => {
                     self.forget(&again);
@@ -188,7 +192,7 @@ impl Trainer {
     }
 
     /// Stands before a step again that ended the run; those after it have moved nothing either.
-    fn forget(&mut self, later: &[StepPlan]) {
+    fn forget(&mut self, later: &[Recording]) {
         for step in later {
             self.uncount(step.moving);
         }
@@ -196,28 +200,27 @@ impl Trainer {
     }
 
     /// Losses and counts of a step that was taken.
-    fn take_in(&mut self, plan: &StepPlan, news: &[ViewNews]) {
-        let mut loss = super::super::step::StepLoss::default();
+    fn take_in_news(&mut self, plan: &StepPlan, news: &[ViewNews]) {
+        let reports: Vec<ViewReport> = news.iter().map(ViewNews::report).collect();
         for view in news {
-            let about = &view.about;
-            self.progress.add_psnr(view.loss.color.psnr());
-            loss.color += view.loss.color.loss * about.weight;
-            if plan.stage == Stage::Instance && plan.labelled > 0 {
-                let of_step = plan.labelled as f64;
-                // The mean over the labelled pixels of all views of the step (A4).
-                *loss.instance.get_or_insert(0.0) +=
-                    if about.labelled > 0 { view.loss.instance_sum / of_step } else { 0.0 };
-                *loss.unsupported.get_or_insert(0.0) += view.loss.unsupported / of_step;
-            }
             self.times.views += 1;
-            self.times.gaussians += about.gaussians as u64;
+            self.times.gaussians += view.about.gaussians as u64;
             self.times.visible += u64::from(view.counts.visible);
             self.times.tile_pairs += u64::from(view.counts.pairs);
         }
-        let instance = loss.instance.unwrap_or(0.0);
-        loss.total = loss.color + f64::from(self.config.loss.lambda_instance) * instance;
-        self.last_loss = loss;
-        self.progress.rollbacks.in_a_row = 0;
+        self.last_loss = StepLoss::new(plan, &reports, self.config.loss.lambda_instance);
+        self.take_in(&reports);
+    }
+}
+
+impl ViewNews {
+    fn report(&self) -> ViewReport {
+        ViewReport {
+            psnr: self.loss.color.psnr(),
+            color_loss: self.loss.color.loss,
+            instance_loss: if self.about.labelled > 0 { self.loss.instance_sum } else { 0.0 },
+            unsupported: self.loss.unsupported,
+        }
     }
 }
 

@@ -11,14 +11,12 @@
 //! | `shape` | what steps took by stage, and what they worked on |
 //! | `flight` | steps on their way: what is read of them later, room for pairs, bad steps |
 //! | `validation` | where a bad step went wrong, and every array of a step looked at |
-//! | `events` | what happens between steps |
 //! | `probe`, `kept` | whether the GPU is faster: trial steps, and undoing them |
 //! | `rearrange` | changes of the set of Gaussians, with their rows staying there |
 //! | `draw` | views between steps |
 //! | `identities` | label mass for the identity stage |
 
 mod draw;
-mod events;
 mod flight;
 mod identities;
 mod kept;
@@ -270,7 +268,7 @@ impl Trainer {
     }
 
     /// After a fault of the device the host stands where its state was fetched last.
-    fn device_failed(&mut self, error: TrainError) -> TrainError {
+    pub(super) fn device_failed(&mut self, error: TrainError) -> TrainError {
         if !matches!(error, TrainError::Gpu(_)) {
             return error;
         }

@@ -12,7 +12,7 @@ use crate::densify::Rearrangement;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::resample::Pair;
-use crate::schedule::falls_on;
+use crate::schedule::Due;
 use crate::wgpu::kernels::{FRESH, RESTARTED};
 use crate::wgpu::rearrange::{GpuRearranger, RowRule, compose};
 
@@ -27,12 +27,12 @@ struct Basis {
 }
 
 impl Trainer {
-    /// What [`Trainer::densify`] does, or in the instance stage [`Trainer::instance_events`] without new estimates, on the
-    /// device.
-    pub(super) fn rearrange_on_device(
+    /// Changes of the set of Gaussians with their rows staying on the device.
+    pub(in crate::trainer) fn change_gaussians_on_device(
         &mut self,
         stage: Stage,
         iteration: u32,
+        due: &Due,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let Some(mut device) = self.device.take() else { return Ok(()) };
@@ -58,16 +58,13 @@ impl Trainer {
         device.origins = Some((0..basis.geometry.len() as u32).collect());
         self.device = Some(device);
         self.take_basis(basis);
-        let densified = match stage {
-            Stage::Instance => self.instance_events(iteration, events),
-            _ => self.densify(stage, iteration, events),
-        };
+        let densified = self.change_gaussians_here(stage, iteration, due, events);
         let Some(mut device) = self.device.take() else { return densified };
         let origins = device.origins.take();
-        let resets = !relocates && falls_on(iteration, self.config.densify.opacity_reset_every);
         let followed = match (&densified, origins, &mut device.resident) {
             (Ok(()), Some(origins), Some(resident)) => {
-                let moved = resident.rearrange(&device.gpu, &device.rearranger, &origins, resets);
+                let moved =
+                    resident.rearrange(&device.gpu, &device.rearranger, &origins, due.resets_opacities);
                 moved.and_then(|()| {
                     let rows = geometry(&self.field.gaussians);
                     resident.canonical.geometry.replace(&device.gpu, &rows)?;

@@ -3,7 +3,7 @@
 use super::super::Trainer;
 use super::super::guard::Fault;
 use super::DeviceTraining;
-use super::step::StepPlan;
+use super::step::Recording;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::wgpu::kernels::fault_name;
@@ -14,7 +14,7 @@ impl Trainer {
     pub(super) fn diagnose(
         &mut self,
         device: &DeviceTraining,
-        plan: &StepPlan,
+        recording: &Recording,
         found: u32,
     ) -> Result<Fault, TrainError> {
         let (part, tensor) = fault_name(found);
@@ -25,26 +25,18 @@ impl Trainer {
         let exposures = self.progress.exposures.as_mut();
         let (field, optimiser) = (&mut self.field, &mut self.optimiser);
         let fetched = resident.fetch(&device.gpu, field, optimiser, &mut self.statistics, exposures);
-        let mut events = Vec::new();
         let result = fetched.and_then(|()| {
-            self.uncount(plan.moving);
+            self.uncount(recording.moving);
             self.gradients = cif_render::Gradients::zeros(&self.field);
-            self.progress.iteration = plan.iteration - 1;
-            self.progress.rollbacks.in_a_row = 0;
             self.set_debug_validation(true);
-            // There is no device at hand here, so this is the processor's step.
-            self.step(&mut events)
+            self.attempt(&recording.plan, &mut Vec::new())
         });
         self.put_back(kept);
-        let told = events.into_iter().find_map(|event| match event {
-            TrainEvent::RolledBack { fault, .. } => Some(fault),
-            _ => None,
-        });
-        match (told, result) {
-            (Some(fault), _) => Ok(fault),
+        match result {
+            Ok(Some(fault)) => Ok(fault),
             // A lost device, say.
-            (None, Err(error @ TrainError::Gpu(_))) => Err(error),
-            (None, _) => Ok(unknown),
+            Err(error @ TrainError::Gpu(_)) => Err(error),
+            _ => Ok(unknown),
         }
     }
 
@@ -53,8 +45,7 @@ impl Trainer {
     pub(super) fn validated_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<(), TrainError> {
         self.fetch_from_device()?;
         let (snapshot, statistics) = (self.snapshot(), self.statistics.clone());
-        let exposures = self.progress.exposures.clone();
-        let psnr_before = self.progress.psnr;
+        let (exposures, psnr_before) = (self.progress.exposures.clone(), self.progress.psnr);
         let fault = match self.fault_before_step() {
             Some(fault) => {
                 self.progress.count_step();
@@ -69,7 +60,8 @@ impl Trainer {
         let Some(fault) = fault else { return Ok(()) };
         // As before the step, but that it counts as done.
         self.progress.iteration -= 1;
-        let undone = self.roll_back(fault, snapshot, psnr_before, events);
+        self.progress.psnr = psnr_before;
+        let undone = self.roll_back(fault, snapshot, events);
         self.statistics = statistics;
         self.progress.exposures = exposures;
         self.everything_changed();

@@ -7,15 +7,27 @@ use cif_render::wgpu::{Commands, GpuError, GpuStatistics, LabelInput, Submission
 use cif_render::{InstanceNormalisation, RenderSettings};
 
 use super::super::Trainer;
+use super::super::step_plan::{StepPlan, StepView};
 use super::super::times::StepTimes;
 use super::DeviceTraining;
 use super::flight::{AboutView, LOSS_WORDS, ViewRead};
 use super::resident::Resident;
-use super::step::{StepPlan, StepView};
+use super::step::Recording;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::wgpu::kernels::{Judgement, fault};
 use crate::wgpu::losses::{GpuTarget, LossWeights, SLOTS};
+use crate::wgpu::optimiser::GaussianStep;
+
+impl GaussianStep {
+    fn of(plan: &StepPlan) -> Self {
+        Self {
+            visible_only: plan.visible_rows_only,
+            renormalise: plan.renormalises,
+            occupancy_limits: plan.occupancy_limits,
+        }
+    }
+}
 
 /// What stops a step whatever moves.
 const ALWAYS: u32 = fault::NO_ROOM | fault::COLOR_LOSS | fault::INSTANCE_LOSS;
@@ -26,9 +38,10 @@ impl Trainer {
         &mut self,
         device: &mut DeviceTraining,
         resident: &mut Resident,
-        plan: &StepPlan,
+        recording: &Recording,
         position: usize,
     ) -> Result<(ViewRead, Submission), TrainError> {
+        let plan = &recording.plan;
         let view = &plan.views[position];
         let (first, last) = (position == 0, position + 1 == plan.views.len());
         device.keep_target(view, u64::from(self.config.frame_memory_mib) << 20)?;
@@ -61,12 +74,10 @@ impl Trainer {
             plan.settings.instances.is_some() && view.frame.labelled > 0 && resident.identities.is_some();
         let settings =
             RenderSettings { instances: plan.settings.instances.filter(|_| with_instances), ..plan.settings };
-        let weight = 1.0 / self.config.stages.batch as f32;
-        let share = view.frame.labelled as f64 / plan.labelled.max(1) as f64;
         let labels = with_instances.then(|| LabelInput {
             labels: &target.labels,
             labelled_pixels: view.frame.labelled,
-            weight: (share * f64::from(self.config.loss.lambda_instance)) as f32,
+            weight: (plan.label_share(view) * f64::from(self.config.loss.lambda_instance)) as f32,
         });
         let input = ViewInput { camera: &frame.camera, settings: &settings, labels };
 
@@ -86,7 +97,7 @@ impl Trainer {
         rasterizer.rasterize(gpu, &mut commands, rows, labels)?;
         let weights = LossWeights {
             lambda_dssim: self.config.loss.lambda_dssim,
-            view: weight,
+            view: plan.view_weight(),
             with_instances,
             by_coverage: settings
                 .instances
@@ -94,7 +105,7 @@ impl Trainer {
             leaves_out: plan.stage == Stage::Coarse && self.travelling_labels().is_some(),
             leaves_judged: view.leaves_judged,
         };
-        let exposed = resident.exposures.as_ref().zip(view.camera);
+        let exposed = resident.exposures.as_ref().zip(view.camera.map(|camera| camera as u32));
         let colors = rasterizer.colors();
         let mut recorded = colors;
         if let Some(camera) = exposed {
@@ -104,7 +115,7 @@ impl Trainer {
         }
         let images = (recorded, rasterizer.blended());
         losses.record(gpu, &mut commands, images, target, &weights, *slot)?;
-        if plan.stage == Stage::Instance && !self.config.instance.color_loss {
+        if !plan.trains_colors {
             commands.clear(&losses.v_colors);
         }
         if let Some((cameras, _)) = exposed {
@@ -122,8 +133,7 @@ impl Trainer {
                 false,
                 faults,
             );
-            let strengths = self.guidance_weight(plan.stage, plan.iteration);
-            if let Some((shifts, pulls)) = self.pulls(frame.time, strengths) {
+            if let Some((shifts, pulls)) = self.pulls(frame.time, plan.pulls) {
                 motion.record(
                     gpu,
                     &mut commands,
@@ -160,23 +170,22 @@ impl Trainer {
         }
         let judgement = Judgement {
             slot: *slot as u32,
-            counts: plan.moving | ALWAYS,
-            known: plan.known,
+            counts: recording.moving | ALWAYS,
+            known: recording.known,
             is_last: u32::from(last),
         };
         let losses_and_counts = (losses.results(), rasterizer.counts());
         judge.record(gpu, &mut commands, judgement, losses_and_counts, faults);
 
         if last {
-            if matches!(plan.stage, Stage::Coarse | Stage::Fine) && plan.iteration < self.config.densify.until
-            {
+            if plan.counts_statistics {
                 let rows = (&resident.screen, &resident.statistics);
                 optimiser.add_statistics(gpu, &mut commands, rows, faults);
             }
             optimiser.step_gaussians(
                 gpu,
                 &mut commands,
-                (&plan.step, &plan.groups),
+                (&GaussianStep::of(plan), &recording.groups),
                 (&resident.canonical, &resident.gradients),
                 &resident.moments,
                 &resident.screen,
@@ -187,20 +196,20 @@ impl Trainer {
                 optimiser.step_calibrations(
                     gpu,
                     &mut commands,
-                    (plan.groups.of(&LOG_CALIBRATIONS), self.config.instance.calibration_limit),
+                    (recording.groups.of(&LOG_CALIBRATIONS), plan.calibration_limit.unwrap_or(f32::MAX)),
                     (&identities.log_calibrations, &identities.gradients),
                     &identities.moments,
                     faults,
                 );
             }
             if let Some(cameras) = &resident.exposures {
-                exposure.step(gpu, &mut commands, plan.exposures, cameras, faults);
+                exposure.step(gpu, &mut commands, recording.exposures, cameras, faults);
             }
             if let Some(deformation) = &resident.deformation {
                 optimiser.step_deformation(
                     gpu,
                     &mut commands,
-                    (plan.groups.of(&PLANES), plan.groups.of(&MLP)),
+                    (recording.groups.of(&PLANES), recording.groups.of(&MLP)),
                     &plan.weights,
                     (&deformation.parameters, &deformation.gradients),
                     &deformation.moments,
@@ -230,7 +239,6 @@ impl Trainer {
         let pixels = target.size[0] as usize * target.size[1] as usize;
         let about = AboutView {
             pixels,
-            weight: f64::from(weight),
             labelled: if with_instances { view.frame.labelled } else { 0 },
             lambda_dssim: self.config.loss.lambda_dssim,
             gaussians: resident.canonical.len(),
