@@ -4,6 +4,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 WHEELS := target/wheels
+# The environment of the tests, whose wheel is built for building fast.
+TEST_BIN := $(VENV)/tests/bin
+TEST_WHEELS := target/test-wheels
 OUT ?= out/demo
 DEMO_CAPTURE := examples/tabletop-mini
 DEMO_LABEL := red mug
@@ -17,7 +20,10 @@ RUFF := ruff==0.17.5
 MUJOCO := mujoco[usd]==4.0.0
 BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13
 
-.PHONY: help build demo plugin test test-rust test-python test-usd test-mujoco test-blender fuzz lint format clean
+# One interpreter for every build, or PyO3 is built again.
+export PYO3_PYTHON := $(abspath $(BIN)/python)
+
+.PHONY: help build demo plugin test test-wheel test-rust test-python test-mujoco test-blender fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -66,20 +72,24 @@ plugin:
 
 # CIF_TEST_GPU says what tests do with a GPU: auto (the default) takes what Vulkan, Metal or Direct3D 12 offers, software
 # such as Mesa's lavapipe too, off skips them, require fails without one.
-test: test-rust test-python test-usd
+test: test-rust test-python
 
-test-rust:
-	cargo test --locked --no-fail-fast
+# In the profile and with the features of the Rust tests, so that both share their libraries: CONTRIBUTING tells more.
+test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	@rm -rf $(TEST_WHEELS)
+	$(BIN)/maturin build --profile dev --interpreter $(BIN)/python --out $(TEST_WHEELS)
+	test -x $(TEST_BIN)/python || $(PYTHON) -m venv $(VENV)/tests
+	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check $(PYTEST) $(TEST_WHEELS)/*.whl
+	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 
-test-python: build
-	$(BIN)/python -m pytest
+# What cif-usd writes and reads is tested in a Python that has usd-core, which the wheel brings.
+test-rust: test-wheel
+	PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
+	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
+	cargo test --locked --no-fail-fast --features cif-usd/python
 
-# What cif-usd writes and reads, in a Python that has usd-core.
-test-usd: build
-	PYO3_PYTHON=$(abspath $(BIN)/python) \
-	PYTHONPATH=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
-	LD_LIBRARY_PATH=$$($(BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
-	cargo test --locked -p cif-usd --features python
+test-python: test-wheel
+	$(TEST_BIN)/python -m pytest
 
 # Runs on with random seeds; failing inputs are kept in target/tmp/fuzz-failures.
 MINUTES ?= 10
@@ -88,10 +98,10 @@ fuzz:
 	CIF_FUZZ_MINUTES=$(MINUTES) CIF_FUZZ_READER=$(READER) \
 	cargo test --locked --test fuzz_readers readers -- --nocapture
 
-test-mujoco: build
+test-mujoco: test-wheel
 	test -x $(VENV)/mujoco/bin/python || $(PYTHON) -m venv $(VENV)/mujoco
 	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check "$(MUJOCO)"
-	CIF_TEST_MUJOCO=$(VENV)/mujoco/bin/python $(BIN)/python -m pytest tests/python/test_mujoco.py
+	CIF_TEST_MUJOCO=$(VENV)/mujoco/bin/python $(TEST_BIN)/python -m pytest tests/python/test_mujoco.py
 
 # Versions of Blender whose Python is not there are skipped.
 test-blender:
