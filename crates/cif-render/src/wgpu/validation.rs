@@ -1,8 +1,10 @@
-//! Parses and validates WGSL modules without a GPU, and compares what they declare with what Rust believes.
+//! Parses and validates WGSL modules without a GPU, compares what they declare with what Rust believes, and translates
+//! them for Metal and Direct3D.
 
 use std::fmt::Write as _;
 
-use naga::valid::{Capabilities, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator};
+use naga::back::{hlsl, msl};
+use naga::valid::{Capabilities, ModuleInfo, ShaderStages, SubgroupOperationSet, ValidationFlags, Validator};
 use naga::{AddressSpace, StorageAccess, TypeInner};
 
 use super::device::MOST_UNIFORM_BLOCKS;
@@ -18,8 +20,8 @@ const MAX_WORKGROUP_BYTES: u32 = 16_384;
 const MAX_INVOCATIONS: u32 = 256;
 
 /// Checks that a module is valid WGSL, without any optional feature and in the form with subgroups, that its bindings
-/// and entry points are the listed ones, that structures lie as in Rust, and that every entry point keeps to the core
-/// limits of WebGPU.
+/// and entry points are the listed ones, that structures lie as in Rust, that every entry point keeps to the core limits
+/// of WebGPU, and that Metal and Direct3D can be given it.
 ///
 /// # Errors
 /// With everything that is wrong, a line each.
@@ -140,7 +142,39 @@ fn validate_in(form: Form, module: &Module, declarations: &str, layouts: &[Layou
             complain(format!("{} uses {shared} bytes of workgroup memory", entry.name));
         }
     }
+    if let Err(error) = to_msl(form, &parsed, &information) {
+        complain(format!("has no translation for Metal: {error}"));
+    }
+    if let Err(error) = to_hlsl(form, &parsed, &information) {
+        complain(format!("has no translation for Direct3D: {error}"));
+    }
     if wrong.is_empty() { Ok(()) } else { Err(wrong) }
+}
+
+/// Translates a module into the Metal Shading Language, in the oldest version that has what the form uses.
+fn to_msl(form: Form, parsed: &naga::Module, information: &ModuleInfo) -> Result<(), String> {
+    let lang_version = match form {
+        Form::Portable => (2, 0),
+        Form::Subgroups => (2, 1),
+    };
+    let options = msl::Options { lang_version, ..msl::Options::default() };
+    let (_, written) = msl::write_string(parsed, information, &options, &msl::PipelineOptions::default())
+        .map_err(|error| error.to_string())?;
+    written.entry_point_names.into_iter().try_for_each(|entry| entry.map(drop).map_err(|e| e.to_string()))
+}
+
+/// Translates a module into the High-Level Shader Language, in the oldest model that has what the form uses.
+fn to_hlsl(form: Form, parsed: &naga::Module, information: &ModuleInfo) -> Result<(), String> {
+    let shader_model = match form {
+        Form::Portable => hlsl::ShaderModel::V5_1,
+        Form::Subgroups => hlsl::ShaderModel::V6_0,
+    };
+    let options = hlsl::Options { shader_model, ..hlsl::Options::default() };
+    let mut text = String::new();
+    let written = hlsl::Writer::new(&mut text, &options, &hlsl::PipelineOptions::default())
+        .write(parsed, information, None)
+        .map_err(|error| error.to_string())?;
+    written.entry_point_names.into_iter().try_for_each(|entry| entry.map(drop).map_err(|e| e.to_string()))
 }
 
 #[cfg(test)]
@@ -224,5 +258,10 @@ mod tests {
         // Validity at all: a uniform that is written.
         let invalid = GOOD.replace("out[i] = ", "probe.c = ");
         fails(Module { text: Box::leak(invalid.into_boxed_str()), ..PROBE }, &layout, "probe.wgsl");
+        // What naga accepts but has no translation for.
+        let open = GOOD.replace("@compute", "override unset: f32;\n@compute").replace("probe.c;", "unset;");
+        let open = Module { text: Box::leak(open.into_boxed_str()), ..PROBE };
+        fails(open, &layout, "no translation for Metal");
+        fails(open, &layout, "no translation for Direct3D");
     }
 }
