@@ -37,6 +37,7 @@ pub(super) struct MovingRows {
     put: Kernel,
     put_gradients: Kernel,
     no_faults: GpuVec<u32>,
+    moves_sh: bool,
 }
 
 impl MovingRows {
@@ -81,6 +82,7 @@ impl MovingRows {
             put,
             put_gradients,
             no_faults: GpuVec::zeros(gpu, "no faults", super::super::faults::WORDS)?,
+            moves_sh,
         })
     }
 
@@ -150,7 +152,7 @@ impl MovingRows {
         posed: &GpuGaussians,
     ) {
         commands.copy(&canonical.geometry, &posed.geometry);
-        if !self.canonical.sh.is_empty() {
+        if self.moves_sh {
             commands.copy(&canonical.sh, &posed.sh);
         }
         self.copy(gpu, commands, &self.put, (&self.posed, posed));
