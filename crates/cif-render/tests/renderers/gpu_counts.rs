@@ -1,6 +1,4 @@
 //! Label mass on the device against the double-precision reference. `CIF_TEST_GPU=off|auto|require`.
-#![cfg(feature = "wgpu")]
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use cif_geometry::PixelGrid;
 use cif_render::RenderSettings;

@@ -1,8 +1,6 @@
 //! Recorded motion: the fast path against the reference, and images that must not change.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
-mod common;
-
+use crate::support::{pixel_discontinuity, render};
 use cif_field::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use cif_field::{Field, Heads};
 use cif_geometry::RigidTransform;
@@ -10,7 +8,6 @@ use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::reference::{self, Scene};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::{Channels, InstanceSettings, RenderSettings, RenderedImage};
-use common::{pixel_discontinuity, render};
 use glam::{DMat3, DQuat, DVec3};
 
 const EVERYTHING: Channels = Channels { depth: true, instances: true };

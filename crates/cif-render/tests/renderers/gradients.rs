@@ -6,15 +6,13 @@
 //! the antialiasing factor, the weights 1/255 and 0.99, the stop at transmittance 1e-4, and the floor of the
 //! label probability. What happens on either side of them is tested in `hard_cases.rs`.
 
-mod common;
-
+use crate::support::{Case, Mismatches, check_gradients, compare_with_differences};
 use cif_field::{Heads, SortMetric};
 use cif_render::reference::cross_entropy::instance_loss;
 use cif_render::reference::rasterize::rasterize;
 use cif_render::reference::{InstanceTarget, ParameterGroup, Scene};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig};
 use cif_render::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};
-use common::{Case, Mismatches, check_gradients, compare_with_differences};
 
 const NO_HEADS: Heads = Heads { position: false, scale: false, rotation: false, opacity: false, sh: false };
 

@@ -1,25 +1,21 @@
-//! Numerically hard cases of rendering: the reference in both precisions, the fast path, and where there is one the GPU
-//! (`CIF_TEST_GPU=off|auto|require`), forward and backward; numbers are rows of methods reference 7. `tests/README.md` lists them with the worst errors that these tests
-//! print.
-
-mod common;
-#[cfg(feature = "wgpu")]
-#[path = "common/gpu.rs"]
-mod on_gpu;
+//! Numerically hard cases of rendering, through every renderer in both directions; numbers are rows of methods
+//! reference 7. `tests/README.md` lists them with the worst errors that these tests print.
 
 use cif_field::{Field, Identities};
 use cif_geometry::scalar::{logit, sigmoid};
 use cif_geometry::{PinholeCamera, PixelGrid, Real};
-use cif_render::cpu::{ForwardPass, IdentityCounts, Renderer, SimdLevel};
+use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
 use cif_render::reference::project::{project, project_backward};
 use cif_render::reference::rasterize::{footprint, weight};
 use cif_render::reference::{
     self, Forward, ParameterGroup as Group, Scene, SceneGradients, Splat2d, SplatGradient, View,
 };
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
-use cif_render::{Gradients, InstanceSettings, RenderSettings};
-use common::{Cotangents, STEP, pixel_discontinuity, plain_camera};
+use cif_render::{InstanceSettings, RenderSettings};
 use proptest::prelude::*;
+
+use crate::renderers::{Path, Seen, everywhere};
+use crate::support::{ABSOLUTE, Case, Cotangents, STEP, pixel_discontinuity, plain_camera, render};
 
 fn settings() -> RenderSettings {
     RenderSettings { instances: Some(InstanceSettings::default()), ..RenderSettings::default() }
@@ -55,16 +51,26 @@ fn assert_finite<R: Real>(name: &str, (forward, gradients): &(Forward<R>, SceneG
 }
 
 /// What computed a number, a column of the table in `tests/README.md`.
-#[derive(Clone, Copy)]
-enum Path {
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Column {
     /// Reference in double precision.
     F64,
     /// Reference in single precision.
     F32,
-    /// Fast path.
+    /// Fast path at any level.
     Fast,
     /// GPU.
     Gpu,
+}
+
+impl Column {
+    fn of(path: Path) -> Self {
+        match path {
+            Path::Single => Self::F32,
+            Path::Fast(_) => Self::Fast,
+            Path::Gpu => Self::Gpu,
+        }
+    }
 }
 
 /// Which way, a half of a cell of the table.
@@ -75,137 +81,68 @@ enum Way {
 }
 
 /// Prints the worst error of a case for the table in `tests/README.md`, and holds it to its limit.
-fn worst(row: u32, path: Path, way: Way, what: &str, error: f64, limit: f64) {
+fn worst(row: u32, path: Column, way: Way, what: &str, error: f64, limit: f64) {
     let path = ["f64", "f32", "fast", "gpu"][path as usize];
     let way = ["forward", "backward"][way as usize];
     println!("hard case {row} | {path} | {way} | {what} | {error:.1e} | {limit:.0e}");
     assert!(error <= limit, "row {row}, {what}, {path} {way}: {error:e} is above {limit:e}");
 }
 
-/// All gradients of the fast path by group, in the order of [`Group`].
-fn groups(gradients: &Gradients) -> [(Group, &[f32]); 9] {
-    let g = &gradients.gaussians;
-    [
-        (Group::Means, g.means.as_flattened()),
-        (Group::LogScales, g.log_scales.as_flattened()),
-        (Group::Quaternions, g.quaternions.as_flattened()),
-        (Group::OpacityLogits, &g.opacity_logits),
-        (Group::OccupancyLogits, &g.occupancy_logits),
-        (Group::ShCoefficients, g.sh_coefficients.as_flattened()),
-        (Group::LogCalibrations, &gradients.log_calibrations),
-        (Group::Planes, &gradients.planes),
-        (Group::Mlp, &gradients.mlp),
-    ]
+/// A field in the view of [`plain_camera`], 16 pixels wide and high, all of label 1.
+fn plain(field: &Field) -> SyntheticScene {
+    let (camera, labels) = (plain_camera(16, 16, 20.0), PixelGrid::filled(16, 16, 1));
+    SyntheticScene { field: field.clone(), camera, labels, time: 0.5 }
 }
 
-/// A view of the fast path, forward and backward.
-fn fast(
-    simd: SimdLevel,
-    field: &Field,
-    settings: &RenderSettings,
-    labels: &PixelGrid<u16>,
-    cotangents: &Cotangents,
-) -> (ForwardPass, Gradients) {
-    let camera = plain_camera(labels.width, labels.height, 20.0);
-    fast_view(simd, field, settings, (&camera, 0.5), labels, cotangents)
-}
-
-fn fast_view(
-    simd: SimdLevel,
-    field: &Field,
-    settings: &RenderSettings,
-    (camera, time): (&PinholeCamera, f64),
-    labels: &PixelGrid<u16>,
-    cotangents: &Cotangents,
-) -> (ForwardPass, Gradients) {
-    let mut renderer = Renderer::new(simd);
-    let forward = renderer.forward(field, camera, time, settings, Some(labels));
-    let mut gradients = Gradients::zeros(field);
-    let v_color = cotangents.color.map(|color| color.map(|v| v as f32));
-    renderer.backward(field, &v_color, cotangents.instance_weight as f32, &mut gradients);
-    (forward, gradients)
-}
-
-fn assert_fast_is_finite(name: &str, (forward, gradients): &(ForwardPass, Gradients)) {
-    assert!(forward.color.pixels.as_flattened().iter().all(|value| value.is_finite()), "{name}: colour");
-    assert!(forward.instance_loss.is_finite(), "{name}: loss");
-    for (group, values) in groups(gradients) {
-        assert!(values.iter().all(|value| value.is_finite()), "{name}: {group:?} of the fast path");
+fn assert_seen_finite(name: &str, field: &Field, seen: &Seen) {
+    let path = seen.path;
+    assert!(seen.colors.as_flattened().iter().all(|value| value.is_finite()), "{name}, {path:?}: colour");
+    assert!(seen.loss.is_none_or(|loss| loss.0.is_finite()), "{name}, {path:?}: loss");
+    let parameters = Scene::<f32>::from_field(field).parameters;
+    for group in Group::ALL {
+        let mut values = (0..parameters.len(group)).map(|index| seen.gradient(group, index));
+        assert!(values.all(|value| value.is_finite()), "{name}: {group:?} of {path:?}");
     }
-    assert!(gradients.screen.as_flattened().iter().chain(&gradients.radii).all(|v| v.is_finite()), "{name}");
+    let screen = seen.screen.as_flattened().iter().chain(&seen.radii);
+    assert!(screen.into_iter().all(|v| v.is_finite()), "{name}, {path:?}: screen");
 }
 
 /// Largest errors of a view: of colours, and of gradients as a share of the largest of their group.
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Default)]
 struct Errors {
     /// Of the `f64` reference against central differences of its loss.
     differences: Option<f64>,
-    /// Of the `f32` reference against the `f64` one, forward and backward.
-    single: [f64; 2],
-    /// Of the fast path, on every level of instructions, likewise.
-    fast: [f64; 2],
-    /// Of the GPU, likewise, where there is one; without deformation, which is another kernel.
-    gpu: Option<[f64; 2]>,
-}
-
-/// A gradient by its group and index.
-type GradientAt = Box<dyn Fn(Group, usize) -> f64>;
-
-/// Colours and gradients of a view on the GPU, where there is one.
-#[cfg(feature = "wgpu")]
-fn gpu_view(
-    scene: &SyntheticScene,
-    settings: &RenderSettings,
-    v: &Cotangents,
-) -> Option<(Vec<[f64; 3]>, GradientAt)> {
-    let mut device = on_gpu::device()?;
-    let seen = on_gpu::run(&mut device, scene, settings, v, |_| {}).expect("the view fits");
-    let color = seen.colors.iter().map(|color| [0, 1, 2].map(|channel| f64::from(color[channel]))).collect();
-    Some((color, Box::new(move |group, index| on_gpu::gradient(&seen, group, index))))
-}
-
-#[cfg(not(feature = "wgpu"))]
-fn gpu_view(_: &SyntheticScene, _: &RenderSettings, _: &Cotangents) -> Option<(Vec<[f64; 3]>, GradientAt)> {
-    None
-}
-
-/// What is measured of a view.
-#[derive(Clone, Copy, PartialEq, PartialOrd)]
-enum Scope {
-    /// The reference in single precision and the fast path.
-    Processor,
-    /// The GPU as well, where there is one.
-    Gpu,
-    /// The reference in double precision too, against central differences.
-    Differences,
+    /// Of every renderer against the `f64` reference, forward and backward.
+    of: Vec<(Column, [f64; 2])>,
 }
 
 /// Most Gaussians whose every parameter is moved for central differences.
 const FEW: usize = 8;
 
-/// Measures a view against the `f64` reference. Pixels at a threshold, where two may decide differently, take no part.
+/// Measures a view against the `f64` reference, and that against central differences where asked to. Pixels at a
+/// threshold, where two may decide differently, take no part.
 fn errors(
     name: &str,
     field: &Field,
     settings: &RenderSettings,
-    view: (&PinholeCamera, f64),
-    scope: Scope,
+    (camera, time): (&PinholeCamera, f64),
+    with_differences: bool,
 ) -> Errors {
-    let (camera, time) = view;
     let (width, height) = (camera.width, camera.height);
-    let mut labels = PixelGrid::filled(width, height, 1);
+    let labels = PixelGrid::filled(width, height, 1);
+    let mut view = SyntheticScene { field: field.clone(), camera: *camera, labels, time };
     let scene = Scene::<f64>::from_field(field);
-    let unmasked = reference::forward(&scene, camera, time, settings, Some(&labels));
+    let unmasked = reference::forward(&scene, camera, time, settings, Some(&view.labels));
     let mut cotangents = Cotangents::random(5, width, height);
     (cotangents.depth, cotangents.alpha) = (None, None);
-    let band: Vec<bool> = (0..labels.pixels.len())
+    let band: Vec<bool> = (0..unmasked.pixels.pixels.len())
         .map(|position| pixel_discontinuity(&unmasked, position, 1e-3).is_some())
         .collect();
     for (position, _) in band.iter().enumerate().filter(|(_, near)| **near) {
         cotangents.color.pixels[position] = [0.0; 3];
-        labels.pixels[position] = 0;
+        view.labels.pixels[position] = 0;
     }
-    let render = |scene: &Scene<f64>| reference::forward(scene, camera, time, settings, Some(&labels));
+    let render = |scene: &Scene<f64>| reference::forward(scene, camera, time, settings, Some(&view.labels));
     let expected = render(&scene);
     let gradients = cotangents.backward(&scene, &expected).parameters;
     let of_color = |actual: &[[f64; 3]]| {
@@ -236,42 +173,18 @@ fn errors(
         worst
     };
 
-    let single_scene = Scene::<f32>::from_field(field);
-    let single = reference::forward(&single_scene, camera, time, settings, Some(&labels));
-    let single_gradients = cotangents.backward(&single_scene, &single).parameters;
-    let all = Group::ALL;
-    let single_color: Vec<[f64; 3]> = single.color.pixels.iter().map(|c| c.map(f64::from)).collect();
-    let mut found = Errors {
-        single: [
-            of_color(&single_color),
-            of_gradients(&all, 0.0, &mut |group, index| f64::from(single_gradients.get(group, index))),
-        ],
-        ..Errors::default()
-    };
-    for simd in SimdLevel::available() {
-        let actual = fast_view(simd, field, settings, view, &labels, &cotangents);
-        assert_fast_is_finite(name, &actual);
-        let color: Vec<[f64; 3]> = actual.0.color.pixels.iter().map(|c| c.map(f64::from)).collect();
-        found.fast[0] = found.fast[0].max(of_color(&color));
-        let of_fast = groups(&actual.1);
-        let backward = of_gradients(&all, 0.0, &mut |group, index| {
-            let (_, values) = of_fast.iter().find(|(of, _)| *of == group).expect("all groups are there");
-            f64::from(values[index])
-        });
-        found.fast[1] = found.fast[1].max(backward);
+    let mut found = Errors::default();
+    for seen in everywhere(&view, settings, &cotangents) {
+        assert_seen_finite(name, field, &seen);
+        let backward = of_gradients(&Group::ALL, 0.0, &mut |group, index| seen.gradient(group, index));
+        found.of.push((Column::of(seen.path), [of_color(&seen.colors), backward]));
     }
-    if scope >= Scope::Gpu && field.deformation.is_none() {
-        let (field, camera, labels) = (field.clone(), *camera, labels.clone());
-        let scene = SyntheticScene { field, camera, labels, time };
-        found.gpu = gpu_view(&scene, settings, &cotangents).map(|(color, at)| {
-            [of_color(&color), of_gradients(&all, 0.0, &mut |group, index| at(group, index))]
-        });
-    }
-    if scope == Scope::Differences && field.len() <= FEW {
+    if with_differences && field.len() <= FEW {
         let mut moved = scene.clone();
-        let of_gaussians = all.into_iter().filter(|group| !matches!(group, Group::Planes | Group::Mlp));
+        let of_gaussians =
+            Group::ALL.into_iter().filter(|group| !matches!(group, Group::Planes | Group::Mlp));
         let of_gaussians: Vec<Group> = of_gaussians.collect();
-        found.differences = Some(of_gradients(&of_gaussians, common::ABSOLUTE, &mut |group, index| {
+        found.differences = Some(of_gradients(&of_gaussians, ABSOLUTE, &mut |group, index| {
             let value = scene.parameters.get(group, index);
             let mut at = |offset: f64| {
                 *moved.parameters.get_mut(group, index) = value + offset;
@@ -296,30 +209,25 @@ fn agrees_there(row: u32, what: &str, scene: &SyntheticScene, settings: &RenderS
 }
 
 fn agrees_from(row: u32, what: &str, field: &Field, settings: &RenderSettings, view: (&PinholeCamera, f64)) {
-    let found = errors(what, field, settings, view, Scope::Differences);
+    let found = errors(what, field, settings, view, true);
     if let Some(differences) = found.differences {
-        worst(row, Path::F64, Way::Backward, what, differences, 1e-5);
+        worst(row, Column::F64, Way::Backward, what, differences, 1e-5);
     }
-    both_agree(row, what, &found);
+    all_agree(row, what, &found);
 }
 
 /// Holds the others to the `f64` reference.
-fn both_agree(row: u32, what: &str, found: &Errors) {
-    let gpu = found.gpu.map(|errors| (Path::Gpu, errors));
-    for (path, [forward, backward]) in
-        [(Path::F32, found.single), (Path::Fast, found.fast)].into_iter().chain(gpu)
-    {
-        worst(row, path, Way::Forward, what, forward, 1e-5);
-        worst(row, path, Way::Backward, what, backward, 1e-3);
+fn all_agree(row: u32, what: &str, found: &Errors) {
+    for (column, [forward, backward]) in &found.of {
+        worst(row, *column, Way::Forward, what, *forward, 1e-5);
+        worst(row, *column, Way::Backward, what, *backward, 1e-3);
     }
 }
 
-/// Renders in both precisions and on the fast path, and asserts that everything is finite; returns the double one.
+/// Draws with every renderer, asserts that everything is finite, and returns what the double precision made of it.
 fn finite(name: &str, field: &Field, settings: &RenderSettings) -> (Forward<f64>, SceneGradients<f64>) {
-    assert_finite(name, &run::<f32>(field, settings));
-    let labels = PixelGrid::filled(16, 16, 1);
-    for simd in SimdLevel::available() {
-        assert_fast_is_finite(name, &fast(simd, field, settings, &labels, &Cotangents::random(5, 16, 16)));
+    for seen in everywhere(&plain(field), settings, &Cotangents::random(5, 16, 16)) {
+        assert_seen_finite(name, field, &seen);
     }
     let double = run::<f64>(field, settings);
     assert_finite(name, &double);
@@ -331,7 +239,7 @@ fn row_8_transmittance_is_never_divided() {
     // The replay forms the same products in the same order: ends of the lists prove it bit for bit.
     let synthetic = generate(&SyntheticConfig { gaussians: 20, ..SyntheticConfig::default() });
     let scene = Scene::<f32>::from_field(&synthetic.field);
-    let forward = common::render(&scene, &synthetic, &settings());
+    let forward = render(&scene, &synthetic, &settings());
     for (position, state) in forward.pixels.pixels.iter().enumerate() {
         let pixel = [position as u32 % 32, position as u32 / 32];
         let mut transmittance = 1.0_f32;
@@ -365,7 +273,7 @@ fn row_9_no_gradient_beyond_the_cap() {
     };
     let (transmittance, v) = at(0.989);
     // The logit is a float of single precision.
-    worst(9, Path::F64, Way::Forward, "remainder behind 0.989", (transmittance - 0.011).abs(), 1e-6);
+    worst(9, Column::F64, Way::Forward, "remainder behind 0.989", (transmittance - 0.011).abs(), 1e-6);
     assert!(v.opacity != 0.0 && v.color[0] > 0.98);
     let (transmittance, v) = at(0.991);
     assert!((transmittance - 0.01).abs() < 1e-7, "{transmittance}");
@@ -444,7 +352,7 @@ fn row_13_needles_keep_their_determinant() {
         for k in 0..3 {
             let (a, b) = (f64::from(single.factor[k]), double.factor[k]);
             let what = format!("focal {focal}, entry {k} of the factor");
-            worst(13, Path::F32, Way::Forward, &what, (a - b).abs() / b.abs(), 1e-5);
+            worst(13, Column::F32, Way::Forward, &what, (a - b).abs() / b.abs(), 1e-5);
         }
     }
     agrees(13, "one needle", &field, &settings());
@@ -460,8 +368,8 @@ fn row_13_images_of_needles_agree_in_both_precisions() {
         for log_scale in synthetic.field.gaussians.log_scales.iter_mut().step_by(5) {
             *log_scale = [log_scale[0] + growth, -9.0, -9.0];
         }
-        let single = common::render(&Scene::<f32>::from_field(&synthetic.field), &synthetic, &settings());
-        let double = common::render(&Scene::<f64>::from_field(&synthetic.field), &synthetic, &settings());
+        let single = render(&Scene::<f32>::from_field(&synthetic.field), &synthetic, &settings());
+        let double = render(&Scene::<f64>::from_field(&synthetic.field), &synthetic, &settings());
         assert_eq!(single.order, double.order);
         let mut differences: Vec<f64> = (0..single.color.pixels.len())
             .map(|position| {
@@ -472,7 +380,7 @@ fn row_13_images_of_needles_agree_in_both_precisions() {
         // Not the maximum: single pixels may lie on a threshold.
         let high = differences[differences.len() * 99 / 100];
         let what = format!("needles grown by {growth}, 99 % of the pixels");
-        worst(13, Path::F32, Way::Forward, &what, high, 1e-5);
+        worst(13, Column::F32, Way::Forward, &what, high, 1e-5);
     }
 }
 
@@ -487,12 +395,9 @@ fn row_14_huge_scales_are_clamped() {
         assert_eq!(gradients.parameters.gaussians[0].log_scale[..2], [0.0, 0.0]);
     }
     field.gaussians.log_scales[0] = [60.0, -60.0, 3.0];
-    let found =
-        errors("a scale of e^60", &field, &settings(), (&plain_camera(16, 16, 20.0), 0.5), Scope::Gpu);
-    worst(14, Path::F32, Way::Forward, "a scale of e^60", found.single[0], 1e-5);
-    worst(14, Path::Fast, Way::Forward, "a scale of e^60", found.fast[0], 1e-5);
-    if let Some([forward, _]) = found.gpu {
-        worst(14, Path::Gpu, Way::Forward, "a scale of e^60", forward, 1e-5);
+    let view = (&plain_camera(16, 16, 20.0), 0.5);
+    for (column, [forward, _]) in errors("a scale of e^60", &field, &settings(), view, false).of {
+        worst(14, column, Way::Forward, "a scale of e^60", forward, 1e-5);
     }
     field.gaussians.log_scales[0] = [f32::INFINITY, 0.0, 0.0];
     assert!(finite("infinite", &field, &settings()).0.splats[0].is_none());
@@ -505,7 +410,7 @@ fn row_15_deformed_scales_are_clamped_too() {
     let mlp = &mut scene.field.deformation.as_mut().unwrap().mlp;
     mlp[layout.heads[1].output.biases.start] = 40.0;
     let double = Scene::<f64>::from_field(&scene.field);
-    let forward = common::render(&double, &scene, &settings());
+    let forward = render(&double, &scene, &settings());
     assert!(forward.deformed[0].gaussian.log_scale[0] > 10.0);
     let gradients = Cotangents::random(1, 32, 24).backward(&double, &forward);
     assert_finite("spike", &(forward, gradients.clone()));
@@ -513,12 +418,13 @@ fn row_15_deformed_scales_are_clamped_too() {
     assert!(gradients.parameters.gaussians.iter().any(|v| v.log_scale[1] != 0.0));
     let (width, height) = (scene.camera.width, scene.camera.height);
     let cotangents = Cotangents::random(1, width, height);
-    let view = (&scene.camera, scene.time);
-    for simd in SimdLevel::available() {
-        let found = fast_view(simd, &scene.field, &settings(), view, &scene.labels, &cotangents);
-        assert_fast_is_finite("spike", &found);
-        let log_scales = &found.1.gaussians.log_scales;
-        assert!(log_scales.iter().all(|v| v[0] == 0.0) && log_scales.iter().any(|v| v[1] != 0.0));
+    for seen in everywhere(&scene, &settings(), &cotangents) {
+        assert_seen_finite("spike", &scene.field, &seen);
+        let along = |axis: usize| {
+            let rows = 0..scene.field.len();
+            rows.map(|row| seen.gradient(Group::LogScales, 3 * row + axis)).collect::<Vec<f64>>()
+        };
+        assert!(along(0).iter().all(|v| *v == 0.0) && along(1).iter().any(|v| *v != 0.0), "{:?}", seen.path);
     }
     // A spike that the clamp does not reach is drawn alike.
     let mlp = &mut scene.field.deformation.as_mut().unwrap().mlp;
@@ -634,7 +540,7 @@ fn row_21_a_zero_plane_still_learns() {
     let range = layout[3].offset..layout[4].offset;
     deformation.planes[range.clone()].fill(0.0);
     let double = Scene::<f64>::from_field(&scene.field);
-    let forward = common::render(&double, &scene, &settings());
+    let forward = render(&double, &scene, &settings());
     let gradients = Cotangents::random(1, 32, 24).backward(&double, &forward);
     assert_finite("zero plane", &(forward, gradients.clone()));
     let planes = &gradients.parameters.planes;
@@ -652,11 +558,11 @@ fn row_22_lookup_at_the_last_node() {
     scene.field.gaussians.means[1] = (bounds.high + 1.0).as_vec3().to_array();
     scene.time = 1.0;
     let double = Scene::<f64>::from_field(&scene.field);
-    let forward = common::render(&double, &scene, &settings());
+    let forward = render(&double, &scene, &settings());
     let (corner, outside) = (&forward.deformed[0], &forward.deformed[1]);
     let (corner, outside) = (corner.tape.as_ref().unwrap(), outside.tape.as_ref().unwrap());
     let difference = corner.features.iter().zip(&outside.features).map(|(a, b)| (a - b).abs());
-    worst(22, Path::F64, Way::Forward, "features at the corner", difference.fold(0.0, f64::max), 1e-5);
+    worst(22, Column::F64, Way::Forward, "features at the corner", difference.fold(0.0, f64::max), 1e-5);
     let deformation = scene.field.deformation.as_ref().unwrap();
     let last: f32 = (0..6)
         .map(|plane| {
@@ -671,7 +577,7 @@ fn row_22_lookup_at_the_last_node() {
     // On the box itself its slope ends, which precisions decide differently.
     scene.field.gaussians.means[0] = (bounds.high + 0.5).as_vec3().to_array();
     let what = "at the last node";
-    both_agree(22, what, &errors(what, &scene.field, &settings(), (&scene.camera, scene.time), Scope::Gpu));
+    all_agree(22, what, &errors(what, &scene.field, &settings(), (&scene.camera, scene.time), false));
 }
 
 #[test]
@@ -720,7 +626,7 @@ fn row_4_probabilities_sum_to_one_whatever_their_logarithms() {
             assert_eq!(probabilities[range.start], 1.0, "a row of one label is certain");
         }
     }
-    worst(4, Path::Fast, Way::Forward, "row sums", error, 4.0 * f64::from(f32::EPSILON));
+    worst(4, Column::Fast, Way::Forward, "row sums", error, 4.0 * f64::from(f32::EPSILON));
     let several = generate(&SyntheticConfig { instances: 4, ..SyntheticConfig::default() });
     agrees_there(4, "rows of up to four labels", &several, &settings());
 }
@@ -790,7 +696,7 @@ fn row_41_nothing_agrees_with_nothing() {
 
 #[test]
 fn row_44_separated_depths_agree() {
-    let scene = common::Case::clear(SyntheticConfig { seed: 40, ..Default::default() }, settings(), |_| {});
+    let scene = Case::clear(SyntheticConfig { seed: 40, ..Default::default() }, settings(), |_| {});
     agrees_there(44, "eight Gaussians", &scene.synthetic, &settings());
 }
 
@@ -807,16 +713,13 @@ fn row_6_thousands_of_faint_splats_add_up() {
         field.gaussians.occupancy_logits[i] = logit(0.0042);
     }
     let (double, _) = run::<f64>(&field, &settings());
-    let (single, _) = run::<f32>(&field, &settings());
     let relative = |a: f64, e: f64| ((a - e) / e).abs();
     let m = |value: f64| (-value).exp();
-    let error = relative(m(f64::from(single.loss.mean)), m(double.loss.mean));
-    worst(6, Path::F32, Way::Forward, "M_y", error, 1e-5);
-    let labels = PixelGrid::filled(16, 16, 1);
-    for simd in SimdLevel::available() {
-        let (forward, _) = fast(simd, &field, &settings(), &labels, &Cotangents::random(5, 16, 16));
-        let error = relative(m(forward.instance_loss), m(double.loss.mean));
-        worst(6, Path::Fast, Way::Forward, "M_y", error, 1e-5);
+    for seen in everywhere(&plain(&field), &settings(), &Cotangents::random(5, 16, 16)) {
+        if let Some((loss, ..)) = seen.loss {
+            let error = relative(m(loss), m(double.loss.mean));
+            worst(6, Column::of(seen.path), Way::Forward, "M_y", error, 1e-5);
+        }
     }
     agrees(6, "2600 layers", &field, &settings());
 }
@@ -835,20 +738,15 @@ fn row_7_the_last_contributor_keeps_its_responsibility() {
         let (_, double) = run::<f64>(&field, &settings());
         worst(
             7,
-            Path::F64,
+            Column::F64,
             Way::Backward,
             "one Gaussian",
             relative(double.parameters.gaussians[0].occupancy_logit),
             1e-6,
         );
-        let (_, single) = run::<f32>(&field, &settings());
-        let v = f64::from(single.parameters.gaussians[0].occupancy_logit);
-        worst(7, Path::F32, Way::Backward, "one Gaussian", relative(v), 2e-6);
-        let labels = PixelGrid::filled(16, 16, 1);
-        for simd in SimdLevel::available() {
-            let (_, v) = fast(simd, &field, &settings(), &labels, &Cotangents::random(5, 16, 16));
-            let v = f64::from(v.gaussians.occupancy_logits[0]);
-            worst(7, Path::Fast, Way::Backward, "one Gaussian", relative(v), 2e-6);
+        for seen in everywhere(&plain(&field), &settings(), &Cotangents::random(5, 16, 16)) {
+            let v = seen.gradient(Group::OccupancyLogits, 0);
+            worst(7, Column::of(seen.path), Way::Backward, "one Gaussian", relative(v), 2e-6);
         }
     }
 }
@@ -865,7 +763,7 @@ fn row_33_coincident_splats_blend_in_index_order_everywhere() {
     // Moving one changes the order: there are no differences to compare with.
     let camera = plain_camera(16, 16, 20.0);
     let what = "four coincident splats";
-    both_agree(33, what, &errors(what, &field, &settings(), (&camera, 0.5), Scope::Gpu));
+    all_agree(33, what, &errors(what, &field, &settings(), (&camera, 0.5), false));
     // The other order is another image, or this could not fail.
     let reversed = field.gather(&[3, 2, 1, 0]);
     let (other, _) = run::<f64>(&reversed, &settings());
@@ -1019,7 +917,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 96, ..ProptestConfig::default() })]
 
     /// Whatever meets in a view, also of one pixel and with the longest table of instances: everything is finite in
-    /// both precisions and on the fast path, and all draw the same.
+    /// every renderer, and all draw the same.
     #[test]
     fn edges_of_every_kind_render_alike(
         gaussians in prop::collection::vec(fuzzed(), 0..6),
@@ -1043,11 +941,11 @@ proptest! {
             g.quaternions[row] = g.quaternions[row].map(|c| c * norm);
         }
         let settings = RenderSettings { antialiased, ..settings() };
-        assert_finite("f32", &run::<f32>(&field, &settings));
         assert_finite("f64", &run::<f64>(&field, &settings));
         let camera = plain_camera(size.0, size.1, 20.0);
-        let found = errors("fuzz", &field, &settings, (&camera, 0.5), Scope::Processor);
-        prop_assert!(found.fast[0] < 2e-4, "colours differ by {}", found.fast[0]);
+        for (column, [forward, _]) in errors("fuzz", &field, &settings, (&camera, 0.5), false).of {
+            prop_assert!(forward < 2e-4, "colours of {:?} differ by {}", column, forward);
+        }
     }
 }
 

@@ -1,5 +1,6 @@
 //! Finite differences on the `f64` reference, away from its discontinuities.
-#![allow(dead_code, unreachable_pub, reason = "compiled into every test binary, which uses its own part")]
+
+use std::collections::BTreeMap;
 
 use cif_geometry::{PinholeCamera, PixelGrid, Real, spherical_harmonics};
 use cif_render::RenderSettings;
@@ -14,16 +15,16 @@ use rand_pcg::Pcg64Mcg;
 
 /// Gradients of the pixel outputs, and the weight of the instance loss.
 #[derive(Clone, Debug)]
-pub struct Cotangents {
-    pub color: PixelGrid<[f64; 3]>,
-    pub depth: Option<PixelGrid<f64>>,
-    pub alpha: Option<PixelGrid<f64>>,
-    pub instance_weight: f64,
+pub(crate) struct Cotangents {
+    pub(crate) color: PixelGrid<[f64; 3]>,
+    pub(crate) depth: Option<PixelGrid<f64>>,
+    pub(crate) alpha: Option<PixelGrid<f64>>,
+    pub(crate) instance_weight: f64,
 }
 
 impl Cotangents {
     /// Uniform noise with about unit norm per image.
-    pub fn random(seed: u64, width: u32, height: u32) -> Self {
+    pub(crate) fn random(seed: u64, width: u32, height: u32) -> Self {
         let mut random = Pcg64Mcg::seed_from_u64(seed ^ 0x5eed);
         let size = 1.0 / f64::from(width * height).sqrt();
         let mut color = PixelGrid::filled(width, height, [0.0; 3]);
@@ -36,7 +37,11 @@ impl Cotangents {
         Self { color, depth: Some(depth), alpha: Some(alpha), instance_weight: 0.75 }
     }
 
-    pub fn backward<R: Real>(&self, scene: &Scene<R>, forward: &Forward<R>) -> reference::SceneGradients<R> {
+    pub(crate) fn backward<R: Real>(
+        &self,
+        scene: &Scene<R>,
+        forward: &Forward<R>,
+    ) -> reference::SceneGradients<R> {
         let of = |grid: &PixelGrid<f64>| grid.map(|value| R::of(*value));
         reference::backward(
             scene,
@@ -49,11 +54,11 @@ impl Cotangents {
     }
 
     /// The loss whose gradient [`Self::backward`] is.
-    pub fn loss(&self, forward: &Forward<f64>) -> f64 {
+    pub(crate) fn loss(&self, forward: &Forward<f64>) -> f64 {
         self.image_loss(forward) + self.instance_weight * forward.loss.mean
     }
 
-    pub fn image_loss(&self, forward: &Forward<f64>) -> f64 {
+    pub(crate) fn image_loss(&self, forward: &Forward<f64>) -> f64 {
         let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
         let mut loss = dot(self.color.pixels.as_flattened(), forward.color.pixels.as_flattened());
         loss += self.depth.as_ref().map_or(0.0, |v| dot(&v.pixels, &forward.depth.pixels));
@@ -62,16 +67,16 @@ impl Cotangents {
 }
 
 /// A scene with its view, its forward pass in double precision and random cotangents.
-pub struct Case {
-    pub synthetic: SyntheticScene,
-    pub settings: RenderSettings,
-    pub scene: Scene<f64>,
-    pub forward: Forward<f64>,
-    pub cotangents: Cotangents,
+pub(crate) struct Case {
+    pub(crate) synthetic: SyntheticScene,
+    pub(crate) settings: RenderSettings,
+    pub(crate) scene: Scene<f64>,
+    pub(crate) forward: Forward<f64>,
+    pub(crate) cotangents: Cotangents,
 }
 
 impl Case {
-    pub fn of(synthetic: SyntheticScene, settings: RenderSettings) -> Self {
+    pub(crate) fn of(synthetic: SyntheticScene, settings: RenderSettings) -> Self {
         let scene = Scene::from_field(&synthetic.field);
         let forward = render(&scene, &synthetic, &settings);
         let (width, height) = (synthetic.camera.width, synthetic.camera.height);
@@ -80,7 +85,7 @@ impl Case {
     }
 
     /// The first scene from `config.seed` on that keeps clear of every discontinuity; `edit` adapts it.
-    pub fn clear(
+    pub(crate) fn clear(
         config: SyntheticConfig,
         settings: RenderSettings,
         edit: impl Fn(&mut SyntheticScene),
@@ -98,12 +103,12 @@ impl Case {
         panic!("no scene is clear of discontinuities; rejected for: {rejected:?}");
     }
 
-    pub fn render(&self, scene: &Scene<f64>) -> Forward<f64> {
+    pub(crate) fn render(&self, scene: &Scene<f64>) -> Forward<f64> {
         render(scene, &self.synthetic, &self.settings)
     }
 }
 
-pub fn render<R: Real>(
+pub(crate) fn render<R: Real>(
     scene: &Scene<R>,
     synthetic: &SyntheticScene,
     settings: &RenderSettings,
@@ -183,7 +188,11 @@ fn near_pixel_discontinuity(forward: &Forward<f64>) -> Option<&'static str> {
 }
 
 /// The threshold that a weight or a transmittance of a pixel meets to within a relative `margin`, if any.
-pub fn pixel_discontinuity(forward: &Forward<f64>, position: usize, margin: f64) -> Option<&'static str> {
+pub(crate) fn pixel_discontinuity(
+    forward: &Forward<f64>,
+    position: usize,
+    margin: f64,
+) -> Option<&'static str> {
     let near = |value: f64, threshold: f32| (value / f64::from(threshold)).ln().abs() < margin;
     let state = &forward.pixels.pixels[position];
     let pixel = [position as u32 % forward.pixels.width, position as u32 / forward.pixels.width];
@@ -217,24 +226,43 @@ pub fn pixel_discontinuity(forward: &Forward<f64>, position: usize, margin: f64)
 }
 
 /// Half the distance of the two evaluations, in units of the parameter (all are of order one here).
-pub const STEP: f64 = 1e-6;
+pub(crate) const STEP: f64 = 1e-6;
 
 /// `|analytic - numerical| <= RELATIVE * max(|analytic|, |numerical|) + ABSOLUTE`. The absolute part is the
 /// rounding of the loss (order 1) over twice the step, times the few dozen roundings that add up in it.
-pub const RELATIVE: f64 = 1e-6;
+pub(crate) const RELATIVE: f64 = 1e-6;
 /// See [`RELATIVE`].
-pub const ABSOLUTE: f64 = 5e-9;
+pub(crate) const ABSOLUTE: f64 = 5e-9;
+
+/// Worst differences by quantity, printed at the end of a test.
+#[derive(Default)]
+pub(crate) struct Worst(BTreeMap<String, f64>);
+
+impl Worst {
+    pub(crate) fn see(&mut self, what: &str, difference: f64) {
+        match self.0.get_mut(what) {
+            Some(worst) => *worst = worst.max(difference),
+            None => drop(self.0.insert(what.to_owned(), difference)),
+        }
+    }
+
+    pub(crate) fn tell(&self, name: &str) {
+        for (what, worst) in &self.0 {
+            println!("{name}: worst {what} {worst:.1e}");
+        }
+    }
+}
 
 /// Rows that disagree, as a table.
 #[derive(Default)]
-pub struct Mismatches {
+pub(crate) struct Mismatches {
     rows: Vec<String>,
     compared: usize,
     nonzero: usize,
 }
 
 impl Mismatches {
-    pub fn compare(
+    pub(crate) fn compare(
         &mut self,
         what: &str,
         index: usize,
@@ -257,7 +285,7 @@ impl Mismatches {
 
     /// # Panics
     /// With the table, unless everything agreed; and when hardly anything but zeros was compared.
-    pub fn finish(self, name: &str) {
+    pub(crate) fn finish(self, name: &str) {
         println!("{name}: {} of {} compared values are not zero", self.nonzero, self.compared);
         assert!(20 * self.nonzero > self.compared, "{name}: {} of {} not zero", self.nonzero, self.compared);
         let shown: Vec<&str> = self.rows.iter().take(40).map(String::as_str).collect();
@@ -277,7 +305,7 @@ impl Mismatches {
 }
 
 /// Compares `analytic` with central differences of `loss` for every scalar of `groups`.
-pub fn compare_with_differences(
+pub(crate) fn compare_with_differences(
     scene: &Scene<f64>,
     groups: &[ParameterGroup],
     analytic: &Parameters<f64>,
@@ -302,7 +330,7 @@ pub fn compare_with_differences(
 }
 
 /// The radial component of a raw quaternion's gradient must vanish: only the direction matters.
-pub fn compare_radial(scene: &Scene<f64>, analytic: &Parameters<f64>, mismatches: &mut Mismatches) {
+pub(crate) fn compare_radial(scene: &Scene<f64>, analytic: &Parameters<f64>, mismatches: &mut Mismatches) {
     for (index, (gaussian, v)) in scene.parameters.gaussians.iter().zip(&analytic.gaussians).enumerate() {
         if scene.deformation.is_none() {
             let radial: f64 = (0..4).map(|k| gaussian.quaternion[k] * v.quaternion[k]).sum();
@@ -312,7 +340,7 @@ pub fn compare_radial(scene: &Scene<f64>, analytic: &Parameters<f64>, mismatches
 }
 
 /// Compares the `f32` instantiation with `f64` on the same field.
-pub fn compare_precisions(case: &Case, expected: &Parameters<f64>, mismatches: &mut Mismatches) {
+pub(crate) fn compare_precisions(case: &Case, expected: &Parameters<f64>, mismatches: &mut Mismatches) {
     let scene = Scene::<f32>::from_field(&case.synthetic.field);
     let forward = render(&scene, &case.synthetic, &case.settings);
     let single = case.cotangents.backward(&scene, &forward).parameters;
@@ -325,7 +353,7 @@ pub fn compare_precisions(case: &Case, expected: &Parameters<f64>, mismatches: &
 }
 
 /// Every group against differences of the whole loss, then the other precision.
-pub fn check_gradients(name: &str, case: &Case) {
+pub(crate) fn check_gradients(name: &str, case: &Case) {
     let analytic = case.cotangents.backward(&case.scene, &case.forward).parameters;
     let mut mismatches = Mismatches::default();
     compare_radial(&case.scene, &analytic, &mut mismatches);
@@ -336,7 +364,7 @@ pub fn check_gradients(name: &str, case: &Case) {
 }
 
 /// A camera without rotation at the origin, looking along +z.
-pub fn plain_camera(width: u32, height: u32, focal_px: f64) -> PinholeCamera {
+pub(crate) fn plain_camera(width: u32, height: u32, focal_px: f64) -> PinholeCamera {
     PinholeCamera {
         width,
         height,

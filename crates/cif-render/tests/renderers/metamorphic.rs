@@ -1,13 +1,11 @@
 //! Changes to a scene that must not change its image, and empty scenes.
 
-mod common;
-
+use crate::support::{Cotangents, plain_camera};
 use cif_field::{Field, Gaussians};
 use cif_geometry::PixelGrid;
 use cif_render::reference::{self, Scene};
 use cif_render::synthetic::{SyntheticConfig, SyntheticScene, generate};
 use cif_render::{Channels, InstanceSettings, RenderSettings};
-use common::{Cotangents, plain_camera};
 
 const EVERYTHING: Channels = Channels { depth: true, instances: true };
 
@@ -95,7 +93,7 @@ fn nothing_gives_the_background() {
     assert!(instances.label.pixels.iter().all(|label| *label == 0));
     assert!(instances.entropy.pixels.iter().all(|entropy| *entropy == 0.0));
     let scene = Scene::<f64>::from_field(&synthetic.field);
-    let forward = common::render(&scene, &synthetic, &settings());
+    let forward = crate::support::render(&scene, &synthetic, &settings());
     assert_eq!(forward.loss.labelled_pixels, forward.loss.unsupported_pixels);
     assert!((forward.loss.mean + f64::from(1e-8_f32).ln()).abs() < 1e-9);
     let gradients = Cotangents::random(3, config.width, config.height).backward(&scene, &forward);
@@ -107,7 +105,7 @@ fn a_frame_without_labels_has_no_instance_loss() {
     let mut synthetic = generate(&SyntheticConfig::default());
     synthetic.labels.pixels.fill(0);
     let scene = Scene::<f64>::from_field(&synthetic.field);
-    let forward = common::render(&scene, &synthetic, &settings());
+    let forward = crate::support::render(&scene, &synthetic, &settings());
     assert_eq!((forward.loss.mean, forward.loss.labelled_pixels), (0.0, 0));
     let (width, height) = (synthetic.camera.width, synthetic.camera.height);
     let mut cotangents = Cotangents::random(3, width, height);

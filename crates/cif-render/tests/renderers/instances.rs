@@ -1,7 +1,6 @@
 //! The instance pass: hand-checked pixel, K-free against dense K, identities of the calibration gradient.
 
-mod common;
-
+use crate::support::{Cotangents, Mismatches};
 use cif_geometry::PixelGrid;
 use cif_render::reference::cross_entropy::{instance_loss, pixel_loss};
 use cif_render::reference::dense::{
@@ -14,7 +13,6 @@ use cif_render::reference::{IdentityProbabilities, InstanceTarget, Scene, Splat2
 use cif_render::synthetic::{SyntheticConfig, generate};
 use cif_render::{GeometryPath, InstanceNormalisation, InstanceSettings, RenderSettings};
 use cif_render::{cpu::IdentityCounts, reference};
-use common::{Cotangents, Mismatches};
 
 /// A splat with unit conic that pixel (0, 0) sees at a given sigma.
 fn splat_at(sigma: f64, occupancy: f64, depth: f64) -> Option<Splat2d<f64>> {
@@ -123,7 +121,7 @@ fn compare_with_dense(config: &SyntheticConfig, instances: InstanceSettings) {
     let synthetic = generate(config);
     let scene = Scene::<f64>::from_field(&synthetic.field);
     let settings = RenderSettings { instances: Some(instances), ..RenderSettings::default() };
-    let forward = common::render(&scene, &synthetic, &settings);
+    let forward = crate::support::render(&scene, &synthetic, &settings);
     let identities = forward.identities.as_ref().expect("the scene has identities");
     let (splats, order, labels) = (&forward.splats, &forward.order, &synthetic.labels);
     let target = InstanceTarget { labels, identities, normalisation: instances.normalisation };
@@ -173,7 +171,7 @@ fn soft_labels_match_differences() {
     let targets: Vec<f64> = (0..9 * 7 * 4).map(|i| f64::from((i * 37) % 11) / 20.0).collect();
     for normalisation in [InstanceNormalisation::None, InstanceNormalisation::Coverage] {
         let value = |scene: &Scene<f64>| {
-            let forward = common::render(scene, &synthetic, &settings);
+            let forward = crate::support::render(scene, &synthetic, &settings);
             let identities = forward.identities.clone().unwrap();
             let maps = rasterize_dense(&forward.splats, &forward.order, 9, 7, &identities, 4);
             let (loss, v_maps) = dense_cross_entropy(&maps, &targets, normalisation);
@@ -230,7 +228,7 @@ fn responsibilities_add_up_to_the_supported_pixels() {
         let scene = Scene::<f64>::from_field(&synthetic.field);
         let settings =
             RenderSettings { instances: Some(InstanceSettings::default()), ..RenderSettings::default() };
-        let forward = common::render(&scene, &synthetic, &settings);
+        let forward = crate::support::render(&scene, &synthetic, &settings);
         let mut cotangents = Cotangents::random(seed, 30, 22);
         cotangents.instance_weight = forward.loss.labelled_pixels as f64;
         let gradients = cotangents.backward(&scene, &forward);
@@ -255,7 +253,7 @@ fn a_single_label_needs_no_calibration() {
     let scene = Scene::<f32>::from_field(&synthetic.field);
     let settings =
         RenderSettings { instances: Some(InstanceSettings::default()), ..RenderSettings::default() };
-    let forward = common::render(&scene, &synthetic, &settings);
+    let forward = crate::support::render(&scene, &synthetic, &settings);
     assert!(forward.identities.as_ref().unwrap().values.iter().all(|p| *p == 1.0));
     let gradients = Cotangents::random(1, config.width, config.height).backward(&scene, &forward);
     assert!(gradients.parameters.log_calibrations.iter().all(|v| *v == 0.0));
