@@ -1,16 +1,12 @@
 //! Runs on a GPU beside the same runs on the processor. `CIF_TEST_GPU=off|auto|require` says whether they run.
-#![cfg(feature = "wgpu")]
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
-mod support;
-
+use crate::support::{Scene, capture, relative_gain, small_config, with_known_points};
 use cif_dataset::Dataset;
 use cif_field::{Checkpoint, Field};
 use cif_render::wgpu::{Gpu, testing};
 use cif_train::exposure::trained_exposures;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::{Control, Outcome, TrainConfig, TrainError, TrainEvent, Trainer};
-use support::{Scene, capture, relative_gain, small_config, with_known_points};
 
 /// A run, on the GPU where one is given; stops after so many steps of all stages.
 fn run(dataset: &Dataset, config: &TrainConfig, gpu: Option<&Gpu>, stop_at: u64) -> Trainer {

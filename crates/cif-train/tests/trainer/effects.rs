@@ -1,16 +1,13 @@
 //! Effects that a capture does not call for are not run, and what is left out costs no quality.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
-mod support;
-
+use crate::support::{
+    Scene, capture, relative_gain, small_config, stopped_after, train, with_known_points, without_record,
+};
 use cif_dataset::{Dataset, Split};
 use cif_train::exposure::{Exposure, trained_exposures};
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::plan::EffectKind;
 use cif_train::{Control, EffectChoice, EffectPlan, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
-use support::{
-    Scene, capture, relative_gain, small_config, stopped_after, train, with_known_points, without_record,
-};
 
 /// The settings with what a capture calls for.
 fn planned(dataset: &Dataset, config: &TrainConfig, choice: &str) -> TrainConfig {

@@ -1,10 +1,7 @@
 //! Steps for measuring do the work of training steps, and only that.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
-mod support;
-
+use crate::support::{Scene, capture, small_config, train};
 use cif_train::{InstancePass, Stage, TrainError, Trainer};
-use support::{Scene, capture, small_config, train};
 
 #[test]
 fn a_longer_table_of_instances_changes_labels_and_nothing_else() {

@@ -1,14 +1,11 @@
 //! Runs that end by a budget or by a target, on a clock of the tests' own.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
-
-mod support;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use crate::support::{Scene, capture, small_config};
 use cif_train::budget::{Budget, BudgetClock, Targets, Workload, calibrate, choose};
 use cif_train::{Clock, Control, Outcome, Seconds, Stage, TrainConfig, TrainEvent, Trainer};
-use support::{Scene, capture, small_config};
 
 /// A clock that moves on by a tenth of a second whenever it is read: a step reads it three times.
 #[derive(Default)]
@@ -164,7 +161,7 @@ fn steps_are_measured_and_settings_chosen() {
     let clock: Arc<dyn Clock> = Arc::new(Ticking::default());
     let base = small_config();
     let calibration = calibrate(&dataset, &base, &clock, BudgetClock::Wall, 1, 0.5).unwrap();
-    assert_eq!(calibration.image_size, [support::WIDTH, support::HEIGHT]);
+    assert_eq!(calibration.image_size, [crate::support::WIDTH, crate::support::HEIGHT]);
     assert_eq!(calibration.gaussians, 450);
     // The clock is read around all steps, and after each from the third on.
     assert_eq!(calibration.steps, 7);

@@ -1,12 +1,9 @@
 //! Runs that begin with the reconstruction of another run.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
-mod support;
-
+use crate::support::{Scene, capture, small_config, stopped_after, train, without_record};
 use cif_dataset::{Dataset, InstanceLabel, Split};
 use cif_field::{Checkpoint, Field, Gaussians};
 use cif_train::{Control, Outcome, Stage, TrainConfig, TrainError, TrainEvent, Trainer};
-use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 fn short() -> TrainConfig {
     let mut config = small_config();

@@ -1,8 +1,6 @@
 //! Properties of the method on a tiny capture (methods reference 13).
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
-mod support;
-
+use crate::support::{Scene, capture, small_config, train};
 use cif_dataset::{Dataset, Split};
 use cif_field::{Field, Gaussians, Identities, Instance, SortMetric, Timeline};
 use cif_geometry::scalar::{logit, sigmoid};
@@ -14,7 +12,6 @@ use cif_train::config::{ResampleConfig, ScaleCorrection};
 use cif_train::resample::{Pair, Plan, ResampleContext, apply, footprint_integral};
 use glam::{DMat3, DVec2, DVec3};
 use rand::SeedableRng;
-use support::{Scene, capture, small_config, train};
 
 /// A trained static field with estimated identities, and its capture.
 fn estimated(folder: &std::path::Path) -> (Field, Dataset) {

@@ -1,13 +1,10 @@
 //! Travelling objects, seen by one moving camera.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
-mod support;
-
+use crate::support::{Scene, capture, small_config, stopped_after, train, without_record};
 use cif_dataset::Dataset;
 use cif_field::{Checkpoint, Field};
 use cif_train::{Control, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
 use glam::DVec3;
-use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 const TRAVEL: f64 = 0.9;
 

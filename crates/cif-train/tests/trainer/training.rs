@@ -1,12 +1,10 @@
 //! Whole runs on a tiny capture.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
-
-mod support;
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 
+use crate::support::{Scene, capture, small_config, stopped_after, train, without_record};
 use cif_field::{Field, Gaussians};
 use cif_train::config::InstanceGeometry;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
@@ -14,7 +12,6 @@ use cif_train::{
     Ablation, Clock, Control, Outcome, Seconds, Stage, Start, Stop, TrainConfig, TrainError, TrainEvent,
     Trainer,
 };
-use support::{Scene, capture, small_config, stopped_after, train, without_record};
 
 fn assert_equal(a: &Field, b: &Field) {
     assert_eq!(a.gaussians.len(), b.gaussians.len());

@@ -1,13 +1,10 @@
 //! The curve of a run: quality against time, on a clock of the tests' own.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
-
-mod support;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
+use crate::support::{Scene, capture, small_config, train, without_record};
 use cif_train::{Clock, Control, Curve, CurveFrames, Outcome, Seconds, Stage, TrainEvent, Trainer};
-use support::{Scene, capture, small_config, train, without_record};
 
 /// A clock that moves on by a quarter of a second whenever it is read.
 struct Ticking(AtomicU64);
@@ -114,7 +111,9 @@ fn withheld_frames_are_not_trained_on() {
     for frame in dataset.frames.iter_mut().filter(|frame| curve.frame_names.contains(&frame.name)) {
         frame.image = folder.path().join("black.png");
     }
-    image::RgbImage::new(support::WIDTH, support::HEIGHT).save(folder.path().join("black.png")).unwrap();
+    image::RgbImage::new(crate::support::WIDTH, crate::support::HEIGHT)
+        .save(folder.path().join("black.png"))
+        .unwrap();
     let other = train(dataset.clone(), config.clone());
     assert!(without_record(trainer.field()) == without_record(other.field()));
     assert!(other.curve().points[0].psnr < trainer.curve().points[0].psnr);

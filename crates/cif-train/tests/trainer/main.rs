@@ -1,0 +1,24 @@
+//! Runs of the trainer on a tiny capture.
+//!
+//! | module | holds |
+//! |---|---|
+//! | `support` | the capture: three shaded balls, ray-cast with exact masks; settings that train it in seconds. Unit tests compile it too |
+//! | `training`, `effects`, `guidance` | whole runs: quality, resuming, threads, what is skipped, what masks tell |
+//! | `acceptance` | identities and their resampling keep what they promise |
+//! | `from_scene` | instances on the reconstruction of another run |
+//! | `curve`, `pacing`, `measure` | error curves, budgets of time, measured steps |
+//! | `gpu` | runs on a GPU beside the same runs on the processor (`CIF_TEST_GPU=off|auto|require`) |
+#![allow(clippy::unwrap_used)] // Helpers of tests.
+
+mod acceptance;
+mod curve;
+mod effects;
+mod from_scene;
+#[cfg(feature = "wgpu")]
+mod gpu;
+mod guidance;
+mod measure;
+mod pacing;
+#[path = "../support/mod.rs"]
+mod support;
+mod training;
