@@ -165,11 +165,12 @@ fn memory_does_not_grow_with_the_steps() {
         let events = log.lines().map(|line| serde_json::from_str::<Value>(line).unwrap());
         events.filter_map(|event| event["peak_rss_mb"].as_f64()).next_back()
     };
-    let Some((few, many)) = peak_mb(40).zip(peak_mb(440)) else {
+    let Some((few, many)) = peak_mb(40).zip(peak_mb(190)) else {
         eprintln!("skipped: this system does not tell how much memory a process takes");
         return;
     };
-    assert!(many < few + 50.0, "{few} MB after 40 steps, {many} MB after 440");
+    // A megabyte that each of 150 more steps keeps would show.
+    assert!(many < few + 50.0, "{few} MB after 40 steps, {many} MB after 190");
 }
 
 #[test]

@@ -108,7 +108,7 @@ fn a_run_is_as_good_as_on_the_processor() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
     let mut config = small_config();
-    (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 240, 80);
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (40, 120, 60);
     let scores = |gpu: Option<&Gpu>, seed: u64| {
         let config = TrainConfig { seed, ..config.clone() };
         let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
@@ -291,10 +291,11 @@ fn a_run_goes_on_on_either_backend() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
     let mut config = small_config();
-    (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 40, 30);
-    (config.densify.from, config.densify.every) = (5, 10);
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 18, 12);
+    (config.densify.from, config.densify.every) = (5, 5);
+    (config.resample.from, config.resample.every) = (4, 4);
     for (first, second) in [(Some(&gpu), None), (None, Some(&gpu)), (Some(&gpu), Some(&gpu))] {
-        for stop_at in [13_u64, 35, 75] {
+        for stop_at in [7_u64, 19, 35] {
             let trainer = run(&dataset, &config, first, stop_at);
             assert_eq!(trainer.steps_done(), stop_at);
             let path = folder.path().join("stopped.cif");
@@ -304,7 +305,7 @@ fn a_run_goes_on_on_either_backend() {
                 resumed.use_gpu(gpu).unwrap();
             }
             assert_eq!(go_on(&mut resumed, u64::MAX), Outcome::Finished);
-            assert_eq!(resumed.steps_done(), 90);
+            assert_eq!(resumed.steps_done(), 40);
             resumed.field().validate().unwrap();
         }
     }
