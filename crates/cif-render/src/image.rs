@@ -14,16 +14,6 @@ pub struct Channels {
     pub instances: bool,
 }
 
-/// Whose weights values per Gaussian are blended with.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum BlendingWeights {
-    /// Those of colour: opacity and its transmittance.
-    #[default]
-    Color,
-    /// Those of the instance pass: occupancy and its transmittance.
-    Instances,
-}
-
 /// A rendered view.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RenderedImage {

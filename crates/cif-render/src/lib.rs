@@ -2,6 +2,7 @@
 //!
 //! | module | answers |
 //! |---|---|
+//! | [`blend`] | values per Gaussian in an image: features, logits, codes |
 //! | [`constants`] | thresholds of the blending rule, each with its derivation |
 //! | [`settings`] | what a render may vary |
 //! | [`gradients`] | where gradients of all parameters are kept |
@@ -12,6 +13,7 @@
 //! | `wgpu` | the GPU path, with the feature of that name |
 //! | [`synthetic`] | small random scenes for tests and benchmarks |
 
+pub mod blend;
 pub mod constants;
 pub mod cpu;
 pub mod gradients;
@@ -23,7 +25,8 @@ pub mod synthetic;
 #[cfg(feature = "wgpu")]
 pub mod wgpu;
 
+pub use blend::{BlendRequest, BlendedImage, Blending};
 pub use gradients::Gradients;
-pub use image::{BlendingWeights, Channels, InstanceImage, InstanceRanks, RenderedImage, UNLABELLED};
+pub use image::{Channels, InstanceImage, InstanceRanks, RenderedImage, UNLABELLED};
 pub use motion::screen_motion;
 pub use settings::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};

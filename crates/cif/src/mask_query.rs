@@ -19,7 +19,7 @@ use cif_dataset::{Dataset, Split};
 use cif_field::Field;
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{IdentityCounts, Renderer};
-use cif_render::{BlendingWeights, Channels, RenderSettings};
+use cif_render::{BlendRequest, Blending, Channels, RenderSettings};
 use serde::Serialize;
 
 /// Share of an instance that has to lie inside the masks.
@@ -220,16 +220,16 @@ pub fn render(
     renderer: &mut Renderer,
     settings: &RenderSettings,
 ) -> PixelGrid<bool> {
-    let mut chosen = vec![[0.0_f32]; field.gaussians.len()];
+    let mut chosen = vec![0.0_f32; field.gaussians.len()];
     for row in rows {
-        chosen[*row as usize] = [1.0];
+        chosen[*row as usize] = 1.0;
     }
     let image = renderer.render(field, camera, time, settings, Channels { depth: false, instances: true });
     let layers = image.instances.expect("a scene with instances is asked");
-    let share = renderer.blend(&chosen, BlendingWeights::Instances);
-    let pixels = (0..share.pixels.len())
+    let share = renderer.blend(&BlendRequest { values: &chosen, channels: 1, blending: Blending::Own });
+    let pixels = (0..share.values.len())
         .map(|pixel| {
-            share.pixels[pixel][0] > 0.5 * layers.coverage.pixels[pixel]
+            share.values[pixel] > 0.5 * layers.coverage.pixels[pixel]
                 && layers.foreground.pixels[pixel] >= 0.5
         })
         .collect();

@@ -6,7 +6,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use rayon::prelude::*;
 
 use super::project::Splat;
-use super::tile::{Groups, Pass};
+use super::tile::Groups;
+use crate::Blending;
 use crate::constants::TILE;
 
 /// A splat of a tile: its rank (index into the depth-sorted splats) and which passes draw it there.
@@ -28,8 +29,8 @@ impl TileEntry {
     }
 
     #[inline(always)]
-    fn draws(self, pass: Pass) -> bool {
-        self.0 >> Self::RANK_BITS >> pass as u32 & 1 == 1
+    fn draws(self, blending: Blending) -> bool {
+        self.0 >> Self::RANK_BITS >> blending as u32 & 1 == 1
     }
 
     /// The groups that each pass wants of the splat, of those that are live in it.
@@ -37,8 +38,8 @@ impl TileEntry {
     pub(super) fn wanted<const INSTANCES: bool>(self, color: Groups, instances: Groups) -> [Groups; 2] {
         let none = Groups::default();
         [
-            if self.draws(Pass::Color) { color } else { none },
-            if INSTANCES && self.draws(Pass::Instances) { instances } else { none },
+            if self.draws(Blending::Color) { color } else { none },
+            if INSTANCES && self.draws(Blending::Own) { instances } else { none },
         ]
     }
 }

@@ -8,7 +8,7 @@ use super::bin::TileEntry;
 use super::labels::IdentityRows;
 use super::pixels::{LANES, load, splat};
 use super::project::Splat;
-use super::tile::{Blending, GROUPS, SplatInTile, TilePixels, TilePlace, live, prepare};
+use super::tile::{BlendingRule, GROUPS, SplatInTile, TilePixels, TilePlace, live, prepare};
 
 /// Instance outputs of a tile.
 #[derive(Clone, Debug)]
@@ -64,7 +64,7 @@ pub(super) fn instance_tile<S: Simd>(
     tile.foreground = [[0.0; LANES]; GROUPS];
     let mut masses: Vec<TilePixels> = vec![[[0.0; LANES]; GROUPS]; labels.len()];
 
-    let blending = Blending::new(simd);
+    let blending = BlendingRule::new(simd);
     let mut color_transmittance = place.initial_transmittance();
     let mut instance_transmittance = color_transmittance;
     let mut slots: Vec<(usize, f32)> = Vec::new();

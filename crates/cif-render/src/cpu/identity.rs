@@ -8,7 +8,7 @@ use super::labels::TileLabels;
 use super::pixels::{LANES, load, splat, sum};
 use super::project::Splat;
 use super::rasterize::TileImage;
-use super::tile::{Blending, GROUPS, Groups, SplatInTile, TilePlace, live, prepare};
+use super::tile::{BlendingRule, GROUPS, Groups, SplatInTile, TilePlace, live, prepare};
 use crate::constants::MIN_COVERAGE;
 
 /// Adds `w_i(u) = T_i alpha_i / A_c(u)` of a tile: `mass` is `[entries, labels + 1]`, the last column the sum
@@ -23,7 +23,7 @@ pub(super) fn label_mass_tile<S: Simd>(
     image: &TileImage,
     mass: &mut [f32],
 ) {
-    let blending = Blending::new(simd);
+    let blending = BlendingRule::new(simd);
     let mut transmittance = place.initial_transmittance();
     let mut inverse_coverage = [[0.0_f32; LANES]; GROUPS];
     for group in 0..GROUPS {

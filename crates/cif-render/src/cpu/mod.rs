@@ -9,7 +9,7 @@
 //! | `tile` | how a splat falls on a tile's pixels and blends: the steps that all of these share: |
 //! | `rasterize`, `rasterize_backward` | pixels, and back |
 //! | `dense` | instance images |
-//! | `blend` | other values per Gaussian, blended like colour |
+//! | `blend` | other values per Gaussian |
 //! | `identity`, `counts` | label mass for identity estimation |
 //! | `renderer` | the stages in order, in both directions |
 //!

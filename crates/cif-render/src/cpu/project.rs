@@ -12,7 +12,7 @@ use crate::constants::{
     JACOBIAN_MARGIN, LOG_SCALE_RANGE, LOW_PASS, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
     MIN_ANTIALIASING,
 };
-use crate::{OccupancySource, RenderSettings};
+use crate::{Blending, OccupancySource, RenderSettings};
 
 type Vector = [f32; 3];
 type Matrix = [[f32; 3]; 3];
@@ -105,6 +105,15 @@ pub(super) struct Splat {
 }
 
 impl Splat {
+    /// Peak of the blending weight.
+    #[inline(always)]
+    pub(super) fn strength(&self, blending: Blending) -> f32 {
+        match blending {
+            Blending::Color => self.opacity,
+            Blending::Own => self.occupancy,
+        }
+    }
+
     /// The factor scaled so that the footprint is `2^-|u|^2` with `u` its product with an offset.
     #[inline(always)]
     pub(super) fn binary_factor(&self) -> [f32; 3] {

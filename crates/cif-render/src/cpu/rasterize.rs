@@ -9,7 +9,9 @@ use super::bin::TileEntry;
 use super::labels::{IdentityRows, TileLabels};
 use super::pixels::{LANES, load, splat, splat_each};
 use super::project::Splat;
-use super::tile::{Blending, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare};
+use super::tile::{
+    BlendingRule, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare,
+};
 
 /// Blended values of a tile.
 #[derive(Clone, Debug)]
@@ -60,7 +62,7 @@ pub(super) fn labelled_transmittance(labels: &TileLabels) -> TilePixels {
 
 /// A splat as the pixels of a tile blend it.
 struct Painted<'a, S: Simd> {
-    blending: Blending<S>,
+    blending: BlendingRule<S>,
     opacity: f32x16<S>,
     occupancy: f32x16<S>,
     color: [f32x16<S>; 3],
@@ -129,7 +131,7 @@ pub(super) fn rasterize_tile<S: Simd, const INSTANCES: bool, const DEPTH: bool>(
     }
     image.transmittance = place.initial_transmittance();
     (image.evaluated, image.evaluated_instances) = (0, 0);
-    let blending = Blending::new(simd);
+    let blending = BlendingRule::new(simd);
     let mut probabilities = Vec::new();
     let mut live_color = live(&image.transmittance);
     let mut live_instances = Groups::default();

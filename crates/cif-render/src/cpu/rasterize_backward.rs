@@ -16,7 +16,9 @@ use super::bin::TileEntry;
 use super::labels::{IdentityRows, TileLabels};
 use super::pixels::{LANES, Lanes, load, splat, splat_each, sum, sum_each};
 use super::project::{Splat, SplatGradient};
-use super::tile::{Blending, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare};
+use super::tile::{
+    BlendingRule, Footprint, GROUPS, Groups, SplatInTile, TilePixels, TilePlace, live, prepare,
+};
 use crate::GeometryPath;
 
 /// Undoes the scale of [`Splat::binary_factor`] in a product of two values that carry it.
@@ -72,7 +74,7 @@ impl<'a> Replay<'a> {
 
 /// A splat as the cotangents of a tile see it.
 struct Seen<S: Simd> {
-    blending: Blending<S>,
+    blending: BlendingRule<S>,
     one: f32x16<S>,
     zero: f32x16<S>,
     opacity: f32x16<S>,
@@ -212,7 +214,7 @@ pub(super) fn rasterize_tile_backward<S: Simd, const INSTANCES: bool>(
     label_mass: &mut [f32],
 ) {
     let (zero, one) = (splat(simd, 0.0), splat(simd, 1.0));
-    let blending = Blending::new(simd);
+    let blending = BlendingRule::new(simd);
     let mut transmittance = place.initial_transmittance();
     let mut live_color = live(&transmittance);
     let mut live_instances = Groups::default();

@@ -30,13 +30,6 @@ pub(super) fn pixel_in_tile(group: usize, lane: usize) -> (u32, u32) {
     ((group / PAIRS * COLUMNS + lane % COLUMNS) as u32, (group % PAIRS * 2 + lane / COLUMNS) as u32)
 }
 
-/// Which of the two blendings.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Pass {
-    Color = 0,
-    Instances = 1,
-}
-
 /// A set of groups.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Groups(u32);
@@ -238,7 +231,7 @@ impl<S: Simd> SplatInTile<S> {
 /// The blending rule. A pixel that is finished has its transmittance negated, so that one value says both how
 /// much light is left and whether anything still happens.
 #[derive(Clone, Copy)]
-pub(super) struct Blending<S: Simd> {
+pub(super) struct BlendingRule<S: Simd> {
     zero: f32x16<S>,
     min_alpha: f32x16<S>,
     max_alpha: f32x16<S>,
@@ -259,7 +252,7 @@ pub(super) struct Blended<S: Simd> {
     pub(super) finished: bool,
 }
 
-impl<S: Simd> Blending<S> {
+impl<S: Simd> BlendingRule<S> {
     #[inline(always)]
     pub(super) fn new(simd: S) -> Self {
         Self {

@@ -11,6 +11,7 @@
 //! | [`project`] | what it looks like in a view: [`Splat2d`] |
 //! | [`sort`] | in which order splats are blended |
 //! | [`rasterize`] | colour, depth and the label's rendered identity per pixel |
+//! | [`blend`] | other values per Gaussian, blended into an image |
 //! | [`cross_entropy`] | the instance loss |
 //! | [`dense`] | rendered identities of all instances: images, soft labels, oracle of the K-free form |
 //! | [`identity`] | identity distributions, their calibration gradient, label mass per Gaussian |
@@ -18,6 +19,7 @@
 //!
 //! Source: methods reference 2 to 5.1; notation as there: `v_x` is the gradient of the loss by x.
 
+pub mod blend;
 pub mod cross_entropy;
 pub mod deform;
 pub mod dense;
@@ -30,11 +32,12 @@ pub mod scene;
 pub mod sort;
 pub mod tracks;
 
+pub use blend::BlendGradients;
 pub use deform::Deformed;
 pub use identity::IdentityProbabilities;
 pub use project::{Splat2d, SplatGradient, View};
 pub use rasterize::{InstanceTarget, PixelState, RasterGradients};
-pub use render::{Forward, SceneGradients, backward, count_identities, forward, render};
+pub use render::{Forward, SceneGradients, backward, count_identities, forward, render, splats_backward};
 pub use scene::{Gaussian, ParameterGroup, Parameters, Scene};
 
 /// A constant of [`crate::constants`] in the scalar of the evaluation: its `f32` value exactly, so that all

@@ -11,7 +11,7 @@ use super::cross_entropy::is_supported;
 use super::identity::IdentityProbabilities;
 use super::project::{Splat2d, SplatGradient};
 use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE};
-use crate::image::{BlendingWeights, UNLABELLED};
+use crate::image::UNLABELLED;
 use crate::settings::{GeometryPath, InstanceNormalisation};
 
 /// What the instance pass of a training view needs.
@@ -115,42 +115,6 @@ pub fn rasterize<R: Real>(
         }
     }
     PixelGrid::from_pixels(width, height, pixels)
-}
-
-/// Values per Gaussian over an image of `width` x `height`, blended with the weights of colour,
-/// `sum_i T_i alpha_i v_i`, or of the instance pass.
-#[must_use]
-pub fn blend<R: Real, const C: usize>(
-    splats: &[Option<Splat2d<R>>],
-    order: &[u32],
-    width: u32,
-    height: u32,
-    values: &[[R; C]],
-    weights: BlendingWeights,
-) -> PixelGrid<[R; C]> {
-    let mut image = PixelGrid::filled(width, height, [R::zero(); C]);
-    for (position, blended) in image.pixels.iter_mut().enumerate() {
-        let pixel = [position as u32 % width, position as u32 / width];
-        let mut transmittance = R::one();
-        for &index in order {
-            let Some(splat) = &splats[index as usize] else { continue };
-            let footprint = footprint(splat, pixel);
-            let strength = match weights {
-                BlendingWeights::Color => splat.opacity,
-                BlendingWeights::Instances => splat.occupancy,
-            };
-            let Some(alpha) = weight(strength, footprint.peak) else { continue };
-            let next = transmittance * (R::one() - alpha.value);
-            if next < constant(MIN_TRANSMITTANCE) {
-                break;
-            }
-            for (sum, value) in blended.iter_mut().zip(&values[index as usize]) {
-                *sum += transmittance * alpha.value * *value;
-            }
-            transmittance = next;
-        }
-    }
-    image
 }
 
 fn rasterize_pixel<R: Real>(

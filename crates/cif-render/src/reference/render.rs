@@ -8,7 +8,7 @@ use super::cross_entropy::{InstanceLoss, instance_loss};
 use super::deform::{Deformed, deform, deform_backward};
 use super::dense::{instance_image, rasterize_dense};
 use super::identity::{IdentityProbabilities, count_label_mass};
-use super::project::{Splat2d, View, project, project_backward};
+use super::project::{Splat2d, SplatGradient, View, project, project_backward};
 use super::rasterize::{
     InstanceCotangent, InstanceTarget, PixelCotangents, PixelState, RasterGradients, rasterize,
     rasterize_backward,
@@ -167,15 +167,7 @@ pub fn backward<R: Real>(
         &PixelCotangents { color: v_color, depth: v_depth, alpha: v_alpha },
         instances.as_ref(),
     );
-    let mut parameters = scene.parameters.zeros_like();
-    let mut clipped = 0;
-    for &index in &forward.order {
-        let index = index as usize;
-        let (deformed, Some(splat)) = (&forward.deformed[index], &forward.splats[index]) else { continue };
-        let v = project_backward(&deformed.gaussian, &forward.view, settings, splat, &raster.splats[index]);
-        clipped += usize::from(v.clipped);
-        deform_backward(scene, index, deformed, &v.gaussian, &mut parameters);
-    }
+    let (mut parameters, clipped) = splats_backward(scene, forward, &raster.splats);
     if let Some(instances) = &instances {
         parameters.log_calibrations = instances.target.identities.calibration_backward(&raster.label_mass);
     }
@@ -191,6 +183,27 @@ pub fn backward<R: Real>(
         raster,
         clipped,
     }
+}
+
+/// Carries gradients of splats, `[N]`, to every parameter but the calibrations, which come out 0; and how many
+/// camera-space position gradients were clipped.
+#[must_use]
+pub fn splats_backward<R: Real>(
+    scene: &Scene<R>,
+    forward: &Forward<R>,
+    v_splats: &[SplatGradient<R>],
+) -> (Parameters<R>, usize) {
+    let mut parameters = scene.parameters.zeros_like();
+    let mut clipped = 0;
+    for &index in &forward.order {
+        let index = index as usize;
+        let (deformed, Some(splat)) = (&forward.deformed[index], &forward.splats[index]) else { continue };
+        let v =
+            project_backward(&deformed.gaussian, &forward.view, &forward.settings, splat, &v_splats[index]);
+        clipped += usize::from(v.clipped);
+        deform_backward(scene, index, deformed, &v.gaussian, &mut parameters);
+    }
+    (parameters, clipped)
 }
 
 /// Renders a view for looking at or measuring.

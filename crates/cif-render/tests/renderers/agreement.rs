@@ -12,7 +12,7 @@ use cif_render::reference::rasterize::{footprint, weight};
 use cif_render::reference::{self, Forward, ParameterGroup, Scene, SceneGradients};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::{
-    BlendingWeights, Channels, GeometryPath, Gradients, InstanceNormalisation, InstanceSettings,
+    BlendRequest, Blending, Channels, GeometryPath, Gradients, InstanceNormalisation, InstanceSettings,
     OccupancySource, RenderSettings, RenderedImage,
 };
 
@@ -585,11 +585,12 @@ fn blended_values_and_ranks() {
         let forward = reference::forward(&scene, camera, time, &settings, None);
         let values: Vec<[f32; 2]> =
             (0..synthetic.field.gaussians.len()).map(|row| [row as f32 * 0.7 - 3.0, 1.0]).collect();
-        let doubles: Vec<[f64; 2]> = values.iter().map(|value| value.map(f64::from)).collect();
-        let both = [BlendingWeights::Color, BlendingWeights::Instances];
-        let expected = both.map(|weights| {
+        let doubles: Vec<f64> = values.as_flattened().iter().map(|value| f64::from(*value)).collect();
+        let both = [Blending::Color, Blending::Own];
+        let expected = both.map(|blending| {
             let (width, height) = (camera.width, camera.height);
-            reference::rasterize::blend(&forward.splats, &forward.order, width, height, &doubles, weights)
+            let request = BlendRequest { values: &doubles[..], channels: 2, blending };
+            reference::blend::blend(&forward.splats, &forward.order, width, height, &request)
         });
         let maps = rasterize_dense(
             &forward.splats,
@@ -603,20 +604,23 @@ fn blended_values_and_ranks() {
         for simd in levels() {
             let mut renderer = Renderer::new(simd);
             let image = renderer.render(&synthetic.field, camera, time, &settings, CHANNELS);
-            let [blended, by_instances] = both.map(|weights| renderer.blend(&values, weights));
+            let [blended, by_instances] = both.map(|blending| {
+                renderer.blend(&BlendRequest { values: values.as_flattened(), channels: 2, blending })
+            });
             let ranks = renderer.instance_ranks(synthetic.field.identities.as_ref().unwrap(), RANKS);
             let mut mismatches = Mismatches::default();
             let mut covered = 0;
-            for position in 0..blended.pixels.len() {
+            for position in 0..forward.pixels.pixels.len() {
                 if pixel_discontinuity(&forward, position, BAND).is_some() {
                     continue;
                 }
-                let (e, a) = (expected[1].pixels[position], by_instances.pixels[position]);
+                let of = |image: &[f32]| [image[2 * position], image[2 * position + 1]];
+                let (e, a) = (&expected[1].values[2 * position..], of(&by_instances.values));
                 mismatches.compare("instance value", position, e[0], a[0].into(), 1e-5, 1e-4);
                 let layers = image.instances.as_ref().unwrap();
                 let coverage = f64::from(layers.coverage.pixels[position]);
                 mismatches.compare("instance one", position, coverage, a[1].into(), 0.0, 2e-5);
-                let (e, a) = (expected[0].pixels[position], blended.pixels[position]);
+                let (e, a) = (&expected[0].values[2 * position..], of(&blended.values));
                 mismatches.compare("value", position, e[0], a[0].into(), 1e-5, 1e-4);
                 // The blended 1 is alpha itself.
                 let alpha = f64::from(image.alpha.pixels[position]);

@@ -5,7 +5,7 @@ use cif_geometry::PixelGrid;
 use cif_render::constants::TILE;
 use cif_render::cpu::{BandRequest, RenderedBand, Renderer, SimdLevel};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
-use cif_render::{BlendingWeights, Channels, RenderSettings};
+use cif_render::{BlendRequest, Blending, Channels, RenderSettings};
 
 const ALL: Channels = Channels { depth: true, instances: true };
 
@@ -125,8 +125,9 @@ fn whole_images_do_not_depend_on_the_bands() {
         let mut renderer = Renderer::new(SimdLevel::Auto);
         renderer.set_band_memory(memory);
         let image = renderer.render(&scene.field, &scene.camera, scene.time, &settings, ALL);
-        let blended = [BlendingWeights::Color, BlendingWeights::Instances]
-            .map(|weights| renderer.blend(&values, weights));
+        let blended = [Blending::Color, Blending::Own].map(|blending| {
+            renderer.blend(&BlendRequest { values: values.as_flattened(), channels: 2, blending })
+        });
         (image, blended, renderer.instance_ranks(identities, 4))
     });
     assert_eq!((drawn[0].0.color.width, drawn[0].0.color.height), (90, 75));

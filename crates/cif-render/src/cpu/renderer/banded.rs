@@ -7,13 +7,13 @@ use super::super::bands::{Band, bands};
 use super::super::bin::TileRegion;
 use super::super::labels::TileLabels;
 use super::super::rasterize::TileImage;
-use super::super::tile::{Pass, TilePixels};
+use super::super::tile::TilePixels;
 use super::super::timing::timed;
 use super::Renderer;
-use super::images::{DrawnIdentities, gather_ranks, gather_tiles, gather_values, instance_tile_bytes};
+use super::images::{DrawnIdentities, gather_ranks, gather_tiles, instance_tile_bytes};
 use crate::constants::{MIN_COVERAGE, TILE};
 use crate::image::{InstanceImage, InstanceRanks};
-use crate::{Channels, RenderSettings, RenderedImage};
+use crate::{BlendRequest, Blending, Channels, RenderSettings, RenderedImage};
 
 /// Bytes of a band, unless said otherwise: a view of 1920 x 1080 pixels with all channels fits.
 pub(super) const BAND_MEMORY: u64 = 256 << 20;
@@ -191,8 +191,9 @@ impl Renderer {
             }
         }
         if let (Some(blended), Some(values)) = (&mut band.blended, request.values) {
-            let tiles = self.blended_tiles(lists, values, Pass::Color);
-            gather_values(lists, width, &tiles, &mut blended.pixels);
+            let request =
+                BlendRequest { values: values.as_flattened(), channels: 2, blending: Blending::Color };
+            self.blend_region(lists, &request, blended.pixels.as_flattened_mut());
         }
     }
 }

@@ -1,24 +1,23 @@
-//! Pictures of a view: whole, of values per Gaussian, and of instances.
+//! Pictures of a view: whole, and of instances.
 
 use std::convert::Infallible;
 
 use cif_field::{Field, Identities};
-use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_geometry::PinholeCamera;
 use fearless_simd::dispatch;
 use rayon::prelude::*;
 
 use super::super::bands::bands;
 use super::super::bin::{TileLists, TileRegion};
-use super::super::blend::blend_tile;
 use super::super::dense::{InstanceTile, instance_tile};
 use super::super::labels::IdentityRows;
 use super::super::pixels::LANES;
-use super::super::tile::{GROUPS, Pass, TilePixels, pixel_in_tile};
+use super::super::tile::{GROUPS, pixel_in_tile};
 use super::Renderer;
 use super::banded::BandRequest;
 use crate::constants::TILE;
 use crate::image::InstanceRanks;
-use crate::{BlendingWeights, Channels, RenderSettings, RenderedImage};
+use crate::{Channels, RenderSettings, RenderedImage};
 
 /// What the instance pass reads of identities.
 pub(super) struct DrawnIdentities<'a> {
@@ -80,29 +79,9 @@ impl Renderer {
             .collect()
     }
 
-    /// Values per Gaussian blended over every tile.
-    pub(super) fn blended_tiles<const C: usize>(
-        &self,
-        lists: &TileLists,
-        values: &[[f32; C]],
-        pass: Pass,
-    ) -> Vec<[TilePixels; C]> {
-        let level = self.level;
-        (0..lists.tiles())
-            .into_par_iter()
-            .map(|tile| {
-                let mut blended = [[[0.0; LANES]; GROUPS]; C];
-                let place = self.place_in(lists, tile);
-                dispatch!(level, simd => blend_tile(
-                    simd, &self.tape.splats, lists.tile(tile), &place, pass, values, &mut blended));
-                blended
-            })
-            .collect()
-    }
-
     /// Calls `each` with the tile lists of the view that was rendered last, all at once where they are still there,
     /// else region by region.
-    fn each_region(&self, tile_bytes: usize, mut each: impl FnMut(&TileLists)) {
+    pub(super) fn each_region(&self, tile_bytes: usize, mut each: impl FnMut(&TileLists)) {
         let (view, ..) = self.tape.view.expect("a view was rendered");
         let whole = TileRegion::whole(view.width, view.height);
         if self.tape.lists.region == whole {
@@ -133,34 +112,6 @@ impl Renderer {
             gather_ranks(lists, &tiles, start, &mut found);
         });
         found
-    }
-
-    /// Values per Gaussian (`[N]`, by row of the field) blended over the view that was rendered last, with the weights
-    /// of colour, `sum_i T_i alpha_i v_i`, or of the instance pass; divided by the blended 1 it is the mean over what
-    /// the pixel shows.
-    ///
-    /// # Panics
-    /// Without such a view, when there are fewer values than Gaussians, or for weights of the instance pass when
-    /// the view was rendered without instances.
-    #[must_use]
-    pub fn blend<const C: usize>(
-        &self,
-        values: &[[f32; C]],
-        weights: BlendingWeights,
-    ) -> PixelGrid<[f32; C]> {
-        let (view, settings, _) = self.tape.view.expect("a view was rendered");
-        let pass = match weights {
-            BlendingWeights::Color => Pass::Color,
-            BlendingWeights::Instances => Pass::Instances,
-        };
-        assert!(pass == Pass::Color || settings.instances.is_some(), "the view was rendered with instances");
-        let mut image = PixelGrid::filled(view.width, view.height, [0.0; C]);
-        self.each_region(size_of::<[TilePixels; C]>(), |lists| {
-            let tiles = self.blended_tiles(lists, values, pass);
-            let start = (lists.region.first_row * TILE) as usize * view.width as usize;
-            gather_values(lists, view.width, &tiles, &mut image.pixels[start..]);
-        });
-        image
     }
 
     /// Colours on the background of the tiles that were blended last, into the rows of the image that hold them.
@@ -196,18 +147,6 @@ pub(super) fn gather_ranks(
             tiles[tile].ranks[rank][group][lane].1
         });
     }
-}
-
-/// Writes values blended over a region's tiles to the rows of pixels that hold them.
-pub(super) fn gather_values<const C: usize>(
-    lists: &TileLists,
-    width: u32,
-    tiles: &[[TilePixels; C]],
-    rows: &mut [[f32; C]],
-) {
-    gather_tiles(lists, width, rows, |tile, group, lane| {
-        std::array::from_fn(|channel| tiles[tile][channel][group][lane])
-    });
 }
 
 /// Writes per-tile values of a region to rows of pixels, so many wide, of which the first is the region's first.

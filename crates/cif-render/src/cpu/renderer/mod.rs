@@ -4,7 +4,8 @@
 //! |---|---|
 //! | this | forward |
 //! | `backward` | gradients of the last forward pass |
-//! | `images` | pictures of a view and of values per Gaussian, instance images |
+//! | `images` | pictures of a view, instance images |
+//! | `blend` | values per Gaussian |
 //! | `banded` | the same band by band, within a budget of memory |
 //! | `count` | label mass for identity estimation |
 //! | `pose` | Gaussians at the time of the view |
@@ -13,6 +14,7 @@
 
 mod backward;
 mod banded;
+mod blend;
 mod count;
 mod displace;
 mod images;
