@@ -6,13 +6,16 @@
 
 mod common;
 
+use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
+use cif_render::reference::Parameters;
 use cif_render::reference::blend::{blend, blend_backward};
 use cif_render::reference::{Forward, ParameterGroup, Scene, splats_backward};
-use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene};
+use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::{
-    BlendRequest, BlendedImage, Blending, GeometryPath, InstanceSettings, OccupancySource, RenderSettings,
+    BlendRequest, BlendedImage, Blending, GeometryPath, Gradients, InstanceSettings, OccupancySource,
+    RenderSettings,
 };
-use common::{Case, Mismatches, compare_with_differences};
+use common::{Case, Mismatches, compare_with_differences, pixel_discontinuity, render};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
@@ -212,4 +215,293 @@ fn known_values() {
         mismatches.compare("coverage", position, 1.0 - state.transmittance, blended[3], 1e-14, 1e-15);
     }
     mismatches.finish("known values");
+}
+
+/// Relative width of the boundary band: above the rounding of a weight in single precision.
+const BAND: f64 = 1e-3;
+
+/// Many small Gaussians over several tiles, also partial ones.
+fn many() -> SyntheticConfig {
+    SyntheticConfig {
+        seed: 11,
+        gaussians: 250,
+        instances: 6,
+        width: 71,
+        height: 53,
+        screen_size: (0.01, 0.08),
+        ..SyntheticConfig::default()
+    }
+}
+
+/// What the reference makes of a head, with gradients by pixels away from the boundary band.
+struct Expected {
+    scene: SyntheticScene,
+    head: Head,
+    band: Vec<bool>,
+    image: BlendedImage<f64>,
+    /// By the values, `[N, C]`, and by the parameters through the weights, for each path.
+    v_values: Vec<f64>,
+    parameters: Vec<(GeometryPath, Parameters<f64>)>,
+}
+
+fn expected(
+    config: &SyntheticConfig,
+    settings: RenderSettings,
+    (channels, blending): (usize, Blending),
+    paths: &[GeometryPath],
+    edit: impl Fn(&mut SyntheticScene),
+) -> Expected {
+    let mut synthetic = generate(config);
+    edit(&mut synthetic);
+    let scene = Scene::<f64>::from_field(&synthetic.field);
+    let forward = render(&scene, &synthetic, &settings);
+    let mut head = Head::new(&synthetic, channels, blending, 1.0);
+    let band: Vec<bool> = (0..forward.pixels.pixels.len())
+        .map(|position| pixel_discontinuity(&forward, position, BAND).is_some())
+        .collect();
+    let near = band.iter().filter(|near| **near).count();
+    assert!(2 * near < band.len(), "{near} of {} pixels lie in the boundary band", band.len());
+    for (v_pixel, near) in head.v_blended.chunks_exact_mut(channels).zip(&band) {
+        if *near {
+            v_pixel.fill(0.0);
+        }
+    }
+    let image = head.blend(&forward, &head.values);
+    let backward = |weights| {
+        let (request, width) = (head.request(&head.values), forward.view.width);
+        blend_backward(&forward.splats, &forward.order, width, &request, &head.v_blended, weights)
+    };
+    let v_values = backward(None).values;
+    let parameters = (paths.iter())
+        .map(|path| (*path, splats_backward(&scene, &forward, &backward(Some(*path)).splats).0))
+        .collect();
+    Expected { scene: synthetic, head, band, image, v_values, parameters }
+}
+
+fn single(values: &[f64]) -> Vec<f32> {
+    values.iter().map(|value| *value as f32).collect()
+}
+
+impl Expected {
+    fn compare_image(&self, actual: &[f32], tolerance: f64, mismatches: &mut Mismatches) {
+        assert_eq!(actual.len(), self.image.values.len());
+        for (index, (e, a)) in self.image.values.iter().zip(actual).enumerate() {
+            if !self.band[index / self.head.channels] {
+                mismatches.compare("blended", index, *e, f64::from(*a), 0.0, tolerance);
+            }
+        }
+    }
+
+    fn compare_values(&self, actual: &[f32], relative: f64, mismatches: &mut Mismatches) {
+        assert_eq!(actual.len(), self.v_values.len());
+        compare_group("values", &self.v_values, |index| f64::from(actual[index]), relative, mismatches);
+    }
+}
+
+fn compare_group(
+    name: &str,
+    expected: &[f64],
+    actual: impl Fn(usize) -> f64,
+    relative: f64,
+    mismatches: &mut Mismatches,
+) {
+    // Sums of terms of both signs are as exact as their largest term, not as their result.
+    let largest = expected.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
+    for (index, e) in expected.iter().enumerate() {
+        mismatches.compare(name, index, *e, actual(index), relative, 0.01 * relative * largest + 1e-12);
+    }
+}
+
+/// Scalars of a group.
+fn of_group(parameters: &Parameters<f64>, group: ParameterGroup) -> Vec<f64> {
+    (0..parameters.len(group)).map(|index| parameters.get(group, index)).collect()
+}
+
+/// Scalar `index` of a group of the fast path's gradients.
+fn fast(gradients: &Gradients, group: ParameterGroup, index: usize) -> f64 {
+    let g = &gradients.gaussians;
+    f64::from(match group {
+        ParameterGroup::Means => g.means.as_flattened()[index],
+        ParameterGroup::LogScales => g.log_scales.as_flattened()[index],
+        ParameterGroup::Quaternions => g.quaternions.as_flattened()[index],
+        ParameterGroup::OpacityLogits => g.opacity_logits[index],
+        ParameterGroup::OccupancyLogits => g.occupancy_logits[index],
+        ParameterGroup::ShCoefficients => g.sh_coefficients.as_flattened()[index],
+        ParameterGroup::LogCalibrations => gradients.log_calibrations[index],
+        ParameterGroup::Planes => gradients.planes[index],
+        ParameterGroup::Mlp => gradients.mlp[index],
+    })
+}
+
+const PATHS: [GeometryPath; 3] = [GeometryPath::Full, GeometryPath::MeansOnly, GeometryPath::Off];
+
+fn check_fast_path(
+    name: &str,
+    config: &SyntheticConfig,
+    settings: RenderSettings,
+    channels: usize,
+    edit: impl Fn(&mut SyntheticScene),
+) {
+    for blending in BOTH {
+        let expected = expected(config, settings, (channels, blending), &PATHS, &edit);
+        let (head, field) = (&expected.head, &expected.scene.field);
+        let (values, v_blended) = (single(&head.values), single(&head.v_blended));
+        let request = head.request(&values);
+        for simd in SimdLevel::available() {
+            let mut mismatches = Mismatches::default();
+            let mut renderer = Renderer::new(simd);
+            renderer.prepare(field, &expected.scene.camera, expected.scene.time, &settings);
+            let blended = renderer.blend(&request);
+            expected.compare_image(&blended.values, 2e-5, &mut mismatches);
+            let mut frozen = vec![0.0; values.len()];
+            renderer.blend_backward(&request, &v_blended, &mut frozen, None);
+            expected.compare_values(&frozen, 1e-4, &mut mismatches);
+            for (geometry, parameters) in &expected.parameters {
+                let (mut v_values, mut gradients) = (vec![0.0; values.len()], Gradients::zeros(field));
+                let weights = BlendWeightGradients {
+                    field,
+                    blended: &blended,
+                    geometry: *geometry,
+                    gradients: &mut gradients,
+                };
+                renderer.blend_backward(&request, &v_blended, &mut v_values, Some(weights));
+                assert_eq!(v_values, frozen, "the weights do not change what the values get");
+                for group in ParameterGroup::ALL {
+                    let of_group = of_group(parameters, group);
+                    let actual = |index| fast(&gradients, group, index);
+                    let name = format!("{group:?} {geometry:?}");
+                    compare_group(&name, &of_group, actual, 1e-3, &mut mismatches);
+                }
+            }
+            mismatches.finish(&format!("{name}, C = {channels}, {blending:?}, {simd:?}"));
+        }
+    }
+}
+
+#[test]
+fn fast_path_with_few_and_many_channels() {
+    for channels in [1, 3, 16, 100] {
+        check_fast_path("static", &many(), settings(), channels, |_| {});
+    }
+}
+
+#[test]
+fn fast_path_of_a_deformed_scene() {
+    let config = SyntheticConfig { heads: Some(ALL_HEADS), ..many() };
+    check_fast_path("deformed", &config, settings(), 5, |_| {});
+}
+
+#[test]
+fn fast_path_where_weights_saturate_and_pixels_stop() {
+    let config = SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() };
+    check_fast_path("saturated", &config, settings(), 3, |scene| {
+        for row in 0..60 {
+            scene.field.gaussians.opacity_logits[row] = if row % 2 == 0 { 7.0 } else { 1.0 };
+            scene.field.gaussians.occupancy_logits[row] = if row % 3 == 0 { 7.0 } else { 0.0 };
+        }
+    });
+}
+
+#[test]
+fn fast_path_of_every_setting() {
+    let instances = InstanceSettings { occupancy: OccupancySource::Opacity, ..InstanceSettings::default() };
+    for antialiased in [false, true] {
+        let settings = RenderSettings { antialiased, instances: Some(instances), ..settings() };
+        check_fast_path("opacity as occupancy", &many(), settings, 3, |_| {});
+    }
+}
+
+/// What a head gets of a view, by so many threads and within so much memory.
+fn head_on(
+    threads: usize,
+    memory: u64,
+    scene: &SyntheticScene,
+    head: &Head,
+) -> (BlendedImage, Vec<f32>, Gradients) {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads can be started");
+    let (values, v_blended) = (single(&head.values), single(&head.v_blended));
+    pool.install(|| {
+        let mut renderer = Renderer::new(SimdLevel::Auto);
+        renderer.set_band_memory(memory);
+        renderer.prepare(&scene.field, &scene.camera, scene.time, &settings());
+        let blended = renderer.blend(&head.request(&values));
+        let (mut v_values, mut gradients) = (vec![0.0; values.len()], Gradients::zeros(&scene.field));
+        // Twice: gradients are added.
+        for _ in 0..2 {
+            let (field, geometry) = (&scene.field, GeometryPath::Full);
+            let weights =
+                BlendWeightGradients { field, blended: &blended, geometry, gradients: &mut gradients };
+            renderer.blend_backward(&head.request(&values), &v_blended, &mut v_values, Some(weights));
+        }
+        (blended, v_values, gradients)
+    })
+}
+
+#[test]
+fn threads_and_memory_do_not_change_a_bit() {
+    let scene = generate(&SyntheticConfig { gaussians: 3000, ..many() });
+    for blending in BOTH {
+        let head = Head::new(&scene, 7, blending, 1.0);
+        let one = head_on(1, u64::MAX, &scene, &head);
+        for (threads, memory) in [(2, u64::MAX), (3, 40_000), (8, 1)] {
+            let other = head_on(threads, memory, &scene, &head);
+            assert!(other == one, "{threads} threads and {memory} bytes differ, {blending:?}");
+        }
+        let mut other = scene.clone();
+        other.field.gaussians.means[0][0] += 1e-3;
+        assert!(head_on(1, u64::MAX, &other, &head) != one, "the comparison must be able to fail");
+    }
+}
+
+/// After a training pass the same tile lists serve, and pictures have none for gradients.
+#[test]
+fn gradients_follow_a_forward_pass_and_not_a_picture() {
+    let scene = generate(&many());
+    let head = Head::new(&scene, 2, Blending::Own, 1.0);
+    let (values, v_blended) = (single(&head.values), single(&head.v_blended));
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    let [prepared, drawn] = [false, true].map(|draws| {
+        if draws {
+            renderer.forward(&scene.field, &scene.camera, scene.time, &settings(), Some(&scene.labels));
+        } else {
+            renderer.prepare(&scene.field, &scene.camera, scene.time, &settings());
+        }
+        let mut v_values = vec![0.0; values.len()];
+        renderer.blend_backward(&head.request(&values), &v_blended, &mut v_values, None);
+        v_values
+    });
+    assert!(prepared == drawn && prepared.iter().any(|v| *v != 0.0));
+    renderer.render(&scene.field, &scene.camera, scene.time, &settings(), cif_render::Channels::default());
+    let refused = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+        renderer.blend_backward(&head.request(&values), &v_blended, &mut vec![0.0; values.len()], None);
+    }));
+    let message = *refused.unwrap_err().downcast::<&str>().unwrap();
+    assert!(message.contains("prepared"), "{message}");
+}
+
+/// Products that are far from 1, but within the range of single precision, are no fault.
+#[test]
+fn large_and_small_values_stay_finite() {
+    let scene = generate(&SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() });
+    for blending in BOTH {
+        for (magnitude, v_magnitude) in [(1e-30, 1.0), (1e30, 1e-3), (1e10, 1e10)] {
+            let mut head = Head::new(&scene, 3, blending, magnitude);
+            head.v_blended = noise(2, head.v_blended.len(), v_magnitude);
+            let (blended, v_values, gradients) = head_on(1, u64::MAX, &scene, &head);
+            let through = [gradients.gaussians.means.as_flattened(), &gradients.gaussians.opacity_logits];
+            let all = [&blended.values[..], &v_values, through[0], through[1]];
+            assert!(all.iter().flat_map(|values| *values).all(|value| value.is_finite()), "{magnitude:e}");
+            let largest = |values: &[f32]| values.iter().fold(0.0_f32, |most, value| most.max(value.abs()));
+            assert!(largest(&blended.values) > 0.1 * magnitude as f32, "{magnitude:e}");
+            assert!(largest(&v_values) > 0.1 * v_magnitude as f32, "{magnitude:e}");
+        }
+    }
+}
+
+#[test]
+fn scenes_without_gaussians() {
+    let scene = generate(&SyntheticConfig { gaussians: 0, instances: 0, ..many() });
+    let head = Head::new(&scene, 4, Blending::Color, 1.0);
+    let (blended, v_values, _) = head_on(1, u64::MAX, &scene, &head);
+    assert!(v_values.is_empty() && blended.values == vec![0.0; 4 * 71 * 53]);
 }

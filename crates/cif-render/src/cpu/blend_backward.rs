@@ -94,8 +94,7 @@ pub(super) fn blend_tile_backward<S: Simd, const WEIGHTS: bool>(
                 for (v, value) in of_group.iter().zip(values) {
                     e = load(simd, v).mul_add(splat(simd, *value), e);
                 }
-                let v_alpha =
-                    rule.backward(simd, &blended, unclamped, e, &mut cotangents.remainder[group]);
+                let v_alpha = rule.backward(simd, &blended, unclamped, e, &mut cotangents.remainder[group]);
                 let v_sigma = -(blended.alpha * v_alpha);
                 match request.blending {
                     Blending::Color => sums.opacity = at.peak.mul_add(v_alpha, sums.opacity),

@@ -9,7 +9,7 @@
 //! | `tile` | how a splat falls on a tile's pixels and blends: the steps that all of these share: |
 //! | `rasterize`, `rasterize_backward` | pixels, and back |
 //! | `dense` | instance images |
-//! | `blend` | other values per Gaussian |
+//! | `blend`, `blend_backward` | other values per Gaussian, and back |
 //! | `identity`, `counts` | label mass for identity estimation |
 //! | `renderer` | the stages in order, in both directions |
 //!
@@ -19,6 +19,7 @@
 mod bands;
 mod bin;
 mod blend;
+mod blend_backward;
 mod channels;
 mod counts;
 mod deform;
@@ -38,5 +39,7 @@ mod vector;
 
 pub use counts::IdentityCounts;
 pub use level::SimdLevel;
-pub use renderer::{BandRequest, ForwardPass, NotFinite, RenderedBand, Renderer, ViewStatistics};
+pub use renderer::{
+    BandRequest, BlendWeightGradients, ForwardPass, NotFinite, RenderedBand, Renderer, ViewStatistics,
+};
 pub use timing::StageTimes;

@@ -87,10 +87,10 @@ struct Seen<S: Simd> {
 }
 
 /// Gradient of a splat, per lane.
-struct Sums<S: Simd> {
+pub(super) struct Sums<S: Simd> {
     color: [f32x16<S>; 3],
-    opacity: f32x16<S>,
-    responsibility: f32x16<S>,
+    pub(super) opacity: f32x16<S>,
+    pub(super) responsibility: f32x16<S>,
     /// Moments of v_sigma by u: first for the mean, second for the covariance.
     first: [f32x16<S>; 2],
     second: [f32x16<S>; 3],
@@ -98,13 +98,13 @@ struct Sums<S: Simd> {
 
 impl<S: Simd> Sums<S> {
     #[inline(always)]
-    fn zero(zero: f32x16<S>) -> Self {
+    pub(super) fn zero(zero: f32x16<S>) -> Self {
         Self { color: [zero; 3], opacity: zero, responsibility: zero, first: [zero; 2], second: [zero; 3] }
     }
 
     /// Adds the moments of a group: `v_sigma` for the covariance, `v_sigma_mean` for the mean.
     #[inline(always)]
-    fn add_moments(&mut self, at: &Footprint<S>, v_sigma: f32x16<S>, v_sigma_mean: f32x16<S>) {
+    pub(super) fn add_moments(&mut self, at: &Footprint<S>, v_sigma: f32x16<S>, v_sigma_mean: f32x16<S>) {
         let (v0, v1) = (v_sigma * at.u0, v_sigma * at.u1);
         self.first[0] = v_sigma_mean.mul_add(at.u0, self.first[0]);
         self.first[1] = v_sigma_mean.mul_add(at.u1, self.first[1]);
@@ -114,7 +114,7 @@ impl<S: Simd> Sums<S> {
     }
 
     #[inline(always)]
-    fn finish(self, simd: S, splat: &Splat) -> SplatGradient {
+    pub(super) fn finish(self, simd: S, splat: &Splat) -> SplatGradient {
         let [l00, l01, l11] = splat.binary_factor();
         let [u0, u1, u00, u01] =
             sum_each(simd, [self.first[0], self.first[1], self.second[0], self.second[1]]);
@@ -150,11 +150,8 @@ impl<S: Simd> Seen<S> {
         for channel in 0..3 {
             sums.color[channel] = blended.weight.mul_add(v_c[channel], sums.color[channel]);
         }
-        let remainder = load(simd, &cotangents.remainder[group]) - blended.weight * e;
-        remainder.store_array(&mut cotangents.remainder[group]);
-        let v_alpha = blended.transmittance.mul_add(e, -(remainder / (self.one - blended.alpha)));
-        let flows = blended.drawn & self.blending.unclamped(unclamped);
-        let v_alpha = flows.select(v_alpha, self.zero);
+        let remainder = &mut cotangents.remainder[group];
+        let v_alpha = self.blending.backward(simd, &blended, unclamped, e, remainder);
         sums.opacity = at.peak.mul_add(v_alpha, sums.opacity);
         (-(blended.alpha * v_alpha), blended.finished)
     }

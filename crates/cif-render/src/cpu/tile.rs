@@ -233,6 +233,7 @@ impl<S: Simd> SplatInTile<S> {
 #[derive(Clone, Copy)]
 pub(super) struct BlendingRule<S: Simd> {
     zero: f32x16<S>,
+    one: f32x16<S>,
     min_alpha: f32x16<S>,
     max_alpha: f32x16<S>,
     min_transmittance: f32x16<S>,
@@ -257,6 +258,7 @@ impl<S: Simd> BlendingRule<S> {
     pub(super) fn new(simd: S) -> Self {
         Self {
             zero: splat(simd, 0.0),
+            one: splat(simd, 1.0),
             min_alpha: splat(simd, MIN_ALPHA),
             max_alpha: splat(simd, MAX_ALPHA),
             min_transmittance: splat(simd, MIN_TRANSMITTANCE),
@@ -282,6 +284,23 @@ impl<S: Simd> BlendingRule<S> {
             weight: drawn.select(weight, self.zero),
             finished: after.simd_gt(self.zero).to_bitmask() == 0,
         }
+    }
+
+    /// The gradient by a weight that [`Self::step`] blended, 0 where none flows. `e` is the gradient along what the
+    /// splat shows; `remainder` holds what is left of the sum of all `T alpha e` behind the splats so far.
+    #[inline(always)]
+    pub(super) fn backward(
+        &self,
+        simd: S,
+        blended: &Blended<S>,
+        unclamped: f32x16<S>,
+        e: f32x16<S>,
+        remainder: &mut Lanes,
+    ) -> f32x16<S> {
+        let left = load(simd, remainder) - blended.weight * e;
+        left.store_array(remainder);
+        let v_alpha = blended.transmittance.mul_add(e, -(left / (self.one - blended.alpha)));
+        (blended.drawn & self.unclamped(unclamped)).select(v_alpha, self.zero)
     }
 
     /// Where a weight was not clamped, so that gradients flow through it.

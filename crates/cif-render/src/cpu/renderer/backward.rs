@@ -56,22 +56,39 @@ impl Renderer {
         v_displacements: &[[f32; 3]],
         gradients: &mut Gradients,
     ) {
-        let (view, settings, time) = self.tape.view.expect("backward follows a forward pass");
-        assert!(field.tracks.is_none(), "recorded motion has no gradients: trainers refuse such fields");
+        let (view, settings, _) = self.tape.view.expect("backward follows a forward pass");
         assert_eq!((v_color.width, v_color.height), (view.width, view.height), "cotangent size");
         let mut times = self.times;
         let (pairs, label_mass) = timed(&mut times.rasterize_backward, || {
             self.rasterize_backward(field, v_color, instance_weight, &settings)
         });
         self.inspect_pairs(&pairs, &label_mass.values);
+        timed(&mut times.project_backward, || self.calibration_backward(field, &label_mass, gradients));
+        self.times = times;
+        self.splats_backward(field, &pairs, v_displacements, gradients);
+    }
 
+    /// Carries gradients of (tile, splat) pairs, and those by what the deformation adds to the centres, to the
+    /// parameters.
+    ///
+    /// # Panics
+    /// When the field has recorded motion.
+    pub(super) fn splats_backward(
+        &mut self,
+        field: &Field,
+        pairs: &[SplatGradient],
+        v_displacements: &[[f32; 3]],
+        gradients: &mut Gradients,
+    ) {
+        assert!(field.tracks.is_none(), "recorded motion has no gradients: trainers refuse such fields");
+        let (view, settings, time) = self.tape.view.expect("backward follows a forward pass");
+        let mut times = self.times;
         let n = field.gaussians.len();
         let deformation =
             field.deformation.as_ref().filter(|_| settings.deform).map(|d| DeformationAtTime::new(d, time));
         let mut v_posed = Gaussians::default();
         timed(&mut times.project_backward, || {
-            self.project_backward(field, &view, &pairs, gradients, &mut v_posed);
-            self.calibration_backward(field, &label_mass, gradients);
+            self.project_backward(field, &view, pairs, gradients, &mut v_posed);
         });
         self.inspect_posed_gradients(&v_posed, gradients);
         if let Some(deformation) = deformation {

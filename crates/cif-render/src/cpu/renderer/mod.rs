@@ -5,7 +5,7 @@
 //! | this | forward |
 //! | `backward` | gradients of the last forward pass |
 //! | `images` | pictures of a view, instance images |
-//! | `blend` | values per Gaussian |
+//! | `blend` | values per Gaussian, in both directions |
 //! | `banded` | the same band by band, within a budget of memory |
 //! | `count` | label mass for identity estimation |
 //! | `pose` | Gaussians at the time of the view |
@@ -27,6 +27,7 @@ use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 pub use self::banded::{BandRequest, RenderedBand};
+pub use self::blend::BlendWeightGradients;
 pub use self::inspect::NotFinite;
 use self::pose::{PosedView, pose};
 use super::bin::{TileLists, TileRegion, sort_by_depth};
