@@ -5,6 +5,9 @@
 //! see `agreement.rs`, carry no gradient and are not compared.
 
 mod common;
+#[cfg(feature = "wgpu")]
+#[path = "common/gpu.rs"]
+mod on_gpu;
 
 use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
 use cif_render::reference::Parameters;
@@ -504,4 +507,152 @@ fn scenes_without_gaussians() {
     let head = Head::new(&scene, 4, Blending::Color, 1.0);
     let (blended, v_values, _) = head_on(1, u64::MAX, &scene, &head);
     assert!(v_values.is_empty() && blended.values == vec![0.0; 4 * 71 * 53]);
+}
+
+#[cfg(feature = "wgpu")]
+mod gpu {
+    use cif_render::wgpu::{
+        BlendWeightGradients, Commands, DeviceIdentities, Gpu, GpuError, GpuGaussians, GpuVec, Rasterizer,
+        ViewInput,
+    };
+
+    use super::*;
+    use crate::on_gpu::device;
+
+    /// Everything that comes back of a head.
+    #[derive(Debug, PartialEq)]
+    struct Outcome {
+        blended: Vec<f32>,
+        v_values: Vec<f32>,
+        /// Of the geometry of the Gaussians, through the weights.
+        posed: Vec<[f32; 12]>,
+    }
+
+    /// Blends and differentiates a head on the device, as often as there are `paths`; gradients by the values add up.
+    fn run(
+        device: &mut (Gpu, Rasterizer),
+        expected: &Expected,
+        settings: &RenderSettings,
+        paths: &[Option<GeometryPath>],
+    ) -> Result<Outcome, GpuError> {
+        let (gpu, rasterizer) = (&device.0, &mut device.1);
+        let (scene, head) = (&expected.scene, &expected.head);
+        let gaussians = GpuGaussians::upload(gpu, &scene.field.gaussians)?;
+        let identities = scene.field.identities.as_ref().filter(|_| settings.instances.is_some());
+        let identities = identities
+            .map(|rows| DeviceIdentities::from_identities(gpu, rows, scene.field.instances.len()))
+            .transpose()?;
+        let input = ViewInput { camera: &scene.camera, settings, labels: None };
+        let values = GpuVec::from_slice(gpu, "values", &single(&head.values))?;
+        let v_blended = GpuVec::from_slice(gpu, "gradients of pixels", &single(&head.v_blended))?;
+        let mut blended = GpuVec::zeros(gpu, "blended values", 0)?;
+        let v_values = GpuVec::zeros(gpu, "gradients of values", values.len())?;
+        let request = BlendRequest { values: &values, channels: head.channels, blending: head.blending };
+
+        let mut commands = Commands::new(gpu, None);
+        rasterizer.project(gpu, &mut commands, (&gaussians).into(), identities.as_ref(), &input)?;
+        rasterizer.measure(gpu, commands)?;
+        let mut commands = Commands::new(gpu, None);
+        rasterizer.list_tiles(gpu, &mut commands, identities.as_ref())?;
+        rasterizer.blend(gpu, &mut commands, &request, &mut blended)?;
+        for path in paths {
+            let weights = path.map(|geometry| BlendWeightGradients {
+                gaussians: (&gaussians).into(),
+                blended: &blended,
+                geometry,
+            });
+            rasterizer.blend_backward(gpu, &mut commands, &request, &v_blended, &v_values, weights)?;
+        }
+        commands.submit();
+        let through = paths.iter().any(Option::is_some);
+        let posed = if through { rasterizer.gradients().gaussians.geometry.read(gpu)? } else { Vec::new() };
+        Ok(Outcome { blended: blended.read(gpu)?, v_values: v_values.read(gpu)?, posed })
+    }
+
+    fn check(
+        name: &str,
+        config: &SyntheticConfig,
+        settings: RenderSettings,
+        channels: usize,
+        edit: impl Fn(&mut SyntheticScene),
+    ) {
+        let Some(mut device) = device() else { return };
+        for blending in BOTH {
+            let expected = expected(config, settings, (channels, blending), &PATHS, &edit);
+            let mut mismatches = Mismatches::default();
+            let frozen = run(&mut device, &expected, &settings, &[None]).expect("the view is drawn");
+            expected.compare_image(&frozen.blended, 3e-5, &mut mismatches);
+            expected.compare_values(&frozen.v_values, 1e-3, &mut mismatches);
+            for (geometry, parameters) in &expected.parameters {
+                let path = [Some(*geometry)];
+                let actual = run(&mut device, &expected, &settings, &path).expect("the view is drawn");
+                expected.compare_values(&actual.v_values, 1e-3, &mut mismatches);
+                let places: [(ParameterGroup, usize, usize); 5] = [
+                    (ParameterGroup::Means, 3, 0),
+                    (ParameterGroup::OpacityLogits, 1, 3),
+                    (ParameterGroup::LogScales, 3, 4),
+                    (ParameterGroup::OccupancyLogits, 1, 7),
+                    (ParameterGroup::Quaternions, 4, 8),
+                ];
+                for (group, width, first) in places {
+                    let at = |index: usize| f64::from(actual.posed[index / width][first + index % width]);
+                    let name = format!("{group:?} {geometry:?}");
+                    compare_group(&name, &of_group(parameters, group), at, 2e-3, &mut mismatches);
+                }
+            }
+            mismatches.finish(&format!("{name}, C = {channels}, {blending:?}"));
+        }
+    }
+
+    #[test]
+    fn few_and_many_channels() {
+        for channels in [1, 3, 4, 16, 101] {
+            check("on the GPU", &many(), settings(), channels, |_| {});
+        }
+    }
+
+    #[test]
+    fn weights_that_saturate_and_pixels_that_stop() {
+        let config = SyntheticConfig { gaussians: 60, screen_size: (0.05, 0.4), ..many() };
+        check("saturated on the GPU", &config, settings(), 3, |scene| {
+            for row in 0..60 {
+                scene.field.gaussians.opacity_logits[row] = if row % 2 == 0 { 7.0 } else { 1.0 };
+                scene.field.gaussians.occupancy_logits[row] = if row % 3 == 0 { 7.0 } else { 0.0 };
+            }
+        });
+    }
+
+    #[test]
+    fn opacity_as_occupancy() {
+        let instances =
+            InstanceSettings { occupancy: OccupancySource::Opacity, ..InstanceSettings::default() };
+        let settings = RenderSettings { antialiased: true, instances: Some(instances), ..settings() };
+        check("opacity as occupancy on the GPU", &many(), settings, 3, |_| {});
+    }
+
+    #[test]
+    fn gradients_add_up_and_two_runs_give_the_same_bits() {
+        let Some(mut device) = device() else { return };
+        let config = SyntheticConfig { gaussians: 3000, screen_size: (0.01, 0.03), ..many() };
+        let expected = expected(&config, settings(), (6, Blending::Color), &[], |_| {});
+        let both = [None, Some(GeometryPath::Full)];
+        let twice = run(&mut device, &expected, &settings(), &both).unwrap();
+        assert!(run(&mut device, &expected, &settings(), &both).unwrap() == twice);
+        let once = run(&mut device, &expected, &settings(), &both[..1]).unwrap();
+        let largest = once.v_values.iter().fold(0.0_f32, |most, v| most.max(v.abs()));
+        for (twice, once) in twice.v_values.iter().zip(&once.v_values) {
+            assert!((twice - 2.0 * once).abs() <= 1e-6 * largest, "{twice} is not twice {once}");
+        }
+        assert!(largest > 0.0);
+    }
+
+    #[test]
+    fn views_without_gaussians() {
+        let Some(mut device) = device() else { return };
+        let config = SyntheticConfig { gaussians: 0, instances: 0, ..many() };
+        let expected = expected(&config, settings(), (5, Blending::Color), &[], |_| {});
+        let settings = RenderSettings { instances: None, ..settings() };
+        let outcome = run(&mut device, &expected, &settings, &[Some(GeometryPath::Full)]).unwrap();
+        assert!(outcome.v_values.is_empty() && outcome.blended == vec![0.0; 5 * 71 * 53]);
+    }
 }

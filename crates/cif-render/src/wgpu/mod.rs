@@ -9,6 +9,7 @@
 //! | [`gaussians`], [`identities`] | Gaussians and their gradients, and identities, on the device |
 //! | [`faults`] | what no optimiser may take |
 //! | [`counts`] | label mass of Gaussians |
+//! | [`blend`] | other values per Gaussian, and back |
 //! | [`deform`] | canonical Gaussians to the time of a view, and back |
 //! | [`buffers`] | typed arrays that grow, uploads and read-backs |
 //! | [`layout`] | structures that Rust and WGSL share |
@@ -25,6 +26,7 @@
 //! Kernels need the core limits of WebGPU and no more: 8 storage buffers, 16 KiB of workgroup memory and 256
 //! invocations per workgroup. Subgroups are used where they are there.
 
+pub mod blend;
 pub mod buffers;
 pub mod cache;
 pub mod counts;
@@ -48,6 +50,7 @@ pub mod view;
 pub mod workgroup;
 
 pub use ::wgpu::{BindGroup, SubmissionIndex as Submission};
+pub use blend::BlendWeightGradients;
 pub use buffers::{Arriving, GpuVec, Letter, Mailbox, Recorded, Uniform};
 pub use cache::{BindCache, Place, UniformCache};
 pub use counts::GpuIdentityCounts;
@@ -87,6 +90,11 @@ pub const MODULES: &[&Module] = &[
     &stages::GATHER_GRADIENTS,
     &stages::IDENTITY_BACKWARD,
     &stages::PROJECT_BACKWARD,
+    &blend::BLEND,
+    &blend::BLEND_BACKWARD,
+    &blend::BLEND_BACKWARD_WEIGHTS,
+    &blend::GATHER_VALUES,
+    &blend::GATHER_VALUES_WEIGHTS,
     &counts::COUNT_LABELS,
     &counts::GATHER_COUNTS,
     &workgroup::SELF_CHECK,
@@ -99,5 +107,6 @@ pub const LAYOUTS: &[fn() -> Layout] = &[
     Splat::layout,
     view::ScanParameters::layout,
     view::SortParameters::layout,
+    blend::BlendChunk::layout,
     counts::LabelChunk::layout,
 ];

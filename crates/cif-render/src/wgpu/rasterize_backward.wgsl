@@ -24,11 +24,11 @@
 #import tile_staging
 #import identity
 
-// Splats that are summed at a time.
+// Splats that are summed at a time, and their sums.
 const BATCH: u32 = 4u;
+const SUMS: u32 = GRADIENT_SUMS;
+#import partial_sums
 
-// Of every splat of the batch and sum, by invocation.
-var<workgroup> partial_sums: array<f32, BATCH * GRADIENT_SUMS * 64u>;
 // Weighted r of every splat of the batch, by invocation, a quadrant each.
 var<workgroup> responsibilities: array<vec4f, BATCH * 64u>;
 // Labels by invocation, 16 bits each, quadrants 0 and 1 first.
@@ -316,23 +316,7 @@ fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_in
             let own = local / 16u;
             let part = local % 16u;
             if (own < count && part < GRADIENT_SUMS) {
-                let sums = (own * GRADIENT_SUMS + part) * 64u;
-                var sum = vec4f(0.0);
-                // Every invocation starts at another place, so that they read from different banks of memory.
-                var at = local;
-                loop {
-                    sum += vec4f(
-                        partial_sums[sums + at % 64u],
-                        partial_sums[sums + (at + 1u) % 64u],
-                        partial_sums[sums + (at + 2u) % 64u],
-                        partial_sums[sums + (at + 3u) % 64u],
-                    );
-                    continuing {
-                        at += 4u;
-                        break if at >= local + 64u;
-                    }
-                }
-                pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = (sum.x + sum.y) + (sum.z + sum.w);
+                pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = sum_of(own * SUMS + part, local);
             }
             workgroupBarrier();
             if (longest_row > 0u) {

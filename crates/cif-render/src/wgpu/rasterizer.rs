@@ -1,9 +1,11 @@
 //! Strings the stages together, forward and backward, on one device.
 //!
 //! A view goes through [`Rasterizer::project`] and [`Rasterizer::rasterize`], then
-//! [`Rasterizer::render_instances`] or [`Rasterizer::backward`]. Each records commands; nothing waits but
-//! [`Rasterizer::measure`], which makes room for the pairs of a view. A trainer does not wait: it reads
-//! [`Rasterizer::counts`] when they arrive, and draws a view again whose pairs did not fit, for it drew nothing.
+//! [`Rasterizer::render_instances`] or [`Rasterizer::backward`]; other values per Gaussian through
+//! [`Rasterizer::list_tiles`], which rasterizing begins with, [`Rasterizer::blend`] and [`Rasterizer::blend_backward`].
+//! Each records commands; nothing waits but [`Rasterizer::measure`], which makes room for the pairs of a view. A trainer
+//! does not wait: it reads [`Rasterizer::counts`] when they arrive, and draws a view again whose pairs did not fit, for
+//! it drew nothing.
 //!
 //! Memory grows with need: per Gaussian 64 + 4 x 9 bytes for a view and 48 + 48 + 192 + 16 for gradients, per pair 40
 //! and 48, per label slot 4, per pixel 32 and 48.
@@ -11,6 +13,7 @@
 use cif_field::gaussians::SH_FLOATS;
 use cif_geometry::PinholeCamera;
 
+use super::blend::BlendKernels;
 use super::buffers::{GpuVec, Recorded, Uniform};
 use super::cache::BindCache;
 use super::device::Gpu;
@@ -122,27 +125,27 @@ pub struct PosedGradients {
 
 /// Arrays of a view.
 #[derive(Debug)]
-struct Arrays {
-    splats: GpuVec<Splat>,
+pub(super) struct Arrays {
+    pub(super) splats: GpuVec<Splat>,
     /// Keys are depths, values Gaussians.
-    depth: SortArrays,
+    pub(super) depth: SortArrays,
     tile_counts: GpuVec<u32>,
-    pair_offsets: GpuVec<u32>,
+    pub(super) pair_offsets: GpuVec<u32>,
     slot_offsets: GpuVec<u32>,
-    work: GpuVec<u32>,
+    pub(super) work: GpuVec<u32>,
     /// Keys are tiles, values pairs.
     tiles: SortArrays,
-    pairs: GpuVec<[u32; 2]>,
-    entries: GpuVec<[u32; 4]>,
-    tile_ranges: GpuVec<[u32; 2]>,
+    pub(super) pairs: GpuVec<[u32; 2]>,
+    pub(super) entries: GpuVec<[u32; 4]>,
+    pub(super) tile_ranges: GpuVec<[u32; 2]>,
     colors: GpuVec<[f32; 4]>,
     blended: GpuVec<[f32; 4]>,
     instance_images: GpuVec<[f32; 4]>,
     foregrounds: GpuVec<f32>,
     cotangents: GpuVec<[f32; 4]>,
-    pair_sums: GpuVec<f32>,
+    pub(super) pair_sums: GpuVec<f32>,
     label_mass: GpuVec<f32>,
-    splat_gradients: GpuVec<[f32; 4]>,
+    pub(super) splat_gradients: GpuVec<[f32; 4]>,
     /// Stand in where a view has no labels or no identities.
     no_labels: GpuVec<u32>,
     no_entries: GpuVec<[u32; 2]>,
@@ -214,12 +217,14 @@ pub struct Rasterizer {
     kernels: Kernels,
     scan: Scan,
     sort: RadixSort,
-    cache: BindCache,
-    uniform: Uniform<View>,
-    view: View,
+    pub(super) cache: BindCache,
+    pub(super) uniform: Uniform<View>,
+    pub(super) view: View,
     /// Which of the two depth arrays and pair arrays holds the sorted ones.
-    depth_result: usize,
-    arrays: Arrays,
+    pub(super) depth_result: usize,
+    pub(super) arrays: Arrays,
+    /// Compiled when values are blended first.
+    pub(super) blend: Option<BlendKernels>,
     gradients: PosedGradients,
 }
 
@@ -238,6 +243,7 @@ impl Rasterizer {
             view: View::default(),
             depth_result: 0,
             arrays: Arrays::new(gpu)?,
+            blend: None,
             gradients: PosedGradients {
                 gaussians: GpuGaussians::zeros(gpu, 0)?,
                 screen: GpuVec::zeros(gpu, "screen gradients", 0)?,
@@ -444,23 +450,22 @@ impl Rasterizer {
         Ok(())
     }
 
-    /// Records tile lists and blending of the projected view.
+    /// Records tile lists of the projected view, without drawing colour: all that [`Self::blend`] and
+    /// [`Self::blend_backward`] need, for losses that do not look at colour.
     ///
     /// # Errors
     /// When scratch memory exceeds what the device binds.
-    pub fn rasterize(
+    pub fn list_tiles(
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
         identities: Option<&DeviceIdentities>,
-        labels: Option<LabelInput<'_>>,
     ) -> Result<(), GpuError> {
         let arrays = &self.arrays;
         let kernels = &self.kernels;
         let view = self.view;
         let uniform = self.uniform.buffer();
         let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
-        let identity_entries = identities.map_or(&arrays.no_entries, |identities| &identities.entries);
         let order = &arrays.depth.values[self.depth_result];
         commands.clear(&arrays.tile_ranges);
         let bin = self.cache.get(
@@ -522,6 +527,27 @@ impl Rasterizer {
         commands.stage("ranges", |stage| {
             stage.dispatch_indirect(&kernels.ranges, &ranges, &arrays.work, work::BY_PAIR);
         });
+        Ok(())
+    }
+
+    /// Records tile lists and blending of the projected view.
+    ///
+    /// # Errors
+    /// As [`Self::list_tiles`].
+    pub fn rasterize(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        identities: Option<&DeviceIdentities>,
+        labels: Option<LabelInput<'_>>,
+    ) -> Result<(), GpuError> {
+        self.list_tiles(gpu, commands, identities)?;
+        let arrays = &self.arrays;
+        let kernels = &self.kernels;
+        let view = self.view;
+        let uniform = self.uniform.buffer();
+        let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
+        let identity_entries = identities.map_or(&arrays.no_entries, |identities| &identities.entries);
         let label_map = labels.map_or(&arrays.no_labels, |labels| labels.labels);
         let (variant, kernel) = match view.label_pixels {
             0 => (0, &kernels.rasterize_color),
@@ -607,16 +633,13 @@ impl Rasterizer {
         assert_eq!(v_colors.len(), view.pixels(), "cotangent size");
         let arrays = &mut self.arrays;
         arrays.cotangents.resize(gpu, 2 * view.pixels())?;
-        arrays.pair_sums.resize(gpu, PAIR_SUMS * arrays.entries.len())?;
-        arrays.splat_gradients.resize(gpu, 3 * n)?;
-        self.gradients.gaussians.geometry.resize(gpu, n)?;
-        self.gradients.gaussians.sh.resize(gpu, n)?;
-        self.gradients.screen.resize(gpu, n)?;
+        self.reserve_sums(gpu)?;
+        self.reserve_gradients(gpu)?;
         if let Some(identities) = identities {
             self.gradients.calibrations.resize(gpu, identities.entries.len())?;
         }
         let arrays = &self.arrays;
-        let (kernels, gradients) = (&self.kernels, &self.gradients);
+        let kernels = &self.kernels;
         let uniform = self.uniform.buffer();
         let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
         let identity_entries = identities.map_or(&arrays.no_entries, |identities| &identities.entries);
@@ -677,27 +700,12 @@ impl Rasterizer {
                 arrays.splat_gradients.buffer(),
             ],
         );
-        let project = self.cache.get(
-            gpu,
-            ("project_backward", 0),
-            &kernels.project_backward,
-            &[
-                uniform,
-                gaussians.geometry.buffer(),
-                gaussians.sh.buffer(),
-                arrays.splats.buffer(),
-                arrays.splat_gradients.buffer(),
-                gradients.gaussians.geometry.buffer(),
-                gradients.gaussians.sh.buffer(),
-                gradients.screen.buffer(),
-            ],
-        );
         commands.stage("gather gradients", |stage| {
             stage.dispatch(&kernels.gather_gradients, &gather, workgroups(n, 64));
         });
-        commands.stage("project backward", |stage| {
-            stage.dispatch(&kernels.project_backward, &project, workgroups(n, 64));
-        });
+        self.project_backward(gpu, commands, gaussians);
+        let (arrays, kernels, gradients) = (&self.arrays, &self.kernels, &self.gradients);
+        let (uniform, order) = (self.uniform.buffer(), &arrays.depth.values[self.depth_result]);
         if let Some(identities) = identities.filter(|_| view.label_slots != 0) {
             let identity = self.cache.get(
                 gpu,
@@ -719,6 +727,45 @@ impl Rasterizer {
             });
         }
         Ok(())
+    }
+
+    /// Makes room for gradients of splats and Gaussians.
+    pub(super) fn reserve_gradients(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
+        let n = self.view.gaussians as usize;
+        self.arrays.splat_gradients.resize(gpu, 3 * n)?;
+        self.gradients.gaussians.geometry.resize(gpu, n)?;
+        self.gradients.gaussians.sh.resize(gpu, n)?;
+        self.gradients.screen.resize(gpu, n)?;
+        Ok(())
+    }
+
+    /// Records the gradients of the posed Gaussians, from those of their splats.
+    pub(super) fn project_backward(
+        &mut self,
+        gpu: &Gpu,
+        commands: &mut Commands<'_>,
+        gaussians: PosedInput<'_>,
+    ) {
+        let (arrays, gradients) = (&self.arrays, &self.gradients);
+        let kernel = &self.kernels.project_backward;
+        let project = self.cache.get(
+            gpu,
+            ("project_backward", 0),
+            kernel,
+            &[
+                self.uniform.buffer(),
+                gaussians.geometry.buffer(),
+                gaussians.sh.buffer(),
+                arrays.splats.buffer(),
+                arrays.splat_gradients.buffer(),
+                gradients.gaussians.geometry.buffer(),
+                gradients.gaussians.sh.buffer(),
+                gradients.screen.buffer(),
+            ],
+        );
+        commands.stage("project backward", |stage| {
+            stage.dispatch(kernel, &project, workgroups(self.view.gaussians as usize, 64));
+        });
     }
 
     /// Records a read-back of the counts of the view, for [`GpuStatistics::of`].

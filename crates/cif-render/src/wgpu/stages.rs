@@ -6,7 +6,8 @@ use super::kernel::Access::{Read, ReadWrite, Uniform};
 use super::kernel::{Kernel, Module};
 use super::view::{
     BACKWARD, COEFFICIENTS, COLOR_ONLY, CONSTANTS, FOOTPRINT, FORWARD, HARMONICS, IDENTITY, NUMBERS,
-    PACKED_COEFFICIENTS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, TILE_STAGING, TILES, VIEW, WITH_INSTANCES,
+    PACKED_COEFFICIENTS, PARTIAL_SUMS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, TILE_STAGING, TILES, VIEW,
+    WITH_INSTANCES,
 };
 
 /// Projection.
@@ -102,14 +103,14 @@ pub const COTANGENTS: Module = Module {
 pub const RASTERIZE_BACKWARD: Module = Module {
     name: "rasterize_backward",
     text: include_str!("rasterize_backward.wgsl"),
-    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY, PARTIAL_SUMS],
     bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize_backward"],
 };
 
 /// Gradients of pairs from colour alone.
 pub const RASTERIZE_BACKWARD_COLOR: Module = Module {
-    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY],
+    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY, PARTIAL_SUMS],
     ..RASTERIZE_BACKWARD
 };
 

@@ -22,6 +22,8 @@ pub(crate) const SORT_BLOCK: usize = 2048;
 pub(crate) const PAIR_SUMS: usize = 12;
 /// Those of them that gradients take.
 const GRADIENT_SUMS: usize = 10;
+/// Channels of values that a dispatch blends.
+pub(super) const BLEND_CHANNELS: usize = 4;
 /// Depth key of what is not visible.
 const NOT_VISIBLE: u32 = u32::MAX;
 /// Bits of the passes that draw something.
@@ -31,7 +33,7 @@ pub const INSTANCE_PASS: u32 = 2;
 /// "The count comes with the parameters, not from the work counts."
 pub(crate) const NONE: u32 = u32::MAX;
 
-const OCCUPANCY_NONE: u32 = 0;
+pub(super) const OCCUPANCY_NONE: u32 = 0;
 const OCCUPANCY_OWN: u32 = 1;
 const OCCUPANCY_OPACITY: u32 = 2;
 
@@ -250,6 +252,7 @@ fn shared_constants() -> String {
         ("SORT_BLOCK", Unsigned(SORT_BLOCK as u32)),
         ("PAIR_SUMS", Unsigned(PAIR_SUMS as u32)),
         ("GRADIENT_SUMS", Unsigned(GRADIENT_SUMS as u32)),
+        ("BLEND_CHANNELS", Unsigned(BLEND_CHANNELS as u32)),
         ("COLOR_PASS", Unsigned(COLOR_PASS)),
         ("INSTANCE_PASS", Unsigned(INSTANCE_PASS)),
         ("NOT_VISIBLE", Unsigned(NOT_VISIBLE)),
@@ -303,6 +306,8 @@ pub(crate) const TILES: Snippet =
     Snippet { name: "tiles", text: || include_str!("shared/tiles.wgsl").to_owned() };
 pub(crate) const TILE_STAGING: Snippet =
     Snippet { name: "tile_staging", text: || include_str!("shared/tile_staging.wgsl").to_owned() };
+pub(crate) const PARTIAL_SUMS: Snippet =
+    Snippet { name: "partial_sums", text: || include_str!("shared/partial_sums.wgsl").to_owned() };
 pub(crate) const IDENTITY: Snippet =
     Snippet { name: "identity", text: || include_str!("shared/identity.wgsl").to_owned() };
 /// Declares that the instance pass is drawn, or is not: what a kernel does not do costs nothing then.

@@ -1,5 +1,16 @@
 // Rows of identities: (dense instance index, bits of its probability), ascending indices.
 
+fn drawn_passes() -> u32 {
+    return COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES);
+}
+
+fn row_range(row: u32) -> vec2u {
+    if (!WITH_INSTANCES) {
+        return vec2u(0u);
+    }
+    return vec2u(row_offsets[row], row_offsets[row + 1u]);
+}
+
 // Probabilities of four labels (dense index + 1) in a row; 0 outside its support.
 fn probabilities_of(first: u32, end: u32, labels: vec4u) -> vec4f {
     var found = vec4f(0.0);

@@ -1,5 +1,6 @@
 // Splats of a tile in workgroup memory, in order, with the quadrants that each pass draws them in: two bits per
-// quadrant, 0 and 1 above, 2 and 3 below.
+// quadrant, 0 and 1 above, 2 and 3 below. The module says which passes it draws, `drawn_passes`, and where the values of
+// a Gaussian begin and end, `row_range`.
 
 const STAGED: u32 = 16u;
 // Bits of the instance pass.
@@ -14,7 +15,7 @@ struct Staged {
     factor: vec4f,
     // Colour and occupancy.
     color: vec4f,
-    // First label slot, of gradients alone, and identity row.
+    // First label slot, of gradients alone, and the values of the Gaussian.
     slot: u32,
     row_first: u32,
     row_end: u32,
@@ -24,7 +25,7 @@ var<workgroup> staged: array<Staged, STAGED>;
 var<workgroup> staged_passes: array<atomic<u32>, STAGED>;
 // Passes that any pixel lets light through.
 var<workgroup> live: atomic<u32>;
-// Entries of the longest identity row, for gradients alone.
+// Values of the longest row, for gradients alone.
 var<workgroup> longest: atomic<u32>;
 
 // Stages entries from `first` on; returns the passes that any pixel lets light through, of which `open` are those of the
@@ -47,7 +48,7 @@ fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32
         let entry = entries[first + place];
         let row = entry.y & INDEX_MASK;
         let splat = splats[row];
-        let drawn = (entry.y >> PASS_SHIFT) & (COLOR_PASS | select(0u, INSTANCE_PASS, WITH_INSTANCES));
+        let drawn = (entry.y >> PASS_SHIFT) & drawn_passes();
         let passes = drawn & passes_in_quadrant(splat, quadrant_origin(tile, quadrant));
         atomicOr(&staged_passes[place], passes << (2u * quadrant));
         if (quadrant == 0u) {
@@ -56,10 +57,9 @@ fn stage_tile(first: u32, end: u32, tile: vec2u, open: vec4u, local: u32) -> u32
             item.depth = splat.depth;
             item.factor = splat.factor;
             item.color = splat.color;
-            if (WITH_INSTANCES) {
-                item.row_first = row_offsets[row];
-                item.row_end = row_offsets[row + 1u];
-            }
+            let range = row_range(row);
+            item.row_first = range.x;
+            item.row_end = range.y;
             if (BACKWARD) {
                 item.pair = entry.x;
                 item.slot = entry.z;
