@@ -193,7 +193,7 @@ mod tests {
     fn the_error_follows_the_tolerance() {
         let report = |tolerance, size| {
             let splats = cif_scene::Splats::default();
-            MotionReport { tolerance, size, ..MotionReport::unfitted(&splats, 0) }
+            MotionReport { tolerance, size, ..MotionReport::unfitted(&splats, &cif_scene::Motion::Static) }
         };
         assert!((allowed_error(&report(0.001, 1.0)) - 4e-5).abs() < 1e-12);
         assert_eq!(allowed_error(&report(0.5, 1.0)), LARGEST_ERROR);

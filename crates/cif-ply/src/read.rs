@@ -3,14 +3,11 @@
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
+use cif_geometry::quaternion;
 use cif_geometry::spherical_harmonics::coefficient_count;
-use cif_geometry::{RigidTransform, quaternion};
+use cif_scene::assemble::{AssembleError, Prim, Prims, assemble};
 use cif_scene::files::FileError;
-use cif_scene::{
-    CaptureFrame, Motion, MotionReport, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes, UpAxis,
-    extent, naming,
-};
-use glam::DVec3;
+use cif_scene::{CaptureFrame, SceneGraph, Splats};
 use ply_rs_bw::parser::{ParseError, Parser, Reader};
 use ply_rs_bw::ply::{
     ElementDef, Encoding, Property, PropertyAccess, PropertyAccessResult, PropertyType, ScalarType,
@@ -78,7 +75,7 @@ pub(crate) fn read(path: &Path) -> Result<SceneGraph, PlyError> {
         if splats.is_empty() {
             return Err(invalid(format!("none of its {} splats can be drawn", element.count)));
         }
-        return Ok(SceneGraph { frame, ..scene(path, splats, left_out) });
+        return scene(path, splats, left_out, frame).map_err(|error| invalid(error.to_string()));
     }
     Err(invalid("it has no element `vertex`; splats are expected".to_owned()))
 }
@@ -321,51 +318,20 @@ impl Collected {
 }
 
 /// A still scene of one object, labelled by the name of the file.
-fn scene(path: &Path, splats: Splats, left_out: usize) -> SceneGraph {
+fn scene(
+    path: &Path,
+    splats: Splats,
+    left_out: usize,
+    frame: CaptureFrame,
+) -> Result<SceneGraph, AssembleError> {
     let label =
         path.file_stem().map_or_else(|| "splats".to_owned(), |stem| stem.to_string_lossy().into_owned());
-    let extent = extent::ellipsoid_bounds(
-        &RigidTransform::IDENTITY,
-        &splats.means,
-        &splats.orientations,
-        &splats.scales,
-    );
-    let report = MotionReport::unfitted(&splats, 0);
-    let node = Node {
-        kind: NodeKind::Instance { id: 1, index: 0 },
-        name: naming::instance_name(&label, 1),
-        category: label.clone(),
-        label,
-        pivot: DVec3::ZERO,
-        motion: Motion::Static,
-        splats,
-        proxy: None,
-        colliders: Vec::new(),
-        visibility: Vec::new(),
-        extent,
-        source_frames: (0, 0),
-        mean_occupancy: 1.0,
-        report,
-        appearance: Default::default(),
-    };
-    let warnings = if left_out > 0 {
-        vec![format!(
+    let mut warnings = Vec::new();
+    if left_out > 0 {
+        warnings.push(format!(
             "{left_out} splats with values that are not finite, or without a rotation, were left out"
-        )]
-    } else {
-        Vec::new()
-    };
-    SceneGraph {
-        up_axis: UpAxis::default(),
-        meters_per_unit: 1.0,
-        frame: CaptureFrame::default(),
-        time_codes: TimeCodes { samples: vec![0.0], times: vec![0.0], frames_per_second: 24.0 },
-        nodes: vec![node],
-        cameras: Vec::new(),
-        background_color: [0.0; 3],
-        sort_metric: cif_field::SortMetric::Z,
-        omitted: Vec::new(),
-        warnings,
-        origin: Origin::default(),
+        ));
     }
+    let prims = vec![Prim::still(path.display().to_string(), label, splats)];
+    assemble(Prims { frame, prims, warnings, ..Prims::default() })
 }

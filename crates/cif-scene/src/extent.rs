@@ -2,6 +2,9 @@
 
 use cif_geometry::{Bounds, RigidTransform, quaternion};
 use glam::{DMat3, DVec3};
+use std::ops::Range;
+
+use crate::graph::{Motion, Part, Splats};
 
 /// Standard deviations that a box holds on each side; the splat formats cut the kernel there.
 pub const SIGMAS: f64 = 3.0;
@@ -29,6 +32,30 @@ pub fn ellipsoid_bounds(
         bounds = bounds.including(centre - half).including(centre + half);
     }
     bounds
+}
+
+/// As [`ellipsoid_bounds`], of a range of splats.
+#[must_use]
+pub fn splat_bounds(target_from_local: &RigidTransform, splats: &Splats, range: Range<usize>) -> Bounds {
+    let (means, orientations) = (&splats.means[range.clone()], &splats.orientations[range.clone()]);
+    ellipsoid_bounds(target_from_local, means, orientations, &splats.scales[range])
+}
+
+/// As [`ellipsoid_bounds`], of the splats of a node; `node_from_part` tells where its parts are.
+#[must_use]
+pub fn node_bounds(
+    target_from_local: &RigidTransform,
+    splats: &Splats,
+    motion: &Motion,
+    node_from_part: impl Fn(&Part) -> RigidTransform,
+) -> Bounds {
+    let Motion::Parts(motion) = motion else {
+        return splat_bounds(target_from_local, splats, 0..splats.len());
+    };
+    let of_part = |part: &Part| {
+        splat_bounds(&target_from_local.compose(&node_from_part(part)), splats, part.splats.clone())
+    };
+    motion.parts.iter().map(of_part).fold(Bounds::EMPTY, Bounds::union)
 }
 
 /// The box in single precision, rounded outwards: `[low, high]`.

@@ -1,10 +1,12 @@
 //! What a scene is made of.
 
 use cif_dataset::CaptureFrame;
+use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
+use crate::choose::{DENSE_BYTES, POSE_BYTES};
 use crate::report::MotionReport;
 use crate::{SceneOptions, UpAxis, extent, placement};
 
@@ -161,6 +163,47 @@ pub enum Motion {
     Parts(PartsMotion),
     /// The local frame moves and the splats deform in it.
     Dense(DenseMotion),
+}
+
+impl Motion {
+    /// The motion model.
+    #[must_use]
+    pub fn model(&self) -> MotionModel {
+        match self {
+            Self::Static => MotionModel::Static,
+            Self::Rigid(_) => MotionModel::Rigid,
+            Self::Parts(_) => MotionModel::Parts,
+            Self::Dense(_) => MotionModel::Dense,
+        }
+    }
+
+    /// Number of samples: poses over all parts, or times of a dense motion.
+    #[must_use]
+    pub fn sample_count(&self) -> usize {
+        match self {
+            Self::Static => 0,
+            Self::Rigid(track) => track.len(),
+            Self::Parts(motion) => {
+                motion.track.len() + motion.parts.iter().map(|part| part.track.len()).sum::<usize>()
+            }
+            Self::Dense(dense) => dense.samples.len(),
+        }
+    }
+
+    /// Size of the sampled values, bytes.
+    #[must_use]
+    pub fn bytes(&self) -> usize {
+        let Self::Dense(dense) = self else { return self.sample_count() * POSE_BYTES };
+        let per_splat = |sample: &DenseSample| DENSE_BYTES + if sample.scales.is_some() { 12 } else { 0 };
+        let shapes = dense.samples.iter().map(|sample| sample.means.len() * per_splat(sample));
+        shapes.sum::<usize>() + dense.track.len() * POSE_BYTES
+    }
+
+    /// Number of parts; 0 for other motion.
+    #[must_use]
+    pub fn part_count(&self) -> usize {
+        if let Self::Parts(motion) = self { motion.parts.len() } else { 0 }
+    }
 }
 
 /// Pose of a node's local frame in the world at a time code.
@@ -328,17 +371,66 @@ impl Splats {
         self.means.len()
     }
 
-    /// Whether there are none.
+    /// True when there are none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }
 
+    /// Adds splats; the higher degree of the two is kept, the other is filled up with zeros, and so are identities that
+    /// only one of them has.
+    pub fn append(&mut self, mut more: Self) {
+        if self.is_empty() {
+            *self = more;
+            return;
+        }
+        let degree = self.sh_degree.max(more.sh_degree);
+        self.raise_degree(degree);
+        more.raise_degree(degree);
+        if !(self.identities.is_empty() && more.identities.is_empty()) {
+            self.identities.resize(self.len(), IdentityShares::default());
+            more.identities.resize(more.len(), IdentityShares::default());
+            self.identities.append(&mut more.identities);
+        }
+        self.means.append(&mut more.means);
+        self.orientations.append(&mut more.orientations);
+        self.scales.append(&mut more.scales);
+        self.opacities.append(&mut more.opacities);
+        self.sh_coefficients.append(&mut more.sh_coefficients);
+        self.occupancies.append(&mut more.occupancies);
+        self.identity_probabilities.append(&mut more.identity_probabilities);
+        self.rows.append(&mut more.rows);
+    }
+
+    fn raise_degree(&mut self, degree: u8) {
+        if self.sh_degree == degree {
+            return;
+        }
+        let (from, to) = (3 * coefficient_count(self.sh_degree), 3 * coefficient_count(degree));
+        let mut raised = Vec::with_capacity(self.len() * to);
+        for row in self.sh_coefficients.chunks_exact(from) {
+            raised.extend_from_slice(row);
+            raised.resize(raised.len() + to - from, 0.0);
+        }
+        self.sh_coefficients = raised;
+        self.sh_degree = degree;
+    }
+
+    /// Opacity-weighted mean of the occupancies; 0 where all splats are clear.
+    #[must_use]
+    pub fn mean_occupancy(&self) -> f32 {
+        let pairs = self.occupancies.iter().zip(&self.opacities);
+        let (sum, total) = pairs.fold((0.0, 0.0), |(sum, total), (occupancy, opacity)| {
+            (sum + f64::from(occupancy * opacity), total + f64::from(*opacity))
+        });
+        if total > 0.0 { (sum / total) as f32 } else { 0.0 }
+    }
+
     /// View-independent colours `clamp(0.5 + 0.28209 c0)`, display-referred.
     #[must_use]
     pub fn base_colors(&self) -> Vec<[f32; 3]> {
-        let stride = 3 * cif_geometry::spherical_harmonics::coefficient_count(self.sh_degree);
-        let band_0 = cif_geometry::spherical_harmonics::BAND_0 as f32;
+        let stride = 3 * coefficient_count(self.sh_degree);
+        let band_0 = BAND_0 as f32;
         self.sh_coefficients
             .chunks_exact(stride)
             .map(|sh| std::array::from_fn(|c| (0.5 + band_0 * sh[c]).clamp(0.0, 1.0)))
@@ -423,12 +515,7 @@ impl Node {
     /// Chosen motion model.
     #[must_use]
     pub fn model(&self) -> MotionModel {
-        match self.motion {
-            Motion::Static => MotionModel::Static,
-            Motion::Rigid(_) => MotionModel::Rigid,
-            Motion::Parts(_) => MotionModel::Parts,
-            Motion::Dense(_) => MotionModel::Dense,
-        }
+        self.motion.model()
     }
 
     /// `world_from_local` at a time code: linear in translation, spherical in rotation between samples, held
@@ -448,20 +535,6 @@ impl Node {
     #[must_use]
     pub fn bounds(&self, time_code: f64) -> Bounds {
         let world_from_local = self.world_transform(time_code);
-        if let Motion::Parts(motion) = &self.motion {
-            let boxes = motion.parts.iter().map(|part| {
-                let world_from_part =
-                    world_from_local.compose(&pose_at(&part.track, part.pivot, time_code).transform());
-                let (splats, range) = (&self.splats, part.splats.clone());
-                extent::ellipsoid_bounds(
-                    &world_from_part,
-                    &splats.means[range.clone()],
-                    &splats.orientations[range.clone()],
-                    &splats.scales[range],
-                )
-            });
-            return boxes.fold(Bounds::EMPTY, |all, bounds| all.union(bounds));
-        }
         if let Motion::Dense(dense) = &self.motion {
             let placed = placement::local_splats_at(dense, &self.splats.scales, time_code);
             let means: Vec<[f32; 3]> = placed.means.iter().map(|mean| mean.as_vec3().to_array()).collect();
@@ -469,7 +542,8 @@ impl Node {
                 placed.orientations.iter().map(|q| q.map(|component| component as f32)).collect();
             return extent::ellipsoid_bounds(&world_from_local, &means, &orientations, &placed.scales);
         }
-        let Splats { means, orientations, scales, .. } = &self.splats;
-        extent::ellipsoid_bounds(&world_from_local, means, orientations, scales)
+        extent::node_bounds(&world_from_local, &self.splats, &self.motion, |part| {
+            pose_at(&part.track, part.pivot, time_code).transform()
+        })
     }
 }

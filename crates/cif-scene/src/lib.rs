@@ -27,6 +27,7 @@
 //! | [`query`] | nodes by label |
 //! | [`diff`] | what differs between two graphs, object by object |
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
+//! | [`assemble`](mod@assemble) | graphs from what readers find in files |
 //! | [`field_from_graph`] | the way back: Gaussians, recorded motion and instances of a graph |
 //!
 //! Frames: world as captured (right-handed, metres), or a frame of the scene's own in it (see [`world`]). A node's
@@ -34,6 +35,7 @@
 //! time, so that no rotation is baked into splats and their spherical harmonics are stored as trained.
 
 pub mod appearance;
+pub mod assemble;
 pub mod assignment;
 pub mod build;
 pub mod camera_tracks;

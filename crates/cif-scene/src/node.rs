@@ -6,16 +6,16 @@ use glam::DVec3;
 
 use crate::assignment::Identity;
 use crate::build::sigmoid;
-use crate::choose::{Chosen, DENSE_BYTES, POSE_BYTES};
+use crate::choose::Chosen;
 use crate::dense::positive_scales;
 use crate::frames::Frames;
 use crate::graph::{
-    Appearance, DenseMotion, DenseSample, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part,
-    PartsMotion, SHARES_PER_SPLAT, Splats,
+    Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part, PartsMotion,
+    SHARES_PER_SPLAT, Splats,
 };
 use crate::motion::{MeanShape, MovingGroup, ResidualSum, add_turns_between, trimmed_box, vector};
 use crate::report::{MotionReport, ResidualStatistics};
-use crate::{MotionModel, extent, naming};
+use crate::{extent, naming};
 
 /// What a node is called.
 pub(crate) struct Naming {
@@ -93,12 +93,7 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
                 take_shape(&mut splats, &part.rigid_shape);
                 out.push(Part {
                     name: format!("part_{number:02}"),
-                    extent: extent::ellipsoid_bounds(
-                        &RigidTransform::IDENTITY,
-                        &splats.means[range.clone()],
-                        &splats.orientations[range.clone()],
-                        &splats.scales[range.clone()],
-                    ),
+                    extent: extent::splat_bounds(&RigidTransform::IDENTITY, &splats, range.clone()),
                     splats: range,
                     pivot: part.pivot - group.pivot,
                     track,
@@ -120,25 +115,24 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
         }
     };
     let report = motion_report(group, &motion, residual, input);
-    let mut node = Node {
+    let at_pivot = |part: &Part| RigidTransform { translation: part.pivot, ..RigidTransform::IDENTITY };
+    Node {
         kind: naming.kind,
         name: naming.name,
         label: naming.label,
         category: naming.category,
         pivot: group.pivot,
+        extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, at_pivot),
         motion,
-        mean_occupancy: mean_occupancy(&splats),
+        mean_occupancy: splats.mean_occupancy(),
         splats,
         appearance: Appearance::default(),
         proxy: None,
         colliders: Vec::new(),
         visibility: Vec::new(),
-        extent: cif_geometry::Bounds::EMPTY,
         source_frames: (0, 0),
         report,
-    };
-    node.extent = resting_extent(&node);
-    node
+    }
 }
 
 /// Adds the splats of a shape.
@@ -146,38 +140,6 @@ fn take_shape(splats: &mut Splats, shape: &MeanShape) {
     splats.means.extend(shape.means.iter().map(|mean| mean.to_array().map(|v| v as f32)));
     splats.orientations.extend(shape.orientations.iter().map(|q| q.map(|v| v as f32)));
     splats.scales.extend(shape.log_scales.iter().map(|log| positive_scales(log.to_array())));
-}
-
-/// Box of the splats in the local frame; parts as they are at their pivots.
-fn resting_extent(node: &Node) -> cif_geometry::Bounds {
-    let splats = &node.splats;
-    match &node.motion {
-        Motion::Parts(motion) => motion.parts.iter().fold(cif_geometry::Bounds::EMPTY, |all, part| {
-            let range = part.splats.clone();
-            let rest = RigidTransform { translation: part.pivot, ..RigidTransform::IDENTITY };
-            all.union(extent::ellipsoid_bounds(
-                &rest,
-                &splats.means[range.clone()],
-                &splats.orientations[range.clone()],
-                &splats.scales[range],
-            ))
-        }),
-        _ => extent::ellipsoid_bounds(
-            &RigidTransform::IDENTITY,
-            &splats.means,
-            &splats.orientations,
-            &splats.scales,
-        ),
-    }
-}
-
-fn mean_occupancy(splats: &Splats) -> f32 {
-    let (sum, total) = splats
-        .occupancies
-        .iter()
-        .zip(&splats.opacities)
-        .fold((0.0, 0.0), |(sum, total), (pi, o)| (sum + f64::from(pi * o), total + f64::from(*o)));
-    if total > 0.0 { (sum / total) as f32 } else { 0.0 }
 }
 
 /// Highest degree of spherical harmonics, up to `highest`, that any of the rows has: bands of zeros are not written.
@@ -292,23 +254,8 @@ fn motion_report(
     input: &NodeInput<'_>,
 ) -> MotionReport {
     let (low, high) = trimmed_box(&group.rows, &group.weights, &input.reference.means);
-    let (model, samples, motion_bytes) = match motion {
-        Motion::Static => (MotionModel::Static, 0, 0),
-        Motion::Rigid(track) => (MotionModel::Rigid, track.len(), track.len() * POSE_BYTES),
-        Motion::Parts(motion) => {
-            let samples =
-                motion.track.len() + motion.parts.iter().map(|part| part.track.len()).sum::<usize>();
-            (MotionModel::Parts, samples, samples * POSE_BYTES)
-        }
-        Motion::Dense(dense) => {
-            let per_splat = |sample: &DenseSample| DENSE_BYTES + if sample.scales.is_some() { 12 } else { 0 };
-            let bytes: usize =
-                dense.samples.iter().map(|sample| sample.means.len() * per_splat(sample)).sum();
-            (MotionModel::Dense, dense.samples.len(), bytes + dense.track.len() * POSE_BYTES)
-        }
-    };
     MotionReport {
-        model,
+        model: motion.model(),
         gaussians: group.rows.len(),
         size: DVec3::length(high - low),
         tolerance: group.tolerance,
@@ -316,9 +263,9 @@ fn motion_report(
         static_residual: group.static_residual.statistics(),
         rigid_residual: group.is_body.then(|| group.rigid_residual.statistics()),
         parts_residual: group.parts_residual,
-        parts: if let Motion::Parts(motion) = motion { motion.parts.len() } else { 0 },
-        samples,
-        motion_bytes,
+        parts: motion.part_count(),
+        samples: motion.sample_count(),
+        motion_bytes: motion.bytes(),
         seconds: group.seconds,
     }
 }

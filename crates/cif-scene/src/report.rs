@@ -4,7 +4,7 @@ use cif_geometry::Bounds;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::{MotionModel, Node, SceneGraph, Splats};
+use crate::{Motion, MotionModel, Node, SceneGraph, Splats};
 
 /// How far a motion model is from the trained motion, world units.
 ///
@@ -97,22 +97,22 @@ impl PartialEq for MotionReport {
 }
 
 impl MotionReport {
-    /// What there is to say about motion that was read from a file of others, not fitted: `samples` poses.
+    /// What there is to say about motion that was read from a file of others, not fitted.
     #[must_use]
-    pub fn unfitted(splats: &Splats, samples: usize) -> Self {
+    pub fn unfitted(splats: &Splats, motion: &Motion) -> Self {
         let centres = splats.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)));
         Self {
-            model: MotionModel::Static,
+            model: motion.model(),
             gaussians: splats.len(),
             size: Bounds::around(centres).size().length(),
             tolerance: 0.0,
             residual: ResidualStatistics::default(),
             static_residual: ResidualStatistics::default(),
             rigid_residual: None,
-            samples,
-            motion_bytes: samples * 28,
+            samples: motion.sample_count(),
+            motion_bytes: motion.bytes(),
             parts_residual: None,
-            parts: 0,
+            parts: motion.part_count(),
             seconds: 0.0,
         }
     }

@@ -8,16 +8,15 @@ use gltf::json::validation::Checked;
 
 use super::hierarchy::Placed;
 use super::motion::Chain;
-use super::objects::Builder;
+use super::objects::Reader;
 use crate::conventions;
 use crate::extras::{self, Cif};
 
 /// Reads the cameras of the scene; those that cannot be taken over are said in the warnings.
-pub(crate) fn read(builder: &mut Builder<'_>, placed: &[Placed]) -> Vec<CameraTrack> {
+pub(crate) fn read(reader: &mut Reader<'_>, placed: &[Placed]) -> Vec<CameraTrack> {
     let mut tracks: Vec<CameraTrack> = Vec::new();
-    let mut names = naming::Names::default();
     for placed in placed {
-        let source = builder.stage.source;
+        let source = reader.stage.source;
         let node = &source.root.nodes[placed.index];
         let camera = node.camera.and_then(|camera| source.root.cameras.get(camera.value()));
         let perspective = camera.and_then(|camera| match &camera.type_ {
@@ -35,20 +34,19 @@ pub(crate) fn read(builder: &mut Builder<'_>, placed: &[Placed]) -> Vec<CameraTr
             (_, None) => {
                 if node.camera.is_some() {
                     let name = source.node_name(placed.index);
-                    builder.warnings.push(format!("{name}: only perspective cameras are read; left out"));
+                    reader.warnings.push(format!("{name}: only perspective cameras are read; left out"));
                 }
                 continue;
             }
         };
-        let (prefix, nodes) = builder.below_world(&placed.chain);
-        let chain = builder.stage.chain(prefix, nodes, false);
-        let samples = samples(builder, &chain, &views);
+        let (prefix, nodes) = reader.below_world(&placed.chain);
+        let chain = reader.stage.chain(prefix, nodes, false);
+        let samples = samples(reader, &chain, &views);
         if samples.is_empty() {
             let name = source.node_name(placed.index);
-            builder.warnings.push(format!("{name}: the camera has no angle of view or no pose; left out"));
+            reader.warnings.push(format!("{name}: the camera has no angle of view or no pose; left out"));
             continue;
         }
-        let name = names.take(name);
         tracks.push(CameraTrack { name, label, samples });
     }
     tracks
@@ -98,13 +96,13 @@ fn foreign_view(perspective: &Perspective) -> Option<extras::View> {
     Some(extras::View { width, height, focal_px: focal_px.to_array(), principal_px })
 }
 
-fn samples(builder: &Builder<'_>, chain: &Chain, views: &Views) -> Vec<CameraSample> {
-    let stage = builder.stage;
+fn samples(reader: &Reader<'_>, chain: &Chain, views: &Views) -> Vec<CameraSample> {
+    let stage = reader.stage;
     let views: Vec<(f64, extras::View)> = match views {
         Views::Recorded(views) => views.clone(),
         Views::Foreign(None) => Vec::new(),
         Views::Foreign(Some(view)) => {
-            let keys = stage.movement(chain).map(|movement| movement.keys).unwrap_or_default();
+            let keys = stage.movement(chain).map(|movement| movement.track.samples).unwrap_or_default();
             if keys.is_empty() {
                 vec![(stage.start, *view)]
             } else {

@@ -7,38 +7,36 @@
 //! | `hierarchy` | nodes and their transforms |
 //! | `animation` | curves over time |
 //! | `motion` | poses of chains of nodes |
-//! | `bake` | scales and mirrors worked into splats |
 //! | `splats` | splats of meshes |
 //! | `objects` | which nodes are objects, and who they are |
 //! | `cameras` | cameras over time |
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_field::SortMetric;
-use cif_scene::{CaptureFrame, Motion, NodeKind, Origin, SceneGraph, TimeCodes, UpAxis, naming};
+use cif_scene::assemble::{
+    AssembleError, Copies, FRAMES_PER_SECOND, Identity, Prim, Prims, Timeline, assemble,
+};
+use cif_scene::{Origin, SceneGraph, TimeCodes, UpAxis};
 use glam::{DAffine3, DVec3};
 
 use self::animation::Curves;
 use self::hierarchy::{Hierarchy, Placed};
 use self::motion::{Clock, Stage};
-use self::objects::Builder;
+use self::objects::Reader;
 use self::source::Source;
 use crate::extras::{self, Cif, World};
 use crate::{GltfError, conventions};
 
 mod accessor;
 mod animation;
-mod bake;
 mod cameras;
 mod hierarchy;
 mod motion;
 mod objects;
 mod source;
 mod splats;
-
-/// Time codes per second of files that have none.
-const FRAMES_PER_SECOND: f64 = 24.0;
 
 pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
     let source = Source::open(path)?;
@@ -60,65 +58,70 @@ pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
     let found = objects::find(&stage, &hierarchy.placed);
     check_keys(&stage, &found)?;
     let moved = world.as_ref().and_then(|(placed, world)| moved_world(&stage, placed, world, &mut warnings));
-    let mut builder = Builder {
+    let mut reader = Reader {
         stage: &stage,
         world: world.as_ref().map(|(placed, _)| (placed.index, moved)),
         warnings: &mut warnings,
-        nodes: Vec::new(),
-        names: naming::Names::default(),
-        used_ids: BTreeSet::new(),
-        next_index: next_index(&hierarchy),
         next_row: (!is_traced(&source)).then_some(0),
-        reserved_ids: reserved_ids(&hierarchy),
     };
-    for object in &found {
-        builder.add(object)?;
-    }
-    let cameras = cameras::read(&mut builder, &hierarchy.placed);
-    let mut nodes = builder.nodes;
-    let objects = nodes.iter().flat_map(|node| [&node.label, &node.category]);
+    let prims = found.iter().map(|object| reader.prim(object)).collect::<Result<Vec<_>, _>>()?;
+    let mut prims: Vec<Prim> = prims.into_iter().flatten().collect();
+    prims.sort_by_key(|prim| prim.identity == Identity::Background);
+    let cameras = cameras::read(&mut reader, &hierarchy.placed);
+    let objects = prims.iter().flat_map(|prim| [&prim.label, &prim.category]);
     if let Some(name) =
         objects.chain(cameras.iter().map(|track| &track.label)).find(|name| name.contains('\0'))
     {
         return Err(source.invalid(format!("the name {name:?}"), "it holds a NUL character; leave it out"));
     }
-    nodes.sort_by_key(|node| node.kind == NodeKind::Background);
-    if nodes.is_empty() {
+    if prims.is_empty() {
         return Err(GltfError::NoSplats { path: path.to_owned(), found: what_else(&source) });
     }
     warn_of_meshes(&source, &hierarchy, &mut warnings);
-    let time_codes = match &world {
-        Some((_, world)) => TimeCodes {
-            samples: world.time_codes.clone(),
-            times: world.times.clone(),
-            frames_per_second: world.frames_per_second,
-        },
-        None => foreign_time_codes(&nodes, &cameras),
-    };
     let world = world.map(|(_, world)| world);
-    for node in nodes.iter_mut().filter(|node| node.source_frames == objects::ALL_FRAMES) {
-        let frame = |code: f64| code.max(0.0).round() as usize;
-        node.source_frames = match &world {
-            Some(_) => (frame(time_codes.start()), frame(time_codes.end())),
-            None => (0, time_codes.samples.len() - 1),
-        };
-    }
-    Ok(SceneGraph {
-        up_axis: world.as_ref().map_or(UpAxis::Y, |world| world.up_axis),
-        meters_per_unit: world.as_ref().map_or(1.0, |world| world.meters_per_unit),
-        frame: world.as_ref().map_or_else(CaptureFrame::default, |world| world.frame),
-        time_codes,
-        nodes,
+    let timeline = match &world {
+        Some(world) => {
+            let codes = &world.time_codes;
+            let frame = |code: Option<&f64>| code.map_or(0, |code| code.max(0.0).round() as usize);
+            let frames = (frame(codes.first()), frame(codes.last()));
+            for prim in &mut prims {
+                prim.source_frames.get_or_insert(frames);
+            }
+            Timeline::Recorded(TimeCodes {
+                samples: codes.clone(),
+                times: world.times.clone(),
+                frames_per_second: world.frames_per_second,
+            })
+        }
+        None => {
+            let of_cameras = cameras.iter().flat_map(|track| &track.samples).map(|sample| sample.time_code);
+            let codes = std::iter::once(0.0).chain(of_cameras).collect();
+            Timeline::Sampled { codes, start: 0.0, frames_per_second: FRAMES_PER_SECOND }
+        }
+    };
+    let scene = Prims {
+        timeline,
+        prims,
         cameras,
-        background_color: world.as_ref().map_or([0.0; 3], |world| world.background_color),
-        sort_metric: world.as_ref().map_or(SortMetric::Distance, |world| world.sort_metric),
-        omitted: world.as_ref().map_or_else(Vec::new, |world| world.omitted.clone()),
-        warnings: world.iter().flat_map(|world| world.warnings.clone()).chain(warnings).collect(),
-        origin: Origin {
-            field_fingerprint: world.as_ref().and_then(|world| world.field_fingerprint.clone()),
-            options: world.and_then(|world| world.options),
+        reserved: reserved(&hierarchy),
+        copies: Copies::Renumber,
+        ..Prims::default()
+    };
+    let scene = match world {
+        Some(world) => Prims {
+            up_axis: world.up_axis,
+            meters_per_unit: world.meters_per_unit,
+            frame: world.frame,
+            background_color: world.background_color,
+            sort_metric: world.sort_metric,
+            omitted: world.omitted,
+            warnings: world.warnings.into_iter().chain(warnings).collect(),
+            origin: Origin { field_fingerprint: world.field_fingerprint, options: world.options },
+            ..scene
         },
-    })
+        None => Prims { up_axis: UpAxis::Y, sort_metric: SortMetric::Distance, warnings, ..scene },
+    };
+    assemble(scene).map_err(|AssembleError { place, what }| source.invalid(place, what))
 }
 
 /// What our exporter wrote may have been changed since.
@@ -197,22 +200,13 @@ fn is_traced(source: &Source) -> bool {
     source.root.meshes.iter().flat_map(|mesh| &mesh.primitives).any(|p| p.attributes.contains_key(&row))
 }
 
-/// Mask values that objects of ours carry.
-fn reserved_ids(hierarchy: &Hierarchy) -> BTreeSet<u16> {
+/// Mask values that objects of ours carry, and their places in the instance table.
+fn reserved(hierarchy: &Hierarchy) -> BTreeMap<u16, usize> {
     let ids = hierarchy.placed.iter().filter_map(|placed| match &placed.cif {
-        Some(Cif::Instance(instance)) => Some(instance.id),
+        Some(Cif::Instance(instance)) => Some((instance.id, instance.index)),
         _ => None,
     });
     ids.collect()
-}
-
-/// First place behind those of our instance table.
-fn next_index(hierarchy: &Hierarchy) -> usize {
-    let indices = hierarchy.placed.iter().filter_map(|placed| match &placed.cif {
-        Some(Cif::Instance(instance)) => Some(instance.index.saturating_add(1)),
-        _ => None,
-    });
-    indices.max().unwrap_or(0)
 }
 
 /// Meshes may be placed often; what they become must stay in proportion to the file.
@@ -252,24 +246,6 @@ fn check_keys(stage: &Stage<'_>, found: &[objects::Found<'_>]) -> Result<(), Glt
         }
     }
     Ok(())
-}
-
-/// The keys of everything, as time codes; normalised times run from the first to the last.
-fn foreign_time_codes(nodes: &[cif_scene::Node], cameras: &[cif_scene::CameraTrack]) -> TimeCodes {
-    let mut samples: Vec<f64> = vec![0.0];
-    for node in nodes {
-        if let Motion::Rigid(track) = &node.motion {
-            samples.extend(track.iter().map(|pose| pose.time_code));
-        }
-        samples.extend(node.visibility.iter().map(|sample| sample.time_code));
-    }
-    samples.extend(cameras.iter().flat_map(|track| &track.samples).map(|sample| sample.time_code));
-    samples.sort_by(f64::total_cmp);
-    samples.dedup();
-    let (first, last) = (samples[0], samples[samples.len() - 1]);
-    let length = if last > first { last - first } else { 1.0 };
-    let times = samples.iter().map(|code| (code - first) / length).collect();
-    TimeCodes { samples, times, frames_per_second: FRAMES_PER_SECOND }
 }
 
 fn what_else(source: &Source) -> String {

@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use cif_scene::assemble::{Decomposed, Track, one_hemisphere};
 use cif_scene::{PoseSample, VisibilitySample};
 use glam::{DAffine3, DMat3, DQuat, DVec3};
 use gltf::json::animation::Interpolation;
 
 use super::animation::{Curve, Curves, NodeCurves};
-use super::bake::Decomposed;
 use super::hierarchy::{Local, is_hidden};
 use super::source::Source;
 use crate::conventions;
@@ -55,10 +55,8 @@ pub(crate) struct Chain {
 
 /// How a chain moves.
 pub(crate) struct Movement {
-    /// Keys; empty where nothing moves.
-    pub(crate) keys: Vec<PoseSample>,
-    /// Pose at the first moment at which the node can be seen.
-    pub(crate) rest: PoseSample,
+    /// Its keys, and at rest the pose at the first moment at which the node can be seen.
+    pub(crate) track: Track,
     /// To be worked into the splats.
     pub(crate) stretch: DMat3,
     pub(crate) visibility: Vec<VisibilitySample>,
@@ -155,14 +153,9 @@ impl Stage<'_> {
             let change = d.stretch - first.stretch;
             change.to_cols_array().iter().any(|value| value.abs() > 1e-3 * largest)
         });
-        let mut keys: Vec<PoseSample> = Vec::with_capacity(poses.len());
-        for (time, pose) in &poses {
-            let Some(pose) = pose else { continue };
-            let turned = keys.last().is_some_and(|before| before.rotation.dot(pose.rotation) < 0.0);
-            let rotation = if turned { -pose.rotation } else { pose.rotation };
-            let (time_code, translation) = (self.clock.code(*time), pose.translation);
-            keys.push(PoseSample { time_code, translation, rotation });
-        }
+        let keys = poses.iter().filter_map(|(time, pose)| Some((*pose)?.pose(self.clock.code(*time))));
+        let mut keys: Vec<PoseSample> = keys.collect();
+        one_hemisphere(&mut keys);
         let mut visibility: Vec<VisibilitySample> = scales
             .iter()
             .map(|(time, d)| VisibilitySample { time_code: self.clock.code(*time), visible: visible(d) })
@@ -177,9 +170,8 @@ impl Stage<'_> {
         if hidden || (always_hidden && visibility.is_empty()) {
             visibility = vec![VisibilitySample { time_code: self.start, visible: false }];
         }
-        let rest =
-            PoseSample { time_code: self.start, translation: first.translation, rotation: first.rotation };
-        Some(Movement { keys, rest, stretch, visibility, stretch_changes })
+        let track = Track { rest: first.pose(self.start), samples: keys };
+        Some(Movement { track, stretch, visibility, stretch_changes })
     }
 
     /// Key times of a curve, so close that straight lines between them follow it.

@@ -46,47 +46,11 @@ impl Source {
                     _ => format!("{}, primitive {position}", self.mesh_name(mesh)),
                 };
                 let part = Reader { source: self, object, primitive }.read(settings, warnings)?;
-                append(&mut all, part);
+                all.append(part);
             }
         }
         Ok(all)
     }
-}
-
-/// Adds splats; the higher degree of the two is kept, the other is filled up with zeros.
-pub(crate) fn append(all: &mut Splats, mut more: Splats) {
-    let degree = all.sh_degree.max(more.sh_degree);
-    raise_degree(all, degree);
-    raise_degree(&mut more, degree);
-    let before = all.means.len();
-    all.means.append(&mut more.means);
-    all.orientations.append(&mut more.orientations);
-    all.scales.append(&mut more.scales);
-    all.opacities.append(&mut more.opacities);
-    all.sh_coefficients.append(&mut more.sh_coefficients);
-    all.occupancies.append(&mut more.occupancies);
-    all.identity_probabilities.append(&mut more.identity_probabilities);
-    all.rows.append(&mut more.rows);
-    // Some primitives may tell of instances where others do not.
-    if !(all.identities.is_empty() && more.identities.is_empty()) {
-        all.identities.resize(before, IdentityShares::default());
-        all.identities.append(&mut more.identities);
-        all.identities.resize(all.means.len(), IdentityShares::default());
-    }
-}
-
-fn raise_degree(splats: &mut Splats, degree: u8) {
-    if splats.sh_degree == degree {
-        return;
-    }
-    let (from, to) = (3 * coefficient_count(splats.sh_degree), 3 * coefficient_count(degree));
-    let mut raised = Vec::with_capacity(splats.len() * to);
-    for row in splats.sh_coefficients.chunks_exact(from) {
-        raised.extend_from_slice(row);
-        raised.resize(raised.len() + to - from, 0.0);
-    }
-    splats.sh_coefficients = raised;
-    splats.sh_degree = degree;
 }
 
 /// A splat primitive.

@@ -1,12 +1,13 @@
 //! Cameras: recorded ones and those of others.
 
 use cif_geometry::PinholeCamera;
-use cif_scene::{CameraSample, CameraTrack, naming};
+use cif_scene::assemble::{Decomposed, Track};
+use cif_scene::{CameraSample, CameraTrack};
 use glam::{DVec2, DVec3};
 use pyo3::prelude::*;
 
 use super::values::{attribute, plain, samples, text, value, vector};
-use super::{bake, labels, stage::Reading};
+use super::{labels, stage::Reading};
 use crate::conventions::{self, UsdCamera};
 use crate::tokens;
 
@@ -25,7 +26,6 @@ const LENS: [(&str, f64); 5] = [
 pub(super) fn read<'py>(
     reading: &Reading<'_, 'py>,
     prim: &Bound<'py, PyAny>,
-    taken: &mut naming::Names,
 ) -> PyResult<Option<CameraTrack>> {
     let earliest = reading.pxr.earliest()?;
     let path = super::values::path(prim)?;
@@ -80,15 +80,14 @@ pub(super) fn read<'py>(
         views.push(CameraSample { time_code, camera });
     }
     let label = text(&prim.call_method0("GetDisplayName")?)?;
-    let name = labels::node_name(prim, taken)?;
-    let label = if label.is_empty() { name.clone() } else { label };
+    let name = labels::node_name(prim)?;
     Ok(Some(CameraTrack { name, label, samples: views }))
 }
 
 fn pose<'py>(
     reading: &Reading<'_, 'py>,
     prim: &Bound<'py, PyAny>,
-    track: &super::frames::Track,
+    track: &Track,
     time_code: f64,
 ) -> PyResult<(DVec3, glam::DQuat)> {
     if track.samples.is_empty() {
@@ -98,8 +97,9 @@ fn pose<'py>(
     if let Some(sample) = exact {
         return Ok((sample.translation, sample.rotation.normalize()));
     }
-    let split = bake::split(&reading.frames.world(prim, Some(time_code))?);
-    Ok((split.translation, split.rotation))
+    // `Frames::node` has seen that it collapses nowhere.
+    let pose = Decomposed::of(&reading.frames.world(prim, Some(time_code))?);
+    Ok(pose.map_or((track.rest.translation, track.rest.rotation), |pose| (pose.translation, pose.rotation)))
 }
 
 /// The pinhole camera, with the recorded height where there is one: apertures tell it only to rounding.

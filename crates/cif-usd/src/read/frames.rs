@@ -3,11 +3,11 @@
 use std::cell::RefCell;
 use std::collections::BTreeMap;
 
+use cif_scene::assemble::{Decomposed, Placement, Track, is_identity, one_hemisphere};
 use cif_scene::{CaptureFrame, PoseSample, world};
 use glam::{DAffine3, DQuat, DVec3};
 use pyo3::prelude::*;
 
-use super::bake::{self, Split};
 use super::values;
 use crate::pxr::Pxr;
 use crate::tokens;
@@ -33,59 +33,6 @@ enum Operations<'py> {
     Pose { translate: Bound<'py, PyAny>, orient: Bound<'py, PyAny> },
     /// Anything else.
     Other,
-}
-
-/// A frame that moves rigidly.
-#[derive(Clone, Debug)]
-pub(super) struct Track {
-    /// Where it is when nothing is sampled, or at the earliest time.
-    pub(super) rest: PoseSample,
-    /// Samples; empty where it stands still.
-    pub(super) samples: Vec<PoseSample>,
-}
-
-/// How a prim lies in the frame of its node.
-#[derive(Clone, Debug)]
-pub(super) enum Placement {
-    /// `node_from_prim = track * baked`.
-    Rigid { track: Track, baked: Option<DAffine3> },
-    /// Anything else, at every time.
-    Sampled(Vec<(f64, DAffine3)>),
-}
-
-impl Track {
-    fn still() -> Self {
-        let rest = PoseSample { time_code: 0.0, translation: DVec3::ZERO, rotation: DQuat::IDENTITY };
-        Self { rest, samples: Vec::new() }
-    }
-
-    /// Whether it stays at the origin.
-    pub(super) fn is_identity(&self) -> bool {
-        let PoseSample { translation, rotation, .. } = self.rest;
-        self.samples.is_empty() && translation == DVec3::ZERO && rotation == DQuat::IDENTITY
-    }
-}
-
-fn affine(pose: &PoseSample) -> DAffine3 {
-    DAffine3::from_rotation_translation(pose.rotation, pose.translation)
-}
-
-fn pose(time_code: f64, split: &Split) -> PoseSample {
-    PoseSample { time_code, translation: split.translation, rotation: split.rotation }
-}
-
-/// Successive rotations in one hemisphere, so that what is between them takes the shorter way.
-fn in_one_hemisphere(samples: &mut [PoseSample]) {
-    for index in 1..samples.len() {
-        if samples[index].rotation.dot(samples[index - 1].rotation) < 0.0 {
-            samples[index].rotation = -samples[index].rotation;
-        }
-    }
-}
-
-/// A pose that is a mirror or a collapse is none.
-fn usable(affine: &DAffine3) -> bool {
-    affine.is_finite() && affine.matrix3.determinant().abs() > f64::MIN_POSITIVE
 }
 
 impl<'a, 'py> Frames<'a, 'py> {
@@ -297,21 +244,15 @@ impl<'a, 'py> Frames<'a, 'py> {
         if let Some(track) = self.exact_between(prim, None)? {
             return Ok(Some((track, true)));
         }
-        let first = self.world(prim, None)?;
-        if !usable(&first) {
-            return Ok(None);
-        }
+        let Some(first) = Decomposed::of(&self.world(prim, None)?) else { return Ok(None) };
         let times = self.times(prim, None)?;
-        let rest = pose(times.first().copied().unwrap_or(0.0), &bake::split(&first));
+        let rest = first.pose(times.first().copied().unwrap_or(0.0));
         let mut samples = Vec::with_capacity(times.len());
         for &time in &times {
-            let world = self.world(prim, Some(time))?;
-            if !usable(&world) {
-                return Ok(None);
-            }
-            samples.push(pose(time, &bake::split(&world)));
+            let Some(world) = Decomposed::of(&self.world(prim, Some(time))?) else { return Ok(None) };
+            samples.push(world.pose(time));
         }
-        in_one_hemisphere(&mut samples);
+        one_hemisphere(&mut samples);
         let moves = samples
             .iter()
             .any(|sample| sample.translation != rest.translation || sample.rotation != rest.rotation);
@@ -333,76 +274,35 @@ impl<'a, 'py> Frames<'a, 'py> {
         if exact && let Some(track) = self.exact_between(prim, Some(owner))? {
             return Ok(Some(Placement::Rigid { track, baked: None }));
         }
-        let local = |time: Option<f64>| -> PyResult<DAffine3> {
-            let at = match time {
-                Some(time) => cif_scene::graph::pose_at(&track.samples, track.rest.translation, time),
-                None => track.rest,
-            };
-            let at = if track.samples.is_empty() { track.rest } else { at };
-            Ok(affine(&at).inverse() * self.world(prim, time)?)
+        let local = |time: Option<f64>| -> PyResult<Option<(DAffine3, Decomposed)>> {
+            let PoseSample { translation, rotation, .. } = time.map_or(track.rest, |time| track.at(time));
+            let owner = DAffine3::from_rotation_translation(rotation, translation);
+            let map = owner.inverse() * self.world(prim, time)?;
+            Ok(Decomposed::of(&map).map(|parts| (map, parts)))
         };
-        let first = local(None)?;
-        if !usable(&first) {
-            return Ok(None);
-        }
+        let Some((first, rest)) = local(None)? else { return Ok(None) };
         let mut samples = Vec::new();
         for time in self.times(prim, None)? {
-            let local = local(Some(time))?;
-            if !usable(&local) {
-                return Ok(None);
-            }
-            samples.push((time, local));
+            let Some((map, parts)) = local(Some(time))? else { return Ok(None) };
+            samples.push((time, map, parts));
         }
         let same = |a: &DAffine3, b: &DAffine3| {
             let scale = 1.0 + a.translation.length();
-            bake::is_identity(&(a.matrix3.inverse() * b.matrix3))
+            is_identity(&(a.matrix3.inverse() * b.matrix3))
                 && (a.translation - b.translation).length() < 1e-6 * scale
         };
-        if samples.iter().all(|(_, local)| same(&first, local)) {
-            let identity = bake::is_identity(&first.matrix3) && first.translation.length() < 1e-12;
-            let baked = (!identity).then_some(first);
-            return Ok(Some(Placement::Rigid { track: Track::still(), baked }));
+        if samples.iter().all(|(_, map, _)| same(&first, map)) {
+            let identity = is_identity(&first.matrix3) && first.translation.length() < 1e-12;
+            return Ok(Some(Placement::still((!identity).then_some(first))));
         }
-        let rest = bake::split(&first);
-        let splits: Vec<(f64, Split)> =
-            samples.iter().map(|(time, local)| (*time, bake::split(local))).collect();
-        if splits.iter().all(|(_, split)| bake::is_identity(&(rest.rest.inverse() * split.rest))) {
-            let mut samples: Vec<PoseSample> =
-                splits.iter().map(|(time, split)| pose(*time, split)).collect();
-            in_one_hemisphere(&mut samples);
-            let baked = (!bake::is_identity(&rest.rest)).then(|| DAffine3::from_mat3(rest.rest));
-            let track = Track { rest: pose(samples[0].time_code, &rest), samples };
+        if samples.iter().all(|(.., parts)| is_identity(&(rest.stretch.inverse() * parts.stretch))) {
+            let mut poses: Vec<PoseSample> =
+                samples.iter().map(|(time, _, parts)| parts.pose(*time)).collect();
+            one_hemisphere(&mut poses);
+            let baked = (!is_identity(&rest.stretch)).then(|| DAffine3::from_mat3(rest.stretch));
+            let track = Track { rest: rest.pose(samples[0].0), samples: poses };
             return Ok(Some(Placement::Rigid { track, baked }));
         }
-        Ok(Some(Placement::Sampled(samples)))
-    }
-}
-
-impl Placement {
-    /// `node_from_prim` at a time code.
-    pub(super) fn at(&self, time_code: f64) -> DAffine3 {
-        match self {
-            Self::Rigid { track, baked } => {
-                let at = if track.samples.is_empty() {
-                    track.rest
-                } else {
-                    cif_scene::graph::pose_at(&track.samples, track.rest.translation, time_code)
-                };
-                affine(&at) * baked.unwrap_or(DAffine3::IDENTITY)
-            }
-            Self::Sampled(samples) => {
-                let nearest =
-                    samples.iter().min_by(|a, b| (a.0 - time_code).abs().total_cmp(&(b.0 - time_code).abs()));
-                nearest.map_or(DAffine3::IDENTITY, |(_, affine)| *affine)
-            }
-        }
-    }
-
-    /// Times at which it is sampled.
-    pub(super) fn times(&self) -> Vec<f64> {
-        match self {
-            Self::Rigid { track, .. } => track.samples.iter().map(|sample| sample.time_code).collect(),
-            Self::Sampled(samples) => samples.iter().map(|(time, _)| *time).collect(),
-        }
+        Ok(Some(Placement::Sampled(samples.into_iter().map(|(time, map, _)| (time, map)).collect())))
     }
 }

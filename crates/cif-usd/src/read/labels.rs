@@ -109,13 +109,18 @@ pub(super) fn names<'py>(
     Ok((label, category))
 }
 
-/// Name of a node for a prim: its own, made usable and unique.
-pub(super) fn node_name(prim: &Bound<'_, PyAny>, taken: &mut naming::Names) -> PyResult<String> {
+/// True when a prim of ours is still called as its `instance` label says.
+pub(super) fn is_original<'py>(pxr: &Pxr<'py>, prim: &Bound<'py, PyAny>) -> PyResult<bool> {
+    let name = text(&prim.call_method0("GetName")?)?;
+    Ok(in_taxonomy(pxr, prim, tokens::TAXONOMY_INSTANCE)?.contains(&name))
+}
+
+/// Name of a node for a prim: its own, made usable.
+pub(super) fn node_name(prim: &Bound<'_, PyAny>) -> PyResult<String> {
     let name = text(&prim.call_method0("GetName")?)?;
     let usable = name.starts_with(|first: char| first.is_ascii_alphabetic() || first == '_')
         && name.chars().all(|character| character.is_ascii_alphanumeric() || character == '_');
-    let name = if usable { name } else { naming::identifier(&name, "instance") };
-    Ok(taken.take(name))
+    Ok(if usable { name } else { naming::identifier(&name, "instance") })
 }
 
 /// Changes of visibility of a prim, through its own attribute and those of its ancestors.

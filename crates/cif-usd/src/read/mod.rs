@@ -1,7 +1,6 @@
 //! Stages as scene graphs, and prims by label.
 
 mod arrays;
-mod bake;
 mod cameras;
 mod expansion;
 mod frames;

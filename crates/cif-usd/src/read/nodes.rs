@@ -1,17 +1,12 @@
-//! One node from a prim and the splat prims under it.
+//! An object from a prim and the splat prims under it.
 
-use cif_geometry::{Bounds, RigidTransform};
-use cif_scene::{
-    Appearance, AppearanceSample, ConvexHull, DenseMotion, DenseSample, IdentityShares, Motion, MotionModel,
-    MotionReport, Node, NodeKind, Part, PartsMotion, PointProxy, PoseSample, Splats, extent, naming,
-};
-use glam::{DAffine3, DQuat, DVec3};
+use cif_scene::assemble::{Identity, Piece, Placement, Prim, PrimName, Shape, Track};
+use cif_scene::{ConvexHull, MotionModel, PointProxy, Splats};
+use glam::DVec3;
 use pyo3::prelude::*;
 
-use super::bake::Bake;
-use super::frames::{Placement, Track};
 use super::labels::{self, Recorded};
-use super::splats::{Shape, SplatPrim};
+use super::splats::SplatPrim;
 use super::stage::Reading;
 use super::values::{attribute, text, value};
 use crate::{UsdError, primvars, tokens};
@@ -25,28 +20,18 @@ pub(super) struct Owner<'py> {
     pub(super) splats: Vec<SplatPrim<'py>>,
 }
 
-/// Splats of one prim and how they lie in the node.
-struct Piece {
-    splats: Splats,
-    placement: Placement,
+impl Owner<'_> {
+    fn identity(&self, original: bool) -> Identity {
+        match (self.recorded.background, self.recorded.id) {
+            (true, _) => Identity::Background,
+            (false, Some(id)) => Identity::Recorded { id, index: self.recorded.index, original },
+            (false, None) => Identity::New,
+        }
+    }
 }
 
-/// Box of the 3-sigma ellipsoids in their own frame.
-fn bounds(means: &[[f32; 3]], orientations: &[[f32; 4]], scales: &[[f32; 3]]) -> Bounds {
-    extent::ellipsoid_bounds(&RigidTransform::IDENTITY, means, orientations, scales)
-}
-
-fn splat_bounds(splats: &Splats) -> Bounds {
-    bounds(&splats.means, &splats.orientations, &splats.scales)
-}
-
-/// The node.
-pub(super) fn read<'py>(
-    reading: &Reading<'_, 'py>,
-    owner: &Owner<'py>,
-    kind: NodeKind,
-    taken: &mut naming::Names,
-) -> Result<Node, UsdError> {
+/// What the assembler makes a node of.
+pub(super) fn read<'py>(reading: &Reading<'_, 'py>, owner: &Owner<'py>) -> Result<Prim, UsdError> {
     let python = |error: PyErr| reading.python(&error);
     let collapses = |path: &str| {
         reading.prim_error(
@@ -76,216 +61,123 @@ pub(super) fn read<'py>(
         placements = vec![place(prim, &prim.prim, &own, exact)?];
         track = own;
     }
-    let mut times: Vec<f64> = Vec::new();
-    for prim in &owner.splats {
-        times.extend(prim.times().map_err(python)?);
+    let [mut shape_codes, opacity_codes, color_codes] = codes(owner).map_err(python)?;
+    if !shape_codes.is_empty()
+        || placements.iter().any(|placement| matches!(placement, Placement::Sampled(_)))
+    {
+        shape_codes.extend(placements.iter().flat_map(Placement::codes));
+        sort(&mut shape_codes);
     }
-    let deforms =
-        !times.is_empty() || placements.iter().any(|placement| matches!(placement, Placement::Sampled(_)));
-    let mut pieces = Vec::with_capacity(placements.len());
-    for (prim, placement) in owner.splats.iter().zip(placements) {
-        pieces.push(Piece { splats: prim.splats(reading)?, placement });
-    }
-    if kind == NodeKind::Background {
-        for (piece, prim) in pieces.iter_mut().zip(&owner.splats) {
-            if !prim.has_identities().map_err(python)? {
-                piece.splats.identity_probabilities.fill(0.0);
-            }
-        }
-    }
-    let parts = !deforms && is_parts(recorded, &pieces);
-    let appearance = appearance(reading, owner, &pieces, parts)?;
-    let (motion, splats) = if deforms {
-        for piece in &pieces {
-            times.extend(piece.placement.times());
-        }
-        times.sort_by(f64::total_cmp);
-        times.dedup();
-        dense(reading, owner, &pieces, &times, &track)?
-    } else if parts {
-        in_parts(owner, pieces, &track).map_err(python)?
-    } else {
-        let splats = merge(pieces.into_iter().map(|piece| {
-            let map = piece.placement.at(0.0);
-            baked(piece.splats, map)
-        }));
-        let turned = track.rest.rotation != DQuat::IDENTITY;
-        let samples =
-            if track.samples.is_empty() && turned { vec![track.rest] } else { track.samples.clone() };
-        let kept = recorded.model == Some(MotionModel::Rigid) && !samples.is_empty();
-        let motion = if samples.is_empty() && !kept { Motion::Static } else { Motion::Rigid(samples) };
-        (motion, splats)
+    let in_parts = shape_codes.is_empty() && is_parts(recorded, &placements);
+    let mut prim = Prim {
+        shape_codes,
+        opacity_codes,
+        color_codes,
+        in_parts,
+        ..Prim::still(owner.path.clone(), String::new(), Splats::default())
     };
-    let stands = matches!(motion, Motion::Static) || track.samples.is_empty();
-    let pivot =
-        if stands { track.rest.translation } else { recorded.pivot.unwrap_or(track.rest.translation) };
+    prim.scales_change = placements.iter().any(|placement| matches!(placement, Placement::Sampled(_)));
+    for splats in &owner.splats {
+        prim.scales_change |= splats.samples_scales().map_err(python)?;
+    }
+    prim.pieces = owner
+        .splats
+        .iter()
+        .zip(placements)
+        .map(|(splats, placement)| piece(reading, owner, &prim, splats, placement))
+        .collect::<Result<_, _>>()?;
+    let splats = prim.pieces.iter().map(|piece| piece.splats.len()).sum();
+    let original = labels::is_original(reading.pxr, &owner.prim).map_err(python)?;
     let (label, category) = labels::names(reading.pxr, &owner.prim, recorded).map_err(python)?;
-    let mut node = Node {
-        kind,
-        name: labels::node_name(&owner.prim, taken).map_err(python)?,
+    Ok(Prim {
+        identity: owner.identity(original),
+        name: PrimName::Given(labels::node_name(&owner.prim).map_err(python)?),
         label,
         category,
-        pivot,
-        proxy: proxy(reading, owner, &motion, splats.len())?,
-        colliders: colliders(reading, owner, &motion)?,
+        // Of what stands still the transform tells the pivot.
+        pivot: recorded.pivot.filter(|_| !track.samples.is_empty()),
+        track,
+        proxy: proxy(reading, owner, in_parts, splats)?,
+        colliders: colliders(reading, owner, in_parts)?,
         visibility: labels::visibility(reading.pxr, &owner.prim, reading.start).map_err(python)?,
-        extent: Bounds::EMPTY,
-        source_frames: recorded.source_frames.unwrap_or(reading.source_frames),
-        mean_occupancy: recorded.mean_occupancy.unwrap_or_else(|| mean_occupancy(&splats)),
-        report: report(recorded, &motion, &splats),
-        motion,
-        splats,
-        appearance,
-    };
-    node.extent = node_extent(&node);
-    Ok(node)
+        source_frames: Some(recorded.source_frames.unwrap_or(reading.source_frames)),
+        mean_occupancy: recorded.mean_occupancy,
+        report: recorded.report.as_deref().and_then(|text| serde_json::from_str(text).ok()),
+        ..prim
+    })
 }
 
-/// Box in the local frame at the first time.
-fn node_extent(node: &Node) -> Bounds {
-    let Motion::Parts(motion) = &node.motion else { return splat_bounds(&node.splats) };
-    let boxes = motion.parts.iter().map(|part| {
-        let rest = part.track.first().map_or(
-            RigidTransform { rotation: glam::DMat3::IDENTITY, translation: part.pivot },
-            PoseSample::transform,
-        );
-        let (splats, range) = (&node.splats, part.splats.clone());
-        extent::ellipsoid_bounds(
-            &rest,
-            &splats.means[range.clone()],
-            &splats.orientations[range.clone()],
-            &splats.scales[range],
-        )
-    });
-    boxes.fold(Bounds::EMPTY, |all, bounds| all.union(bounds))
+fn sort(codes: &mut Vec<f64>) {
+    codes.sort_by(f64::total_cmp);
+    codes.dedup();
 }
 
-/// Whether several prims move, or were written, as parts.
-fn is_parts(recorded: &Recorded, pieces: &[Piece]) -> bool {
-    let moves = |piece: &Piece| match &piece.placement {
+/// Time codes at which shapes, opacities and colours of any of the splat prims are sampled.
+fn codes(owner: &Owner<'_>) -> PyResult<[Vec<f64>; 3]> {
+    let mut codes = [Vec::new(), Vec::new(), Vec::new()];
+    for prim in &owner.splats {
+        codes[0].extend(prim.times()?);
+        codes[1].extend(prim.opacity_times()?);
+        codes[2].extend(prim.color_times()?);
+    }
+    codes.iter_mut().for_each(sort);
+    Ok(codes)
+}
+
+/// True when several prims move, or were written, as parts.
+fn is_parts(recorded: &Recorded, placements: &[Placement]) -> bool {
+    let moves = |placement: &Placement| match placement {
         Placement::Rigid { track, .. } => !track.samples.is_empty(),
         Placement::Sampled(_) => false,
     };
-    pieces.len() > 1 && (recorded.model == Some(MotionModel::Parts) || pieces.iter().any(moves))
+    placements.len() > 1 && (recorded.model == Some(MotionModel::Parts) || placements.iter().any(moves))
 }
 
-/// Splats moved by an affine map; those that do not move stay exact.
-fn baked(mut splats: Splats, map: DAffine3) -> Splats {
-    if map != DAffine3::IDENTITY {
-        let bake = Bake::new(map);
-        bake.means(&mut splats.means);
-        bake.shapes(&mut splats.orientations, &mut splats.scales);
-        bake.harmonics(&mut splats.sh_coefficients, splats.sh_degree);
-    }
-    splats
-}
-
-/// Several sets of splats as one; coefficients are padded to the highest degree.
-fn merge(sets: impl Iterator<Item = Splats>) -> Splats {
-    let mut sets: Vec<Splats> = sets.collect();
-    if sets.len() == 1 {
-        return sets.swap_remove(0);
-    }
-    let floats = |degree| 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
-    let degree = sets.iter().map(|set| set.sh_degree).max().unwrap_or(0);
-    let mut all = Splats { sh_degree: degree, ..Splats::default() };
-    let tells = sets.iter().any(|set| !set.identities.is_empty());
-    for mut set in sets {
-        if tells {
-            set.identities.resize(set.means.len(), IdentityShares::default());
-            all.identities.append(&mut set.identities);
-        }
-        for sh in set.sh_coefficients.chunks_exact(floats(set.sh_degree)) {
-            all.sh_coefficients.extend_from_slice(sh);
-            all.sh_coefficients.resize(all.sh_coefficients.len() + floats(degree) - sh.len(), 0.0);
-        }
-        all.means.extend(set.means);
-        all.orientations.extend(set.orientations);
-        all.scales.extend(set.scales);
-        all.opacities.extend(set.opacities);
-        all.occupancies.extend(set.occupancies);
-        all.identity_probabilities.extend(set.identity_probabilities);
-        all.rows.extend(set.rows);
-    }
-    all
-}
-
-/// Opacities and colours of all pieces over time, these in the frame of the node or of its parts.
-fn appearance<'py>(
+/// Splats of one prim, at all times that its owner is sampled at.
+fn piece<'py>(
     reading: &Reading<'_, 'py>,
     owner: &Owner<'py>,
-    pieces: &[Piece],
-    parts: bool,
-) -> Result<Appearance, UsdError> {
+    sampled: &Prim,
+    prim: &SplatPrim<'py>,
+    placement: Placement,
+) -> Result<Piece, UsdError> {
     let python = |error: PyErr| reading.python(&error);
-    let mut times = [Vec::new(), Vec::new()];
-    for prim in &owner.splats {
-        times[0].extend(prim.opacity_times().map_err(python)?);
-        times[1].extend(prim.color_times().map_err(python)?);
+    let mut splats = prim.splats(reading)?;
+    if owner.recorded.background && !prim.has_identities().map_err(python)? {
+        splats.identity_probabilities.fill(0.0);
     }
-    let [opacity_times, color_times] = times.map(|mut times| {
-        times.sort_by(f64::total_cmp);
-        times.dedup();
-        times
-    });
-    let mut appearance = Appearance::default();
-    for time_code in opacity_times {
-        let mut values = Vec::new();
-        for (prim, piece) in owner.splats.iter().zip(pieces) {
-            values.extend(prim.opacities_at(reading, time_code, piece.splats.len())?);
+    let (count, degree) = (splats.len(), splats.sh_degree);
+    let opacities = sampled.opacity_codes.iter().map(|&code| prim.opacities_at(reading, code, count));
+    let opacities = opacities.collect::<Result<_, _>>()?;
+    let mut colors = Vec::with_capacity(sampled.color_codes.len());
+    for &code in &sampled.color_codes {
+        let (own, coefficients) = prim.harmonics_at(reading, code, count)?;
+        if own != degree {
+            let problem = format!("coefficients of degree {own} at time code {code}");
+            return Err(reading.prim_error(&prim.path, problem, "keep one degree over time"));
         }
-        appearance.opacities.push(AppearanceSample { time_code, values });
+        colors.push(coefficients);
     }
-    let degree = pieces.iter().map(|piece| piece.splats.sh_degree).max().unwrap_or(0);
-    let floats = |degree| 3 * cif_geometry::spherical_harmonics::coefficient_count(degree);
-    for time_code in color_times {
-        let mut values = Vec::new();
-        for (prim, piece) in owner.splats.iter().zip(pieces) {
-            let (own, mut coefficients) = prim.harmonics_at(reading, time_code, piece.splats.len())?;
-            if own != piece.splats.sh_degree {
-                let problem = format!("coefficients of degree {own} at time code {time_code}");
-                return Err(reading.prim_error(&prim.path, problem, "keep one degree over time"));
-            }
-            let map = match &piece.placement {
-                Placement::Rigid { baked, .. } if parts => baked.unwrap_or(DAffine3::IDENTITY),
-                placement => placement.at(time_code),
-            };
-            if map != DAffine3::IDENTITY {
-                Bake::new(map).harmonics(&mut coefficients, own);
-            }
-            for sh in coefficients.chunks_exact(floats(own)) {
-                values.extend_from_slice(sh);
-                values.resize(values.len() + floats(degree) - sh.len(), 0.0);
-            }
+    let mut shapes: Vec<Shape> = Vec::with_capacity(sampled.shape_codes.len());
+    for &code in &sampled.shape_codes {
+        let shape = prim.shape(reading, Some(code))?;
+        if shape.means.len() != count {
+            return Err(reading.prim_error(
+                &prim.path,
+                format!("{} splats at time code {code}, {count} at first", shape.means.len()),
+                "keep the number of splats; fade with opacity 0 what comes or goes",
+            ));
         }
-        appearance.colors.push(AppearanceSample { time_code, values });
+        shapes.push(shape);
     }
-    Ok(appearance)
-}
-
-/// Every piece a part with its own track.
-fn in_parts(owner: &Owner<'_>, pieces: Vec<Piece>, track: &Track) -> PyResult<(Motion, Splats)> {
-    let (mut parts, mut sets, mut start) = (Vec::<Part>::new(), Vec::new(), 0);
-    let mut names = naming::Names::default();
-    for (piece, prim) in pieces.into_iter().zip(&owner.splats) {
-        let Placement::Rigid { track, baked: map } = piece.placement else { continue };
-        let set = baked(piece.splats, map.unwrap_or(DAffine3::IDENTITY));
-        let carrier = prim.carrier(&owner.prim)?;
-        let turned = track.rest.rotation != DQuat::IDENTITY;
-        let samples = if track.samples.is_empty() && turned { vec![track.rest] } else { track.samples };
-        parts.push(Part {
-            name: labels::node_name(&carrier, &mut names)?,
-            splats: start..start + set.len(),
-            pivot: part_pivot(&carrier)?.unwrap_or(track.rest.translation),
-            track: samples,
-            extent: splat_bounds(&set),
-        });
-        start += set.len();
-        sets.push(set);
-    }
-    let turned = track.rest.rotation != DQuat::IDENTITY;
-    let samples = if track.samples.is_empty() && turned { vec![track.rest] } else { track.samples.clone() };
-    Ok((Motion::Parts(PartsMotion { track: samples, parts }), merge(sets.into_iter())))
+    let (name, pivot) = match sampled.in_parts {
+        true => {
+            let carrier = prim.carrier(&owner.prim).map_err(python)?;
+            (labels::node_name(&carrier).map_err(python)?, part_pivot(&carrier).map_err(python)?)
+        }
+        false => (String::new(), None),
+    };
+    Ok(Piece { name, splats, placement, pivot, shapes, opacities, colors })
 }
 
 /// Origin of a part's frame at the reference time, where it is recorded and the part moves.
@@ -294,103 +186,13 @@ fn part_pivot(prim: &Bound<'_, PyAny>) -> PyResult<Option<DVec3>> {
     super::values::vec3(&attribute.call_method0("Get")?).map(Some)
 }
 
-/// Samples of everything that deforms.
-fn dense<'py>(
-    reading: &Reading<'_, 'py>,
-    owner: &Owner<'py>,
-    pieces: &[Piece],
-    times: &[f64],
-    track: &Track,
-) -> Result<(Motion, Splats), UsdError> {
-    let mut scaled = false;
-    for (prim, piece) in owner.splats.iter().zip(pieces) {
-        scaled |= prim.samples_scales().map_err(|error| reading.python(&error))?;
-        scaled |= matches!(piece.placement, Placement::Sampled(_));
-    }
-    let mut samples: Vec<DenseSample> = Vec::with_capacity(times.len());
-    for &time in times {
-        let mut whole = Shape { means: Vec::new(), orientations: Vec::new(), scales: Vec::new() };
-        for (prim, piece) in owner.splats.iter().zip(pieces) {
-            let mut shape = prim.shape(reading, Some(time))?;
-            if shape.means.len() != piece.splats.len() {
-                return Err(reading.prim_error(
-                    &prim.path,
-                    format!(
-                        "{} splats at time code {time}, {} at first",
-                        shape.means.len(),
-                        piece.splats.len()
-                    ),
-                    "keep the number of splats; fade with opacity 0 what comes or goes",
-                ));
-            }
-            let map = piece.placement.at(time);
-            if map != DAffine3::IDENTITY {
-                let bake = Bake::new(map);
-                bake.means(&mut shape.means);
-                bake.shapes(&mut shape.orientations, &mut shape.scales);
-            }
-            whole.means.extend(shape.means);
-            whole.orientations.extend(shape.orientations);
-            whole.scales.extend(shape.scales);
-        }
-        if let Some(before) = samples.last() {
-            for (q, before) in whole.orientations.iter_mut().zip(&before.orientations) {
-                if q.iter().zip(before).map(|(a, b)| a * b).sum::<f32>() < 0.0 {
-                    *q = q.map(|component| -component);
-                }
-            }
-        }
-        let extent = bounds(&whole.means, &whole.orientations, &whole.scales);
-        samples.push(DenseSample {
-            time_code: time,
-            means: whole.means,
-            orientations: whole.orientations,
-            scales: scaled.then_some(whole.scales),
-            extent,
-        });
-    }
-    let first = times.first().copied().unwrap_or(0.0);
-    let splats = merge(pieces.iter().map(|piece| baked(piece.splats.clone(), piece.placement.at(first))));
-    let turned = track.rest.rotation != DQuat::IDENTITY;
-    let poses = if track.samples.is_empty() && turned { vec![track.rest] } else { track.samples.clone() };
-    Ok((Motion::Dense(DenseMotion { track: poses, samples }), splats))
-}
-
-fn mean_occupancy(splats: &Splats) -> f32 {
-    let (sum, total) = splats
-        .occupancies
-        .iter()
-        .zip(&splats.opacities)
-        .fold((0.0, 0.0), |(sum, total), (pi, o)| (sum + f64::from(pi * o), total + f64::from(*o)));
-    if total > 0.0 { (sum / total) as f32 } else { 0.0 }
-}
-
-/// The motion report of the export where it still holds, else what can be told from the stage.
-fn report(recorded: &Recorded, motion: &Motion, splats: &Splats) -> MotionReport {
-    let (model, samples) = match motion {
-        Motion::Static => (MotionModel::Static, 0),
-        Motion::Rigid(track) => (MotionModel::Rigid, track.len()),
-        Motion::Parts(parts) => {
-            let samples = parts.track.len() + parts.parts.iter().map(|part| part.track.len()).sum::<usize>();
-            (MotionModel::Parts, samples)
-        }
-        Motion::Dense(dense) => (MotionModel::Dense, dense.samples.len()),
-    };
-    let before = recorded.report.as_deref().and_then(|text| serde_json::from_str::<MotionReport>(text).ok());
-    if let Some(before) = before.filter(|before| before.model == model) {
-        return before;
-    }
-    let parts = if let Motion::Parts(parts) = motion { parts.parts.len() } else { 0 };
-    MotionReport { model, parts, ..MotionReport::unfitted(splats, samples) }
-}
-
 /// A prim, its name, and the part that it moves with.
 type Child<'py> = (Bound<'py, PyAny>, String, Option<usize>);
 
 /// Prims of a type under an owner and its parts whose name starts so, with the index of their part.
-fn children<'py>(owner: &Owner<'py>, motion: &Motion, prefix: &str) -> PyResult<Vec<Child<'py>>> {
+fn children<'py>(owner: &Owner<'py>, in_parts: bool, prefix: &str) -> PyResult<Vec<Child<'py>>> {
     let mut places = vec![(owner.prim.clone(), None)];
-    if let Motion::Parts(_) = motion {
+    if in_parts {
         for (index, prim) in owner.splats.iter().enumerate() {
             places.push((prim.carrier(&owner.prim)?, Some(index)));
         }
@@ -412,7 +214,7 @@ fn children<'py>(owner: &Owner<'py>, motion: &Motion, prefix: &str) -> PyResult<
 fn proxy<'py>(
     reading: &Reading<'_, 'py>,
     owner: &Owner<'py>,
-    motion: &Motion,
+    in_parts: bool,
     splats: usize,
 ) -> Result<Option<PointProxy>, UsdError> {
     let python = |error: PyErr| reading.python(&error);
@@ -426,7 +228,7 @@ fn proxy<'py>(
         return Ok(None);
     }
     let mut all: Option<PointProxy> = None;
-    for (prim, _, _) in children(owner, motion, tokens::PROXY).map_err(python)? {
+    for (prim, _, _) in children(owner, in_parts, tokens::PROXY).map_err(python)? {
         // Below the instancer; earlier stages have the points in its place.
         let inside = prim.call_method1("GetPrimAtPath", (tokens::PROXY_POINTS,)).map_err(python)?;
         let prim = if inside.is_truthy().map_err(python)? { inside } else { prim };
@@ -449,11 +251,11 @@ fn proxy<'py>(
 fn colliders<'py>(
     reading: &Reading<'_, 'py>,
     owner: &Owner<'py>,
-    motion: &Motion,
+    in_parts: bool,
 ) -> Result<Vec<ConvexHull>, UsdError> {
     let python = |error: PyErr| reading.python(&error);
     let mut found: Vec<(u64, ConvexHull)> = Vec::new();
-    for (prim, name, part) in children(owner, motion, tokens::COLLIDER).map_err(python)? {
+    for (prim, name, part) in children(owner, in_parts, tokens::COLLIDER).map_err(python)? {
         let path = super::values::path(&prim).map_err(python)?;
         let at = reading.pxr.earliest().map_err(python)?;
         let get = |name: &str| value(&prim, name, &at).map_err(python);

@@ -1,6 +1,7 @@
 //! Splats of one prim: single or half precision, checked.
 
 use cif_geometry::spherical_harmonics::{BAND_0, COEFFICIENTS, coefficient_count};
+use cif_scene::assemble::Shape;
 use cif_scene::{IdentityShare, IdentityShares, Splats};
 use pyo3::prelude::*;
 
@@ -16,13 +17,6 @@ const UNIT: f32 = 1e-5;
 pub(super) struct SplatPrim<'py> {
     pub(super) prim: Bound<'py, PyAny>,
     pub(super) path: String,
-}
-
-/// What changes over time.
-pub(super) struct Shape {
-    pub(super) means: Vec<[f32; 3]>,
-    pub(super) orientations: Vec<[f32; 4]>,
-    pub(super) scales: Vec<[f32; 3]>,
 }
 
 /// Indices, widths and colours of a proxy.

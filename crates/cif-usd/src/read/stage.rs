@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_field::SortMetric;
-use cif_scene::{CaptureFrame, Node, NodeKind, Origin, SceneGraph, SceneOptions, TimeCodes, UpAxis, naming};
+use cif_scene::assemble::{AssembleError, FRAMES_PER_SECOND, Prim, Prims, Timeline, assemble};
+use cif_scene::{CaptureFrame, Origin, SceneGraph, SceneOptions, TimeCodes, UpAxis};
 use pyo3::prelude::*;
 
 use super::arrays::Arrays;
@@ -18,9 +19,6 @@ use super::values::{self, plain, text};
 use super::{cameras, open};
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, tokens};
-
-/// Time codes per second where nobody says.
-const FRAMES_PER_SECOND: f64 = 24.0;
 
 /// What every part of the reader sees.
 pub(super) struct Reading<'a, 'py> {
@@ -127,16 +125,11 @@ fn read<'py>(
     if owners.is_empty() {
         return Err(UsdError::NoSplats { path: reading.path.to_owned() });
     }
-    let kinds = kinds(reading, &owners).map_err(failed)?;
-    let mut nodes: Vec<Node> = Vec::with_capacity(owners.len());
-    let mut names = naming::Names::default();
-    for (owner, kind) in owners.iter().zip(kinds) {
-        nodes.push(nodes::read(reading, owner, kind, &mut names)?);
-    }
+    let prims: Vec<Prim> =
+        owners.iter().map(|owner| nodes::read(reading, owner)).collect::<Result<_, _>>()?;
     let mut cameras = Vec::with_capacity(camera_prims.len());
-    let mut names = naming::Names::default();
     for prim in &camera_prims {
-        cameras.extend(cameras::read(reading, prim, &mut names).map_err(failed)?);
+        cameras.extend(cameras::read(reading, prim).map_err(failed)?);
     }
     let text_info = |name: &str| info::<String>(stage, name).map_err(failed);
     let up_axis = match text_info("upAxis")?.as_deref() {
@@ -156,15 +149,18 @@ fn read<'py>(
         None => plain(&owners[0].splats[0].prim, "sortingModeHint", &reading.pxr.earliest().map_err(failed)?)
             .map_err(failed)?,
     };
-    let time_codes = time_codes(&mark, &nodes, reading.start, frames_per_second);
+    let timeline = match !mark.codes.is_empty() && mark.codes.len() == mark.times.len() {
+        true => Timeline::Recorded(TimeCodes { samples: mark.codes, times: mark.times, frames_per_second }),
+        false => Timeline::Sampled { codes: Vec::new(), start: reading.start, frames_per_second },
+    };
     let mut warnings = mark.warnings;
     warnings.extend(reading.warnings.take());
-    Ok(SceneGraph {
+    let scene = Prims {
         up_axis,
         meters_per_unit,
         frame: mark.frame,
-        time_codes,
-        nodes,
+        timeline,
+        prims,
         cameras,
         background_color: mark.background,
         sort_metric: match sort.as_deref() {
@@ -174,6 +170,10 @@ fn read<'py>(
         omitted: mark.omitted,
         warnings,
         origin: mark.origin,
+        ..Prims::default()
+    };
+    assemble(scene).map_err(|AssembleError { place, what }| {
+        reading.prim_error(&place, what.to_owned(), "write them into several stages")
     })
 }
 
@@ -260,35 +260,6 @@ fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
         });
     }
     Ok(Mark::default())
-}
-
-/// Sampled time codes: those of the export, else all at which a node is sampled.
-fn time_codes(mark: &Mark, nodes: &[Node], start: f64, frames_per_second: f64) -> TimeCodes {
-    if !mark.codes.is_empty() && mark.codes.len() == mark.times.len() {
-        return TimeCodes { samples: mark.codes.clone(), times: mark.times.clone(), frames_per_second };
-    }
-    let mut samples: Vec<f64> = Vec::new();
-    for node in nodes {
-        samples.extend(node.track().iter().map(|sample| sample.time_code));
-        samples.extend(node.visibility.iter().map(|sample| sample.time_code));
-        match &node.motion {
-            cif_scene::Motion::Dense(dense) => samples.extend(dense.samples.iter().map(|s| s.time_code)),
-            cif_scene::Motion::Parts(motion) => {
-                let tracks = motion.parts.iter().flat_map(|part| &part.track);
-                samples.extend(tracks.map(|sample| sample.time_code));
-            }
-            _ => {}
-        }
-    }
-    samples.sort_by(f64::total_cmp);
-    samples.dedup();
-    if samples.is_empty() {
-        samples.push(start);
-    }
-    let (first, last) = (samples[0], samples[samples.len() - 1]);
-    let length = if last > first { last - first } else { 1.0 };
-    let times = samples.iter().map(|code| (code - first) / length).collect();
-    TimeCodes { samples, times, frames_per_second }
 }
 
 /// Prims that become nodes, in stage order, and cameras.
@@ -387,60 +358,4 @@ fn owner_of<'py>(
     }
     // A plain scan is no object.
     Ok((splats.clone(), Recorded { background: single, ..Recorded::default() }))
-}
-
-/// Kind of every node: recorded ids first, then free ones in order.
-fn kinds<'py>(reading: &Reading<'_, 'py>, owners: &[Owner<'py>]) -> PyResult<Vec<NodeKind>> {
-    let mut first: BTreeMap<u16, &str> = BTreeMap::new();
-    for owner in owners.iter().filter(|owner| !owner.recorded.background) {
-        let Some(id) = owner.recorded.id else { continue };
-        let original = is_original(reading.pxr, owner)?;
-        match first.get(&id) {
-            None => {
-                first.insert(id, &owner.path);
-            }
-            Some(known) => {
-                let (original, copy) =
-                    if original { (owner.path.as_str(), *known) } else { (*known, owner.path.as_str()) };
-                reading.warn(format!("{copy} is a copy of {original} (instance {id})"));
-                first.insert(id, original);
-            }
-        }
-    }
-    let mut indices =
-        owners.iter().filter_map(|owner| owner.recorded.index).max().map_or(0, |index| index + 1);
-    let mut next = 1_u16;
-    let mut kinds = Vec::with_capacity(owners.len());
-    for owner in owners {
-        let recorded = &owner.recorded;
-        if recorded.background {
-            kinds.push(NodeKind::Background);
-            continue;
-        }
-        let (id, index) = match (recorded.id, recorded.index) {
-            (Some(id), Some(index)) => (id, index),
-            (id, _) => {
-                let id = match id {
-                    Some(id) => id,
-                    None => {
-                        while first.contains_key(&next) && next < u16::MAX {
-                            next += 1;
-                        }
-                        first.insert(next, &owner.path);
-                        next
-                    }
-                };
-                indices += 1;
-                (id, indices - 1)
-            }
-        };
-        kinds.push(NodeKind::Instance { id, index });
-    }
-    Ok(kinds)
-}
-
-/// Whether a prim of ours is still called as its `instance` label says.
-fn is_original<'py>(pxr: &Pxr<'py>, owner: &Owner<'py>) -> PyResult<bool> {
-    let name = text(&owner.prim.call_method0("GetName")?)?;
-    Ok(labels::in_taxonomy(pxr, &owner.prim, tokens::TAXONOMY_INSTANCE)?.contains(&name))
 }
