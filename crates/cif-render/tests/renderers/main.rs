@@ -10,12 +10,14 @@
 //! | `gradients` | the reference against finite differences |
 //! | `instances` | the instance pass of the reference, worked out by hand |
 //! | `metamorphic` | changes to a scene that must not change its image |
+//! | `blend` | values per Gaussian, blended and differentiated |
 //! | `bands`, `tracks` | views drawn in bands, recorded motion |
 //! | `gpu`, `gpu_counts` | stages on the GPU with the reference's own inputs, and what only a GPU does |
 #![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod agreement;
 mod bands;
+mod blend;
 #[cfg(feature = "wgpu")]
 mod gpu;
 #[cfg(feature = "wgpu")]

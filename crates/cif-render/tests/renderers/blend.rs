@@ -4,11 +4,6 @@
 //! Differences are taken where the loss is smooth, see `gradients.rs` for what is skipped. Pixels in the boundary band,
 //! see `agreement.rs`, carry no gradient and are not compared.
 
-mod common;
-#[cfg(feature = "wgpu")]
-#[path = "common/gpu.rs"]
-mod on_gpu;
-
 use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
 use cif_render::reference::Parameters;
 use cif_render::reference::blend::{blend, blend_backward};
@@ -18,9 +13,10 @@ use cif_render::{
     BlendRequest, BlendedImage, Blending, GeometryPath, Gradients, InstanceSettings, OccupancySource,
     RenderSettings,
 };
-use common::{Case, Mismatches, compare_with_differences, pixel_discontinuity, render};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
+
+use crate::support::{Case, Mismatches, compare_with_differences, pixel_discontinuity, render};
 
 const BOTH: [Blending; 2] = [Blending::Color, Blending::Own];
 
