@@ -8,7 +8,8 @@ pub enum Blending {
     #[default]
     Color,
     /// Those of the instance pass: the occupancy, by its own logit or as [`crate::OccupancySource`] says, and a
-    /// transmittance of its own. The view is projected with [`crate::RenderSettings::instances`].
+    /// transmittance of its own. The view is projected with [`crate::RenderSettings::instances`]; a head with another
+    /// logit than the occupancy puts it in that one's place.
     Own,
 }
 
