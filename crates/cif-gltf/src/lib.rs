@@ -40,10 +40,11 @@ mod write;
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::{MotionModel, SceneGraph};
+use cif_scene::{Ending, FormatError, MotionModel, ReadOptions, SceneGraph};
 
+pub use cif_scene::format::{ExportOptions, ExportSummary, Relabelled, SceneFormat};
 pub use error::GltfError;
-pub use relabel::{Relabelled, relabel};
+pub use relabel::relabel;
 
 /// The extension that holds the splats.
 pub const EXTENSION: &str = "KHR_gaussian_splatting";
@@ -64,30 +65,64 @@ pub const INSTANCE_SHARES: &str = "_CIF_INSTANCE_SHARES";
 const GENERATOR: &str = concat!("cif ", env!("CARGO_PKG_VERSION"));
 const GENERATOR_PREFIX: &str = "cif ";
 
-/// How a file is written.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ExportOptions {
-    /// Replace an existing file even when it was not written by cif.
-    pub force: bool,
-}
+/// glTF 2.0: `.glb`, `.gltf`.
+#[derive(Clone, Copy, Debug)]
+pub struct Gltf;
 
-/// What was written.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ExportSummary {
-    /// The `.glb` or `.gltf`.
-    pub path: PathBuf,
-    /// All files: `path`, and the `.bin` beside a `.gltf`.
-    pub files: Vec<PathBuf>,
-    /// Their size together.
-    pub bytes: u64,
-    /// Instances and background.
-    pub nodes: usize,
-    /// Splats over all nodes.
-    pub splats: usize,
-    /// Time samples of the timeline.
-    pub samples: usize,
-    /// What the format does not hold of the scene, object by object.
-    pub not_held: Vec<String>,
+impl SceneFormat for Gltf {
+    fn name(&self) -> &'static str {
+        "glTF"
+    }
+
+    fn key(&self) -> &'static str {
+        "gltf"
+    }
+
+    fn endings(&self) -> &'static [Ending] {
+        const ENDINGS: [Ending; 2] =
+            [Ending::written("glb", "one file"), Ending::written("gltf", "text beside a .bin")];
+        &ENDINGS
+    }
+
+    fn about(&self) -> &'static str {
+        "Objects that deform move as a few rigid parts; the table says what that misses"
+    }
+
+    fn most_expensive_motion(&self) -> Option<MotionModel> {
+        Some(MOST_EXPENSIVE_MOTION)
+    }
+
+    fn files(&self, path: &Path) -> Vec<PathBuf> {
+        write::files(path)
+    }
+
+    fn check_target(&self, path: &Path, options: &ExportOptions) -> Result<(), FormatError> {
+        Ok(check_target(path, *options)?)
+    }
+
+    fn write(
+        &self,
+        graph: &SceneGraph,
+        path: &Path,
+        options: &ExportOptions,
+    ) -> Result<ExportSummary, FormatError> {
+        Ok(export(graph, path, *options)?)
+    }
+
+    fn read(&self, path: &Path, _: ReadOptions) -> Result<SceneGraph, FormatError> {
+        Ok(read_scene(path)?)
+    }
+
+    fn relabel(
+        &self,
+        path: &Path,
+        output: &Path,
+        object: &str,
+        label: &str,
+        category: Option<&str>,
+    ) -> Result<Relabelled, FormatError> {
+        Ok(relabel(path, output, object, label, category)?)
+    }
 }
 
 /// Writes a scene to a `.glb`, or to a `.gltf` with a `.bin` beside it: to temporary files in the same folder,

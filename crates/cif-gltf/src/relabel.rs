@@ -7,20 +7,7 @@ use cif_output::NewFile;
 use cif_scene::files::{FileError, folder_of, target_of};
 use serde_json::{Value, json};
 
-use crate::GltfError;
-
-/// What [`relabel`] changed.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Relabelled {
-    /// Name of the node.
-    pub node: String,
-    /// The label before.
-    pub before: String,
-    /// The label now.
-    pub label: String,
-    /// The class now.
-    pub category: String,
-}
+use crate::{GltfError, Relabelled};
 
 /// Marks of a `.glb`.
 const MAGIC: &[u8; 4] = b"glTF";
@@ -152,7 +139,7 @@ fn edit(
     let Some(ours) = node.pointer_mut("/extras/cif").and_then(Value::as_object_mut) else {
         node["name"] = json!(label);
         return Ok(Relabelled {
-            node: label.to_owned(),
+            object: label.to_owned(),
             before: before_name,
             label: label.to_owned(),
             category: label.to_owned(),
@@ -167,5 +154,5 @@ fn edit(
     };
     ours.insert("label".to_owned(), json!(label));
     ours.insert("category".to_owned(), json!(category));
-    Ok(Relabelled { node: before_name, before, label: label.to_owned(), category })
+    Ok(Relabelled { object: before_name, before, label: label.to_owned(), category })
 }

@@ -294,7 +294,7 @@ fn foreign_files_are_not_replaced() {
     let error = export(&graph, &path, ExportOptions::default()).unwrap_err();
     assert!(error.to_string().contains("was not written by cif"), "{error}");
     assert_eq!(std::fs::read(&path).unwrap(), b"glTF and something else");
-    export(&graph, &path, ExportOptions { force: true }).unwrap();
+    export(&graph, &path, ExportOptions { force: true, ..ExportOptions::default() }).unwrap();
     let text = folder.path().join("other.gltf");
     std::fs::write(text.with_extension("bin"), b"precious").unwrap();
     let error = export(&graph, &text, ExportOptions::default()).unwrap_err();
@@ -328,7 +328,7 @@ fn labels_change_and_everything_else_stays() {
         let files = || std::fs::read_dir(folder.path()).unwrap().count();
         let count = files();
         let done = relabel(&path, &path, &id.to_string(), "blaue Tasse \u{676f}", Some("mug")).unwrap();
-        assert_eq!((&done.node, &done.before), (&instance.name, &instance.label));
+        assert_eq!((&done.object, &done.before), (&instance.name, &instance.label));
         assert_eq!(files(), count, "no temporary file is left");
         let mut expected = before.clone();
         for node in expected.nodes.iter_mut().filter(|node| node.name == instance.name) {

@@ -37,6 +37,12 @@ fn buffer_path(path: &Path) -> PathBuf {
     path.with_extension("bin")
 }
 
+/// A `.glb`, or a `.gltf` and its buffer.
+pub(crate) fn files(path: &Path) -> Vec<PathBuf> {
+    let text = kind_of(path).is_ok_and(|kind| kind == Kind::Text);
+    std::iter::once(path.to_owned()).chain(text.then(|| buffer_path(path))).collect()
+}
+
 pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), GltfError> {
     checked_kind(path, options).map(|_| ())
 }
@@ -135,6 +141,7 @@ pub(crate) fn export(
         splats: graph.nodes.iter().map(|node| node.splats.len()).sum(),
         samples: graph.time_codes.samples.len(),
         not_held: graph.nodes.iter().flat_map(cif_scene::appearance::lost_without_samples).collect(),
+        library: None,
     })
 }
 

@@ -199,11 +199,7 @@ pub fn finish_all(files: impl IntoIterator<Item = NewFile>) -> io::Result<()> {
         live.files.remove(&new.unfinished.path);
     }
     drop(live);
-    #[cfg(unix)]
-    for folder in files.iter().map(|new| folder_of(&new.target)).collect::<BTreeSet<_>>() {
-        // A rename survives a power cut only once the folder is synced; not every file system can.
-        let _ = File::open(folder).and_then(|folder| folder.sync_all());
-    }
+    sync_folders(files.iter().map(|new| new.target.as_path()));
     Ok(())
 }
 
@@ -238,14 +234,52 @@ impl Scratch {
         path.into()
     }
 
-    /// Runs the renames that put the files into their places; [`abandon`] waits for them.
+    /// Moves files and folders of this scratch, `(from, to)`, to their places, one after the other, the one that names the
+    /// others last; [`abandon`] waits for it. What is in the way goes, and so does the folder `unneeded`. When something
+    /// fails, everything is as it was.
     ///
     /// # Errors
-    /// Those of `renames`.
-    pub fn finish<T>(self, renames: impl FnOnce() -> io::Result<T>) -> io::Result<T> {
-        let _live = live();
-        renames()
+    /// What the system says.
+    pub fn replace(self, moves: &[(PathBuf, PathBuf)], unneeded: Option<&Path>) -> io::Result<()> {
+        let live = live();
+        // What was renamed, in order: from, to.
+        let mut done: Vec<(PathBuf, PathBuf)> = Vec::new();
+        let mut rename = |from: &Path, to: &Path| -> io::Result<()> {
+            fs::rename(from, to)?;
+            done.push((from.to_owned(), to.to_owned()));
+            Ok(())
+        };
+        let mut all = || -> io::Result<()> {
+            for (number, (from, to)) in moves.iter().enumerate() {
+                // The last rename replaces a file without a moment in which it is missing.
+                let last = number + 1 == moves.len();
+                if to.is_dir() || (!last && to.exists()) {
+                    rename(to, &self.file(&format!("replaced-{number}")))?;
+                }
+                rename(from, to)?;
+            }
+            unneeded.map_or(Ok(()), |folder| rename(folder, &self.file("unneeded")))
+        };
+        let result = all();
+        if result.is_err() {
+            for (from, to) in done.iter().rev() {
+                fs::rename(to, from)?;
+            }
+        }
+        drop(live);
+        sync_folders(moves.iter().map(|(_, to)| to.as_path()));
+        result
     }
+}
+
+/// Puts renames on the disk: they survive a power cut only once the folder is synced; not every file system can.
+fn sync_folders<'a>(paths: impl Iterator<Item = &'a Path>) {
+    #[cfg(unix)]
+    for folder in paths.map(folder_of).collect::<BTreeSet<_>>() {
+        let _ = File::open(folder).and_then(|folder| folder.sync_all());
+    }
+    #[cfg(not(unix))]
+    drop(paths);
 }
 
 #[cfg(test)]
@@ -291,8 +325,36 @@ mod tests {
         let scratch = Scratch::inside(folder.path()).unwrap();
         fill(&scratch);
         let from = scratch.file("usda");
-        scratch.finish(|| fs::rename(from, folder.path().join("out.usda"))).unwrap();
+        scratch.replace(&[(from, folder.path().join("out.usda"))], None).unwrap();
         assert_eq!(names(folder.path()), ["out.usda"]);
+    }
+
+    #[test]
+    fn files_that_belong_together_are_replaced_together() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        let read = |name: &str| fs::read_to_string(at(name)).unwrap_or_default();
+        let write = |text: &str| {
+            let scratch = Scratch::inside(folder.path()).unwrap();
+            let (arrays, root) = (scratch.folder().unwrap(), scratch.file("usda"));
+            fs::write(arrays.join("a.usdc"), text).unwrap();
+            fs::write(&root, text).unwrap();
+            (scratch, arrays, root)
+        };
+        for text in ["one", "two"] {
+            let (scratch, arrays, root) = write(text);
+            scratch.replace(&[(arrays, at("payloads")), (root, at("out.usda"))], None).unwrap();
+            assert_eq!((read("payloads/a.usdc").as_str(), read("out.usda").as_str()), (text, text));
+        }
+        // The second move fails, so the first is undone.
+        let (scratch, arrays, _) = write("three");
+        let missing = at("missing");
+        assert!(scratch.replace(&[(arrays, at("payloads")), (missing, at("out.usda"))], None).is_err());
+        assert_eq!((read("payloads/a.usdc").as_str(), read("out.usda").as_str()), ("two", "two"));
+        // A file alone makes the folder beside it unneeded.
+        let (scratch, _, root) = write("four");
+        scratch.replace(&[(root, at("out.usda"))], Some(&at("payloads"))).unwrap();
+        assert_eq!((names(folder.path()), read("out.usda").as_str()), (vec!["out.usda".to_owned()], "four"));
     }
 
     #[test]

@@ -17,34 +17,79 @@ mod read;
 mod tests;
 mod write;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use cif_scene::SceneGraph;
+use cif_scene::{Ending, FormatError, MotionModel, ReadOptions, Relabelled, SceneGraph};
 
+pub use cif_scene::format::{ExportOptions, ExportSummary, SceneFormat};
 pub use error::PlyError;
 
-/// How a scene is written.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct ExportOptions {
-    /// Replace existing files even when they were not written by cif.
-    pub force: bool,
-    /// Moment that is written, as time code; `None` takes the first. A sequence does not need it.
-    pub time_code: Option<f64>,
-    /// A file per object, in a folder.
-    pub split: bool,
-    /// A file per sampled time code, numbered by it, in a folder; with `split`, in a folder per object.
-    pub sequence: bool,
-}
+/// Splats as PLY: `.ply`.
+#[derive(Clone, Copy, Debug)]
+pub struct Ply;
 
-/// What was written.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ExportSummary {
-    /// The files.
-    pub files: Vec<PathBuf>,
-    /// Their size together.
-    pub bytes: u64,
-    /// Splats over all files.
-    pub splats: usize,
+impl SceneFormat for Ply {
+    fn name(&self) -> &'static str {
+        "PLY"
+    }
+
+    fn key(&self) -> &'static str {
+        "ply"
+    }
+
+    fn endings(&self) -> &'static [Ending] {
+        const ENDINGS: [Ending; 1] = [Ending::written("ply", "splats")];
+        &ENDINGS
+    }
+
+    fn about(&self) -> &'static str {
+        "The layout that splat viewers and editors read: the whole scene as it stands at one moment. With --ply-split or \
+         --ply-sequence a folder"
+    }
+
+    fn most_expensive_motion(&self) -> Option<MotionModel> {
+        None
+    }
+
+    fn note_on_place(&self) -> Option<&'static str> {
+        Some(
+            "splats of PLY files, which are single precision, stay in that frame; the comments `world offset` and \
+             `world scale` tell it: a place in the world is that in the file / scale + offset",
+        )
+    }
+
+    fn fills_folder(&self, options: &ExportOptions) -> bool {
+        options.split || options.sequence
+    }
+
+    fn check_target(&self, path: &Path, options: &ExportOptions) -> Result<(), FormatError> {
+        Ok(check_target(path, *options)?)
+    }
+
+    fn write(
+        &self,
+        graph: &SceneGraph,
+        path: &Path,
+        options: &ExportOptions,
+    ) -> Result<ExportSummary, FormatError> {
+        Ok(export(graph, path, *options)?)
+    }
+
+    fn read(&self, path: &Path, _: ReadOptions) -> Result<SceneGraph, FormatError> {
+        Ok(read(path)?)
+    }
+
+    fn relabel(
+        &self,
+        path: &Path,
+        _: &Path,
+        _: &str,
+        _: &str,
+        _: Option<&str>,
+    ) -> Result<Relabelled, FormatError> {
+        let what = "PLY holds no labels; label the scene that it was exported from".to_owned();
+        Err(PlyError::Invalid { path: path.to_owned(), what }.into())
+    }
 }
 
 /// Writes a scene: to the file `path` (`.ply`), or with [`ExportOptions::split`] or [`ExportOptions::sequence`]

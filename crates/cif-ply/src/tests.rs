@@ -1,4 +1,5 @@
 use std::io::Write;
+use std::path::PathBuf;
 
 use cif_geometry::spherical_harmonics::{basis, coefficient_count};
 use cif_scene::{CaptureFrame, Motion, PoseSample, Splats};

@@ -87,7 +87,12 @@ pub(crate) fn export(
             check_file(&job.path, options.force)?;
         }
     }
-    let mut summary = ExportSummary { files: Vec::new(), bytes: 0, splats: 0 };
+    let mut summary = ExportSummary {
+        path: path.to_owned(),
+        nodes: graph.nodes.len(),
+        samples: if options.sequence { graph.time_codes.samples.len() } else { 1 },
+        ..ExportSummary::default()
+    };
     for job in jobs {
         if job.nodes.is_empty() {
             if options.split || options.sequence {

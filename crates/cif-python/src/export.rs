@@ -2,7 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::{LabelQuery, MotionModel, MotionSource, SceneGraph, SceneOptions};
+use cif::formats;
+use cif_scene::{
+    ExportOptions, LabelQuery, MotionModel, MotionSource, Payloads, ReadOptions, SceneGraph, SceneOptions,
+};
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -62,11 +65,11 @@ pub(crate) fn motion_model(name: &str) -> PyResult<MotionModel> {
     }
 }
 
-pub(crate) fn payloads(name: &str) -> PyResult<cif_usd::Payloads> {
+pub(crate) fn payloads(name: &str) -> PyResult<Payloads> {
     match name {
-        "by-kind" => Ok(cif_usd::Payloads::ByKind),
-        "separate" => Ok(cif_usd::Payloads::Separate),
-        "single-file" => Ok(cif_usd::Payloads::SingleFile),
+        "by-kind" => Ok(Payloads::ByKind),
+        "separate" => Ok(Payloads::Separate),
+        "single-file" => Ok(Payloads::SingleFile),
         _ => {
             Err(PyValueError::new_err(format!("payloads '{name}': choose by-kind, separate or single-file")))
         }
@@ -90,87 +93,29 @@ fn build(
     }
 }
 
+/// Writes a field in the format that the ending tells; the answer tells of the files.
 pub(crate) fn export<'py>(
     py: Python<'py>,
     field: &Field,
     path: &Path,
     options: &SceneOptions,
     motion: Option<Bound<'py, PyAny>>,
-    export_options: cif_usd::ExportOptions,
+    writing: ExportOptions,
 ) -> PyResult<Bound<'py, PyDict>> {
-    let force = export_options.force;
-    match ending(path).as_str() {
-        "glb" | "gltf" => return export_gltf(py, field, path, options, motion, force),
-        "ply" => return export_ply(py, field, path, options, motion, force),
-        _ => {}
-    }
-    cif_usd::check_target(path, export_options).map_err(cif_error)?;
-    let graph = build(py, field, options, motion)?;
-    let summary = py.detach(|| cif_usd::export(&graph, path, export_options)).map_err(cif_error)?;
-    let out = told(py, &graph, &summary.path, summary.bytes, summary.splats)?;
-    out.set_item("samples", summary.samples)?;
-    out.set_item("usd_version", summary.usd_version)?;
-    out.set_item("motion", arrays::to_python(py, &graph.motion_table())?)?;
-    Ok(out)
-}
-
-/// What every export tells.
-fn told<'py>(
-    py: Python<'py>,
-    graph: &SceneGraph,
-    path: &Path,
-    bytes: u64,
-    splats: usize,
-) -> PyResult<Bound<'py, PyDict>> {
+    let format = formats::format_of(path).map_err(|error| cif_error(error.with_help()))?;
+    format.check_target(path, &writing).map_err(cif_error)?;
+    let graph = build(py, field, &formats::held_by(format, options), motion)?;
+    let summary = py.detach(|| format.write(&graph, path, &writing)).map_err(cif_error)?;
     let out = PyDict::new(py);
-    out.set_item("path", path)?;
-    out.set_item("bytes", bytes)?;
-    out.set_item("splats", splats)?;
-    out.set_item("warnings", &graph.warnings)?;
-    Ok(out)
-}
-
-fn ending(path: &Path) -> String {
-    path.extension().unwrap_or_default().to_string_lossy().to_lowercase()
-}
-
-/// glTF holds no motion splat by splat: what deforms leaves as a few rigid parts.
-fn export_gltf<'py>(
-    py: Python<'py>,
-    field: &Field,
-    path: &Path,
-    options: &SceneOptions,
-    motion: Option<Bound<'py, PyAny>>,
-    force: bool,
-) -> PyResult<Bound<'py, PyDict>> {
-    let export_options = cif_gltf::ExportOptions { force };
-    cif_gltf::check_target(path, export_options).map_err(cif_error)?;
-    let most_expensive_motion = options.most_expensive_motion.min(cif_gltf::MOST_EXPENSIVE_MOTION);
-    let options = SceneOptions { most_expensive_motion, ..options.clone() };
-    let graph = build(py, field, &options, motion)?;
-    let summary = py.detach(|| cif_gltf::export(&graph, path, export_options)).map_err(cif_error)?;
-    let out = told(py, &graph, &summary.path, summary.bytes, summary.splats)?;
+    out.set_item("path", summary.path)?;
     out.set_item("files", summary.files)?;
+    out.set_item("bytes", summary.bytes)?;
+    out.set_item("splats", summary.splats)?;
     out.set_item("samples", summary.samples)?;
+    out.set_item("library", summary.library)?;
+    out.set_item("not_held", summary.not_held)?;
+    out.set_item("warnings", &graph.warnings)?;
     out.set_item("motion", arrays::to_python(py, &graph.motion_table())?)?;
-    Ok(out)
-}
-
-/// The scene as it stands at the first exported frame.
-fn export_ply<'py>(
-    py: Python<'py>,
-    field: &Field,
-    path: &Path,
-    options: &SceneOptions,
-    motion: Option<Bound<'py, PyAny>>,
-    force: bool,
-) -> PyResult<Bound<'py, PyDict>> {
-    let export_options = cif_ply::ExportOptions { force, ..cif_ply::ExportOptions::default() };
-    cif_ply::check_target(path, export_options).map_err(cif_error)?;
-    let graph = build(py, field, options, motion)?;
-    let summary = py.detach(|| cif_ply::export(&graph, path, export_options)).map_err(cif_error)?;
-    let out = told(py, &graph, path, summary.bytes, summary.splats)?;
-    out.set_item("files", summary.files)?;
     Ok(out)
 }
 
@@ -216,7 +161,8 @@ pub(crate) fn query_stage<'py>(
     follow_external: bool,
 ) -> PyResult<Bound<'py, PyAny>> {
     let query = LabelQuery { pattern: label, time_code };
-    let found = cif_usd::query(&path, &query, cif_usd::ReadOptions { follow_external }).map_err(cif_error)?;
+    let format = formats::format_of(&path).map_err(|error| cif_error(error.with_help()))?;
+    let found = format.query(&path, &query, ReadOptions { follow_external }).map_err(cif_error)?;
     arrays::to_python(py, &found)
 }
 

@@ -387,9 +387,13 @@ impl Field {
             background_hulls,
             ..defaults
         };
-        let export_options =
-            cif_usd::ExportOptions { force, payloads: export::payloads(payloads)?, levels_of_detail };
-        export::export(py, self, &path, &options, motion, export_options)
+        let writing = cif_scene::ExportOptions {
+            force,
+            payloads: export::payloads(payloads)?,
+            levels_of_detail,
+            ..cif_scene::ExportOptions::default()
+        };
+        export::export(py, self, &path, &options, motion, writing)
     }
 }
 

@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-use cif::graph_file;
+use cif::formats;
+use cif_scene::ReadOptions;
 use pyo3::prelude::*;
 
 use crate::arrays;
@@ -25,7 +26,7 @@ pub(crate) fn import_scene<'py>(
     let base = base.as_deref();
     let (inner, changes) = py
         .detach(|| {
-            let graph = graph_file::read(&path).map_err(|error| error.to_string())?;
+            let graph = formats::read(&path, ReadOptions::default()).map_err(|error| error.to_string())?;
             let source = name_of(&path);
             match base {
                 Some(base) => cif_scene::import_edits(&base.inner, &graph, &source, force_base)
@@ -43,7 +44,7 @@ pub(crate) fn import_scene<'py>(
 pub(crate) fn diff<'py>(py: Python<'py>, before: PathBuf, after: PathBuf) -> PyResult<Bound<'py, PyAny>> {
     let changes = py
         .detach(|| {
-            graph_file::read_both(&before, &after)
+            formats::read_both(&before, &after)
                 .map(|[before, after]| cif_scene::diff::diff(&before, &after))
                 .map_err(|error| error.to_string())
         })

@@ -27,6 +27,7 @@
 //! | [`query`] | nodes by label |
 //! | [`diff`] | what differs between two graphs, object by object |
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
+//! | [`format`](mod@format) | what a file format does for graphs |
 //! | [`assemble`](mod@assemble) | graphs from what readers find in files |
 //! | [`field_from_graph`] | the way back: Gaussians, recorded motion and instances of a graph |
 //!
@@ -49,6 +50,7 @@ pub mod error;
 pub mod extent;
 pub mod field_from_graph;
 pub mod files;
+pub mod format;
 pub mod frames;
 pub mod graph;
 pub mod keys;
@@ -81,6 +83,9 @@ pub use diff::{ChangeKind, ObjectChange, SceneDiff};
 pub use edits::import_edits;
 pub use error::SceneError;
 pub use field_from_graph::field_from_graph;
+pub use format::{
+    Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
+};
 pub use graph::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample,
     IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion,

@@ -45,64 +45,91 @@ mod tests;
 #[cfg(feature = "python")]
 mod write;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use cif_scene::{LabelMatch, LabelQuery, ObjectMatch, ObjectQuery, SceneGraph};
+use cif_scene::{
+    Ending, FormatError, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, SceneGraph,
+};
 
+pub use cif_scene::format::{ExportOptions, ExportSummary, Payloads, ReadOptions, Relabelled, SceneFormat};
 pub use error::UsdError;
 
-/// Where the arrays of instances go.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Payloads {
-    /// Beside `.usda`, so that it stays readable; inside `.usdc` and `.usdz`.
-    #[default]
-    ByKind,
-    /// One `.usdc` per instance in a folder beside the stage: `out.payloads` for `out.usda`, `out.usdc.payloads` for
-    /// `out.usdc`.
-    Separate,
-    /// All in the stage itself.
-    SingleFile,
-}
+/// Stages: `.usda`, `.usdc`, `.usdz`.
+#[derive(Clone, Copy, Debug)]
+pub struct Usd;
 
-/// How a stage is written.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ExportOptions {
-    /// Replace an existing file even when it was not written by cif.
-    pub force: bool,
-    /// Where the arrays of instances go.
-    pub payloads: Payloads,
-    /// Write the variants `half` and `quarter` of the set `lod` beside `full`.
-    pub levels_of_detail: bool,
-}
-
-impl Default for ExportOptions {
-    fn default() -> Self {
-        Self { force: false, payloads: Payloads::default(), levels_of_detail: true }
+impl SceneFormat for Usd {
+    fn name(&self) -> &'static str {
+        "USD"
     }
-}
 
-/// How a stage is read.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct ReadOptions {
-    /// Follow sublayers, references and payloads that lie outside the folder of the stage.
-    pub follow_external: bool,
-}
+    fn key(&self) -> &'static str {
+        "usd"
+    }
 
-/// What was written.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct ExportSummary {
-    /// The file.
-    pub path: PathBuf,
-    /// Its size, payloads included.
-    pub bytes: u64,
-    /// Instances and background.
-    pub nodes: usize,
-    /// Splats over all nodes.
-    pub splats: usize,
-    /// Time samples of the timeline.
-    pub samples: usize,
-    /// Version of usd-core that wrote it, e.g. `26.11`.
-    pub usd_version: String,
+    fn endings(&self) -> &'static [Ending] {
+        const ENDINGS: [Ending; 4] = [
+            Ending::written("usda", "text"),
+            Ending::written("usdc", "binary"),
+            Ending::written("usdz", "package"),
+            Ending { name: "usd", kind: "text or binary", written: false },
+        ];
+        &ENDINGS
+    }
+
+    fn about(&self) -> &'static str {
+        "One prim per object"
+    }
+
+    fn most_expensive_motion(&self) -> Option<MotionModel> {
+        Some(MotionModel::Dense)
+    }
+
+    fn check_target(&self, path: &Path, options: &ExportOptions) -> Result<(), FormatError> {
+        Ok(check_target(path, *options)?)
+    }
+
+    fn write(
+        &self,
+        graph: &SceneGraph,
+        path: &Path,
+        options: &ExportOptions,
+    ) -> Result<ExportSummary, FormatError> {
+        Ok(export(graph, path, *options)?)
+    }
+
+    fn read(&self, path: &Path, options: ReadOptions) -> Result<SceneGraph, FormatError> {
+        Ok(read_scene_with(path, options)?)
+    }
+
+    fn relabel(
+        &self,
+        path: &Path,
+        output: &Path,
+        object: &str,
+        label: &str,
+        category: Option<&str>,
+    ) -> Result<Relabelled, FormatError> {
+        Ok(relabel(path, output, object, label, category)?)
+    }
+
+    fn query(
+        &self,
+        path: &Path,
+        wanted: &LabelQuery,
+        options: ReadOptions,
+    ) -> Result<Vec<LabelMatch>, FormatError> {
+        Ok(query(path, wanted, options)?)
+    }
+
+    fn search(
+        &self,
+        path: &Path,
+        wanted: &ObjectQuery,
+        options: ReadOptions,
+    ) -> Result<Vec<ObjectMatch>, FormatError> {
+        Ok(search(path, wanted, options)?)
+    }
 }
 
 /// Writes a scene to a `.usda`, `.usdc` or `.usdz` file: to a temporary file beside it, then renamed.
@@ -166,19 +193,6 @@ pub fn search(path: &Path, wanted: &ObjectQuery, options: ReadOptions) -> Result
     }
 }
 
-/// What [`relabel`] changed.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Relabelled {
-    /// Path of the prim.
-    pub path: String,
-    /// The label before.
-    pub before: String,
-    /// The label now.
-    pub label: String,
-    /// The class now.
-    pub category: String,
-}
-
 /// Gives an object of a stage another label, and another class where one is given: as semantic labels, display name
 /// and user property. `object` is a mask value, a unique name or a prim path. The root layer is edited in a copy
 /// beside `output`, which then takes its place; `output` may be `path` itself.
@@ -200,14 +214,6 @@ pub fn relabel(
         let _ = (path, output, object, label, category);
         Err(UsdError::NotBuilt)
     }
-}
-
-/// [`export`] for callers that have asked already whether a file there may go: replaces it.
-///
-/// # Errors
-/// As [`export`].
-pub fn write_stage(graph: &SceneGraph, path: &Path) -> Result<(), UsdError> {
-    export(graph, path, ExportOptions { force: true, ..ExportOptions::default() }).map(|_| ())
 }
 
 /// Reads a stage as a scene graph: one of ours exactly, also when it was edited, and any stage with Gaussian splats.
@@ -248,25 +254,6 @@ pub fn read_scene_with(path: &Path, options: ReadOptions) -> Result<SceneGraph, 
     {
         let _ = (path, options);
         Err(UsdError::NotBuilt)
-    }
-}
-
-/// [`query`] by normalised time in [0, 1] instead of time code; a stage of ours knows when its samples are,
-/// others are taken to run evenly from their first to their last time code.
-///
-/// # Errors
-/// As [`query`].
-pub fn query_stage(path: &Path, pattern: &str, time: Option<f64>) -> Result<Vec<LabelMatch>, UsdError> {
-    let of = |time_code| LabelQuery { pattern: pattern.to_owned(), time_code };
-    #[cfg(feature = "python")]
-    return match time {
-        Some(time) => query(path, &of(Some(read::query::time_code(path, time)?)), ReadOptions::default()),
-        None => query(path, &of(None), ReadOptions::default()),
-    };
-    #[cfg(not(feature = "python"))]
-    {
-        let _ = time;
-        query(path, &of(None), ReadOptions::default())
     }
 }
 

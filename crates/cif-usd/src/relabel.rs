@@ -80,7 +80,7 @@ pub(crate) fn relabel(
         }
         Ok(done)
     })?;
-    scratch.finish(|| std::fs::rename(&copy, &target)).map_err(unwritable)?;
+    scratch.replace(&[(copy, target)], None).map_err(unwritable)?;
     Ok(done)
 }
 
@@ -156,7 +156,7 @@ fn edit(pxr: &Pxr<'_>, prim: &Bound<'_, PyAny>, label: &str, category: Option<&s
     set(&user, label)?;
     prim.call_method1("SetDisplayName", (label,))?;
     Ok(Relabelled {
-        path: prim.call_method0("GetPath")?.str()?.extract()?,
+        object: prim.call_method0("GetPath")?.str()?.extract()?,
         before: old_label.unwrap_or_default(),
         label: label.to_owned(),
         category,

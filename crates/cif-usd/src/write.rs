@@ -124,15 +124,21 @@ pub(crate) fn export(
         let written =
             write(pxr, graph, &target, options, &folder).map_err(|error| failed(reason(pxr.py, &error)))?;
         let bytes = written.sync().map_err(system)?;
-        let may_go = is_folder_of_ours(pxr, &payloads_of(&target.path));
-        scratch.finish(|| written.replace(&target.path, &folder, may_go)).map_err(system)?;
+        let place = payloads_of(&target.path);
+        let unneeded = written.payloads.is_none() && place.is_dir() && is_folder_of_ours(pxr, &place);
+        let mut moves: Vec<(PathBuf, PathBuf)> = Vec::new();
+        moves.extend(written.payloads.map(|payloads| (payloads, place.clone())));
+        moves.push((written.root, target.path));
+        scratch.replace(&moves, unneeded.then_some(place.as_path())).map_err(system)?;
         Ok(ExportSummary {
             path: path.to_owned(),
+            files: vec![path.to_owned()],
             bytes,
             nodes: graph.nodes.len(),
             splats: graph.nodes.iter().map(|node| node.splats.len()).sum(),
             samples: graph.time_codes.samples.len(),
-            usd_version: pxr.version.clone(),
+            library: Some(format!("usd-core {}", pxr.version)),
+            ..ExportSummary::default()
         })
     })
 }
@@ -158,32 +164,6 @@ impl Written {
             }
         }
         Ok(bytes)
-    }
-
-    /// Moves the stage into place. Old payloads step aside first and come back when something fails; `may_go`
-    /// tells whether payloads that the new stage does not need may go.
-    fn replace(&self, path: &Path, scratch: &Path, may_go: bool) -> std::io::Result<()> {
-        let (place, aside) = (payloads_of(path), scratch.join("replaced"));
-        let steps_aside = place.exists() && (self.payloads.is_some() || (place.is_dir() && may_go));
-        if steps_aside {
-            fs::rename(&place, &aside)?;
-        }
-        let moved = match &self.payloads {
-            Some(folder) => fs::rename(folder, &place),
-            None => Ok(()),
-        };
-        let moved = moved.and_then(|()| fs::rename(&self.root, path));
-        if moved.is_err() {
-            if let Some(folder) = &self.payloads
-                && place.exists()
-            {
-                fs::rename(&place, folder)?;
-            }
-            if steps_aside {
-                fs::rename(&aside, &place)?;
-            }
-        }
-        moved
     }
 }
 

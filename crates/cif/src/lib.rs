@@ -16,7 +16,7 @@
 //! | [`pictures`] | instance, depth and error colours, panels, PNG files |
 //! | `backend` | whether the processor or a GPU does the work, behind the feature `wgpu` |
 //! | [`camera_file`] | views that no capture has |
-//! | [`graph_file`] | scenes of any format as scene graphs |
+//! | [`formats`] | the formats that scenes are exchanged in |
 //! | [`mask_query`] | which objects 2D masks show |
 //! | [`detector`] | a command that makes such masks |
 //! | [`ground_truth`] | exported motion against known motion |
@@ -31,7 +31,7 @@ pub mod commands;
 pub mod destination;
 pub mod detector;
 pub mod error;
-pub mod graph_file;
+pub mod formats;
 pub mod ground_truth;
 pub mod hard_captures;
 pub mod interrupt;

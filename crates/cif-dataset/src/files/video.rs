@@ -5,6 +5,8 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use cif_output::Scratch;
+
 use super::listing;
 use crate::Error;
 
@@ -37,15 +39,15 @@ fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Resu
             }
         }
     }
-    let (cache, partial) = match scratch(&caches[0]) {
-        Ok(partial) => (&caches[0], partial),
-        Err(_) => (&caches[1], scratch(&caches[1]).map_err(Error::write(&caches[1]))?),
+    let (cache, (scratch, partial)) = match begun(&caches[0]) {
+        Ok(begun) => (&caches[0], begun),
+        Err(_) => (&caches[1], begun(&caches[1]).map_err(Error::write(&caches[1]))?),
     };
     let output = Command::new(ffmpeg)
         .args(["-nostdin", "-v", "error", "-i"])
         .arg(video)
         .args(["-start_number", "0"])
-        .arg(partial.path().join("%04d.png"))
+        .arg(partial.join("%04d.png"))
         .output();
     let output = match output {
         Ok(output) => output,
@@ -60,14 +62,11 @@ fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Resu
     if !output.status.success() {
         return Err(failed(words.lines().last().unwrap_or("it gave no reason")));
     }
-    if listing::images(partial.path())?.is_empty() {
+    if listing::images(&partial)?.is_empty() {
         return Err(failed("it holds no frame"));
     }
     let folder = cache.join(&name);
-    if folder.is_dir() {
-        std::fs::remove_dir_all(&folder).map_err(Error::write(&folder))?;
-    }
-    std::fs::rename(partial.keep(), &folder).map_err(Error::write(&folder))?;
+    scratch.replace(&[(partial, folder.clone())], None).map_err(Error::write(&folder))?;
     numbered(&folder)
 }
 
@@ -78,10 +77,12 @@ fn numbered(folder: &Path) -> Result<Vec<PathBuf>, Error> {
     Ok(found)
 }
 
-/// A folder beside the final one, removed again unless kept.
-fn scratch(cache: &Path) -> io::Result<tempfile::TempDir> {
+/// An empty folder beside the final one, removed again unless it takes its place.
+fn begun(cache: &Path) -> io::Result<(Scratch, PathBuf)> {
     std::fs::create_dir_all(cache)?;
-    tempfile::Builder::new().prefix(".partial").tempdir_in(cache)
+    let scratch = Scratch::inside(cache)?;
+    let folder = scratch.folder()?;
+    Ok((scratch, folder))
 }
 
 /// FNV-1a of the path, so that captures do not share a cache.

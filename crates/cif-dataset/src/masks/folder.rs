@@ -47,12 +47,6 @@ impl NewFolder {
     /// When it cannot be moved.
     pub(super) fn finish(self) -> Result<(), Error> {
         let Self { scratch, partial, place } = self;
-        let renames = || {
-            if place.is_dir() {
-                std::fs::remove_dir(&place)?;
-            }
-            std::fs::rename(&partial, &place)
-        };
-        scratch.finish(renames).map_err(Error::write(&place))
+        scratch.replace(&[(partial, place.clone())], None).map_err(Error::write(&place))
     }
 }

@@ -27,45 +27,6 @@ pub(crate) fn query(
     })
 }
 
-/// Time code of a normalised time.
-pub(crate) fn time_code(path: &Path, time: f64) -> Result<f64, UsdError> {
-    pxr::with(|pxr| {
-        let stage = open(pxr, path, ReadOptions::default())?;
-        let range = || -> PyResult<(Vec<f64>, Vec<f64>)> {
-            let start: f64 = stage.call_method0("GetStartTimeCode")?.extract()?;
-            let end: f64 = stage.call_method0("GetEndTimeCode")?.extract()?;
-            let data = stage.call_method0("GetRootLayer")?.getattr("customLayerData")?;
-            if data.contains(tokens::CIF)? {
-                let ours = data.get_item(tokens::CIF)?;
-                if ours.contains(tokens::SAMPLE_TIMES)? && ours.contains(tokens::SAMPLE_CODES)? {
-                    let list = |key: &str| -> PyResult<Vec<f64>> {
-                        ours.get_item(key)?.try_iter()?.map(|value| value?.extract()).collect()
-                    };
-                    return Ok((list(tokens::SAMPLE_TIMES)?, list(tokens::SAMPLE_CODES)?));
-                }
-            }
-            Ok((vec![0.0, 1.0], vec![start, end]))
-        };
-        let (times, codes) = range()
-            .map_err(|error| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) })?;
-        Ok(interpolate(&times, &codes, time))
-    })
-}
-
-/// Linear between samples, held outside them.
-fn interpolate(times: &[f64], codes: &[f64], time: f64) -> f64 {
-    let count = times.len().min(codes.len());
-    let after = times[..count].partition_point(|sample| *sample <= time);
-    if after == 0 || count == 1 {
-        return codes.first().copied().unwrap_or(0.0);
-    }
-    if after == count {
-        return codes[count - 1];
-    }
-    let fraction = (time - times[after - 1]) / (times[after] - times[after - 1]);
-    codes[after - 1] + fraction * (codes[after] - codes[after - 1])
-}
-
 /// Matching prims, and all labels of the stage.
 fn search<'py>(
     pxr: &Pxr<'py>,

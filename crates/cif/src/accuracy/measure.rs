@@ -7,7 +7,7 @@ use cif_field::{Checkpoint, Field};
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, RenderSettings, RenderedImage, reference};
-use cif_scene::{SceneOptions, Tolerance};
+use cif_scene::{ExportOptions, SceneFormat, SceneOptions, Tolerance};
 use cif_train::metrics::image::psnr;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, Scores, evaluate, trained_settings};
 use cif_train::{
@@ -19,6 +19,7 @@ use image::{ExtendedColorType, ImageEncoder};
 
 use super::record::{Folder, Record};
 use crate::error::Error;
+use crate::formats;
 use crate::interrupt;
 use crate::output;
 use crate::pictures::{Picture, instance_picture, rgb_picture};
@@ -318,19 +319,16 @@ pub fn render(field: &Field, dataset: &Dataset, quality: Quality, record: &mut R
 pub fn export(field: &Field, tolerance: Tolerance, record: &mut Record) -> Result<(), Error> {
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
-    let options = SceneOptions {
-        tolerance,
-        most_expensive_motion: cif_gltf::MOST_EXPENSIVE_MOTION,
-        ..SceneOptions::default()
-    };
+    let format: &dyn SceneFormat = &cif_gltf::Gltf;
+    let options = formats::held_by(format, &SceneOptions { tolerance, ..SceneOptions::default() });
     let clock = SystemClock::start();
     let start = clock.now();
     let graph = cif_scene::build(field, &options).map_err(Error::plain)?;
     let path = folder.path().join("rung.glb");
-    cif_gltf::export(&graph, &path, cif_gltf::ExportOptions { force: true }).map_err(Error::plain)?;
+    let written = format.write(&graph, &path, &ExportOptions::default()).map_err(Error::plain)?;
     let spent = clock.now() - start;
     (record.cpu_s, record.wall_s) = (spent.cpu_s, spent.wall_s);
-    record.bytes = Some(std::fs::metadata(&path).map_err(Error::io("read", &path))?.len());
+    record.bytes = Some(written.bytes);
     let residual = graph.motion_table().iter().map(|row| row.motion.residual.decisive).fold(0.0, f64::max);
     record.residual = Some(residual);
     Ok(())

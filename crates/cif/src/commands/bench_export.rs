@@ -5,13 +5,14 @@ use std::time::Instant;
 
 use cif_field::Field;
 use cif_scene::report::ReportRow;
-use cif_scene::{MotionModel, SceneGraph, SceneOptions, Tolerance};
+use cif_scene::{ExportOptions, MotionModel, SceneFormat, SceneGraph, SceneOptions, Tolerance};
 use clap::Args;
 use serde::Serialize;
 
 use super::model_options::ModelOptions;
 use super::{motion_table, scene};
 use crate::error::Error;
+use crate::formats::{self, FORMATS};
 use crate::output::{self, Outputs};
 
 /// Tell what accuracy of motion costs
@@ -91,72 +92,33 @@ struct Simplified {
     nodes: Vec<ReportRow>,
 }
 
-/// A format: its name, the ending of its files, what it can hold, and what writes them.
-struct Format {
-    name: &'static str,
-    ending: &'static str,
-    most_expensive_motion: MotionModel,
-    /// Bytes written, payloads included.
-    write: fn(&SceneGraph, &Path) -> Result<u64, String>,
-}
-
-/// Formats that hold moving objects.
-const FORMATS: [Format; 2] = [
-    Format { name: "USD", ending: "usdc", most_expensive_motion: MotionModel::Dense, write: write_usd },
-    Format {
-        name: "glTF",
-        ending: "glb",
-        most_expensive_motion: cif_gltf::MOST_EXPENSIVE_MOTION,
-        write: write_gltf,
-    },
-];
-
-fn write_usd(graph: &SceneGraph, path: &Path) -> Result<u64, String> {
-    cif_usd::export(graph, path, cif_usd::ExportOptions::default())
-        .map(|written| written.bytes)
-        .map_err(|error| error.to_string())
-}
-
-fn write_gltf(graph: &SceneGraph, path: &Path) -> Result<u64, String> {
-    cif_gltf::export(graph, path, cif_gltf::ExportOptions::default())
-        .map(|written| written.bytes)
-        .map_err(|error| error.to_string())
-}
-
-impl Format {
-    /// Writes a rung; a graph with motion that the format does not know is built again without it.
-    fn measure(
-        &self,
-        field: &Field,
-        graph: &SceneGraph,
-        options: &SceneOptions,
-        path: &Path,
-    ) -> Result<WrittenFile, String> {
-        let start = Instant::now();
-        let rebuilt = if graph.nodes.iter().any(|node| node.model() > self.most_expensive_motion) {
-            let most_expensive_motion = self.most_expensive_motion;
-            let options = SceneOptions { most_expensive_motion, ..options.clone() };
-            Some(cif_scene::build(field, &options).map_err(|error| error.to_string())?)
-        } else {
-            None
-        };
-        let graph_seconds = start.elapsed().as_secs_f64();
-        let start = Instant::now();
-        let bytes = (self.write)(rebuilt.as_ref().unwrap_or(graph), path)?;
-        let seconds = start.elapsed().as_secs_f64();
-        let nodes = rebuilt.as_ref().unwrap_or(graph).motion_table();
-        let share = |row: &ReportRow| row.motion.residual.decisive / row.motion.tolerance;
-        let shares: Vec<f64> = nodes.iter().map(share).filter(|share| share.is_finite()).collect();
-        Ok(WrittenFile {
-            format: self.name,
-            bytes,
-            seconds,
-            samples: nodes.iter().map(|row| row.motion.samples).sum(),
-            worst_share: shares.iter().copied().fold(0.0, f64::max),
-            nodes_outside: shares.iter().filter(|share| **share > 1.0).count(),
-            simplified: rebuilt.is_some().then_some(Simplified { graph_seconds, nodes }),
-        })
-    }
+/// Writes a rung; a graph with motion that the format does not know is built again without it.
+fn measure(
+    format: &dyn SceneFormat,
+    field: &Field,
+    graph: &SceneGraph,
+    options: &SceneOptions,
+    path: &Path,
+) -> Result<WrittenFile, String> {
+    let start = Instant::now();
+    let rebuilt = formats::rebuilt_for(format, field, graph, options).map_err(|error| error.to_string())?;
+    let graph_seconds = start.elapsed().as_secs_f64();
+    let start = Instant::now();
+    let held = rebuilt.as_ref().unwrap_or(graph);
+    let written = format.write(held, path, &ExportOptions::default()).map_err(|error| error.to_string())?;
+    let seconds = start.elapsed().as_secs_f64();
+    let nodes = held.motion_table();
+    let share = |row: &ReportRow| row.motion.residual.decisive / row.motion.tolerance;
+    let shares: Vec<f64> = nodes.iter().map(share).filter(|share| share.is_finite()).collect();
+    Ok(WrittenFile {
+        format: format.name(),
+        bytes: written.bytes,
+        seconds,
+        samples: nodes.iter().map(|row| row.motion.samples).sum(),
+        worst_share: shares.iter().copied().fold(0.0, f64::max),
+        nodes_outside: shares.iter().filter(|share| **share > 1.0).count(),
+        simplified: rebuilt.is_some().then_some(Simplified { graph_seconds, nodes }),
+    })
 }
 
 pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
@@ -170,7 +132,8 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
     // A format that does not work is told once, and left out of all rungs.
-    let mut formats: Vec<&Format> = if command.no_files { Vec::new() } else { FORMATS.iter().collect() };
+    let moving = FORMATS.into_iter().filter(|format| format.most_expensive_motion().is_some());
+    let mut formats: Vec<&dyn SceneFormat> = if command.no_files { Vec::new() } else { moving.collect() };
     let mut rungs = Vec::new();
     for &tolerance in &command.tolerances {
         let options = command.models.apply(&field, SceneOptions { tolerance, ..SceneOptions::default() });
@@ -178,14 +141,17 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
         let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
         let mut rung = Rung::of(tolerance, start.elapsed().as_secs_f64(), &graph);
         formats.retain(|format| {
-            let path = folder.path().join(format!("rung_{}.{}", rungs.len(), format.ending));
-            match format.measure(&field, &graph, &options, &path) {
+            // One file without text, which is what takes the least room.
+            let ending = format.endings().iter().find(|ending| ending.kind != "text");
+            let ending = ending.map_or_else(|| format.key(), |ending| ending.name);
+            let path = folder.path().join(format!("rung_{}.{ending}", rungs.len()));
+            match measure(*format, &field, &graph, &options, &path) {
                 Ok(file) => {
                     rung.files.push(file);
                     true
                 }
                 Err(reason) => {
-                    eprintln!("note: no {} files are measured: {reason}", format.name);
+                    eprintln!("note: no {} files are measured: {reason}", format.name());
                     false
                 }
             }

@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::json;
 
 use crate::error::Error;
-use crate::graph_file;
+use crate::formats;
 
 /// Tell what differs between two scenes, object by object
 #[derive(Debug, Args)]
@@ -30,7 +30,7 @@ pub(super) struct Diff {
 }
 
 pub(super) fn run(command: &Diff) -> Result<(), Error> {
-    let [before, after] = graph_file::read_both(&command.before, &command.after)?;
+    let [before, after] = formats::read_both(&command.before, &command.after)?;
     let changes = cif_scene::diff::diff(&before, &after);
     if command.json {
         println!("{:#}", json!(changes));

@@ -1,17 +1,18 @@
 //! `cif export`: a scene as USD, glTF and PLY.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use cif_field::Field;
-use cif_scene::{FrameRange, SceneGraph, SceneOptions, Tolerance, UpAxis};
+use cif_scene::{FrameRange, MotionModel, SceneFormat, SceneGraph, SceneOptions, Tolerance, UpAxis};
 use clap::{ArgGroup, Args};
 use serde_json::json;
 
-use super::export_gltf::Gltf;
-use super::export_ply::Ply;
 use super::model_options::ModelOptions;
+use super::query::code_at;
+use super::targets::{Targets, Writing};
 use super::{motion_table, scene};
 use crate::error::Error;
+use crate::formats::{self, FORMATS};
 use crate::ground_truth::{self, MotionError};
 use crate::output::{self, Outputs};
 
@@ -19,7 +20,7 @@ use crate::output::{self, Outputs};
 #[derive(Debug, Args)]
 #[command(
     group = ArgGroup::new("result").required(true).multiple(true)
-        .args(["usd", "gltf", "ply", "report", "report_json"]),
+        .args(FORMATS.iter().map(|format| format.key()).chain(["report", "report_json"])),
     after_help = "\
 Every object gets the cheapest motion that stays inside the tolerance: static, rigid, parts (a few
 rigid bodies), or dense (a path for every splat). Samples that interpolation reproduces inside the
@@ -36,13 +37,10 @@ pub(super) struct Export {
     /// Trained scene
     #[arg(value_name = "SCENE.cif")]
     scene: PathBuf,
-    /// Stage to write; the ending decides: .usda (text), .usdc (binary), .usdz (package)
-    #[arg(long, value_name = "OUT.usda|usdc|usdz")]
-    usd: Option<PathBuf>,
     #[command(flatten)]
-    gltf: Gltf,
+    targets: Targets,
     #[command(flatten)]
-    ply: Ply,
+    writing: Writing,
     /// Largest error of a simplified motion: 0.2% of the object's size, or 0.002 in world units
     #[arg(long, default_value = "0.2%", value_name = "TOLERANCE")]
     tolerance: Tolerance,
@@ -67,16 +65,6 @@ pub(super) struct Export {
     /// Splats with less instance mass are background too [default: 0, the share of labelled pixels decides]
     #[arg(long, value_name = "MASS")]
     background_threshold: Option<f32>,
-    /// Put the arrays of every object into a file of its own in OUT.usdc.payloads, loaded on demand;
-    /// .usda does so anyway
-    #[arg(long, conflicts_with = "single_file")]
-    payloads: bool,
-    /// Keep everything in one file; .usdc and .usdz do so anyway
-    #[arg(long)]
-    single_file: bool,
-    /// Leave out the variants with half and a quarter of the splats
-    #[arg(long)]
-    no_lod: bool,
     /// Most points of an object's stand-in; 0 for none
     #[arg(long, value_name = "N")]
     proxy_points: Option<usize>,
@@ -103,37 +91,41 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
     command.ground_truth.as_deref().map_or(Ok(()), |truth| outputs.reads(truth))?;
-    if let Some(path) = &command.usd {
-        check_stage_name(path)?;
-        outputs.file(path)?;
-        cif_usd::check_target(path, writing(command)).map_err(Error::plain)?;
-    }
     let report_to_stdout = command.report_json.as_deref().is_some_and(output::is_stdout);
     if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
         outputs.text(path)?;
     }
-    command.gltf.check(command.force, &mut outputs)?;
-    command.ply.check(command.force, &mut outputs)?;
+    command.targets.check(&command.writing, command.force, &mut outputs)?;
     let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
     let field = scene::load(&command.scene)?;
-    scene::note_frame(&scene::frame(&field)?, command.ply.ply.is_some());
-    let options = options(command, &field);
-    let only_gltf = command.gltf.gltf.is_some() && command.usd.is_none() && command.ply.ply.is_none();
-    let options = if only_gltf { Gltf::options(&options) } else { options };
+    let notes = command.targets.iter().filter_map(|target| target.format.note_on_place());
+    scene::note_frame(&scene::frame(&field)?, notes);
+    // The graph is as rich as the richest of the formats.
+    let asked = options(command, &field);
+    let held = command.targets.iter().map(|target| formats::held_by(target.format, &asked));
+    let options = held.max_by_key(|held| held.most_expensive_motion).unwrap_or_else(|| asked.clone());
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }
-    let written = match &command.usd {
-        Some(path) => Some(cif_usd::export(&graph, path, writing(command)).map_err(Error::plain)?),
-        None => None,
-    };
-    command.ply.write(&graph, command.force)?;
-    let of_gltf = command.gltf.write(&field, &graph, &options, command.force)?;
+    let codes = &graph.time_codes;
+    let writing = command.writing.options(command.force, |time| code_at(&codes.times, &codes.samples, time));
+    let mut rebuilt: Vec<(&dyn SceneFormat, SceneGraph)> = Vec::new();
+    for target in command.targets.iter() {
+        let other = formats::rebuilt_for(target.format, &field, &graph, &options)?;
+        let held = other.as_ref().unwrap_or(&graph);
+        let written = target.format.write(held, &target.path, &writing).map_err(Error::plain)?;
+        target.tell(&written);
+        rebuilt.extend(other.map(|graph| (target.format, graph)));
+    }
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
-    let of_gltf_table = of_gltf.as_ref().map(SceneGraph::motion_table);
-    let tables =
-        json!({ "motion": graph.motion_table(), "gltf_motion": of_gltf_table, "ground_truth": errors });
+    let mut tables = json!({ "motion": graph.motion_table(), "ground_truth": errors });
+    let simplifies = |most: MotionModel| most < MotionModel::Dense;
+    for format in FORMATS.into_iter().filter(|format| format.most_expensive_motion().is_some_and(simplifies))
+    {
+        let table = rebuilt.iter().find(|(other, _)| other.key() == format.key());
+        tables[format!("{}_motion", format.key())] = json!(table.map(|(_, graph)| graph.motion_table()));
+    }
     if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
         output::write_file(path, format!("{tables:#}\n").as_bytes())?;
     }
@@ -141,35 +133,15 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         println!("{tables:#}");
     } else {
         print_motion(&graph);
-        if let Some(of_gltf) = &of_gltf {
-            println!("motion in the glTF, which holds no motion splat by splat:");
-            print_motion(of_gltf);
+        for (format, graph) in &rebuilt {
+            println!("motion in the {}, which holds no motion splat by splat:", format.name());
+            print_motion(graph);
         }
         if let Some(errors) = &errors {
             print_errors(errors);
         }
     }
-    if let Some(written) = written {
-        eprintln!(
-            "wrote {}: {} prims, {} splats, {} time samples, {:.1} MB (usd-core {})",
-            written.path.display(),
-            written.nodes,
-            written.splats,
-            written.samples,
-            written.bytes as f64 / 1e6,
-            written.usd_version
-        );
-    }
     Ok(())
-}
-
-fn writing(command: &Export) -> cif_usd::ExportOptions {
-    let payloads = match (command.payloads, command.single_file) {
-        (true, _) => cif_usd::Payloads::Separate,
-        (_, true) => cif_usd::Payloads::SingleFile,
-        _ => cif_usd::Payloads::ByKind,
-    };
-    cif_usd::ExportOptions { force: command.force, payloads, levels_of_detail: !command.no_lod }
 }
 
 fn options(command: &Export, field: &Field) -> SceneOptions {
@@ -189,17 +161,6 @@ fn options(command: &Export, field: &Field) -> SceneOptions {
             ..defaults
         },
     )
-}
-
-fn check_stage_name(path: &Path) -> Result<(), Error> {
-    let extension = path.extension().unwrap_or_default().to_string_lossy().to_lowercase();
-    if ["usda", "usdc", "usdz"].contains(&extension.as_str()) {
-        return Ok(());
-    }
-    Err(Error::usage(
-        format!("--usd {}: the ending decides the format", path.display()),
-        "end the name in .usda (text), .usdc (binary) or .usdz (package)",
-    ))
 }
 
 fn print_motion(graph: &SceneGraph) {

@@ -2,13 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
+use cif_scene::ReadOptions;
 use clap::Args;
 use serde_json::json;
 
 use super::diff::{cameras, print_objects};
 use super::scene;
 use crate::error::Error;
-use crate::graph_file;
+use crate::formats;
 use crate::output::Outputs;
 
 /// Turn USD, glTF or PLY into a scene, or bring edits of an exported file home
@@ -51,7 +52,7 @@ pub(super) struct Import {
 }
 
 pub(super) fn run(command: &Import) -> Result<(), Error> {
-    if !scene::is_scene(&command.output) {
+    if !formats::is_field(&command.output) {
         return Err(Error::usage(
             format!("-o {}: a scene is written", command.output.display()),
             "end its name in .cif",
@@ -63,7 +64,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     outputs.file(&command.output)?;
     // Before the file is read, which may take longer.
     let base = command.base.as_deref().map(scene::load).transpose()?;
-    let graph = graph_file::read_following(&command.file, command.follow_external)?;
+    let graph = formats::read(&command.file, ReadOptions { follow_external: command.follow_external })?;
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }

@@ -13,6 +13,7 @@ use serde_json::{Value, json};
 
 use super::{CaptureOptions, scene};
 use crate::error::Error;
+use crate::formats;
 
 /// Tell what is in a capture or a trained scene, or what GPUs there are
 #[derive(Debug, Args)]
@@ -45,7 +46,7 @@ pub(super) fn run(command: &Info) -> Result<(), Error> {
     let facts = if path.is_file() {
         let checkpoint = Checkpoint::load(path).map_err(Error::plain)?;
         scene_facts(&checkpoint)
-    } else if scene::is_scene(path) {
+    } else if formats::is_field(path) {
         return scene::load(path).map(drop);
     } else {
         capture_facts(&command.capture_options.open(path)?)?

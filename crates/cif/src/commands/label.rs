@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use cif_field::{Checkpoint, Instance};
 use clap::Args;
 
-use super::scene::{self, Format};
 use crate::error::Error;
+use crate::formats::Content;
 use crate::output::Outputs;
 
 /// Give an object another label
@@ -43,7 +43,7 @@ pub(super) struct Label {
 pub(super) fn run(command: &Label) -> Result<(), Error> {
     let label = checked(&command.label, "the label")?;
     let category = command.category.as_deref().map(|category| checked(category, "--category")).transpose()?;
-    let format = scene::format(&command.path)?;
+    let content = Content::of(&command.path)?;
     if let Some(output) = &command.output {
         let ending = |path: &Path| path.extension().map(|ending| ending.to_ascii_lowercase());
         if ending(output) != ending(&command.path) {
@@ -57,17 +57,12 @@ pub(super) fn run(command: &Label) -> Result<(), Error> {
         outputs.file(output)?;
     }
     let target = command.output.as_deref().unwrap_or(&command.path);
-    let (before, after) = match format {
-        Format::Scene => in_scene(&command.path, target, &command.instance, label, category)?,
-        Format::Usd => {
-            let done = cif_usd::relabel(&command.path, target, &command.instance, label, category)
-                .map_err(Error::plain)?;
-            (done.before, format!("'{}', class '{}' ({})", done.label, done.category, done.path))
-        }
-        Format::Gltf => {
-            let done = cif_gltf::relabel(&command.path, target, &command.instance, label, category)
-                .map_err(Error::plain)?;
-            (done.before, format!("'{}', class '{}' ({})", done.label, done.category, done.node))
+    let (before, after) = match content {
+        Content::Field => in_scene(&command.path, target, &command.instance, label, category)?,
+        Content::Graph(format) => {
+            let done = format.relabel(&command.path, target, &command.instance, label, category);
+            let done = done.map_err(Error::plain)?;
+            (done.before, format!("'{}', class '{}' ({})", done.label, done.category, done.object))
         }
     };
     println!("{}: '{before}' is now {after}", target.display());

@@ -10,8 +10,6 @@ mod check;
 mod diff;
 mod eval;
 mod export;
-mod export_gltf;
-mod export_ply;
 mod import;
 mod info;
 #[cfg(feature = "wgpu")]
@@ -26,6 +24,7 @@ mod query;
 mod render;
 mod render_files;
 mod scene;
+mod targets;
 mod train;
 mod train_budget;
 

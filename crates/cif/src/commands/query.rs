@@ -6,13 +6,14 @@ use std::path::{Path, PathBuf};
 
 use cif_field::Field;
 use cif_geometry::Bounds;
-use cif_scene::{ObjectMatch, ObjectQuery, SceneOptions, When};
+use cif_scene::{ObjectMatch, ObjectQuery, ReadOptions, SceneOptions, When};
 use clap::Args;
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::json;
 
-use super::scene::{self, Format};
+use super::scene;
 use crate::error::Error;
+use crate::formats::Content;
 
 /// Find objects by label, time, place, or masks; or tell what is at a place
 #[derive(Debug, Args)]
@@ -39,7 +40,7 @@ masks of training frames; --eval renders them from held-out frames and compares 
   cif query table.cif --prompt 'steel jug' --capture captures/table \\
       --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'")]
 pub(super) struct Query {
-    /// Trained scene (.cif), stage (.usda, .usdc, .usdz) or glTF file (.glb, .gltf)
+    /// Trained scene (.cif), or a file of any format that cif export writes
     #[arg(value_name = "FILE")]
     path: PathBuf,
     /// Label to look for
@@ -87,9 +88,10 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     if command.by_masks.is_asked() {
         return by_masks::run(command);
     }
-    let format = scene::format(&command.path)?;
-    let wanted = question(command, format)?;
-    if let (Format::Scene, Some(place)) = (format, wanted.point) {
+    let content = Content::of(&command.path)?;
+    let is_field = matches!(content, Content::Field);
+    let wanted = question(command, is_field)?;
+    if let (true, Some(place)) = (is_field, wanted.point) {
         if command.label.is_some() || wanted.region.is_some() || command.interval.is_some() {
             return Err(Error::usage(
                 "--point in a .cif asks the field itself, without other conditions than --time",
@@ -99,15 +101,11 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         return at(command, place);
     }
     let place = command.path.display().to_string();
-    let found = match format {
-        Format::Scene => in_scene(&command.path, wanted)?,
-        Format::Usd => {
-            let options = cif_usd::ReadOptions { follow_external: command.follow_external };
-            cif_usd::search(&command.path, &wanted, options).map_err(Error::plain)?
-        }
-        Format::Gltf => {
-            let graph = cif_gltf::read_scene(&command.path).map_err(Error::plain)?;
-            cif_scene::search(&graph, &wanted, &place, str::to_owned).map_err(Error::plain)?
+    let found = match content {
+        Content::Field => in_scene(&command.path, wanted)?,
+        Content::Graph(format) => {
+            let options = ReadOptions { follow_external: command.follow_external };
+            format.search(&command.path, &wanted, options).map_err(Error::plain)?
         }
     };
     if command.json {
@@ -121,8 +119,8 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
 }
 
 /// The conditions of the command line; times of a `.cif` are still normalised.
-fn question(command: &Query, format: Format) -> Result<ObjectQuery, Error> {
-    if format == Format::Scene {
+fn question(command: &Query, is_field: bool) -> Result<ObjectQuery, Error> {
+    if is_field {
         scene::check_time(command.time)?;
     }
     let when = match (command.time, &command.interval) {
@@ -130,7 +128,7 @@ fn question(command: &Query, format: Format) -> Result<ObjectQuery, Error> {
             return Err(Error::usage("--time needs a finite number", "for example --time 12"));
         }
         (Some(time), _) => When::At(time),
-        (None, Some(text)) => interval(text, format)?,
+        (None, Some(text)) => interval(text, is_field)?,
         (None, None) => When::Default,
     };
     let point = command.point.as_deref().map(|numbers| corner("--point", numbers)).transpose()?;
@@ -150,14 +148,14 @@ fn question(command: &Query, format: Format) -> Result<ObjectQuery, Error> {
     Ok(ObjectQuery { label: command.label.clone(), taxonomy: command.taxonomy.clone(), when, point, region })
 }
 
-fn interval(text: &str, format: Format) -> Result<When, Error> {
+fn interval(text: &str, is_field: bool) -> Result<When, Error> {
     let ends: Option<(f64, f64)> = text
         .split_once(':')
         .and_then(|(from, to)| Some((from.trim().parse().ok()?, to.trim().parse().ok()?)));
-    let example = if format == Format::Scene { "--interval 0:0.5" } else { "--interval 0:20" };
+    let example = if is_field { "--interval 0:0.5" } else { "--interval 0:20" };
     match ends {
         Some((from, to)) if from.is_finite() && to.is_finite() && from <= to => {
-            if format == Format::Scene {
+            if is_field {
                 scene::check_time(Some(from))?;
                 scene::check_time(Some(to))?;
             }
@@ -304,11 +302,11 @@ mod tests {
 
     #[test]
     fn intervals_are_two_times_in_order() {
-        assert_eq!(interval("2:7.5", Format::Usd).unwrap(), When::Over(2.0, 7.5));
-        assert_eq!(interval("-3:-3", Format::Usd).unwrap(), When::Over(-3.0, -3.0));
+        assert_eq!(interval("2:7.5", false).unwrap(), When::Over(2.0, 7.5));
+        assert_eq!(interval("-3:-3", false).unwrap(), When::Over(-3.0, -3.0));
         for text in ["7:2", "3", "a:b", "nan:1", "0:inf"] {
-            assert!(interval(text, Format::Usd).is_err(), "{text}");
+            assert!(interval(text, false).is_err(), "{text}");
         }
-        assert!(interval("0:2", Format::Scene).is_err(), "times of a .cif end at 1");
+        assert!(interval("0:2", true).is_err(), "times of a .cif end at 1");
     }
 }

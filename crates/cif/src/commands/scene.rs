@@ -22,49 +22,6 @@ pub(super) fn load(path: &Path) -> Result<Field, Error> {
     Field::load(path).map_err(Error::plain)
 }
 
-/// Whether a path names a trained scene rather than a stage or a capture.
-pub(super) fn is_scene(path: &Path) -> bool {
-    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("cif"))
-}
-
-/// What a file is, by its extension.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Format {
-    /// A trained scene.
-    Scene,
-    /// A stage.
-    Usd,
-    /// A glTF file.
-    Gltf,
-}
-
-/// Extensions of every format.
-const FORMATS: [(&str, Format); 7] = [
-    ("cif", Format::Scene),
-    ("usda", Format::Usd),
-    ("usdc", Format::Usd),
-    ("usdz", Format::Usd),
-    ("usd", Format::Usd),
-    ("glb", Format::Gltf),
-    ("gltf", Format::Gltf),
-];
-
-/// Tells what a file is.
-///
-/// # Errors
-/// When its extension is none of ours.
-pub(super) fn format(path: &Path) -> Result<Format, Error> {
-    let extension = path.extension().map(|extension| extension.to_string_lossy().to_lowercase());
-    let known = FORMATS.iter().find(|(name, _)| extension.as_deref() == Some(name));
-    known.map(|(_, format)| *format).ok_or_else(|| {
-        let names: Vec<String> = FORMATS.iter().map(|(name, _)| format!(".{name}")).collect();
-        Error::usage(
-            format!("{}: the extension does not say what the file is", path.display()),
-            format!("files that can be asked end with {}", names.join(", ")),
-        )
-    })
-}
-
 /// The settings that a scene is to be rendered with: those of its training.
 pub(super) fn render_settings(field: &Field) -> RenderSettings {
     cif_train::metrics::trained_settings(field)
@@ -78,9 +35,9 @@ pub(super) fn frame(field: &Field) -> Result<CaptureFrame, Error> {
     cif_scene::frame_of(field).map_err(Error::plain)
 }
 
-/// Says where a scene lies in the world of its capture, where that is not at its origin. `relative`: whether a file
-/// that is written holds places relative to there.
-pub(super) fn note_frame(frame: &CaptureFrame, relative: bool) {
+/// Says where a scene lies in the world of its capture, where that is not at its origin; `notes` tell of formats whose
+/// files do not place it.
+pub(super) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &'static str>) {
     if frame.is_identity() {
         return;
     }
@@ -90,11 +47,8 @@ pub(super) fn note_frame(frame: &CaptureFrame, relative: bool) {
          or glTF file places the scene there",
         frame.scale
     );
-    if relative {
-        eprintln!(
-            "note: splats of PLY files, which are single precision, stay in that frame; the comments `world offset` and \
-             `world scale` tell it: a place in the world is that in the file / scale + offset"
-        );
+    for note in notes {
+        eprintln!("note: {note}");
     }
 }
 

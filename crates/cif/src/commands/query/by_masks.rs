@@ -15,6 +15,7 @@ use super::Query;
 use crate::commands::{CaptureOptions, LayoutName, print_misfits, print_warnings, scene};
 use crate::detector::{Detected, detect};
 use crate::error::Error;
+use crate::formats;
 use crate::mask_query::{Agreement, Found, FoundMasks, Selection, agreement, find, render};
 use crate::pictures::save_grey;
 use crate::{interrupt, output};
@@ -97,7 +98,7 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     let Some(capture) = &options.capture else {
         return Err(Error::usage("masks belong to frames", "name their capture with --capture"));
     };
-    if !scene::is_scene(&command.path) {
+    if !formats::is_field(&command.path) {
         return Err(Error::usage(
             format!(
                 "masks are compared with renders of a trained scene (.cif), and {} is none",

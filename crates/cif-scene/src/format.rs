@@ -1,0 +1,232 @@
+//! What a file format does for scene graphs. Every format is a crate with one implementation of [`SceneFormat`]; the
+//! command keeps the list of them.
+
+use std::path::{Path, PathBuf};
+
+use crate::{
+    LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneGraph, query, search,
+};
+
+/// Why a format refuses; the message names the file and what to do.
+pub type FormatError = Box<dyn std::error::Error + Send + Sync>;
+
+/// A file format of scene graphs.
+pub trait SceneFormat: Sync {
+    /// Name of the format, e.g. `glTF`.
+    fn name(&self) -> &'static str;
+
+    /// The name as flags, keys and Python have it, e.g. `gltf`.
+    fn key(&self) -> &'static str;
+
+    /// Endings of its files.
+    fn endings(&self) -> &'static [Ending];
+
+    /// What is written, in one or two sentences for the help of the command.
+    fn about(&self) -> &'static str;
+
+    /// The most expensive motion that a file holds: graphs are built with no more than this. `None` for formats that
+    /// hold one moment, to which any motion leads.
+    fn most_expensive_motion(&self) -> Option<MotionModel>;
+
+    /// What the user should know of a scene that lies elsewhere in the world of its capture, where files do not place it.
+    fn note_on_place(&self) -> Option<&'static str> {
+        None
+    }
+
+    /// True when the name of a file says that it is of this format.
+    fn recognises(&self, path: &Path) -> bool {
+        ending_of(path, self.endings()).is_some()
+    }
+
+    /// True when a file of this name can be written.
+    fn writes(&self, path: &Path) -> bool {
+        ending_of(path, self.endings()).is_some_and(|ending| ending.written)
+    }
+
+    /// True when the output is a folder of several files.
+    fn fills_folder(&self, _: &ExportOptions) -> bool {
+        false
+    }
+
+    /// Files that are written beside `path` and itself.
+    fn files(&self, path: &Path) -> Vec<PathBuf> {
+        vec![path.to_owned()]
+    }
+
+    /// Checks everything about an output that can be checked before the work starts.
+    ///
+    /// # Errors
+    /// As [`SceneFormat::write`].
+    fn check_target(&self, path: &Path, options: &ExportOptions) -> Result<(), FormatError>;
+
+    /// Writes a graph: beside its place, and then moved there.
+    ///
+    /// # Errors
+    /// A name that does not fit, a missing folder, a file there that is not ours (without [`ExportOptions::force`]), a
+    /// graph that the format does not hold, disk full. Nothing existing is touched then.
+    fn write(
+        &self,
+        graph: &SceneGraph,
+        path: &Path,
+        options: &ExportOptions,
+    ) -> Result<ExportSummary, FormatError>;
+
+    /// Reads a file as the graph that it holds.
+    ///
+    /// # Errors
+    /// Missing, damaged or foreign files without splats.
+    fn read(&self, path: &Path, options: ReadOptions) -> Result<SceneGraph, FormatError>;
+
+    /// Gives an object of a file another label, and another class where one is given. `object` is a mask value or what
+    /// the file calls it. The result takes the place of `output`, which may be `path` itself.
+    ///
+    /// # Errors
+    /// No such object or several, formats without labels, and as [`SceneFormat::read`]. Nothing existing is touched then.
+    fn relabel(
+        &self,
+        path: &Path,
+        output: &Path,
+        object: &str,
+        label: &str,
+        category: Option<&str>,
+    ) -> Result<Relabelled, FormatError>;
+
+    /// Objects of a file whose label, class or name matches.
+    ///
+    /// # Errors
+    /// When nothing matches, and as [`SceneFormat::read`].
+    fn query(
+        &self,
+        path: &Path,
+        wanted: &LabelQuery,
+        options: ReadOptions,
+    ) -> Result<Vec<LabelMatch>, FormatError> {
+        Ok(query(&self.read(path, options)?, wanted, &path.display().to_string())?)
+    }
+
+    /// Objects of a file that meet every condition.
+    ///
+    /// # Errors
+    /// When no label matches, and as [`SceneFormat::read`].
+    fn search(
+        &self,
+        path: &Path,
+        wanted: &ObjectQuery,
+        options: ReadOptions,
+    ) -> Result<Vec<ObjectMatch>, FormatError> {
+        let found: Result<_, QueryError> =
+            search(&self.read(path, options)?, wanted, &path.display().to_string(), str::to_owned);
+        Ok(found?)
+    }
+}
+
+/// An ending of file names.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Ending {
+    /// Without the dot, in lower case.
+    pub name: &'static str,
+    /// Kind of file, e.g. `text`.
+    pub kind: &'static str,
+    /// False when such files are only read.
+    pub written: bool,
+}
+
+impl Ending {
+    /// An ending of files that are read and written.
+    #[must_use]
+    pub const fn written(name: &'static str, kind: &'static str) -> Self {
+        Self { name, kind, written: true }
+    }
+}
+
+/// The ending that a name has, of those given.
+#[must_use]
+pub fn ending_of<'a>(path: &Path, endings: &'a [Ending]) -> Option<&'a Ending> {
+    let own = path.extension()?;
+    endings.iter().find(|ending| own.eq_ignore_ascii_case(ending.name))
+}
+
+/// Where the arrays of instances go.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Payloads {
+    /// Beside files of text, so that they stay readable; inside others.
+    #[default]
+    ByKind,
+    /// One file per instance in a folder beside the output: `out.payloads` for `out.usda`, `out.usdc.payloads` for
+    /// `out.usdc`.
+    Separate,
+    /// All in the output itself.
+    SingleFile,
+}
+
+/// How a graph is written. A format leaves aside what it does not know.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ExportOptions {
+    /// Replace existing files even when they were not written by cif.
+    pub force: bool,
+    /// USD: where the arrays of instances go.
+    pub payloads: Payloads,
+    /// USD: write the variants `half` and `quarter` of the set `lod` beside `full`.
+    pub levels_of_detail: bool,
+    /// Formats of one moment: the time code that is written; `None` takes the first.
+    pub time_code: Option<f64>,
+    /// Formats of one moment: a file per object, in a folder.
+    pub split: bool,
+    /// Formats of one moment: a file per sampled time code, numbered by it, in a folder; with `split`, in a folder per
+    /// object.
+    pub sequence: bool,
+}
+
+impl Default for ExportOptions {
+    fn default() -> Self {
+        Self {
+            force: false,
+            payloads: Payloads::default(),
+            levels_of_detail: true,
+            time_code: None,
+            split: false,
+            sequence: false,
+        }
+    }
+}
+
+/// How a file is read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ReadOptions {
+    /// USD: follow sublayers, references and payloads that lie outside the folder of the stage.
+    pub follow_external: bool,
+}
+
+/// What was written.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ExportSummary {
+    /// The file or folder.
+    pub path: PathBuf,
+    /// All files that can be named: `path` and those beside or in it.
+    pub files: Vec<PathBuf>,
+    /// Size of everything together.
+    pub bytes: u64,
+    /// Instances and background.
+    pub nodes: usize,
+    /// Splats over all files.
+    pub splats: usize,
+    /// Time samples of the timeline, or moments that were written.
+    pub samples: usize,
+    /// What the format does not hold of the scene, object by object.
+    pub not_held: Vec<String>,
+    /// Library that wrote it, with its version, e.g. `usd-core 26.11`; `None` for cif itself.
+    pub library: Option<String>,
+}
+
+/// What a new label changed.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Relabelled {
+    /// The object as the file calls it: path of the prim, or name of the node.
+    pub object: String,
+    /// The label before.
+    pub before: String,
+    /// The label now.
+    pub label: String,
+    /// The class now.
+    pub category: String,
+}

@@ -1,0 +1,183 @@
+//! The part of `cif export` that knows of formats: a flag for each, and what is written where.
+
+use std::path::{Path, PathBuf};
+
+use cif_scene::{ExportOptions, ExportSummary, Payloads, SceneFormat};
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, value_parser};
+
+use crate::error::Error;
+use crate::formats::FORMATS;
+use crate::output::{self, Outputs};
+
+/// Files to write, one per format at most; `--usd OUT`, `--gltf OUT` and so on.
+#[derive(Debug, Default)]
+pub(super) struct Targets(Vec<Target>);
+
+/// A file to write.
+pub(super) struct Target {
+    pub(super) format: &'static dyn SceneFormat,
+    pub(super) path: PathBuf,
+}
+
+impl std::fmt::Debug for Target {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "--{} {}", self.format.key(), self.path.display())
+    }
+}
+
+/// Endings that are written, e.g. `.usda (text)`.
+fn written(format: &dyn SceneFormat) -> Vec<String> {
+    let endings = format.endings().iter().filter(|ending| ending.written);
+    endings.map(|ending| format!(".{} ({})", ending.name, ending.kind)).collect()
+}
+
+impl Args for Targets {
+    fn augment_args(command: Command) -> Command {
+        FORMATS.into_iter().fold(command, |command, format| {
+            let help = format!(
+                "{} to write; the ending decides: {}. {}",
+                format.name(),
+                written(format).join(", "),
+                format.about()
+            );
+            let arg = Arg::new(format.key())
+                .long(format.key())
+                .value_name("OUT")
+                .value_parser(value_parser!(PathBuf))
+                .help(help);
+            command.arg(arg)
+        })
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+impl FromArgMatches for Targets {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        let given = FORMATS.into_iter().filter_map(|format| {
+            let path = matches.get_one::<PathBuf>(format.key())?.clone();
+            Some(Target { format, path })
+        });
+        Ok(Self(given.collect()))
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        *self = Self::from_arg_matches(matches)?;
+        Ok(())
+    }
+}
+
+/// How the files are written.
+#[derive(Debug, Args)]
+pub(super) struct Writing {
+    /// Put the arrays of every object into a file of its own in OUT.usdc.payloads, loaded on demand;
+    /// .usda does so anyway
+    #[arg(long, conflicts_with = "single_file")]
+    payloads: bool,
+    /// Keep everything in one file; .usdc and .usdz do so anyway
+    #[arg(long)]
+    single_file: bool,
+    /// Leave out the variants with half and a quarter of the splats
+    #[arg(long)]
+    no_lod: bool,
+    /// Moment of --ply, from 0 (first time) to 1 (last) [default: the first]
+    #[arg(long, value_name = "TIME", requires = "ply", conflicts_with = "ply_sequence")]
+    ply_time: Option<f64>,
+    /// A file per object: FOLDER/red_mug_001.ply
+    #[arg(long, requires = "ply")]
+    ply_split: bool,
+    /// A file per sampled frame: FOLDER/0000.ply; with --ply-split FOLDER/red_mug_001/0000.ply
+    #[arg(long, requires = "ply")]
+    ply_sequence: bool,
+}
+
+impl Writing {
+    /// Options; the moment is that of a graph, which `code_at` tells.
+    pub(super) fn options(&self, force: bool, code_at: impl FnOnce(f64) -> f64) -> ExportOptions {
+        let payloads = match (self.payloads, self.single_file) {
+            (true, _) => Payloads::Separate,
+            (_, true) => Payloads::SingleFile,
+            _ => Payloads::ByKind,
+        };
+        ExportOptions {
+            force,
+            payloads,
+            levels_of_detail: !self.no_lod,
+            time_code: self.ply_time.map(code_at),
+            split: self.ply_split,
+            sequence: self.ply_sequence,
+        }
+    }
+}
+
+impl Targets {
+    pub(super) fn iter(&self) -> std::slice::Iter<'_, Target> {
+        self.0.iter()
+    }
+
+    /// Checks names and places before the work starts.
+    pub(super) fn check(&self, writing: &Writing, force: bool, outputs: &mut Outputs) -> Result<(), Error> {
+        if let Some(time) = writing.ply_time
+            && !(0.0..=1.0).contains(&time)
+        {
+            return Err(Error::usage(
+                format!("--ply-time {time}: times are normalised"),
+                "give a number from 0 (first captured time) to 1 (last)",
+            ));
+        }
+        // Nothing that is checked depends on the moment.
+        let options = writing.options(force, |time| time);
+        self.0.iter().try_for_each(|target| target.check(&options, outputs))
+    }
+}
+
+impl Target {
+    fn check(&self, options: &ExportOptions, outputs: &mut Outputs) -> Result<(), Error> {
+        let (format, path): (_, &Path) = (self.format, &self.path);
+        let folder = format.fills_folder(options);
+        if folder && format.recognises(path) {
+            return Err(Error::usage(
+                format!("{self:?}: several files go into a folder"),
+                "name a folder, for example splats",
+            ));
+        }
+        if !folder && !format.writes(path) {
+            let or_folder = match format.most_expensive_motion() {
+                Some(_) => "",
+                None => ", or write into a folder with --ply-split or --ply-sequence",
+            };
+            return Err(Error::usage(
+                format!("{self:?}: the ending decides the format"),
+                format!("end the name in {}{or_folder}", written(format).join(", ")),
+            ));
+        }
+        if folder {
+            format.check_target(path, options).map_err(Error::plain)?;
+            return output::check_folder(path, options.force);
+        }
+        format.files(path).iter().try_for_each(|file| outputs.file(file))?;
+        format.check_target(path, options).map_err(Error::plain)
+    }
+
+    /// Tells what was written.
+    pub(super) fn tell(&self, summary: &ExportSummary) {
+        for lost in &summary.not_held {
+            eprintln!("warning: {} does not hold everything of {lost}", self.format.name());
+        }
+        let files = match summary.files.len() {
+            0 | 1 => String::new(),
+            count => format!("{count} files, "),
+        };
+        let library = summary.library.as_ref().map_or_else(String::new, |library| format!(" ({library})"));
+        eprintln!(
+            "wrote {}: {files}{} objects, {} splats, {} time samples, {:.1} MB{library}",
+            summary.path.display(),
+            summary.nodes,
+            summary.splats,
+            summary.samples,
+            summary.bytes as f64 / 1e6,
+        );
+    }
+}

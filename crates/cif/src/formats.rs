@@ -1,0 +1,164 @@
+//! The formats that scenes are exchanged in, and files of any of them as scene graphs.
+
+use std::path::Path;
+
+use cif_field::Field;
+use cif_scene::{ReadOptions, SceneFormat, SceneGraph, SceneOptions};
+
+use crate::error::Error;
+
+/// Every format that is read and written. A new one is a crate that implements [`SceneFormat`], and a line here.
+pub static FORMATS: [&dyn SceneFormat; 3] = [&cif_usd::Usd, &cif_gltf::Gltf, &cif_ply::Ply];
+
+/// What the name of a file says about its content.
+#[derive(Clone, Copy)]
+pub enum Content {
+    /// `.cif`: a field.
+    Field,
+    /// A scene graph in this format.
+    Graph(&'static dyn SceneFormat),
+}
+
+impl Content {
+    /// What the ending of a name tells.
+    ///
+    /// # Errors
+    /// When no reader knows the ending.
+    pub fn of(path: &Path) -> Result<Self, Error> {
+        if is_field(path) {
+            return Ok(Self::Field);
+        }
+        format_of(path).map(Self::Graph)
+    }
+}
+
+/// True when a path names a trained scene rather than a file of an exchange format or a capture.
+#[must_use]
+pub fn is_field(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("cif"))
+}
+
+/// The exchange format of a file.
+///
+/// # Errors
+/// When its ending is not known.
+pub fn format_of(path: &Path) -> Result<&'static dyn SceneFormat, Error> {
+    let found = FORMATS.into_iter().find(|format| format.recognises(path));
+    found.ok_or_else(|| {
+        Error::usage(
+            format!("{}: the ending of the name tells the format, and this one is not known", path.display()),
+            format!("use {}", endings()),
+        )
+    })
+}
+
+/// Endings that can be read, for messages: `.usda, .usdc (USD), .glb (glTF) or .ply (PLY)`.
+#[must_use]
+pub fn endings() -> String {
+    let of_format = |format: &&dyn SceneFormat| {
+        let endings: Vec<String> =
+            format.endings().iter().map(|ending| format!(".{}", ending.name)).collect();
+        format!("{} ({})", endings.join(", "), format.name())
+    };
+    let mut all: Vec<String> = FORMATS.iter().map(of_format).collect();
+    let last = all.pop().unwrap_or_default();
+    format!("{} or {last}", all.join(", "))
+}
+
+/// Reads a file of an exchange format as the graph that it holds.
+///
+/// # Errors
+/// When the file is missing or broken, is a `.cif`, or its ending is not known.
+pub fn read(path: &Path, options: ReadOptions) -> Result<SceneGraph, Error> {
+    let advice = || format!("use {}", endings());
+    if path.is_dir() {
+        return Err(Error::failed(
+            format!("{} is a folder; a file is expected here", path.display()),
+            advice(),
+        ));
+    }
+    match Content::of(path)? {
+        Content::Graph(format) => format.read(path, options).map_err(Error::plain),
+        Content::Field => {
+            Err(Error::usage(format!("{} is a scene of cif already", path.display()), advice()))
+        }
+    }
+}
+
+/// Reads two files of any format to be compared. A `.cif` beside a file that was exported becomes the graph that
+/// it would be exported as with the same options.
+///
+/// # Errors
+/// As [`read`], and when a scene cannot be loaded or has nothing to show.
+pub fn read_both(first: &Path, second: &Path) -> Result<[SceneGraph; 2], Error> {
+    enum Read {
+        Graph(Box<SceneGraph>),
+        Field(Box<Field>),
+    }
+    let read = |path: &Path| match Content::of(path)? {
+        Content::Field => Ok(Read::Field(Box::new(Field::load(path).map_err(Error::plain)?))),
+        Content::Graph(_) => read(path, ReadOptions::default()).map(|graph| Read::Graph(Box::new(graph))),
+    };
+    let both = [read(first)?, read(second)?];
+    let options = both.iter().find_map(|one| match one {
+        Read::Graph(graph) => graph.origin.options.clone(),
+        Read::Field(_) => None,
+    });
+    let options = SceneOptions { proxy_points: 0, ..options.unwrap_or_default() };
+    let graph = |one: Read| match one {
+        Read::Graph(graph) => Ok(*graph),
+        Read::Field(field) => cif_scene::build(&field, &options).map_err(Error::plain),
+    };
+    let [first, second] = both;
+    Ok([graph(first)?, graph(second)?])
+}
+
+/// Options of graphs that a format can hold.
+#[must_use]
+pub fn held_by(format: &dyn SceneFormat, options: &SceneOptions) -> SceneOptions {
+    let most = format.most_expensive_motion().unwrap_or(options.most_expensive_motion);
+    SceneOptions { most_expensive_motion: options.most_expensive_motion.min(most), ..options.clone() }
+}
+
+/// The graph of a field as a format can hold it; `None` where that is the graph that was built already.
+///
+/// # Errors
+/// When it cannot be built.
+pub fn rebuilt_for(
+    format: &dyn SceneFormat,
+    field: &Field,
+    graph: &SceneGraph,
+    options: &SceneOptions,
+) -> Result<Option<SceneGraph>, Error> {
+    let too_much = |most| graph.nodes.iter().any(|node| node.model() > most);
+    if !format.most_expensive_motion().is_some_and(too_much) {
+        return Ok(None);
+    }
+    cif_scene::build(field, &held_by(format, options)).map(Some).map_err(Error::plain)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_ending_belongs_to_one_format() {
+        for format in FORMATS {
+            for ending in format.endings() {
+                let name = format!("scene.{}", ending.name.to_uppercase());
+                let path = Path::new(&name);
+                assert_eq!(FORMATS.iter().filter(|other| other.recognises(path)).count(), 1, "{name}");
+                assert_eq!(format_of(path).unwrap().key(), format.key());
+                assert_eq!(format.writes(path), ending.written, "{name}");
+            }
+            assert!(
+                format.endings()[0].written,
+                "{}: the first ending is taken where nobody says",
+                format.name()
+            );
+        }
+        assert!(matches!(Content::of(Path::new("a.cif")), Ok(Content::Field)));
+        assert!(Content::of(Path::new("a.splat")).is_err());
+        assert_eq!(endings(), ".usda, .usdc, .usdz, .usd (USD), .glb, .gltf (glTF) or .ply (PLY)");
+    }
+}
