@@ -37,7 +37,7 @@ fn train(dataset: &Dataset, threads: usize, simd: SimdLevel) -> Trainer {
 /// Everything that is saved, the record of wall times and memory left out.
 fn bytes(trainer: &Trainer) -> Vec<u8> {
     let mut checkpoint = trainer.checkpoint(true);
-    checkpoint.field.provenance = serde_json::Value::Null;
+    checkpoint.field.record = Default::default();
     let state = checkpoint.training.as_mut().unwrap();
     for key in ["wall_s", "cpu_s", "curve"] {
         state.json["progress"][key] = serde_json::Value::Null;

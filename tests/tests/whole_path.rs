@@ -173,7 +173,7 @@ fn an_interrupted_run_resumes_to_the_same_scene() {
     let mut parts = Checkpoint::load(path.join("parts.cif")).unwrap();
     assert!(parts.training.is_none());
     // Times and memory differ; everything else may not.
-    parts.field.provenance = whole.field.provenance.clone();
+    parts.field.record = whole.field.record.clone();
     assert!(parts == whole, "the resumed scene differs from the uninterrupted one");
 }
 
@@ -262,7 +262,7 @@ fn instances_are_trained_on_the_reconstruction_of_another_scene() {
     cif(path, "train table -o named.cif --from bare.cif --ablate no-resampling").succeeds();
     let named = Checkpoint::load(path.join("named.cif")).unwrap().field;
     assert!(named.identities.is_some());
-    let record = &named.provenance;
+    let record = named.record.to_json();
     assert_eq!(record["train"]["from"]["scene"], "bare.cif");
     assert!((record["config"]["near"].as_f64().unwrap() - 0.19).abs() < 1e-6, "settings of the scene");
     assert_eq!(record["config"]["instance"]["ablate"][0], "no-resampling");
@@ -277,7 +277,7 @@ fn threads_do_not_change_the_scene() {
     }
     let load = |name: &str| {
         let mut field = Checkpoint::load(folder.path().join(name)).unwrap().field;
-        field.provenance = Value::Null;
+        field.record = Default::default();
         field
     };
     assert!(load("1.cif") == load("3.cif"));

@@ -6,8 +6,8 @@ use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::CaptureFrame;
 use crate::cryptomatte::ObjectIds;
-use crate::placement::CaptureFrame;
 
 /// The layouts that can be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]

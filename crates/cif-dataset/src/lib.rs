@@ -42,9 +42,10 @@ mod placement;
 mod points;
 mod summary;
 
+/// Where a dataset lies in the coordinates of its capture.
+pub use cif_geometry::CaptureFrame;
 pub use dataset::{
     Dataset, Frame, FrameData, InstanceLabel, Layout, OpenOptions, PointCloud, PointSource, Split,
 };
 pub use error::Error;
-pub use placement::CaptureFrame;
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

@@ -4,9 +4,8 @@
 //! thousandth of the scene apart, and no optimiser reaches what is between. Settings in metres (the near plane, the
 //! smallest Gaussian) and the motion network suit scenes of metres. Ordinary captures are left exactly as they are.
 
-use cif_geometry::{PinholeCamera, RigidTransform};
+use cif_geometry::CaptureFrame;
 use glam::DVec3;
-use serde::{Deserialize, Serialize};
 
 use crate::Dataset;
 
@@ -19,69 +18,19 @@ const USUAL_SIZE: f64 = 3.0;
 /// Distance of the cameras from the origin, in sizes, that is left alone.
 const ORDINARY_DISTANCE: f64 = 10.0;
 
-/// Where a dataset lies in the coordinates of its capture: `x_dataset = scale * (x_capture - offset)`.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct CaptureFrame {
-    /// Origin of the dataset, in the units of the capture.
-    pub offset: [f64; 3],
-    /// Dataset units per unit of the capture.
-    pub scale: f64,
-}
-
-impl Default for CaptureFrame {
-    fn default() -> Self {
-        Self { offset: [0.0; 3], scale: 1.0 }
+/// The frame for a scene of `size` whose cameras are around `middle`.
+fn own_frame(middle: DVec3, size: f64) -> CaptureFrame {
+    let mut frame = CaptureFrame::default();
+    if !(size.is_finite() && size > 0.0 && middle.is_finite()) {
+        return frame;
     }
-}
-
-impl CaptureFrame {
-    /// Whether the dataset has the coordinates of its capture.
-    #[must_use]
-    pub fn is_identity(&self) -> bool {
-        *self == Self::default()
+    if !ORDINARY_SIZES.contains(&size) {
+        frame.scale = 10.0_f64.powi(-(size / USUAL_SIZE).log10().round() as i32);
     }
-
-    /// Whether the frame can be used: finite numbers, a scale above 0.
-    #[must_use]
-    pub fn is_valid(&self) -> bool {
-        self.offset.iter().all(|value| value.is_finite()) && self.scale.is_normal() && self.scale > 0.0
+    if middle.length() > ORDINARY_DISTANCE * size {
+        frame.offset = middle.to_array();
     }
-
-    /// A point of the capture in the dataset.
-    #[must_use]
-    pub fn dataset_from_capture(&self, point: DVec3) -> DVec3 {
-        self.scale * (point - DVec3::from(self.offset))
-    }
-
-    /// A point of the dataset in the capture.
-    #[must_use]
-    pub fn capture_from_dataset(&self, point: DVec3) -> DVec3 {
-        point / self.scale + DVec3::from(self.offset)
-    }
-
-    /// A camera of the capture in the dataset: it sees the same picture, in other units of depth.
-    #[must_use]
-    pub fn camera(&self, camera: &PinholeCamera) -> PinholeCamera {
-        let RigidTransform { rotation, translation } = camera.camera_from_world;
-        let translation = self.scale * (rotation * DVec3::from(self.offset) + translation);
-        PinholeCamera { camera_from_world: RigidTransform { rotation, translation }, ..*camera }
-    }
-
-    /// The frame for a scene of `size` whose cameras are around `middle`.
-    fn of(middle: DVec3, size: f64) -> Self {
-        let mut frame = Self::default();
-        if !(size.is_finite() && size > 0.0 && middle.is_finite()) {
-            return frame;
-        }
-        if !ORDINARY_SIZES.contains(&size) {
-            frame.scale = 10.0_f64.powi(-(size / USUAL_SIZE).log10().round() as i32);
-        }
-        if middle.length() > ORDINARY_DISTANCE * size {
-            frame.offset = middle.to_array();
-        }
-        frame
-    }
+    frame
 }
 
 impl Dataset {
@@ -100,7 +49,7 @@ impl Dataset {
         distances.sort_by(f64::total_cmp);
         let looks = distances.get(distances.len() / 2).copied().unwrap_or_default();
         let size = self.camera_spread().max(looks);
-        let frame = CaptureFrame::of(middle, size);
+        let frame = own_frame(middle, size);
         if frame.is_identity() {
             return;
         }
@@ -138,49 +87,24 @@ fn place(position: [f32; 3]) -> DVec3 {
 
 #[cfg(test)]
 mod tests {
-    use glam::{DMat3, DVec2};
-
     use super::*;
 
     #[test]
     fn ordinary_captures_keep_their_coordinates() {
         for (distance, size) in [(0.0, 0.1), (1.0, 3.0), (29.0, 3.0), (0.0, 100.0)] {
-            assert!(CaptureFrame::of(DVec3::X * distance, size).is_identity(), "{distance} {size}");
+            assert!(own_frame(DVec3::X * distance, size).is_identity(), "{distance} {size}");
         }
         // Nothing to measure: nothing to change.
         for size in [0.0, f64::NAN, f64::INFINITY] {
-            assert!(CaptureFrame::of(DVec3::X * 1e9, size).is_identity());
+            assert!(own_frame(DVec3::X * 1e9, size).is_identity());
         }
     }
 
     #[test]
     fn a_capture_in_other_units_is_the_one_in_metres() {
         for power in [-6, -3, 2, 3, 6] {
-            let frame = CaptureFrame::of(DVec3::ZERO, 3.1 * 10.0_f64.powi(power));
+            let frame = own_frame(DVec3::ZERO, 3.1 * 10.0_f64.powi(power));
             assert!((frame.scale * 10.0_f64.powi(power) - 1.0).abs() < 1e-12, "{power}: {frame:?}");
         }
-    }
-
-    #[test]
-    fn cameras_see_the_same_picture_in_the_frame() {
-        let frame = CaptureFrame { offset: [3e4, -2e4, 1e4], scale: 1e-3 };
-        let camera = PinholeCamera {
-            width: 40,
-            height: 30,
-            focal_px: DVec2::new(42.0, 40.0),
-            principal_px: DVec2::new(20.0, 15.0),
-            camera_from_world: RigidTransform {
-                rotation: DMat3::from_rotation_y(0.4) * DMat3::from_rotation_x(-0.2),
-                translation: DVec3::new(-2.5e4, 1.8e4, -2e4),
-            },
-        };
-        let point =
-            camera.centre() + camera.camera_from_world.inverse().rotation * DVec3::new(100.0, -50.0, 900.0);
-        let (pixel, depth) = camera.project(point).unwrap();
-        let (same, closer) = frame.camera(&camera).project(frame.dataset_from_capture(point)).unwrap();
-        assert!((pixel - same).length() < 1e-8, "{pixel} {same}");
-        assert!((closer / depth / frame.scale - 1.0).abs() < 1e-9);
-        let back = frame.capture_from_dataset(frame.dataset_from_capture(point));
-        assert!((back - point).length() < 1e-9);
     }
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Deformation, Gaussians, Identities, Instance, RecordedCamera, Timeline, Tracks};
+use crate::{Deformation, Gaussians, Identities, Instance, Record, RecordedCamera, Timeline, Tracks};
 
 /// Order in which a view sorts its Gaussians.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -40,8 +40,8 @@ pub struct Field {
     pub sort_metric: SortMetric,
     /// Scene extent: 1.1 x the largest distance of a training camera centre from their mean, metres.
     pub extent: f32,
-    /// How the field came about (settings, dataset, seed, times, versions); free-form JSON object.
-    pub provenance: serde_json::Value,
+    /// How the field came about, and how it has to be drawn.
+    pub record: Record,
 }
 
 impl Field {
@@ -91,7 +91,7 @@ impl Field {
             instances: self.instances.clone(),
             timeline: self.timeline.clone(),
             cameras: self.cameras.clone(),
-            provenance: self.provenance.clone(),
+            record: self.record.clone(),
             ..*self
         }
     }

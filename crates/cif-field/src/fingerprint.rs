@@ -9,7 +9,7 @@ const RULES: &str = "cif-field 1";
 
 impl Field {
     /// A fingerprint of what a scene is made from: Gaussians, learned and recorded motion, identities, the
-    /// instance table, times, and colour settings. Equal on every machine; cameras and provenance do not count.
+    /// instance table, times, and colour settings. Equal on every machine; cameras and record do not count.
     ///
     /// 32 hexadecimal digits (XXH3, 128 bits). It tells apart files that were mixed up, not files that were
     /// forged.
@@ -125,7 +125,7 @@ mod tests {
             |field| field.timeline.times[1] += 1e-9,
         ];
         let field = testing::tracked_field(30, 5);
-        let same = Field { cameras: Vec::new(), provenance: serde_json::Value::Null, ..field.clone() };
+        let same = Field { cameras: Vec::new(), record: crate::Record::default(), ..field.clone() };
         assert_eq!(same.fingerprint(), field.fingerprint());
         assert_eq!(field.fingerprint().len(), 32);
         let mut seen = vec![field.fingerprint()];

@@ -10,6 +10,8 @@
 //! | [`identity`] | whose a Gaussian is |
 //! | [`instance`] | what the instances are called |
 //! | [`timeline`] | which times were captured, and from which cameras |
+//! | [`record`] | how a field came about, and how it has to be drawn |
+//! | [`exposure`] | what cameras make of colours |
 //! | [`field`] | all of it together |
 //! | [`fingerprint`] | whether two fields are the same |
 //! | [`validate`] | which rules every field keeps |
@@ -20,7 +22,7 @@
 //! A scene of one red Gaussian, saved, read and asked:
 //!
 //! ```
-//! use cif_field::{Field, Gaussians, Identities, Instance, SortMetric, Timeline};
+//! use cif_field::{Field, Gaussians, Identities, Instance, Record, SortMetric, Timeline};
 //! use glam::DVec3;
 //!
 //! let field = Field {
@@ -41,7 +43,7 @@
 //!     background: [1.0; 3],
 //!     sort_metric: SortMetric::Z,
 //!     extent: 1.0,
-//!     provenance: serde_json::json!({ "made by": "hand" }),
+//!     record: Record::default(),
 //! };
 //! let folder = tempfile::tempdir()?;
 //! field.save(folder.path().join("mug.cif"))?;
@@ -55,6 +57,7 @@
 
 pub mod checkpoint;
 pub mod deformation;
+pub mod exposure;
 pub mod field;
 pub mod fingerprint;
 pub mod gaussians;
@@ -64,6 +67,7 @@ pub mod instance;
 pub mod neighbours;
 pub mod parameters;
 pub mod query;
+pub mod record;
 #[cfg(test)]
 mod testing;
 pub mod timeline;
@@ -72,12 +76,14 @@ pub mod validate;
 
 pub use checkpoint::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 pub use deformation::{Deformation, DeformationConfig, Heads, TimeEncoding};
+pub use exposure::Exposure;
 pub use field::{Field, SortMetric};
 pub use gaussians::{Gaussians, GaussiansMut};
 pub use identity::{Identities, Owner};
 pub use instance::Instance;
 pub use parameters::Parameter;
 pub use query::{FieldAtTime, QueryResult};
+pub use record::{Drawing, Record, RecordError, Run};
 pub use timeline::{RecordedCamera, Timeline};
 pub use tracks::{TrackGroup, Tracks};
 pub use validate::FieldError;

@@ -86,7 +86,13 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
         background: [1.0, 0.1, 0.0],
         sort_metric: SortMetric::Distance,
         extent: 2.345_678_9,
-        provenance: serde_json::json!({ "seed": u64::MAX, "loss": 0.1 + 0.2, "tiny": 5e-324, "z": [null, -0.0] }),
+        record: crate::Record {
+            notes: serde_json::Map::from_iter([(
+                "odd".to_owned(),
+                serde_json::json!({ "seed": u64::MAX, "loss": 0.1 + 0.2, "tiny": 5e-324, "z": [null, -0.0] }),
+            )]),
+            ..crate::Record::default()
+        },
     }
 }
 

@@ -7,6 +7,7 @@
 //! | [`quaternion`] | rotation of a (w, x, y, z) quaternion, with derivative |
 //! | [`spherical_harmonics`] | view-dependent colour basis, degrees 0 to 3, with derivative and rotation |
 //! | [`camera`] | ideal pinhole cameras |
+//! | [`capture_frame`] | where coordinates lie in the world of a capture |
 //! | [`lens`] | lens distortion and its removal |
 //! | [`grid`] | row-major pixel grids |
 //! | [`bounds`] | axis-aligned boxes |
@@ -16,6 +17,7 @@
 
 pub mod bounds;
 pub mod camera;
+pub mod capture_frame;
 pub mod grid;
 pub mod lens;
 pub mod quaternion;
@@ -25,6 +27,7 @@ pub mod transform;
 
 pub use bounds::Bounds;
 pub use camera::PinholeCamera;
+pub use capture_frame::CaptureFrame;
 pub use grid::PixelGrid;
 pub use lens::LensDistortion;
 pub use scalar::Real;

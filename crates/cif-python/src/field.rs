@@ -173,7 +173,10 @@ impl Field {
             sh_degree: 0,
             background: background.into(),
             sort_metric: SortMetric::Z,
-            provenance: serde_json::json!({ "source": "arrays" }),
+            record: cif_field::Record {
+                notes: serde_json::Map::from_iter([("source".to_owned(), "arrays".into())]),
+                ..cif_field::Record::default()
+            },
         };
         inner.validate().map_err(cif_error)?;
         Ok(Self { inner })
@@ -264,7 +267,7 @@ impl Field {
 
     #[getter]
     fn provenance<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        arrays::to_python(py, &self.inner.provenance)
+        arrays::to_python(py, &self.inner.record.to_json())
     }
 
     fn at<'py>(&self, py: Python<'py>, time: f64) -> PyResult<Bound<'py, PyDict>> {

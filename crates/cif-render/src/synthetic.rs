@@ -88,7 +88,7 @@ pub fn generate(config: &SyntheticConfig) -> SyntheticScene {
         background: [0.2, 0.5, 0.9],
         sort_metric: SortMetric::Z,
         extent: 4.0,
-        provenance: serde_json::Value::Null,
+        record: Default::default(),
     };
     SyntheticScene { field, camera, labels, time: 0.37 }
 }

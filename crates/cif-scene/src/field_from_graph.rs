@@ -11,7 +11,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use cif_field::gaussians::{INITIAL_OCCUPANCY, SH_FLOATS, saturated_logit};
 use cif_field::tracks::{DenseTrack, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
-use cif_field::{Field, Gaussians, Identities, Instance, Owner, RecordedCamera, Timeline};
+use cif_field::{Field, Gaussians, Identities, Instance, Owner, Record, RecordedCamera, Timeline};
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
 use glam::{DMat3, DQuat, DVec3};
@@ -27,7 +27,7 @@ const NO_TURN: f64 = 1e-9;
 const STILL: f64 = 1e-9;
 
 /// Builds a field without learned motion that shows what the graph shows. `source` names the file in the
-/// field's provenance.
+/// field's record.
 ///
 /// Occupancies that the graph does not have are the opacities; splats outside the instances of a file that cif
 /// did not write get the occupancy of Gaussians that no mask spoke for.
@@ -68,6 +68,15 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
     }
     let cameras = cameras(&graph.cameras, &times);
     let degrees = graph.nodes.iter().map(|node| node.splats.sh_degree);
+    let imported = serde_json::json!({
+        "file": source,
+        "up_axis": graph.up_axis,
+        "meters_per_unit": graph.meters_per_unit,
+        "first_time_code": reference,
+        "exported_from": graph.origin.field_fingerprint,
+        "cif": env!("CARGO_PKG_VERSION"),
+    });
+    let imported = serde_json::Map::from_iter([("imported".to_owned(), imported)]);
     let field = Field {
         extent: extent(&cameras, &gaussians),
         gaussians,
@@ -83,17 +92,7 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
         sh_degree: degrees.max().unwrap_or(0),
         background: graph.background_color.map(|channel| channel.clamp(0.0, 1.0)),
         sort_metric: graph.sort_metric,
-        provenance: serde_json::json!({
-            "imported": {
-                "file": source,
-                "up_axis": graph.up_axis,
-                "meters_per_unit": graph.meters_per_unit,
-                "frame": (!graph.frame.is_identity()).then_some(graph.frame),
-                "first_time_code": reference,
-                "exported_from": graph.origin.field_fingerprint,
-                "cif": env!("CARGO_PKG_VERSION"),
-            }
-        }),
+        record: Record { frame: graph.frame, notes: imported, ..Record::default() },
     };
     field
         .validate()

@@ -74,7 +74,7 @@ pub(crate) fn recorded_field(objects: usize, seed: u64) -> Field {
         background: [0.25, 0.5, 1.0],
         sort_metric: SortMetric::Distance,
         extent: 1.0,
-        provenance: serde_json::Value::Null,
+        record: Default::default(),
     }
 }
 

@@ -11,23 +11,17 @@ use glam::{DAffine3, DMat3, DMat4, DVec3};
 
 use crate::SceneError;
 
-/// The frame that a field was trained or imported in, as its provenance has it.
+/// The frame that a field was trained or imported in, as its record has it.
 ///
 /// # Errors
-/// When what stands there is no frame.
+/// When it places the field nowhere.
 pub fn frame_of(field: &Field) -> Result<CaptureFrame, SceneError> {
-    let places = ["dataset", "imported"].iter();
-    let Some(recorded) = places
-        .filter_map(|key| field.provenance.get(key)?.get("frame").filter(|frame| !frame.is_null()))
-        .next()
-    else {
-        return Ok(CaptureFrame::default());
-    };
-    serde_json::from_value::<CaptureFrame>(recorded.clone()).ok().filter(CaptureFrame::is_valid).ok_or_else(
-        || SceneError::Inconsistent {
-            what: format!("the frame of the capture is recorded as {recorded}; train the scene again"),
-        },
-    )
+    let frame = field.record.frame;
+    if frame.is_valid() {
+        return Ok(frame);
+    }
+    let what = format!("the frame of the capture is recorded as {frame:?}; train the scene again");
+    Err(SceneError::Inconsistent { what })
 }
 
 /// `world_from_graph`, for column vectors.
@@ -62,23 +56,14 @@ mod tests {
     use crate::testing;
 
     #[test]
-    fn frames_come_from_the_provenance_and_nothing_is_guessed() {
+    fn frames_come_from_the_record_and_nothing_is_guessed() {
         let mut field = testing::recorded_field(1, 3);
         assert!(frame_of(&field).unwrap().is_identity());
-        let frame = CaptureFrame { offset: [3e6, -2e5, 14.5], scale: 1e-3 };
-        for key in ["dataset", "imported"] {
-            field.provenance = serde_json::json!({ key: { "frame": frame } });
-            assert_eq!(frame_of(&field).unwrap(), frame, "{key}");
-        }
-        for wrong in [
-            serde_json::json!({ "offset": [0.0, 0.0], "scale": 1.0 }),
-            serde_json::json!({ "offset": [0.0, 0.0, 0.0], "scale": 0.0 }),
-            serde_json::json!("far"),
-        ] {
-            field.provenance = serde_json::json!({ "dataset": { "frame": wrong } });
-            let told = frame_of(&field).unwrap_err().to_string();
-            assert!(told.contains("train the scene again"), "{told}");
-        }
+        field.record.frame = CaptureFrame { offset: [3e6, -2e5, 14.5], scale: 1e-3 };
+        assert_eq!(frame_of(&field).unwrap(), field.record.frame);
+        field.record.frame.scale = 0.0;
+        let told = frame_of(&field).unwrap_err().to_string();
+        assert!(told.contains("train the scene again"), "{told}");
     }
 
     #[test]

@@ -110,6 +110,6 @@ fn score(dataset: &Dataset, choice: &str, is_dark: bool) -> Result<Score, Box<dy
     let field = trainer.field();
     let options = EvaluationOptions::held_out(field);
     let scores = evaluate::<EvaluationError>(field, trainer.dataset(), &options, |_| Ok(()))?.overall;
-    let cpu_s = field.provenance["train"]["cpu_s"].as_f64().unwrap_or_default();
+    let cpu_s = field.record.run.as_ref().and_then(|run| run.cpu_s).unwrap_or_default();
     Ok(Score { psnr: scores.psnr.unwrap_or_default(), miou: scores.instance.miou, cpu_s })
 }

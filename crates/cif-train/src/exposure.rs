@@ -5,59 +5,17 @@ use std::collections::BTreeMap;
 
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
-use cif_geometry::PixelGrid;
 use serde::{Deserialize, Serialize};
 
 use crate::adam::{Moments, RowRates};
 
-/// What a camera makes of a colour: `gain * colour + offset` per channel, colours as captured, in [0, 1].
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Exposure {
-    /// Factor per channel.
-    pub gain: [f32; 3],
-    /// Added per channel.
-    pub offset: [f32; 3],
-}
+pub use cif_field::Exposure;
 
 /// Floats of an exposure: logarithms of gains, then offsets.
-pub(crate) const WIDTH: usize = 6;
+pub(crate) const WIDTH: usize = Exposure::WIDTH;
 
 /// First and last learning rate of the logarithms of gains, and of offsets.
 pub(crate) const RATES: [f32; 2] = [1e-2, 5e-4];
-
-impl Exposure {
-    /// What changes nothing.
-    pub const NEUTRAL: Self = Self { gain: [1.0; 3], offset: [0.0; 3] };
-
-    /// What the camera records of colours.
-    pub fn apply(&self, colors: &mut PixelGrid<[f32; 3]>) {
-        for pixel in &mut colors.pixels {
-            for channel in 0..3 {
-                pixel[channel] = self.gain[channel] * pixel[channel] + self.offset[channel];
-            }
-        }
-    }
-
-    /// Takes gradients by recorded colours back to those by the `rendered` ones; returns the gradient by the
-    /// exposure, logarithms of gains and then offsets.
-    pub fn pull_back(
-        &self,
-        rendered: &PixelGrid<[f32; 3]>,
-        v_color: &mut PixelGrid<[f32; 3]>,
-    ) -> [f32; WIDTH] {
-        // Summed in order and in double precision: images have many pixels.
-        let mut sums = [0.0_f64; WIDTH];
-        for (v, color) in v_color.pixels.iter_mut().zip(&rendered.pixels) {
-            for channel in 0..3 {
-                sums[channel] += f64::from(v[channel] * self.gain[channel] * color[channel]);
-                sums[3 + channel] += f64::from(v[channel]);
-                v[channel] *= self.gain[channel];
-            }
-        }
-        sums.map(|sum| sum as f32)
-    }
-}
 
 /// Exposures of the training cameras while they are learnt; saved with the progress of a run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -217,8 +175,7 @@ impl Exposures {
 /// Exposures that a scene was trained with, by camera; empty where it was trained without.
 #[must_use]
 pub fn trained_exposures(field: &Field) -> BTreeMap<String, Exposure> {
-    let recorded = field.provenance.get("train").and_then(|train| train.get("exposures"));
-    recorded.and_then(|value| serde_json::from_value(value.clone()).ok()).unwrap_or_default()
+    field.record.drawing.exposures.clone()
 }
 
 #[cfg(test)]

@@ -247,7 +247,7 @@ mod tests {
 
     fn checkpoint(iterations: u32) -> Checkpoint {
         let mut field = generate(&SyntheticConfig::default()).field;
-        field.provenance = serde_json::json!({ "iterations": iterations });
+        field.record.notes.insert("iterations".to_owned(), serde_json::json!(iterations));
         Checkpoint { field, training: None }
     }
 

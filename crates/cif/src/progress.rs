@@ -120,7 +120,7 @@ impl Progress {
                 if *rolled_back > 0 {
                     self.line(&format!(
                         "warning: {rolled_back} of {iterations} steps met values that are not finite and were rolled \
-                         back; the scene's provenance names the last"
+                         back; the scene's record names the last"
                     ));
                 }
                 self.plain_or_bar(&format!(

@@ -320,7 +320,7 @@ fn field() -> Field {
         background: [1.0; 3],
         sort_metric: SortMetric::Z,
         extent: 1.0,
-        provenance: json!({ "made by": "a test" }),
+        record: Default::default(),
     }
 }
 

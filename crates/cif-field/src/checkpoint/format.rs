@@ -272,7 +272,7 @@ impl FieldJson {
             background: field.background,
             sort_metric: field.sort_metric,
             extent: field.extent,
-            provenance: field.provenance.clone(),
+            provenance: field.record.to_json(),
         }
     }
 }

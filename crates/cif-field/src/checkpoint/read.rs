@@ -18,7 +18,7 @@ use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 use crate::gaussians::RowSource;
 use crate::gaussians::SH_FLOATS;
 use crate::parameters::{LOG_CALIBRATIONS, MEANS, MLP, PLANES};
-use crate::{Deformation, Field, Gaussians, Identities, Owner, Parameter, Tracks};
+use crate::{Deformation, Field, Gaussians, Identities, Owner, Parameter, Record, Tracks};
 
 pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
     let checkpoint = load_unchecked(path, with_training)?;
@@ -79,6 +79,8 @@ fn read_unchecked<S: Read + Seek>(
 }
 
 fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Result<Field, CheckpointError> {
+    let record = Record::from_json(json.provenance)
+        .map_err(|error| reader.damaged(format!("`{FIELD_KEY}`: {error}")))?;
     let means = MEANS.file_name();
     let n = match reader.info(&means, Dtype::F32)?.shape[..] {
         [n, 3] => n,
@@ -133,7 +135,7 @@ fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Re
         background: json.background,
         sort_metric: json.sort_metric,
         extent: json.extent,
-        provenance: json.provenance,
+        record,
     })
 }
 

@@ -9,7 +9,7 @@ use serde_json::json;
 
 use super::write::MAX_JSON_DEPTH;
 use super::*;
-use crate::{FieldError, Identities, Owner, testing};
+use crate::{FieldError, Identities, Owner, Record, testing};
 
 /// Words of the message that a change must cause.
 type Change<T> = (&'static str, fn(&mut T));
@@ -152,7 +152,8 @@ proptest! {
         field.extent = extent;
         field.instances[1].label = text.replace('\0', "");
         let finite = |values: &[f64]| values.iter().copied().filter(|value| value.is_finite()).collect::<Vec<_>>();
-        field.provenance = json!({ "text": text, "doubles": finite(&doubles) });
+        field.record.notes.insert("text".to_owned(), json!(text));
+        field.record.notes.insert("doubles".to_owned(), json!(finite(&doubles)));
         for (row, value) in floats.iter().filter(|value| value.is_finite()).take(n).enumerate() {
             field.gaussians.means[row][1] = *value;
         }
@@ -429,12 +430,13 @@ fn broken_scenes_are_neither_saved_nor_loaded() {
 fn json_too_deep_to_be_read_back_is_not_saved() {
     let nested = |depth: usize| (0..depth).fold(json!(1), |inner, _| json!([inner]));
     let mut checkpoint = example(2);
-    checkpoint.field.provenance = nested(MAX_JSON_DEPTH);
+    let record = |depth| Record { settings: Some(nested(depth - 1)), ..Record::default() };
+    checkpoint.field.record = record(MAX_JSON_DEPTH);
     checkpoint.training.as_mut().unwrap().json = nested(MAX_JSON_DEPTH);
     let loaded = read_bytes(&bytes_of(&checkpoint)).unwrap();
-    assert!(loaded.field.provenance == checkpoint.field.provenance);
+    assert!(loaded.field.record == checkpoint.field.record);
     assert!(loaded.training.unwrap().json == checkpoint.training.as_ref().unwrap().json);
-    checkpoint.field.provenance = nested(MAX_JSON_DEPTH + 1);
+    checkpoint.field.record = record(MAX_JSON_DEPTH + 1);
     let error = checkpoint.write(&mut Vec::new(), "deep.cif").unwrap_err().to_string();
     assert!(error.contains("nested too deeply"), "{error}");
 }

@@ -74,15 +74,16 @@ pub(super) fn write(
     let unsaveable =
         |problem: String| CheckpointError::Write { path: path.to_owned(), problem, source: None };
     let json = |value: serde_json::Result<String>| value.map_err(|error| unsaveable(error.to_string()));
-    let free_form = [Some(&field.provenance), training.map(|training| &training.json)];
+    let own = FieldJson::of(field);
+    let free_form = [Some(&own.provenance), training.map(|training| &training.json)];
     if free_form.into_iter().flatten().any(|value| deeper_than(value, MAX_JSON_DEPTH)) {
-        return Err(unsaveable("its provenance or training state is nested too deeply".to_owned()));
+        return Err(unsaveable("its record or training state is nested too deeply".to_owned()));
     }
 
     let mut metadata = BTreeMap::from([
         (FORMAT_KEY, format_of(field).to_string()),
         (VERSION_KEY, env!("CARGO_PKG_VERSION").to_owned()),
-        (FIELD_KEY, json(serde_json::to_string(&FieldJson::of(field)))?),
+        (FIELD_KEY, json(serde_json::to_string(&own))?),
     ]);
     let track_arrays = field.tracks.as_ref().map(TrackArrays::of);
     let mut tensors = field_tensors(field, track_arrays.as_ref());
@@ -123,7 +124,7 @@ pub(super) fn write(
     header.resize(header.len().next_multiple_of(8), b' ');
     if header.len() as u64 > MAX_HEADER {
         return Err(unsaveable(format!(
-            "its names, cameras and provenance take {} bytes, more than the {MAX_HEADER} that the format holds",
+            "its names, cameras and record take {} bytes, more than the {MAX_HEADER} that the format holds",
             header.len()
         )));
     }

@@ -34,7 +34,7 @@ use identities::{Owner, RowIdentity, unseen_members};
 use parts::subset;
 
 /// Applies the edits of a file to the field that the file was exported from, and lists them. `source` names the
-/// file, in errors and in the field's provenance. With `force` another field than the exported one is taken as
+/// file, in errors and in the field's record. With `force` another field than the exported one is taken as
 /// its base all the same: rows are then compared as they are numbered.
 ///
 /// # Errors
@@ -388,17 +388,7 @@ impl Work {
         field.tracks = tracks.compact();
         (field.instances, field.identities) =
             identities::rebuild(plan, instances.entries, field.identities.as_ref(), &rows);
-        let entry = serde_json::json!({ "file": source, "objects": changes.objects });
-        match &mut field.provenance {
-            serde_json::Value::Object(record) => {
-                let edits = record.entry("edits").or_insert_with(|| serde_json::json!([]));
-                match edits {
-                    serde_json::Value::Array(edits) => edits.push(entry),
-                    other => *other = serde_json::json!([entry]),
-                }
-            }
-            other => *other = serde_json::json!({ "edits": [entry] }),
-        }
+        field.record.edits.push(serde_json::json!({ "file": source, "objects": changes.objects }));
         field
             .validate()
             .map_err(|error| SceneError::Import { object: source.to_owned(), what: error.to_string() })?;

@@ -189,7 +189,7 @@ fn labels_names_and_categories_go_to_the_table() {
     assert_eq!(table, [(2, "blue mug", "thing"), (5, "tea pot", "thing"), (8, "thing 2", "box")]);
     assert_eq!(changes.objects.len(), 3);
     assert_eq!(field.gaussians, case.base.gaussians);
-    assert_eq!(field.provenance["edits"][0]["file"], "edited.usda");
+    assert_eq!(field.record.edits[0]["file"], "edited.usda");
 }
 
 #[test]

@@ -67,7 +67,7 @@ fn assert_same(a: &SceneGraph, b: &SceneGraph) {
 fn a_graph_keeps_its_place_in_the_world() {
     let mut field = recorded_field(2, 5);
     let frame = crate::CaptureFrame { offset: [3e6, -2e5, 40.0], scale: 0.01 };
-    field.provenance = serde_json::json!({ "dataset": { "frame": frame } });
+    field.record.frame = frame;
     let graph = build(&field, &options()).unwrap();
     assert_eq!(graph.frame, frame);
     let back = field_from_graph(&graph, "far.usda").unwrap();
@@ -91,7 +91,7 @@ fn a_graph_comes_back_as_the_graph_it_was() {
         assert_eq!(back.len(), field.len());
         assert_eq!(back.instances, field.instances);
         assert_eq!(back.timeline, field.timeline);
-        assert_eq!(back.provenance["imported"]["exported_from"], field.fingerprint());
+        assert_eq!(back.record.notes["imported"]["exported_from"], field.fingerprint());
         let again = build(&back, &options()).unwrap();
         assert_same(&graph, &again);
         // What is posed is the same at every frame, hidden or not.

@@ -61,7 +61,7 @@ fn field(objects: usize) -> Field {
         background: [1.0; 3],
         sort_metric: SortMetric::Z,
         extent: 1.0,
-        provenance: serde_json::Value::Null,
+        record: Default::default(),
     }
 }
 

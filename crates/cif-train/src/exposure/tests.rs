@@ -1,3 +1,4 @@
+use cif_geometry::PixelGrid;
 use rand::{RngExt, SeedableRng};
 
 use super::*;

@@ -11,7 +11,7 @@ use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, OccupancySource, RenderSettings, RenderedImage};
 use serde::Serialize;
 
-use crate::config::{Ablation, TrainConfig};
+use crate::config::TrainConfig;
 use crate::exposure::trained_exposures;
 
 use super::image::{psnr, ssim, unit_color};
@@ -210,21 +210,18 @@ pub fn evaluate<E: From<EvaluationError>>(
 /// The settings that a field was trained with; `None` for a field of other origin.
 #[must_use]
 pub fn training_config(field: &Field) -> Option<TrainConfig> {
-    TrainConfig::recorded(field.provenance.get("config")?.clone()).ok()
+    TrainConfig::recorded(field.record.settings.clone()?).ok()
 }
 
-/// Render settings that repeat those of the training run: what the field itself says, plus near plane,
-/// antialiasing and the source of occupancy from its recorded settings.
+/// Render settings that repeat those of the training run, as the record of the field has them.
 #[must_use]
 pub fn trained_settings(field: &Field) -> RenderSettings {
     let mut settings = RenderSettings::of_field(field);
-    if let Some(config) = training_config(field) {
-        settings.near = config.near;
-        settings.antialiased = config.antialiased;
-        if let (Some(instances), true) = (&mut settings.instances, config.ablates(Ablation::OpacityOccupancy))
-        {
-            instances.occupancy = OccupancySource::Opacity;
-        }
+    let drawing = &field.record.drawing;
+    settings.near = drawing.near.unwrap_or(settings.near);
+    settings.antialiased = drawing.antialiased.unwrap_or(settings.antialiased);
+    if let (Some(instances), true) = (&mut settings.instances, drawing.opacity_is_occupancy) {
+        instances.occupancy = OccupancySource::Opacity;
     }
     settings
 }

@@ -43,8 +43,7 @@ pub fn misfits(field: &Field, dataset: &Dataset, split: Split) -> Vec<Misfit> {
         return Vec::new();
     }
     let root = dataset.root.display();
-    let trained_on = field.provenance.pointer("/dataset/name").and_then(serde_json::Value::as_str);
-    let trained_on = trained_on.map_or_else(String::new, |name| format!(" of `{name}`"));
+    let trained_on = field.record.capture.as_ref().map_or_else(String::new, |name| format!(" of `{name}`"));
     let extent = f64::from(field.extent).max(f64::MIN_POSITIVE);
     let recorded: Vec<Recorded<'_>> = field.cameras.iter().map(Recorded::of).collect();
     let views: Vec<View> = frames.iter().map(|frame| View::of(frame, &recorded, field, extent)).collect();
@@ -273,7 +272,7 @@ mod tests {
             category: label.category.clone(),
         };
         field.instances = dataset.instances.iter().map(instance).collect();
-        field.provenance = serde_json::json!({ "dataset": { "name": "table" } });
+        field.record.capture = Some("table".to_owned());
         assert!(field.moves() && field.identities.is_some());
         field
     }

@@ -37,7 +37,7 @@ fn field() -> Field {
         background: [1.0; 3],
         sort_metric: SortMetric::Z,
         extent: 1.0,
-        provenance: serde_json::json!({}),
+        record: Default::default(),
     }
 }
 

@@ -73,7 +73,7 @@ impl Trainer {
         progress.source = Some(Source {
             scene: name.to_owned(),
             gaussians: field.gaussians.len(),
-            train: field.provenance.get("train").cloned().unwrap_or_default(),
+            train: serde_json::to_value(&field.record.run).unwrap_or_default(),
         });
         field.identities = None;
         field.instances = initialize::instances(&dataset);

@@ -82,7 +82,7 @@ fn a_bad_gradient_is_rolled_back_told_and_counted() {
         assert!(events.is_empty() && state(&trainer) != before, "{events:?}");
         assert_eq!(trainer.progress.rollbacks.in_a_row, 0);
     }
-    let record = trainer.provenance();
+    let record = trainer.provenance().to_json();
     assert_eq!(record["train"]["rolled_back"]["steps"], 2);
     assert!(
         record["train"]["rolled_back"]["last"].as_str().unwrap().contains("gradient of means[10] is NaN")
@@ -203,7 +203,7 @@ fn looking_at_every_array_changes_no_bit() {
     }
     let (mut a, mut b) = (state(&plain), state(&looked_at));
     // The record of a run holds wall times.
-    (a.0.provenance, b.0.provenance) = Default::default();
+    (a.0.record, b.0.record) = Default::default();
     assert!(a == b);
     assert_eq!(looked_at.rolled_back(), 0);
 }

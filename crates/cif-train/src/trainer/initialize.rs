@@ -50,7 +50,7 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
         background: config.background,
         sort_metric: config.sort_metric,
         extent: dataset.extent() as f32,
-        provenance: serde_json::json!({}),
+        record: Default::default(),
     })
 }
 

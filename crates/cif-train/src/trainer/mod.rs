@@ -277,7 +277,7 @@ impl Trainer {
         }
     }
 
-    /// The field as it is now; its provenance is up to date once a run has returned.
+    /// The field as it is now; its record is up to date once a run has returned.
     #[must_use]
     pub fn field(&self) -> &Field {
         &self.field
@@ -286,7 +286,7 @@ impl Trainer {
     /// The trained field, once a run has returned.
     #[must_use]
     pub fn into_field(mut self) -> Field {
-        self.field.provenance = self.provenance();
+        self.field.record = self.provenance();
         self.field
     }
 
@@ -326,7 +326,7 @@ impl Trainer {
         self.plan.steps_left(&self.config, self.progress.stage, self.progress.iteration)
     }
 
-    /// Records what was planned for the capture, for the field's provenance.
+    /// Records what was planned for the capture, for the field's record.
     pub fn record_effects(&mut self, plan: serde_json::Value) {
         self.progress.effects = Some(plan);
     }

@@ -1,71 +1,78 @@
 //! How a field came about, as recorded in it.
 
-use serde_json::{Value, json};
+use cif_field::{Drawing, Record, Run};
+use serde_json::{Map, Value, json};
 
 use super::Trainer;
+use crate::config::Ablation;
 use crate::events::Stage;
 
+/// The members of a JSON object that are not null.
+fn members(object: Value) -> Map<String, Value> {
+    match object {
+        Value::Object(members) => members.into_iter().filter(|(_, value)| !value.is_null()).collect(),
+        _ => Map::new(),
+    }
+}
+
 impl Trainer {
-    /// The record: settings, capture, steps, times, memory, versions.
-    pub(super) fn provenance(&self) -> Value {
-        let dataset = &self.dataset;
+    /// The record: how to draw the field, settings, capture, steps, times, memory, versions.
+    pub(super) fn provenance(&self) -> Record {
+        let (dataset, config, progress) = (&self.dataset, &self.config, &self.progress);
         let masks = dataset.frames.iter().find_map(|frame| frame.mask.as_ref()).and_then(|mask| {
             let folder = mask.strip_prefix(&dataset.root).ok().unwrap_or(mask).components().next()?;
             folder.as_os_str().to_str().map(str::to_owned)
         });
-        let mut record = json!({
-            "generator": { "name": "cif", "version": env!("CARGO_PKG_VERSION") },
-            "dataset": {
-                "name": dataset.root.file_name().and_then(|name| name.to_str()),
-                "layout": dataset.layout,
-                "frames": dataset.frames.len(),
-                "training_frames": self.frames.len(),
-                "times": dataset.times.len(),
-                "instances": dataset.instances.len(),
-                "masks": masks,
+        let rollbacks = &progress.rollbacks;
+        let rolled_back =
+            (!rollbacks.is_empty()).then(|| json!({ "steps": rollbacks.total, "last": rollbacks.last }));
+        let exposures = progress.exposures.iter().flat_map(|exposures| exposures.by_camera());
+        Record {
+            drawing: Drawing {
+                near: Some(config.near),
+                antialiased: Some(config.antialiased),
+                opacity_is_occupancy: config.ablates(Ablation::OpacityOccupancy),
+                exposures: exposures.map(|(camera, exposure)| (camera.to_owned(), exposure)).collect(),
             },
-            "train": {
-                "complete": self.progress.stage == Stage::Done,
-                "preset": self.config.preset,
-                "seed": self.config.seed,
-                "iterations": self.progress.total_steps,
-                "iterations_by_stage": self.progress.steps,
-                "wall_s": self.progress.total_wall_s(),
-                "wall_s_by_stage": self.progress.wall_s,
-                "cpu_s": self.progress.total_cpu_s(),
-                "cpu_s_by_stage": self.progress.cpu_s,
-                "peak_rss_mb": peak_rss_mb(),
-                "simd": self.simd_name(),
-                "gaussians": self.field.gaussians.len(),
-                "psnr_training_views": self.progress.psnr,
-                "work": (self.progress.work.views > 0).then_some(self.progress.work),
-            },
-            "config": self.config,
-        });
-        if !dataset.frame.is_identity() {
-            record["dataset"]["frame"] = json!(dataset.frame);
+            frame: dataset.frame,
+            capture: dataset.root.file_name().and_then(|name| name.to_str()).map(str::to_owned),
+            run: Some(Run {
+                complete: progress.stage == Stage::Done,
+                preset: json!(config.preset).as_str().map(str::to_owned),
+                seed: Some(config.seed),
+                iterations: Some(progress.total_steps),
+                wall_s: Some(progress.total_wall_s()),
+                wall_s_by_stage: progress.wall_s.clone(),
+                cpu_s: Some(progress.total_cpu_s()),
+                peak_rss_mb: peak_rss_mb(),
+                notes: members(json!({
+                    "iterations_by_stage": progress.steps,
+                    "cpu_s_by_stage": progress.cpu_s,
+                    "simd": self.simd_name(),
+                    "gaussians": self.field.gaussians.len(),
+                    "psnr_training_views": progress.psnr,
+                    "work": (progress.work.views > 0).then_some(progress.work),
+                    "rolled_back": rolled_back,
+                    "effects": progress.effects,
+                    "goals": self.goals_record(),
+                    "from": progress.source,
+                })),
+            }),
+            settings: Some(json!(config)),
+            curve: (!progress.curve.points.is_empty()).then(|| json!(progress.curve)),
+            edits: Vec::new(),
+            notes: members(json!({
+                "generator": { "name": "cif", "version": env!("CARGO_PKG_VERSION") },
+                "dataset": {
+                    "layout": dataset.layout,
+                    "frames": dataset.frames.len(),
+                    "training_frames": self.frames.len(),
+                    "times": dataset.times.len(),
+                    "instances": dataset.instances.len(),
+                    "masks": masks,
+                },
+            })),
         }
-        if !self.progress.rollbacks.is_empty() {
-            let rollbacks = &self.progress.rollbacks;
-            record["train"]["rolled_back"] = json!({ "steps": rollbacks.total, "last": rollbacks.last });
-        }
-        if let Some(effects) = &self.progress.effects {
-            record["train"]["effects"] = effects.clone();
-        }
-        if let Some(exposures) = &self.progress.exposures {
-            record["train"]["exposures"] = json!(exposures.by_camera());
-        }
-        if !self.progress.curve.points.is_empty() {
-            record["curve"] = json!(self.progress.curve);
-        }
-        let goals = self.goals_record();
-        if !goals.is_null() {
-            record["train"]["goals"] = goals;
-        }
-        if let Some(source) = &self.progress.source {
-            record["train"]["from"] = json!(source);
-        }
-        record
     }
 }
 

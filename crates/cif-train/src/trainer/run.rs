@@ -49,7 +49,7 @@ impl Trainer {
             Err(TrainError::Stopped) => Ok(Outcome::Interrupted),
             result => result,
         };
-        self.field.provenance = self.provenance();
+        self.field.record = self.provenance();
         result
     }
 

@@ -119,7 +119,7 @@ impl Trainer {
     #[must_use]
     pub fn checkpoint(&self, with_state: bool) -> Checkpoint {
         let mut field = self.field.clone();
-        field.provenance = self.provenance();
+        field.record = self.provenance();
         Checkpoint { field, training: with_state.then(|| self.training_state()) }
     }
 

@@ -290,5 +290,5 @@ pub(crate) fn stopped_after(dataset: &Dataset, config: &TrainConfig, steps: u64)
 
 /// A field without its record, which holds wall times.
 pub(crate) fn without_record(field: &Field) -> Field {
-    Field { provenance: serde_json::Value::Null, ..field.clone() }
+    Field { record: Default::default(), ..field.clone() }
 }

@@ -192,7 +192,7 @@ fn one_in_view(others: usize) -> (Field, PinholeCamera) {
         background: [1.0; 3],
         sort_metric: SortMetric::Z,
         extent: 1.0,
-        provenance: serde_json::json!({}),
+        record: Default::default(),
     };
     let camera = PinholeCamera {
         width: 33,

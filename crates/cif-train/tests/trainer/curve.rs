@@ -58,13 +58,13 @@ fn a_run_records_its_curve_and_ends_as_without_it() {
     assert_eq!((curve.frames, curve.frame_names.len()), (CurveFrames::HeldOut, 3));
     assert!(curve.points[..3].iter().all(|point| point.miou.is_none() && point.psnr > Some(10.0)));
     assert!(curve.points[3..].iter().all(|point| point.miou > Some(30.0) && point.ssim > Some(0.3)));
-    let recorded: Curve = serde_json::from_value(trainer.field().provenance["curve"].clone()).unwrap();
+    let recorded: Curve = serde_json::from_value(trainer.field().record.curve.clone().unwrap()).unwrap();
     assert_eq!(recorded, curve);
-    assert_eq!(trainer.field().provenance["train"]["cpu_s"], 180.5);
+    assert_eq!(trainer.field().record.to_json()["train"]["cpu_s"], 180.5);
 
     config.report.curve_frames = 0;
     let without = train(dataset, config);
-    assert!(without.curve().points.is_empty() && without.field().provenance.get("curve").is_none());
+    assert!(without.curve().points.is_empty() && without.field().record.curve.is_none());
     assert!(
         without_record(trainer.field()) == without_record(without.field()),
         "measuring changed the result"

@@ -45,7 +45,7 @@ fn a_static_capture_without_masks_trains_plain_splats_only() {
     assert_eq!((times.labelled_tiles, times.identity_rows, times.instance_pairs), (0, 0, 0));
     assert!(trainer.field().deformation.is_none() && trainer.field().identities.is_none());
     // The scene records as much.
-    let work = trainer.field().provenance["train"]["work"].clone();
+    let work = trainer.field().record.to_json()["train"]["work"].clone();
     assert_eq!(work, serde_json::json!(trainer.work()));
     let nothing = ["deformed", "deformed_backward", "labelled_tiles", "identity_rows", "instance_pairs"];
     assert!(nothing.iter().all(|name| work[name] == 0), "{work}");

@@ -62,12 +62,12 @@ fn it_begins_where_the_reconstruction_of_a_whole_run_ends() {
     assert_eq!(stages, [Stage::Identity, Stage::Instance]);
     let begun = begun.into_field();
     assert!(without_record(&begun) == without_record(&whole));
-    let from = &begun.provenance["train"]["from"];
+    let from = begun.record.to_json()["train"]["from"].clone();
     assert_eq!(
         (&from["scene"], &from["gaussians"], &from["train"]["seed"]),
         (&"a.cif".into(), &at_end.field().len().into(), &config.seed.into())
     );
-    assert!(whole.provenance["train"].get("from").is_none());
+    assert!(whole.record.to_json()["train"].get("from").is_none());
 
     // A scene trained without masks has the same reconstruction; only its moments are not stored.
     let bare = train(without_masks(&dataset), config.clone());
@@ -90,7 +90,7 @@ fn it_begins_where_the_reconstruction_of_a_whole_run_ends() {
     assert_eq!(outcome.unwrap(), Outcome::Interrupted);
     let resumed = finish(Trainer::resume(dataset, begun.checkpoint(true)).unwrap());
     assert!(without_record(&resumed) == without_record(&whole));
-    assert_eq!(resumed.provenance["train"]["from"]["scene"], "a.cif");
+    assert_eq!(resumed.record.to_json()["train"]["from"]["scene"], "a.cif");
 }
 
 #[test]

@@ -278,7 +278,7 @@ fn judged_runs_go_on_on_either_backend_and_end_the_same_on_a_gpu() {
         field.validate().unwrap();
         assert!(!field.deformation.as_ref().unwrap().config.heads.rotation);
         if first.is_some() && second.is_some() {
-            let plain = |field: &Field| Field { provenance: serde_json::Value::Null, ..field.clone() };
+            let plain = |field: &Field| Field { record: Default::default(), ..field.clone() };
             assert!(plain(field) == plain(whole.field()), "stopped after {stop_at}");
             assert_eq!(trained_exposures(field), trained_exposures(whole.field()));
         }
@@ -324,8 +324,7 @@ fn interrupted_runs_on_a_gpu_end_where_uninterrupted_ones_end() {
         for (name, difference) in differences(whole.field(), other.field(), whole.field()) {
             assert!(difference == 0.0, "{what}: {name} differ");
         }
-        let plain =
-            |trainer: &Trainer| Field { provenance: serde_json::Value::Null, ..trainer.field().clone() };
+        let plain = |trainer: &Trainer| Field { record: Default::default(), ..trainer.field().clone() };
         assert!(plain(&whole) == plain(other), "{what}: the fields differ");
     };
     same(&run(&dataset, &config, Some(&gpu), u64::MAX), "the same run again");

@@ -43,7 +43,7 @@ fn a_budget_ends_every_stage_on_time() {
         assert_eq!(stages, [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]);
         let used = budget.used(clock.now());
         assert!((54.0..=62.0).contains(&used), "{used}");
-        let record = &trainer.field().provenance["train"];
+        let record = trainer.field().record.to_json()["train"].clone();
         let steps = |stage: &str| record["iterations_by_stage"][stage].as_u64().unwrap();
         let planned = small_config().stages;
         assert!(steps("coarse") < u64::from(planned.coarse) && steps("coarse") > 5);
@@ -79,7 +79,7 @@ fn a_resumed_run_takes_a_budget_for_the_rest() {
     assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
     let used = budget.used(clock.now());
     assert!((27.0..=32.0).contains(&used), "{used}");
-    let record = &resumed.field().provenance["train"]["iterations_by_stage"];
+    let record = resumed.field().record.to_json()["train"]["iterations_by_stage"].clone();
     assert!(record["fine"].as_u64() > Some(60) && record["instance"].as_u64() > Some(10), "{record}");
 }
 
@@ -129,7 +129,7 @@ fn targets_end_a_run_as_soon_as_they_are_reached() {
     assert!(last.psnr >= Some(16.0) && last.miou >= Some(40.0), "{last:?}");
     assert!(trainer.steps_done() < 1_000, "{}", trainer.steps_done());
     assert!(trainer.config().stages.instance < 500, "instances follow the shorter fine stage");
-    assert_eq!(trainer.field().provenance["train"]["goals"]["targets"]["reached"], true);
+    assert_eq!(trainer.field().record.to_json()["train"]["goals"]["targets"]["reached"], true);
     assert!(warnings.is_empty(), "{warnings:?}");
 }
 

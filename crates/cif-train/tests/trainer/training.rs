@@ -52,8 +52,8 @@ fn a_run_reaches_its_quality_and_reports_its_stages() {
     }
     let field = trainer.into_field();
     field.validate().unwrap();
-    assert_eq!(field.provenance["train"]["complete"], true);
-    assert_eq!(field.provenance["train"]["iterations"], 720);
+    assert_eq!(field.record.to_json()["train"]["complete"], true);
+    assert_eq!(field.record.to_json()["train"]["iterations"], 720);
     let scores =
         evaluate::<EvaluationError>(&field, &dataset, &EvaluationOptions::held_out(&field), |_| Ok(()))
             .unwrap()
@@ -279,7 +279,7 @@ fn one_frame_is_a_static_capture() {
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 20, 10);
     let trainer = train(dataset, config);
     assert!(trainer.field().deformation.is_none());
-    assert_eq!(trainer.field().provenance["train"]["iterations_by_stage"]["fine"], 30);
+    assert_eq!(trainer.field().record.to_json()["train"]["iterations_by_stage"]["fine"], 30);
     assert!(trainer.field().identities.is_some());
 }
 

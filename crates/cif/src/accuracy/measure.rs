@@ -91,13 +91,13 @@ pub fn train(
     }
     let curve = trainer.curve().clone();
     let field = trainer.into_field();
-    let seconds = |key: &str| field.provenance["train"][key].as_f64().unwrap_or(0.0);
+    let run = field.record.run.clone().unwrap_or_default();
     let record = Record {
-        cpu_s: seconds("cpu_s"),
-        wall_s: seconds("wall_s"),
+        cpu_s: run.cpu_s.unwrap_or(0.0),
+        wall_s: run.wall_s.unwrap_or(0.0),
         gaussians: Some(field.len()),
         bytes: Some(parameter_bytes(&field, 4, 4, 4)),
-        peak_rss_mb: field.provenance["train"]["peak_rss_mb"].as_f64(),
+        peak_rss_mb: run.peak_rss_mb,
         curve: Some(curve),
         ..Record::default()
     };

@@ -142,19 +142,18 @@ fn to_json(evaluation: &Evaluation, field: &Field) -> Value {
     let mut report = scores_json(&evaluation.overall, field);
     let groups: serde_json::Map<String, Value> =
         evaluation.groups.iter().map(|(name, scores)| (name.clone(), scores_json(scores, field))).collect();
-    let run = field.provenance.get("train").unwrap_or(&Value::Null);
-    let key = |name: &str| run.get(name).cloned().unwrap_or(Value::Null);
+    let run = field.record.run.clone().unwrap_or_default();
     report["groups"] = Value::Object(groups);
     report["per_frame"] = json!(evaluation.frames);
     report["gaussians"] = json!(evaluation.gaussians);
     report["frames_with_exposure"] = json!(evaluation.exposed_frames);
     report["render_ms_per_frame"] = json!(evaluation.render_ms_per_frame);
     report["train"] = json!({
-        "wall_s": key("wall_s"),
-        "iterations": key("iterations"),
-        "preset": key("preset"),
-        "peak_rss_mb": key("peak_rss_mb"),
-        "seed": key("seed"),
+        "wall_s": run.wall_s,
+        "iterations": run.iterations,
+        "preset": run.preset,
+        "peak_rss_mb": run.peak_rss_mb,
+        "seed": run.seed,
     });
     report
 }

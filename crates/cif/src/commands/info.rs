@@ -140,9 +140,9 @@ fn scene_facts(checkpoint: &Checkpoint) -> Facts {
         ("extent".to_owned(), json!(field.extent)),
         ("instances".to_owned(), json!(instances)),
         ("resumable".to_owned(), json!(checkpoint.training.is_some())),
-        ("work".to_owned(), field.provenance.pointer("/train/work").cloned().unwrap_or_default()),
-        ("curve".to_owned(), field.provenance.get("curve").cloned().unwrap_or_default()),
-        ("provenance".to_owned(), field.provenance.clone()),
+        ("work".to_owned(), json!(field.record.run.as_ref().and_then(|run| run.notes.get("work")))),
+        ("curve".to_owned(), json!(field.record.curve)),
+        ("provenance".to_owned(), field.record.to_json()),
     ]
 }
 

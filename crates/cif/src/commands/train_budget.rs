@@ -177,10 +177,8 @@ impl Goals {
     pub(super) fn report(&self, timing: &Timing, trainer: &Trainer) {
         let curve = trainer.curve();
         if let Some(budget) = self.budget(timing) {
-            let record = &trainer.field().provenance["train"]["wall_s_by_stage"];
-            let stages = record.as_object().into_iter().flatten();
-            let stages: Vec<String> =
-                stages.map(|(stage, s)| format!("{stage} {:.1} s", s.as_f64().unwrap_or(0.0))).collect();
+            let stages = trainer.field().record.run.iter().flat_map(|run| &run.wall_s_by_stage);
+            let stages: Vec<String> = stages.map(|(stage, s)| format!("{stage} {s:.1} s")).collect();
             eprintln!(
                 "used {:.1} s of the budget of {:.0} s: {}; measuring {:.1} s",
                 budget.used(timing.clock.now()),

@@ -197,7 +197,7 @@ fn views_without_room_are_drawn_again_and_no_bit_differs() {
         assert_eq!(losses, [0], "room is no fault");
         let wanted = trainer.device.as_ref().unwrap().wanted;
         let mut state = state(&mut trainer);
-        state.0.provenance = serde_json::Value::Null;
+        state.0.record = Default::default();
         (state, wanted)
     };
     let (roomy, _) = run(1 << 17);
@@ -320,7 +320,7 @@ fn debug_validation_names_the_part_and_changes_no_bit() {
         assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
     }
     let (mut a, mut b) = (state(&mut plain), state(&mut looked_at));
-    (a.0.provenance, b.0.provenance) = Default::default();
+    (a.0.record, b.0.record) = Default::default();
     assert!(a == b);
 
     let fault_of = |damage: &dyn Fn(&mut Trainer)| {
@@ -379,7 +379,7 @@ fn the_faster_of_both_is_taken_and_the_trial_leaves_no_trace() {
         let (mut other, _folder) = self::trainer(taken.then_some(&gpu));
         assert_eq!(other.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         let (mut a, mut b) = (state(&mut trainer), state(&mut other));
-        (a.0.provenance, b.0.provenance) = Default::default();
+        (a.0.record, b.0.record) = Default::default();
         assert!(a == b, "the trial left a trace");
     }
 }

@@ -1,0 +1,288 @@
+//! How a field came about, and how it has to be drawn.
+//!
+//! In a file the record is the JSON object `provenance`. What programs act on has a type here; everything else is kept
+//! as [`Record::notes`], which people read and no behaviour depends on. Files of older versions have the same facts at
+//! other keys (near plane and antialiasing among the settings, exposures in the run) and are read into the same record.
+
+use std::collections::BTreeMap;
+
+use cif_geometry::CaptureFrame;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+
+use crate::Exposure;
+
+/// How a field came about, and how it has to be drawn.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Record {
+    /// How it has to be drawn.
+    pub drawing: Drawing,
+    /// Where its coordinates lie in the world of its capture, or of the file that it was imported from.
+    pub frame: CaptureFrame,
+    /// Name of the capture that it was trained on.
+    pub capture: Option<String>,
+    /// The run that trained it.
+    pub run: Option<Run>,
+    /// Settings of the run, for information and as the base of other runs.
+    pub settings: Option<Value>,
+    /// Quality over the steps of the run, as the trainer measured it.
+    pub curve: Option<Value>,
+    /// Edits that were brought home from exported files, oldest first.
+    pub edits: Vec<Value>,
+    /// Everything else: versions, counts of the capture, the imported file. No behaviour reads it.
+    pub notes: Map<String, Value>,
+}
+
+/// What a renderer has to know to show a field as it was trained.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Drawing {
+    /// Distance of the near plane, world units; `None` for the renderer's own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub near: Option<f32>,
+    /// True when footprints are widened and their opacity lowered in turn; `None` for the renderer's own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub antialiased: Option<bool>,
+    /// True when the opacity takes the place of the occupancy.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub opacity_is_occupancy: bool,
+    /// What every camera makes of colours; empty where all record them as they are.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub exposures: BTreeMap<String, Exposure>,
+}
+
+/// A training run.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct Run {
+    /// True when all stages were run.
+    pub complete: bool,
+    /// Name of the preset.
+    pub preset: Option<String>,
+    /// Seed of all random numbers.
+    pub seed: Option<u64>,
+    /// Steps over all stages.
+    pub iterations: Option<u64>,
+    /// Time of the steps on the clock, seconds.
+    pub wall_s: Option<f64>,
+    /// The same per stage.
+    pub wall_s_by_stage: BTreeMap<String, f64>,
+    /// Time of the steps over all threads, seconds.
+    pub cpu_s: Option<f64>,
+    /// Largest resident memory, MB; `None` where the system did not tell.
+    pub peak_rss_mb: Option<f64>,
+    /// Everything else about the run. No behaviour reads it.
+    #[serde(flatten)]
+    pub notes: Map<String, Value>,
+}
+
+/// Why a record cannot be read.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum RecordError {
+    /// The scene lies nowhere.
+    #[error("the frame of the capture is recorded as {found}; train the scene again")]
+    Frame {
+        /// What is recorded.
+        found: String,
+    },
+}
+
+const CAPTURE: &str = "dataset";
+const IMPORTED: &str = "imported";
+const RUN: &str = "train";
+const SETTINGS: &str = "config";
+const CURVE: &str = "curve";
+const EDITS: &str = "edits";
+const DRAWING: &str = "drawing";
+const NAME: &str = "name";
+const FRAME: &str = "frame";
+const EXPOSURES: &str = "exposures";
+
+impl Record {
+    /// Reads the JSON of this version or of an older one. What has not the type that is expected stays a note, except for
+    /// frames, which nobody may guess.
+    ///
+    /// # Errors
+    /// A frame that places the field nowhere.
+    pub fn from_json(json: Value) -> Result<Self, RecordError> {
+        let mut notes = match json {
+            Value::Object(notes) => notes,
+            Value::Null => return Ok(Self::default()),
+            // Nobody wrote such records, but files may hold anything here.
+            other => Map::from_iter([("note".to_owned(), other)]),
+        };
+        let mut record = Self { frame: take_frame(&mut notes)?, ..Self::default() };
+        record.capture = notes.get_mut(CAPTURE).and_then(Value::as_object_mut).and_then(|of| take(of, NAME));
+        record.run = take(&mut notes, RUN);
+        record.settings = notes.remove(SETTINGS);
+        record.curve = notes.remove(CURVE);
+        record.edits = take(&mut notes, EDITS).unwrap_or_default();
+        record.drawing = match take(&mut notes, DRAWING) {
+            Some(drawing) => drawing,
+            None => drawing_of_older_files(record.settings.as_ref(), record.run.as_mut()),
+        };
+        notes.retain(|_, value| value.as_object().is_none_or(|members| !members.is_empty()));
+        record.notes = notes;
+        Ok(record)
+    }
+
+    /// The record as JSON object.
+    #[must_use]
+    pub fn to_json(&self) -> Value {
+        let mut json = self.notes.clone();
+        let place =
+            if json.contains_key(IMPORTED) && !json.contains_key(CAPTURE) { IMPORTED } else { CAPTURE };
+        let mut put = |object: &str, key: &str, value: Value| {
+            if let Value::Object(members) = json.entry(object).or_insert_with(|| json!({})) {
+                members.insert(key.to_owned(), value);
+            }
+        };
+        if let Some(name) = &self.capture {
+            put(CAPTURE, NAME, json!(name));
+        }
+        if !self.frame.is_identity() {
+            put(place, FRAME, json!(self.frame));
+        }
+        let run = self.run.as_ref().map(|run| json!(run));
+        let edits = (!self.edits.is_empty()).then(|| json!(self.edits));
+        let drawing = (self.drawing != Drawing::default()).then(|| json!(self.drawing));
+        let members = [
+            (RUN, run),
+            (SETTINGS, self.settings.clone()),
+            (CURVE, self.curve.clone()),
+            (EDITS, edits),
+            (DRAWING, drawing),
+        ];
+        json.extend(members.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
+        Value::Object(json)
+    }
+}
+
+/// Takes a member where it has a type; others stay.
+fn take<T: DeserializeOwned>(object: &mut Map<String, Value>, key: &str) -> Option<T> {
+    let value = serde_json::from_value(object.get(key)?.clone()).ok()?;
+    object.remove(key);
+    Some(value)
+}
+
+/// The frame of the capture, else that of the imported file.
+fn take_frame(notes: &mut Map<String, Value>) -> Result<CaptureFrame, RecordError> {
+    for key in [CAPTURE, IMPORTED] {
+        let members = notes.get_mut(key).and_then(Value::as_object_mut);
+        let Some(found) = members.and_then(|members| members.remove(FRAME)).filter(|found| !found.is_null())
+        else {
+            continue;
+        };
+        let frame = serde_json::from_value::<CaptureFrame>(found.clone()).ok().filter(CaptureFrame::is_valid);
+        return frame.ok_or_else(|| RecordError::Frame { found: found.to_string() });
+    }
+    Ok(CaptureFrame::default())
+}
+
+/// Until version 0.1 files told how to draw them by the settings of the run, and exposures beside its times.
+fn drawing_of_older_files(settings: Option<&Value>, run: Option<&mut Run>) -> Drawing {
+    let setting = |pointer: &str| settings.and_then(|settings| settings.pointer(pointer));
+    let ablations = setting("/instance/ablate").and_then(Value::as_array);
+    Drawing {
+        near: setting("/near").and_then(Value::as_f64).map(|near| near as f32),
+        antialiased: setting("/antialiased").and_then(Value::as_bool),
+        opacity_is_occupancy: ablations.is_some_and(|names| names.contains(&json!("opacity-occupancy"))),
+        exposures: run.and_then(|run| take(&mut run.notes, EXPOSURES)).unwrap_or_default(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As the trainer wrote it before there were typed records.
+    fn older() -> Value {
+        json!({
+            "generator": { "name": "cif", "version": "0.1.0" },
+            "dataset": {
+                "name": "table", "layout": "nerfstudio", "frames": 40, "masks": "masks",
+                "frame": { "offset": [3e6, -2e5, 14.5], "scale": 0.001 },
+            },
+            "train": {
+                "complete": true, "preset": "draft", "seed": 3, "iterations": 720, "wall_s": 61.5,
+                "iterations_by_stage": { "coarse": 200, "fine": 520 },
+                "wall_s_by_stage": { "coarse": 21.5, "fine": 40.0 },
+                "cpu_s": 180.5, "peak_rss_mb": null, "simd": "avx2",
+                "exposures": { "left": { "gain": [1.25, 1.0, 1.0], "offset": [0.0, 0.5, 0.0] } },
+            },
+            "config": {
+                "near": 0.25, "antialiased": true, "preset": "draft",
+                "instance": { "ablate": ["no-resampling", "opacity-occupancy"] },
+            },
+            "curve": { "points": [] },
+            "edits": [{ "file": "edited.usda", "objects": [] }],
+        })
+    }
+
+    #[test]
+    fn older_records_are_understood() {
+        let record = Record::from_json(older()).unwrap();
+        assert_eq!(record.frame, CaptureFrame { offset: [3e6, -2e5, 14.5], scale: 0.001 });
+        assert_eq!(record.capture.as_deref(), Some("table"));
+        let Drawing { near, antialiased, opacity_is_occupancy, exposures } = &record.drawing;
+        assert_eq!((*near, *antialiased, *opacity_is_occupancy), (Some(0.25), Some(true), true));
+        assert_eq!(exposures["left"].gain, [1.25, 1.0, 1.0]);
+        let run = record.run.as_ref().unwrap();
+        assert_eq!((run.iterations, run.wall_s, run.peak_rss_mb), (Some(720), Some(61.5), None));
+        assert_eq!(run.wall_s_by_stage["fine"], 40.0);
+        assert_eq!(run.notes["simd"], "avx2");
+        assert_eq!(record.edits.len(), 1);
+        assert_eq!(record.notes["dataset"]["layout"], "nerfstudio");
+        assert!(record.notes["dataset"].get("name").is_none(), "nothing is there twice");
+    }
+
+    #[test]
+    fn records_come_back_and_show_what_older_ones_showed() {
+        let (older, record) = (older(), Record::from_json(older()).unwrap());
+        let json = record.to_json();
+        assert_eq!(Record::from_json(json.clone()).unwrap(), record);
+        for key in ["generator", "dataset", "config", "curve", "edits"] {
+            assert_eq!(json[key], older[key], "{key}");
+        }
+        for (key, value) in older["train"].as_object().unwrap() {
+            let moved = if key == "exposures" { &json["drawing"][key] } else { &json["train"][key] };
+            assert_eq!(moved, value, "{key}");
+        }
+        assert_eq!(Record::from_json(Value::Null).unwrap().to_json(), json!({}));
+    }
+
+    #[test]
+    fn what_the_new_key_says_counts() {
+        let mut json = older();
+        json["drawing"] = json!({ "near": 0.5 });
+        let record = Record::from_json(json).unwrap();
+        assert_eq!(record.drawing, Drawing { near: Some(0.5), ..Drawing::default() });
+    }
+
+    #[test]
+    fn imported_scenes_keep_the_frame_of_their_file() {
+        let frame = CaptureFrame { offset: [1.0, 2.0, 3.0], scale: 0.5 };
+        let json = json!({ "imported": { "file": "a.usda", "frame": frame } });
+        let record = Record::from_json(json.clone()).unwrap();
+        assert_eq!(record.frame, frame);
+        assert_eq!(record.to_json(), json);
+    }
+
+    #[test]
+    fn what_nobody_knows_is_kept_and_wrong_frames_are_refused() {
+        let odd = json!({ "train": "yesterday", "made by": ["hand", 3], "edits": 7 });
+        let record = Record::from_json(odd.clone()).unwrap();
+        assert!(record.run.is_none() && record.edits.is_empty());
+        assert_eq!(record.to_json(), odd);
+        for wrong in [
+            json!({ "offset": [0.0, 0.0], "scale": 1.0 }),
+            json!({ "offset": [0.0, 0.0, 0.0], "scale": 0.0 }),
+            json!("far"),
+        ] {
+            let told = Record::from_json(json!({ "dataset": { "frame": wrong } })).unwrap_err().to_string();
+            assert!(told.contains("train the scene again"), "{told}");
+        }
+    }
+}
