@@ -28,7 +28,8 @@ impl Content {
         if is_field(path) {
             return Ok(Self::Field);
         }
-        format_of(path).map(Self::Graph)
+        let found = recognised(path).map(Self::Graph);
+        found.ok_or_else(|| unknown_ending(path, &format!(".cif, {}", endings())))
     }
 }
 
@@ -43,13 +44,18 @@ pub fn is_field(path: &Path) -> bool {
 /// # Errors
 /// When its ending is not known.
 pub fn format_of(path: &Path) -> Result<&'static dyn SceneFormat, Error> {
-    let found = FORMATS.into_iter().find(|format| format.recognises(path));
-    found.ok_or_else(|| {
-        Error::usage(
-            format!("{}: the ending of the name tells the format, and this one is not known", path.display()),
-            format!("use {}", endings()),
-        )
-    })
+    recognised(path).ok_or_else(|| unknown_ending(path, &endings()))
+}
+
+fn recognised(path: &Path) -> Option<&'static dyn SceneFormat> {
+    FORMATS.into_iter().find(|format| format.recognises(path))
+}
+
+fn unknown_ending(path: &Path, known: &str) -> Error {
+    Error::usage(
+        format!("{}: the ending of the name tells the format, and this one is not known", path.display()),
+        format!("use {known}"),
+    )
 }
 
 /// Endings that can be read, for messages: `.usda, .usdc (USD), .glb (glTF) or .ply (PLY)`.
