@@ -1,9 +1,11 @@
 //! The GPU: which one, what it can do, and what went wrong on it.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::error::GpuError;
 use super::features::GpuFeatures;
+use super::kernel::Kernel;
 use super::workgroup::{Form, SubgroupUse, self_check};
 
 /// Interfaces that are asked for GPUs. OpenGL is left out: its drivers are listed twice where Vulkan is there, and
@@ -110,7 +112,10 @@ fn missing(limits: &wgpu::Limits) -> Vec<String> {
 /// The first fault that the driver told, kept until someone asks.
 type Fault = Arc<Mutex<Option<GpuError>>>;
 
-/// A device with its queue. Clones share it.
+/// Kernels by the name and the source of their module.
+type Compiled = Arc<Mutex<BTreeMap<(&'static str, String), Vec<Kernel>>>>;
+
+/// A device with its queue and what was compiled for it. Clones share all.
 #[derive(Clone, Debug)]
 pub struct Gpu {
     device: wgpu::Device,
@@ -119,6 +124,7 @@ pub struct Gpu {
     subgroups: Arc<SubgroupUse>,
     constants_in_storage: bool,
     fault: Fault,
+    kernels: Compiled,
 }
 
 impl Gpu {
@@ -224,7 +230,25 @@ impl Gpu {
             (false, None) => SubgroupUse::Missing,
         };
         let (facts, subgroups) = (Arc::new(facts), Arc::new(subgroups));
-        Self { device, queue, facts, subgroups, constants_in_storage, fault }.checked()
+        let kernels = Compiled::default();
+        Self { device, queue, facts, subgroups, constants_in_storage, fault, kernels }.checked()
+    }
+
+    /// Kernels of a module's source: those compiled before, or else what `compile` makes of it.
+    pub(super) fn compiled(
+        &self,
+        module: &'static str,
+        source: String,
+        compile: impl FnOnce(&str) -> Result<Vec<Kernel>, GpuError>,
+    ) -> Result<Vec<Kernel>, GpuError> {
+        let compiled = || self.kernels.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = (module, source);
+        if let Some(kernels) = compiled().get(&key) {
+            return Ok(kernels.clone());
+        }
+        let kernels = compile(&key.1)?;
+        compiled().insert(key, kernels.clone());
+        Ok(kernels)
     }
 
     /// Itself with subgroups that are used only where they compute known numbers right.

@@ -130,7 +130,7 @@ pub struct Kernel {
 }
 
 impl Kernel {
-    /// Compiles every entry point of a module, in order.
+    /// Every entry point of a module, in order; compiled unless the device has them already.
     ///
     /// # Errors
     /// When the driver rejects it.
@@ -147,6 +147,10 @@ impl Kernel {
         if gpu.constants_in_storage() {
             source = source.replace("var<uniform>", "var<storage, read>");
         }
+        gpu.compiled(module.name, source, |source| Self::compile_source(gpu, module, source))
+    }
+
+    fn compile_source(gpu: &Gpu, module: &Module, source: &str) -> Result<Vec<Self>, GpuError> {
         let device = gpu.device();
         let scope = device.push_error_scope(wgpu::ErrorFilter::Validation);
         let shader = device.create_shader_module(wgpu::ShaderModuleDescriptor {
@@ -519,6 +523,23 @@ mod tests {
         assert!(!values.resize(&gpu, 10).unwrap(), "shrinking allocates nothing");
         assert!(values.resize(&gpu, 1 << 40).is_err());
         assert_eq!(values.len(), 10);
+    }
+
+    #[test]
+    fn a_device_compiles_a_source_once() {
+        let Some(gpu) = crate::wgpu::testing::gpu() else { return };
+        let text = "@group(0) @binding(0) var<storage, read_write> values: array<u32>;\n\
+            @compute @workgroup_size(64)\n\
+            fn run(@builtin(global_invocation_id) id: vec3u) { values[id.x] = STEP; }";
+        let module =
+            Module { name: "step", text, imports: &[], bindings: &[Access::ReadWrite], entries: &["run"] };
+        let compiled = |gpu: &Gpu, step: u32| {
+            let declarations = constants(&[("STEP", Constant::Unsigned(step))]);
+            Kernel::compile_with(gpu, &module, &declarations).unwrap().remove(0).pipeline
+        };
+        let first = compiled(&gpu, 1);
+        assert!(compiled(&gpu.clone(), 1) == first, "clones share what was compiled");
+        assert!(compiled(&gpu, 2) != first, "other constants make another kernel");
     }
 
     #[test]
