@@ -19,8 +19,7 @@ pub const MIN_ANTIALIASING: f32 = 0.005;
 /// Margin, in half image widths over focal length, to which the Jacobian's ratio x / z is clamped.
 pub const JACOBIAN_MARGIN: f32 = 0.3;
 
-/// Log-scales are clamped to this range before use; no gradient flows outside.
-pub const LOG_SCALE_RANGE: (f32, f32) = (-20.0, 10.0);
+pub use cif_field::gaussians::LOG_SCALE_RANGE;
 
 /// Entries of a projected covariance above this are scaled down, so that products stay finite.
 pub const MAX_COVARIANCE: f32 = 1e18;

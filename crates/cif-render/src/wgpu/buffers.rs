@@ -270,27 +270,27 @@ impl<T: Pod> Arriving<T> {
 
 /// Small read-backs of equal size, again and again: their memory is used anew once they have been read.
 #[derive(Debug)]
-pub struct Mailbox {
+pub struct Readback {
     words: usize,
     free: Vec<wgpu::Buffer>,
 }
 
-/// Words on their way to the host.
+/// A read-back that has been submitted.
 #[derive(Debug)]
 #[must_use = "open it, or wait for its submission"]
-pub struct Letter(Arriving<u32>);
+pub struct PendingWords(Arriving<u32>);
 
-impl Mailbox {
-    /// For letters of so many words of 4 bytes.
+impl Readback {
+    /// Read-backs of at most so many `words` of 4 bytes.
     #[must_use]
     pub fn new(words: usize) -> Self {
         Self { words, free: Vec::new() }
     }
 
-    /// Records copies of words, (array, first byte, words) each, into one letter, in their order.
+    /// Records copies of words, (array, first byte, words) each, into one read-back, in their order.
     ///
     /// # Panics
-    /// When they are more words than a letter has.
+    /// When they are more words than a read-back has.
     pub fn record(
         &mut self,
         gpu: &Gpu,
@@ -299,7 +299,7 @@ impl Mailbox {
     ) -> Recorded<u32> {
         let staging = self.free.pop().unwrap_or_else(|| {
             gpu.device().create_buffer(&wgpu::BufferDescriptor {
-                label: Some("letter"),
+                label: Some("read-back"),
                 size: 4 * self.words as u64,
                 usage: wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST,
                 mapped_at_creation: false,
@@ -307,34 +307,38 @@ impl Mailbox {
         });
         let mut at = 0;
         for (array, first_byte, words) in parts {
-            assert!(at + words <= self.words, "a letter has {} words", self.words);
+            assert!(at + words <= self.words, "a read-back has {} words", self.words);
             encoder.copy_buffer_to_buffer(array, *first_byte, &staging, 4 * at as u64, 4 * *words as u64);
             at += words;
         }
         Recorded { staging, count: at, marker: PhantomData }
     }
 
-    /// What has arrived, or the letter itself when it is still under way; never waits.
+    /// The words that have arrived, or `pending` again while they are under way; never waits.
     ///
     /// # Errors
     /// When the device is lost or a command was rejected.
-    pub fn open(&mut self, gpu: &Gpu, letter: Letter) -> Result<Result<Vec<u32>, Letter>, GpuError> {
-        let staging = letter.0.staging.clone();
-        Ok(match letter.0.take(gpu)? {
+    pub fn open(
+        &mut self,
+        gpu: &Gpu,
+        pending: PendingWords,
+    ) -> Result<Result<Vec<u32>, PendingWords>, GpuError> {
+        let staging = pending.0.staging.clone();
+        Ok(match pending.0.take(gpu)? {
             Ok(words) => {
                 staging.unmap();
                 self.free.push(staging);
                 Ok(words)
             }
-            Err(arriving) => Err(Letter(arriving)),
+            Err(arriving) => Err(PendingWords(arriving)),
         })
     }
 }
 
 impl Recorded<u32> {
-    /// As [`Self::start`], for a letter.
-    pub fn send(self) -> Letter {
-        Letter(self.start())
+    /// As [`Self::start`], for [`Readback::open`].
+    pub fn send(self) -> PendingWords {
+        PendingWords(self.start())
     }
 }
 
@@ -428,21 +432,21 @@ mod tests {
         let Some(gpu) = crate::wgpu::testing::gpu() else { return };
         let a = GpuVec::from_slice(&gpu, "a", &[1_u32, 2, 3]).unwrap();
         let b = GpuVec::from_slice(&gpu, "b", &[[4.0_f32; 4]; 2]).unwrap();
-        let mut mailbox = Mailbox::new(6);
+        let mut readback = Readback::new(6);
         for round in 0..3_u32 {
             a.write(&gpu, 0, &[round]);
             let mut encoder = gpu.device().create_command_encoder(&Default::default());
             let parts = [(a.buffer(), 0, 2), (b.buffer(), 16, 4)];
-            let recorded = mailbox.record(&gpu, &mut encoder, &parts);
+            let recorded = readback.record(&gpu, &mut encoder, &parts);
             let submission = gpu.queue().submit([encoder.finish()]);
-            let letter = recorded.send();
+            let pending = recorded.send();
             gpu.wait_for(submission).unwrap();
-            let words = mailbox.open(&gpu, letter).unwrap().unwrap();
+            let words = readback.open(&gpu, pending).unwrap().unwrap();
             assert_eq!(
                 words,
                 [round, 2, 4.0_f32.to_bits(), 4.0_f32.to_bits(), 4.0_f32.to_bits(), 4.0_f32.to_bits()]
             );
-            assert_eq!(mailbox.free.len(), 1, "one after the other needs one");
+            assert_eq!(readback.free.len(), 1, "one after the other needs one");
         }
     }
 

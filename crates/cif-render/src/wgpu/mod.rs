@@ -51,7 +51,7 @@ pub mod workgroup;
 
 pub use ::wgpu::{BindGroup, SubmissionIndex as Submission};
 pub use blend::BlendWeightGradients;
-pub use buffers::{Arriving, GpuVec, Letter, Mailbox, Recorded, Uniform};
+pub use buffers::{Arriving, GpuVec, PendingWords, Readback, Recorded, Uniform};
 pub use cache::{BindCache, Place, UniformCache};
 pub use counts::GpuIdentityCounts;
 pub use deform::{DeformationGradients, GpuDeformation};

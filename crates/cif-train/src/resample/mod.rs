@@ -44,7 +44,7 @@ pub struct Pair {
 
 /// Pairs of one event, in the order of their instances.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Plan {
+pub struct Relocations {
     /// Relocations; no row is both weak and source, and none is weak twice.
     pub pairs: Vec<Pair>,
     /// Instances with at least one pair.
@@ -85,8 +85,8 @@ fn gammas(field: &Field, identities: &Identities, context: &ResampleContext<'_>)
 ///
 /// Shares that an instance cannot use (too few members, no source) are left out.
 #[must_use]
-pub fn plan(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) -> Plan {
-    let Some(identities) = &field.identities else { return Plan::default() };
+pub fn choose(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) -> Relocations {
+    let Some(identities) = &field.identities else { return Relocations::default() };
     let n = identities.len();
     let k = field.instances.len();
     let gamma = gammas(field, identities, context);
@@ -138,7 +138,7 @@ pub fn plan(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) ->
             is_weak[*row as usize] = true;
         }
     }
-    let mut plan = Plan::default();
+    let mut plan = Relocations::default();
     for (label, weak) in weak.into_iter().enumerate().filter(|(_, weak)| !weak.is_empty()) {
         let (mut candidates, mut weights) = (Vec::new(), Vec::new());
         for row in (0..n).filter(|row| !is_weak[*row] && !context.unseen.get(*row).is_some_and(|u| *u)) {
@@ -165,7 +165,12 @@ fn gamma_of(identities: &Identities, gamma: &[f64], row: usize, label: u16) -> O
 }
 
 /// Relocates the pairs of a plan in place.
-pub fn apply(field: &mut Field, plan: &Plan, context: &ResampleContext<'_>, rng: &mut impl Rng) -> Relocated {
+pub fn apply(
+    field: &mut Field,
+    plan: &Relocations,
+    context: &ResampleContext<'_>,
+    rng: &mut impl Rng,
+) -> Relocated {
     let mut replicas = std::collections::BTreeMap::<u32, u32>::new();
     for pair in &plan.pairs {
         *replicas.entry(pair.source).or_default() += 1;

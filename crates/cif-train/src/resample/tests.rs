@@ -56,7 +56,7 @@ fn context<'a>(config: &'a ResampleConfig, unseen: &'a [bool]) -> ResampleContex
 fn a_plan_shares_pairs_equally_inside_instances() {
     let config = ResampleConfig { rate: 0.25, ..ResampleConfig::default() };
     let unseen = vec![false; 40];
-    let plan = plan(&field(), &context(&config, &unseen), &mut Pcg64::seed_from_u64(1));
+    let plan = choose(&field(), &context(&config, &unseen), &mut Pcg64::seed_from_u64(1));
     assert_eq!((plan.pairs.len(), plan.labels), (10, 2));
     let weak: std::collections::BTreeSet<u32> = plan.pairs.iter().map(|p| p.weak).collect();
     assert_eq!(weak.len(), 10, "no row is weak twice");
@@ -69,7 +69,7 @@ fn flagged_rows_are_never_sources() {
     let config = ResampleConfig { rate: 0.25, ..ResampleConfig::default() };
     let unseen: Vec<bool> = (0..40).map(|k| k >= 20).collect();
     for seed in 0..20 {
-        let plan = plan(&field(), &context(&config, &unseen), &mut Pcg64::seed_from_u64(seed));
+        let plan = choose(&field(), &context(&config, &unseen), &mut Pcg64::seed_from_u64(seed));
         assert!(!plan.pairs.is_empty());
         assert!(plan.pairs.iter().all(|p| p.source < 20));
     }
@@ -86,7 +86,7 @@ fn instances_with_one_member_take_no_part() {
     rows.log_estimates[0] = 0.1_f32.ln();
     rows.log_estimates[1] = 0.9_f32.ln();
     let config = ResampleConfig { rate: 0.25, ..ResampleConfig::default() };
-    let plan = plan(&scene, &context(&config, &[false; 40]), &mut Pcg64::seed_from_u64(1));
+    let plan = choose(&scene, &context(&config, &[false; 40]), &mut Pcg64::seed_from_u64(1));
     assert_eq!((plan.pairs.len(), plan.labels), (10, 1));
     assert!(plan.pairs.iter().all(|p| p.weak != 0));
 }
@@ -95,7 +95,7 @@ fn instances_with_one_member_take_no_part() {
 fn relocation_copies_everything_and_conserves_coverage() {
     let before = field();
     let mut after = before.clone();
-    let plan = Plan {
+    let plan = Relocations {
         pairs: vec![Pair { weak: 0, source: 38 }, Pair { weak: 2, source: 38 }, Pair { weak: 1, source: 39 }],
         labels: 2,
     };
@@ -131,7 +131,7 @@ fn relocation_copies_everything_and_conserves_coverage() {
 fn faint_sources_stop_at_the_floor_and_are_counted() {
     let mut scene = field();
     scene.gaussians.occupancy_logits[38] = logit(0.006);
-    let plan = Plan { pairs: vec![Pair { weak: 0, source: 38 }], labels: 1 };
+    let plan = Relocations { pairs: vec![Pair { weak: 0, source: 38 }], labels: 1 };
     let config = ResampleConfig::default();
     let relocated = apply(&mut scene, &plan, &context(&config, &[false; 40]), &mut Pcg64::seed_from_u64(1));
     assert_eq!(relocated.floored, 1);
@@ -142,7 +142,7 @@ fn faint_sources_stop_at_the_floor_and_are_counted() {
 fn constant_occupancy_is_left_alone() {
     let mut scene = field();
     scene.gaussians.occupancy_logits.fill(logit(0.02));
-    let plan = Plan { pairs: vec![Pair { weak: 0, source: 38 }], labels: 1 };
+    let plan = Relocations { pairs: vec![Pair { weak: 0, source: 38 }], labels: 1 };
     let config = ResampleConfig::default();
     let context = ResampleContext { occupancy_is_constant: true, ..context(&config, &[false; 40]) };
     apply(&mut scene, &plan, &context, &mut Pcg64::seed_from_u64(1));
@@ -153,7 +153,8 @@ fn constant_occupancy_is_left_alone() {
 fn the_scale_correction_conserves_the_footprint() {
     let mut scene = field();
     let before = scene.clone();
-    let plan = Plan { pairs: vec![Pair { weak: 0, source: 39 }, Pair { weak: 1, source: 39 }], labels: 1 };
+    let plan =
+        Relocations { pairs: vec![Pair { weak: 0, source: 39 }, Pair { weak: 1, source: 39 }], labels: 1 };
     let config = ResampleConfig { scale_correction: ScaleCorrection::Mcmc, ..ResampleConfig::default() };
     apply(&mut scene, &plan, &context(&config, &[false; 40]), &mut Pcg64::seed_from_u64(1));
     let shrink = f64::from(scene.gaussians.log_scales[39][0] - before.gaussians.log_scales[39][0]).exp();
@@ -170,7 +171,7 @@ fn the_same_stream_gives_the_same_event() {
         let mut scene = field();
         let mut rng = Pcg64::seed_from_u64(8);
         let context = context(&config, &[false; 40]);
-        let plan = plan(&scene, &context, &mut rng);
+        let plan = choose(&scene, &context, &mut rng);
         let relocated = apply(&mut scene, &plan, &context, &mut rng);
         (scene, plan, relocated)
     };

@@ -21,11 +21,11 @@ const FRAMES_PER_WITHHELD: usize = 4;
 
 /// Frames that the curve is measured on, decoded once.
 #[derive(Default)]
-pub(super) struct Yardstick {
+pub(super) struct MeasuredFrames {
     /// Training frames that are not trained on, as indices of the capture.
     withheld: Vec<usize>,
     /// Index in the capture, and what was captured; none before the first point.
-    frames: Option<Vec<(usize, FrameData)>>,
+    decoded: Option<Vec<(usize, FrameData)>>,
 }
 
 /// Means over frames.
@@ -36,7 +36,7 @@ struct MeanScores {
     macc_pix: Option<f64>,
 }
 
-impl Yardstick {
+impl MeasuredFrames {
     /// Takes the frames to withhold out of the training split.
     pub(super) fn withhold(dataset: &mut Dataset, config: &TrainConfig) -> Self {
         let of_split = |dataset: &Dataset| -> Vec<usize> {
@@ -53,7 +53,7 @@ impl Yardstick {
         for index in &withheld {
             dataset.frames[*index].split = Split::Val;
         }
-        Self { withheld, frames: None }
+        Self { withheld, decoded: None }
     }
 
     /// Whether a frame belongs to the training split of the capture, though it is not trained on.
@@ -85,7 +85,7 @@ impl Trainer {
     pub(super) fn evaluate(&mut self, stage: Stage) -> Result<TrainEvent, TrainError> {
         let held_out: Vec<usize> = (0..self.dataset.frames.len())
             .filter(|index| {
-                self.dataset.frames[*index].split == Split::Val && !self.yardstick.withholds(*index)
+                self.dataset.frames[*index].split == Split::Val && !self.measured_frames.withholds(*index)
             })
             .collect();
         let count = held_out.len().min(self.config.report.evaluate_frames as usize);
@@ -114,7 +114,7 @@ impl Trainer {
         stage: Stage,
         ends: bool,
     ) -> Result<Option<TrainEvent>, TrainError> {
-        let count = self.config.report.curve_frames.max(self.yardstick.withheld.len() as u32);
+        let count = self.config.report.curve_frames.max(self.measured_frames.withheld.len() as u32);
         let (iteration, step) = (self.progress.iteration, self.progress.total_steps);
         let curve = &self.progress.curve;
         let due = curve.is_due(stage, iteration, !self.progress.goals.targets.is_empty()) || ends;
@@ -123,10 +123,10 @@ impl Trainer {
         }
         self.fetch_from_gpu()?;
         let start = self.clock.now();
-        let frames = match self.yardstick.frames.take() {
+        let frames = match self.measured_frames.decoded.take() {
             Some(frames) => frames,
             None => {
-                let (kind, indices) = self.yardstick.select(&self.dataset, count as usize);
+                let (kind, indices) = self.measured_frames.select(&self.dataset, count as usize);
                 let name = |index: &usize| self.dataset.frames[*index].name.clone();
                 self.progress.curve.frames = kind;
                 self.progress.curve.frame_names = indices.iter().map(name).collect();
@@ -150,7 +150,7 @@ impl Trainer {
             miou: scores.miou,
         };
         let count = frames.len();
-        self.yardstick.frames = Some(frames);
+        self.measured_frames.decoded = Some(frames);
         self.progress.curve.points.push(point.clone());
         self.progress.curve.measuring += self.clock.now() - start;
         let measuring_s = self.progress.curve.measuring.wall_s;

@@ -6,7 +6,7 @@ use cif_field::{Checkpoint, Field};
 use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::logit;
 
-use super::evaluate::Yardstick;
+use super::evaluate::MeasuredFrames;
 use super::progress::{Progress, Source};
 use super::state::{State, restore};
 use super::{Trainer, initialize};
@@ -45,7 +45,7 @@ impl Trainer {
         config.validate()?;
         // Settings of a scene without instances say that there shall be none; here they are all there is to train.
         config.effects.instances = true;
-        let yardstick = Yardstick::withhold(&mut dataset, &config);
+        let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let Checkpoint { mut field, training } = scene;
         check_capture(&field, &dataset)?;
         let mut progress = Progress::at(Stage::Identity);
@@ -79,8 +79,9 @@ impl Trainer {
         field.instances = initialize::instances(&dataset);
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
         (field.background, field.sort_metric) = (config.background, config.sort_metric);
-        let mut trainer = Self::assemble(Start { dataset, stop }, yardstick, config, field, Some(progress))?;
-        if !trainer.plan.has_instances {
+        let mut trainer =
+            Self::assemble(Start { dataset, stop }, measured_frames, config, field, Some(progress))?;
+        if !trainer.stages.has_instances {
             return Err(TrainError::NoLabels { root: trainer.dataset.root });
         }
         let known = trained_exposures(&trainer.field);

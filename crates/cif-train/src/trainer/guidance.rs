@@ -140,7 +140,7 @@ impl Trainer {
     fn is_guided(&self) -> bool {
         // Without masks nobody knows what may be held in place.
         let is_asked = self.config.motion.guidance > 0.0 || self.config.motion.stillness > 0.0;
-        is_asked && self.plan.is_dynamic && self.plan.has_instances
+        is_asked && self.stages.is_dynamic && self.stages.has_instances
     }
 
     /// Finds out which instances travel.

@@ -7,7 +7,7 @@ use cif_field::parameters::LOG_CALIBRATIONS;
 use cif_field::{Field, Identities, Instance};
 use cif_render::UNLABELLED;
 
-use super::evaluate::Yardstick;
+use super::evaluate::MeasuredFrames;
 use super::state::check_instances;
 use super::{StepTimes, Trainer, initialize};
 use crate::config::TrainConfig;
@@ -45,7 +45,7 @@ impl Trainer {
     ) -> Result<Self, TrainError> {
         assert!(!matches!(stage, Stage::Identity | Stage::Done), "the {stage} stage has no steps");
         config.validate()?;
-        let yardstick = Yardstick::withhold(&mut dataset, &config);
+        let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let is_trained = scene.is_some();
         let mut field = match scene {
             Some(field) => field,
@@ -62,9 +62,9 @@ impl Trainer {
         } else if field.deformation.is_none() && dataset.times.len() > 1 && config.effects.motion {
             field.deformation = Some(initialize::initial_deformation(&dataset, &config)?);
         }
-        let mut trainer = Self::assemble(dataset.into(), yardstick, config, field, None)?;
+        let mut trainer = Self::assemble(dataset.into(), measured_frames, config, field, None)?;
         if stage == Stage::Instance {
-            if !trainer.plan.has_instances {
+            if !trainer.stages.has_instances {
                 return Err(TrainError::NoLabels { root: trainer.dataset.root.clone() });
             }
             if trainer.field.identities.is_none() {

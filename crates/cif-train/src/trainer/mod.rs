@@ -5,12 +5,13 @@
 //! | `initialize` | what a run starts from |
 //! | `progress` | which stages there are, and where the run stands |
 //! | `run` | how it goes through its stages, and where it may be stopped |
-//! | `step` | what one step does |
-//! | `optimiser` | which parameter groups there are, and how fast they move |
+//! | `step_plan` | a step as data: its views, settings, rates and limits, for either backend |
+//! | `step` | a step on the processor, what either backend reports of one, and what falls behind it |
+//! | `optimiser` | moments and rates of the parameters |
 //! | `guard` | what happens to a step that leaves the finite numbers |
 //! | `still` | which Gaussians skip the deformation network |
 //! | `changes` | where cameras that stay in place see the capture change |
-//! | `earned` | what has to show that it helps |
+//! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
@@ -30,7 +31,6 @@ mod changes;
 #[cfg(feature = "wgpu")]
 mod device;
 mod draw;
-mod earned;
 mod evaluate;
 mod frames;
 mod from_scene;
@@ -40,6 +40,7 @@ mod guard_tests;
 mod guidance;
 mod identity;
 mod initialize;
+mod judged;
 mod measure;
 mod motions;
 mod optimiser;
@@ -64,19 +65,19 @@ use cif_render::cpu::{Renderer, SimdLevel};
 use self::changes::Changes;
 #[cfg(feature = "wgpu")]
 pub use self::device::Probe;
-#[cfg(feature = "wgpu")]
-pub(crate) use self::earned::{FIRST_JUDGED, JUDGED_SPACING};
-use self::evaluate::Yardstick;
+use self::evaluate::MeasuredFrames;
 use self::frames::FrameStore;
 #[cfg(all(test, feature = "wgpu"))]
 pub(crate) use self::guard::MAX_GRADIENT;
 pub use self::guard::{Fault, Hint, MAX_ROLLBACKS_IN_A_ROW};
 use self::guidance::Guidance;
 pub(crate) use self::initialize::automatic_time_nodes;
+#[cfg(feature = "wgpu")]
+pub(crate) use self::judged::{FIRST_JUDGED, JUDGED_SPACING};
 pub use self::measure::InstancePass;
 use self::optimiser::Optimiser;
 use self::pacing::Pacing;
-use self::progress::{Plan, Progress};
+use self::progress::{Progress, Stages};
 use self::saving::Saving;
 use self::step::Scratch;
 #[cfg(feature = "wgpu")]
@@ -117,7 +118,7 @@ pub struct Trainer {
     config: TrainConfig,
     field: Field,
     frames: FrameStore,
-    plan: Plan,
+    stages: Stages,
     progress: Progress,
     optimiser: Optimiser,
     statistics: DensifyStatistics,
@@ -146,7 +147,7 @@ pub struct Trainer {
     /// When the next state is saved by time.
     saving: Saving,
     /// Frames that the curve is measured on.
-    yardstick: Yardstick,
+    measured_frames: MeasuredFrames,
     /// A budget that stages keep to.
     pacing: Option<Pacing>,
     /// Warnings not sent yet.
@@ -171,22 +172,22 @@ impl Trainer {
     pub fn new(start: impl Into<Start>, config: TrainConfig) -> Result<Self, TrainError> {
         let Start { mut dataset, stop } = start.into();
         config.validate()?;
-        let yardstick = Yardstick::withhold(&mut dataset, &config);
+        let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let field = initialize::initial_field(&dataset, &config)?;
-        let mut trainer = Self::assemble(Start { dataset, stop }, yardstick, config, field, None)?;
+        let mut trainer = Self::assemble(Start { dataset, stop }, measured_frames, config, field, None)?;
         trainer.warn_of_capture();
         trainer.find_travelling()?;
-        let first = trainer.plan.from(&trainer.config, Stage::Coarse);
+        let first = trainer.stages.from(&trainer.config, Stage::Coarse);
         trainer.progress = Progress::at(first);
         trainer.progress.exposures = trainer.exposures();
         trainer.enter(first)?;
         Ok(trainer)
     }
 
-    /// Everything but the state of the optimiser; frames of `yardstick` are no training frames of the capture.
+    /// Everything but the state of the optimiser; frames of `measured_frames` are no training frames of the capture.
     fn assemble(
         Start { dataset, stop }: Start,
-        yardstick: Yardstick,
+        measured_frames: MeasuredFrames,
         config: TrainConfig,
         field: Field,
         progress: Option<Progress>,
@@ -205,7 +206,7 @@ impl Trainer {
         }
         let n = field.gaussians.len();
         Ok(Self {
-            plan: Plan { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
+            stages: Stages { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
             progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
             optimiser: Optimiser::new(&field),
             statistics: DensifyStatistics::zeros(n),
@@ -223,7 +224,7 @@ impl Trainer {
             clock: Arc::new(SystemClock::start()),
             stop,
             saving: Saving::default(),
-            yardstick,
+            measured_frames,
             pacing: None,
             warnings,
             #[cfg(feature = "wgpu")]
@@ -245,7 +246,7 @@ impl Trainer {
     }
 
     fn warn_of_capture(&mut self) {
-        if !self.plan.has_instances {
+        if !self.stages.has_instances {
             let why = if !self.config.effects.instances {
                 "instances are switched off"
             } else if self.dataset.instances.is_empty() {
@@ -255,7 +256,7 @@ impl Trainer {
             };
             self.warnings.push(format!("{why}: colour only, without identity and instance stages"));
         }
-        if !self.plan.is_dynamic {
+        if !self.stages.is_dynamic {
             let why = if self.dataset.times.len() > 1 {
                 "motion is switched off"
             } else {
@@ -323,7 +324,7 @@ impl Trainer {
     /// Steps left in all stages.
     #[must_use]
     pub fn steps_left(&self) -> u64 {
-        self.plan.steps_left(&self.config, self.progress.stage, self.progress.iteration)
+        self.stages.steps_left(&self.config, self.progress.stage, self.progress.iteration)
     }
 
     /// Records what was planned for the capture, for the field's record.

@@ -57,7 +57,7 @@ impl Trainer {
     /// Makes the stages that are left end inside a budget, each with its share. Steps of the settings are where
     /// it starts from, see [`crate::budget::choose`]; [`Self::config`] has those that came of it.
     pub fn set_budget(&mut self, budget: Budget) {
-        let fine = f64::from(self.plan.iterations(&self.config, Stage::Fine).max(1));
+        let fine = f64::from(self.stages.iterations(&self.config, Stage::Fine).max(1));
         let instance = f64::from(self.config.stages.instance.max(1));
         let shares = Shares {
             densify: f64::from(self.config.densify.until) / fine,
@@ -75,7 +75,7 @@ impl Trainer {
     /// # Errors
     /// When mIoU is a target and the capture has no labels.
     pub fn set_targets(&mut self, targets: Targets) -> Result<(), TrainError> {
-        if targets.miou.is_some() && !self.plan.has_instances {
+        if targets.miou.is_some() && !self.stages.has_instances {
             return Err(TrainError::NoLabels { root: self.dataset.root.clone() });
         }
         self.progress.goals = Goals { targets, ..Goals::default() };
@@ -100,14 +100,14 @@ impl Trainer {
         let steps: Vec<(Stage, u32)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
             .into_iter()
             .filter(|other| *other >= stage)
-            .map(|other| (other, self.plan.iterations(&self.config, other)))
+            .map(|other| (other, self.stages.iterations(&self.config, other)))
             .map(|(other, steps)| {
                 let done = if other == stage { self.progress.iteration } else { 0 };
                 (other, steps.saturating_sub(done))
             })
             .filter(|(other, steps)| *steps > 0 || *other == stage)
             .collect();
-        let frames = if self.plan.has_instances && stage < Stage::Identity {
+        let frames = if self.stages.has_instances && stage < Stage::Identity {
             self.frames.len().div_ceil(self.config.identity.stride.max(1) as usize)
         } else {
             0
@@ -137,10 +137,10 @@ impl Trainer {
         let stages = &mut self.config.stages;
         match stage {
             Stage::Coarse => stages.coarse = steps,
-            Stage::Fine if self.plan.is_dynamic && stages.fine_includes_coarse => {
+            Stage::Fine if self.stages.is_dynamic && stages.fine_includes_coarse => {
                 stages.fine = steps.saturating_add(stages.coarse);
             }
-            Stage::Fine if self.plan.is_dynamic => stages.fine = steps,
+            Stage::Fine if self.stages.is_dynamic => stages.fine = steps,
             Stage::Fine => (stages.coarse, stages.fine, stages.fine_includes_coarse) = (0, steps, false),
             Stage::Instance => stages.instance = steps,
             Stage::Identity | Stage::Done => {}
@@ -164,8 +164,8 @@ impl Trainer {
             _ => false,
         };
         if ends {
-            let planned = self.plan.iterations(&self.config, stage).max(1);
-            if stage == Stage::Fine && self.plan.has_instances {
+            let planned = self.stages.iterations(&self.config, stage).max(1);
+            if stage == Stage::Fine && self.stages.has_instances {
                 let share = f64::from(point.iteration) / f64::from(planned);
                 let shortened = |steps: u32| (f64::from(steps) * share).ceil() as u32;
                 self.config.stages.instance = shortened(self.config.stages.instance);
@@ -179,7 +179,7 @@ impl Trainer {
 
     /// The last stage with steps.
     fn last_stage(&self) -> Stage {
-        if self.plan.iterations(&self.config, Stage::Instance) > 0 { Stage::Instance } else { Stage::Fine }
+        if self.stages.iterations(&self.config, Stage::Instance) > 0 { Stage::Instance } else { Stage::Fine }
     }
 
     /// Says once that the trend does not lead to a target.

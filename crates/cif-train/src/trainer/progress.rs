@@ -190,14 +190,14 @@ impl Progress {
 
 /// What decides which stages a run has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Plan {
+pub(super) struct Stages {
     /// More than one time.
     pub is_dynamic: bool,
     /// Masks with labelled pixels.
     pub has_instances: bool,
 }
 
-impl Plan {
+impl Stages {
     /// Steps of a stage.
     pub(super) fn iterations(self, config: &TrainConfig, stage: Stage) -> u32 {
         match stage {
@@ -250,7 +250,7 @@ mod tests {
     #[test]
     fn stages_follow_what_the_capture_has() {
         let config = TrainConfig::default();
-        let walk = |plan: Plan| {
+        let walk = |plan: Stages| {
             let mut stages = vec![plan.from(&config, Stage::Coarse)];
             while stages[stages.len() - 1] != Stage::Done {
                 stages.push(plan.after(&config, stages[stages.len() - 1]));
@@ -259,11 +259,11 @@ mod tests {
         };
         use Stage::{Coarse, Done, Fine, Identity, Instance};
         assert_eq!(
-            walk(Plan { is_dynamic: true, has_instances: true }),
+            walk(Stages { is_dynamic: true, has_instances: true }),
             [Coarse, Fine, Identity, Instance, Done]
         );
-        assert_eq!(walk(Plan { is_dynamic: true, has_instances: false }), [Coarse, Fine, Done]);
-        let still = Plan { is_dynamic: false, has_instances: true };
+        assert_eq!(walk(Stages { is_dynamic: true, has_instances: false }), [Coarse, Fine, Done]);
+        let still = Stages { is_dynamic: false, has_instances: true };
         assert_eq!(walk(still), [Fine, Identity, Instance, Done]);
         assert_eq!(still.iterations(&config, Fine), config.stages.coarse + config.stages.fine);
     }
@@ -272,7 +272,7 @@ mod tests {
     fn steps_left_count_later_stages() {
         let mut config = TrainConfig::default();
         (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 20, 5);
-        let plan = Plan { is_dynamic: true, has_instances: true };
+        let plan = Stages { is_dynamic: true, has_instances: true };
         assert_eq!(plan.steps_left(&config, Stage::Coarse, 4), 31);
         assert_eq!(plan.steps_left(&config, Stage::Fine, 4), 21);
         assert_eq!(plan.steps_left(&config, Stage::Done, 0), 0);

@@ -64,7 +64,7 @@ impl Trainer {
             if stage == Stage::Done {
                 break;
             }
-            let iterations = self.plan.iterations(&self.config, stage);
+            let iterations = self.stages.iterations(&self.config, stage);
             let started = TrainEvent::StageStarted {
                 stage,
                 iteration: self.progress.iteration,
@@ -102,7 +102,7 @@ impl Trainer {
                 }
                 fetched?;
             }
-            let next = self.plan.after(&self.config, stage);
+            let next = self.stages.after(&self.config, stage);
             let ends = stage == Stage::Identity || next == Stage::Done || self.progress.iteration >= MIN_GAP;
             if ends {
                 match self.follow_curve(stage, true, observer, &mut requests) {
@@ -150,7 +150,7 @@ impl Trainer {
         self.pace_stage(stage);
         // A budget or a target may change how many there are.
         while self.progress.after_step.is_some()
-            || self.progress.iteration < self.plan.iterations(&self.config, stage)
+            || self.progress.iteration < self.stages.iterations(&self.config, stage)
         {
             if requests.stop || self.stop.requested() {
                 return Ok(Outcome::Interrupted);
@@ -172,7 +172,7 @@ impl Trainer {
             }
             let loss = done?;
             let iteration = self.progress.iteration;
-            let iterations = self.plan.iterations(&self.config, stage);
+            let iterations = self.stages.iterations(&self.config, stage);
             if let Some(loss) = loss
                 && (falls_on(iteration, self.config.report.step_every) || iteration == iterations)
             {
@@ -297,7 +297,7 @@ impl Trainer {
 
     /// Gives the fine stage its deformation and a new optimiser (methods reference 1.3).
     fn prepare_fine(&mut self) -> Result<(), TrainError> {
-        if self.plan.is_dynamic {
+        if self.stages.is_dynamic {
             self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
         }
         self.start_guidance()?;

@@ -10,7 +10,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use serde_json::Value;
 
 use super::Trainer;
-use super::evaluate::Yardstick;
+use super::evaluate::MeasuredFrames;
 use super::optimiser::Optimiser;
 use super::progress::Progress;
 use crate::config::TrainConfig;
@@ -174,11 +174,11 @@ impl Trainer {
         let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
         let state = State::parse(json)?;
         state.config.validate()?;
-        let yardstick = Yardstick::withhold(&mut dataset, &state.config);
+        let measured_frames = MeasuredFrames::withhold(&mut dataset, &state.config);
         state.capture.check(&Capture::of(&dataset), &dataset)?;
         let start = Start { dataset, stop };
         let mut trainer =
-            Self::assemble(start, yardstick, state.config, checkpoint.field, Some(state.progress))?;
+            Self::assemble(start, measured_frames, state.config, checkpoint.field, Some(state.progress))?;
 
         let n = trainer.field.gaussians.len();
         restore(&mut trainer.optimiser, &mut tensors, &state.adam_steps)?;

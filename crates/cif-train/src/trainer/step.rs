@@ -8,8 +8,8 @@ use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings};
 use rand::seq::SliceRandom;
 
 use super::Trainer;
-use super::earned::leave_out_held_out;
 use super::guard::{Fault, exposure_fault, gradient_fault};
+use super::judged::leave_out_held_out;
 use super::progress::AfterStep;
 use super::step_plan::{StepPlan, StepView};
 use super::times::lap;
@@ -19,7 +19,7 @@ use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::losses::{SsimScratch, color_loss};
 use crate::random::{Purpose, stream};
-use crate::resample::{ResampleContext, apply, plan};
+use crate::resample::{ResampleContext, apply, choose};
 use crate::schedule::Due;
 
 /// Memory kept between steps.
@@ -308,7 +308,7 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let iteration = self.progress.iteration;
-        let due = Due::after(&self.config, stage, iteration, self.plan.iterations(&self.config, stage));
+        let due = Due::after(&self.config, stage, iteration, self.stages.iterations(&self.config, stage));
         let judges = [self.judges_heads(stage, iteration), self.settles(stage, iteration)];
         #[cfg(feature = "wgpu")]
         if judges.contains(&true) || due.estimates_identities || self.device_is_far_ahead() {
@@ -495,15 +495,15 @@ impl Trainer {
             occupancy_floor: self.config.instance.occupancy_limits[0],
         };
         let mut rng = stream(self.config.seed, Purpose::Resample, u64::from(iteration));
-        let plan = plan(&self.field, &context, &mut rng);
-        if plan.pairs.is_empty() {
+        let relocations = choose(&self.field, &context, &mut rng);
+        if relocations.pairs.is_empty() {
             return Ok(());
         }
-        let relocated = apply(&mut self.field, &plan, &context, &mut rng);
+        let relocated = apply(&mut self.field, &relocations, &context, &mut rng);
         #[cfg(feature = "wgpu")]
-        self.relocates_on_device(&plan.pairs);
+        self.relocates_on_device(&relocations.pairs);
         self.optimiser.relocate(&relocated.weak, &relocated.sources, &relocated.entry_origins);
-        for pair in &plan.pairs {
+        for pair in &relocations.pairs {
             self.guidance.copy(pair.weak, pair.source);
             self.copy_still(pair.weak, pair.source);
             self.unseen[pair.weak as usize] = self.unseen[pair.source as usize];
@@ -511,8 +511,8 @@ impl Trainer {
         self.gradients = Gradients::zeros(&self.field);
         events.push(TrainEvent::Resampled {
             iteration,
-            pairs: plan.pairs.len(),
-            labels: plan.labels,
+            pairs: relocations.pairs.len(),
+            labels: relocations.labels,
             sources: relocated.sources.len(),
             floored: relocated.floored,
         });

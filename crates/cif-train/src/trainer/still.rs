@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use super::Trainer;
 use super::changes::{Changes, Sight};
-use super::earned::gain;
+use super::judged::gain;
 use super::motions::{Limits, Motion, accumulate, probe, probe_times, put_to_rest, restless, wake};
 use crate::config::EffectsConfig;
 use crate::error::TrainError;
@@ -38,7 +38,7 @@ pub(super) const RUNGS: u32 = 3;
 impl Trainer {
     /// Whether Gaussians are tested after a step.
     pub(super) fn settles(&self, stage: Stage, iteration: u32) -> bool {
-        let last = self.plan.iterations(&self.config, stage);
+        let last = self.stages.iterations(&self.config, stage);
         self.field.deformation.is_some()
             && falls_due(&self.config.effects, self.first_test(), stage, iteration, last)
     }
@@ -52,7 +52,7 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let last = self.plan.iterations(&self.config, stage);
+        let last = self.stages.iterations(&self.config, stage);
         let due = self.settles(stage, iteration);
         let Some(deformation) = self.field.deformation.as_ref().filter(|_| due) else { return Ok(()) };
         let effects = &self.config.effects;
@@ -143,15 +143,15 @@ impl Trainer {
     /// Whether Gaussians will be tested on this step or a later one.
     pub(super) fn tests_to_come(&self, stage: Stage, iteration: u32) -> bool {
         let every = self.config.effects.still_every;
-        if every == 0 || !self.plan.is_dynamic {
+        if every == 0 || !self.stages.is_dynamic {
             return false;
         }
-        let last = self.plan.iterations(&self.config, Stage::Fine);
+        let last = self.stages.iterations(&self.config, Stage::Fine);
         match stage {
             Stage::Coarse => true,
             // The instance stage begins with a test; else the last one is in this stage.
             Stage::Fine => {
-                self.plan.has_instances
+                self.stages.has_instances
                     || (iteration..last)
                         .take(every as usize)
                         .any(|later| falls_due(&self.config.effects, self.first_test(), stage, later, last))
@@ -166,7 +166,7 @@ impl Trainer {
         if self.shows_changes {
             return 1;
         }
-        let fine_steps = f64::from(self.plan.iterations(&self.config, Stage::Fine));
+        let fine_steps = f64::from(self.stages.iterations(&self.config, Stage::Fine));
         let from = (f64::from(self.config.effects.still_from) * fine_steps).round() as u32;
         let told = if self.guidance.knows_what_travels() { self.config.effects.still_told } else { from };
         from.min(told).max(1)
@@ -175,7 +175,7 @@ impl Trainer {
     /// Whether masks tell on this step what stands still: on the first test, when the network has helped everything
     /// into place and learnt little else that could be lost.
     fn is_told(&self, stage: Stage, iteration: u32) -> bool {
-        let fine_steps = self.plan.iterations(&self.config, Stage::Fine);
+        let fine_steps = self.stages.iterations(&self.config, Stage::Fine);
         stage == Stage::Fine
             && iteration == self.first_test()
             && TOLD_STEPS * f64::from(iteration) <= f64::from(fine_steps)

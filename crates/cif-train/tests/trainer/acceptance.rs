@@ -9,7 +9,7 @@ use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, Gradients, InstanceSettings, RenderSettings};
 use cif_train::adam::{Moments, RowRates};
 use cif_train::config::{ResampleConfig, ScaleCorrection};
-use cif_train::resample::{Pair, Plan, ResampleContext, apply, footprint_integral};
+use cif_train::resample::{Pair, Relocations, ResampleContext, apply, footprint_integral};
 use glam::{DMat3, DVec2, DVec3};
 use rand::SeedableRng;
 
@@ -228,7 +228,7 @@ fn relocation_conserves_what_is_rendered() {
             occupancy_floor: 0.005,
         };
         let pairs = (1..=replicas as u32).map(|weak| Pair { weak, source: 0 }).collect();
-        let plan = Plan { pairs, labels: 1 };
+        let plan = Relocations { pairs, labels: 1 };
         apply(&mut field, &plan, &context, &mut rand_pcg::Pcg64::seed_from_u64(0));
         let after = renderer.render(&field, &camera, 0.0, &settings, channels);
         let centre = |image: &PixelGrid<f32>| *image.at(16, 16);

@@ -8,7 +8,7 @@
 
 use std::collections::VecDeque;
 
-use cif_render::wgpu::{Gpu, GpuError, GpuStatistics, Letter, Mailbox, Submission, faults};
+use cif_render::wgpu::{Gpu, GpuError, GpuStatistics, PendingWords, Readback, Submission, faults};
 
 use super::super::step::{StepLoss, ViewReport};
 use super::super::step_plan::StepPlan;
@@ -22,8 +22,8 @@ use crate::wgpu::losses::ViewLoss;
 /// Steps that the host may be ahead of what it knows of the device.
 const AHEAD: usize = 8;
 
-/// Words of a view's letter: losses, counts, fault words.
-pub(super) const LETTER_WORDS: usize = LOSS_WORDS + GpuStatistics::WORDS + faults::WORDS;
+/// Words of the readback of a view: losses, counts, fault words.
+pub(super) const VIEW_WORDS: usize = LOSS_WORDS + GpuStatistics::WORDS + faults::WORDS;
 
 /// Words of the losses of a view.
 pub(super) const LOSS_WORDS: usize = 8;
@@ -45,12 +45,12 @@ pub(super) struct ViewRead {
 }
 
 enum Words {
-    Waiting(Letter),
+    Waiting(PendingWords),
     Here(Vec<u32>),
 }
 
 /// What arrived of a view.
-pub(super) struct ViewNews {
+pub(super) struct ViewResult {
     pub(super) about: AboutView,
     pub(super) loss: ViewLoss,
     pub(super) counts: GpuStatistics,
@@ -59,29 +59,29 @@ pub(super) struct ViewNews {
 }
 
 impl ViewRead {
-    pub(super) fn new(letter: Letter, about: AboutView) -> Self {
-        Self { words: Words::Waiting(letter), about }
+    pub(super) fn new(pending: PendingWords, about: AboutView) -> Self {
+        Self { words: Words::Waiting(pending), about }
     }
 
-    fn poll(self, gpu: &Gpu, mailbox: &mut Mailbox) -> Result<Self, GpuError> {
+    fn poll(self, gpu: &Gpu, readback: &mut Readback) -> Result<Self, GpuError> {
         let words = match self.words {
-            Words::Waiting(letter) => match mailbox.open(gpu, letter)? {
+            Words::Waiting(pending) => match readback.open(gpu, pending)? {
                 Ok(words) => Words::Here(words),
-                Err(letter) => Words::Waiting(letter),
+                Err(pending) => Words::Waiting(pending),
             },
             here => here,
         };
         Ok(Self { words, ..self })
     }
 
-    fn news(self) -> Option<ViewNews> {
+    fn result(self) -> Option<ViewResult> {
         let Words::Here(words) = self.words else { return None };
         let about = self.about;
         let (losses, rest) = words.split_at(LOSS_WORDS);
         let (counts, found) = rest.split_at(GpuStatistics::WORDS);
         let number = |k: usize| f32::from_bits(losses[k]);
         let sums = [0, 4].map(|first| [0, 1, 2, 3].map(|k| number(first + k)));
-        Some(ViewNews {
+        Some(ViewResult {
             loss: ViewLoss::new(sums, about.pixels, about.lambda_dssim),
             counts: GpuStatistics::of(counts),
             faults: [found[0], found[1]],
@@ -114,54 +114,54 @@ impl Flights {
     fn next(
         &mut self,
         gpu: &Gpu,
-        mailbox: &mut Mailbox,
+        readback: &mut Readback,
         all: bool,
-    ) -> Result<Option<(Recording, Vec<ViewNews>)>, GpuError> {
+    ) -> Result<Option<(Recording, Vec<ViewResult>)>, GpuError> {
         let Some(mut front) = self.waiting.pop_front() else { return Ok(None) };
         if all || self.waiting.len() >= AHEAD {
             gpu.wait_for(front.submission.clone())?;
         }
         let mut reads = Vec::with_capacity(front.reads.len());
         for read in front.reads {
-            reads.push(read.poll(gpu, mailbox)?);
+            reads.push(read.poll(gpu, readback)?);
         }
         if reads.iter().any(|read| matches!(read.words, Words::Waiting(_))) {
             front.reads = reads;
             self.waiting.push_front(front);
             return Ok(None);
         }
-        Ok(Some((front.recording, reads.into_iter().filter_map(ViewRead::news).collect())))
+        Ok(Some((front.recording, reads.into_iter().filter_map(ViewRead::result).collect())))
     }
 }
 
 impl Trainer {
     /// Takes in the steps that have arrived; `all` waits for every one that was recorded.
     pub(super) fn receive(&mut self, device: &mut DeviceTraining, all: bool) -> Result<(), TrainError> {
-        while let Some((recording, news)) = device.flights.next(&device.gpu, &mut device.mailbox, all)? {
-            for view in &news {
+        while let Some((recording, results)) = device.flights.next(&device.gpu, &mut device.readback, all)? {
+            for view in &results {
                 device.learn(&view.counts);
             }
-            let [found, waits] = news.last().map_or([0; 2], |view| view.faults);
+            let [found, waits] = results.last().map_or([0; 2], |view| view.faults);
             if waits == 0 {
-                self.take_in_news(&recording.plan, &news);
+                self.take_in_results(&recording.plan, &results);
                 device.make_room(recording.plan.gaussians)?;
                 continue;
             }
-            self.answer(device, recording, found)?;
+            self.redo(device, recording, found)?;
         }
         Ok(())
     }
 
-    /// Answers a step that must not be taken, and records those after it again.
-    fn answer(
+    /// Leaves out a step that must not be taken, or makes room for it, and records it and those after it again.
+    fn redo(
         &mut self,
         device: &mut DeviceTraining,
         recording: Recording,
         found: u32,
     ) -> Result<(), TrainError> {
         let mut again = Vec::new();
-        while let Some((later, news)) = device.flights.next(&device.gpu, &mut device.mailbox, true)? {
-            for view in &news {
+        while let Some((later, results)) = device.flights.next(&device.gpu, &mut device.readback, true)? {
+            for view in &results {
                 device.learn(&view.counts);
             }
             again.push(later);
@@ -200,9 +200,9 @@ impl Trainer {
     }
 
     /// Losses and counts of a step that was taken.
-    fn take_in_news(&mut self, plan: &StepPlan, news: &[ViewNews]) {
-        let reports: Vec<ViewReport> = news.iter().map(ViewNews::report).collect();
-        for view in news {
+    fn take_in_results(&mut self, plan: &StepPlan, results: &[ViewResult]) {
+        let reports: Vec<ViewReport> = results.iter().map(ViewResult::report).collect();
+        for view in results {
             self.times.views += 1;
             self.times.gaussians += view.about.gaussians as u64;
             self.times.visible += u64::from(view.counts.visible);
@@ -213,7 +213,7 @@ impl Trainer {
     }
 }
 
-impl ViewNews {
+impl ViewResult {
     fn report(&self) -> ViewReport {
         ViewReport {
             psnr: self.loss.color.psnr(),

@@ -35,9 +35,9 @@ use std::time::Duration;
 
 use cif_field::gaussians::SH_FLOATS;
 use cif_render::wgpu::deform::Shape;
-use cif_render::wgpu::{Gpu, GpuError, GpuVec, Mailbox, Rasterizer, Timestamps, faults};
+use cif_render::wgpu::{Gpu, GpuError, GpuVec, Rasterizer, Readback, Timestamps, faults};
 
-use self::flight::{Flights, LETTER_WORDS};
+use self::flight::{Flights, VIEW_WORDS};
 use self::kept::Kept;
 pub use self::probe::Probe;
 use self::resident::{Resident, Stale};
@@ -79,7 +79,7 @@ pub(super) struct DeviceTraining {
     stale: Stale,
     /// See [`cif_render::wgpu::faults`].
     faults: GpuVec<u32>,
-    mailbox: Mailbox,
+    readback: Readback,
     flights: Flights,
     /// Most pairs and label slots that a view wanted so far, and of how many Gaussians.
     wanted: [usize; 2],
@@ -131,7 +131,7 @@ impl Trainer {
             resident: None,
             stale: Stale::default(),
             faults: GpuVec::zeros(gpu, "faults", faults::WORDS)?,
-            mailbox: Mailbox::new(LETTER_WORDS),
+            readback: Readback::new(VIEW_WORDS),
             flights: Flights::default(),
             wanted: [SMALLEST_ROOM; 2],
             wanted_of: 0,
@@ -186,7 +186,7 @@ impl Trainer {
         // The similarity keeps five images of 16 bytes per pixel, the backward pass two.
         let per_pixel = if self.config.loss.lambda_dssim > 0.0 { 80 } else { 32 };
         check("images of a view", pixels.max().unwrap_or(0), per_pixel, "a larger downscale")?;
-        if self.plan.is_dynamic {
+        if self.stages.is_dynamic {
             let fresh;
             let deformation = match &self.field.deformation {
                 Some(deformation) => deformation,

@@ -224,7 +224,7 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
         let mut result = Vec::new();
         while trainer.stage() != Stage::Instance && result.len() < 40 {
             let stage = trainer.stage();
-            if trainer.iteration() == trainer.plan.iterations(&trainer.config, stage) {
+            if trainer.iteration() == trainer.stages.iterations(&trainer.config, stage) {
                 break;
             }
             if fetches && let Some(device) = &mut trainer.device {

@@ -54,7 +54,7 @@ impl Trainer {
             motion,
             targets,
             judge,
-            mailbox,
+            readback,
             faults,
             slot,
             timestamps,
@@ -223,14 +223,14 @@ impl Trainer {
             (rasterizer.counts().buffer(), 0, GpuStatistics::WORDS),
             (faults.buffer(), 0, faults::WORDS),
         ];
-        let letter = mailbox.record(gpu, commands.encoder(), &parts);
+        let pending = readback.record(gpu, commands.encoder(), &parts);
         *slot = (*slot + 1) % SLOTS;
         if last {
             // Whether steps wait stays.
             commands.clear_range(faults, 0, 1);
         }
         let submission = commands.submit();
-        let letter = letter.send();
+        let pending = pending.send();
         if let Some(timestamps) = timestamps {
             let stages = timestamps.read(gpu)?;
             add_stage_times(&mut self.times, &stages);
@@ -243,7 +243,7 @@ impl Trainer {
             lambda_dssim: self.config.loss.lambda_dssim,
             gaussians: resident.canonical.len(),
         };
-        Ok((ViewRead::new(letter, about), submission))
+        Ok((ViewRead::new(pending, about), submission))
     }
 }
 

@@ -54,7 +54,7 @@ impl Trainer {
     /// Whether anything is still to be judged by pixels that are held out; then all pixels train.
     fn judges(&self, stage: Stage, iteration: u32) -> bool {
         let effects = &self.config.effects;
-        let half = self.plan.iterations(&self.config, Stage::Fine) / 2;
+        let half = self.stages.iterations(&self.config, Stage::Fine) / 2;
         let earns = effects.sh_gain > 0.0 || effects.head_gain > 0.0;
         (earns && (stage == Stage::Coarse || (stage == Stage::Fine && iteration <= half)))
             || self.tests_to_come(stage, iteration)
@@ -143,7 +143,7 @@ impl Trainer {
 
     /// Whether a step is the one on which what has not earned its place is taken back.
     fn is_half_way(&self, stage: Stage, iteration: u32) -> bool {
-        let last = self.plan.iterations(&self.config, Stage::Fine);
+        let last = self.stages.iterations(&self.config, Stage::Fine);
         stage == Stage::Fine && iteration == (last / 2).max(1)
     }
 
