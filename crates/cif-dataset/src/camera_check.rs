@@ -106,7 +106,7 @@ fn pose(path: &Path, frame: &str, pose: RigidTransform) -> Result<RigidTransform
     Ok(RigidTransform { rotation, translation: -(rotation * centre) })
 }
 
-/// Whether the lens model still has an inverse at the corners of the image.
+/// True when the lens model still has an inverse at the corners of the image.
 pub(crate) fn lens_covers_image(camera: &PinholeCamera, lens: &LensDistortion) -> bool {
     let (width, height) = (f64::from(camera.width), f64::from(camera.height));
     [(0.0, 0.0), (width, 0.0), (0.0, height), (width, height)].into_iter().all(|(x, y)| {

@@ -126,7 +126,7 @@ pub struct Dataset {
     pub mask_objects: ObjectIds,
     /// Initial points.
     pub points: PointCloud,
-    /// Whether images carry alpha and are composited on the background when loaded.
+    /// True when images carry alpha and are composited on the background when loaded.
     pub has_alpha: bool,
     /// Oddities met while reading, one sentence each, naming the file.
     pub warnings: Vec<String>,

@@ -81,7 +81,7 @@ impl Dataset {
     }
 }
 
-/// Whether two sizes have one aspect, up to the rounding of either to whole pixels.
+/// True when two sizes have one aspect, up to the rounding of either to whole pixels.
 pub(crate) fn same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
     let [aw, ah, bw, bh] = [a.0, a.1, b.0, b.1].map(f64::from);
     let slack = 1.0 / aw.min(ah).max(1.0) + 1.0 / bw.min(bh).max(1.0);

@@ -17,7 +17,7 @@ pub(crate) const DEFAULT_FOLDER: &str = "masks";
 /// Endings of mask files, first choice first.
 const EXTENSIONS: [&str; 2] = ["png", "exr"];
 
-/// Whether a mask is a Cryptomatte.
+/// True when a mask is a Cryptomatte.
 pub(crate) fn is_cryptomatte(path: &Path) -> bool {
     listing::has_extension(path, &["exr"])
 }
@@ -70,7 +70,7 @@ pub(crate) struct MaskListing {
     pub(crate) folder: Option<PathBuf>,
     /// PNG and EXR files in the folder that belong to no frame.
     pub(crate) strangers: usize,
-    /// Whether files are numbered in the order of the frames instead of named as them.
+    /// True when files are numbered in the order of the frames instead of named as them.
     pub(crate) numbered: bool,
 }
 

@@ -40,7 +40,7 @@ pub struct CaptureSummary {
     pub field_of_view_degrees: [f64; 2],
     /// Frames whose lens is removed on loading.
     pub frames_with_lens: usize,
-    /// Whether images carry alpha.
+    /// True when images carry alpha.
     pub has_alpha: bool,
     /// Masks, where there are any.
     pub masks: Option<MaskSummary>,
@@ -69,7 +69,7 @@ pub struct CameraSummary {
     pub train: usize,
     /// Held-out frames.
     pub val: usize,
-    /// Whether its pose changes.
+    /// True when its pose changes.
     pub moves: bool,
 }
 

@@ -51,7 +51,7 @@ impl Field {
         self.gaussians.len()
     }
 
-    /// Whether there are no Gaussians.
+    /// True when there are no Gaussians.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.gaussians.is_empty()
@@ -71,7 +71,7 @@ impl Field {
         posed
     }
 
-    /// Whether Gaussians move or deform over time, by learning or by record.
+    /// True when Gaussians move or deform over time, by learning or by record.
     #[must_use]
     pub fn moves(&self) -> bool {
         self.deformation.is_some() || self.tracks.as_ref().is_some_and(Tracks::moves)

@@ -248,7 +248,7 @@ impl Gaussians {
         self.means.len()
     }
 
-    /// Whether there are none.
+    /// True when there are none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()

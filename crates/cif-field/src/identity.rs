@@ -61,7 +61,7 @@ impl Identities {
         self.row_offsets.len() - 1
     }
 
-    /// Whether there are no rows.
+    /// True when there are no rows.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0

@@ -21,7 +21,7 @@ pub struct RecordedCamera {
     pub name: String,
     /// Index into [`Timeline::times`].
     pub time_index: usize,
-    /// Whether the frame was trained on.
+    /// True when the frame was trained on.
     pub trained: bool,
     /// The view.
     pub camera: PinholeCamera,

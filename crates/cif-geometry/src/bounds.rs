@@ -34,7 +34,7 @@ impl Bounds {
         Self { low: self.low.min(other.low), high: self.high.max(other.high) }
     }
 
-    /// Whether the box holds nothing.
+    /// True when the box holds nothing.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         !(self.low.cmple(self.high).all())

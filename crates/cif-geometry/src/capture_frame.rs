@@ -22,13 +22,13 @@ impl Default for CaptureFrame {
 }
 
 impl CaptureFrame {
-    /// Whether the dataset has the coordinates of its capture.
+    /// True when the dataset has the coordinates of its capture.
     #[must_use]
     pub fn is_identity(&self) -> bool {
         *self == Self::default()
     }
 
-    /// Whether the frame can be used: finite numbers, a scale above 0.
+    /// True when the frame can be used: finite numbers, a scale above 0.
     #[must_use]
     pub fn is_valid(&self) -> bool {
         self.offset.iter().all(|value| value.is_finite()) && self.scale.is_normal() && self.scale > 0.0

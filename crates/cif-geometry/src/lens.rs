@@ -18,7 +18,7 @@ pub struct LensDistortion {
 }
 
 impl LensDistortion {
-    /// Whether the lens is ideal, so that images need no resampling.
+    /// True when the lens is ideal, so that images need no resampling.
     #[must_use]
     pub fn is_identity(&self) -> bool {
         *self == Self::default()

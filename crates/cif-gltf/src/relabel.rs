@@ -96,7 +96,7 @@ pub fn relabel(
     Ok(done)
 }
 
-/// Whether buffers or images lie in files of their own.
+/// True when buffers or images lie in files of their own.
 fn names_files(document: &Value) -> bool {
     ["buffers", "images"].iter().any(|key| {
         document[*key].as_array().is_some_and(|list| {

@@ -72,7 +72,7 @@ fn checked_kind(path: &Path, options: ExportOptions) -> Result<(Kind, PathBuf), 
     Ok((kind, target))
 }
 
-/// Whether cif wrote a file: its generator says so. Only the JSON is read.
+/// True when cif wrote a file: its generator says so. Only the JSON is read.
 fn is_ours(path: &Path) -> bool {
     #[derive(Deserialize)]
     struct Document {

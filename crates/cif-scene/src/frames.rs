@@ -103,13 +103,13 @@ impl<'a> Frames<'a> {
         self.times.len()
     }
 
-    /// Whether there are none.
+    /// True when there are none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.times.is_empty()
     }
 
-    /// Whether there is more than one time, and anything can move.
+    /// True when there is more than one time, and anything can move.
     #[must_use]
     pub fn moves(&self) -> bool {
         self.times.len() > 1 && self.motion.moves()

@@ -272,7 +272,7 @@ pub struct ConvexHull {
 pub struct VisibilitySample {
     /// Time code.
     pub time_code: f64,
-    /// Whether the node can be seen from here on.
+    /// True when the node can be seen from here on.
     pub visible: bool,
 }
 
@@ -469,7 +469,7 @@ pub struct CameraSample {
     pub camera: PinholeCamera,
 }
 
-/// Whether changes of visibility leave something visible at a time code; before the first one it counts.
+/// True when changes of visibility leave something visible at a time code; before the first one it counts.
 #[must_use]
 pub fn is_visible_at(changes: &[VisibilitySample], time_code: f64) -> bool {
     let after = changes.partition_point(|sample| sample.time_code <= time_code);
@@ -525,7 +525,7 @@ impl Node {
         pose_at(self.track(), self.pivot, time_code).transform()
     }
 
-    /// Whether the node can be seen at a time code.
+    /// True when the node can be seen at a time code.
     #[must_use]
     pub fn is_visible(&self, time_code: f64) -> bool {
         is_visible_at(&self.visibility, time_code)

@@ -31,7 +31,7 @@ pub struct MovingGroup {
     pub weights: Vec<f64>,
     /// Origin of the local frame at the reference time, world.
     pub pivot: DVec3,
-    /// Whether one rigid body may be fitted; the background is not one body.
+    /// True when one rigid body may be fitted; the background is not one body.
     pub is_body: bool,
     /// True where all but the outliers stand still as far as a picture shows ([`crate::loose`]).
     pub stands_still: bool,

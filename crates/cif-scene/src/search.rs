@@ -76,13 +76,13 @@ impl ObjectQuery {
         self.label.as_ref().map(|pattern| LabelQuery { pattern: pattern.clone(), time_code })
     }
 
-    /// Whether labels of a taxonomy count.
+    /// True when labels of a taxonomy count.
     #[must_use]
     pub fn counts(&self, taxonomy: &str) -> bool {
         self.taxonomy.as_deref().is_none_or(|wanted| wanted == taxonomy)
     }
 
-    /// Whether a world box is where the query looks.
+    /// True when a world box is where the query looks.
     #[must_use]
     pub fn is_at(&self, bounds: &Bounds) -> bool {
         let contains = |low: DVec3, high: DVec3| {

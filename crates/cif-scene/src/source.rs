@@ -9,7 +9,7 @@ pub trait MotionSource {
     /// given as if it were not: visibility is told apart from motion.
     fn gaussians_at(&mut self, time: f64) -> Gaussians;
 
-    /// Whether anything can move at all.
+    /// True when anything can move at all.
     fn moves(&self) -> bool {
         true
     }

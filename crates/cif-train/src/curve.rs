@@ -81,7 +81,7 @@ pub struct Curve {
 }
 
 impl Curve {
-    /// Whether a point is due after `iteration` steps of `stage`; closer together when `watchful`.
+    /// True when a point is due after `iteration` steps of `stage`; closer together when `watchful`.
     #[must_use]
     pub fn is_due(&self, stage: Stage, iteration: u32, watchful: bool) -> bool {
         let last = self.points.last().filter(|point| point.stage == stage).map_or(0, |point| point.iteration);
@@ -90,7 +90,7 @@ impl Curve {
         f64::from(iteration) >= next
     }
 
-    /// Whether the state after `step` steps is measured already.
+    /// True when the state after `step` steps is measured already.
     #[must_use]
     pub fn holds(&self, stage: Stage, step: u64) -> bool {
         self.points.last().is_some_and(|point| (point.stage, point.step) == (stage, step))

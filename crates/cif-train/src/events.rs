@@ -164,7 +164,7 @@ pub enum TrainEvent {
         what: String,
         /// What it gains on held-out pixels of training views, dB.
         gain_db: f64,
-        /// Whether it stays; else it is removed for good.
+        /// True when it stays; else it is removed for good.
         kept: bool,
     },
     /// Held-out frames were scored.

@@ -85,7 +85,7 @@ impl Due {
     }
 }
 
-/// Whether an event that happens `every` steps (0: never) falls on `step`.
+/// True when an event that happens `every` steps (0: never) falls on `step`.
 #[must_use]
 pub fn falls_on(step: u32, every: u32) -> bool {
     step > 0 && step.checked_rem(every) == Some(0)

@@ -26,7 +26,7 @@ pub struct Observation {
     pub centroid_px: DVec2,
     /// Pixels of the mask.
     pub area_px: f64,
-    /// Whether the mask touches the border of the image, so that its area says nothing.
+    /// True when the mask touches the border of the image, so that its area says nothing.
     pub cut: bool,
     /// Camera depth of what is seen just outside the mask where that is nearest, metres.
     pub contact_depth: Option<f64>,
@@ -117,7 +117,7 @@ const LATE: usize = 8;
 /// Observations that a path needs.
 const FEWEST: usize = 5;
 
-/// Whether an instance travels: no fixed point explains the directions that its mask is seen in. The median
+/// True when an instance travels: no fixed point explains the directions that its mask is seen in. The median
 /// distance of that point from the mask's centre is compared with the mask's radius.
 #[must_use]
 pub fn travels(observations: &[Observation]) -> bool {

@@ -54,7 +54,7 @@ fn is_ours(pxr: &Pxr<'_>, path: &Path) -> bool {
         .unwrap_or(false)
 }
 
-/// Whether a folder holds nothing but layers of ours.
+/// True when a folder holds nothing but layers of ours.
 fn is_folder_of_ours(pxr: &Pxr<'_>, folder: &Path) -> bool {
     fs::read_dir(folder).is_ok_and(|mut entries| {
         entries.all(|entry| {
@@ -75,7 +75,7 @@ struct Target {
     /// The file, where links lead.
     path: PathBuf,
     kind: Kind,
-    /// Whether arrays go to payloads.
+    /// True when arrays go to payloads.
     split: bool,
 }
 

@@ -49,7 +49,7 @@ pub enum Selection {
 pub struct FoundMasks {
     /// Files per frame, `[frames]`; empty where the detector was not asked.
     pub files: Vec<Vec<PathBuf>>,
-    /// Whether they were made on loaded images, without lens, rather than on captured ones.
+    /// True when they were made on loaded images, without lens, rather than on captured ones.
     pub loaded: bool,
 }
 
@@ -67,7 +67,7 @@ pub struct Vote {
     pub category: String,
     /// v_k: share of what the frames show of it that lies inside the masks, in [0, 1].
     pub score: f64,
-    /// Whether it is chosen.
+    /// True when it is chosen.
     pub chosen: bool,
 }
 

@@ -52,12 +52,12 @@ pub(crate) fn is_there(path: &Path) -> bool {
     path.exists() && !path.is_dir()
 }
 
-/// Whether the extension is one of an image that can be read.
+/// True when the extension is one of an image that can be read.
 pub(crate) fn is_image(path: &Path) -> bool {
     has_extension(path, &["png", "jpg", "jpeg"])
 }
 
-/// Whether the extension is one of these, in any case.
+/// True when the extension is one of these, in any case.
 pub(crate) fn has_extension(path: &Path, extensions: &[&str]) -> bool {
     path.extension()
         .and_then(|extension| extension.to_str())

@@ -86,7 +86,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     Ok(Draft { frames, stored_reduction: 1, points: customary_points(root)?, warnings, ..Draft::default() })
 }
 
-/// Whether a name is that of a camera: `cam` and digits.
+/// True when a name is that of a camera: `cam` and digits.
 fn is_camera(name: &str) -> bool {
     name.strip_prefix("cam").is_some_and(|rest| !rest.is_empty() && rest.chars().all(|c| c.is_ascii_digit()))
 }

@@ -88,7 +88,7 @@ impl ZigzagIndex {
         Ok(index)
     }
 
-    /// Whether ids are compared across views.
+    /// True when ids are compared across views.
     #[must_use]
     pub fn is_multi_view(&self) -> bool {
         self.views.len() > 1

@@ -32,7 +32,7 @@ pub fn failure_with(folder: &TempDir, options: &OpenOptions) -> String {
     error.to_string()
 }
 
-/// Whether some warning holds all the words.
+/// True when some warning holds all the words.
 pub fn warns(dataset: &Dataset, words: &[&str]) -> bool {
     dataset.warnings.iter().any(|warning| words.iter().all(|word| warning.contains(word)))
 }

@@ -52,7 +52,7 @@ fn has_owners(field: &Field) -> bool {
     })
 }
 
-/// Whether any Gaussian of a deformed field stands still.
+/// True when any Gaussian of a deformed field stands still.
 fn stands_still(field: &Field) -> bool {
     field.deformation.as_ref().is_some_and(|deformation| deformation.still.contains(&true))
 }
@@ -118,7 +118,7 @@ pub(super) struct FieldJson {
 pub(super) struct DeformationJson {
     pub(super) config: DeformationConfig,
     pub(super) bounds: Bounds,
-    /// Whether there is a tensor of Gaussians that stand still.
+    /// True when there is a tensor of Gaussians that stand still.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub(super) has_still: bool,
 }
@@ -163,7 +163,7 @@ pub(super) struct DenseJson {
     times: Vec<f64>,
     /// Rows of the dense tensors.
     pub(super) rows: usize,
-    /// Whether log-scales are sampled too.
+    /// True when log-scales are sampled too.
     pub(super) log_scales: bool,
 }
 

@@ -15,9 +15,9 @@ pub struct PlaneTap<R> {
     pub column_fraction: R,
     /// Row fraction g.
     pub row_fraction: R,
-    /// Whether the column coordinate was clamped, so that no gradient reaches the position.
+    /// True when the column coordinate was clamped, so that no gradient reaches the position.
     pub column_clamped: bool,
-    /// Whether the row coordinate was clamped.
+    /// True when the row coordinate was clamped.
     pub row_clamped: bool,
 }
 

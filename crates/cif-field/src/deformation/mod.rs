@@ -73,7 +73,7 @@ pub const PLANES: usize = 6;
 /// Axes (columns, rows) of the planes in storage order xy, xz, xt, yz, yt, zt; axis 3 is time.
 pub const PLANE_AXES: [(usize, usize); PLANES] = [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)];
 
-/// Whether the plane has time as its row axis.
+/// True when the plane has time as its row axis.
 #[must_use]
 pub const fn is_time_plane(plane: usize) -> bool {
     PLANE_AXES[plane].1 == 3
@@ -267,7 +267,7 @@ pub struct Deformation {
 }
 
 impl Deformation {
-    /// Whether the network leaves a Gaussian where it is.
+    /// True when the network leaves a Gaussian where it is.
     #[must_use]
     pub fn is_still(&self, row: usize) -> bool {
         self.still.get(row).copied().unwrap_or(false)

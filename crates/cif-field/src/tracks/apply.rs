@@ -23,11 +23,11 @@ const NO_TURN: f64 = 1e-12;
 pub struct GroupAtTime<'a> {
     /// See [`super::TrackGroup::deformed`].
     pub deformed: bool,
-    /// Whether it is drawn.
+    /// True when it is drawn.
     pub visible: bool,
-    /// Whether the pose does anything.
+    /// True when the pose does anything.
     pub moved: bool,
-    /// Whether the pose turns.
+    /// True when the pose turns.
     pub turned: bool,
     /// Turn around the pivot.
     pub rotation: DQuat,
@@ -44,7 +44,7 @@ pub struct GroupAtTime<'a> {
 }
 
 impl GroupAtTime<'_> {
-    /// Whether nothing happens to the group.
+    /// True when nothing happens to the group.
     fn is_still(&self) -> bool {
         self.deformed
             && self.visible
@@ -191,7 +191,7 @@ impl<'a> TracksAtTime<'a> {
         (group != NO_GROUP).then(|| (&self.groups[group as usize], member))
     }
 
-    /// Whether any Gaussian is other than posed without tracks.
+    /// True when any Gaussian is other than posed without tracks.
     #[must_use]
     pub fn changes_anything(&self) -> bool {
         self.groups.iter().any(|group| !group.is_still())

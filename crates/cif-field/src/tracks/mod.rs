@@ -39,7 +39,7 @@ pub struct Tracks {
 pub struct TrackGroup {
     /// What the group is, for people: the object's name.
     pub name: String,
-    /// Whether the learned deformation moves the group before its track does; off for what was added to a
+    /// True when the learned deformation moves the group before its track does; off for what was added to a
     /// trained scene.
     pub deformed: bool,
     /// Point that the poses carry, world, metres.
@@ -99,7 +99,7 @@ pub struct TrackPose {
 pub struct VisibilityStep {
     /// Normalised time.
     pub time: f64,
-    /// Whether the group can be seen from here on.
+    /// True when the group can be seen from here on.
     pub visible: bool,
 }
 
@@ -193,14 +193,14 @@ impl TrackGroup {
         (a.rotation.slerp(b.rotation, fraction), a.translation.lerp(b.translation, fraction))
     }
 
-    /// Whether the group can be seen at a time.
+    /// True when the group can be seen at a time.
     #[must_use]
     pub fn is_visible(&self, time: f64) -> bool {
         let after = self.visibility.partition_point(|step| step.time <= time);
         self.visibility.get(after.max(1) - 1).is_none_or(|step| step.visible)
     }
 
-    /// Whether anything of the group changes over time, apart from its visibility.
+    /// True when anything of the group changes over time, apart from its visibility.
     #[must_use]
     pub fn moves(&self) -> bool {
         self.poses.len() > 1
@@ -217,7 +217,7 @@ impl Tracks {
         TracksAtTime::new(self, time)
     }
 
-    /// Whether anything moves, apart from visibility.
+    /// True when anything moves, apart from visibility.
     #[must_use]
     pub fn moves(&self) -> bool {
         self.groups.iter().any(TrackGroup::moves)

@@ -195,7 +195,7 @@ impl Curve {
         Ok(Self { times, values, tangents, interpolation, path })
     }
 
-    /// Whether it drives a scale, whose steps show and hide.
+    /// True when it drives a scale, whose steps show and hide.
     pub(crate) fn hides(&self) -> bool {
         self.path == Path::Scale
     }

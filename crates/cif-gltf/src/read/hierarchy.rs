@@ -150,7 +150,7 @@ fn ours(source: &Source, index: usize, warnings: &mut Vec<String>) -> Option<Cif
     }
 }
 
-/// Whether `KHR_node_visibility` hides a node.
+/// True when `KHR_node_visibility` hides a node.
 pub(crate) fn is_hidden(source: &Source, index: usize) -> bool {
     let extensions = source.root.nodes[index].extensions.as_ref();
     extensions

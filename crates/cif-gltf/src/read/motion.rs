@@ -49,7 +49,7 @@ impl Clock {
 pub(crate) struct Chain {
     pub(crate) prefix: Option<DAffine3>,
     pub(crate) nodes: Vec<usize>,
-    /// Whether every key of a scale says something about visibility, as in our own files.
+    /// True when every key of a scale says something about visibility, as in our own files.
     pub(crate) ours: bool,
 }
 
@@ -60,7 +60,7 @@ pub(crate) struct Movement {
     /// To be worked into the splats.
     pub(crate) stretch: DMat3,
     pub(crate) visibility: Vec<VisibilitySample>,
-    /// Whether the stretch changes over time.
+    /// True when the stretch changes over time.
     pub(crate) stretch_changes: bool,
 }
 

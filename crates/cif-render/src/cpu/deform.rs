@@ -169,7 +169,7 @@ impl<'a> DeformationAtTime<'a> {
         Self { deformation, axes, mlp, trunk, heads, levels, channels, lines, time_row, time_fraction }
     }
 
-    /// Whether the network moves a row.
+    /// True when the network moves a row.
     pub(super) fn moves(&self, row: usize) -> bool {
         !self.deformation.is_still(row)
     }

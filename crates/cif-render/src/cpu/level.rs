@@ -23,7 +23,7 @@ impl SimdLevel {
         [Self::Avx512, Self::Avx2, Self::Portable].into_iter().filter(|level| level.is_available()).collect()
     }
 
-    /// Whether this processor has the instructions.
+    /// True when this processor has the instructions.
     #[must_use]
     pub fn is_available(self) -> bool {
         self.level().is_some()

@@ -249,7 +249,7 @@ pub(super) struct Blended<S: Simd> {
     pub(super) drawn: mask32x16<S>,
     /// T alpha where drawn, else 0.
     pub(super) weight: f32x16<S>,
-    /// Whether no pixel of the group lets light through any more.
+    /// True when no pixel of the group lets light through any more.
     pub(super) finished: bool,
 }
 

@@ -31,7 +31,7 @@ fn probability<R: Real>(state: &PixelState<R>, normalisation: InstanceNormalisat
     }
 }
 
-/// Whether a labelled pixel carries a gradient.
+/// True when a labelled pixel carries a gradient.
 #[must_use]
 pub fn is_supported<R: Real>(state: &PixelState<R>, normalisation: InstanceNormalisation) -> bool {
     probability(state, normalisation) >= constant(MIN_LABEL_PROBABILITY)

@@ -317,7 +317,7 @@ pub fn project<R: Real>(
 pub struct ProjectGradient<R> {
     /// By the raw parameters of the Gaussian at its time.
     pub gaussian: Gaussian<R>,
-    /// Whether the norm of the camera-space position gradient was clipped (methods reference 7, row 16).
+    /// True when the norm of the camera-space position gradient was clipped (methods reference 7, row 16).
     pub clipped: bool,
 }
 

@@ -85,7 +85,7 @@ pub fn footprint<R: Real>(splat: &Splat2d<R>, pixel: [u32; 2]) -> Footprint<R> {
 pub struct Weight<R> {
     /// In [1/255, 0.99].
     pub value: R,
-    /// Whether it sits at 0.99, where no gradient reaches strength and footprint.
+    /// True when it sits at 0.99, where no gradient reaches strength and footprint.
     pub clamped: bool,
 }
 

@@ -124,7 +124,7 @@ impl<R: Real> Parameters<R> {
         }
     }
 
-    /// Whether there is nothing at all.
+    /// True when there is nothing at all.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         ParameterGroup::ALL.iter().all(|group| self.len(*group) == 0)

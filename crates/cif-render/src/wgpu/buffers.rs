@@ -62,7 +62,7 @@ impl<T: Pod> GpuVec<T> {
         self.len
     }
 
-    /// Whether there are no elements.
+    /// True when there are no elements.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len == 0

@@ -67,7 +67,7 @@ pub struct GpuIdentityCounts {
 }
 
 impl GpuIdentityCounts {
-    /// Whether the device holds the counts of so many Gaussians and instances: their table has no gaps, so that of
+    /// True when the device holds the counts of so many Gaussians and instances: their table has no gaps, so that of
     /// a scene with very many instances does not fit, and is counted by the processor.
     #[must_use]
     pub fn fits(gpu: &Gpu, gaussians: usize, instances: usize) -> bool {

@@ -27,15 +27,15 @@ pub struct AdapterFacts {
     pub kind: &'static str,
     /// Driver and its version.
     pub driver: String,
-    /// Whether the processor does the work: no GPU at all, then.
+    /// True when the processor does the work: no GPU at all, then.
     pub software: bool,
-    /// Whether kernels can be timed on the device.
+    /// True when kernels can be timed on the device.
     pub timestamps: bool,
     /// Least and largest size of its subgroups, where kernels can use them.
     pub subgroups: Option<(u32, u32)>,
-    /// Whether kernels can compute in 16-bit floats.
+    /// True when kernels can compute in 16-bit floats.
     pub half_floats: bool,
-    /// Whether kernels can read numbers that are kept in 16-bit floats.
+    /// True when kernels can read numbers that are kept in 16-bit floats.
     pub packed_half_floats: bool,
     /// Limits that decide how large a scene may be and how kernels are cut.
     pub limits: [(&'static str, u64); 6],
@@ -318,7 +318,7 @@ impl Gpu {
         limits.max_storage_buffer_binding_size.min(limits.max_buffer_size) & !15
     }
 
-    /// Whether kernels may use the timestamps of the device.
+    /// True when kernels may use the timestamps of the device.
     #[must_use]
     pub fn has_timestamps(&self) -> bool {
         self.device.features().contains(wgpu::Features::TIMESTAMP_QUERY)

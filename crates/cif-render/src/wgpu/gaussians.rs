@@ -73,7 +73,7 @@ impl GpuGaussians {
         self.geometry.len()
     }
 
-    /// Whether there are none.
+    /// True when there are none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.geometry.is_empty()

@@ -104,7 +104,7 @@ impl GpuStatistics {
         }
     }
 
-    /// Whether the view was drawn.
+    /// True when the view was drawn.
     #[must_use]
     pub fn fits(&self) -> bool {
         self.pairs == self.wanted_pairs

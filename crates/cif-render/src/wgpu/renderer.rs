@@ -88,7 +88,7 @@ impl GpuRenderer {
         })
     }
 
-    /// Whether spherical harmonics are in 16-bit floats.
+    /// True when spherical harmonics are in 16-bit floats.
     #[must_use]
     pub fn is_compact(&self) -> bool {
         self.packed_sh.is_some()

@@ -60,7 +60,7 @@ pub struct Moved {
     pub translation: f64,
     /// Largest turn, degrees.
     pub rotation_degrees: f64,
-    /// Whether the move is the same at all times.
+    /// True when the move is the same at all times.
     pub constant: bool,
 }
 
@@ -85,14 +85,14 @@ pub struct ObjectChange {
     pub recategorised: Option<FromTo>,
     /// Move, if there is one.
     pub moved: Option<Moved>,
-    /// Whether it is seen at other times.
+    /// True when it is seen at other times.
     pub visibility: bool,
     /// Splats that differ; `None` where none does.
     pub splats: Option<SplatChanges>,
 }
 
 impl ObjectChange {
-    /// Whether anything differs.
+    /// True when anything differs.
     #[must_use]
     pub fn is_change(&self) -> bool {
         self.kind != ChangeKind::Changed
@@ -150,7 +150,7 @@ pub struct SceneDiff {
 }
 
 impl SceneDiff {
-    /// Whether no object differs.
+    /// True when no object differs.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.objects.is_empty()
@@ -172,7 +172,7 @@ pub fn diff(before: &SceneGraph, after: &SceneGraph) -> SceneDiff {
     result
 }
 
-/// Whether rows of two graphs mean the same Gaussians.
+/// True when rows of two graphs mean the same Gaussians.
 pub(crate) fn same_rows(before: &SceneGraph, after: &SceneGraph) -> bool {
     before.origin.field_fingerprint.is_some()
         && before.origin.field_fingerprint == after.origin.field_fingerprint
@@ -234,7 +234,7 @@ fn moved(first: &Node, second: &Node, codes: &[f64]) -> Option<Moved> {
     any.then_some(largest)
 }
 
-/// Whether two nodes are seen at different times.
+/// True when two nodes are seen at different times.
 pub(crate) fn visibility_differs(first: &Node, second: &Node, codes: &[f64]) -> bool {
     let steps = first.visibility.iter().chain(&second.visibility).map(|step| step.time_code);
     codes.iter().copied().chain(steps).any(|code| first.is_visible(code) != second.is_visible(code))

@@ -12,7 +12,7 @@ pub struct Pair {
     pub before: Option<usize>,
     /// In the second graph; `None` for a removed node.
     pub after: Option<usize>,
-    /// Whether the node of the second graph is a copy beside the original.
+    /// True when the node of the second graph is a copy beside the original.
     pub duplicate: bool,
 }
 
@@ -54,7 +54,7 @@ pub fn pairs(before: &SceneGraph, after: &SceneGraph) -> Vec<Pair> {
     pairs
 }
 
-/// Whether both are the background, or instances with one id.
+/// True when both are the background, or instances with one id.
 fn same_object(a: &Node, b: &Node) -> bool {
     match (a.kind, b.kind) {
         (NodeKind::Background, NodeKind::Background) => true,

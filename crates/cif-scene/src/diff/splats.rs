@@ -36,7 +36,7 @@ pub struct SplatChanges {
 }
 
 impl SplatChanges {
-    /// Whether none differs.
+    /// True when none differs.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         *self == Self::default()

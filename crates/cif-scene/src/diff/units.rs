@@ -88,7 +88,7 @@ pub(crate) struct Delta {
     pub(crate) translation: f64,
     /// Largest turn, radians.
     pub(crate) rotation: f64,
-    /// Whether `after * before^-1` is the same at all times.
+    /// True when `after * before^-1` is the same at all times.
     pub(crate) constant: bool,
 }
 

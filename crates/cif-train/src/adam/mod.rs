@@ -230,7 +230,7 @@ impl RowRates {
     }
 }
 
-/// Whether every value is finite: a product with zero is zero for those alone.
+/// True when every value is finite: a product with zero is zero for those alone.
 fn all_finite(values: &[f32]) -> bool {
     let mut lanes = [0.0_f32; 16];
     let blocks = values.chunks_exact(16);

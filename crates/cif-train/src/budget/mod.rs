@@ -65,13 +65,13 @@ pub struct Targets {
 }
 
 impl Targets {
-    /// Whether there is none.
+    /// True when there is none.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.psnr.is_none() && self.miou.is_none()
     }
 
-    /// Whether measured values reach all targets.
+    /// True when measured values reach all targets.
     #[must_use]
     pub fn reached_by(&self, psnr: Option<f64>, miou: Option<f64>) -> bool {
         let reached = |target: Option<f64>, value: Option<f64>| {

@@ -75,7 +75,7 @@ pub struct StagesConfig {
     pub coarse: u32,
     /// Fine steps: deformation and regularisers on, default 7000.
     pub fine: u32,
-    /// Whether the coarse steps count towards `fine`, default no (A1).
+    /// True when the coarse steps count towards `fine`, default no (A1).
     pub fine_includes_coarse: bool,
     /// Instance steps, default 1500; skipped without masks.
     pub instance: u32,
@@ -122,7 +122,7 @@ pub struct RatesConfig {
     /// Steps over which scheduled rates run from first to last, counted from the start of a reconstruction
     /// stage. Default 0: fine plus instance steps.
     pub schedule_steps: u32,
-    /// Whether the schedule restarts with the instance stage, default no: it continues (A29).
+    /// True when the schedule restarts with the instance stage, default no: it continues (A29).
     pub restart_in_instance_stage: bool,
     /// Centres, x extent, default [1.6e-4, 1.6e-6].
     pub means: [f32; 2],
@@ -269,7 +269,7 @@ pub struct InstanceConfig {
     /// Geometry that the instance loss trains, `full`, `means_only` or `off` (A6); default `off`, `full` in the preset
     /// `paper`.
     pub geometry: InstanceGeometry,
-    /// Whether the colour loss goes on, default yes (A15).
+    /// True when the colour loss goes on, default yes (A15).
     pub color_loss: bool,
     /// Parts of the method switched off, default none.
     pub ablate: BTreeSet<Ablation>,
@@ -304,9 +304,9 @@ pub struct ResampleConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct EffectsConfig {
-    /// Whether anything moves, default yes; without, a capture of several times is trained as if it had one.
+    /// True when anything moves, default yes; without, a capture of several times is trained as if it had one.
     pub motion: bool,
-    /// Whether instances are trained where there are masks, default yes.
+    /// True when instances are trained where there are masks, default yes.
     pub instances: bool,
     /// Steps between tests for Gaussians that stand still, which then skip the deformation network; default 0:
     /// every Gaussian goes through it.
@@ -336,9 +336,9 @@ pub struct EffectsConfig {
     /// Gain, likewise, that the motion of scales, rotations, opacities and colours must each bring at half of the
     /// fine stage; else it is removed. Default 0: all stay.
     pub head_gain: f32,
-    /// Whether exports hold hulls of instances for simulators unless told otherwise, default yes.
+    /// True when exports hold hulls of instances for simulators unless told otherwise, default yes.
     pub physics: bool,
-    /// Whether an exposure and a white balance are learnt for every camera, default no.
+    /// True when an exposure and a white balance are learnt for every camera, default no.
     pub exposure: bool,
 }
 
@@ -377,7 +377,7 @@ impl TrainConfig {
         }
     }
 
-    /// Whether an ablation is on.
+    /// True when an ablation is on.
     #[must_use]
     pub fn ablates(&self, ablation: Ablation) -> bool {
         self.instance.ablate.contains(&ablation)

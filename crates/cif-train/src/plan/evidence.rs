@@ -66,7 +66,7 @@ pub(super) struct Evidence {
     pub view_angle: f64,
     /// Training frames whose lens is removed.
     pub lenses: usize,
-    /// Whether images carry alpha.
+    /// True when images carry alpha.
     pub has_alpha: bool,
 }
 
@@ -219,7 +219,7 @@ impl<'a> Sightings<'a> {
     }
 }
 
-/// Whether an instance is seen as large as in the other frames, away from the border.
+/// True when an instance is seen as large as in the other frames, away from the border.
 fn is_whole(observation: &Observation, others: &[Observation]) -> bool {
     let mut areas: Vec<f64> = others.iter().map(|other| other.area_px).collect();
     areas.sort_by(f64::total_cmp);

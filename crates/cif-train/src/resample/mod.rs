@@ -25,9 +25,9 @@ pub struct ResampleContext<'a> {
     pub unseen: &'a [bool],
     /// Labelled pixels per instance, for shares by pixels.
     pub label_pixels: &'a [f64],
-    /// Whether opacity takes the place of occupancy (ablation ii).
+    /// True when opacity takes the place of occupancy (ablation ii).
     pub opacity_is_occupancy: bool,
-    /// Whether occupancy stays as it is (ablation i).
+    /// True when occupancy stays as it is (ablation i).
     pub occupancy_is_constant: bool,
     /// Lowest occupancy.
     pub occupancy_floor: f32,

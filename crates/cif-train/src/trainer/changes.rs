@@ -58,7 +58,7 @@ fn fixed_cameras(dataset: &Dataset, frames: &FrameStore) -> Vec<Vec<usize>> {
 }
 
 impl Changes {
-    /// Whether a capture shows what changes: every camera with several training frames stays in place, at several
+    /// True when a capture shows what changes: every camera with several training frames stays in place, at several
     /// times.
     pub(super) fn are_shown(dataset: &Dataset, frames: &FrameStore) -> bool {
         dataset.times.len() > 1 && !fixed_cameras(dataset, frames).is_empty()

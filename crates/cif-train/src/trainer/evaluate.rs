@@ -56,7 +56,7 @@ impl MeasuredFrames {
         Self { withheld, decoded: None }
     }
 
-    /// Whether a frame belongs to the training split of the capture, though it is not trained on.
+    /// True when a frame belongs to the training split of the capture, though it is not trained on.
     pub(super) fn withholds(&self, index: usize) -> bool {
         self.withheld.contains(&index)
     }

@@ -92,7 +92,7 @@ impl FrameStore {
         }
     }
 
-    /// Whether any frame has a labelled pixel; frames not kept count by having a mask.
+    /// True when any frame has a labelled pixel; frames not kept count by having a mask.
     pub(super) fn has_labels(&self, dataset: &Dataset) -> bool {
         self.frames.iter().any(|(index, frame)| match frame {
             Some(frame) => frame.labelled > 0,

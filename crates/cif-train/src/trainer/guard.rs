@@ -73,7 +73,7 @@ pub(super) struct Rollbacks {
 }
 
 impl Rollbacks {
-    /// Whether there were none.
+    /// True when there were none.
     pub(super) fn is_empty(&self) -> bool {
         self.total == 0
     }

@@ -51,12 +51,12 @@ pub(super) struct Guidance {
 }
 
 impl Guidance {
-    /// Whether Gaussians of travelling objects are told from the others.
+    /// True when Gaussians of travelling objects are told from the others.
     pub(super) fn knows_what_travels(&self) -> bool {
         !self.guides.is_empty()
     }
 
-    /// Whether a Gaussian was made for a travelling object.
+    /// True when a Gaussian was made for a travelling object.
     pub(super) fn travels(&self, row: usize) -> bool {
         self.guide_of.get(row).is_some_and(|guide| *guide > 0)
     }

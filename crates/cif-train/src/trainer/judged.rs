@@ -51,7 +51,7 @@ fn judged_views(views: usize) -> impl Iterator<Item = usize> {
 }
 
 impl Trainer {
-    /// Whether anything is still to be judged by pixels that are held out; then all pixels train.
+    /// True when anything is still to be judged by pixels that are held out; then all pixels train.
     fn judges(&self, stage: Stage, iteration: u32) -> bool {
         let effects = &self.config.effects;
         let half = self.stages.iterations(&self.config, Stage::Fine) / 2;
@@ -60,7 +60,7 @@ impl Trainer {
             || self.tests_to_come(stage, iteration)
     }
 
-    /// Whether a step keeps the pixels that are judged by out of the colour gradient of a frame of the capture: while
+    /// True when a step keeps the pixels that are judged by out of the colour gradient of a frame of the capture: while
     /// anything is still to be judged, and where the frame is one of those that are judged by.
     pub(super) fn leaves_out_judged(&self, stage: Stage, iteration: u32, frame: usize) -> bool {
         judged_views(self.frames.len()).any(|view| self.frames.index(view) == frame)
@@ -77,7 +77,7 @@ impl Trainer {
         scheduled.min(self.progress.sh_judged + 1).min(self.progress.sh_cap.unwrap_or(u8::MAX))
     }
 
-    /// Whether spherical harmonics are judged before a step.
+    /// True when spherical harmonics are judged before a step.
     pub(super) fn judges_sh(&self, stage: Stage, iteration: u32) -> bool {
         if self.config.effects.sh_gain <= 0.0 || !matches!(stage, Stage::Coarse | Stage::Fine) {
             return false;
@@ -121,7 +121,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// Whether the highest degree of spherical harmonics gains as much on the held-out pixels.
+    /// True when the highest degree of spherical harmonics gains as much on the held-out pixels.
     fn degree_gains(
         &mut self,
         stage: Stage,
@@ -141,13 +141,13 @@ impl Trainer {
         Ok(kept)
     }
 
-    /// Whether a step is the one on which what has not earned its place is taken back.
+    /// True when a step is the one on which what has not earned its place is taken back.
     fn is_half_way(&self, stage: Stage, iteration: u32) -> bool {
         let last = self.stages.iterations(&self.config, Stage::Fine);
         stage == Stage::Fine && iteration == (last / 2).max(1)
     }
 
-    /// Whether outputs of the deformation are judged after a step.
+    /// True when outputs of the deformation are judged after a step.
     pub(super) fn judges_heads(&self, stage: Stage, iteration: u32) -> bool {
         self.config.effects.head_gain > 0.0
             && self.is_half_way(stage, iteration)

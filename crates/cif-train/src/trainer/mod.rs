@@ -126,7 +126,7 @@ pub struct Trainer {
     unseen: Vec<bool>,
     /// Labelled pixels per instance, of the frames that identities were estimated from.
     label_pixels: Vec<f64>,
-    /// Whether every camera stays in place, and where these see changes, once that is asked.
+    /// True when every camera stays in place, and where these see changes, once that is asked.
     shows_changes: bool,
     changes: Option<Changes>,
     /// Paths that Gaussians are held to.
@@ -136,7 +136,7 @@ pub struct Trainer {
     scratch: Scratch,
     /// Where the time of steps went.
     times: StepTimes,
-    /// Whether every array of a step is looked at.
+    /// True when every array of a step is looked at.
     debug_validation: bool,
     /// Off only while the cost of the pass is measured.
     instance_pass: InstancePass,

@@ -28,9 +28,9 @@ const MARGIN: (f64, f64) = (0.5, 2.0);
 pub(super) struct Goals {
     /// What is to be reached.
     pub targets: Targets,
-    /// Whether all of it was.
+    /// True when all of it was.
     pub reached: bool,
-    /// Whether the user was told that a target is out of reach.
+    /// True when the user was told that a target is out of reach.
     pub doubted: bool,
 }
 
@@ -88,7 +88,7 @@ impl Trainer {
         self.progress.goals.targets
     }
 
-    /// Whether the run has targets and reached all of them.
+    /// True when the run has targets and reached all of them.
     #[must_use]
     pub fn reached_targets(&self) -> bool {
         self.progress.goals.reached

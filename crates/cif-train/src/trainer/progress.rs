@@ -59,11 +59,11 @@ pub(super) struct Progress {
     /// What is still to follow the last step, where a stop came in between.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub after_step: Option<AfterStep>,
-    /// Whether opacities were reset in this stage.
+    /// True when opacities were reset in this stage.
     pub opacities_were_reset: bool,
     /// Running mean PSNR of training views, dB.
     pub psnr: Option<f64>,
-    /// Whether the user was told about unsupported pixels.
+    /// True when the user was told about unsupported pixels.
     pub warned_of_unsupported: bool,
     /// Steps that were rolled back.
     #[serde(default, skip_serializing_if = "Rollbacks::is_empty")]

@@ -36,7 +36,7 @@ const TOLD_STEPS: f64 = 15.0;
 pub(super) const RUNGS: u32 = 3;
 
 impl Trainer {
-    /// Whether Gaussians are tested after a step.
+    /// True when Gaussians are tested after a step.
     pub(super) fn settles(&self, stage: Stage, iteration: u32) -> bool {
         let last = self.stages.iterations(&self.config, stage);
         self.field.deformation.is_some()
@@ -140,7 +140,7 @@ impl Trainer {
         Ok(Some(found))
     }
 
-    /// Whether Gaussians will be tested on this step or a later one.
+    /// True when Gaussians will be tested on this step or a later one.
     pub(super) fn tests_to_come(&self, stage: Stage, iteration: u32) -> bool {
         let every = self.config.effects.still_every;
         if every == 0 || !self.stages.is_dynamic {
@@ -172,7 +172,7 @@ impl Trainer {
         from.min(told).max(1)
     }
 
-    /// Whether masks tell on this step what stands still: on the first test, when the network has helped everything
+    /// True when masks tell on this step what stands still: on the first test, when the network has helped everything
     /// into place and learnt little else that could be lost.
     fn is_told(&self, stage: Stage, iteration: u32) -> bool {
         let fine_steps = self.stages.iterations(&self.config, Stage::Fine);
@@ -229,7 +229,7 @@ impl Trainer {
     }
 }
 
-/// Whether a test falls on a step: at a share of the fine stage, then every so many steps, never at its end, where
+/// True when a test falls on a step: at a share of the fine stage, then every so many steps, never at its end, where
 /// nothing is left to make good for it; and once more when the instance stage begins.
 fn falls_due(effects: &EffectsConfig, first_test: u32, stage: Stage, iteration: u32, last: u32) -> bool {
     if effects.still_every == 0 || iteration >= last {

@@ -31,7 +31,7 @@ pub struct StepShape {
     pub coefficients: f64,
     /// Entries of the identity rows of the scene; 0 in stages without.
     pub identity_entries: f64,
-    /// Whether the loss has the structural similarity.
+    /// True when the loss has the structural similarity.
     pub similarity: bool,
     /// How Gaussians move, if they do.
     pub deformation: Option<DeformationShape>,
@@ -87,7 +87,7 @@ impl Floor {
         (self.bytes / speed.bytes_per_second).max(self.flops / speed.flops_per_second)
     }
 
-    /// Whether memory, not arithmetic, sets the floor.
+    /// True when memory, not arithmetic, sets the floor.
     #[must_use]
     pub fn is_by_memory(&self, speed: &DeviceSpeed) -> bool {
         self.bytes / speed.bytes_per_second >= self.flops / speed.flops_per_second

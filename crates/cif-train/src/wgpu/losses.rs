@@ -59,13 +59,13 @@ pub struct LossWeights {
     pub lambda_dssim: f32,
     /// Of the view in the step.
     pub view: f32,
-    /// Whether the view was drawn with labels.
+    /// True when the view was drawn with labels.
     pub with_instances: bool,
     /// Coverage normalisation of the instance loss.
     pub by_coverage: bool,
-    /// Whether labels are left out, see [`GpuLosses::leave_out`].
+    /// True when labels are left out, see [`GpuLosses::leave_out`].
     pub leaves_out: bool,
-    /// Whether the pixels that effects are judged by are left out of the gradient.
+    /// True when the pixels that effects are judged by are left out of the gradient.
     pub leaves_judged: bool,
 }
 

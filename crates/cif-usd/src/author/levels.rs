@@ -89,7 +89,7 @@ impl<'a> Selection<'a> {
         }
     }
 
-    /// Whether all splats are selected in order.
+    /// True when all splats are selected in order.
     pub(super) fn is_whole(&self) -> bool {
         matches!(&self.picked, Picked::Range(range) if range.len() == self.node.splats.len())
     }

@@ -23,7 +23,7 @@ use crate::{conventions, tokens};
 pub(crate) struct Storage<'a> {
     /// Folder for one layer per instance, and how the root layer calls it; `None` keeps all in the root layer.
     pub(crate) payloads: Option<(&'a Path, &'a str)>,
-    /// Whether coarser levels of detail are written too.
+    /// True when coarser levels of detail are written too.
     pub(crate) levels: bool,
 }
 

@@ -32,7 +32,7 @@ impl<C: Clock> TimeLimit<C> {
         self.clock.now().wall_s - self.begin_s
     }
 
-    /// Whether so many training steps fit; what trains nothing takes no time to speak of.
+    /// True when so many training steps fit; what trains nothing takes no time to speak of.
     #[must_use]
     pub fn has_time_for(&self, steps: u64) -> bool {
         steps == 0 || self.elapsed_s() + CAUTION * self.step_s * steps as f64 <= self.seconds

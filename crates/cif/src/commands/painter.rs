@@ -34,7 +34,7 @@ pub(super) struct Sample<'a> {
     pub(super) time: f64,
     pub(super) settings: &'a RenderSettings,
     pub(super) channels: Channels,
-    /// Whether a GPU keeps spherical harmonics in 16-bit floats.
+    /// True when a GPU keeps spherical harmonics in 16-bit floats.
     pub(super) compact: bool,
 }
 

@@ -168,7 +168,7 @@ impl Goals {
         })
     }
 
-    /// Whether steps may differ from those of the settings.
+    /// True when steps may differ from those of the settings.
     pub(super) fn changes_steps(&self) -> bool {
         self.budget.is_some() || !self.targets().is_empty()
     }

@@ -328,7 +328,7 @@ impl GpuDeformation {
         });
     }
 
-    /// Whether a head moves the spherical harmonics.
+    /// True when a head moves the spherical harmonics.
     #[must_use]
     pub fn moves_sh(&self) -> bool {
         self.shape.moves_sh

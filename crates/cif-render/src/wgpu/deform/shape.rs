@@ -104,7 +104,7 @@ pub struct Shape {
     pub chunk_rows: u32,
     /// Vectors of scratch per workgroup of the backward pass.
     pub block_quads: u32,
-    /// Whether a head moves the spherical harmonics.
+    /// True when a head moves the spherical harmonics.
     pub moves_sh: bool,
     levels: u32,
     channels: u32,

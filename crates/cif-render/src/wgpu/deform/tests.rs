@@ -19,7 +19,7 @@ const BACKWARD: f64 = 2e-5;
 
 const SOME_HEADS: Heads = Heads { position: true, scale: false, rotation: true, opacity: false, sh: false };
 
-/// Whether a row stands still.
+/// True when a row stands still.
 type Still = fn(usize) -> bool;
 
 fn scene(heads: Heads, gaussians: usize) -> SyntheticScene {

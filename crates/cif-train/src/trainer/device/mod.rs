@@ -84,7 +84,7 @@ pub(super) struct DeviceTraining {
     /// Most pairs and label slots that a view wanted so far, and of how many Gaussians.
     wanted: [usize; 2],
     wanted_of: usize,
-    /// Whether the device is ahead of the host.
+    /// True when the device is ahead of the host.
     ahead: bool,
     /// Steps since the host's state was fetched.
     since_fetch: u32,

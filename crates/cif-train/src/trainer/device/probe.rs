@@ -22,7 +22,7 @@ pub struct Probe {
 }
 
 impl Probe {
-    /// Whether the GPU is to be taken.
+    /// True when the GPU is to be taken.
     #[must_use]
     pub fn gpu_is_faster(&self) -> bool {
         self.gpu_s < self.processor_s

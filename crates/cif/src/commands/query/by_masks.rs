@@ -87,7 +87,7 @@ impl From<Select> for Selection {
 }
 
 impl ByMasks {
-    /// Whether the question is asked by masks.
+    /// True when the question is asked by masks.
     pub(super) fn is_asked(&self) -> bool {
         self.masks.is_some() || self.prompt.is_some()
     }
