@@ -37,14 +37,12 @@ pub fn saturated_logit(probability: f64) -> f32 {
 }
 
 /// A row of a parameter: one float, or an array of them.
-trait Row: Copy {
-    const ZERO: Self;
+trait Row: bytemuck::Pod {
     fn floats(rows: &[Self]) -> &[f32];
     fn floats_mut(rows: &mut [Self]) -> &mut [f32];
 }
 
 impl Row for f32 {
-    const ZERO: Self = 0.0;
     fn floats(rows: &[Self]) -> &[f32] {
         rows
     }
@@ -53,8 +51,10 @@ impl Row for f32 {
     }
 }
 
-impl<const WIDTH: usize> Row for [f32; WIDTH] {
-    const ZERO: Self = [0.0; WIDTH];
+impl<const WIDTH: usize> Row for [f32; WIDTH]
+where
+    Self: bytemuck::Pod,
+{
     fn floats(rows: &[Self]) -> &[f32] {
         rows.as_flattened()
     }
@@ -86,7 +86,14 @@ macro_rules! gaussian_parameters {
             /// Zeros.
             #[must_use]
             pub fn zeros(rows: usize) -> Self {
-                Self { $($field: vec![<$row as Row>::ZERO; rows],)* }
+                Self::zeros_of(rows, |_| true)
+            }
+
+            /// Zeros of the parameters that are `wanted`; the arrays of the others are empty.
+            #[must_use]
+            pub fn zeros_of(rows: usize, wanted: impl Fn(&Parameter) -> bool) -> Self {
+                // Fresh memory is zero already: nothing is written.
+                Self { $($field: bytemuck::zeroed_vec(if wanted(&$parameter) { rows } else { 0 }),)* }
             }
 
             /// Every parameter with its values.

@@ -1,5 +1,6 @@
 //! Gradients of the last forward pass.
 
+use cif_field::parameters::{OCCUPANCY_LOGITS, Parameter, SH_COEFFICIENTS};
 use cif_field::{Field, Gaussians};
 use cif_geometry::PixelGrid;
 use fearless_simd::dispatch;
@@ -204,11 +205,12 @@ impl Renderer {
         let rank_of = self.ranks(n);
         let posed = PosedView::new(&field.gaussians, &tape.posed);
         let moves_sh = !tape.posed.sh_coefficients.is_empty();
-        *v_posed = Gaussians::zeros(n);
-        v_posed.occupancy_logits = Vec::new();
-        if !moves_sh {
-            v_posed.sh_coefficients = Vec::new();
-        }
+        let is_moved = |parameter: &Parameter| match *parameter {
+            OCCUPANCY_LOGITS => false,
+            SH_COEFFICIENTS => moves_sh,
+            _ => true,
+        };
+        *v_posed = Gaussians::zeros_of(n, is_moved);
         let half = [view.width as f32 / 2.0, view.height as f32 / 2.0];
         let level = self.level;
         let rows = gradients.gaussians.rows_mut().chunks(CHUNK, n).into_par_iter();

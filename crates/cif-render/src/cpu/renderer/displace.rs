@@ -1,5 +1,6 @@
 //! Motion without pictures: where the deformation puts the centres, and its gradients by that alone.
 
+use cif_field::parameters::SH_COEFFICIENTS;
 use cif_field::{Field, Gaussians};
 
 use super::super::deform::DeformationAtTime;
@@ -33,7 +34,9 @@ impl Renderer {
         let n = v_displacements.len();
         let active: Vec<u32> =
             deformation.moving_rows(n).filter(|row| v_displacements[*row as usize] != [0.0; 3]).collect();
-        let v_posed = Gaussians { means: v_displacements, ..Gaussians::zeros(n) };
+        let moves_sh = deformation.config.heads.sh;
+        let zeros = Gaussians::zeros_of(n, |parameter| moves_sh || *parameter != SH_COEFFICIENTS);
+        let v_posed = Gaussians { means: v_displacements, ..zeros };
         DeformationAtTime::new(deformation, time).backward(
             self.level,
             &field.gaussians,
