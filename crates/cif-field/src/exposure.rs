@@ -1,9 +1,9 @@
-//! What cameras make of colours.
+//! Exposures of cameras.
 
 use cif_geometry::PixelGrid;
 use serde::{Deserialize, Serialize};
 
-/// What a camera makes of a colour: `gain * colour + offset` per channel, colours as captured, in [0, 1].
+/// Exposure of a camera: `gain * colour + offset` per channel, colours as captured, in [0, 1].
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Exposure {
@@ -16,10 +16,10 @@ pub struct Exposure {
 impl Exposure {
     /// Number of learnt values: logarithms of gains, then offsets.
     pub const WIDTH: usize = 6;
-    /// What changes nothing.
+    /// The exposure that changes nothing.
     pub const NEUTRAL: Self = Self { gain: [1.0; 3], offset: [0.0; 3] };
 
-    /// What the camera records of colours.
+    /// Colours as the camera records them.
     pub fn apply(&self, colors: &mut PixelGrid<[f32; 3]>) {
         for pixel in &mut colors.pixels {
             for channel in 0..3 {

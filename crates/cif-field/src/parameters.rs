@@ -3,7 +3,7 @@
 
 use crate::Field;
 
-/// What the rows of a parameter belong to.
+/// Owner of the rows of a parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Rows {
     /// A row per Gaussian.
@@ -27,7 +27,7 @@ pub enum Activation {
     UnitQuaternion,
 }
 
-/// What happens to the row of a Gaussian that is copied onto other ones by relocation.
+/// Fate of the row of a Gaussian that relocation copies onto other ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum OnCopy {
     /// The copies have it too.
@@ -45,13 +45,13 @@ pub struct Parameter {
     pub part: &'static str,
     /// Name of its learning rate in settings, and of its optimiser state in saved runs.
     pub rate: &'static str,
-    /// What its rows belong to.
+    /// Owner of its rows.
     pub rows: Rows,
     /// Shape of a row; empty for one float.
     pub shape: &'static [usize],
     /// How it is read.
     pub activation: Activation,
-    /// What becomes of it under relocation.
+    /// Its fate under relocation.
     pub on_copy: OnCopy,
 }
 

@@ -34,7 +34,7 @@ pub struct Record {
     pub notes: Map<String, Value>,
 }
 
-/// What a renderer has to know to show a field as it was trained.
+/// Settings by which a renderer shows a field as it was trained.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Drawing {
@@ -47,7 +47,7 @@ pub struct Drawing {
     /// True when the opacity takes the place of the occupancy.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub opacity_is_occupancy: bool,
-    /// What every camera makes of colours; empty where all record them as they are.
+    /// Exposure of every camera; empty where all record them as they are.
     #[serde(skip_serializing_if = "BTreeMap::is_empty")]
     pub exposures: BTreeMap<String, Exposure>,
 }
@@ -84,7 +84,7 @@ pub enum RecordError {
     /// The scene lies nowhere.
     #[error("the frame of the capture is recorded as {found}; train the scene again")]
     Frame {
-        /// What is recorded.
+        /// The recorded value.
         found: String,
     },
 }

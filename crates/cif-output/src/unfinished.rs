@@ -39,7 +39,7 @@ pub fn abandon() {
 /// Checks that files can be created in `folder`.
 ///
 /// # Errors
-/// What the system says.
+/// Error of the system.
 pub fn probe(folder: &Path) -> io::Result<()> {
     Unfinished::create(folder).map(drop)
 }

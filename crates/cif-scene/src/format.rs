@@ -1,4 +1,4 @@
-//! What a file format does for scene graphs. Every format is a crate with one implementation of [`SceneFormat`]; the
+//! The interface of file formats. Every format is a crate with one implementation of [`SceneFormat`]; the
 //! command keeps the list of them.
 
 use std::path::{Path, PathBuf};
@@ -21,14 +21,14 @@ pub trait SceneFormat: Sync {
     /// Endings of its files.
     fn endings(&self) -> &'static [Ending];
 
-    /// What is written, in one or two sentences for the help of the command.
+    /// Description of the files, in one or two sentences for the help of the command.
     fn about(&self) -> &'static str;
 
     /// The most expensive motion that a file holds: graphs are built with no more than this. `None` for formats that
     /// hold one moment, to which any motion leads.
     fn most_expensive_motion(&self) -> Option<MotionModel>;
 
-    /// What the user should know of a scene that lies elsewhere in the world of its capture, where files do not place it.
+    /// Advice on a scene that lies elsewhere in the world of its capture, where files do not place it.
     fn note_on_place(&self) -> Option<&'static str> {
         None
     }
@@ -197,7 +197,7 @@ pub struct ReadOptions {
     pub follow_external: bool,
 }
 
-/// What was written.
+/// Summary of an export.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ExportSummary {
     /// The file or folder.
@@ -212,13 +212,13 @@ pub struct ExportSummary {
     pub splats: usize,
     /// Time samples of the timeline, or moments that were written.
     pub samples: usize,
-    /// What the format does not hold of the scene, object by object.
+    /// Losses of the format, object by object.
     pub not_held: Vec<String>,
     /// Library that wrote it, with its version, e.g. `usd-core 26.11`; `None` for cif itself.
     pub library: Option<String>,
 }
 
-/// What a new label changed.
+/// Changes by a new label.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Relabelled {
     /// The object as the file calls it: path of the prim, or name of the node.

@@ -97,7 +97,7 @@ impl PartialEq for MotionReport {
 }
 
 impl MotionReport {
-    /// What there is to say about motion that was read from a file of others, not fitted.
+    /// Report on motion that was read from a file of others, not fitted.
     #[must_use]
     pub fn unfitted(splats: &Splats, motion: &Motion) -> Self {
         let centres = splats.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)));

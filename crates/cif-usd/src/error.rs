@@ -64,7 +64,7 @@ pub enum UsdError {
     Unreadable {
         /// Given path.
         path: PathBuf,
-        /// What USD says.
+        /// Message of USD.
         reason: String,
     },
     /// A stage without splats.

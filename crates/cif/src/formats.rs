@@ -10,7 +10,7 @@ use crate::error::Error;
 /// Every format that is read and written. A new one is a crate that implements [`SceneFormat`], and a line here.
 pub static FORMATS: [&dyn SceneFormat; 3] = [&cif_usd::Usd, &cif_gltf::Gltf, &cif_ply::Ply];
 
-/// What the name of a file says about its content.
+/// Content of a file, by its name.
 #[derive(Clone, Copy)]
 pub enum Content {
     /// `.cif`: a field.
@@ -20,7 +20,7 @@ pub enum Content {
 }
 
 impl Content {
-    /// What the ending of a name tells.
+    /// Content by the ending of a name.
     ///
     /// # Errors
     /// When no reader knows the ending.

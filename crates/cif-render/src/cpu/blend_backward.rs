@@ -18,7 +18,7 @@ use crate::{BlendRequest, Blending, GeometryPath};
 /// Channels whose sums are taken at once.
 const TOGETHER: usize = 4;
 
-/// What a tile's pixels ask of blended values.
+/// Gradients by the blended values of the pixels of a tile.
 pub(super) struct BlendCotangents {
     /// dL/dblended, `[GROUPS, padded]`: C channels and zeros up to a multiple of [`TOGETHER`].
     v_blended: Vec<Lanes>,

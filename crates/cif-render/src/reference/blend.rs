@@ -18,7 +18,7 @@ struct Contributor<'a, R> {
     transmittance: R,
 }
 
-/// What a pixel shows, front to back.
+/// Gaussians that a pixel shows, front to back.
 fn contributors<'a, R: Real>(
     splats: &'a [Option<Splat2d<R>>],
     order: &[u32],

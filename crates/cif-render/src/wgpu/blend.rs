@@ -164,7 +164,7 @@ impl BlendKernels {
     }
 }
 
-/// What gradients through blending weights need beside those of the values.
+/// Inputs of gradients through blending weights, beside those of the values.
 #[derive(Clone, Copy, Debug)]
 pub struct BlendWeightGradients<'a> {
     /// The Gaussians of the view.

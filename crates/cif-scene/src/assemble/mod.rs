@@ -29,7 +29,7 @@ use crate::{
 /// Time codes per second of files that have none.
 pub const FRAMES_PER_SECOND: f64 = 24.0;
 
-/// What a reader found in a file.
+/// Content of a file, as its reader found it.
 #[derive(Clone, Debug)]
 pub struct Prims {
     /// Declared up axis of the world.
@@ -50,7 +50,7 @@ pub struct Prims {
     pub sort_metric: SortMetric,
     /// Labels of instances without a node.
     pub omitted: Vec<String>,
-    /// What the user should know, one sentence each.
+    /// Warnings, one sentence each.
     pub warnings: Vec<String>,
     /// Where the scene came from.
     pub origin: Origin,
@@ -117,7 +117,7 @@ pub struct Prim {
     pub place: String,
     /// Instance or background.
     pub identity: Identity,
-    /// What the node is called.
+    /// Name of the node.
     pub name: PrimName,
     /// Human name.
     pub label: String,
@@ -211,7 +211,7 @@ pub enum Identity {
     New,
 }
 
-/// What a node is called; made unique in any case.
+/// Name of a node; made unique in any case.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum PrimName {
     /// As the object is called in the file.
@@ -241,7 +241,7 @@ pub struct Piece {
     pub colors: Vec<Vec<f32>>,
 }
 
-/// What of splats changes when they deform.
+/// Attributes of splats that change when they deform.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Shape {
     /// Centres.
@@ -258,7 +258,7 @@ pub struct Shape {
 pub struct AssembleError {
     /// The object; see [`Prim::place`].
     pub place: String,
-    /// What is wrong with it and what to do.
+    /// The problem, and its remedy.
     pub what: &'static str,
 }
 

@@ -66,9 +66,9 @@ pub fn one_hemisphere(samples: &mut [PoseSample]) {
 pub enum Placement {
     /// `object_from_piece = track * baked`.
     Rigid {
-        /// What turns and moves.
+        /// The part that turns and moves.
         track: Track,
-        /// What does not; `None` for nothing.
+        /// The constant part; `None` for the identity.
         baked: Option<DAffine3>,
     },
     /// Anything else, at every time code.

@@ -45,7 +45,7 @@ pub(super) struct StepLoss {
     pub instance: Option<f64>,
     /// Share of them that no covering Gaussian supports.
     pub unsupported: Option<f64>,
-    /// What is minimised.
+    /// The sum that is minimised.
     pub total: f64,
 }
 

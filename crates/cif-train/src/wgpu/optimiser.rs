@@ -65,7 +65,7 @@ impl GroupSteps {
     }
 }
 
-/// What the step of the Gaussians depends on beside their rates.
+/// Settings of the step of the Gaussians, beside their rates.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct GaussianStep {
     /// Only visible rows move.

@@ -30,7 +30,7 @@ impl Owner<'_> {
     }
 }
 
-/// What the assembler makes a node of.
+/// Prim that the assembler makes a node of.
 pub(super) fn read<'py>(reading: &Reading<'_, 'py>, owner: &Owner<'py>) -> Result<Prim, UsdError> {
     let python = |error: PyErr| reading.python(&error);
     let collapses = |path: &str| {
