@@ -6,7 +6,7 @@ use thiserror::Error;
 
 use crate::Stage;
 use crate::config::ConfigError;
-use crate::trainer::{Fault, Hint};
+use crate::guard::{Fault, Hint};
 
 /// Errors of training.
 #[derive(Debug, Error)]
@@ -67,9 +67,8 @@ pub enum TrainError {
         hint: Hint,
     },
     /// The GPU cannot hold the scene, or failed.
-    #[cfg(feature = "wgpu")]
     #[error(transparent)]
-    Gpu(#[from] cif_render::wgpu::GpuError),
+    Device(Box<dyn std::error::Error + Send + Sync>),
     /// All Gaussians were pruned.
     #[error(
         "{stage} stage, step {iteration}: every Gaussian was pruned; the cameras may look past the initial \

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::Trainer;
-use crate::trainer::{Fault, Work};
+use crate::guard::Fault;
+use crate::times::Work;
 
 /// Parts of a run, in order (methods reference 1.3).
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -243,31 +243,6 @@ pub enum Control {
 pub enum Outcome {
     /// All stages are done.
     Finished,
-    /// The observer or a [`Stop`](crate::Stop) stopped it; [`Trainer::checkpoint`] with state can be resumed.
+    /// The observer or a [`Stop`](crate::Stop) stopped it; [`Trainer::checkpoint`](crate::Trainer::checkpoint) with state can be resumed.
     Interrupted,
-}
-
-/// What an observer may look at during an event.
-pub struct TrainerView<'a> {
-    pub(crate) trainer: &'a Trainer,
-}
-
-impl TrainerView<'_> {
-    /// The field as it is now.
-    #[must_use]
-    pub fn field(&self) -> &cif_field::Field {
-        self.trainer.field()
-    }
-
-    /// The run's settings.
-    #[must_use]
-    pub fn config(&self) -> &crate::TrainConfig {
-        self.trainer.config()
-    }
-
-    /// A checkpoint, see [`Trainer::checkpoint`].
-    #[must_use]
-    pub fn checkpoint(&self, with_state: bool) -> cif_field::checkpoint::Checkpoint {
-        self.trainer.checkpoint(with_state)
-    }
 }

@@ -22,12 +22,12 @@ pub(crate) const RATES: [f32; 2] = [1e-2, 5e-4];
 #[serde(deny_unknown_fields)]
 pub(crate) struct Exposures {
     /// Names, ascending.
-    cameras: Vec<String>,
+    pub cameras: Vec<String>,
     /// Logarithms of gains and offsets per camera.
-    values: Vec<f32>,
-    first: Vec<f32>,
-    second: Vec<f32>,
-    steps: u32,
+    pub values: Vec<f32>,
+    pub first: Vec<f32>,
+    pub second: Vec<f32>,
+    pub steps: u32,
     #[serde(skip)]
     gradients: Vec<f32>,
 }
@@ -75,30 +75,6 @@ impl Exposures {
             }
         }
         self
-    }
-
-    /// Number of cameras.
-    #[cfg(feature = "wgpu")]
-    pub(crate) fn cameras(&self) -> usize {
-        self.cameras.len()
-    }
-
-    /// Values, first and second moments, `[cameras, WIDTH]`.
-    #[cfg(feature = "wgpu")]
-    pub(crate) fn arrays(&self) -> [&[f32]; 3] {
-        [&self.values, &self.first, &self.second]
-    }
-
-    /// What [`Self::arrays`] returns, from elsewhere.
-    #[cfg(feature = "wgpu")]
-    pub(crate) fn set_arrays(&mut self, [values, first, second]: [Vec<f32>; 3]) {
-        (self.values, self.first, self.second) = (values, first, second);
-    }
-
-    /// Steps done; counted by whoever does them elsewhere.
-    #[cfg(feature = "wgpu")]
-    pub(crate) fn steps_mut(&mut self) -> &mut u32 {
-        &mut self.steps
     }
 
     /// The first summed gradient beyond a limit or not a number.

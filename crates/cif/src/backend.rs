@@ -77,7 +77,7 @@ impl Backend {
         match trainer.use_faster(gpu) {
             Ok(probe) if probe.gpu_is_faster() => eprintln!("training on {name}: {probe}"),
             Ok(probe) => eprintln!("training on the processor, not on {name}: {probe}"),
-            Err(error @ TrainError::Gpu(_)) => {
+            Err(error @ TrainError::Device(_)) => {
                 eprintln!("note: {error}; using --backend cpu");
             }
             Err(error) => return Err(Error::plain(error)),

@@ -4,13 +4,11 @@
 //! Every float is updated from its own gradient and moments alone, so results do not depend on the number of
 //! threads. Gradients are set to zero once used.
 
-mod planes;
+pub(crate) mod planes;
 mod regularizer;
 
 use rayon::prelude::*;
 
-#[cfg(feature = "wgpu")]
-pub(crate) use planes::factors;
 pub use planes::{PlaneWeights, step_planes};
 pub use regularizer::plane_penalty;
 
@@ -166,12 +164,6 @@ impl Moments {
                 Ok(())
             })
             .reduce(|| Ok(()), Result::and)
-    }
-
-    /// Replaces both moments.
-    #[cfg(feature = "wgpu")]
-    pub(crate) fn set(&mut self, first: Vec<f32>, second: Vec<f32>) {
-        (self.first, self.second) = (first, second);
     }
 
     /// Zeroes the moments of a row.

@@ -1,6 +1,7 @@
 //! Losses and their gradients: of the colours of a view (methods reference 1.4), and of motion that is known.
 
 pub mod displacement;
+pub(crate) mod held_out;
 pub(crate) mod ssim;
 
 use cif_geometry::PixelGrid;

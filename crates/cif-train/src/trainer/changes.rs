@@ -6,8 +6,8 @@ use cif_dataset::Dataset;
 use cif_geometry::{PinholeCamera, PixelGrid};
 use glam::DVec3;
 
-use super::frames::FrameStore;
 use crate::error::TrainError;
+use crate::frames::FrameStore;
 
 /// Images of a camera that are compared, spread evenly over its time.
 const IMAGES: usize = 24;

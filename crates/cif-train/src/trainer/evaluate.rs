@@ -4,9 +4,9 @@ use cif_dataset::{Dataset, FrameData, Split};
 use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
-use super::draw::Views;
 use crate::config::TrainConfig;
 use crate::curve::{CurveFrames, CurvePoint};
+use crate::engine::Views;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::metrics::evaluate::mask_ids;
@@ -83,23 +83,24 @@ impl MeasuredFrames {
 impl Trainer {
     /// Scores evenly spread held-out frames.
     pub(super) fn evaluate(&mut self, stage: Stage) -> Result<TrainEvent, TrainError> {
-        let held_out: Vec<usize> = (0..self.dataset.frames.len())
+        let held_out: Vec<usize> = (0..self.state.dataset.frames.len())
             .filter(|index| {
-                self.dataset.frames[*index].split == Split::Val && !self.measured_frames.withholds(*index)
+                self.state.dataset.frames[*index].split == Split::Val
+                    && !self.measured_frames.withholds(*index)
             })
             .collect();
-        let count = held_out.len().min(self.config.report.evaluate_frames as usize);
+        let count = held_out.len().min(self.state.config.report.evaluate_frames as usize);
         let frames = (0..count)
             .map(|k| {
                 self.check_stop()?;
                 let index = held_out[k * held_out.len() / count];
-                Ok((index, self.dataset.load_frame(index, self.config.background)?))
+                Ok((index, self.state.dataset.load_frame(index, self.state.config.background)?))
             })
             .collect::<Result<Vec<_>, TrainError>>()?;
         let scores = self.score(&frames)?;
         Ok(TrainEvent::Evaluated {
             stage,
-            iteration: self.progress.iteration,
+            iteration: self.state.progress.iteration,
             frames: count,
             psnr: scores.psnr,
             ssim: scores.ssim,
@@ -114,25 +115,25 @@ impl Trainer {
         stage: Stage,
         ends: bool,
     ) -> Result<Option<TrainEvent>, TrainError> {
-        let count = self.config.report.curve_frames.max(self.measured_frames.withheld.len() as u32);
-        let (iteration, step) = (self.progress.iteration, self.progress.total_steps);
-        let curve = &self.progress.curve;
-        let due = curve.is_due(stage, iteration, !self.progress.goals.targets.is_empty()) || ends;
+        let count = self.state.config.report.curve_frames.max(self.measured_frames.withheld.len() as u32);
+        let (iteration, step) = (self.state.progress.iteration, self.state.progress.total_steps);
+        let curve = &self.state.progress.curve;
+        let due = curve.is_due(stage, iteration, !self.state.progress.goals.targets.is_empty()) || ends;
         if count == 0 || !due || curve.holds(stage, step) {
             return Ok(None);
         }
-        self.fetch_from_gpu()?;
+        self.fetch()?;
         let start = self.clock.now();
         let frames = match self.measured_frames.decoded.take() {
             Some(frames) => frames,
             None => {
-                let (kind, indices) = self.measured_frames.select(&self.dataset, count as usize);
-                let name = |index: &usize| self.dataset.frames[*index].name.clone();
-                self.progress.curve.frames = kind;
-                self.progress.curve.frame_names = indices.iter().map(name).collect();
+                let (kind, indices) = self.measured_frames.select(&self.state.dataset, count as usize);
+                let name = |index: &usize| self.state.dataset.frames[*index].name.clone();
+                self.state.progress.curve.frames = kind;
+                self.state.progress.curve.frame_names = indices.iter().map(name).collect();
                 let load = |index| {
                     self.check_stop()?;
-                    Ok((index, self.dataset.load_frame(index, self.config.background)?))
+                    Ok((index, self.state.dataset.load_frame(index, self.state.config.background)?))
                 };
                 indices.into_iter().map(load).collect::<Result<_, TrainError>>()?
             }
@@ -142,26 +143,26 @@ impl Trainer {
             stage,
             iteration,
             step,
-            wall_s: self.progress.total_wall_s(),
-            cpu_s: self.progress.total_cpu_s(),
-            gaussians: self.field.gaussians.len(),
+            wall_s: self.state.progress.total_wall_s(),
+            cpu_s: self.state.progress.total_cpu_s(),
+            gaussians: self.state.field.gaussians.len(),
             psnr: scores.psnr,
             ssim: scores.ssim,
             miou: scores.miou,
         };
         let count = frames.len();
         self.measured_frames.decoded = Some(frames);
-        self.progress.curve.points.push(point.clone());
-        self.progress.curve.measuring += self.clock.now() - start;
-        let measuring_s = self.progress.curve.measuring.wall_s;
+        self.state.progress.curve.points.push(point.clone());
+        self.state.progress.curve.measuring += self.clock.now() - start;
+        let measuring_s = self.state.progress.curve.measuring.wall_s;
         Ok(Some(TrainEvent::Measured { point, frames: count, measuring_s }))
     }
 
     /// Renders frames of the capture and compares them.
     fn score(&mut self, frames: &[(usize, FrameData)]) -> Result<MeanScores, TrainError> {
         let settings = RenderSettings {
-            instances: self.field.identities.as_ref().map(|_| self.instance_settings()),
-            ..self.color_settings()
+            instances: self.state.field.identities.as_ref().map(|_| self.state.instance_settings()),
+            ..self.state.color_settings()
         };
         let channels = Channels { depth: false, instances: settings.instances.is_some() };
         let (mut psnrs, mut ssims, mut labels) = (Vec::new(), Vec::new(), Vec::new());
@@ -178,8 +179,8 @@ impl Trainer {
         let mut confusions = Vec::new();
         for ((index, truth), labels) in frames.iter().zip(labels) {
             if let (Some(mask), Some(labels)) = (&truth.mask, labels) {
-                let frame = &self.dataset.frames[*index];
-                let predicted = mask_ids(&self.field, &labels);
+                let frame = &self.state.dataset.frames[*index];
+                let predicted = mask_ids(&self.state.field, &labels);
                 confusions.push(FrameConfusion::new(&frame.camera_name, frame.time_index, mask, &predicted));
             }
         }

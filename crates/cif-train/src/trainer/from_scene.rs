@@ -7,13 +7,13 @@ use cif_geometry::PinholeCamera;
 use cif_geometry::scalar::logit;
 
 use super::evaluate::MeasuredFrames;
-use super::progress::{Progress, Source};
-use super::state::{State, restore};
+use super::resume::{SavedState, restore};
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::exposure::trained_exposures;
+use crate::progress::{Progress, Source};
 use crate::stop::Start;
 
 /// Times that differ by less are the same.
@@ -51,7 +51,7 @@ impl Trainer {
         let mut progress = Progress::at(Stage::Identity);
         let mut state = None;
         if let Some(training) = training {
-            let parsed = State::parse(training.json)?;
+            let parsed = SavedState::parse(training.json)?;
             match parsed.progress.stage {
                 stage @ (Stage::Coarse | Stage::Fine) => {
                     return Err(TrainError::Unfinished { scene: name.to_owned(), stage });
@@ -82,14 +82,14 @@ impl Trainer {
         let mut trainer =
             Self::assemble(Start { dataset, stop }, measured_frames, config, field, Some(progress))?;
         if !trainer.stages.has_instances {
-            return Err(TrainError::NoLabels { root: trainer.dataset.root });
+            return Err(TrainError::NoLabels { root: trainer.state.dataset.root });
         }
-        let known = trained_exposures(&trainer.field);
-        if !trainer.config.effects.exposure || trainer.progress.exposures.is_none() {
-            trainer.progress.exposures = trainer.exposures().map(|fresh| fresh.start_with(&known));
+        let known = trained_exposures(&trainer.state.field);
+        if !trainer.state.config.effects.exposure || trainer.state.progress.exposures.is_none() {
+            trainer.state.progress.exposures = trainer.exposures().map(|fresh| fresh.start_with(&known));
         }
         if let Some((mut tensors, steps)) = state {
-            restore(&mut trainer.optimiser, &mut tensors, &steps)?;
+            restore(&mut trainer.state.optimiser, &mut tensors, &steps)?;
             trainer.restore_guidance(&mut tensors)?;
         }
         trainer.warn_of_capture();

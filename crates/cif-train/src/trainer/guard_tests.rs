@@ -8,9 +8,11 @@ use cif_field::parameters::OPACITY_LOGITS;
 use tempfile::TempDir;
 
 use self::support::{Scene, capture, small_config};
-use super::{MAX_ROLLBACKS_IN_A_ROW, Optimiser, Trainer};
+use super::Trainer;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::guard::{MAX_ROLLBACKS_IN_A_ROW, loss_fault};
+use crate::optimiser::Optimiser;
 
 fn trainer(times: usize) -> (Trainer, TempDir) {
     let folder = tempfile::tempdir().unwrap();
@@ -22,7 +24,7 @@ fn trainer(times: usize) -> (Trainer, TempDir) {
 }
 
 fn state(trainer: &Trainer) -> (Field, Optimiser) {
-    (trainer.field.clone(), trainer.optimiser.clone())
+    (trainer.state.field.clone(), trainer.state.optimiser.clone())
 }
 
 /// One step, and what it told.
@@ -41,11 +43,11 @@ fn a_bad_gradient_of_an_exposure_moves_neither_exposures_nor_field() {
     let mut trainer = Trainer::new(dataset, config).unwrap();
     step(&mut trainer).0.unwrap();
     let arrays = |trainer: &Trainer| {
-        let exposures = serde_json::to_value(trainer.progress.exposures.as_ref().unwrap()).unwrap();
+        let exposures = serde_json::to_value(trainer.state.progress.exposures.as_ref().unwrap()).unwrap();
         (state(trainer), exposures)
     };
     let before = arrays(&trainer);
-    trainer.progress.exposures.as_mut().unwrap().add("cam1", &[0.0, 0.0, f32::INFINITY, 0.0, 0.0, 0.0]);
+    trainer.state.progress.exposures.as_mut().unwrap().add("cam1", &[0.0, 0.0, f32::INFINITY, 0.0, 0.0, 0.0]);
     let (result, events) = step(&mut trainer);
     result.unwrap();
     let [TrainEvent::RolledBack { fault, .. }] = &events[..] else { panic!("{events:?}") };
@@ -61,13 +63,13 @@ fn a_bad_gradient_is_rolled_back_told_and_counted() {
     for debug in [false, true] {
         trainer.set_debug_validation(debug);
         step(&mut trainer).0.unwrap();
-        let (before, psnr) = (state(&trainer), trainer.progress.psnr);
+        let (before, psnr) = (state(&trainer), trainer.state.progress.psnr);
         let (iteration, total) = (trainer.iteration(), trainer.rolled_back());
-        trainer.gradients.gaussians.means[3][1] = f32::NAN;
+        trainer.state.gradients.gaussians.means[3][1] = f32::NAN;
         let (result, events) = step(&mut trainer);
         result.unwrap();
         assert!(state(&trainer) == before, "parameters and moments are those before the step");
-        assert_eq!(trainer.progress.psnr, psnr);
+        assert_eq!(trainer.state.progress.psnr, psnr);
         assert_eq!((trainer.iteration(), trainer.rolled_back()), (iteration + 1, total + 1));
         let [TrainEvent::RolledBack { stage: Stage::Coarse, iteration: at, fault, in_a_row: 1, .. }] =
             &events[..]
@@ -80,7 +82,7 @@ fn a_bad_gradient_is_rolled_back_told_and_counted() {
         let (result, events) = step(&mut trainer);
         result.unwrap();
         assert!(events.is_empty() && state(&trainer) != before, "{events:?}");
-        assert_eq!(trainer.progress.rollbacks.in_a_row, 0);
+        assert_eq!(trainer.state.progress.rollbacks.in_a_row, 0);
     }
     let record = trainer.provenance().to_json();
     assert_eq!(record["train"]["rolled_back"]["steps"], 2);
@@ -92,7 +94,7 @@ fn a_bad_gradient_is_rolled_back_told_and_counted() {
 #[test]
 fn a_gradient_whose_square_overflows_is_rolled_back_too() {
     let (mut trainer, _folder) = trainer(3);
-    trainer.gradients.gaussians.opacity_logits[0] = 1e25;
+    trainer.state.gradients.gaussians.opacity_logits[0] = 1e25;
     let before = state(&trainer);
     let (result, events) = step(&mut trainer);
     result.unwrap();
@@ -107,8 +109,8 @@ fn too_many_bad_steps_in_a_row_stop_the_run_which_can_be_resumed() {
     let (mut trainer, folder) = trainer(3);
     step(&mut trainer).0.unwrap();
     // A colour that overflows in every view.
-    let sound = trainer.field.gaussians.sh_coefficients[0];
-    for row in &mut trainer.field.gaussians.sh_coefficients {
+    let sound = trainer.state.field.gaussians.sh_coefficients[0];
+    for row in &mut trainer.state.field.gaussians.sh_coefficients {
         row[0] = 3e38;
     }
     let before = state(&trainer);
@@ -167,29 +169,30 @@ fn debug_validation_names_the_part_where_it_begins() {
         }
     };
     let planes = fault_of(&|trainer| {
-        trainer.field.deformation.as_mut().unwrap().planes[5] = f32::NAN;
+        trainer.state.field.deformation.as_mut().unwrap().planes[5] = f32::NAN;
     });
     assert_eq!(planes, "parameters: planes[5] is NaN");
     let deform = fault_of(&|trainer| {
-        let deformation = trainer.field.deformation.as_mut().unwrap();
+        let deformation = trainer.state.field.deformation.as_mut().unwrap();
         let layout = deformation.config.mlp_layout();
         deformation.mlp[layout.heads[0].output.biases.start] = f32::MAX;
-        trainer.field.gaussians.means[2][0] = f32::MAX;
+        trainer.state.field.gaussians.means[2][0] = f32::MAX;
     });
     assert_eq!(deform, "deform: posed means[6] is inf");
     let overflow = fault_of(&|trainer| {
-        for row in &mut trainer.field.gaussians.sh_coefficients {
+        for row in &mut trainer.state.field.gaussians.sh_coefficients {
             row[0] = 3e38;
         }
     });
     assert!(overflow.starts_with("gradients: gradient of means["), "{overflow}");
-    let losses = sound.fault_of_view(f64::NAN, 0.0).unwrap().to_string();
+    let losses = loss_fault("colour loss", f64::NAN).unwrap().to_string();
     assert_eq!(losses, "losses: colour loss[0] is NaN");
-    let moments = fault_of(&|trainer| trainer.optimiser.of(&OPACITY_LOGITS).second[1] = f32::INFINITY);
+    let moments = fault_of(&|trainer| trainer.state.optimiser.of(&OPACITY_LOGITS).second[1] = f32::INFINITY);
     assert_eq!(moments, "optimiser: second moments[1] is inf");
-    let gradients = fault_of(&|trainer| trainer.gradients.gaussians.sh_coefficients[1][2] = f32::INFINITY);
+    let gradients =
+        fault_of(&|trainer| trainer.state.gradients.gaussians.sh_coefficients[1][2] = f32::INFINITY);
     assert_eq!(gradients, "project backward: gradient of sh_coefficients[50] is inf");
-    let network = fault_of(&|trainer| trainer.gradients.mlp[7] = f32::NAN);
+    let network = fault_of(&|trainer| trainer.state.gradients.mlp[7] = f32::NAN);
     assert_eq!(network, "deform backward: gradient of mlp[7] is NaN");
 }
 

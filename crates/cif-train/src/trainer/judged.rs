@@ -5,44 +5,22 @@
 use cif_field::deformation::HeadKind;
 use cif_field::parameters::MLP;
 use cif_field::{Deformation, Field};
-use cif_geometry::PixelGrid;
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
-use super::draw::Views;
 use super::motions::{probe, probe_times};
+use crate::engine::{Changed, Views};
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
+use crate::losses::held_out::held_out;
 use crate::schedule::{falls_on, sh_degree};
-
-/// Every so many columns and rows there is a pixel that the colour loss leaves out.
-pub(crate) const JUDGED_SPACING: u32 = 8;
-
-/// Column and row of the first of them.
-pub(crate) const FIRST_JUDGED: (u32, u32) = (3, 5);
 
 /// Views that are compared.
 const VIEWS: usize = 8;
 
 /// Outputs that may go, the least needed first.
 const OPTIONAL: [HeadKind; 4] = [HeadKind::Sh, HeadKind::Opacity, HeadKind::Scale, HeadKind::Rotation];
-
-/// Positions in an image of the pixels that are left out of the colour loss.
-fn held_out(width: u32, height: u32) -> impl Iterator<Item = usize> {
-    let spacing = JUDGED_SPACING as usize;
-    let rows = (FIRST_JUDGED.1..height).step_by(spacing);
-    rows.flat_map(move |y| {
-        (FIRST_JUDGED.0..width).step_by(spacing).map(move |x| y as usize * width as usize + x as usize)
-    })
-}
-
-/// Takes the gradient from the pixels that are judged by.
-pub(super) fn leave_out_held_out(v_color: &mut PixelGrid<[f32; 3]>) {
-    for pixel in held_out(v_color.width, v_color.height) {
-        v_color.pixels[pixel] = [0.0; 3];
-    }
-}
 
 /// Training views that are judged by, evenly spread.
 fn judged_views(views: usize) -> impl Iterator<Item = usize> {
@@ -53,8 +31,8 @@ fn judged_views(views: usize) -> impl Iterator<Item = usize> {
 impl Trainer {
     /// True when anything is still to be judged by pixels that are held out; then all pixels train.
     fn judges(&self, stage: Stage, iteration: u32) -> bool {
-        let effects = &self.config.effects;
-        let half = self.stages.iterations(&self.config, Stage::Fine) / 2;
+        let effects = &self.state.config.effects;
+        let half = self.stages.iterations(&self.state.config, Stage::Fine) / 2;
         let earns = effects.sh_gain > 0.0 || effects.head_gain > 0.0;
         (earns && (stage == Stage::Coarse || (stage == Stage::Fine && iteration <= half)))
             || self.tests_to_come(stage, iteration)
@@ -63,28 +41,28 @@ impl Trainer {
     /// True when a step keeps the pixels that are judged by out of the colour gradient of a frame of the capture: while
     /// anything is still to be judged, and where the frame is one of those that are judged by.
     pub(super) fn leaves_out_judged(&self, stage: Stage, iteration: u32, frame: usize) -> bool {
-        judged_views(self.frames.len()).any(|view| self.frames.index(view) == frame)
+        judged_views(self.state.frames.len()).any(|view| self.state.frames.index(view) == frame)
             && self.judges(stage, iteration)
     }
 
     /// Degree of spherical harmonics at a step: as the schedule says, but not two above one that helps, and not
     /// above what was taken back.
     pub(super) fn degree_at(&self, iteration: u32) -> u8 {
-        let scheduled = sh_degree(&self.config, self.progress.sh_start, iteration);
-        if self.config.effects.sh_gain <= 0.0 {
+        let scheduled = sh_degree(&self.state.config, self.state.progress.sh_start, iteration);
+        if self.state.config.effects.sh_gain <= 0.0 {
             return scheduled;
         }
-        scheduled.min(self.progress.sh_judged + 1).min(self.progress.sh_cap.unwrap_or(u8::MAX))
+        scheduled.min(self.state.progress.sh_judged + 1).min(self.state.progress.sh_cap.unwrap_or(u8::MAX))
     }
 
     /// True when spherical harmonics are judged before a step.
     pub(super) fn judges_sh(&self, stage: Stage, iteration: u32) -> bool {
-        if self.config.effects.sh_gain <= 0.0 || !matches!(stage, Stage::Coarse | Stage::Fine) {
+        if self.state.config.effects.sh_gain <= 0.0 || !matches!(stage, Stage::Coarse | Stage::Fine) {
             return false;
         }
-        let is_next_due = falls_on(iteration, self.config.model.sh_interval)
-            && self.progress.sh_cap.is_none()
-            && self.field.sh_degree > self.progress.sh_judged;
+        let is_next_due = falls_on(iteration, self.state.config.model.sh_interval)
+            && self.state.progress.sh_cap.is_none()
+            && self.state.field.sh_degree > self.state.progress.sh_judged;
         is_next_due || self.is_half_way(stage, iteration)
     }
 
@@ -100,23 +78,22 @@ impl Trainer {
             return Ok(());
         }
         if self.is_half_way(stage, iteration) {
-            while self.field.sh_degree > 0 {
-                let gain_wanted = f64::from(self.config.effects.sh_gain);
-                let degree = self.field.sh_degree;
+            while self.state.field.sh_degree > 0 {
+                let gain_wanted = f64::from(self.state.config.effects.sh_gain);
+                let degree = self.state.field.sh_degree;
                 if self.degree_gains(stage, iteration, gain_wanted, events)? {
                     break;
                 }
                 let first = 3 * coefficient_count(degree - 1);
-                for coefficients in &mut self.field.gaussians.sh_coefficients {
+                for coefficients in &mut self.state.field.gaussians.sh_coefficients {
                     coefficients[first..].fill(0.0);
                 }
-                #[cfg(feature = "wgpu")]
-                self.gaussians_changed();
-                self.field.sh_degree = degree - 1;
-                self.progress.sh_cap = Some(degree - 1);
+                self.engine.changed(Changed::Gaussians);
+                self.state.field.sh_degree = degree - 1;
+                self.state.progress.sh_cap = Some(degree - 1);
             }
         } else if self.degree_gains(stage, iteration, 0.0, events)? {
-            self.progress.sh_judged = self.field.sh_degree;
+            self.state.progress.sh_judged = self.state.field.sh_degree;
         }
         Ok(())
     }
@@ -129,8 +106,8 @@ impl Trainer {
         gain_wanted: f64,
         events: &mut Vec<TrainEvent>,
     ) -> Result<bool, TrainError> {
-        let degree = self.field.sh_degree;
-        let settings = self.color_settings();
+        let degree = self.state.field.sh_degree;
+        let settings = self.state.color_settings();
         let lower = RenderSettings { sh_degree: degree - 1, ..settings };
         let with = self.judged_error(None, &settings)?;
         let without = self.judged_error(None, &lower)?;
@@ -143,15 +120,15 @@ impl Trainer {
 
     /// True when a step is the one on which what has not earned its place is taken back.
     fn is_half_way(&self, stage: Stage, iteration: u32) -> bool {
-        let last = self.stages.iterations(&self.config, Stage::Fine);
+        let last = self.stages.iterations(&self.state.config, Stage::Fine);
         stage == Stage::Fine && iteration == (last / 2).max(1)
     }
 
     /// True when outputs of the deformation are judged after a step.
     pub(super) fn judges_heads(&self, stage: Stage, iteration: u32) -> bool {
-        self.config.effects.head_gain > 0.0
+        self.state.config.effects.head_gain > 0.0
             && self.is_half_way(stage, iteration)
-            && self.field.deformation.is_some()
+            && self.state.field.deformation.is_some()
     }
 
     /// Judges the optional outputs of the deformation, once, at half of the fine stage, and removes those that do
@@ -162,26 +139,25 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let gain_wanted = f64::from(self.config.effects.head_gain);
+        let gain_wanted = f64::from(self.state.config.effects.head_gain);
         if !self.judges_heads(stage, iteration) {
             return Ok(());
         }
-        let settings = self.color_settings();
-        let times = probe_times(&self.dataset.times);
+        let settings = self.state.color_settings();
+        let times = probe_times(&self.state.dataset.times);
         for kind in OPTIONAL {
-            let Some(trial) = without_output(&self.field, kind, &times) else { continue };
+            let Some(trial) = without_output(&self.state.field, kind, &times) else { continue };
             let with = self.judged_error(None, &settings)?;
             let without = self.judged_error(Some(&trial.field), &settings)?;
             let gain_db = gain(without, with);
             let kept = gain_db >= gain_wanted;
             if !kept {
-                self.field = trial.field;
-                let mlp = self.optimiser.of(&MLP);
+                self.state.field = trial.field;
+                let mlp = self.state.optimiser.of(&MLP);
                 mlp.first.drain(trial.removed.clone());
                 mlp.second.drain(trial.removed.clone());
-                self.gradients.mlp.drain(trial.removed);
-                #[cfg(feature = "wgpu")]
-                self.everything_changed();
+                self.state.gradients.mlp.drain(trial.removed);
+                self.engine.changed(Changed::Everything);
             }
             let what = format!("motion of {}", name(kind));
             events.push(TrainEvent::Judged { stage, iteration, what, gain_db, kept });
@@ -196,11 +172,11 @@ impl Trainer {
         trial: Option<&Field>,
         settings: &RenderSettings,
     ) -> Result<f64, TrainError> {
-        let views: Vec<usize> = judged_views(self.frames.len()).collect();
-        let frames: Vec<usize> = views.iter().map(|view| self.frames.index(*view)).collect();
+        let views: Vec<usize> = judged_views(self.state.frames.len()).collect();
+        let frames: Vec<usize> = views.iter().map(|view| self.state.frames.index(*view)).collect();
         let mut truth = Vec::with_capacity(views.len());
         for view in views {
-            truth.push(self.frames.get(&self.dataset, view)?);
+            truth.push(self.state.frames.get(&self.state.dataset, view)?);
         }
         let (mut squares, mut values) = (0.0, 0_u64);
         let channels = Channels { depth: false, instances: false };

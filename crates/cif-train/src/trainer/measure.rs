@@ -8,11 +8,12 @@ use cif_field::{Field, Identities, Instance};
 use cif_render::UNLABELLED;
 
 use super::evaluate::MeasuredFrames;
-use super::state::check_instances;
-use super::{StepTimes, Trainer, initialize};
+use super::resume::check_instances;
+use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::events::Stage;
+use crate::times::StepTimes;
 
 /// Whether the steps of the instance stage blend identities.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -65,17 +66,17 @@ impl Trainer {
         let mut trainer = Self::assemble(dataset.into(), measured_frames, config, field, None)?;
         if stage == Stage::Instance {
             if !trainer.stages.has_instances {
-                return Err(TrainError::NoLabels { root: trainer.dataset.root.clone() });
+                return Err(TrainError::NoLabels { root: trainer.state.dataset.root.clone() });
             }
-            if trainer.field.identities.is_none() {
+            if trainer.state.field.identities.is_none() {
                 trainer.begin(Stage::Fine);
                 for _ in 0..if is_trained { 0 } else { warm_up } {
                     trainer.measure_step(InstancePass::Off)?;
                 }
                 trainer.estimate_identities(true)?;
             } else {
-                trainer.unseen = vec![false; trainer.field.gaussians.len()];
-                trainer.label_pixels = trainer.count_label_pixels()?;
+                trainer.state.unseen = vec![false; trainer.state.field.gaussians.len()];
+                trainer.state.label_pixels = trainer.count_label_pixels()?;
             }
         }
         trainer.begin(stage);
@@ -96,7 +97,7 @@ impl Trainer {
 
     /// Makes the next step take the views of the last one again.
     pub fn repeat_views(&mut self) {
-        self.progress.iteration = self.progress.iteration.saturating_sub(1);
+        self.state.progress.iteration = self.state.progress.iteration.saturating_sub(1);
     }
 
     /// Pads the table of instances to `count` and spreads the labels over it by a fixed permutation; the
@@ -105,9 +106,9 @@ impl Trainer {
     /// # Panics
     /// When the table is longer than `count`, or `count` leaves the labels of masks.
     pub fn spread_instances(&mut self, count: usize) {
-        let present = self.field.instances.len();
+        let present = self.state.field.instances.len();
         assert!((present..=usize::from(u16::MAX) - 1).contains(&count), "{count} labels for {present}");
-        let mut taken: Vec<u16> = self.field.instances.iter().map(|instance| instance.id).collect();
+        let mut taken: Vec<u16> = self.state.field.instances.iter().map(|instance| instance.id).collect();
         taken.sort_unstable();
         let free = (1..=u16::MAX).filter(|id| taken.binary_search(id).is_err());
         let new_label = |label: u16| spread(usize::from(label), count);
@@ -115,30 +116,30 @@ impl Trainer {
             let label = format!("padding_{id}");
             Instance { id, category: label.clone(), label }
         });
-        let old: Vec<Instance> = self.field.instances.drain(..).chain(padding).collect();
+        let old: Vec<Instance> = self.state.field.instances.drain(..).chain(padding).collect();
         let mut table: Vec<(u16, Instance)> =
             old.into_iter().enumerate().map(|(label, one)| (new_label(label as u16), one)).collect();
         table.sort_by_key(|(label, _)| *label);
-        self.field.instances = table.into_iter().map(|(_, instance)| instance).collect();
-        if let Some(rows) = &mut self.field.identities {
+        self.state.field.instances = table.into_iter().map(|(_, instance)| instance).collect();
+        if let Some(rows) = &mut self.state.field.identities {
             let origins = relabel(rows, new_label);
-            self.optimiser.of(&LOG_CALIBRATIONS).gather(&origins);
+            self.state.optimiser.of(&LOG_CALIBRATIONS).gather(&origins);
         }
-        if !self.label_pixels.is_empty() {
+        if !self.state.label_pixels.is_empty() {
             let mut pixels = vec![0.0; count];
-            for (label, number) in self.label_pixels.iter().enumerate() {
+            for (label, number) in self.state.label_pixels.iter().enumerate() {
                 pixels[usize::from(new_label(label as u16))] = *number;
             }
-            self.label_pixels = pixels;
+            self.state.label_pixels = pixels;
         }
-        self.frames.relabel(new_label);
+        self.state.frames.relabel(new_label);
     }
 
     /// Labelled pixels per instance, over all training frames.
     fn count_label_pixels(&self) -> Result<Vec<f64>, TrainError> {
-        let mut pixels = vec![0.0; self.field.instances.len()];
-        for view in 0..self.frames.len() {
-            let frame = Arc::clone(&self.frames.get(&self.dataset, view)?);
+        let mut pixels = vec![0.0; self.state.field.instances.len()];
+        for view in 0..self.state.frames.len() {
+            let frame = Arc::clone(&self.state.frames.get(&self.state.dataset, view)?);
             let Some(labels) = &frame.labels else { continue };
             for label in labels.pixels.iter().filter(|label| **label != UNLABELLED) {
                 pixels[usize::from(*label) - 1] += 1.0;

@@ -3,38 +3,33 @@
 //! | file | answers |
 //! |---|---|
 //! | `initialize` | what a run starts from |
-//! | `progress` | which stages there are, and where the run stands |
 //! | `run` | how it goes through its stages, and where it may be stopped |
-//! | `step_plan` | a step as data: its views, settings, rates and limits, for either backend |
-//! | `step` | a step on the processor, what either backend reports of one, and what falls behind it |
-//! | `optimiser` | moments and rates of the parameters |
-//! | `guard` | what happens to a step that leaves the finite numbers |
+//! | `plan_step` | what decides a step |
+//! | `step` | how a step is done, and what falls behind it |
 //! | `still` | which Gaussians skip the deformation network |
 //! | `changes` | where cameras that stay in place see the capture change |
 //! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
-//! | `state` | what is saved, and how a run resumes |
-//! | `draw` | how views are rendered between steps |
+//! | `resume` | what is saved, and how a run resumes |
 //! | `evaluate` | what a run has reached, on a few frames |
 //! | `pacing` | when stages end by time, or by what was reached |
 //! | `saving` | when a run asks to be saved |
-//! | `times`, `measure` | where the time of a step goes |
-//! | `device` | how steps run on a GPU, behind the feature `wgpu` |
+//! | `measure`, `shape` | steps for measuring, and what they work on |
+//! | `backend` | which engine computes the steps |
 //!
 //! Random choices depend on the seed and the step alone (see `random`), and all sums have a fixed order: a
 //! run that was interrupted and resumed ends bit for bit where an uninterrupted one ends, on any number of
 //! threads.
 
+mod backend;
 mod changes;
-#[cfg(feature = "wgpu")]
-mod device;
-mod draw;
 mod evaluate;
-mod frames;
 mod from_scene;
-mod guard;
+#[cfg(test)]
+#[cfg(feature = "wgpu")]
+mod gpu_tests;
 #[cfg(test)]
 mod guard_tests;
 mod guidance;
@@ -43,56 +38,49 @@ mod initialize;
 mod judged;
 mod measure;
 mod motions;
-mod optimiser;
 mod pacing;
-mod progress;
+mod plan_step;
 mod provenance;
+mod resume;
 mod run;
 mod saving;
-mod state;
+#[cfg(feature = "wgpu")]
+mod shape;
 mod step;
-mod step_plan;
 mod still;
-mod times;
 
 use std::sync::Arc;
 
 use cif_dataset::Dataset;
 use cif_field::Field;
 use cif_render::Gradients;
-use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::cpu::SimdLevel;
 
+#[cfg(feature = "wgpu")]
+pub use self::backend::Probe;
 use self::changes::Changes;
-#[cfg(feature = "wgpu")]
-pub use self::device::Probe;
 use self::evaluate::MeasuredFrames;
-use self::frames::FrameStore;
-#[cfg(all(test, feature = "wgpu"))]
-pub(crate) use self::guard::MAX_GRADIENT;
-pub use self::guard::{Fault, Hint, MAX_ROLLBACKS_IN_A_ROW};
-use self::guidance::Guidance;
 pub(crate) use self::initialize::automatic_time_nodes;
-#[cfg(feature = "wgpu")]
-pub(crate) use self::judged::{FIRST_JUDGED, JUDGED_SPACING};
 pub use self::measure::InstancePass;
-use self::optimiser::Optimiser;
 use self::pacing::Pacing;
-use self::progress::{Progress, Stages};
 use self::saving::Saving;
-use self::step::Scratch;
-#[cfg(feature = "wgpu")]
-use self::step::StepLoss;
-pub use self::times::{StepTimes, Work};
 use crate::clock::{Clock, SystemClock};
 use crate::config::TrainConfig;
 use crate::curve::Curve;
 use crate::densify::DensifyStatistics;
+use crate::engine::Engine;
+use crate::engine::processor::Processor;
 use crate::error::TrainError;
-use crate::events::Stage;
-#[cfg(feature = "wgpu")]
-use crate::events::TrainEvent;
+use crate::events::{Stage, TrainEvent};
 use crate::exposure::Exposures;
-use crate::stop::{Start, Stop};
+use crate::frames::FrameStore;
+use crate::guidance::Guidance;
+use crate::optimiser::Optimiser;
+use crate::progress::{Progress, Stages};
+use crate::state::State;
+use crate::step::StepLoss;
+use crate::stop::Start;
+use crate::times::{StepTimes, Work};
 
 /// Names that a warning lists at most.
 const MOST_NAMES: usize = 8;
@@ -114,36 +102,23 @@ fn misfit_warning(dataset: &Dataset, left_out: &[usize]) -> Option<String> {
 
 /// Trains one field on one capture.
 pub struct Trainer {
-    dataset: Dataset,
-    config: TrainConfig,
-    field: Field,
-    frames: FrameStore,
+    state: State,
+    /// Computes the steps.
+    engine: Box<dyn Engine>,
+    /// Vector instructions of the processor.
+    simd: SimdLevel,
     stages: Stages,
-    progress: Progress,
-    optimiser: Optimiser,
-    statistics: DensifyStatistics,
-    /// Gaussians whose identity row is not from their own label mass.
-    unseen: Vec<bool>,
-    /// Labelled pixels per instance, of the frames that identities were estimated from.
-    label_pixels: Vec<f64>,
+    /// Order of the training views of an epoch, by stage and epoch.
+    order: Option<((Stage, u64), Vec<u32>)>,
     /// True when every camera stays in place, and where these see changes, once that is asked.
     shows_changes: bool,
     changes: Option<Changes>,
-    /// Paths that Gaussians are held to.
-    guidance: Guidance,
-    renderer: Renderer,
-    gradients: Gradients,
-    scratch: Scratch,
-    /// Where the time of steps went.
-    times: StepTimes,
     /// True when every array of a step is looked at.
     debug_validation: bool,
     /// Off only while the cost of the pass is measured.
     instance_pass: InstancePass,
     /// Where the run reads time.
     clock: Arc<dyn Clock>,
-    /// What may stop the run between two events.
-    stop: Stop,
     /// When the next state is saved by time.
     saving: Saving,
     /// Frames that the curve is measured on.
@@ -152,14 +127,9 @@ pub struct Trainer {
     pacing: Option<Pacing>,
     /// Warnings not sent yet.
     warnings: Vec<String>,
-    /// The GPU that steps run on.
-    #[cfg(feature = "wgpu")]
-    device: Option<Box<device::DeviceTraining>>,
-    /// Loss of the last step that has arrived from the GPU.
-    #[cfg(feature = "wgpu")]
+    /// Loss of the last step that was taken in.
     last_loss: StepLoss,
-    /// Events of steps that have arrived from it, not sent yet.
-    #[cfg(feature = "wgpu")]
+    /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
 }
 
@@ -177,9 +147,9 @@ impl Trainer {
         let mut trainer = Self::assemble(Start { dataset, stop }, measured_frames, config, field, None)?;
         trainer.warn_of_capture();
         trainer.find_travelling()?;
-        let first = trainer.stages.from(&trainer.config, Stage::Coarse);
-        trainer.progress = Progress::at(first);
-        trainer.progress.exposures = trainer.exposures();
+        let first = trainer.stages.from(&trainer.state.config, Stage::Coarse);
+        trainer.state.progress = Progress::at(first);
+        trainer.state.progress.exposures = trainer.exposures();
         trainer.enter(first)?;
         Ok(trainer)
     }
@@ -205,51 +175,51 @@ impl Trainer {
             warnings.extend(misfit_warning(&dataset, &left_out));
         }
         let n = field.gaussians.len();
+        let simd = SimdLevel::Auto;
         Ok(Self {
             stages: Stages { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
-            progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
-            optimiser: Optimiser::new(&field),
-            statistics: DensifyStatistics::zeros(n),
-            unseen: Vec::new(),
-            label_pixels: Vec::new(),
+            engine: Box::new(Processor::new(simd)),
+            simd,
+            order: None,
             shows_changes: Changes::are_shown(&dataset, &frames),
             changes: None,
-            guidance: Guidance::default(),
-            renderer: Renderer::new(SimdLevel::Auto),
-            gradients: Gradients::zeros(&field),
-            scratch: Scratch::new(),
-            times: StepTimes::default(),
             debug_validation: false,
             instance_pass: InstancePass::On,
             clock: Arc::new(SystemClock::start()),
-            stop,
             saving: Saving::default(),
             measured_frames,
             pacing: None,
             warnings,
-            #[cfg(feature = "wgpu")]
-            device: None,
-            #[cfg(feature = "wgpu")]
             last_loss: StepLoss::default(),
-            #[cfg(feature = "wgpu")]
             arrived: Vec::new(),
-            dataset,
-            config,
-            field,
-            frames,
+            state: State {
+                progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
+                optimiser: Optimiser::new(&field),
+                statistics: DensifyStatistics::zeros(n),
+                guidance: Guidance::default(),
+                unseen: Vec::new(),
+                label_pixels: Vec::new(),
+                gradients: Gradients::zeros(&field),
+                times: StepTimes::default(),
+                dataset,
+                config,
+                frames,
+                stop,
+                field,
+            },
         })
     }
 
     /// Neutral exposures of the cameras, where they are to be learnt.
     fn exposures(&self) -> Option<Exposures> {
-        self.config.effects.exposure.then(|| Exposures::of(&self.dataset)).flatten()
+        self.state.config.effects.exposure.then(|| Exposures::of(&self.state.dataset)).flatten()
     }
 
     fn warn_of_capture(&mut self) {
         if !self.stages.has_instances {
-            let why = if !self.config.effects.instances {
+            let why = if !self.state.config.effects.instances {
                 "instances are switched off"
-            } else if self.dataset.instances.is_empty() {
+            } else if self.state.dataset.instances.is_empty() {
                 "the capture has no masks"
             } else {
                 "no training mask has a labelled pixel"
@@ -257,23 +227,23 @@ impl Trainer {
             self.warnings.push(format!("{why}: colour only, without identity and instance stages"));
         }
         if !self.stages.is_dynamic {
-            let why = if self.dataset.times.len() > 1 {
+            let why = if self.state.dataset.times.len() > 1 {
                 "motion is switched off"
             } else {
                 "the capture has a single time"
             };
             self.warnings.push(format!("{why}: trained without deformation"));
         }
-        if self.frames.len() == 1 {
+        if self.state.frames.len() == 1 {
             self.warnings.push("one training frame: depth and occluded parts are not determined".into());
         }
-        let not_kept = self.frames.not_kept();
+        let not_kept = self.state.frames.not_kept();
         if not_kept > 0 {
             self.warnings.push(format!(
                 "{not_kept} of {} training frames do not fit into frame_memory_mib = {} and are decoded \
                  whenever they are needed",
-                self.frames.len(),
-                self.config.frame_memory_mib
+                self.state.frames.len(),
+                self.state.config.frame_memory_mib
             ));
         }
     }
@@ -281,62 +251,55 @@ impl Trainer {
     /// The field as it is now; its record is up to date once a run has returned.
     #[must_use]
     pub fn field(&self) -> &Field {
-        &self.field
+        &self.state.field
     }
 
     /// The trained field, once a run has returned.
     #[must_use]
     pub fn into_field(mut self) -> Field {
-        self.field.record = self.provenance();
-        self.field
+        self.state.field.record = self.provenance();
+        self.state.field
     }
 
     /// The run's settings.
     #[must_use]
     pub fn config(&self) -> &TrainConfig {
-        &self.config
+        &self.state.config
     }
 
     /// The capture.
     #[must_use]
     pub fn dataset(&self) -> &Dataset {
-        &self.dataset
+        &self.state.dataset
     }
 
     /// Stage of the run.
     #[must_use]
     pub fn stage(&self) -> Stage {
-        self.progress.stage
+        self.state.progress.stage
     }
 
     /// Steps done in the stage.
     #[must_use]
     pub fn iteration(&self) -> u32 {
-        self.progress.iteration
+        self.state.progress.iteration
     }
 
     /// Steps done in all stages.
     #[must_use]
     pub fn steps_done(&self) -> u64 {
-        self.progress.total_steps
+        self.state.progress.total_steps
     }
 
     /// Steps left in all stages.
     #[must_use]
     pub fn steps_left(&self) -> u64 {
-        self.stages.steps_left(&self.config, self.progress.stage, self.progress.iteration)
+        self.stages.steps_left(&self.state.config, self.state.progress.stage, self.state.progress.iteration)
     }
 
     /// Records what was planned for the capture, for the field's record.
     pub fn record_effects(&mut self, plan: serde_json::Value) {
-        self.progress.effects = Some(plan);
-    }
-
-    /// Chooses the vector instructions of the renderer, the widest there are by default. Results of two levels
-    /// differ by rounding.
-    pub fn set_simd(&mut self, simd: SimdLevel) {
-        self.renderer = Renderer::new(simd);
-        self.renderer.set_inspection(self.debug_validation);
+        self.state.progress.effects = Some(plan);
     }
 
     /// Reads time from another clock; times of the run and its curve follow it.
@@ -347,35 +310,61 @@ impl Trainer {
     /// What the run reached when, so far.
     #[must_use]
     pub fn curve(&self) -> &Curve {
-        &self.progress.curve
+        &self.state.progress.curve
     }
 
-    /// Name of the vector instructions in use.
-    #[must_use]
-    pub fn simd_name(&self) -> String {
-        self.renderer.simd_name()
+    /// Looks at every array of a step, so that a value which is not finite is told with the part, the tensor and
+    /// the index where it first appeared. Costs time and a second copy of field and moments; results do not
+    /// change.
+    pub fn set_debug_validation(&mut self, on: bool) {
+        self.debug_validation = on;
     }
 
-    /// Name of the vector instructions that runs take unless told otherwise.
+    /// Steps rolled back so far, over interruptions.
     #[must_use]
-    pub fn vector_instructions() -> String {
-        Renderer::new(SimdLevel::Auto).simd_name()
+    pub fn rolled_back(&self) -> u64 {
+        self.state.progress.rollbacks.total
     }
 
     /// Where the time of the steps since [`Self::reset_times`] went, and what they did.
     #[must_use]
     pub fn times(&self) -> StepTimes {
-        self.times
+        self.state.times
     }
 
     /// What the steps of the whole run worked on, over interruptions.
     #[must_use]
     pub fn work(&self) -> Work {
-        self.progress.work
+        self.state.progress.work
     }
 
     /// Sets times and counts to zero.
     pub fn reset_times(&mut self) {
-        self.times = StepTimes::default();
+        self.state.times = StepTimes::default();
+    }
+}
+
+/// What an observer may look at during an event.
+pub struct TrainerView<'a> {
+    pub(crate) trainer: &'a Trainer,
+}
+
+impl TrainerView<'_> {
+    /// The field as it is now.
+    #[must_use]
+    pub fn field(&self) -> &cif_field::Field {
+        self.trainer.field()
+    }
+
+    /// The run's settings.
+    #[must_use]
+    pub fn config(&self) -> &crate::TrainConfig {
+        self.trainer.config()
+    }
+
+    /// A checkpoint, see [`Trainer::checkpoint`].
+    #[must_use]
+    pub fn checkpoint(&self, with_state: bool) -> cif_field::checkpoint::Checkpoint {
+        self.trainer.checkpoint(with_state)
     }
 }

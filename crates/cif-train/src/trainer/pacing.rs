@@ -4,7 +4,6 @@
 //! that a stage is expected to have, so that a run that is cut short ends settled. With a budget the number of
 //! steps depends on the machine, and so does the result.
 
-use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use super::Trainer;
@@ -12,6 +11,7 @@ use crate::budget::{Budget, Pacer, Targets, weights};
 use crate::curve::CurvePoint;
 use crate::error::TrainError;
 use crate::events::Stage;
+use crate::progress::Goals;
 
 /// Points of a stage before its trend is believed.
 const POINTS_OF_TREND: usize = 6;
@@ -21,18 +21,6 @@ const EARLIEST_VERDICT: f64 = 0.3;
 
 /// A trend may be so much too low, dB and points of mIoU.
 const MARGIN: (f64, f64) = (0.5, 2.0);
-
-/// What a run is held to; saved with its state, but for the budget, which is one of a single call.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub(super) struct Goals {
-    /// What is to be reached.
-    pub targets: Targets,
-    /// True when all of it was.
-    pub reached: bool,
-    /// True when the user was told that a target is out of reach.
-    pub doubted: bool,
-}
 
 /// Lengths that follow the steps of a stage, as shares of them.
 #[derive(Clone, Copy, Debug)]
@@ -57,13 +45,13 @@ impl Trainer {
     /// Makes the stages that are left end inside a budget, each with its share. Steps of the settings are where
     /// it starts from, see [`crate::budget::choose`]; [`Self::config`] has those that came of it.
     pub fn set_budget(&mut self, budget: Budget) {
-        let fine = f64::from(self.stages.iterations(&self.config, Stage::Fine).max(1));
-        let instance = f64::from(self.config.stages.instance.max(1));
+        let fine = f64::from(self.stages.iterations(&self.state.config, Stage::Fine).max(1));
+        let instance = f64::from(self.state.config.stages.instance.max(1));
         let shares = Shares {
-            densify: f64::from(self.config.densify.until) / fine,
-            instance: f64::from(self.config.stages.instance) / fine,
-            schedule: f64::from(self.config.rates.schedule_steps) / fine,
-            resample: f64::from(self.config.resample.until) / instance,
+            densify: f64::from(self.state.config.densify.until) / fine,
+            instance: f64::from(self.state.config.stages.instance) / fine,
+            schedule: f64::from(self.state.config.rates.schedule_steps) / fine,
+            resample: f64::from(self.state.config.resample.until) / instance,
         };
         self.pacing = Some(Pacing { pacer: Pacer::new(budget), shares });
     }
@@ -76,22 +64,22 @@ impl Trainer {
     /// When mIoU is a target and the capture has no labels.
     pub fn set_targets(&mut self, targets: Targets) -> Result<(), TrainError> {
         if targets.miou.is_some() && !self.stages.has_instances {
-            return Err(TrainError::NoLabels { root: self.dataset.root.clone() });
+            return Err(TrainError::NoLabels { root: self.state.dataset.root.clone() });
         }
-        self.progress.goals = Goals { targets, ..Goals::default() };
+        self.state.progress.goals = Goals { targets, ..Goals::default() };
         Ok(())
     }
 
     /// What the run is to reach.
     #[must_use]
     pub fn targets(&self) -> Targets {
-        self.progress.goals.targets
+        self.state.progress.goals.targets
     }
 
     /// True when the run has targets and reached all of them.
     #[must_use]
     pub fn reached_targets(&self) -> bool {
-        self.progress.goals.reached
+        self.state.progress.goals.reached
     }
 
     /// Gives a stage that begins, or goes on, its deadline.
@@ -100,41 +88,41 @@ impl Trainer {
         let steps: Vec<(Stage, u32)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
             .into_iter()
             .filter(|other| *other >= stage)
-            .map(|other| (other, self.stages.iterations(&self.config, other)))
+            .map(|other| (other, self.stages.iterations(&self.state.config, other)))
             .map(|(other, steps)| {
-                let done = if other == stage { self.progress.iteration } else { 0 };
+                let done = if other == stage { self.state.progress.iteration } else { 0 };
                 (other, steps.saturating_sub(done))
             })
             .filter(|(other, steps)| *steps > 0 || *other == stage)
             .collect();
         let frames = if self.stages.has_instances && stage < Stage::Identity {
-            self.frames.len().div_ceil(self.config.identity.stride.max(1) as usize)
+            self.state.frames.len().div_ceil(self.state.config.identity.stride.max(1) as usize)
         } else {
             0
         };
-        pacing.pacer.enter(&weights(&steps), self.progress.iteration, frames, self.clock.now());
+        pacing.pacer.enter(&weights(&steps), self.state.progress.iteration, frames, self.clock.now());
     }
 
     /// Stretches or ends the stage as the budget says.
     pub(super) fn follow_budget(&mut self, stage: Stage) {
         let now = self.clock.now();
         let Some(pacing) = &mut self.pacing else { return };
-        let Some(steps) = pacing.pacer.after_step(self.progress.iteration, now) else { return };
+        let Some(steps) = pacing.pacer.after_step(self.state.progress.iteration, now) else { return };
         let shares = pacing.shares;
         self.set_steps(stage, steps);
         let scaled = |share: f64, steps: u32| (share * f64::from(steps)).round() as u32;
         if stage == Stage::Fine {
-            self.config.densify.until = scaled(shares.densify, steps);
-            self.config.stages.instance =
+            self.state.config.densify.until = scaled(shares.densify, steps);
+            self.state.config.stages.instance =
                 scaled(shares.instance, steps).max(u32::from(shares.instance > 0.0));
-            self.config.rates.schedule_steps = scaled(shares.schedule, steps);
+            self.state.config.rates.schedule_steps = scaled(shares.schedule, steps);
         }
-        self.config.resample.until = scaled(shares.resample, self.config.stages.instance);
+        self.state.config.resample.until = scaled(shares.resample, self.state.config.stages.instance);
     }
 
     /// Gives a stage another number of steps.
     fn set_steps(&mut self, stage: Stage, steps: u32) {
-        let stages = &mut self.config.stages;
+        let stages = &mut self.state.config.stages;
         match stage {
             Stage::Coarse => stages.coarse = steps,
             Stage::Fine if self.stages.is_dynamic && stages.fine_includes_coarse => {
@@ -149,27 +137,27 @@ impl Trainer {
 
     /// Ends the stage when a point reaches what it is to reach; a warning when that is out of reach.
     pub(super) fn follow_targets(&mut self, point: &CurvePoint) -> Option<String> {
-        let targets = self.progress.goals.targets;
+        let targets = self.state.progress.goals.targets;
         if targets.is_empty() {
             return None;
         }
         let (stage, last) = (point.stage, self.last_stage());
-        self.progress.goals.reached = targets.reached_by(point.psnr, point.miou);
+        self.state.progress.goals.reached = targets.reached_by(point.psnr, point.miou);
         let psnr_reached = Targets { miou: None, ..targets }.reached_by(point.psnr, None);
         let ends = match stage {
-            Stage::Fine if last == Stage::Fine => self.progress.goals.reached,
+            Stage::Fine if last == Stage::Fine => self.state.progress.goals.reached,
             // What instances add is measured only behind the fine stage.
             Stage::Fine => targets.psnr.is_some() && psnr_reached,
-            Stage::Instance => self.progress.goals.reached,
+            Stage::Instance => self.state.progress.goals.reached,
             _ => false,
         };
         if ends {
-            let planned = self.stages.iterations(&self.config, stage).max(1);
+            let planned = self.stages.iterations(&self.state.config, stage).max(1);
             if stage == Stage::Fine && self.stages.has_instances {
                 let share = f64::from(point.iteration) / f64::from(planned);
                 let shortened = |steps: u32| (f64::from(steps) * share).ceil() as u32;
-                self.config.stages.instance = shortened(self.config.stages.instance);
-                self.config.resample.until = shortened(self.config.resample.until);
+                self.state.config.stages.instance = shortened(self.state.config.stages.instance);
+                self.state.config.resample.until = shortened(self.state.config.resample.until);
             }
             self.set_steps(stage, point.iteration);
             return None;
@@ -179,19 +167,23 @@ impl Trainer {
 
     /// The last stage with steps.
     fn last_stage(&self) -> Stage {
-        if self.stages.iterations(&self.config, Stage::Instance) > 0 { Stage::Instance } else { Stage::Fine }
+        if self.stages.iterations(&self.state.config, Stage::Instance) > 0 {
+            Stage::Instance
+        } else {
+            Stage::Fine
+        }
     }
 
     /// Says once that the trend does not lead to a target.
     fn doubt(&mut self, point: &CurvePoint) -> Option<String> {
-        let curve = &self.progress.curve;
+        let curve = &self.state.progress.curve;
         let of_stage = curve.points.iter().filter(|other| other.stage == point.stage).count();
-        let all = self.progress.total_steps + self.steps_left();
+        let all = self.state.progress.total_steps + self.steps_left();
         let early = (point.step as f64) < EARLIEST_VERDICT * all as f64;
-        if self.progress.goals.doubted || of_stage < POINTS_OF_TREND || early {
+        if self.state.progress.goals.doubted || of_stage < POINTS_OF_TREND || early {
             return None;
         }
-        let targets = self.progress.goals.targets;
+        let targets = self.state.progress.goals.targets;
         let short = |name: &str,
                      unit: &str,
                      target: Option<f64>,
@@ -212,17 +204,17 @@ impl Trainer {
         let miou =
             short("mIoU", " %", targets.miou, point.miou, curve.trend(|point| point.miou, all), MARGIN.1);
         let message = psnr.or(miou)?;
-        self.progress.goals.doubted = true;
+        self.state.progress.goals.doubted = true;
         Some(message)
     }
 
     /// What to say of targets at the end; none when there are none or all were reached.
     pub(super) fn missed_targets(&self) -> Option<String> {
-        let goals = &self.progress.goals;
+        let goals = &self.state.progress.goals;
         if goals.targets.is_empty() || goals.reached {
             return None;
         }
-        let last = self.progress.curve.points.last();
+        let last = self.state.progress.curve.points.last();
         let mut missed = Vec::new();
         let values = [
             ("PSNR", " dB", goals.targets.psnr, last.and_then(|point| point.psnr)),
@@ -241,7 +233,7 @@ impl Trainer {
         }
         Some(format!(
             "not reached on {}: {}; more Gaussians, more steps or larger images may help",
-            self.progress.curve.frames.describe(),
+            self.state.progress.curve.frames.describe(),
             missed.join(", ")
         ))
     }
@@ -257,7 +249,7 @@ impl Trainer {
                 "used_s": budget.used(self.clock.now()),
             })
         });
-        let goals = &self.progress.goals;
+        let goals = &self.state.progress.goals;
         let targets = (!goals.targets.is_empty()).then(
             || json!({ "psnr": goals.targets.psnr, "miou": goals.targets.miou, "reached": goals.reached }),
         );

@@ -18,7 +18,7 @@ fn members(object: Value) -> Map<String, Value> {
 impl Trainer {
     /// The record: how to draw the field, settings, capture, steps, times, memory, versions.
     pub(super) fn provenance(&self) -> Record {
-        let (dataset, config, progress) = (&self.dataset, &self.config, &self.progress);
+        let (dataset, config, progress) = (&self.state.dataset, &self.state.config, &self.state.progress);
         let masks = dataset.frames.iter().find_map(|frame| frame.mask.as_ref()).and_then(|mask| {
             let folder = mask.strip_prefix(&dataset.root).ok().unwrap_or(mask).components().next()?;
             folder.as_os_str().to_str().map(str::to_owned)
@@ -49,7 +49,7 @@ impl Trainer {
                     "iterations_by_stage": progress.steps,
                     "cpu_s_by_stage": progress.cpu_s,
                     "simd": self.simd_name(),
-                    "gaussians": self.field.gaussians.len(),
+                    "gaussians": self.state.field.gaussians.len(),
                     "psnr_training_views": progress.psnr,
                     "work": (progress.work.views > 0).then_some(progress.work),
                     "rolled_back": rolled_back,
@@ -66,7 +66,7 @@ impl Trainer {
                 "dataset": {
                     "layout": dataset.layout,
                     "frames": dataset.frames.len(),
-                    "training_frames": self.frames.len(),
+                    "training_frames": self.state.frames.len(),
                     "times": dataset.times.len(),
                     "instances": dataset.instances.len(),
                     "masks": masks,

@@ -2,16 +2,17 @@
 
 use cif_render::Gradients;
 
-use super::optimiser::Optimiser;
-use super::progress::{AfterStep, Progress};
 use super::saving::Saving;
-use super::step::StepLoss;
-use super::{Trainer, initialize, provenance};
+use super::{Trainer, TrainerView, initialize, provenance};
 use crate::curve::MIN_GAP;
 use crate::densify::DensifyStatistics;
+use crate::engine::Changed;
 use crate::error::TrainError;
-use crate::events::{Control, Outcome, Stage, TrainEvent, TrainerView};
+use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::optimiser::Optimiser;
+use crate::progress::{AfterStep, Progress};
 use crate::schedule::falls_on;
+use crate::step::StepLoss;
 
 /// Observer of a run.
 type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
@@ -49,36 +50,36 @@ impl Trainer {
             Err(TrainError::Stopped) => Ok(Outcome::Interrupted),
             result => result,
         };
-        self.field.record = self.provenance();
+        self.state.field.record = self.provenance();
         result
     }
 
     fn run_stages(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
         let mut requests = Requests::default();
-        self.saving = Saving::begin(self.config.report.checkpoint_seconds, self.clock.now().wall_s);
+        self.saving = Saving::begin(self.state.config.report.checkpoint_seconds, self.clock.now().wall_s);
         for message in std::mem::take(&mut self.warnings) {
             requests.add(self.emit(observer, &TrainEvent::Warning { message }));
         }
         loop {
-            let stage = self.progress.stage;
+            let stage = self.state.progress.stage;
             if stage == Stage::Done {
                 break;
             }
-            let iterations = self.stages.iterations(&self.config, stage);
+            let iterations = self.stages.iterations(&self.state.config, stage);
             let started = TrainEvent::StageStarted {
                 stage,
-                iteration: self.progress.iteration,
+                iteration: self.state.progress.iteration,
                 iterations,
-                gaussians: self.field.gaussians.len(),
+                gaussians: self.state.field.gaussians.len(),
             };
             requests.add(self.emit(observer, &started));
             if stage == Stage::Identity {
-                if requests.stop || self.stop.requested() {
+                if requests.stop || self.state.stop.requested() {
                     return Ok(Outcome::Interrupted);
                 }
                 let start = self.clock.now();
                 let event = self.estimate_identities(true)?;
-                self.progress.add_time(stage, self.clock.now() - start);
+                self.state.progress.add_time(stage, self.clock.now() - start);
                 requests.add(self.emit(observer, &event));
                 if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
                     && !empty_instances.is_empty()
@@ -92,9 +93,8 @@ impl Trainer {
             } else {
                 let outcome = self.run_steps(stage, observer, &mut requests);
                 // Whatever ended the steps, the field is whole again.
-                let fetched = self.fetch_from_gpu();
-                #[cfg(feature = "wgpu")]
-                for event in self.arrived_events() {
+                let fetched = self.fetch();
+                for event in std::mem::take(&mut self.arrived) {
                     requests.add(self.emit(observer, &event));
                 }
                 if outcome? == Outcome::Interrupted {
@@ -102,8 +102,9 @@ impl Trainer {
                 }
                 fetched?;
             }
-            let next = self.stages.after(&self.config, stage);
-            let ends = stage == Stage::Identity || next == Stage::Done || self.progress.iteration >= MIN_GAP;
+            let next = self.stages.after(&self.state.config, stage);
+            let ends =
+                stage == Stage::Identity || next == Stage::Done || self.state.progress.iteration >= MIN_GAP;
             if ends {
                 match self.follow_curve(stage, true, observer, &mut requests) {
                     // The rows are there: the run goes on behind them, without this point.
@@ -115,10 +116,10 @@ impl Trainer {
             if next == Stage::Done {
                 continue;
             }
-            if requests.stop || self.stop.requested() {
+            if requests.stop || self.state.stop.requested() {
                 return Ok(Outcome::Interrupted);
             }
-            if self.config.report.checkpoint_seconds > 0 {
+            if self.state.config.report.checkpoint_seconds > 0 {
                 self.request_checkpoint(observer, &mut requests);
             }
         }
@@ -126,13 +127,13 @@ impl Trainer {
             self.emit(observer, &TrainEvent::Warning { message });
         }
         let finished = TrainEvent::Finished {
-            wall_s: self.progress.total_wall_s(),
-            iterations: self.progress.total_steps,
-            gaussians: self.field.gaussians.len(),
-            psnr: self.progress.psnr.unwrap_or(0.0),
+            wall_s: self.state.progress.total_wall_s(),
+            iterations: self.state.progress.total_steps,
+            gaussians: self.state.field.gaussians.len(),
+            psnr: self.state.progress.psnr.unwrap_or(0.0),
             peak_rss_mb: provenance::peak_rss_mb(),
-            rolled_back: self.progress.rollbacks.total,
-            work: self.progress.work,
+            rolled_back: self.state.progress.rollbacks.total,
+            work: self.state.progress.work,
         };
         self.emit(observer, &finished);
         Ok(Outcome::Finished)
@@ -149,20 +150,20 @@ impl Trainer {
         let (mut lap, mut lap_steps) = (0.0, 0);
         self.pace_stage(stage);
         // A budget or a target may change how many there are.
-        while self.progress.after_step.is_some()
-            || self.progress.iteration < self.stages.iterations(&self.config, stage)
+        while self.state.progress.after_step.is_some()
+            || self.state.progress.iteration < self.stages.iterations(&self.state.config, stage)
         {
-            if requests.stop || self.stop.requested() {
+            if requests.stop || self.state.stop.requested() {
                 return Ok(Outcome::Interrupted);
             }
             let start = self.clock.now();
-            let resumed = self.progress.after_step;
+            let resumed = self.state.progress.after_step;
             let done = match resumed {
                 None => self.step(&mut events).map(Some),
                 Some(_) => self.finish_step(stage, &mut events).map(|()| None),
             };
             let spent = self.clock.now() - start;
-            self.progress.add_time(stage, spent);
+            self.state.progress.add_time(stage, spent);
             (lap, lap_steps) = (lap + spent.wall_s, lap_steps + u32::from(resumed.is_none()));
             for message in std::mem::take(&mut self.warnings) {
                 events.push(TrainEvent::Warning { message });
@@ -171,10 +172,10 @@ impl Trainer {
                 requests.add(self.emit(observer, &event));
             }
             let loss = done?;
-            let iteration = self.progress.iteration;
-            let iterations = self.stages.iterations(&self.config, stage);
+            let iteration = self.state.progress.iteration;
+            let iterations = self.stages.iterations(&self.state.config, stage);
             if let Some(loss) = loss
-                && (falls_on(iteration, self.config.report.step_every) || iteration == iterations)
+                && (falls_on(iteration, self.state.config.report.step_every) || iteration == iterations)
             {
                 let rate = f64::from(lap_steps) / lap.max(1e-9);
                 let event = self.step_event(stage, iterations, &loss, rate);
@@ -183,9 +184,9 @@ impl Trainer {
             }
             if let Some(share) =
                 loss.and_then(|loss| loss.unsupported).filter(|share| *share > MANY_UNSUPPORTED)
-                && !self.progress.warned_of_unsupported
+                && !self.state.progress.warned_of_unsupported
             {
-                self.progress.warned_of_unsupported = true;
+                self.state.progress.warned_of_unsupported = true;
                 let message = format!(
                     "{:.1} % of the labelled pixels of step {iteration} are covered by no Gaussian of their \
                      instance; more Gaussians or a longer fine stage may help",
@@ -194,25 +195,25 @@ impl Trainer {
                 requests.add(self.emit(observer, &TrainEvent::Warning { message }));
             }
             if resumed != Some(AfterStep::Evaluation) {
-                self.progress.after_step = Some(AfterStep::Curve);
+                self.state.progress.after_step = Some(AfterStep::Curve);
                 self.follow_curve(stage, false, observer, requests)?;
                 self.follow_budget(stage);
             }
-            self.progress.after_step = Some(AfterStep::Evaluation);
-            let total = (self.progress.total_steps % u64::from(u32::MAX)) as u32;
-            if falls_on(total, self.config.report.evaluate_every) {
-                self.fetch_from_gpu()?;
+            self.state.progress.after_step = Some(AfterStep::Evaluation);
+            let total = (self.state.progress.total_steps % u64::from(u32::MAX)) as u32;
+            if falls_on(total, self.state.config.report.evaluate_every) {
+                self.fetch()?;
                 let event = self.evaluate(stage)?;
                 requests.add(self.emit(observer, &event));
             }
-            self.progress.after_step = None;
-            let report = &self.config.report;
+            self.state.progress.after_step = None;
+            let report = &self.state.config.report;
             if falls_on(total, report.checkpoint_every)
                 || self.saving.is_due(report.checkpoint_seconds, self.clock.now().wall_s)
                 || requests.save
             {
                 requests.save = false;
-                self.fetch_from_gpu()?;
+                self.fetch()?;
                 self.request_checkpoint(observer, requests);
             }
         }
@@ -222,18 +223,14 @@ impl Trainer {
     /// Asks the observer to save the run as it stands.
     fn request_checkpoint(&mut self, observer: &mut Observer<'_>, requests: &mut Requests) {
         let start_s = self.clock.now().wall_s;
-        let Progress { stage, iteration, .. } = self.progress;
+        let Progress { stage, iteration, .. } = self.state.progress;
         requests.add(self.emit(observer, &TrainEvent::CheckpointDue { stage, iteration }));
-        self.saving.saved(self.config.report.checkpoint_seconds, start_s, self.clock.now().wall_s);
+        self.saving.saved(self.state.config.report.checkpoint_seconds, start_s, self.clock.now().wall_s);
     }
 
     /// [`TrainError::Stopped`] once a stop is requested. Work between two steps on a GPU is never left half way.
     pub(super) fn check_stop(&self) -> Result<(), TrainError> {
-        #[cfg(feature = "wgpu")]
-        if self.device.is_some() {
-            return Ok(());
-        }
-        self.stop.check()
+        if self.engine.gpu_name().is_some() { Ok(()) } else { self.state.stop.check() }
     }
 
     /// Measures a point of the curve where one is due, and acts on it.
@@ -257,14 +254,14 @@ impl Trainer {
     fn step_event(&self, stage: Stage, iterations: u32, loss: &StepLoss, rate: f64) -> TrainEvent {
         TrainEvent::Step {
             stage,
-            iteration: self.progress.iteration,
+            iteration: self.state.progress.iteration,
             iterations,
             loss: loss.total,
             color_loss: loss.color,
             instance_loss: loss.instance,
             unsupported_px: loss.unsupported,
-            gaussians: self.field.gaussians.len(),
-            psnr: self.progress.psnr.unwrap_or(0.0),
+            gaussians: self.state.field.gaussians.len(),
+            psnr: self.state.progress.psnr.unwrap_or(0.0),
             iterations_per_second: rate,
             eta_s: self.steps_left() as f64 / rate,
         }
@@ -274,20 +271,12 @@ impl Trainer {
         observer(event, &TrainerView { trainer: self })
     }
 
-    /// Brings the field and the optimiser up to date where steps run on a GPU.
-    pub(super) fn fetch_from_gpu(&mut self) -> Result<(), TrainError> {
-        #[cfg(feature = "wgpu")]
-        self.fetch_from_device()?;
-        Ok(())
-    }
-
     /// Begins a stage. The run stays at the end of the stage before it when that fails or is stopped.
     pub(super) fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
         if stage == Stage::Fine {
-            let before = (self.field.clone(), self.guidance.clone(), self.optimiser.clone());
+            let before = self.state.keep();
             if let Err(error) = self.prepare_fine() {
-                (self.field, self.guidance, self.optimiser) = before;
-                self.gradients = Gradients::zeros(&self.field);
+                self.state.put_back(before);
                 return Err(error);
             }
         }
@@ -298,22 +287,22 @@ impl Trainer {
     /// Gives the fine stage its deformation and a new optimiser (methods reference 1.3).
     fn prepare_fine(&mut self) -> Result<(), TrainError> {
         if self.stages.is_dynamic {
-            self.field.deformation = Some(initialize::initial_deformation(&self.dataset, &self.config)?);
+            self.state.field.deformation =
+                Some(initialize::initial_deformation(&self.state.dataset, &self.state.config)?);
         }
         self.start_guidance()?;
-        self.optimiser = Optimiser::new(&self.field);
-        self.gradients = Gradients::zeros(&self.field);
+        self.state.optimiser = Optimiser::new(&self.state.field);
+        self.state.gradients = Gradients::zeros(&self.state.field);
         Ok(())
     }
 
     /// Stands at the start of a stage, with the field and the optimiser as they are.
     pub(super) fn begin(&mut self, stage: Stage) {
-        self.progress.stage = stage;
-        self.progress.iteration = 0;
-        self.progress.sh_start = self.field.sh_degree;
-        self.progress.opacities_were_reset = false;
-        self.statistics = DensifyStatistics::zeros(self.field.gaussians.len());
-        #[cfg(feature = "wgpu")]
-        self.everything_changed();
+        self.state.progress.stage = stage;
+        self.state.progress.iteration = 0;
+        self.state.progress.sh_start = self.state.field.sh_degree;
+        self.state.progress.opacities_were_reset = false;
+        self.state.statistics = DensifyStatistics::zeros(self.state.field.gaussians.len());
+        self.engine.changed(Changed::Everything);
     }
 }

@@ -17,6 +17,7 @@ use super::changes::{Changes, Sight};
 use super::judged::gain;
 use super::motions::{Limits, Motion, accumulate, probe, probe_times, put_to_rest, restless, wake};
 use crate::config::EffectsConfig;
+use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::{Stage, TrainEvent};
 use crate::random::{Purpose, stream};
@@ -38,9 +39,9 @@ pub(super) const RUNGS: u32 = 3;
 impl Trainer {
     /// True when Gaussians are tested after a step.
     pub(super) fn settles(&self, stage: Stage, iteration: u32) -> bool {
-        let last = self.stages.iterations(&self.config, stage);
-        self.field.deformation.is_some()
-            && falls_due(&self.config.effects, self.first_test(), stage, iteration, last)
+        let last = self.stages.iterations(&self.state.config, stage);
+        self.state.field.deformation.is_some()
+            && falls_due(&self.state.config.effects, self.first_test(), stage, iteration, last)
     }
 
     /// The test for Gaussians that stand still, where it falls on this step: of a ladder of limits, the highest
@@ -52,17 +53,18 @@ impl Trainer {
         iteration: u32,
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        let last = self.stages.iterations(&self.config, stage);
+        let last = self.stages.iterations(&self.state.config, stage);
         let due = self.settles(stage, iteration);
-        let Some(deformation) = self.field.deformation.as_ref().filter(|_| due) else { return Ok(()) };
-        let effects = &self.config.effects;
+        let Some(deformation) = self.state.field.deformation.as_ref().filter(|_| due) else { return Ok(()) };
+        let effects = &self.state.config.effects;
         let highest = Limits {
-            displacement: effects.still_displacement * self.field.extent,
+            displacement: effects.still_displacement * self.state.field.extent,
             shape: effects.still_shape,
         };
         let allowed = f64::from(effects.still_loss);
-        let rows: Vec<u32> = (0..self.field.len() as u32).collect();
-        let mut motions = probe(deformation, &self.field.gaussians, &rows, &probe_times(&self.dataset.times));
+        let rows: Vec<u32> = (0..self.state.field.len() as u32).collect();
+        let mut motions =
+            probe(deformation, &self.state.field.gaussians, &rows, &probe_times(&self.state.dataset.times));
         let sights = self.sights(&motions)?;
         let mut watched = self.draw_watched(stage);
         for (row, _) in sights.iter().enumerate().filter(|(_, sight)| **sight == Sight::Steady) {
@@ -70,8 +72,8 @@ impl Trainer {
             (motions[row].displacement, motions[row].shape) = (0.0, 0.0);
             watched[row] = false;
         }
-        let travels: Vec<bool> = (0..motions.len()).map(|row| self.guidance.travels(row)).collect();
-        let restless = restless(&self.field, &motions, highest);
+        let travels: Vec<bool> = (0..motions.len()).map(|row| self.state.guidance.travels(row)).collect();
+        let restless = restless(&self.state.field, &motions, highest);
         // In the second half the network has learnt what moves.
         let learns = stage == Stage::Fine && iteration <= last / 2;
         let awake: Vec<bool> = (0..motions.len())
@@ -81,7 +83,7 @@ impl Trainer {
                 _ => watched[row] || restless[row] || (learns && travels[row]),
             })
             .collect();
-        let settings = self.color_settings();
+        let settings = self.state.color_settings();
         let mut error = self.judged_error(None, &settings)?;
         let mut settled = None;
         if self.is_told(stage, iteration) {
@@ -91,29 +93,29 @@ impl Trainer {
         let mut released = 0;
         if settled.is_none() {
             // Not far above the rung that held last time, so that few are tried in vain.
-            let mut rung = self.progress.still_rung.saturating_sub(1);
+            let mut rung = self.state.progress.still_rung.saturating_sub(1);
             while settled.is_none() && rung < RUNGS {
                 let limits = highest.scaled(0.5_f32.powi(rung as i32));
                 let rests = |row: usize| !awake[row] && limits.hold(&motions[row]);
                 settled = self.try_to_settle(&motions, rests, &mut error, allowed)?;
                 rung += u32::from(settled.is_none());
             }
-            self.progress.still_rung = rung.min(RUNGS - 1);
-            let mut trial = self.field.clone();
+            self.state.progress.still_rung = rung.min(RUNGS - 1);
+            let mut trial = self.state.field.clone();
             released = wake(&mut trial, &motions, |row| !highest.scaled(RELEASE).hold(&motions[row]));
             let woken = released + wake(&mut trial, &motions, |row| awake[row]);
             // Where nothing is trained, the network may do anything: what it says must fit the pictures.
             if woken > 0 && gain(self.judged_error(Some(&trial), &settings)?, error) > allowed {
-                trial = self.field.clone();
+                trial = self.state.field.clone();
                 released = 0;
                 wake(&mut trial, &motions, |row| watched[row] && highest.hold(&motions[row]));
             }
-            self.field = trial;
+            self.state.field = trial;
         }
-        #[cfg(feature = "wgpu")]
-        self.gaussians_changed();
-        let still = self.field.deformation.as_ref().map_or(0, |d| d.still.iter().filter(|s| **s).count());
-        let gaussians = self.field.len();
+        self.engine.changed(Changed::Gaussians);
+        let still =
+            self.state.field.deformation.as_ref().map_or(0, |d| d.still.iter().filter(|s| **s).count());
+        let gaussians = self.state.field.len();
         let settled = settled.unwrap_or(0);
         events.push(TrainEvent::Settled { stage, iteration, still, settled, released, gaussians });
         Ok(())
@@ -128,33 +130,33 @@ impl Trainer {
         error: &mut f64,
         allowed: f64,
     ) -> Result<Option<usize>, TrainError> {
-        let mut trial = self.field.clone();
+        let mut trial = self.state.field.clone();
         let found = put_to_rest(&mut trial, motions, wanted);
         if found > 0 {
-            let after = self.judged_error(Some(&trial), &self.color_settings())?;
+            let after = self.judged_error(Some(&trial), &self.state.color_settings())?;
             if gain(after, *error) > allowed {
                 return Ok(None);
             }
-            (self.field, *error) = (trial, after);
+            (self.state.field, *error) = (trial, after);
         }
         Ok(Some(found))
     }
 
     /// True when Gaussians will be tested on this step or a later one.
     pub(super) fn tests_to_come(&self, stage: Stage, iteration: u32) -> bool {
-        let every = self.config.effects.still_every;
+        let every = self.state.config.effects.still_every;
         if every == 0 || !self.stages.is_dynamic {
             return false;
         }
-        let last = self.stages.iterations(&self.config, Stage::Fine);
+        let last = self.stages.iterations(&self.state.config, Stage::Fine);
         match stage {
             Stage::Coarse => true,
             // The instance stage begins with a test; else the last one is in this stage.
             Stage::Fine => {
                 self.stages.has_instances
-                    || (iteration..last)
-                        .take(every as usize)
-                        .any(|later| falls_due(&self.config.effects, self.first_test(), stage, later, last))
+                    || (iteration..last).take(every as usize).any(|later| {
+                        falls_due(&self.state.config.effects, self.first_test(), stage, later, last)
+                    })
                     || iteration < self.first_test()
             }
             _ => iteration <= 1,
@@ -166,21 +168,25 @@ impl Trainer {
         if self.shows_changes {
             return 1;
         }
-        let fine_steps = f64::from(self.stages.iterations(&self.config, Stage::Fine));
-        let from = (f64::from(self.config.effects.still_from) * fine_steps).round() as u32;
-        let told = if self.guidance.knows_what_travels() { self.config.effects.still_told } else { from };
+        let fine_steps = f64::from(self.stages.iterations(&self.state.config, Stage::Fine));
+        let from = (f64::from(self.state.config.effects.still_from) * fine_steps).round() as u32;
+        let told = if self.state.guidance.knows_what_travels() {
+            self.state.config.effects.still_told
+        } else {
+            from
+        };
         from.min(told).max(1)
     }
 
     /// True when masks tell on this step what stands still: on the first test, when the network has helped everything
     /// into place and learnt little else that could be lost.
     fn is_told(&self, stage: Stage, iteration: u32) -> bool {
-        let fine_steps = self.stages.iterations(&self.config, Stage::Fine);
+        let fine_steps = self.stages.iterations(&self.state.config, Stage::Fine);
         stage == Stage::Fine
             && iteration == self.first_test()
             && TOLD_STEPS * f64::from(iteration) <= f64::from(fine_steps)
             && !self.shows_changes
-            && self.guidance.knows_what_travels()
+            && self.state.guidance.knows_what_travels()
     }
 
     /// What cameras that stay in place see at each Gaussian, where it is in the mean; empty without such cameras.
@@ -189,13 +195,13 @@ impl Trainer {
             return Ok(Vec::new());
         }
         if self.changes.is_none() {
-            self.changes = Some(Changes::find(&self.dataset, &self.frames)?);
+            self.changes = Some(Changes::find(&self.state.dataset, &self.state.frames)?);
         }
-        let (Some(changes), Some(deformation)) = (&self.changes, &self.field.deformation) else {
+        let (Some(changes), Some(deformation)) = (&self.changes, &self.state.field.deformation) else {
             return Ok(Vec::new());
         };
         let sight = |(row, motion): (usize, &Motion)| {
-            let mut place = self.field.gaussians.means[row];
+            let mut place = self.state.field.gaussians.means[row];
             if !deformation.is_still(row) {
                 accumulate(&mut place, &motion.mean.position, 1.0);
             }
@@ -207,21 +213,21 @@ impl Trainer {
     /// Which Gaussians go through the network until the next test though they could stand still. None in the
     /// instance stage, where nothing learns to move any more.
     fn draw_watched(&self, stage: Stage) -> Vec<bool> {
-        let share = if stage == Stage::Fine { self.config.effects.still_awake } else { 0.0 };
-        let mut rng = stream(self.config.seed, Purpose::Still, self.progress.total_steps);
-        (0..self.field.len()).map(|_| rng.random::<f32>() < share).collect()
+        let share = if stage == Stage::Fine { self.state.config.effects.still_awake } else { 0.0 };
+        let mut rng = stream(self.state.config.seed, Purpose::Still, self.state.progress.total_steps);
+        (0..self.state.field.len()).map(|_| rng.random::<f32>() < share).collect()
     }
 
     /// Follows a change of the set of Gaussians: copies and children of what stands still stand still.
     pub(super) fn gather_still(&mut self, parents: &[u32]) {
-        if let Some(deformation) = &mut self.field.deformation {
+        if let Some(deformation) = &mut self.state.field.deformation {
             deformation.still = deformation.gather_still(parents);
         }
     }
 
     /// Follows a relocation of one Gaussian to another.
     pub(super) fn copy_still(&mut self, to: u32, from: u32) {
-        if let Some(deformation) = &mut self.field.deformation
+        if let Some(deformation) = &mut self.state.field.deformation
             && !deformation.still.is_empty()
         {
             deformation.still[to as usize] = deformation.is_still(from as usize);
@@ -265,17 +271,17 @@ mod tests {
         (effects.still_every, effects.still_from, effects.still_awake) = (10, 0.1, 0.5);
         let mut trainer = stopped_after(&dataset, &config, 25);
         assert_eq!(trainer.stage(), Stage::Fine);
-        let rows: Vec<u32> = (0..trainer.field.len() as u32).collect();
-        let times = probe_times(&trainer.dataset.times);
+        let rows: Vec<u32> = (0..trainer.state.field.len() as u32).collect();
+        let times = probe_times(&trainer.state.dataset.times);
         let probed = |trainer: &Trainer| {
-            let deformation = trainer.field.deformation.as_ref().unwrap();
-            probe(deformation, &trainer.field.gaussians, &rows, &times)
+            let deformation = trainer.state.field.deformation.as_ref().unwrap();
+            probe(deformation, &trainer.state.field.gaussians, &rows, &times)
         };
         let motions = probed(&trainer);
-        put_to_rest(&mut trainer.field, &motions, |_| true);
-        let settings = trainer.color_settings();
+        put_to_rest(&mut trainer.state.field, &motions, |_| true);
+        let settings = trainer.state.color_settings();
         let before = trainer.judged_error(None, &settings).unwrap();
-        for value in &mut trainer.field.deformation.as_mut().unwrap().mlp {
+        for value in &mut trainer.state.field.deformation.as_mut().unwrap().mlp {
             *value *= 20.0;
         }
         let wild = probed(&trainer);

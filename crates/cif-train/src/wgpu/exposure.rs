@@ -24,12 +24,12 @@ impl CameraExposures {
     /// # Errors
     /// When the device is out of memory.
     pub(crate) fn upload(gpu: &Gpu, exposures: &Exposures) -> Result<Self, GpuError> {
-        let [values, first, second] = exposures.arrays();
+        let Exposures { values, first, second, .. } = exposures;
         Ok(Self {
             values: GpuVec::from_slice(gpu, "exposures", values)?,
             gradients: GpuVec::zeros(gpu, "gradients of the exposures", values.len())?,
             moments: GpuMoments::upload(gpu, "moments of the exposures", first, second)?,
-            cameras: exposures.cameras(),
+            cameras: exposures.cameras.len(),
         })
     }
 

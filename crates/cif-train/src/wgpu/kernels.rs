@@ -19,8 +19,8 @@ pub use cif_render::wgpu::faults as fault;
 use crate::adam::{BETA_1, BETA_2, EPSILON};
 use crate::exposure::WIDTH as EXPOSURE_FLOATS;
 use crate::losses::displacement::NO_ROTATION;
+use crate::losses::held_out;
 use crate::losses::ssim::{C1, C2};
-use crate::trainer::{FIRST_JUDGED, JUDGED_SPACING};
 
 cif_render::shared_struct! {
     /// What the losses of a view depend on.
@@ -263,9 +263,9 @@ const CONSTANTS: Snippet = Snippet {
             ("EXPOSURE_FLOATS", Constant::Unsigned(EXPOSURE_FLOATS as u32)),
             ("PAIRS_WORD", Constant::Unsigned(GpuStatistics::PAIRS as u32)),
             ("WANTED_PAIRS_WORD", Constant::Unsigned(GpuStatistics::WANTED_PAIRS as u32)),
-            ("JUDGED_SPACING", Constant::Unsigned(JUDGED_SPACING)),
-            ("JUDGED_COLUMN", Constant::Unsigned(FIRST_JUDGED.0)),
-            ("JUDGED_ROW", Constant::Unsigned(FIRST_JUDGED.1)),
+            ("JUDGED_SPACING", Constant::Unsigned(held_out::SPACING)),
+            ("JUDGED_COLUMN", Constant::Unsigned(held_out::FIRST.0)),
+            ("JUDGED_ROW", Constant::Unsigned(held_out::FIRST.1)),
             ("PLANES_FAULT", Constant::Unsigned(fault::bit(&PLANES))),
             ("MAX_WORKGROUPS", Constant::Unsigned(MAX_WORKGROUPS)),
         ])

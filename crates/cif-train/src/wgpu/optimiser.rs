@@ -13,7 +13,8 @@ use super::kernels::{
     ACCUMULATE, ADAM_GAUSSIANS, ADAM_NETWORK, ADAM_PLANES, Accumulation, GaussianRates, GroupRates, IDENTITY,
     PlaneRates, entries, fault,
 };
-use crate::adam::{BiasCorrection, PlaneWeights, RowRates, factors};
+use crate::adam::planes::factors;
+use crate::adam::{BiasCorrection, PlaneWeights, RowRates};
 
 /// Learning rates of a parameter, and the steps that it has done with this one.
 #[derive(Clone, Copy, Debug, PartialEq)]

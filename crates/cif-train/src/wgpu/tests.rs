@@ -62,7 +62,7 @@ fn faults_have_the_names_of_the_cpu() {
     assert_eq!(fault_name(fault::EXPOSURES), ("gradients", "gradient of exposures".to_owned()));
     assert_eq!(fault_name(bit(&PLANES)), ("gradients", "gradient of planes".to_owned()));
     assert_eq!(fault_name(fault::INSTANCE_LOSS), ("losses", "instance loss".to_owned()));
-    assert_eq!(fault::MAX_GRADIENT, crate::trainer::MAX_GRADIENT, "both backends refuse the same gradients");
+    assert_eq!(fault::MAX_GRADIENT, crate::guard::MAX_GRADIENT, "both backends refuse the same gradients");
 }
 
 /// A view larger than a few workgroups, with partial windows at every border.
@@ -161,7 +161,7 @@ fn some_exposures(cameras: usize) -> Exposures {
     let mut exposures = Exposures::neutral((0..cameras).map(|k| format!("camera {k:04}")).collect());
     let values = (0..cameras * WIDTH).map(|k| 0.2 * wave(k, 0.71)).collect();
     let zeros = vec![0.0; cameras * WIDTH];
-    exposures.set_arrays([values, zeros.clone(), zeros]);
+    (exposures.values, exposures.first, exposures.second) = (values, zeros.clone(), zeros);
     exposures
 }
 
@@ -250,8 +250,10 @@ fn exposures_move_as_on_the_cpu() {
             commands.submit();
         }
         let found = resident.read(&gpu).unwrap();
-        for ((name, found), expected) in
-            ["exposures", "first moments", "second moments"].iter().zip(&found).zip(cpu.arrays())
+        for ((name, found), expected) in ["exposures", "first moments", "second moments"]
+            .iter()
+            .zip(&found)
+            .zip([&cpu.values, &cpu.first, &cpu.second])
         {
             compare(name, found, expected, TOLERANCE);
         }

@@ -361,7 +361,7 @@ fn a_lost_device_leaves_what_was_fetched_last() {
             Control::Continue
         })
         .unwrap_err();
-    assert!(matches!(error, TrainError::Gpu(_)), "{error}");
+    assert!(matches!(error, TrainError::Device(_)), "{error}");
     assert!(trainer.gpu_name().is_none());
     // The state was fetched when the fine stage began; densification leaves it on the device. What came after is gone.
     assert_eq!(trainer.steps_done(), 15, "{error}");

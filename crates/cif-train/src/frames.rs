@@ -12,7 +12,7 @@ use crate::stop::Stop;
 use crate::tracks::{misfits, observe};
 
 /// A decoded frame.
-pub(super) struct TrainFrame {
+pub(crate) struct TrainFrame {
     /// Target colours.
     pub image: PixelGrid<[u8; 3]>,
     /// Dense instance index + 1, 0 = unlabelled; `None` without a mask.
@@ -22,7 +22,7 @@ pub(super) struct TrainFrame {
 }
 
 /// All training frames of a capture.
-pub(super) struct FrameStore {
+pub(crate) struct FrameStore {
     /// Index in the capture, and the frame where it fits into memory.
     frames: Vec<(usize, Option<Arc<TrainFrame>>)>,
     label_of_id: Vec<u16>,
@@ -34,7 +34,7 @@ const BATCH: usize = 32;
 
 impl FrameStore {
     /// Decodes frames until the budget is used.
-    pub(super) fn open(
+    pub(crate) fn open(
         dataset: &Dataset,
         background: [f32; 3],
         budget: u64,
@@ -70,22 +70,22 @@ impl FrameStore {
     }
 
     /// Number of training frames.
-    pub(super) fn len(&self) -> usize {
+    pub(crate) fn len(&self) -> usize {
         self.frames.len()
     }
 
     /// Frames that are decoded again whenever they are needed.
-    pub(super) fn not_kept(&self) -> usize {
+    pub(crate) fn not_kept(&self) -> usize {
         self.frames.iter().filter(|(_, frame)| frame.is_none()).count()
     }
 
     /// Index in the capture of training frame `k`.
-    pub(super) fn index(&self, k: usize) -> usize {
+    pub(crate) fn index(&self, k: usize) -> usize {
         self.frames[k].0
     }
 
     /// Training frame `k`.
-    pub(super) fn get(&self, dataset: &Dataset, k: usize) -> Result<Arc<TrainFrame>, TrainError> {
+    pub(crate) fn get(&self, dataset: &Dataset, k: usize) -> Result<Arc<TrainFrame>, TrainError> {
         match &self.frames[k].1 {
             Some(frame) => Ok(Arc::clone(frame)),
             None => Ok(Arc::new(self.load(dataset, k)?)),
@@ -93,7 +93,7 @@ impl FrameStore {
     }
 
     /// True when any frame has a labelled pixel; frames not kept count by having a mask.
-    pub(super) fn has_labels(&self, dataset: &Dataset) -> bool {
+    pub(crate) fn has_labels(&self, dataset: &Dataset) -> bool {
         self.frames.iter().any(|(index, frame)| match frame {
             Some(frame) => frame.labelled > 0,
             None => dataset.frames[*index].mask.is_some(),
@@ -102,7 +102,7 @@ impl FrameStore {
 
     /// Leaves out the training frames whose masks contradict the others (see [`misfits`]); their indices in the
     /// capture.
-    pub(super) fn leave_out_misfits(
+    pub(crate) fn leave_out_misfits(
         &mut self,
         dataset: &Dataset,
         limit: f64,
@@ -124,7 +124,7 @@ impl FrameStore {
     }
 
     /// Renames dense labels, in frames kept and in those decoded later.
-    pub(super) fn relabel(&mut self, new_label: impl Fn(u16) -> u16) {
+    pub(crate) fn relabel(&mut self, new_label: impl Fn(u16) -> u16) {
         let rename = |label: &u16| if *label == UNLABELLED { UNLABELLED } else { new_label(label - 1) + 1 };
         self.label_of_id.iter_mut().for_each(|label| *label = rename(label));
         for frame in self.frames.iter_mut().filter_map(|(_, frame)| frame.as_mut()) {

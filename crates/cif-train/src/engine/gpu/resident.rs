@@ -1,17 +1,18 @@
 //! What lies on the device: the field, its moments and gradients.
 
-use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES};
-use cif_field::{Field, Gaussians, Identities};
+use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES, Parameter, Rows};
+use cif_field::{Gaussians, Identities};
 use cif_render::wgpu::deform::DeformationGradients;
 use cif_render::wgpu::gaussians::{gaussians, geometry};
 use cif_render::wgpu::{
     Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuVec, PosedInput,
 };
 
-use super::super::optimiser::Optimiser;
+use crate::adam::Moments;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
-use crate::exposure::Exposures;
+use crate::optimiser::Optimiser;
+use crate::state::State;
 use crate::wgpu::exposure::CameraExposures;
 use crate::wgpu::optimiser::GpuMoments;
 
@@ -62,11 +63,17 @@ pub(super) struct Resident {
     pub(super) exposures: Option<CameraExposures>,
 }
 
+/// Moments of a parameter of the table.
+fn moments_of<'a>(optimiser: &'a Optimiser, parameter: &Parameter) -> &'a Moments {
+    let mut groups = optimiser.groups().iter();
+    &groups.find(|(other, _)| other == parameter).expect("a parameter of the table").1
+}
+
 /// First or `second` moments of the Gaussians.
-fn moment_rows(optimiser: &mut Optimiser, second: bool, gaussians: usize) -> Gaussians {
+fn moment_rows(optimiser: &Optimiser, second: bool, gaussians: usize) -> Gaussians {
     let mut rows = Gaussians::zeros(gaussians);
     for (parameter, values) in rows.tensors_mut() {
-        let moments = optimiser.of(&parameter);
+        let moments = moments_of(optimiser, &parameter);
         values.copy_from_slice(if second { &moments.second } else { &moments.first });
     }
     rows
@@ -77,6 +84,20 @@ fn set_moment_rows(optimiser: &mut Optimiser, second: bool, rows: &Gaussians) {
     for (parameter, values) in rows.tensors() {
         let moments = optimiser.of(&parameter);
         *(if second { &mut moments.second } else { &mut moments.first }) = values.to_vec();
+    }
+}
+
+/// Replaces both moments of a parameter.
+pub(super) fn set_moments(optimiser: &mut Optimiser, parameter: &Parameter, [first, second]: [Vec<f32>; 2]) {
+    let moments = optimiser.of(parameter);
+    (moments.first, moments.second) = (first, second);
+}
+
+/// Takes the shape of another set of Gaussians whose moments are on the device; they are zero here.
+pub(super) fn resize_moments(optimiser: &mut Optimiser, rows: usize) {
+    let groups = optimiser.groups_mut().iter_mut();
+    for (parameter, moments) in groups.filter(|(parameter, _)| parameter.rows == Rows::Gaussians) {
+        *moments = Moments { steps: moments.steps, ..Moments::zeros(rows, parameter.width()) };
     }
 }
 
@@ -100,9 +121,9 @@ impl ResidentIdentities {
         gpu: &Gpu,
         rows: &Identities,
         instances: usize,
-        optimiser: &mut Optimiser,
+        optimiser: &Optimiser,
     ) -> Result<Self, GpuError> {
-        let moments = optimiser.of(&LOG_CALIBRATIONS);
+        let moments = moments_of(optimiser, &LOG_CALIBRATIONS);
         Ok(Self {
             rows: DeviceIdentities::from_identities(gpu, rows, instances)?,
             log_estimates: GpuVec::from_slice(gpu, "identity estimates", &rows.log_estimates)?,
@@ -137,15 +158,8 @@ impl Resident {
     }
 
     /// Sends what is stale.
-    pub(super) fn send(
-        &mut self,
-        gpu: &Gpu,
-        stale: Stale,
-        field: &Field,
-        optimiser: &mut Optimiser,
-        statistics: &DensifyStatistics,
-        exposures: Option<&Exposures>,
-    ) -> Result<(), GpuError> {
+    pub(super) fn send(&mut self, gpu: &Gpu, stale: Stale, state: &State) -> Result<(), GpuError> {
+        let State { field, optimiser, statistics, .. } = state;
         if stale.gaussians {
             let n = field.gaussians.len();
             self.canonical.replace(gpu, &field.gaussians)?;
@@ -169,8 +183,8 @@ impl Resident {
                 None => None,
                 Some(deformation) => {
                     let parameters = GpuDeformation::new(gpu, deformation)?;
-                    let mut moments = |label, parameter| {
-                        let moments = optimiser.of(parameter);
+                    let moments = |label, parameter| {
+                        let moments = moments_of(optimiser, parameter);
                         GpuMoments::upload(gpu, label, &moments.first, &moments.second)
                     };
                     Some(ResidentDeformation {
@@ -185,6 +199,7 @@ impl Resident {
             };
         }
         if stale.exposures {
+            let exposures = state.progress.exposures.as_ref();
             self.exposures =
                 exposures.map(|exposures| CameraExposures::upload(gpu, exposures)).transpose()?;
         }
@@ -198,14 +213,7 @@ impl Resident {
     }
 
     /// Reads everything that steps change, waiting for the device.
-    pub(super) fn fetch(
-        &self,
-        gpu: &Gpu,
-        field: &mut Field,
-        optimiser: &mut Optimiser,
-        statistics: &mut DensifyStatistics,
-        exposures: Option<&mut Exposures>,
-    ) -> Result<(), TrainError> {
+    pub(super) fn fetch(&self, gpu: &Gpu, state: &mut State) -> Result<(), TrainError> {
         // Everything is read before anything is changed, so that a device lost on the way leaves the host whole.
         let parameters = (self.canonical.geometry.read(gpu)?, self.canonical.sh.read(gpu)?);
         let mut moments = Vec::new();
@@ -236,6 +244,8 @@ impl Resident {
             ]),
         };
         let of_cameras = self.exposures.as_ref().map(|resident| resident.read(gpu)).transpose()?;
+        let State { field, optimiser, statistics, progress, .. } = state;
+        let exposures = progress.exposures.as_mut();
         debug_assert_eq!(geometry(&field.gaussians).len(), parameters.0.len(), "the set changes on the host");
         field.gaussians = gaussians(&parameters.0, parameters.1);
         for (second, rows) in [false, true].into_iter().zip(moments) {
@@ -243,18 +253,18 @@ impl Resident {
         }
         *statistics = statistics_of(&rows);
         if let (Some(target), Some(arrays)) = (exposures, of_cameras) {
-            target.set_arrays(arrays);
+            [target.values, target.first, target.second] = arrays;
         }
         if let (Some(target), Some(([planes, first, second], [mlp, mlp_first, mlp_second]))) =
             (&mut field.deformation, deformation)
         {
             (target.planes, target.mlp) = (planes, mlp);
-            optimiser.of(&PLANES).set(first, second);
-            optimiser.of(&MLP).set(mlp_first, mlp_second);
+            set_moments(optimiser, &PLANES, [first, second]);
+            set_moments(optimiser, &MLP, [mlp_first, mlp_second]);
         }
         if let (Some(target), Some([values, first, second])) = (&mut field.identities, calibrations) {
             target.log_calibrations = values;
-            optimiser.of(&LOG_CALIBRATIONS).set(first, second);
+            set_moments(optimiser, &LOG_CALIBRATIONS, [first, second]);
         }
         Ok(())
     }

@@ -4,19 +4,19 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use super::guard::Rollbacks;
-use super::pacing::Goals;
-use super::times::Work;
+use crate::budget::Targets;
 use crate::clock::Seconds;
 use crate::config::TrainConfig;
 use crate::curve::Curve;
 use crate::events::Stage;
 use crate::exposure::Exposures;
+use crate::guard::Rollbacks;
+use crate::times::Work;
 
 /// Counters of a run; saved with its state.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Progress {
+pub(crate) struct Progress {
     /// Current stage.
     pub stage: Stage,
     /// Steps done in it.
@@ -73,10 +73,22 @@ pub(super) struct Progress {
     pub source: Option<Source>,
 }
 
+/// What a run is held to; saved with its state, but for the budget, which is one of a single call.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub(crate) struct Goals {
+    /// What is to be reached.
+    pub targets: Targets,
+    /// True when all of it was.
+    pub reached: bool,
+    /// True when the user was told that a target is out of reach.
+    pub doubted: bool,
+}
+
 /// What follows a step, in order; each is done as a whole or not at all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub(super) enum AfterStep {
+pub(crate) enum AfterStep {
     /// Densification; refreshed identities and resampling in the instance stage.
     Changes,
     /// Judgement of the optional outputs of the deformation.
@@ -92,7 +104,7 @@ pub(super) enum AfterStep {
 /// A scene that a run began with, as recorded.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Source {
+pub(crate) struct Source {
     /// What it was called, without its folder.
     pub scene: String,
     /// Its Gaussians.
@@ -112,7 +124,7 @@ const MAX_PSNR: f64 = 100.0;
 
 impl Progress {
     /// What no run leads to, in progress that was read.
-    pub(super) fn problem(&self) -> Option<&'static str> {
+    pub(crate) fn problem(&self) -> Option<&'static str> {
         let degrees = [self.sh_start, self.sh_judged, self.sh_cap.unwrap_or(0)];
         let steps = self.steps.values().chain([&self.total_steps]);
         if degrees.iter().any(|degree| *degree > 3) {
@@ -127,15 +139,14 @@ impl Progress {
     }
 
     /// A step of the current stage is done.
-    pub(super) fn count_step(&mut self) {
+    pub(crate) fn count_step(&mut self) {
         self.iteration += 1;
         self.total_steps += 1;
         *self.steps.entry(self.stage.name().to_owned()).or_default() += 1;
     }
 
     /// The last steps of the current stage are not done after all.
-    #[cfg(feature = "wgpu")]
-    pub(super) fn uncount_steps(&mut self, steps: u32) {
+    pub(crate) fn uncount_steps(&mut self, steps: u32) {
         self.iteration -= steps;
         self.total_steps -= u64::from(steps);
         if let Some(of_stage) = self.steps.get_mut(self.stage.name()) {
@@ -143,7 +154,7 @@ impl Progress {
         }
     }
 
-    pub(super) fn at(stage: Stage) -> Self {
+    pub(crate) fn at(stage: Stage) -> Self {
         Self {
             stage,
             iteration: 0,
@@ -169,28 +180,28 @@ impl Progress {
         }
     }
 
-    pub(super) fn add_psnr(&mut self, psnr: f64) {
+    pub(crate) fn add_psnr(&mut self, psnr: f64) {
         let psnr = psnr.min(MAX_PSNR);
         self.psnr = Some(self.psnr.map_or(psnr, |mean| mean + PSNR_SHARE * (psnr - mean)));
     }
 
-    pub(super) fn add_time(&mut self, stage: Stage, spent: Seconds) {
+    pub(crate) fn add_time(&mut self, stage: Stage, spent: Seconds) {
         *self.wall_s.entry(stage.name().to_owned()).or_default() += spent.wall_s;
         *self.cpu_s.entry(stage.name().to_owned()).or_default() += spent.cpu_s;
     }
 
-    pub(super) fn total_cpu_s(&self) -> f64 {
+    pub(crate) fn total_cpu_s(&self) -> f64 {
         self.cpu_s.values().sum()
     }
 
-    pub(super) fn total_wall_s(&self) -> f64 {
+    pub(crate) fn total_wall_s(&self) -> f64 {
         self.wall_s.values().sum()
     }
 }
 
 /// What decides which stages a run has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Stages {
+pub(crate) struct Stages {
     /// More than one time.
     pub is_dynamic: bool,
     /// Masks with labelled pixels.
@@ -199,7 +210,7 @@ pub(super) struct Stages {
 
 impl Stages {
     /// Steps of a stage.
-    pub(super) fn iterations(self, config: &TrainConfig, stage: Stage) -> u32 {
+    pub(crate) fn iterations(self, config: &TrainConfig, stage: Stage) -> u32 {
         match stage {
             Stage::Coarse if self.is_dynamic => config.stages.coarse,
             Stage::Fine if self.is_dynamic => config.fine_iterations(),
@@ -210,7 +221,7 @@ impl Stages {
     }
 
     /// The first stage with something to do from `stage` on.
-    pub(super) fn from(self, config: &TrainConfig, stage: Stage) -> Stage {
+    pub(crate) fn from(self, config: &TrainConfig, stage: Stage) -> Stage {
         [Stage::Coarse, Stage::Fine, Stage::Identity, Stage::Instance]
             .into_iter()
             .filter(|candidate| *candidate >= stage)
@@ -222,7 +233,7 @@ impl Stages {
     }
 
     /// The stage after `stage`.
-    pub(super) fn after(self, config: &TrainConfig, stage: Stage) -> Stage {
+    pub(crate) fn after(self, config: &TrainConfig, stage: Stage) -> Stage {
         let next = match stage {
             Stage::Coarse => Stage::Fine,
             Stage::Fine => Stage::Identity,
@@ -233,7 +244,7 @@ impl Stages {
     }
 
     /// Steps left after `iteration` steps of `stage`.
-    pub(super) fn steps_left(self, config: &TrainConfig, stage: Stage, iteration: u32) -> u64 {
+    pub(crate) fn steps_left(self, config: &TrainConfig, stage: Stage, iteration: u32) -> u64 {
         [Stage::Coarse, Stage::Fine, Stage::Instance]
             .into_iter()
             .filter(|other| *other >= stage)

@@ -1,56 +1,47 @@
-//! Label mass for the identity stage, counted on the device; its twin is `trainer/identity.rs`.
+//! Label mass for the identity stage, counted on the device.
 
 use cif_render::UNLABELLED;
 use cif_render::cpu::IdentityCounts;
 use cif_render::wgpu::{Commands, GpuIdentityCounts, ViewInput};
 
-use super::super::Trainer;
-use super::DeviceTraining;
+use super::GpuEngine;
 use crate::error::TrainError;
+use crate::state::State;
 use crate::wgpu::losses::GpuTarget;
 
-impl Trainer {
+impl GpuEngine {
     /// Counts of the training views with labels, and how many there were, where the device holds a table of them; the
-    /// host's field is up to date.
-    pub(in crate::trainer) fn count_on_device(
+    /// state is up to date.
+    pub(super) fn count_on_device(
         &mut self,
+        state: &mut State,
     ) -> Result<Option<(IdentityCounts, usize)>, TrainError> {
-        let Some(mut device) = self.device.take() else { return Ok(None) };
-        let counted = self.count_with(&mut device);
-        self.device = Some(device);
-        counted
-    }
-
-    fn count_with(
-        &mut self,
-        device: &mut DeviceTraining,
-    ) -> Result<Option<(IdentityCounts, usize)>, TrainError> {
-        let (n, instances) = (self.field.gaussians.len(), self.field.instances.len());
-        if !GpuIdentityCounts::fits(&device.gpu, n, instances) {
+        let (n, instances) = (state.field.gaussians.len(), state.field.instances.len());
+        if !GpuIdentityCounts::fits(&self.gpu, n, instances) {
             return Ok(None);
         }
-        self.send(device)?;
-        let settings = self.color_settings();
-        let DeviceTraining { gpu, rasterizer, targets, resident, .. } = device;
+        self.send(state)?;
+        let settings = state.color_settings();
+        let Self { gpu, rasterizer, targets, resident, .. } = self;
         let Some(resident) = resident else { return Ok(None) };
         let mut counts = GpuIdentityCounts::zeros(gpu, n, instances)?;
         let mut frames = 0;
-        for view in (0..self.frames.len()).step_by(self.config.identity.stride as usize) {
-            let data = self.frames.get(&self.dataset, view)?;
+        for view in state.views_of_identities() {
+            let data = state.frames.get(&state.dataset, view)?;
             let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
             let mut present: Vec<u16> = labels.pixels.clone();
             present.sort_unstable();
             present.dedup();
             present.retain(|label| *label != UNLABELLED);
             let fresh;
-            let target = match targets.get(&view) {
+            let target = match targets.get(&state.frames.index(view)) {
                 Some(target) => target,
                 None => {
                     fresh = GpuTarget::new(gpu, &data.image, Some(labels))?;
                     &fresh
                 }
             };
-            let frame = &self.dataset.frames[self.frames.index(view)];
+            let frame = &state.dataset.frames[state.frames.index(view)];
             let mut commands = Commands::new(gpu, None);
             let posed = resident.pose(gpu, &mut commands, frame.time);
             let input = ViewInput { camera: &frame.camera, settings: &settings, labels: None };
@@ -62,7 +53,7 @@ impl Trainer {
             counts.add_view(gpu, &mut commands, rasterizer, &target.labels, &present)?;
             commands.submit();
             gpu.check()?;
-            self.add_label_pixels(labels);
+            state.add_label_pixels(labels);
             frames += 1;
         }
         Ok(Some((counts.read(gpu)?, frames)))

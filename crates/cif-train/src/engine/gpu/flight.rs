@@ -10,12 +10,11 @@ use std::collections::VecDeque;
 
 use cif_render::wgpu::{Gpu, GpuError, GpuStatistics, PendingWords, Readback, Submission, faults};
 
-use super::super::step::{StepLoss, ViewReport};
-use super::super::step_plan::StepPlan;
-use super::DeviceTraining;
-use super::step::Recording;
+use super::GpuEngine;
+use super::step::{Recording, uncount};
 use crate::error::TrainError;
-use crate::trainer::Trainer;
+use crate::state::State;
+use crate::step::{StepReport, ViewReport};
 use crate::wgpu::kernels::fault;
 use crate::wgpu::losses::ViewLoss;
 
@@ -134,82 +133,59 @@ impl Flights {
     }
 }
 
-impl Trainer {
-    /// Takes in the steps that have arrived; `all` waits for every one that was recorded.
-    pub(super) fn receive(&mut self, device: &mut DeviceTraining, all: bool) -> Result<(), TrainError> {
-        while let Some((recording, results)) = device.flights.next(&device.gpu, &mut device.readback, all)? {
-            for view in &results {
-                device.learn(&view.counts);
-            }
+impl GpuEngine {
+    /// The oldest step on its way, once it has arrived; `all` waits for it.
+    pub(super) fn receive_step(
+        &mut self,
+        state: &mut State,
+        all: bool,
+    ) -> Result<Option<StepReport>, TrainError> {
+        self.record_again(state)?;
+        loop {
+            let Some((recording, results)) = self.flights.next(&self.gpu, &mut self.readback, all)? else {
+                return Ok(None);
+            };
+            self.learn(&results);
             let [found, waits] = results.last().map_or([0; 2], |view| view.faults);
             if waits == 0 {
-                self.take_in_results(&recording.plan, &results);
-                device.make_room(recording.plan.gaussians)?;
+                for view in &results {
+                    state.times.views += 1;
+                    state.times.gaussians += view.about.gaussians as u64;
+                    state.times.visible += u64::from(view.counts.visible);
+                    state.times.tile_pairs += u64::from(view.counts.pairs);
+                }
+                self.make_room(recording.gaussians)?;
+                let views = results.iter().map(ViewResult::report).collect();
+                return Ok(Some(StepReport { plan: recording.plan, views, fault: None }));
+            }
+            // It and those behind it moved nothing.
+            while let Some((later, results)) = self.flights.next(&self.gpu, &mut self.readback, true)? {
+                self.learn(&results);
+                self.again.push(later);
+            }
+            // Sums of these steps are empty: their own optimiser took them, and moved nothing.
+            self.faults.write(&self.gpu, 0, &[0; faults::WORDS]);
+            if found & fault::NO_ROOM != 0 {
+                self.make_room(recording.gaussians)?;
+                self.again.insert(0, recording);
+                self.record_again(state)?;
                 continue;
             }
-            self.redo(device, recording, found)?;
-        }
-        Ok(())
-    }
-
-    /// Leaves out a step that must not be taken, or makes room for it, and records it and those after it again.
-    fn redo(
-        &mut self,
-        device: &mut DeviceTraining,
-        recording: Recording,
-        found: u32,
-    ) -> Result<(), TrainError> {
-        let mut again = Vec::new();
-        while let Some((later, results)) = device.flights.next(&device.gpu, &mut device.readback, true)? {
-            for view in &results {
-                device.learn(&view.counts);
-            }
-            again.push(later);
-        }
-        // Sums of these steps are empty: their own optimiser took them, and moved nothing.
-        device.faults.write(&device.gpu, 0, &[0; faults::WORDS]);
-        if found & fault::NO_ROOM != 0 {
-            device.make_room(recording.plan.gaussians)?;
-            again.insert(0, recording);
-        } else {
-            let fault = self.diagnose(device, &recording, found)?;
-            self.uncount(recording.moving);
-            for later in &mut again {
+            uncount(state, recording.moving);
+            for later in &mut self.again {
                 later.uncount(recording.moving);
             }
-            match self.count_bad_step(recording.plan.stage, recording.plan.iteration, fault) {
-                Ok(event) => self.arrived.push(event),
-                Err(error) => {
-                    self.forget(&again);
-                    return Err(error);
-                }
-            }
+            let fault = self.diagnose(state, &recording, found)?;
+            return Ok(Some(StepReport { plan: recording.plan, views: Vec::new(), fault: Some(fault) }));
         }
-        for later in again {
-            self.record(device, later)?;
+    }
+
+    /// Records the steps again that were behind one that must not be taken.
+    pub(super) fn record_again(&mut self, state: &mut State) -> Result<(), TrainError> {
+        for recording in std::mem::take(&mut self.again) {
+            self.record(state, recording)?;
         }
         Ok(())
-    }
-
-    /// Stands before a step again that ended the run; those after it have moved nothing either.
-    fn forget(&mut self, later: &[Recording]) {
-        for step in later {
-            self.uncount(step.moving);
-        }
-        self.progress.uncount_steps(1 + later.len() as u32);
-    }
-
-    /// Losses and counts of a step that was taken.
-    fn take_in_results(&mut self, plan: &StepPlan, results: &[ViewResult]) {
-        let reports: Vec<ViewReport> = results.iter().map(ViewResult::report).collect();
-        for view in results {
-            self.times.views += 1;
-            self.times.gaussians += view.about.gaussians as u64;
-            self.times.visible += u64::from(view.counts.visible);
-            self.times.tile_pairs += u64::from(view.counts.pairs);
-        }
-        self.last_loss = StepLoss::new(plan, &reports, self.config.loss.lambda_instance);
-        self.take_in(&reports);
     }
 }
 
@@ -224,11 +200,13 @@ impl ViewResult {
     }
 }
 
-impl DeviceTraining {
+impl GpuEngine {
     /// Remembers the most that a view wanted.
-    fn learn(&mut self, counts: &GpuStatistics) {
-        let wanted = [counts.wanted_pairs, counts.wanted_slots];
-        self.wanted = [0, 1].map(|k| self.wanted[k].max(wanted[k] as usize));
+    fn learn(&mut self, views: &[ViewResult]) {
+        for view in views {
+            let wanted = [view.counts.wanted_pairs, view.counts.wanted_slots];
+            self.wanted = [0, 1].map(|k| self.wanted[k].max(wanted[k] as usize));
+        }
     }
 
     /// Room for what views have wanted, grown with the set, and a quarter more where the device has it: what is

@@ -3,18 +3,23 @@
 use cif_field::Field;
 use cif_field::parameters::OPACITY_LOGITS;
 use cif_render::wgpu::{Gpu, GpuError, testing};
+use cif_render::{Channels, RenderSettings, RenderedImage};
 use tempfile::TempDir;
 
-use super::super::guard_tests::support::{Scene, capture, small_config};
-use super::super::optimiser::Optimiser;
 use super::Trainer;
+use super::guard_tests::support::{Scene, capture, small_config};
 use crate::clock::{Clock, Seconds};
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
+use crate::engine::Views;
+use crate::engine::gpu::GpuEngine;
+use crate::engine::processor::Processor;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent};
 use crate::exposure::Exposures;
-use crate::trainer::{InstancePass, MAX_ROLLBACKS_IN_A_ROW};
+use crate::guard::MAX_ROLLBACKS_IN_A_ROW;
+use crate::optimiser::Optimiser;
+use crate::trainer::InstancePass;
 
 pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     trainer_with(gpu, |_| {})
@@ -30,7 +35,7 @@ fn trainer_with(gpu: Option<&Gpu>, edit: impl FnOnce(&mut TrainConfig)) -> (Trai
     config.effects.exposure = true;
     edit(&mut config);
     let mut trainer = Trainer::new(dataset, config).unwrap();
-    assert!(trainer.progress.exposures.is_some());
+    assert!(trainer.state.progress.exposures.is_some());
     if let Some(gpu) = gpu {
         trainer.use_gpu(gpu).unwrap();
     }
@@ -39,14 +44,19 @@ fn trainer_with(gpu: Option<&Gpu>, edit: impl FnOnce(&mut TrainConfig)) -> (Trai
 
 /// What steps change, brought to the host.
 fn state(trainer: &mut Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
-    trainer.fetch_from_device().unwrap();
+    trainer.fetch().unwrap();
     host(trainer)
 }
 
 /// What the host has of it.
 fn host(trainer: &Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
-    let exposures = trainer.progress.exposures.clone().unwrap();
-    (trainer.field.clone(), trainer.optimiser.clone(), trainer.statistics.clone(), exposures)
+    let exposures = trainer.state.progress.exposures.clone().unwrap();
+    (
+        trainer.state.field.clone(),
+        trainer.state.optimiser.clone(),
+        trainer.state.statistics.clone(),
+        exposures,
+    )
 }
 
 /// One step, and what it told.
@@ -56,19 +66,8 @@ pub(super) fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainE
     (result, events)
 }
 
-/// Puts a value into the gradients of the next step, behind the back of everything: into those of a Gaussian's
-/// geometry, or of the exposures.
-fn damage(trainer: &mut Trainer, column: Option<usize>, value: f32) {
-    let device = trainer.device.as_mut().unwrap();
-    let resident = device.resident.as_ref().unwrap();
-    match column {
-        Some(column) => {
-            let mut row = [0.0; 12];
-            row[column] = value;
-            resident.gradients.geometry.write(&device.gpu, 3, &[row]);
-        }
-        None => resident.exposures.as_ref().unwrap().gradients().write(&device.gpu, 7, &[value]),
-    }
+fn device(trainer: &mut Trainer) -> &mut GpuEngine {
+    GpuEngine::of(&mut *trainer.engine)
 }
 
 #[test]
@@ -84,7 +83,7 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
         step(&mut trainer).0.unwrap();
         let before = state(&mut trainer);
         let (iteration, counters) = (trainer.iteration(), before.1.clone());
-        damage(&mut trainer, column, value);
+        device(&mut trainer).damage(column, value);
         let mut told = Vec::new();
         for _ in 0..4 {
             let (result, events) = step(&mut trainer);
@@ -92,7 +91,7 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
             told.extend(events);
         }
         state(&mut trainer);
-        told.extend(trainer.arrived_events());
+        told.extend(std::mem::take(&mut trainer.arrived));
         let [TrainEvent::RolledBack { stage: Stage::Coarse, iteration: at, fault, in_a_row: 1, total: 1 }] =
             &told[..]
         else {
@@ -101,21 +100,22 @@ fn a_bad_step_moves_nothing_and_those_recorded_after_it_are_done_as_if_it_had_no
         assert_eq!((*at, fault.part, fault.tensor.as_str()), (iteration + 1, "gradients", tensor));
         assert!(fault.value.contains("on the GPU alone"), "{fault}");
         assert_eq!((trainer.iteration(), trainer.rolled_back()), (iteration + 4, 1));
-        assert_eq!(trainer.progress.rollbacks.in_a_row, 0);
+        assert_eq!(trainer.state.progress.rollbacks.in_a_row, 0);
         // Centres, log-scales, quaternions, opacities.
-        for ((parameter, now), (_, then)) in trainer.optimiser.groups().iter().zip(counters.groups()).take(4)
+        for ((parameter, now), (_, then)) in
+            trainer.state.optimiser.groups().iter().zip(counters.groups()).take(4)
         {
             assert_eq!(now.steps, then.steps + 3, "{}", parameter.name);
             assert!(now.first.iter().all(|v| v.is_finite()));
         }
-        let mut exposures = trainer.progress.exposures.clone().unwrap();
-        assert_eq!(*exposures.steps_mut(), *before.3.clone().steps_mut() + 3);
-        assert!(exposures.arrays()[0].iter().all(|value| value.is_finite() && *value != 0.0));
+        let exposures = trainer.state.progress.exposures.clone().unwrap();
+        assert_eq!(exposures.steps, before.3.steps + 3);
+        assert!(exposures.values.iter().all(|value| value.is_finite() && *value != 0.0));
         // The same steps without the bad one.
         let (mut other, _folder) = self::trainer(Some(&gpu));
         step(&mut other).0.unwrap();
-        other.progress.iteration += 1;
-        other.progress.total_steps += 1;
+        other.state.progress.iteration += 1;
+        other.state.progress.total_steps += 1;
         for _ in 0..3 {
             step(&mut other).0.unwrap();
         }
@@ -129,13 +129,13 @@ fn what_the_processor_would_refuse_too_is_told_in_its_words() {
     let fault_on = |gpu: Option<&Gpu>| {
         let (mut trainer, _folder) = trainer(gpu);
         trainer.set_debug_validation(gpu.is_none());
-        for row in &mut trainer.field.gaussians.sh_coefficients {
+        for row in &mut trainer.state.field.gaussians.sh_coefficients {
             row[0] = 3e38;
         }
         let (result, mut events) = step(&mut trainer);
         result.unwrap();
-        trainer.fetch_from_device().unwrap();
-        events.extend(trainer.arrived_events());
+        trainer.fetch().unwrap();
+        events.extend(std::mem::take(&mut trainer.arrived));
         match events.into_iter().next() {
             Some(TrainEvent::RolledBack { fault, .. }) => fault.to_string(),
             other => panic!("{other:?}"),
@@ -148,13 +148,13 @@ fn what_the_processor_would_refuse_too_is_told_in_its_words() {
 fn too_many_bad_steps_in_a_row_stop_the_run_where_the_first_of_them_was() {
     let Some(gpu) = testing::gpu() else { return };
     let (mut trainer, folder) = trainer(Some(&gpu));
-    trainer.config.stages.coarse = 12;
+    trainer.state.config.stages.coarse = 12;
     // A colour that overflows in every view.
-    let sound = trainer.field.gaussians.sh_coefficients[0];
-    for row in &mut trainer.field.gaussians.sh_coefficients {
+    let sound = trainer.state.field.gaussians.sh_coefficients[0];
+    for row in &mut trainer.state.field.gaussians.sh_coefficients {
         row[0] = 3e38;
     }
-    let before = trainer.field.clone();
+    let before = trainer.state.field.clone();
     let mut told = 0;
     let error = trainer
         .run(&mut |event, _| {
@@ -166,8 +166,8 @@ fn too_many_bad_steps_in_a_row_stop_the_run_where_the_first_of_them_was() {
     assert_eq!(in_a_row, MAX_ROLLBACKS_IN_A_ROW);
     assert_eq!(told, MAX_ROLLBACKS_IN_A_ROW - 1);
     assert_eq!((trainer.stage(), trainer.iteration() + 1), (stage, iteration));
-    assert_eq!(trainer.steps_done(), trainer.progress.steps.values().sum::<u64>());
-    assert!(trainer.field.gaussians.sh_coefficients == before.gaussians.sh_coefficients);
+    assert_eq!(trainer.steps_done(), trainer.state.progress.steps.values().sum::<u64>());
+    assert!(trainer.state.field.gaussians.sh_coefficients == before.gaussians.sh_coefficients);
     // What is saved goes on once the cause is gone.
     let path = folder.path().join("stopped.cif");
     trainer.checkpoint(true).save(&path).unwrap();
@@ -185,7 +185,7 @@ fn views_without_room_are_drawn_again_and_no_bit_differs() {
     let Some(gpu) = testing::gpu() else { return };
     let run = |room: usize| {
         let (mut trainer, _folder) = trainer(Some(&gpu));
-        trainer.device.as_mut().unwrap().wanted = [room; 2];
+        *device(&mut trainer).wanted() = [room; 2];
         let mut losses = Vec::new();
         let outcome = trainer.run(&mut |event, _| {
             if let TrainEvent::Finished { rolled_back, .. } = event {
@@ -195,7 +195,7 @@ fn views_without_room_are_drawn_again_and_no_bit_differs() {
         });
         assert_eq!(outcome.unwrap(), Outcome::Finished);
         assert_eq!(losses, [0], "room is no fault");
-        let wanted = trainer.device.as_ref().unwrap().wanted;
+        let wanted = *device(&mut trainer).wanted();
         let mut state = state(&mut trainer);
         state.0.record = Default::default();
         (state, wanted)
@@ -213,23 +213,23 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
         let (mut trainer, _folder) = trainer(Some(&gpu));
         // Half of them are large; opacities that fall, from 0.1 or where they are reset to, go.
         let mut sizes: Vec<f32> =
-            trainer.field.gaussians.log_scales.iter().map(|s| s[0].max(s[1]).max(s[2]).exp()).collect();
+            trainer.state.field.gaussians.log_scales.iter().map(|s| s[0].max(s[1]).max(s[2]).exp()).collect();
         sizes.sort_by(f32::total_cmp);
-        let densify = &mut trainer.config.densify;
+        let densify = &mut trainer.state.config.densify;
         (densify.from, densify.every, densify.prune_every, densify.opacity_reset_every) = (1, 3, 2, 5);
         (densify.gradient_threshold, densify.prune_min_n, densify.until) = (1e-7, 1, 100);
         (densify.prune_opacity, densify.opacity_reset_to) = (0.095, 0.097);
-        densify.split_scale = sizes[sizes.len() / 2] / trainer.field.extent;
+        densify.split_scale = sizes[sizes.len() / 2] / trainer.state.field.extent;
         let mut kinds = [0; 3];
         let mut result = Vec::new();
         while trainer.stage() != Stage::Instance && result.len() < 40 {
             let stage = trainer.stage();
-            if trainer.iteration() == trainer.stages.iterations(&trainer.config, stage) {
+            if trainer.iteration() == trainer.stages.iterations(&trainer.state.config, stage) {
                 break;
             }
-            if fetches && let Some(device) = &mut trainer.device {
-                // As late as can be: everything goes through the host.
-                device.since_fetch = super::FETCH_EVERY;
+            if fetches {
+                // Everything goes through the host.
+                device(&mut trainer).make_far_ahead();
             }
             let (stepped, events) = step(&mut trainer);
             stepped.unwrap();
@@ -238,7 +238,7 @@ fn rows_that_stay_on_the_device_end_as_those_that_the_host_rearranges() {
                     kinds = [kinds[0] + cloned, kinds[1] + split, kinds[2] + pruned];
                 }
             }
-            result.push(trainer.field.gaussians.len());
+            result.push(trainer.state.field.gaussians.len());
         }
         (state(&mut trainer), result, kinds)
     };
@@ -262,13 +262,13 @@ fn rows_relocated_on_the_device_end_as_those_that_the_host_relocates() {
         for _ in 0..4 {
             step(&mut trainer).0.unwrap();
         }
-        trainer.fetch_from_device().unwrap();
+        trainer.fetch().unwrap();
         trainer.estimate_identities(true).unwrap();
         trainer.begin(Stage::Instance);
         let mut relocated = Vec::new();
         for _ in 0..10 {
-            if fetches && let Some(device) = &mut trainer.device {
-                device.since_fetch = super::FETCH_EVERY;
+            if fetches {
+                device(&mut trainer).make_far_ahead();
             }
             let (stepped, events) = step(&mut trainer);
             stepped.unwrap();
@@ -277,7 +277,7 @@ fn rows_relocated_on_the_device_end_as_those_that_the_host_relocates() {
                     relocated.push((iteration, pairs, sources));
                 }
             }
-            let is_ahead = trainer.device.as_ref().is_some_and(|device| device.ahead);
+            let is_ahead = device(&mut trainer).is_ahead();
             assert_eq!(is_ahead, !fetches, "rows stay on the device unless they are fetched");
         }
         (state(&mut trainer), relocated)
@@ -295,17 +295,17 @@ fn a_device_lost_after_a_change_of_the_set_leaves_what_was_fetched_before_it() {
     let Some(_) = testing::gpu() else { return };
     let gpu = Gpu::open().unwrap();
     let (mut trainer, _folder) = trainer(Some(&gpu));
-    let densify = &mut trainer.config.densify;
+    let densify = &mut trainer.state.config.densify;
     (densify.from, densify.every, densify.gradient_threshold, densify.until) = (1, 3, 1e-7, 100);
     step(&mut trainer).0.unwrap();
     let before = state(&mut trainer);
     for _ in 0..3 {
         step(&mut trainer).0.unwrap();
     }
-    assert!(trainer.field.gaussians.len() > before.0.gaussians.len(), "the set has changed");
+    assert!(trainer.state.field.gaussians.len() > before.0.gaussians.len(), "the set has changed");
     gpu.device().destroy();
     let error = (0..20).find_map(|_| step(&mut trainer).0.err()).expect("the device is lost");
-    assert!(matches!(error, TrainError::Gpu(_)), "{error}");
+    assert!(matches!(error, TrainError::Device(_)), "{error}");
     assert_eq!((trainer.iteration(), trainer.steps_done()), (1, 1));
     assert!(host(&trainer) == before);
 }
@@ -327,20 +327,20 @@ fn debug_validation_names_the_part_and_changes_no_bit() {
         let (mut trainer, _folder) = trainer(Some(&gpu));
         trainer.set_debug_validation(true);
         damage(&mut trainer);
-        let before = trainer.field.clone();
+        let before = trainer.state.field.clone();
         let iteration = trainer.iteration();
         let (result, events) = step(&mut trainer);
         result.unwrap();
         assert_eq!((trainer.iteration(), trainer.rolled_back()), (iteration + 1, 1));
-        assert_eq!(format!("{:?}", trainer.field.gaussians), format!("{:?}", before.gaussians));
+        assert_eq!(format!("{:?}", trainer.state.field.gaussians), format!("{:?}", before.gaussians));
         match events.into_iter().next() {
             Some(TrainEvent::RolledBack { fault, .. }) => fault.to_string(),
             other => panic!("{other:?}"),
         }
     };
-    let parameters = fault_of(&|trainer| trainer.field.gaussians.means[1][2] = f32::NAN);
+    let parameters = fault_of(&|trainer| trainer.state.field.gaussians.means[1][2] = f32::NAN);
     assert_eq!(parameters, "parameters: means[5] is NaN");
-    let moments = fault_of(&|trainer| trainer.optimiser.of(&OPACITY_LOGITS).second[1] = f32::INFINITY);
+    let moments = fault_of(&|trainer| trainer.state.optimiser.of(&OPACITY_LOGITS).second[1] = f32::INFINITY);
     assert_eq!(moments, "optimiser: second moments[1] is inf");
 }
 
@@ -362,7 +362,7 @@ fn the_faster_of_both_is_taken_and_the_trial_leaves_no_trace() {
     for (on_gpu, taken) in [(0.9, false), (0.2, true)] {
         let (mut trainer, _folder) = trainer(None);
         let before = state(&mut trainer);
-        let progress = trainer.progress.clone();
+        let progress = trainer.state.progress.clone();
         let gpu_steps = if taken { vec![10.2, 10.4, 10.6, 10.6] } else { vec![10.9, 10.9] };
         let mut readings = vec![5.0, 5.4, 6.0, 6.0, 10.0];
         readings.extend(&gpu_steps);
@@ -372,7 +372,7 @@ fn the_faster_of_both_is_taken_and_the_trial_leaves_no_trace() {
         assert_eq!((probe.gpu_is_faster(), probe.stage), (taken, Stage::Coarse));
         assert!(probe.to_string().contains("500.0 ms on the processor"), "{probe}");
         assert_eq!(trainer.gpu_name().is_some(), taken);
-        assert!(state(&mut trainer) == before && trainer.progress == progress);
+        assert!(state(&mut trainer) == before && trainer.state.progress == progress);
         trainer.set_clock(std::sync::Arc::new(crate::clock::SystemClock::start()));
         assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
         // As good as a run that nothing was tried in.
@@ -405,8 +405,8 @@ fn a_fault_of_the_device_leaves_a_run_that_goes_on_on_the_processor() {
         assert_eq!(error.to_string(), expected);
         assert!(trainer.gpu_name().is_none());
         assert!(trainer.steps_done() >= 6, "what was fetched at the end of the coarse stage is there");
-        assert_eq!(trainer.steps_done(), trainer.progress.steps.values().sum::<u64>());
-        trainer.field.validate().unwrap();
+        assert_eq!(trainer.steps_done(), trainer.state.progress.steps.values().sum::<u64>());
+        trainer.state.field.validate().unwrap();
         let path = folder.path().join("saved.cif");
         trainer.checkpoint(true).save(&path).unwrap();
         let checkpoint = cif_field::Checkpoint::load(&path).unwrap();
@@ -445,4 +445,103 @@ fn every_stage_of_a_step_has_a_floor() {
             assert!(seen.contains(name), "{name} was timed: {seen:?}");
         }
     }
+}
+
+fn drawn(trainer: &mut Trainer, trial: Option<&Field>) -> Vec<RenderedImage> {
+    let settings = RenderSettings {
+        instances: trainer.state.field.identities.as_ref().map(|_| trainer.state.instance_settings()),
+        ..trainer.state.color_settings()
+    };
+    let views = Views {
+        frames: &[0, 1, 3, 4],
+        settings: &settings,
+        channels: Channels { depth: true, instances: settings.instances.is_some() },
+    };
+    let mut images = Vec::new();
+    trainer.draw(trial, views, &mut |image| images.push(image)).unwrap();
+    images
+}
+
+/// The same on the processor, which has what was fetched last.
+fn on_processor<T>(trainer: &mut Trainer, work: impl FnOnce(&mut Trainer) -> T) -> T {
+    let engine = std::mem::replace(&mut trainer.engine, Box::new(Processor::new(trainer.simd)));
+    let result = work(trainer);
+    trainer.engine = engine;
+    result
+}
+
+fn assert_alike(found: &[RenderedImage], expected: &[RenderedImage], what: &str) {
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
+        let (a, b) = (found.color.pixels.as_flattened(), expected.color.pixels.as_flattened());
+        let sum: f64 = a.iter().zip(b).map(|(a, b)| f64::from((a - b).abs())).sum();
+        assert!(sum / (a.len() as f64) < 1e-5, "{what}: colours differ by {sum} in all");
+        assert_eq!(found.instances.is_some(), expected.instances.is_some());
+        if let (Some(a), Some(b)) = (&found.instances, &expected.instances) {
+            let differ = a.label.pixels.iter().zip(&b.label.pixels).filter(|(a, b)| a != b).count();
+            assert!(differ < 5, "{what}: {differ} labels differ");
+        }
+    }
+}
+
+#[test]
+fn views_between_steps_are_those_of_the_processor() {
+    let Some(gpu) = testing::gpu() else { return };
+    let (mut trainer, _folder) = trainer(Some(&gpu));
+    // A fine stage with a little motion.
+    while trainer.stage() != Stage::Fine || trainer.iteration() < 4 {
+        if trainer.iteration() == 6 {
+            trainer.fetch().unwrap();
+            trainer.enter(Stage::Fine).unwrap();
+        }
+        step(&mut trainer).0.unwrap();
+    }
+    trainer.fetch().unwrap();
+    let of_field = drawn(&mut trainer, None);
+    let expected = on_processor(&mut trainer, |trainer| drawn(trainer, None));
+    assert_alike(&of_field, &expected, "the field");
+
+    let mut still = trainer.state.field.clone();
+    let n = still.len();
+    let deformation = still.deformation.as_mut().unwrap();
+    deformation.still = (0..n).map(|row| row % 3 != 0).collect();
+    let mut headless = trainer.state.field.clone();
+    let deformation = headless.deformation.as_mut().unwrap();
+    let layout = deformation.config.mlp_layout();
+    let last = layout.heads.last().unwrap();
+    assert_eq!(last.output.biases.end, deformation.mlp.len());
+    deformation.mlp.truncate(last.hidden.weights.start);
+    deformation.config.heads.rotation = false;
+    headless.validate().unwrap();
+    let mut shrunk = trainer.state.field.clone();
+    shrunk.deformation = None;
+    for scales in &mut shrunk.gaussians.log_scales {
+        scales[0] -= 1.0;
+    }
+    for (what, trial) in [("still", &still), ("without a head", &headless), ("without motion", &shrunk)] {
+        let found = drawn(&mut trainer, Some(trial));
+        let expected = on_processor(&mut trainer, |trainer| drawn(trainer, Some(trial)));
+        assert_alike(&found, &expected, what);
+        // The field is as it was, and so are the steps after it.
+        assert!(drawn(&mut trainer, None) == of_field, "{what} leaves a trace");
+    }
+    trainer.estimate_identities(true).unwrap();
+    trainer.begin(Stage::Instance);
+    step(&mut trainer).0.unwrap();
+    trainer.fetch().unwrap();
+    let found = drawn(&mut trainer, None);
+    assert!(found[0].instances.is_some() && found[0].depth.is_some());
+    let expected = on_processor(&mut trainer, |trainer| drawn(trainer, None));
+    assert_alike(&found, &expected, "with instances");
+    let scores = [false, true].map(|processor| {
+        let score = |trainer: &mut Trainer| match trainer.evaluate(Stage::Instance).unwrap() {
+            TrainEvent::Evaluated { frames, psnr, ssim, miou, .. } => (frames, psnr, ssim, miou),
+            other => panic!("{other:?}"),
+        };
+        if processor { on_processor(&mut trainer, score) } else { score(&mut trainer) }
+    });
+    let [(frames, psnr, ssim, miou), (_, other_psnr, other_ssim, other_miou)] = scores;
+    let close = |a: Option<f64>, b: Option<f64>| (a.unwrap() - b.unwrap()).abs() < 1e-2;
+    assert!(frames > 0 && close(psnr, other_psnr) && close(ssim, other_ssim), "{scores:?}");
+    assert!((miou.unwrap() - other_miou.unwrap()).abs() < 1.0, "{scores:?}");
 }

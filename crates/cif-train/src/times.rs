@@ -7,7 +7,7 @@ use cif_render::cpu::{StageTimes, ViewStatistics};
 use serde::{Deserialize, Serialize};
 
 /// Wall time of training steps by part, and counts of their work, summed over steps and views since
-/// [`Trainer::reset_times`](super::Trainer::reset_times).
+/// [`Trainer::reset_times`](crate::Trainer::reset_times).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct StepTimes {
     /// Steps summed.
@@ -70,7 +70,7 @@ pub struct Work {
 }
 
 impl Work {
-    pub(super) fn add_view(&mut self, gaussians: usize, view: &ViewStatistics) {
+    pub(crate) fn add_view(&mut self, gaussians: usize, view: &ViewStatistics) {
         self.views += 1;
         self.gaussians += gaussians as u64;
         self.deformed += view.deformed as u64;
@@ -101,7 +101,7 @@ impl StepTimes {
     }
 
     /// Time of the optimiser's step of a parameter.
-    pub(super) fn optimiser(&mut self, parameter: &Parameter) -> &mut Duration {
+    pub(crate) fn optimiser(&mut self, parameter: &Parameter) -> &mut Duration {
         match *parameter {
             PLANES => &mut self.optimiser_planes,
             MLP => &mut self.optimiser_mlp,
@@ -110,7 +110,7 @@ impl StepTimes {
     }
 
     /// Adds the renderer's times of a step.
-    pub(super) fn add_render(&mut self, times: &StageTimes) {
+    pub(crate) fn add_render(&mut self, times: &StageTimes) {
         let render = &mut self.render;
         render.deform += times.deform;
         render.project += times.project;
@@ -122,7 +122,7 @@ impl StepTimes {
     }
 
     /// Adds the counts of a view that was rendered forward and backward.
-    pub(super) fn add_view(&mut self, gaussians: usize, view: &ViewStatistics) {
+    pub(crate) fn add_view(&mut self, gaussians: usize, view: &ViewStatistics) {
         self.views += 1;
         self.gaussians += gaussians as u64;
         self.visible += view.visible as u64;
@@ -137,7 +137,7 @@ impl StepTimes {
 }
 
 /// Adds the time since `since` to `total`, and starts anew.
-pub(super) fn lap(total: &mut Duration, since: &mut Instant) {
+pub(crate) fn lap(total: &mut Duration, since: &mut Instant) {
     let now = Instant::now();
     *total += now - *since;
     *since = now;

@@ -11,21 +11,21 @@ use serde_json::Value;
 
 use super::Trainer;
 use super::evaluate::MeasuredFrames;
-use super::optimiser::Optimiser;
-use super::progress::Progress;
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::Stage;
+use crate::optimiser::Optimiser;
+use crate::progress::Progress;
 use crate::stop::Start;
 
 /// Version of the state.
 const VERSION: u32 = 1;
 
-/// The JSON part of the state.
+/// The JSON part of what is saved.
 #[derive(Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct State {
+pub(super) struct SavedState {
     version: u32,
     #[serde(deserialize_with = "recorded")]
     pub(super) config: TrainConfig,
@@ -50,7 +50,7 @@ fn recorded<'de, D: Deserializer<'de>>(settings: D) -> Result<TrainConfig, D::Er
     TrainConfig::recorded(Value::deserialize(settings)?).map_err(D::Error::custom)
 }
 
-impl State {
+impl SavedState {
     pub(super) fn parse(json: serde_json::Value) -> Result<Self, TrainError> {
         if json.get("version").and_then(serde_json::Value::as_u64) != Some(u64::from(VERSION)) {
             return Err(unusable("it was written by another version of the trainer"));
@@ -118,7 +118,7 @@ impl Trainer {
     /// The field as it is now; with state, what [`Trainer::resume`] needs as well.
     #[must_use]
     pub fn checkpoint(&self, with_state: bool) -> Checkpoint {
-        let mut field = self.field.clone();
+        let mut field = self.state.field.clone();
         field.record = self.provenance();
         Checkpoint { field, training: with_state.then(|| self.training_state()) }
     }
@@ -128,8 +128,9 @@ impl Trainer {
         &mut self,
         tensors: &mut BTreeMap<String, StateTensor>,
     ) -> Result<(), TrainError> {
-        let (n, times) = (self.field.gaussians.len(), self.dataset.times.len());
-        self.guidance
+        let (n, times) = (self.state.field.gaussians.len(), self.state.dataset.times.len());
+        self.state
+            .guidance
             .restore(tensors, n, times)
             .ok_or_else(|| unusable("the paths of objects do not fit the capture"))
     }
@@ -137,27 +138,27 @@ impl Trainer {
     fn training_state(&self) -> TrainingState {
         let mut tensors = BTreeMap::new();
         let mut adam_steps = BTreeMap::new();
-        for (parameter, moments) in self.optimiser.groups() {
+        for (parameter, moments) in self.state.optimiser.groups() {
             let name = parameter.rate;
             tensors.insert(format!("adam.{name}.first"), StateTensor::F32(moments.first.clone()));
             tensors.insert(format!("adam.{name}.second"), StateTensor::F32(moments.second.clone()));
             adam_steps.insert(name.to_owned(), moments.steps);
         }
-        let statistics = &self.statistics;
+        let statistics = &self.state.statistics;
         tensors.insert("densify.gradient".into(), StateTensor::F32(statistics.gradient.clone()));
         tensors.insert("densify.count".into(), StateTensor::U32(statistics.count.clone()));
         tensors.insert("densify.radius".into(), StateTensor::F32(statistics.radius.clone()));
-        let unseen = self.unseen.iter().map(|unseen| u32::from(*unseen)).collect();
+        let unseen = self.state.unseen.iter().map(|unseen| u32::from(*unseen)).collect();
         tensors.insert("identity.unseen".into(), StateTensor::U32(unseen));
-        tensors.insert("identity.label_pixels".into(), StateTensor::F64(self.label_pixels.clone()));
-        for (name, tensor) in self.guidance.tensors() {
+        tensors.insert("identity.label_pixels".into(), StateTensor::F64(self.state.label_pixels.clone()));
+        for (name, tensor) in self.state.guidance.tensors() {
             tensors.insert(name.to_owned(), tensor);
         }
-        let state = State {
+        let state = SavedState {
             version: VERSION,
-            config: self.config.clone(),
-            progress: self.progress.clone(),
-            capture: Capture::of(&self.dataset),
+            config: self.state.config.clone(),
+            progress: self.state.progress.clone(),
+            capture: Capture::of(&self.state.dataset),
             adam_steps,
         };
         let json = serde_json::to_value(state).expect("the state holds only strings, numbers and lists");
@@ -172,7 +173,7 @@ impl Trainer {
     pub fn resume(start: impl Into<Start>, checkpoint: Checkpoint) -> Result<Self, TrainError> {
         let Start { mut dataset, stop } = start.into();
         let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
-        let state = State::parse(json)?;
+        let state = SavedState::parse(json)?;
         state.config.validate()?;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &state.config);
         state.capture.check(&Capture::of(&dataset), &dataset)?;
@@ -180,22 +181,22 @@ impl Trainer {
         let mut trainer =
             Self::assemble(start, measured_frames, state.config, checkpoint.field, Some(state.progress))?;
 
-        let n = trainer.field.gaussians.len();
-        restore(&mut trainer.optimiser, &mut tensors, &state.adam_steps)?;
-        trainer.statistics = DensifyStatistics {
+        let n = trainer.state.field.gaussians.len();
+        restore(&mut trainer.state.optimiser, &mut tensors, &state.adam_steps)?;
+        trainer.state.statistics = DensifyStatistics {
             gradient: floats(&mut tensors, "densify.gradient", n)?,
             count: counters(&mut tensors, "densify.count", n)?,
             radius: floats(&mut tensors, "densify.radius", n)?,
         };
         trainer.restore_guidance(&mut tensors)?;
-        if trainer.progress.stage == Stage::Coarse {
+        if trainer.state.progress.stage == Stage::Coarse {
             trainer.find_travelling()?;
         }
-        let has_rows = trainer.field.identities.is_some();
+        let has_rows = trainer.state.field.identities.is_some();
         let unseen = counters(&mut tensors, "identity.unseen", if has_rows { n } else { 0 })?;
-        trainer.unseen = unseen.into_iter().map(|flag| flag != 0).collect();
-        let instances = if has_rows { trainer.field.instances.len() } else { 0 };
-        trainer.label_pixels = match tensors.remove("identity.label_pixels") {
+        trainer.state.unseen = unseen.into_iter().map(|flag| flag != 0).collect();
+        let instances = if has_rows { trainer.state.field.instances.len() } else { 0 };
+        trainer.state.label_pixels = match tensors.remove("identity.label_pixels") {
             Some(StateTensor::F64(values)) if values.len() == instances => values,
             _ => return Err(unusable("tensor identity.label_pixels is missing or has the wrong shape")),
         };

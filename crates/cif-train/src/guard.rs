@@ -4,7 +4,7 @@
 //! parameters and moments exactly as they were. The run then goes on with the next views, since a single view
 //! may be at fault; after [`MAX_ROLLBACKS_IN_A_ROW`] bad steps it stops.
 //!
-//! [`Trainer::set_debug_validation`] also looks at every array on the way from the field to the gradients and
+//! [`Trainer::set_debug_validation`](crate::Trainer::set_debug_validation) also looks at every array on the way from the field to the gradients and
 //! back, which tells where the value first appeared.
 
 use cif_field::Field;
@@ -13,21 +13,18 @@ use cif_render::cpu::NotFinite;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::Trainer;
-use super::optimiser::{Optimiser, StepRates};
-use crate::error::TrainError;
-use crate::events::{Stage, TrainEvent};
 use crate::exposure::Exposures;
+use crate::optimiser::{Optimiser, StepRates};
 
 /// Bad steps in a row after which a run stops.
-pub const MAX_ROLLBACKS_IN_A_ROW: u32 = 10;
+pub(crate) const MAX_ROLLBACKS_IN_A_ROW: u32 = 10;
 
 /// Largest gradient whose square is finite in single precision, with a margin; what is larger counts as not
 /// finite, because it would make a moment infinite for ever.
 pub(crate) const MAX_GRADIENT: f32 = 1e18;
 
 /// Largest learning rate: a step moves by a few times the rate, so that parameters below stay finite.
-pub(super) const MAX_RATE: f32 = 1e30;
+pub(crate) const MAX_RATE: f32 = 1e30;
 
 /// Floats that one task looks at.
 const CHUNK: usize = 1 << 14;
@@ -62,7 +59,7 @@ impl From<NotFinite> for Fault {
 /// Steps rolled back; saved with the progress of a run.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub(super) struct Rollbacks {
+pub(crate) struct Rollbacks {
     /// In the whole run.
     pub total: u64,
     /// Since the last good step.
@@ -74,15 +71,9 @@ pub(super) struct Rollbacks {
 
 impl Rollbacks {
     /// True when there were none.
-    pub(super) fn is_empty(&self) -> bool {
+    pub(crate) fn is_empty(&self) -> bool {
         self.total == 0
     }
-}
-
-/// What a step may have to go back to, where the gradients alone do not tell in time.
-pub(super) struct Snapshot {
-    field: Field,
-    optimiser: Optimiser,
 }
 
 /// The first value above a limit or not a number.
@@ -102,8 +93,19 @@ fn fault(part: &'static str, tensor: &str, values: &[f32], limit: f32) -> Option
     Some(Fault { part, tensor: tensor.to_owned(), index, value: values[index].to_string() })
 }
 
+/// A loss that is not finite.
+pub(crate) fn loss_fault(name: &str, loss: f64) -> Option<Fault> {
+    let (tensor, value) = (name.to_owned(), loss.to_string());
+    (!loss.is_finite()).then_some(Fault { part: "losses", tensor, index: 0, value })
+}
+
+/// The first value that is not finite.
+pub(crate) fn value_fault(part: &'static str, tensor: &str, values: &[f32]) -> Option<Fault> {
+    fault(part, tensor, values, f32::MAX)
+}
+
 /// The first gradient that a group which moves cannot take, or rate that would leave the finite numbers.
-pub(super) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option<Fault> {
+pub(crate) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option<Fault> {
     gradients.tensors().into_iter().find_map(|(parameter, values)| {
         let rate = rates.of(&parameter).fastest();
         if rate == 0.0 {
@@ -118,7 +120,7 @@ pub(super) fn gradient_fault(gradients: &Gradients, rates: &StepRates) -> Option
 }
 
 /// The first gradient of an exposure that no optimiser may take.
-pub(super) fn exposure_fault(exposures: Option<&Exposures>) -> Option<Fault> {
+pub(crate) fn exposure_fault(exposures: Option<&Exposures>) -> Option<Fault> {
     let (index, value) = exposures?.gradient_beyond(MAX_GRADIENT)?;
     Some(Fault {
         part: "gradients",
@@ -129,114 +131,17 @@ pub(super) fn exposure_fault(exposures: Option<&Exposures>) -> Option<Fault> {
 }
 
 /// The first parameter that is not finite.
-fn parameter_fault(part: &'static str, field: &Field) -> Option<Fault> {
+pub(crate) fn parameter_fault(part: &'static str, field: &Field) -> Option<Fault> {
     let mut tensors = field.tensors().into_iter();
     tensors.find_map(|(parameter, values)| fault(part, parameter.name, values, f32::MAX))
 }
 
 /// The first moment that is not finite.
-fn moment_fault(optimiser: &Optimiser) -> Option<Fault> {
+pub(crate) fn moment_fault(optimiser: &Optimiser) -> Option<Fault> {
     optimiser.groups().iter().find_map(|(_, moments)| {
         fault("optimiser", "first moments", &moments.first, f32::MAX)
             .or_else(|| fault("optimiser", "second moments", &moments.second, f32::MAX))
     })
-}
-
-impl Trainer {
-    /// Looks at every array of a step, so that a value which is not finite is told with the part, the tensor and
-    /// the index where it first appeared. Costs time and a second copy of field and moments; results do not
-    /// change.
-    pub fn set_debug_validation(&mut self, on: bool) {
-        self.debug_validation = on;
-        self.renderer.set_inspection(on);
-    }
-
-    /// Steps rolled back so far, over interruptions.
-    #[must_use]
-    pub fn rolled_back(&self) -> u64 {
-        self.progress.rollbacks.total
-    }
-
-    /// A copy to go back to, under debug validation.
-    pub(super) fn snapshot(&self) -> Option<Snapshot> {
-        self.debug_validation
-            .then(|| Snapshot { field: self.field.clone(), optimiser: self.optimiser.clone() })
-    }
-
-    /// What was wrong with the parameters before a step, under debug validation.
-    pub(super) fn fault_before_step(&self) -> Option<Fault> {
-        if self.debug_validation { parameter_fault("parameters", &self.field) } else { None }
-    }
-
-    /// What the renderer met, then a loss that is not finite.
-    pub(super) fn fault_of_view(&mut self, color_loss: f64, instance_loss: f64) -> Option<Fault> {
-        if let Some(found) = self.renderer.take_not_finite() {
-            return Some(found.into());
-        }
-        [("colour loss", color_loss), ("instance loss", instance_loss)]
-            .into_iter()
-            .find(|(_, value)| !value.is_finite())
-            .map(|(tensor, value)| {
-                let (tensor, value) = (tensor.to_owned(), value.to_string());
-                Fault { part: "losses", tensor, index: 0, value }
-            })
-            .or_else(|| {
-                let v_color = self.scratch.v_color.pixels.as_flattened();
-                self.debug_validation.then(|| fault("losses", "gradient of colour", v_color, f32::MAX))?
-            })
-    }
-
-    /// What the renderer met on the way back.
-    pub(super) fn fault_of_backward(&mut self) -> Option<Fault> {
-        self.renderer.take_not_finite().map(Fault::from)
-    }
-
-    /// What the optimiser made, under debug validation.
-    pub(super) fn fault_after_step(&self) -> Option<Fault> {
-        if !self.debug_validation {
-            return None;
-        }
-        parameter_fault("optimiser", &self.field).or_else(|| moment_fault(&self.optimiser))
-    }
-
-    /// Undoes the step that met a fault: parameters and moments are those before it, which views it had counts
-    /// as done. Too many in a row end the run.
-    pub(super) fn roll_back(
-        &mut self,
-        fault: Fault,
-        snapshot: Option<Snapshot>,
-        events: &mut Vec<TrainEvent>,
-    ) -> Result<(), TrainError> {
-        if let Some(Snapshot { field, optimiser }) = snapshot {
-            (self.field, self.optimiser) = (field, optimiser);
-        }
-        // Leftovers of the failed step must not reach another one.
-        self.gradients.reset();
-        let (stage, iteration) = (self.progress.stage, self.progress.iteration + 1);
-        events.push(self.count_bad_step(stage, iteration, fault)?);
-        Ok(())
-    }
-
-    /// Counts a step that was undone; too many in a row end the run.
-    pub(super) fn count_bad_step(
-        &mut self,
-        stage: Stage,
-        iteration: u32,
-        fault: Fault,
-    ) -> Result<TrainEvent, TrainError> {
-        let rollbacks = &mut self.progress.rollbacks;
-        rollbacks.total += 1;
-        rollbacks.in_a_row += 1;
-        rollbacks.last = Some(format!("{stage} stage, step {iteration}: {fault}"));
-        let (in_a_row, total) = (rollbacks.in_a_row, rollbacks.total);
-        if in_a_row >= MAX_ROLLBACKS_IN_A_ROW {
-            // A resumed run gets as many attempts again.
-            rollbacks.in_a_row = 0;
-            let hint = if self.debug_validation { Hint::Rates } else { Hint::Validate };
-            return Err(TrainError::Diverged { stage, iteration, in_a_row, fault, hint });
-        }
-        Ok(TrainEvent::RolledBack { stage, iteration, fault, in_a_row, total })
-    }
 }
 
 /// What to try next.

@@ -6,15 +6,15 @@ use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES};
 use cif_render::wgpu::{Commands, GpuError, GpuStatistics, LabelInput, Submission, ViewInput, faults};
 use cif_render::{InstanceNormalisation, RenderSettings};
 
-use super::super::Trainer;
-use super::super::step_plan::{StepPlan, StepView};
-use super::super::times::StepTimes;
-use super::DeviceTraining;
+use super::GpuEngine;
 use super::flight::{AboutView, LOSS_WORDS, ViewRead};
 use super::resident::Resident;
 use super::step::Recording;
 use crate::error::TrainError;
 use crate::events::Stage;
+use crate::state::State;
+use crate::step::{StepPlan, StepView};
+use crate::times::StepTimes;
 use crate::wgpu::kernels::{Judgement, fault};
 use crate::wgpu::losses::{GpuTarget, LossWeights, SLOTS};
 use crate::wgpu::optimiser::GaussianStep;
@@ -32,11 +32,11 @@ impl GaussianStep {
 /// What stops a step whatever moves.
 const ALWAYS: u32 = fault::NO_ROOM | fault::COLOR_LOSS | fault::INSTANCE_LOSS;
 
-impl Trainer {
+impl GpuEngine {
     /// One view, forward and backward; after the last one of a step, the optimiser.
     pub(super) fn view_on(
         &mut self,
-        device: &mut DeviceTraining,
+        state: &mut State,
         resident: &mut Resident,
         recording: &Recording,
         position: usize,
@@ -44,8 +44,8 @@ impl Trainer {
         let plan = &recording.plan;
         let view = &plan.views[position];
         let (first, last) = (position == 0, position + 1 == plan.views.len());
-        device.keep_target(view, u64::from(self.config.frame_memory_mib) << 20)?;
-        let DeviceTraining {
+        self.keep_target(view, u64::from(state.config.frame_memory_mib) << 20)?;
+        let Self {
             gpu,
             rasterizer,
             losses,
@@ -60,16 +60,18 @@ impl Trainer {
             timestamps,
             stage_times,
             ..
-        } = device;
+        } = self;
         let fresh;
-        let target = match targets.get(&view.view) {
+        let target = match targets.get(&view.index) {
             Some(target) => target,
             None => {
                 fresh = GpuTarget::new(gpu, &view.frame.image, view.frame.labels.as_ref())?;
                 &fresh
             }
         };
-        let frame = &self.dataset.frames[view.index];
+        let frame = &state.dataset.frames[view.index];
+        let cameras = state.progress.exposures.as_ref();
+        let camera = cameras.and_then(|all| all.position(&frame.camera_name)).map(|camera| camera as u32);
         let with_instances =
             plan.settings.instances.is_some() && view.frame.labelled > 0 && resident.identities.is_some();
         let settings =
@@ -77,7 +79,7 @@ impl Trainer {
         let labels = with_instances.then(|| LabelInput {
             labels: &target.labels,
             labelled_pixels: view.frame.labelled,
-            weight: (plan.label_share(view) * f64::from(self.config.loss.lambda_instance)) as f32,
+            weight: (plan.label_share(view) * f64::from(state.config.loss.lambda_instance)) as f32,
         });
         let input = ViewInput { camera: &frame.camera, settings: &settings, labels };
 
@@ -96,16 +98,16 @@ impl Trainer {
         rasterizer.project(gpu, &mut commands, posed, rows, &input)?;
         rasterizer.rasterize(gpu, &mut commands, rows, labels)?;
         let weights = LossWeights {
-            lambda_dssim: self.config.loss.lambda_dssim,
+            lambda_dssim: state.config.loss.lambda_dssim,
             view: plan.view_weight(),
             with_instances,
             by_coverage: settings
                 .instances
                 .is_some_and(|instances| instances.normalisation == InstanceNormalisation::Coverage),
-            leaves_out: plan.stage == Stage::Coarse && self.travelling_labels().is_some(),
+            leaves_out: plan.stage == Stage::Coarse && state.guidance.travelling_labels().is_some(),
             leaves_judged: view.leaves_judged,
         };
-        let exposed = resident.exposures.as_ref().zip(view.camera.map(|camera| camera as u32));
+        let exposed = resident.exposures.as_ref().zip(camera);
         let colors = rasterizer.colors();
         let mut recorded = colors;
         if let Some(camera) = exposed {
@@ -133,11 +135,11 @@ impl Trainer {
                 false,
                 faults,
             );
-            if let Some((shifts, pulls)) = self.pulls(frame.time, plan.pulls) {
+            if let Some(pulls) = state.pulls(frame.time, plan.pulls) {
                 motion.record(
                     gpu,
                     &mut commands,
-                    (&shifts, pulls, f64::from(self.field.extent)),
+                    (&pulls.shifts, pulls.strengths, f64::from(state.field.extent)),
                     (&resident.posed, &resident.canonical),
                     (&gradients.gaussians, &resident.gradients),
                 )?;
@@ -233,27 +235,27 @@ impl Trainer {
         let pending = pending.send();
         if let Some(timestamps) = timestamps {
             let stages = timestamps.read(gpu)?;
-            add_stage_times(&mut self.times, &stages);
+            add_stage_times(&mut state.times, &stages);
             stage_times.extend(stages);
         }
         let pixels = target.size[0] as usize * target.size[1] as usize;
         let about = AboutView {
             pixels,
             labelled: if with_instances { view.frame.labelled } else { 0 },
-            lambda_dssim: self.config.loss.lambda_dssim,
+            lambda_dssim: state.config.loss.lambda_dssim,
             gaussians: resident.canonical.len(),
         };
         Ok((ViewRead::new(pending, about), submission))
     }
 }
 
-impl DeviceTraining {
+impl GpuEngine {
     /// Keeps a frame on the device, while `budget` bytes hold them.
     pub(super) fn keep_target(&mut self, view: &StepView, budget: u64) -> Result<(), GpuError> {
-        if !self.targets.contains_key(&view.view) && self.target_bytes < budget {
+        if !self.targets.contains_key(&view.index) && self.target_bytes < budget {
             let target = GpuTarget::new(&self.gpu, &view.frame.image, view.frame.labels.as_ref())?;
             self.target_bytes += target.bytes();
-            self.targets.insert(view.view, target);
+            self.targets.insert(view.index, target);
         }
         Ok(())
     }

@@ -8,19 +8,19 @@ use cif_field::parameters::{self, OnCopy, Parameter, Rows};
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_render::Gradients;
 
-use super::times::{StepTimes, lap};
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
 use crate::config::{Ablation, TrainConfig};
 use crate::events::Stage;
 use crate::schedule::{log_linear, schedule_steps};
+use crate::times::{StepTimes, lap};
 
 /// Learning rates of one step, by parameter; those that are not listed keep still.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(super) struct StepRates(Vec<(Parameter, RowRates)>);
+pub(crate) struct StepRates(Vec<(Parameter, RowRates)>);
 
 impl StepRates {
     /// Rates of step `iteration` (from 1) of a stage.
-    pub(super) fn at(config: &TrainConfig, stage: Stage, iteration: u32, field: &Field) -> Self {
+    pub(crate) fn at(config: &TrainConfig, stage: Stage, iteration: u32, field: &Field) -> Self {
         let rates = &config.rates;
         let in_instance_stage = stage == Stage::Instance;
         let step = if in_instance_stage && !rates.restart_in_instance_stage {
@@ -59,13 +59,13 @@ impl StepRates {
     }
 
     /// The same for some parameters; the others keep still.
-    pub(super) fn only(mut self, wanted: &[Parameter]) -> Self {
+    pub(crate) fn only(mut self, wanted: &[Parameter]) -> Self {
         self.0.retain(|(parameter, _)| wanted.contains(parameter));
         self
     }
 
     /// Rate of a parameter.
-    pub(super) fn of(&self, parameter: &Parameter) -> RowRates {
+    pub(crate) fn of(&self, parameter: &Parameter) -> RowRates {
         let listed = self.0.iter().find(|(other, _)| other == parameter);
         listed.map_or(RowRates::Uniform(0.0), |(_, rates)| *rates)
     }
@@ -73,7 +73,7 @@ impl StepRates {
 
 /// Moments of all parameters, in the order of [`Field::tensors`].
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct Optimiser {
+pub(crate) struct Optimiser {
     groups: Vec<(Parameter, Moments)>,
     /// Scratch of the planes' sweep.
     halo: Vec<f32>,
@@ -81,7 +81,7 @@ pub(super) struct Optimiser {
 
 impl Optimiser {
     /// Zero moments in the shape of a field.
-    pub(super) fn new(field: &Field) -> Self {
+    pub(crate) fn new(field: &Field) -> Self {
         let group = |(parameter, values): (Parameter, &[f32])| {
             (parameter, Moments::zeros(values.len() / parameter.width(), parameter.width()))
         };
@@ -89,12 +89,12 @@ impl Optimiser {
     }
 
     /// All groups.
-    pub(super) fn groups(&self) -> &[(Parameter, Moments)] {
+    pub(crate) fn groups(&self) -> &[(Parameter, Moments)] {
         &self.groups
     }
 
     /// All groups, to be changed.
-    pub(super) fn groups_mut(&mut self) -> &mut [(Parameter, Moments)] {
+    pub(crate) fn groups_mut(&mut self) -> &mut [(Parameter, Moments)] {
         &mut self.groups
     }
 
@@ -102,7 +102,7 @@ impl Optimiser {
     ///
     /// # Panics
     /// When it is not in the table.
-    pub(super) fn of(&mut self, parameter: &Parameter) -> &mut Moments {
+    pub(crate) fn of(&mut self, parameter: &Parameter) -> &mut Moments {
         let mut groups = self.groups.iter_mut();
         &mut groups.find(|(other, _)| other == parameter).expect("a parameter of the table").1
     }
@@ -116,7 +116,7 @@ impl Optimiser {
     ///
     /// # Errors
     /// The parameter whose gradient is not finite.
-    pub(super) fn step(
+    pub(crate) fn step(
         &mut self,
         field: &mut Field,
         gradients: &mut Gradients,
@@ -152,21 +152,12 @@ impl Optimiser {
     }
 
     /// Follows a change of the set of Gaussians.
-    pub(super) fn gather(&mut self, origins: &[Option<u32>]) {
+    pub(crate) fn gather(&mut self, origins: &[Option<u32>]) {
         self.rows_of_gaussians().for_each(|(_, moments)| moments.gather(origins));
     }
 
-    /// Takes the shape of another set of Gaussians whose moments are elsewhere; they are zero here.
-    #[cfg(feature = "wgpu")]
-    pub(super) fn resize(&mut self, rows: usize) {
-        for (parameter, moments) in self.rows_of_gaussians() {
-            let steps = moments.steps;
-            *moments = Moments { steps, ..Moments::zeros(rows, parameter.width()) };
-        }
-    }
-
     /// Follows a relocation: fresh moments for relocated rows, and for what sources share with their copies.
-    pub(super) fn relocate(&mut self, weak: &[u32], sources: &[u32], entry_origins: &[Option<u32>]) {
+    pub(crate) fn relocate(&mut self, weak: &[u32], sources: &[u32], entry_origins: &[Option<u32>]) {
         for (parameter, moments) in self.rows_of_gaussians() {
             let shared = if parameter.on_copy == OnCopy::Divided { sources } else { &[] };
             for row in weak.iter().chain(shared) {
@@ -177,7 +168,7 @@ impl Optimiser {
     }
 
     /// Starts the calibrations of new identity rows.
-    pub(super) fn start_identities(&mut self, field: &Field) {
+    pub(crate) fn start_identities(&mut self, field: &Field) {
         let entries = field.identities.as_ref().map_or(0, |rows| rows.labels.len());
         *self.of(&parameters::LOG_CALIBRATIONS) = Moments::zeros(entries, 1);
     }

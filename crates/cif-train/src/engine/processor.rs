@@ -1,0 +1,295 @@
+//! Steps on the processor: the definition of what an engine does. Nothing runs ahead.
+
+use std::collections::VecDeque;
+use std::time::Instant;
+
+use cif_field::Field;
+use cif_geometry::{PixelGrid, quaternion};
+use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
+use cif_render::{RenderSettings, RenderedImage};
+
+use super::{Changed, Engine, Views};
+use crate::densify::Rearrangement;
+use crate::error::TrainError;
+use crate::events::Stage;
+use crate::guard::{Fault, exposure_fault, gradient_fault, loss_fault, value_fault};
+use crate::losses::held_out::leave_out_held_out;
+use crate::losses::{SsimScratch, color_loss};
+use crate::resample::{Pair, Relocated};
+use crate::state::State;
+use crate::step::{StepPlan, StepReport, StepView, ViewReport};
+use crate::times::lap;
+
+/// The processor, with memory that is kept between steps.
+pub(crate) struct Processor {
+    renderer: Renderer,
+    v_color: PixelGrid<[f32; 3]>,
+    ssim: SsimScratch,
+    /// True when every array of a step is looked at.
+    inspects: bool,
+    /// Steps that were not received yet.
+    done: VecDeque<StepReport>,
+}
+
+impl Processor {
+    pub(crate) fn new(simd: SimdLevel) -> Self {
+        Self {
+            renderer: Renderer::new(simd),
+            v_color: PixelGrid::filled(0, 0, [0.0; 3]),
+            ssim: SsimScratch::default(),
+            inspects: false,
+            done: VecDeque::new(),
+        }
+    }
+
+    /// The step itself, which moves nothing when it meets a fault.
+    fn attempt(
+        &mut self,
+        state: &mut State,
+        plan: &StepPlan,
+        reports: &mut Vec<ViewReport>,
+    ) -> Result<Option<Fault>, TrainError> {
+        let mut fault = None;
+        for view in &plan.views {
+            if fault.is_some() {
+                break;
+            }
+            fault = self.view(state, plan, view, reports);
+        }
+        state.times.add_render(&self.renderer.times());
+        fault = fault
+            .or_else(|| gradient_fault(&state.gradients, &plan.rates))
+            .or_else(|| exposure_fault(state.progress.exposures.as_ref()));
+        if fault.is_none() {
+            if plan.counts_statistics {
+                state.statistics.add(&state.gradients);
+            }
+            let State { field, gradients, optimiser, times, .. } = state;
+            let stepped =
+                optimiser.step(field, gradients, &plan.rates, &plan.weights, plan.visible_rows_only, times);
+            if let Err(parameter) = stepped {
+                // Leftovers of the failed step must not reach another one.
+                state.gradients.reset();
+                let (stage, iteration) = (plan.stage, plan.iteration);
+                return Err(TrainError::NotFinite { stage, iteration, tensor: parameter.name });
+            }
+        }
+        if let Some(exposures) = &mut state.progress.exposures {
+            match plan.exposure_rate.filter(|_| fault.is_none()) {
+                Some(rate) => exposures.step(rate),
+                None => exposures.reset(),
+            }
+        }
+        if fault.is_some() {
+            state.gradients.reset();
+        }
+        state.gradients.screen.fill([0.0; 2]);
+        state.gradients.radii.fill(0.0);
+        Ok(fault)
+    }
+
+    /// A view of a step, forward and backward.
+    fn view(
+        &mut self,
+        state: &mut State,
+        plan: &StepPlan,
+        view: &StepView,
+        reports: &mut Vec<ViewReport>,
+    ) -> Option<Fault> {
+        let frame = &state.dataset.frames[view.index];
+        let (time, data) = (frame.time, &*view.frame);
+        let with_instances = plan.settings.instances.is_some() && data.labelled > 0;
+        let labels = data.labels.as_ref().filter(|_| with_instances);
+        let with_instances = labels.is_some();
+        let settings =
+            RenderSettings { instances: plan.settings.instances.filter(|_| with_instances), ..plan.settings };
+        let pass = self.renderer.forward(&state.field, &frame.camera, time, &settings, labels);
+        let mut since = Instant::now();
+        let exposure = state.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name));
+        let recorded = exposure.map(|exposure| {
+            let mut recorded = pass.color.clone();
+            exposure.apply(&mut recorded);
+            recorded
+        });
+        let color = color_loss(
+            recorded.as_ref().unwrap_or(&pass.color),
+            &data.image,
+            state.config.loss.lambda_dssim,
+            plan.view_weight(),
+            &mut self.v_color,
+            &mut self.ssim,
+        );
+        lap(&mut state.times.losses, &mut since);
+        let labelled = if with_instances { data.labelled as f64 } else { 0.0 };
+        let instance_loss = pass.instance_loss;
+        reports.push(ViewReport {
+            psnr: color.psnr(),
+            color_loss: color.loss,
+            instance_loss: labelled * instance_loss,
+            unsupported: pass.unsupported_pixels as f64,
+        });
+        if !plan.trains_colors {
+            self.v_color.pixels.fill([0.0; 3]);
+        }
+        if plan.stage == Stage::Coarse {
+            state.guidance.leave_out_travelling(data.labels.as_ref(), &mut self.v_color);
+        }
+        if view.leaves_judged {
+            leave_out_held_out(&mut self.v_color);
+        }
+        if let (Some(exposure), Some(all)) = (exposure, &mut state.progress.exposures) {
+            let gradient = exposure.pull_back(&pass.color, &mut self.v_color);
+            all.add(&frame.camera_name, &gradient);
+        }
+        if let Some(fault) = self.fault_of_view(color.loss, instance_loss) {
+            return Some(fault);
+        }
+        let share = if with_instances { plan.label_share(view) } else { 0.0 };
+        let instance_weight = (share * f64::from(state.config.loss.lambda_instance)) as f32;
+        let pulls = state.pulls(time, plan.pulls);
+        let v_displacements = pulls.map_or_else(Vec::new, |pulls| {
+            state.guidance.gradients(&pulls, &state.field, self.renderer.posed_means())
+        });
+        self.renderer.backward_displaced(
+            &state.field,
+            &self.v_color,
+            instance_weight,
+            &v_displacements,
+            &mut state.gradients,
+        );
+        let fault = self.renderer.take_not_finite().map(Fault::from);
+        let statistics = self.renderer.statistics();
+        let gaussians = state.field.gaussians.len();
+        state.times.add_view(gaussians, &statistics);
+        state.progress.work.add_view(gaussians, &statistics);
+        fault
+    }
+
+    /// A value that the renderer met, then a loss that is not finite.
+    fn fault_of_view(&mut self, color_loss: f64, instance_loss: f64) -> Option<Fault> {
+        if let Some(found) = self.renderer.take_not_finite() {
+            return Some(found.into());
+        }
+        loss_fault("colour loss", color_loss).or_else(|| loss_fault("instance loss", instance_loss)).or_else(
+            || {
+                let v_color = self.v_color.pixels.as_flattened();
+                self.inspects.then(|| value_fault("losses", "gradient of colour", v_color))?
+            },
+        )
+    }
+}
+
+/// Limits of occupancies and calibrations, and unit quaternions now and then.
+fn keep_in_range(field: &mut Field, plan: &StepPlan) {
+    if let Some([low, high]) = plan.occupancy_limits {
+        for value in &mut field.gaussians.occupancy_logits {
+            *value = value.clamp(low, high);
+        }
+    }
+    if let (Some(limit), Some(identities)) = (plan.calibration_limit, &mut field.identities) {
+        for value in &mut identities.log_calibrations {
+            *value = value.clamp(-limit, limit);
+        }
+    }
+    if plan.renormalises {
+        for raw in &mut field.gaussians.quaternions {
+            if let Some(unit) = quaternion::try_normalize(*raw) {
+                *raw = unit;
+            }
+        }
+    }
+}
+
+impl Engine for Processor {
+    fn gpu_name(&self) -> Option<&str> {
+        None
+    }
+
+    fn step(&mut self, state: &mut State, plan: StepPlan) -> Result<(), TrainError> {
+        // Rendering between steps, for scores and identities, is no part of them.
+        self.renderer.reset_times();
+        let mut views = Vec::with_capacity(plan.views.len());
+        let fault = self.attempt(state, &plan, &mut views)?;
+        if fault.is_none() {
+            keep_in_range(&mut state.field, &plan);
+        }
+        self.done.push_back(StepReport { plan, views, fault });
+        Ok(())
+    }
+
+    fn receive(&mut self, _state: &mut State, _all: bool) -> Result<Option<StepReport>, TrainError> {
+        Ok(self.done.pop_front())
+    }
+
+    fn give_up(&mut self, _state: &mut State) -> u32 {
+        0
+    }
+
+    fn fetch(&mut self, _state: &mut State) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    fn is_far_ahead(&self) -> bool {
+        false
+    }
+
+    fn changed(&mut self, _what: Changed) {}
+
+    fn begin_changes(&mut self, _state: &mut State, _relocates: bool) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    fn rearrange(&mut self, state: &mut State, change: &Rearrangement) {
+        state.optimiser.gather(&change.origins);
+    }
+
+    fn relocate(&mut self, state: &mut State, _pairs: &[Pair], relocated: &Relocated) {
+        state.optimiser.relocate(&relocated.weak, &relocated.sources, &relocated.entry_origins);
+    }
+
+    fn end_changes(&mut self, _state: &mut State, _resets: Option<bool>) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    fn draw(
+        &mut self,
+        state: &State,
+        trial: Option<&Field>,
+        views: Views<'_>,
+        each: &mut dyn FnMut(RenderedImage),
+    ) -> Result<(), TrainError> {
+        for index in views.frames {
+            state.stop.check()?;
+            let frame = &state.dataset.frames[*index];
+            let field = trial.unwrap_or(&state.field);
+            let rendered =
+                self.renderer.render(field, &frame.camera, frame.time, views.settings, views.channels);
+            each(state.recorded(*index, rendered));
+        }
+        Ok(())
+    }
+
+    fn count_labels(&mut self, state: &mut State) -> Result<(IdentityCounts, usize), TrainError> {
+        let settings = state.color_settings();
+        let mut counts = IdentityCounts::zeros(state.field.gaussians.len(), state.field.instances.len());
+        let mut frames = 0;
+        for view in state.views_of_identities() {
+            state.stop.check()?;
+            let data = state.frames.get(&state.dataset, view)?;
+            let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
+            let frame = &state.dataset.frames[state.frames.index(view)];
+            let (camera, time) = (&frame.camera, frame.time);
+            self.renderer.count_identities(&state.field, camera, time, &settings, labels, &mut counts);
+            state.add_label_pixels(labels);
+            frames += 1;
+        }
+        Ok((counts, frames))
+    }
+
+    fn inspect(&mut self, on: bool) {
+        self.inspects = on;
+        self.renderer.set_inspection(on);
+    }
+
+    fn withdraw(&mut self, _state: &mut State) {}
+}

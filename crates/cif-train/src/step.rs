@@ -1,0 +1,117 @@
+//! A step as data: the plan that decides it, and the report of what came of it. What computes it, and where, is no
+//! part of either.
+
+use std::sync::Arc;
+
+use cif_render::RenderSettings;
+
+use crate::adam::PlaneWeights;
+use crate::events::Stage;
+use crate::frames::TrainFrame;
+use crate::guard::Fault;
+use crate::optimiser::StepRates;
+
+/// A view of a step.
+#[derive(Clone)]
+pub(crate) struct StepView {
+    /// Index of its frame in the capture.
+    pub index: usize,
+    pub frame: Arc<TrainFrame>,
+    /// True when the pixels that effects are judged by train nothing.
+    pub leaves_judged: bool,
+}
+
+/// A step.
+#[derive(Clone)]
+pub(crate) struct StepPlan {
+    pub stage: Stage,
+    /// Step of the stage, from 1.
+    pub iteration: u32,
+    pub views: Vec<StepView>,
+    /// Labelled pixels of all views.
+    pub labelled: usize,
+    /// Settings of views with labels; those without have no instances.
+    pub settings: RenderSettings,
+    /// False when only the instance loss is differentiated.
+    pub trains_colors: bool,
+    /// Weights of the pulls to paths, and to where Gaussians are.
+    pub pulls: [f32; 2],
+    pub rates: StepRates,
+    /// Learning rate of the exposures; `None` where none are learnt.
+    pub exposure_rate: Option<f32>,
+    pub weights: PlaneWeights,
+    /// True when only rows that some view shows move.
+    pub visible_rows_only: bool,
+    /// True when densification counts what the step sees.
+    pub counts_statistics: bool,
+    /// Limits of the occupancy logits after the step (row 42).
+    pub occupancy_limits: Option<[f32; 2]>,
+    /// Largest magnitude of a calibration after the step (methods reference 5.3).
+    pub calibration_limit: Option<f32>,
+    /// True when raw quaternions become unit ones after the step.
+    pub renormalises: bool,
+}
+
+impl StepPlan {
+    /// Share of the colour loss that a view has.
+    pub(crate) fn view_weight(&self) -> f32 {
+        1.0 / self.views.len() as f32
+    }
+
+    /// Share of the labelled pixels of the step that a view has (A4).
+    pub(crate) fn label_share(&self, view: &StepView) -> f64 {
+        view.frame.labelled as f64 / self.labelled.max(1) as f64
+    }
+}
+
+/// Losses of a step.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct StepLoss {
+    /// Mean over the views.
+    pub color: f64,
+    /// Mean over the labelled pixels of all views.
+    pub instance: Option<f64>,
+    /// Share of them that no covering Gaussian supports.
+    pub unsupported: Option<f64>,
+    /// The sum that is minimised.
+    pub total: f64,
+}
+
+/// Measurements of a view of a step.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct ViewReport {
+    /// Of the picture.
+    pub psnr: f64,
+    /// Mean over the pixels of the view.
+    pub color_loss: f64,
+    /// Summed over its labelled pixels.
+    pub instance_loss: f64,
+    /// Labelled pixels that no covering Gaussian supports.
+    pub unsupported: f64,
+}
+
+impl StepLoss {
+    /// Of the views of a step; `lambda_instance` weighs the instance loss.
+    pub(crate) fn new(plan: &StepPlan, views: &[ViewReport], lambda_instance: f32) -> Self {
+        let sum = |of: fn(&ViewReport) -> f64| views.iter().map(of).sum::<f64>();
+        let is_labelled = plan.stage == Stage::Instance && plan.labelled > 0;
+        let of_labelled = |sum: f64| is_labelled.then(|| sum / plan.labelled as f64);
+        let color = sum(|view| view.color_loss) * f64::from(plan.view_weight());
+        let instance = of_labelled(sum(|view| view.instance_loss));
+        Self {
+            color,
+            instance,
+            unsupported: of_labelled(sum(|view| view.unsupported)),
+            total: color + f64::from(lambda_instance) * instance.unwrap_or(0.0),
+        }
+    }
+}
+
+/// A step that is done, or could not be taken.
+pub(crate) struct StepReport {
+    pub plan: StepPlan,
+    /// As many as were rendered.
+    pub views: Vec<ViewReport>,
+    /// A value that is not finite: the step has moved nothing then.
+    pub fault: Option<Fault>,
+}
