@@ -89,7 +89,7 @@ impl Exposures {
         [&self.values, &self.first, &self.second]
     }
 
-    /// What [`Self::arrays`] returns, from elsewhere.
+    /// Sets the arrays that [`Self::arrays`] returns, after a device has updated them.
     #[cfg(feature = "wgpu")]
     pub(crate) fn set_arrays(&mut self, [values, first, second]: [Vec<f32>; 3]) {
         (self.values, self.first, self.second) = (values, first, second);
@@ -166,7 +166,7 @@ impl Exposures {
         }
     }
 
-    /// What is recorded in the scene: exposures by camera.
+    /// Exposures by camera, as recorded in the scene.
     pub(crate) fn by_camera(&self) -> BTreeMap<&str, Exposure> {
         self.cameras.iter().map(|camera| (camera.as_str(), self.at(camera))).collect()
     }
