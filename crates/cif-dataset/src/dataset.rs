@@ -1,4 +1,4 @@
-//! What every capture becomes, whatever its layout.
+//! The common form into which captures of every layout are read.
 
 use std::path::{Path, PathBuf};
 
@@ -25,7 +25,7 @@ pub enum Layout {
     Colmap,
 }
 
-/// Whether a frame is trained on or held out.
+/// Split of a frame: trained on or held out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Split {
@@ -35,7 +35,7 @@ pub enum Split {
     Val,
 }
 
-/// How a capture is opened.
+/// Options for opening a capture.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct OpenOptions {
     /// Mask folder: a name inside the capture (`masks_tracker`) or a path; `None` takes `masks` where present.

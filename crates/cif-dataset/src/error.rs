@@ -1,5 +1,4 @@
-//! What keeps a capture from being read, for the person at the keyboard: each message names the file and the
-//! way out.
+//! Errors of reading a capture, for the person at the keyboard: each message names the file and the way out.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -13,13 +12,13 @@ pub enum Error {
     /// The folder does not exist.
     #[error("{}: there is no such folder; give the folder of a capture", path.display())]
     MissingFolder {
-        /// What was asked for.
+        /// The path that was asked for.
         path: PathBuf,
     },
     /// A file stands where the capture should be.
     #[error("{}: this is a file; give the folder that holds the capture", path.display())]
     NotAFolder {
-        /// What was asked for.
+        /// The path that was asked for.
         path: PathBuf,
     },
     /// Nothing in the folder marks a layout.
@@ -54,7 +53,7 @@ pub enum Error {
     MissingFile {
         /// The file.
         path: PathBuf,
-        /// What to do.
+        /// Remedy.
         fix: String,
     },
     /// A file could not be read.
@@ -62,7 +61,7 @@ pub enum Error {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// A file or folder could not be written.
@@ -70,7 +69,7 @@ pub enum Error {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// A JSON file does not parse, or does not hold what its layout asks for.
@@ -82,7 +81,7 @@ pub enum Error {
         line: usize,
         /// Column, from 1.
         column: usize,
-        /// What the parser said.
+        /// Message of the parser.
         problem: String,
     },
     /// A camera has no image.
@@ -120,7 +119,7 @@ pub enum Error {
         path: PathBuf,
         /// Frame of the capture.
         frame: String,
-        /// What is wrong.
+        /// The problem, as the predicate of the message.
         problem: &'static str,
     },
     /// Two frames share a name.
@@ -138,7 +137,7 @@ pub enum Error {
         path: PathBuf,
         /// Frame of the capture.
         frame: String,
-        /// What is wrong.
+        /// The problem, as the predicate of the message.
         problem: String,
     },
     /// A camera's focal length, principal point, size or lens makes no sense.
@@ -148,7 +147,7 @@ pub enum Error {
         path: PathBuf,
         /// Frame of the capture.
         frame: String,
-        /// What is wrong, and what is expected.
+        /// The problem and what is expected.
         problem: String,
     },
     /// An image cannot be decoded.
@@ -156,7 +155,7 @@ pub enum Error {
     Image {
         /// The image.
         path: PathBuf,
-        /// What the decoder said.
+        /// Message of the decoder.
         problem: String,
     },
     /// A mask cannot be decoded.
@@ -164,7 +163,7 @@ pub enum Error {
     Mask {
         /// The mask.
         path: PathBuf,
-        /// What is wrong, and what is expected.
+        /// The problem and what is expected.
         problem: String,
     },
     /// A mask and its image differ in shape.
@@ -186,9 +185,9 @@ pub enum Error {
     /// The mask folder that was asked for holds no mask of this capture.
     #[error("{}: {problem}", folder.display())]
     MaskFolder {
-        /// What was asked for.
+        /// The folder that was asked for.
         folder: PathBuf,
-        /// What is wrong, and what would fit.
+        /// The problem and what would fit.
         problem: String,
     },
     /// A video has to be decoded, but there is no ffmpeg.
@@ -216,7 +215,7 @@ pub enum Error {
     Invalid {
         /// The file.
         path: PathBuf,
-        /// What is wrong, and what is expected.
+        /// The problem and what is expected.
         problem: String,
     },
 }

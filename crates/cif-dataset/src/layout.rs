@@ -23,7 +23,7 @@ impl Layout {
         }
     }
 
-    /// What marks a folder as this layout.
+    /// File or folder that marks a folder as this layout.
     #[must_use]
     pub fn marker(self) -> &'static str {
         match self {

@@ -170,7 +170,7 @@ pub(crate) fn folders_like_masks(root: &Path) -> Vec<String> {
     names.into_iter().collect()
 }
 
-/// What the headers of all masks say together.
+/// Facts from the headers of all masks.
 pub(crate) struct MaskHeaders {
     /// Largest id that any of the files can hold.
     pub(crate) largest_id: u16,

@@ -12,7 +12,7 @@ use crate::Dataset;
 /// Sizes that are left alone, metres; the size is how far the cameras spread or look, whichever is more.
 const ORDINARY_SIZES: std::ops::RangeInclusive<f64> = 0.1..=100.0;
 
-/// What other sizes are brought near to, by a power of ten: units are nearly always wrong by one.
+/// Size near which other scenes are scaled, metres, by a power of ten: units are nearly always wrong by one.
 const USUAL_SIZE: f64 = 3.0;
 
 /// Distance of the cameras from the origin, in sizes, that is left alone.

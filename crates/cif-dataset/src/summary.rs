@@ -1,4 +1,4 @@
-//! What was understood of a capture, for `cif info`.
+//! Summary of a capture, for `cif info`.
 
 use std::collections::BTreeMap;
 use std::fmt;

@@ -3,8 +3,8 @@
 /// Which colours a file holds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum ColorEncoding {
-    /// Linear light with Rec. 709 primaries: the sRGB curve of the captured colours is undone. What programs
-    /// assume that open an EXR file.
+    /// Linear light with Rec. 709 primaries: the sRGB curve of the captured colours is undone. Programs that open EXR
+    /// files assume this encoding.
     #[default]
     Linear,
     /// The colours as captured, with the sRGB curve.

@@ -1,7 +1,7 @@
 //! Which objects cover a pixel, and how much: ranks of a Cryptomatte out of instance probabilities.
 //!
-//! A pixel's foreground, the share of what it shows that belongs to any instance, is divided among the instances
-//! as their rendered probabilities M are. What else covers the pixel is the object `background`, so that the
+//! A pixel's foreground, the share of what it shows that belongs to any instance, is divided among the instances as
+//! their rendered probabilities M are. The rest of the covered pixel is the object `background`, so that the
 //! coverages add up to alpha, as those of a renderer of surfaces do.
 
 use std::collections::BTreeMap;

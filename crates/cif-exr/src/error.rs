@@ -1,4 +1,4 @@
-//! What keeps a frame from being written.
+//! Errors of writing an EXR frame.
 
 use std::path::PathBuf;
 
@@ -11,7 +11,7 @@ pub enum ExrError {
     Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
     /// The encoder refused.
@@ -19,7 +19,7 @@ pub enum ExrError {
     Encode {
         /// The file.
         path: PathBuf,
-        /// What the encoder said.
+        /// Message of the encoder.
         reason: String,
     },
     /// Two objects would have the same id in the Cryptomatte.

@@ -23,7 +23,7 @@ pub struct Object {
     pub name: String,
 }
 
-/// What a file is made of, apart from its pixels.
+/// Description of a file apart from its pixels: name, time, size, units, background and objects of the frame.
 #[derive(Clone, Debug)]
 pub struct Frame<'a> {
     /// Name of the frame.

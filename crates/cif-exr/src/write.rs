@@ -1,4 +1,4 @@
-//! How a file is written: whole or not at all, rows as they come.
+//! Writer of EXR files: whole or not at all, rows as they come.
 
 use std::fs::File;
 use std::io::BufWriter;

@@ -40,7 +40,7 @@ pub struct Field {
     pub sort_metric: SortMetric,
     /// Scene extent: 1.1 x the largest distance of a training camera centre from their mean, metres.
     pub extent: f32,
-    /// How the field came about, and how it has to be drawn.
+    /// Origin of the field, and the settings by which a renderer shows it as it was trained.
     pub record: Record,
 }
 
@@ -57,8 +57,8 @@ impl Field {
         self.gaussians.is_empty()
     }
 
-    /// The Gaussians at a normalised time in [0, 1], in raw form: the deformation's deltas added, then moved
-    /// by their tracks. What is hidden at this time has an opacity and an occupancy of 0.
+    /// The Gaussians at a normalised time in [0, 1], in raw form: the deformation's deltas added, then moved by their
+    /// tracks. Gaussians that are hidden at this time have an opacity and an occupancy of 0.
     #[must_use]
     pub fn deformed(&self, time: f64) -> Gaussians {
         let mut posed = match &self.deformation {

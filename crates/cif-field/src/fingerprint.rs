@@ -1,4 +1,4 @@
-//! Whether two fields are the same.
+//! Fingerprints, by which equal fields are recognised.
 
 use xxhash_rust::xxh3::Xxh3;
 

@@ -1,4 +1,4 @@
-//! Whether a field is numerically sound: what is broken, what is merely odd, and how broken parts are repaired.
+//! Numerical soundness of a field: what is broken, what is merely odd, and how broken parts are repaired.
 //!
 //! *Broken* is what cif refuses to load, or can neither draw nor train: values that are not finite, quaternions
 //! without a direction, log-scales that the renderer clamps. *Odd* is what is drawn as asked and may still be a
@@ -30,7 +30,7 @@ const MAX_ASPECT: f32 = 1e4;
 /// Distance from the middle of the cameras beyond which a centre counts as far away, in extents.
 const FAR: f64 = 100.0;
 
-/// How bad a finding is.
+/// Severity of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
@@ -43,9 +43,9 @@ pub enum Severity {
 /// Something found in a field.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Finding {
-    /// What kind of thing, e.g. `not finite`.
+    /// Kind of the finding, e.g. `not finite`.
     pub check: &'static str,
-    /// How bad it is.
+    /// Severity.
     pub severity: Severity,
     /// Array it was found in.
     pub array: &'static str,
@@ -53,16 +53,16 @@ pub struct Finding {
     pub count: usize,
     /// The first of them.
     pub first: Vec<usize>,
-    /// What it means, one sentence.
+    /// Explanation, one sentence.
     pub meaning: String,
 }
 
 /// Something that was changed.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Repair {
-    /// What was done, one sentence.
+    /// Description of the repair, one sentence.
     pub what: String,
-    /// How often.
+    /// Number of values, entries or Gaussians that were repaired.
     pub count: usize,
 }
 

@@ -14,7 +14,7 @@ pub enum Rows {
     Fixed,
 }
 
-/// How a raw parameter becomes what the scene is drawn with.
+/// Activation that maps a raw parameter to the value that the scene is drawn with.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Activation {
     /// As it is.
@@ -49,7 +49,7 @@ pub struct Parameter {
     pub rows: Rows,
     /// Shape of a row; empty for one float.
     pub shape: &'static [usize],
-    /// How it is read.
+    /// Activation of the raw values.
     pub activation: Activation,
     /// Its fate under relocation.
     pub on_copy: OnCopy,

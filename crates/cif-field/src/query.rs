@@ -31,7 +31,7 @@ use crate::{Field, Gaussians, Identities};
 /// Smallest density weight that counts: one step of an 8-bit image.
 pub const MIN_DENSITY: f64 = 1.0 / 255.0;
 
-/// What is at one place and time.
+/// Existence and instances at one place and time.
 #[derive(Clone, Debug, PartialEq)]
 pub struct QueryResult {
     /// Probability that something is there, in [0, 1].
@@ -122,7 +122,7 @@ impl FieldAtTime {
         &self.deformed
     }
 
-    /// What is at each point (world, metres). A point that is not finite is nowhere.
+    /// Existence and instances at each point (world, metres). A point that is not finite is nowhere.
     #[must_use]
     pub fn query(&self, points: &[DVec3]) -> Vec<QueryResult> {
         points.par_iter().map(|point| self.query_one(*point)).collect()
@@ -198,8 +198,8 @@ fn footprint(gaussians: &Gaussians, row: usize, radius: f64) -> Option<(Footprin
 }
 
 impl Field {
-    /// What is at each point (world, metres) at a normalised time in [0, 1]; see [`crate::query`] for the
-    /// definition. For several calls at one time, keep a [`FieldAtTime`].
+    /// Existence and instances at each point (world, metres) at a normalised time in [0, 1]; see [`crate::query`] for
+    /// the definition. For several calls at one time, keep a [`FieldAtTime`].
     #[must_use]
     pub fn query(&self, points: &[DVec3], time: f64) -> Vec<QueryResult> {
         FieldAtTime::new(self, time).query(points)

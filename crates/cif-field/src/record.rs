@@ -1,8 +1,9 @@
-//! How a field came about, and how it has to be drawn.
+//! Origin of a field, and the settings by which a renderer shows it as it was trained.
 //!
-//! In a file the record is the JSON object `provenance`. What programs act on has a type here; everything else is kept
-//! as [`Record::notes`], which people read and no behaviour depends on. Files of older versions have the same facts at
-//! other keys (near plane and antialiasing among the settings, exposures in the run) and are read into the same record.
+//! In a file the record is the JSON object `provenance`. Facts that programs act on have types here; everything else
+//! is kept as [`Record::notes`], which people read and no behaviour depends on. Files of older versions have the same
+//! facts at other keys (near plane and antialiasing among the settings, exposures in the run) and are read into the
+//! same record.
 
 use std::collections::BTreeMap;
 
@@ -13,10 +14,10 @@ use serde_json::{Map, Value, json};
 
 use crate::Exposure;
 
-/// How a field came about, and how it has to be drawn.
+/// Origin of a field, and the settings by which a renderer shows it as it was trained.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Record {
-    /// How it has to be drawn.
+    /// Near plane, antialiasing, occupancy and exposures of the renderer.
     pub drawing: Drawing,
     /// Where its coordinates lie in the world of its capture, or of the file that it was imported from.
     pub frame: CaptureFrame,
@@ -101,7 +102,7 @@ const FRAME: &str = "frame";
 const EXPOSURES: &str = "exposures";
 
 impl Record {
-    /// Reads the JSON of this version or of an older one. What has not the type that is expected stays a note, except for
+    /// Reads the JSON of this version or of an older one. Values of another type than expected stay notes, except for
     /// frames, which nobody may guess.
     ///
     /// # Errors

@@ -63,7 +63,7 @@ pub enum FieldError {
     IdentityRow {
         /// The row.
         row: usize,
-        /// What is wrong.
+        /// The problem.
         problem: String,
     },
     /// The instance table is inconsistent.
@@ -73,7 +73,7 @@ pub enum FieldError {
         index: usize,
         /// Its label.
         label: String,
-        /// What is wrong.
+        /// The problem, as the predicate of the message.
         problem: String,
     },
     /// A group of recorded motion is inconsistent.
@@ -83,13 +83,13 @@ pub enum FieldError {
         index: usize,
         /// Its name.
         name: String,
-        /// What is wrong.
+        /// The problem, as the predicate of the message.
         problem: String,
     },
     /// A captured time or rate is out of range.
     #[error("the timeline is broken: {problem}")]
     Timeline {
-        /// What is wrong.
+        /// The problem.
         problem: String,
     },
     /// A recorded camera is unusable.
@@ -99,7 +99,7 @@ pub enum FieldError {
         index: usize,
         /// Its name.
         name: String,
-        /// What is wrong.
+        /// The problem, as the predicate of the message.
         problem: String,
     },
     /// A single value is out of range.

@@ -12,10 +12,10 @@ pub const MAX_IMAGE_SIDE: u32 = 1 << 16;
 pub const MAX_IMAGE_PIXELS: u64 = 1 << 28;
 
 /// Refuses sizes that no image of cif has: none or more than [`MAX_IMAGE_SIDE`] columns or rows, more than
-/// [`MAX_IMAGE_PIXELS`] pixels. What takes sizes from a file or a caller asks before it takes memory for pixels.
+/// [`MAX_IMAGE_PIXELS`] pixels. Called on sizes from a file or a caller before memory is taken for pixels.
 ///
 /// # Errors
-/// What is wrong, with the size and the limit.
+/// The problem, with the size and the limit.
 pub fn check_image_size(width: u32, height: u32) -> Result<(), String> {
     let pixels = u64::from(width) * u64::from(height);
     if pixels == 0 {

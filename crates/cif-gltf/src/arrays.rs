@@ -1,4 +1,4 @@
-//! What the binary buffer is made of: views of the graph's own arrays, converted while they are written, so that
+//! Arrays of the binary buffer: views of the graph's own arrays, converted while they are written, so that
 //! a scene is never held twice.
 
 use std::io::{self, Write};

@@ -1,4 +1,4 @@
-//! What a file is made of: the glTF document of a scene graph, and the arrays of its buffer.
+//! Authoring of a file: the glTF document of a scene graph, and the arrays of its buffer.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

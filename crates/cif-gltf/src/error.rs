@@ -1,4 +1,4 @@
-//! What can go wrong between a scene and a glTF file.
+//! Errors of writing and reading glTF files.
 
 use std::path::PathBuf;
 
@@ -36,7 +36,7 @@ pub enum GltfError {
     Inconsistent {
         /// Name of the node or camera.
         node: String,
-        /// What is wrong with it.
+        /// The problem.
         what: String,
     },
     /// More than a `.glb` can hold.
@@ -52,7 +52,7 @@ pub enum GltfError {
     Unreadable {
         /// Given path.
         path: PathBuf,
-        /// What is wrong with it and what to do.
+        /// Problem and remedy.
         reason: String,
     },
     /// An object of the file is wrong.
@@ -62,7 +62,7 @@ pub enum GltfError {
         path: PathBuf,
         /// Node, mesh or accessor, with its index.
         object: String,
-        /// What is wrong with it and what to do.
+        /// Problem and remedy.
         what: String,
     },
     /// An extension that must be understood and is not.
@@ -72,9 +72,9 @@ pub enum GltfError {
         path: PathBuf,
         /// Its name.
         extension: String,
-        /// What it does.
+        /// Purpose of the extension in parentheses; empty where it is not known.
         note: String,
-        /// What to do.
+        /// Remedy.
         fix: String,
     },
     /// Nothing to read.
@@ -84,7 +84,7 @@ pub enum GltfError {
     NoSplats {
         /// Given path.
         path: PathBuf,
-        /// What is there instead.
+        /// Contents that were found instead.
         found: String,
     },
 }

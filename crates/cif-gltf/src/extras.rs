@@ -1,4 +1,4 @@
-//! What glTF has no place for: the object `cif` in the `extras` of our nodes.
+//! Data that glTF has no place for: the object `cif` in the `extras` of our nodes.
 //!
 //! The root node says how the file was made, a node per instance says what it is, parts and cameras say which
 //! ones they are. Whatever glTF itself holds (transforms, keys, splats) is read from there, so that edits count.
@@ -16,7 +16,7 @@ pub(crate) struct Extras {
     pub(crate) cif: Cif,
 }
 
-/// What a node is.
+/// Role of a node in the scene, with the data that glTF does not hold.
 #[derive(Serialize, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub(crate) enum Cif {

@@ -23,7 +23,7 @@ const SHARE_OF_TOLERANCE: f64 = 0.04;
 /// A marked key that is further than this from the slerp was changed since: 16 steps of single precision.
 const MOVED: f64 = 1e-6;
 
-/// What stands in the `extras` of a sampler.
+/// `extras` of an animation sampler.
 #[derive(Serialize, Deserialize)]
 pub(crate) struct SamplerExtras {
     pub(crate) cif: Inserted,

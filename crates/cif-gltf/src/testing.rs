@@ -80,7 +80,7 @@ impl Numbers {
     }
 }
 
-/// What a random scene is made of.
+/// Parameters of a random scene.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Recipe {
     pub(crate) seed: u64,

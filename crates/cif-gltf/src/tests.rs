@@ -33,7 +33,7 @@ fn round_trip(graph: &SceneGraph, name: &str) -> SceneGraph {
     read_scene(&path).unwrap()
 }
 
-/// What single precision leaves of a graph: glTF holds no more of poses.
+/// The graph with its poses rounded to single precision, in which glTF holds them.
 fn rounded(mut graph: SceneGraph) -> SceneGraph {
     let round = |v: DVec3| v.as_vec3().as_dvec3();
     let pose = |pose: &mut PoseSample| {

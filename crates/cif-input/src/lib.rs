@@ -47,7 +47,7 @@ pub fn read_to_string(path: impl AsRef<Path>) -> io::Result<String> {
     fs::read_to_string(path)
 }
 
-/// What is there in place of a regular file, in words.
+/// Name of a file type other than a regular file, for error messages.
 fn kind(found: FileType) -> &'static str {
     #[cfg(unix)]
     {

@@ -6,7 +6,7 @@ use std::path::{Component, Path, PathBuf};
 /// Checks that `name`, parts separated by `/`, stays inside any folder that it is joined to.
 ///
 /// # Errors
-/// What is wrong with it, as the predicate of a sentence: `is an absolute path`.
+/// The problem, as the predicate of a sentence: `is an absolute path`.
 pub fn check_name(name: &str) -> Result<(), &'static str> {
     if name.is_empty() {
         return Err("is empty");

@@ -8,8 +8,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use crate::place::{Place, folder_of, place, target};
 
-/// Beginning of the names of temporary files; a random part without a dot follows. What belongs to one of them has
-/// its name, a dot and anything.
+/// Beginning of the names of temporary files; a random part without a dot follows. Files that belong to one of them
+/// have its name, a dot and any suffix.
 const PREFIX: &str = ".cif-tmp-";
 
 /// Temporary files of this process, and the folders that were rid of those of dead ones. Whoever creates, renames or
@@ -44,7 +44,7 @@ pub fn probe(folder: &Path) -> io::Result<()> {
     Unfinished::create(folder).map(drop)
 }
 
-/// Writes a whole file. What was there is replaced once the new file is on the disk, behind links that stay; streams
+/// Writes a whole file. An existing file is replaced once the new one is on the disk, behind links that stay; streams
 /// are written to.
 ///
 /// # Errors
@@ -234,12 +234,12 @@ impl Scratch {
         path.into()
     }
 
-    /// Moves files and folders of this scratch, `(from, to)`, to their places, one after the other, the one that names the
-    /// others last; [`abandon`] waits for it. What is in the way goes, and so does the folder `unneeded`. When something
-    /// fails, everything is as it was.
+    /// Moves files and folders of this scratch, `(from, to)`, to their places, one after the other, the one that
+    /// names the others last; [`abandon`] waits for it. Existing files and folders at these places are removed, and
+    /// so is the folder `unneeded`. When something fails, everything is as it was.
     ///
     /// # Errors
-    /// What the system says.
+    /// When the file system refuses a rename.
     pub fn replace(self, moves: &[(PathBuf, PathBuf)], unneeded: Option<&Path>) -> io::Result<()> {
         let live = live();
         // What was renamed, in order: from, to.

@@ -1,4 +1,4 @@
-//! What can go wrong between a scene and a PLY file.
+//! Errors of writing and reading PLY files.
 
 use std::path::PathBuf;
 
@@ -24,9 +24,9 @@ pub enum PlyError {
     InTheWay {
         /// Given path.
         path: PathBuf,
-        /// What is there.
+        /// The kind of entry that exists: a file or a folder.
         found: &'static str,
-        /// What is to be written.
+        /// The kind of entry that is to be written.
         wanted: &'static str,
     },
     /// Nothing can be seen at that time.
@@ -44,7 +44,7 @@ pub enum PlyError {
     Invalid {
         /// Given path.
         path: PathBuf,
-        /// What is wrong with it and what to do.
+        /// Problem and remedy.
         what: String,
     },
 }

@@ -39,7 +39,7 @@ pub(crate) fn import_scene<'py>(
     Ok((Field { inner }, arrays::to_python(py, &changes)?))
 }
 
-/// What differs between two files.
+/// Differences between two files, object by object.
 #[pyfunction]
 pub(crate) fn diff<'py>(py: Python<'py>, before: PathBuf, after: PathBuf) -> PyResult<Bound<'py, PyAny>> {
     let changes = py

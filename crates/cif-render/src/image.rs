@@ -1,4 +1,4 @@
-//! What comes out per pixel.
+//! Images that renderers return.
 
 use cif_geometry::PixelGrid;
 

@@ -1,4 +1,4 @@
-//! How far Gaussians move on screen between two views: what motion vectors are blended from.
+//! Screen-space motion of Gaussians between two views, from which motion vectors are blended.
 
 use cif_geometry::PinholeCamera;
 use glam::{DVec2, DVec3};

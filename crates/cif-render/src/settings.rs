@@ -1,4 +1,4 @@
-//! What a render may vary.
+//! Settings of a render.
 
 use cif_field::SortMetric;
 
@@ -26,7 +26,7 @@ pub enum GeometryPath {
     Off,
 }
 
-/// Whether rendered identities are divided by coverage before the logarithm (methods reference 4.3).
+/// Division of rendered identities by coverage before the logarithm (methods reference 4.3).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum InstanceNormalisation {
     /// `-log M_y`.

@@ -9,7 +9,7 @@ use rand::seq::SliceRandom;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-/// What to generate.
+/// Parameters of a synthetic scene.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct SyntheticConfig {
     /// Equal configurations give equal scenes.

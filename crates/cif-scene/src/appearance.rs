@@ -47,7 +47,7 @@ impl Opacities {
     }
 }
 
-/// How samples of appearance are thinned.
+/// Parameters for thinning samples of opacities and colours.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Thinning<'a> {
     pub(crate) time_codes: &'a [f64],
@@ -214,8 +214,9 @@ fn at(samples: &[AppearanceSample], time_code: f64) -> Option<Vec<f32>> {
     Some(a.values.iter().zip(&b.values).map(|(a, b)| a + fraction * (b - a)).collect())
 }
 
-/// How a format that holds one opacity and one colour per splat shows a node: one sentence for each that changes, with
-/// the RMS difference over splats (by opacity) and time, and the largest one; empty where nothing changes.
+/// Loss of a node in a format that holds one opacity and one colour per splat: one sentence for each that changes
+/// over time, with the RMS difference over splats (by opacity) and time, and the largest one; empty where nothing
+/// changes.
 #[must_use]
 pub fn lost_without_samples(node: &Node) -> Vec<String> {
     let splats = &node.splats;

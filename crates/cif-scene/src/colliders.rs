@@ -3,7 +3,7 @@
 //! Colliders enclose their splats: those of a node (of every part, where it has some) hold at least [`ENCLOSED`] of
 //! the opacity of its splats, and of what is seen of them (see [`Splats::importance`]), counted by their centres. The
 //! two measures differ where many small or faint splats lie around few broad ones; a simulation that shows an object
-//! outside its collider is wrong by either. What sticks out of the bulk is left out as far as that allows.
+//! outside its collider is wrong by either. Splats that stick out of the bulk are left out as far as that allows.
 //!
 //! A collider is the hull of these centres and of the points one standard deviation along the axes of the opaque
 //! ones, as far as those stay in the bulk. A concave node can have several hulls: its splats are cut by planes, each
@@ -30,7 +30,7 @@ const OPAQUE: f32 = 0.5;
 const SIGMAS: f64 = 1.0;
 /// Weight that may stick out of the bulk in every direction.
 const TRIM: f64 = 0.01;
-/// What sticks out further than this share of the bulk's width strays.
+/// Share of the bulk's width; splats that stick out further stray.
 const TRIM_MARGIN: f64 = 0.1;
 /// Splats at most that colliders are built from: of larger nodes every second, third, ..., which changes the shares
 /// above by a few thousandths.
@@ -118,7 +118,7 @@ struct Slab {
 }
 
 impl Slab {
-    /// How far a point is outside; 0 or less inside.
+    /// Distance of a point from the slab; 0 or less inside.
     fn excess(&self, point: DVec3) -> f64 {
         let along = self.axis.dot(point);
         (self.low - along).max(along - self.high)
@@ -147,7 +147,7 @@ fn bulk(blobs: &[Blob]) -> Vec<Slab> {
         .collect()
 }
 
-/// What a collider is to enclose: leaves out the splats that stick out of the bulk, the furthest first, as far as
+/// Splats that a collider is to enclose: leaves out those that stick out of the bulk, the furthest first, as far as
 /// [`STRAYS`] allows, and pulls in ends that do.
 fn enclosed(mut blobs: Vec<Blob>) -> Vec<Blob> {
     let slabs = bulk(&blobs);

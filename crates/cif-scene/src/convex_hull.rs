@@ -56,7 +56,7 @@ impl HullMesh {
         self.points.iter().sum::<DVec3>() / self.points.len().max(1) as f64
     }
 
-    /// How far a point is outside, at least; 0 or less inside.
+    /// Lower bound of the distance of a point from the hull; 0 or less inside.
     #[must_use]
     pub fn outside(&self, point: DVec3) -> f64 {
         furthest_outside(&self.planes(), point)

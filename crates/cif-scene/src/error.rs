@@ -1,4 +1,4 @@
-//! What can go wrong while a scene is built.
+//! Errors of building a scene.
 
 /// Why a field cannot become a scene.
 #[derive(Debug, thiserror::Error)]
@@ -39,7 +39,7 @@ pub enum SceneError {
     Import {
         /// Name of the node, or the file.
         object: String,
-        /// What does not fit.
+        /// The problem.
         what: String,
     },
     /// A file that does not tell which field it came from.

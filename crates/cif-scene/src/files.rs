@@ -1,4 +1,4 @@
-//! What every format has to do with the file system: where a file goes, and why it cannot.
+//! File-system checks that all formats share: the place of an output, and errors of reading and writing.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -39,7 +39,7 @@ pub enum FileError {
     Write {
         /// Output.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// Reading failed.
@@ -47,7 +47,7 @@ pub enum FileError {
     Read {
         /// Given path.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
 }

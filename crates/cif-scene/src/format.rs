@@ -159,7 +159,7 @@ pub enum Payloads {
     SingleFile,
 }
 
-/// How a graph is written. A format leaves aside what it does not know.
+/// Options for writing a graph. A format ignores those that it does not know.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ExportOptions {
     /// Replace existing files even when they were not written by cif.
@@ -190,7 +190,7 @@ impl Default for ExportOptions {
     }
 }
 
-/// How a file is read.
+/// Options for reading a file.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ReadOptions {
     /// USD: follow sublayers, references and payloads that lie outside the folder of the stage.

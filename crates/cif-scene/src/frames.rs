@@ -14,7 +14,7 @@ const GAUSSIAN_BYTES: usize = 44;
 /// Bytes of the colour.
 const COLOR_BYTES: usize = 4 * SH_FLOATS;
 
-/// What moves of all Gaussians, at one time; rows as in the field, raw form.
+/// Moving parameters of all Gaussians at one time; rows as in the field, raw form.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Frame {
     /// Centres, world.

@@ -1,4 +1,4 @@
-//! What a scene is made of.
+//! The scene graph: nodes, their splats and motion, and cameras.
 
 use cif_dataset::CaptureFrame;
 use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
@@ -17,9 +17,9 @@ pub struct SceneGraph {
     pub up_axis: UpAxis,
     /// Metres per world unit.
     pub meters_per_unit: f64,
-    /// Where the coordinates of the graph lie in the world: that of the capture. What is called *world* in a graph
-    /// is its own frame; writers place it in the world, and readers take it from there. The identity for ordinary
-    /// captures; see [`crate::world`].
+    /// Where the coordinates of the graph lie in the world: that of the capture. *World* in a graph means its own
+    /// frame; writers place it in the world, and readers take it from there. The identity for ordinary captures; see
+    /// [`crate::world`].
     pub frame: CaptureFrame,
     /// When the samples are.
     pub time_codes: TimeCodes,
@@ -33,7 +33,7 @@ pub struct SceneGraph {
     pub sort_metric: cif_field::SortMetric,
     /// Labels of instances that no visible Gaussian belongs to, so that they have no node.
     pub omitted: Vec<String>,
-    /// What the user should know, one sentence each.
+    /// Warnings for the user, one sentence each.
     pub warnings: Vec<String>,
     /// Where the graph came from: what an edited file is compared with when it comes home.
     pub origin: Origin,
@@ -76,7 +76,7 @@ impl TimeCodes {
     }
 }
 
-/// Whether a node is an instance or everything else.
+/// Kind of a node: an instance, or everything else.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum NodeKind {
@@ -104,11 +104,11 @@ pub struct Node {
     pub category: String,
     /// Origin of the local frame at the reference time, world.
     pub pivot: DVec3,
-    /// How the node moves.
+    /// Motion of the node.
     pub motion: Motion,
     /// Splats in the local frame.
     pub splats: Splats,
-    /// How opacities and colours of the splats change over time.
+    /// Changes of opacities and colours of the splats over time.
     pub appearance: Appearance,
     /// Light stand-in for the splats; `None` when proxies were not asked for.
     pub proxy: Option<PointProxy>,
@@ -152,7 +152,7 @@ impl std::fmt::Display for MotionModel {
     }
 }
 
-/// How a node moves.
+/// Motion of a node: its model, with samples.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Motion {
     /// The local frame stays at the pivot.

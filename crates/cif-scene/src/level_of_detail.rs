@@ -3,8 +3,8 @@
 use crate::{Motion, Node, Splats};
 
 impl Splats {
-    /// How much every splat is seen: opacity times the product of its two larger standard deviations, which
-    /// is its area from its broad side up to a factor.
+    /// Importance of every splat: opacity times the product of its two larger standard deviations, which is its area
+    /// from its broad side up to a factor.
     #[must_use]
     pub fn importance(&self) -> Vec<f64> {
         self.opacities

@@ -17,7 +17,7 @@ use crate::motion::{dot, vector};
 /// radians, as far as it is not round. An image changes by about that share of the splat's contrast at most.
 const LEAST_CHANGE: f64 = 0.3;
 
-/// How far one splat has been from where it was first.
+/// Ranges of place and size of one splat over time, and its largest turn since the first.
 #[derive(Clone, Copy, Default)]
 struct Change {
     low: DVec3,

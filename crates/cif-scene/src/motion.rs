@@ -1,4 +1,4 @@
-//! How well standing still and one rigid body fit a group of Gaussians.
+//! Fit of a static model and of one rigid body to a group of Gaussians.
 //!
 //! Two passes over the sampled times, so that no more than one time's Gaussians are in memory:
 //! 1. poses against the shape at the reference time, which give the mean shape (in the world for static, in
@@ -399,8 +399,8 @@ mod tests {
     }
 
     proptest! {
-        /// What the error bounds rest on: smaller distances never give a larger value, and sums stay below the
-        /// sum of the first value and the RMS of what is added, over all weight.
+        /// Properties that the error bounds rest on: smaller distances never give a larger value, and sums stay below
+        /// the sum of the first value and the RMS of what is added, over all weight.
         #[test]
         fn trimmed_rms_is_monotone_and_obeys_the_triangle_inequality(
             values in prop::collection::vec((0.0_f64..1.0, 0.0_f64..1.0, 0.01_f64..5.0), 1..30),

@@ -17,7 +17,7 @@ use crate::motion::{MeanShape, MovingGroup, ResidualSum, add_turns_between, trim
 use crate::report::{MotionReport, ResidualStatistics};
 use crate::{extent, naming};
 
-/// What a node is called.
+/// Kind, names and class of a node.
 pub(crate) struct Naming {
     kind: NodeKind,
     name: String,
@@ -57,7 +57,7 @@ impl Naming {
     }
 }
 
-/// What all nodes are made from.
+/// Inputs from which all nodes are made.
 pub(crate) struct NodeInput<'a> {
     pub(crate) field: &'a Field,
     pub(crate) reference: &'a Gaussians,

@@ -1,4 +1,4 @@
-//! What an export may vary.
+//! Options of an export.
 
 use std::str::FromStr;
 
@@ -29,7 +29,7 @@ impl FromStr for UpAxis {
     }
 }
 
-/// How far a simplified motion may be from the trained one.
+/// Largest deviation of a simplified motion from the trained one.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Tolerance {

@@ -167,7 +167,7 @@ impl Paths {
         (mean, square.sqrt())
     }
 
-    /// How well parts fit.
+    /// Scores a partition: mean of the squared trimmed RMS over the times, and trimmed RMS at the worst time.
     fn evaluate(&self, labels: Vec<usize>, motions: Vec<Poses>) -> Solution {
         let means: Vec<DVec3> =
             labels.iter().enumerate().map(|(k, &part)| self.stillness(k, &motions[part]).0).collect();

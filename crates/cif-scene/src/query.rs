@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use crate::{LabelPattern, SceneGraph, world};
 
-/// What to look for, and when.
+/// Query for objects by label, at a time code.
 #[derive(Clone, Debug, PartialEq)]
 pub struct LabelQuery {
     /// Label, class or instance name; see [`LabelPattern`].

@@ -1,4 +1,4 @@
-//! What the chosen motion models cost and miss.
+//! Cost and residuals of the chosen motion models.
 
 use cif_geometry::Bounds;
 use glam::DVec3;
@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Motion, MotionModel, Node, SceneGraph, Splats};
 
-/// How far a motion model is from the trained motion, world units.
+/// Residuals of a motion model against the trained motion, world units.
 ///
 /// Residuals are distances between the centres that the model predicts and the trained ones, over all sampled
 /// times, weighted by opacity times size. Orientations are reported, but do not decide: the turn of a nearly
@@ -53,11 +53,11 @@ pub struct MotionReport {
     pub tolerance: f64,
     /// Residual of what is exported: of the chosen model, with the samples that were left out interpolated.
     pub residual: ResidualStatistics,
-    /// What standing still would miss.
+    /// Residual of the static model.
     pub static_residual: ResidualStatistics,
-    /// What one rigid body would miss; `None` for the background, which is never one body.
+    /// Residual of one rigid body; `None` for the background, which is never one body.
     pub rigid_residual: Option<ResidualStatistics>,
-    /// What the best rigid parts would miss; `None` where they were not tried.
+    /// Residual of the best rigid parts; `None` where they were not tried.
     #[serde(default)]
     pub parts_residual: Option<ResidualStatistics>,
     /// Rigid parts; 0 for the other models.

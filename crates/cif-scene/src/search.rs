@@ -23,7 +23,7 @@ pub const TAXONOMY_CLASS: &str = "class";
 /// The taxonomy of unique names.
 pub const TAXONOMY_INSTANCE: &str = "instance";
 
-/// What to look for; an object has to meet every condition given.
+/// Conditions of a search; an object has to meet every one given.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct ObjectQuery {
     /// Label, class or unique name; see [`crate::LabelPattern`].
@@ -39,7 +39,7 @@ pub struct ObjectQuery {
     pub region: Option<Bounds>,
 }
 
-/// What a volume is measured on.
+/// Geometry that a volume is measured on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum VolumeOf {
@@ -58,7 +58,7 @@ pub struct ObjectMatch {
     pub found: LabelMatch,
     /// Volume in cubic world units; `None` for an object without extent.
     pub volume: Option<f64>,
-    /// What the volume was measured on.
+    /// Geometry that the volume was measured on.
     pub volume_of: Option<VolumeOf>,
     /// World units per second that the origin of the object's frame moves: around a time code, or on average over an
     /// interval.

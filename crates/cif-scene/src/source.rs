@@ -5,8 +5,8 @@ use cif_render::cpu::{Renderer, SimdLevel};
 
 /// Gives the Gaussians of a field at a time. Rows keep their order and number.
 pub trait MotionSource {
-    /// All Gaussians at a normalised time in [0, 1], raw form, deformation added. What is hidden at the time is
-    /// given as if it were not: visibility is told apart from motion.
+    /// All Gaussians at a normalised time in [0, 1], raw form, deformation added. Gaussians that are hidden at the
+    /// time are given as if they were not: visibility is told apart from motion.
     fn gaussians_at(&mut self, time: f64) -> Gaussians;
 
     /// True when anything can move at all.

@@ -1,4 +1,4 @@
-//! How fast a node moves, for simulators that take over from the recording.
+//! Velocity of a node, for simulators that take over from the recording.
 
 use glam::DVec3;
 use serde::{Deserialize, Serialize};

@@ -1,4 +1,4 @@
-//! What each effect is worth: small captures that call for it and that do not, trained with and without it.
+//! Gain of each effect: small captures that call for it and that do not, trained with and without it.
 //!
 //! Prints the table of `tests/README.md`: quality on held-out frames, and processor time.
 

@@ -1,4 +1,4 @@
-//! What a run had reached when: quality against time, measured on a few frames while it went on.
+//! Curve of a run: quality against time, measured on a few frames while it trains.
 //!
 //! Measuring reads the field and nothing else, so that a run with its curve ends bit for bit where one without
 //! it ends; its own time is kept apart from that of the run.

@@ -12,7 +12,7 @@ use crate::config::DensifyConfig;
 /// Children are smaller than the Gaussian they replace by this factor (0.8 x 2 children).
 const SPLIT_SHRINK: f32 = 1.6;
 
-/// What was seen of every Gaussian since the last change of the set.
+/// Densification statistics of every Gaussian since the last change of the set.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct DensifyStatistics {
     /// Summed norms of the screen gradient.

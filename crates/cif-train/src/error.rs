@@ -1,4 +1,4 @@
-//! What stops a run.
+//! Errors that stop a run.
 
 use std::path::{Path, PathBuf};
 
@@ -59,11 +59,11 @@ pub enum TrainError {
         stage: Stage,
         /// The last such step, from 1.
         iteration: u32,
-        /// How many.
+        /// Number of such steps in a row.
         in_a_row: u32,
-        /// What the last one met.
+        /// Fault of the last one.
         fault: Fault,
-        /// What to try.
+        /// Advice on settings to try.
         hint: Hint,
     },
     /// The GPU cannot hold the scene, or failed.
@@ -104,7 +104,7 @@ pub enum TrainError {
     /// The training state does not fit.
     #[error("the training state of the checkpoint is not usable: {reason}")]
     BadState {
-        /// What is wrong.
+        /// The problem.
         reason: String,
     },
     /// A scene to begin with has no motion, and the capture has.
@@ -133,13 +133,13 @@ pub enum TrainError {
     Scene {
         /// File of the scene.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Problem of the scene.
         problem: Box<TrainError>,
     },
     /// The checkpoint belongs to another capture.
     #[error("the checkpoint was trained on another capture: {what} was {expected}, and is {found} in {}", root.display())]
     OtherCapture {
-        /// What differs.
+        /// Property that differs.
         what: &'static str,
         /// In the checkpoint.
         expected: String,

@@ -1,4 +1,4 @@
-//! What a run tells its observer.
+//! Events that a run reports to its observer.
 
 use serde::{Deserialize, Serialize};
 
@@ -132,7 +132,7 @@ pub enum TrainEvent {
         stage: Stage,
         /// The step, from 1; it counts as done.
         iteration: u32,
-        /// What was met, and where.
+        /// Fault, and where it was met.
         fault: Fault,
         /// Such steps since the last good one.
         in_a_row: u32,
@@ -160,9 +160,9 @@ pub enum TrainEvent {
         stage: Stage,
         /// Steps done in the stage.
         iteration: u32,
-        /// What was judged.
+        /// Part of the model that was judged, in words.
         what: String,
-        /// What it gains on held-out pixels of training views, dB.
+        /// Its gain on held-out pixels of training views, dB.
         gain_db: f64,
         /// True when it stays; else it is removed for good.
         kept: bool,
@@ -221,12 +221,12 @@ pub enum TrainEvent {
         peak_rss_mb: Option<f64>,
         /// Steps that were rolled back.
         rolled_back: u64,
-        /// What the steps worked on.
+        /// Counts of the work of all steps.
         work: Work,
     },
 }
 
-/// What the observer wants next.
+/// Request of the observer in reply to an event.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Control {
     /// Go on.
@@ -238,7 +238,7 @@ pub enum Control {
     Stop,
 }
 
-/// How a run ended.
+/// Way in which a run ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Outcome {
     /// All stages are done.

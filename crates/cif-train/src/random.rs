@@ -4,7 +4,7 @@
 use rand::SeedableRng;
 use rand_pcg::Pcg64;
 
-/// What random numbers are drawn for.
+/// Purpose of random numbers, which names their stream.
 #[derive(Clone, Copy, Debug)]
 pub(crate) enum Purpose {
     /// Order of the training views.

@@ -1,4 +1,4 @@
-//! What changes with the step count. Source: methods reference 1.1 and 1.3.
+//! Schedules of settings over the step count. Source: methods reference 1.1 and 1.3.
 
 use crate::config::{Ablation, TrainConfig};
 use crate::events::Stage;

@@ -47,7 +47,7 @@ impl Observation {
     }
 }
 
-/// What the mask of a frame shows of each label in it, without contacts; labels of a few pixels are left out.
+/// Observations of the labels in the mask of a frame, without contacts; labels of a few pixels are left out.
 #[must_use]
 pub fn observe(
     labels: &PixelGrid<u16>,

@@ -1,4 +1,4 @@
-//! What writing a stage costs: `write_speed SPLATS SAMPLES OUT.usdc` makes one object of so many splats with
+//! Cost of writing a stage: `write_speed SPLATS SAMPLES OUT.usdc` makes one object of so many splats with
 //! spherical harmonics of degree 3 (deforming where SAMPLES is above 1), writes it and prints bytes, wall and CPU
 //! seconds of the writing, and the peak memory of the process. Run it with the feature `python`, as `make test-usd`
 //! does.

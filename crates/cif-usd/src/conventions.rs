@@ -40,7 +40,7 @@ pub fn column_vector_matrix(gf: [[f64; 4]; 4]) -> [[f64; 4]; 4] {
     std::array::from_fn(|row| std::array::from_fn(|column| gf[column][row]))
 }
 
-/// What a `UsdGeomCamera` says.
+/// Pose and lens of a camera, as `UsdGeomCamera` stores them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct UsdCamera {
     /// Camera centre, world.

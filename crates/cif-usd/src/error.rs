@@ -1,4 +1,4 @@
-//! What can go wrong between a scene and a stage.
+//! Errors of writing and reading stages.
 
 use std::path::PathBuf;
 
@@ -24,7 +24,7 @@ pub enum UsdError {
     /// `pxr` cannot be imported.
     #[error("usd-core cannot be imported ({reason}): pip install \"usd-core>=26.3\"")]
     Missing {
-        /// What Python says.
+        /// Message of Python.
         reason: String,
     },
     /// `pxr` is older than the splat schema.
@@ -80,9 +80,9 @@ pub enum UsdError {
         path: PathBuf,
         /// Path of the prim.
         prim: String,
-        /// What is wrong.
+        /// The problem.
         problem: String,
-        /// What to do about it.
+        /// Remedy.
         fix: &'static str,
     },
     /// A layer that a stage is made of does not exist.
@@ -117,7 +117,7 @@ pub enum UsdError {
         path: PathBuf,
         /// Layer that it was met in.
         layer: String,
-        /// What is how deep.
+        /// Kind and depth of the nesting.
         what: String,
         /// Most levels.
         limit: u32,
@@ -162,7 +162,7 @@ pub enum UsdError {
     Write {
         /// Output.
         path: PathBuf,
-        /// What the system or USD says.
+        /// Message of the operating system or of USD.
         reason: String,
     },
     /// An object could not be given another label.
@@ -170,7 +170,7 @@ pub enum UsdError {
     Relabel {
         /// The file.
         path: PathBuf,
-        /// What is wrong, and what would work.
+        /// The problem and what would work.
         problem: String,
     },
     /// usd-core refuses what a stage holds.
@@ -178,13 +178,13 @@ pub enum UsdError {
     Unusable {
         /// The stage.
         path: PathBuf,
-        /// What USD says.
+        /// Message of USD.
         reason: String,
     },
     /// usd-core did something unexpected.
     #[error("usd-core failed: {reason}")]
     Python {
-        /// What Python says.
+        /// Message of Python.
         reason: String,
     },
     /// Bad pattern or unknown label.

@@ -51,11 +51,11 @@ pub(crate) fn search(
     })
 }
 
-/// What is asked of every prim, prepared once.
+/// Search of a stage for prims, with the objects of `pxr` that it needs for each, made once.
 struct Search<'a, 'py> {
     pxr: &'a Pxr<'py>,
     labels_api: Bound<'py, PyAny>,
-    /// What a label query is made for: a time code or an interval.
+    /// Time code or interval that label queries are made for.
     span: Bound<'py, PyAny>,
     time: Bound<'py, PyAny>,
     /// Caches of transforms and boxes at every sampled time code.
@@ -202,7 +202,7 @@ impl<'a, 'py> Search<'a, 'py> {
         }))
     }
 
-    /// Whether a prim is visible at the time, or at any sampled time of the interval.
+    /// True when a prim is visible at the time, or at any sampled time of the interval.
     fn visible(&self, prim: &Bound<'py, PyAny>) -> PyResult<bool> {
         let imageable = self.pxr.usd_geom.getattr("Imageable")?.call1((prim,))?;
         if !imageable.is_truthy()? {

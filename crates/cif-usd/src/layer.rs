@@ -19,7 +19,7 @@ pub(crate) struct Layer<'p, 'py> {
     attribute_spec: Bound<'py, PyAny>,
 }
 
-/// Whether a property may change over time.
+/// Variability of a property: whether it may change over time.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Variability {
     /// It may.

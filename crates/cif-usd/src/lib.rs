@@ -219,13 +219,13 @@ pub fn relabel(
 /// Reads a stage as a scene graph: one of ours exactly, also when it was edited, and any stage with Gaussian splats.
 ///
 /// A stage of ours comes back as it was exported, in the state of its selected variants: splats and samples exact,
-/// rotations and camera lenses as single-precision numbers. What was done to it since is read as follows.
+/// rotations and camera lenses as single-precision numbers. Later edits are read as follows.
 /// - *Deleted or deactivated* prims have no node.
 /// - *Labels*: of `userProperties:label`, display name and class label, the first that is no longer what was
 ///   exported counts.
 /// - *Recoloured*: display colours that differ from those that were written replace the DC coefficients; higher
 ///   degrees stay.
-/// - *Moved*: any transform operations, also on ancestors. What is not rigid is baked into the splats.
+/// - *Moved*: any transform operations, also on ancestors. The part that is not rigid is baked into the splats.
 /// - *Duplicated*: a copy keeps the id and the rows of its original, under its own name; a warning tells so. The
 ///   original is the one whose name is its `instance` label.
 /// - *Hidden*: by `visibility` of the prim or an ancestor, also over time.

@@ -25,7 +25,7 @@ pub(crate) fn with<T>(body: impl FnOnce(&Pxr<'_>) -> Result<T, UsdError>) -> Res
     Python::try_attach(|py| body(&Pxr::import(py)?)).unwrap_or(Err(UsdError::NoInterpreter))
 }
 
-/// What Python says, without the source locations of usd-core's messages.
+/// Message of a Python error, without the source locations of usd-core's messages.
 pub(crate) fn reason(py: Python<'_>, error: &PyErr) -> String {
     let text = error.value(py).to_string();
     let messages: Vec<&str> = text

@@ -84,7 +84,7 @@ pub(crate) fn relabel(
     Ok(done)
 }
 
-/// Whether a layer names others.
+/// True when a layer names other files.
 fn has_references(layer: &Bound<'_, PyAny>) -> PyResult<bool> {
     let dependencies = layer.call_method0("GetCompositionAssetDependencies")?;
     let external = layer.call_method0("GetExternalAssetDependencies")?;

@@ -11,7 +11,7 @@ pub const GENERATOR: &str = "generator";
 pub const LAYOUT: &str = "layout";
 /// Version of the layout described in the crate documentation.
 pub const LAYOUT_VERSION: i32 = 2;
-/// What a layer is for, in `customLayerData`: [`ROLE_ROOT`] or [`ROLE_PAYLOAD`].
+/// Role of a layer, in `customLayerData`: [`ROLE_ROOT`] or [`ROLE_PAYLOAD`].
 pub const ROLE: &str = "role";
 /// A layer that is opened.
 pub const ROLE_ROOT: &str = "root";
@@ -29,7 +29,7 @@ pub const OMITTED: &str = "omitted";
 pub const CAPTURE_OFFSET: &str = "captureOffset";
 /// Units of the scene per unit of the capture, in `customLayerData`.
 pub const CAPTURE_SCALE: &str = "captureScale";
-/// What the user was told, in `customLayerData`.
+/// Warnings of the export, in `customLayerData`.
 pub const WARNINGS: &str = "warnings";
 /// Fingerprint of the exported field, in `customLayerData`.
 pub const FIELD_FINGERPRINT: &str = "fieldFingerprint";
@@ -154,7 +154,7 @@ pub mod instance {
 
 /// Variant sets of an instance.
 pub mod variants {
-    /// How simulators treat the instance.
+    /// Variant set for simulators: no body, a kinematic or a dynamic one.
     pub const PHYSICS: &str = "physics";
     /// No body: only the colliders, at rest.
     pub const NONE: &str = "none";
@@ -162,7 +162,7 @@ pub mod variants {
     pub const KINEMATIC: &str = "kinematic";
     /// A body that starts at the initial pose with the initial velocity.
     pub const DYNAMIC: &str = "dynamic";
-    /// How many splats are loaded.
+    /// Variant set of the levels of detail.
     pub const LOD: &str = "lod";
     /// All splats.
     pub const FULL: &str = "full";
@@ -199,8 +199,8 @@ pub const PRIMVAR_IDENTITY: &str = "primvars:cif:identity";
 /// Primvar of the instances that every splat may belong to, as ids, most probable first; 0 for an unused place.
 /// `elementSize` of them per splat.
 pub const PRIMVAR_INSTANCE_IDS: &str = "primvars:cif:instanceIds";
-/// Primvar beside [`PRIMVAR_INSTANCE_IDS`]: probability of each instance times the share of the splat's image that was
-/// labelled. What is missing to 1 was seen outside of every mask.
+/// Primvar beside [`PRIMVAR_INSTANCE_IDS`]: probability of each instance times the share of the splat's image that
+/// was labelled. The remainder to 1 was seen outside of every mask.
 pub const PRIMVAR_INSTANCE_SHARES: &str = "primvars:cif:instanceShares";
 /// Primvar of the row of every splat in the field.
 pub const PRIMVAR_ROW: &str = "primvars:cif:row";

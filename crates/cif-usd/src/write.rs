@@ -70,7 +70,7 @@ pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), Us
     pxr::with(|pxr| checked(pxr, path, options).map(|_| ()))
 }
 
-/// What will be written where.
+/// File to write, its kind, and the place of its arrays.
 struct Target {
     /// The file, where links lead.
     path: PathBuf,

@@ -6,7 +6,7 @@ use clap::ValueEnum;
 
 use crate::error::Error;
 
-/// What does the work.
+/// Backend that does the work.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Backend {
     /// A GPU where there is one that supports everything that is asked and is faster, which is measured for a

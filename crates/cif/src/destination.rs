@@ -16,7 +16,7 @@ use crate::output;
 /// so that no two states are alike.
 const RECOGNISED_BYTES: u64 = 8 << 20;
 
-/// What a run may do with a scene that is there when it begins.
+/// Treatment of a scene that is there when a run begins.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Existing {
     /// It is refused.
@@ -25,7 +25,7 @@ pub enum Existing {
     Replace,
 }
 
-/// What keeps a state from being saved.
+/// Reasons why a state was not saved.
 #[derive(Debug)]
 pub enum Unsaved {
     /// Something else has appeared in the place of the file since the run began or saved last. The state was saved
@@ -42,7 +42,7 @@ pub struct Destination {
     /// Where the settings go that the run had.
     settings_path: PathBuf,
     existing: Existing,
-    /// What this run knows to be in the file; `None` for no file.
+    /// Contents of the file as this run knows them; `None` for no file.
     known: Option<Contents>,
     /// Settings that are in their file.
     written: Option<String>,

@@ -1,4 +1,4 @@
-//! What the command line reports, and the exit code it ends with.
+//! Errors of the command line, and its exit codes.
 
 use std::path::{Path, PathBuf};
 
@@ -11,18 +11,18 @@ pub enum Error {
     /// The arguments do not fit together (exit code 2).
     #[error("{message}")]
     Usage {
-        /// What does not fit.
+        /// Message, with the arguments that do not fit.
         message: String,
-        /// What to type instead.
+        /// Advice on valid arguments.
         #[help]
         help: Option<String>,
     },
     /// A failure that one sentence and one piece of advice describe.
     #[error("{message}")]
     Failed {
-        /// What went wrong, naming the file or object.
+        /// Message, naming the file or object.
         message: String,
-        /// How to fix it.
+        /// Remedy.
         #[help]
         help: Option<String>,
     },
@@ -33,7 +33,7 @@ pub enum Error {
     /// The file system refused.
     #[error("cannot {action} {}: {source}", path.display())]
     Io {
-        /// What was being done.
+        /// Action that failed, as in `read` or `write`.
         action: &'static str,
         /// To which file or folder.
         path: PathBuf,
@@ -43,9 +43,9 @@ pub enum Error {
     /// Ctrl-C, after saving (exit code 130).
     #[error("{message}")]
     Interrupted {
-        /// What was saved.
+        /// Message, with what was saved.
         message: String,
-        /// How to go on.
+        /// Advice on how to go on.
         #[help]
         help: Option<String>,
     },
@@ -64,7 +64,7 @@ impl From<cif_exr::ExrError> for Error {
     }
 }
 
-/// What is wrong at a place in a text file.
+/// Error at a place in a text file.
 #[derive(Debug, thiserror::Error, Diagnostic)]
 #[error("{}:{line}: {message}", path.display())]
 pub struct TextError {

@@ -42,14 +42,14 @@ struct KnownMotion {
     aabb_max: Vec<[f64; 3]>,
 }
 
-/// How far an exported object strays from its known motion.
+/// Error of an exported object's motion against its known motion.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct MotionError {
     /// Mask id.
     pub id: u16,
     /// Human name.
     pub label: String,
-    /// What the object does in truth: `static`, `rigid`, ...
+    /// True motion of the object: `static`, `rigid`, ...
     pub truth: String,
     /// Exported motion model.
     pub model: MotionModel,

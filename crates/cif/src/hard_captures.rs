@@ -9,7 +9,7 @@ use image::{ImageBuffer, Luma, Rgb};
 
 use crate::error::Error;
 
-/// What a change may cost.
+/// Loss of quality that a change may cost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Demand {
     /// Nothing: the same scene, told in another way.
@@ -23,9 +23,9 @@ pub enum Demand {
 pub struct HardCapture {
     /// Name, as typed.
     pub name: &'static str,
-    /// What is changed, in a few words.
+    /// The change, in a few words.
     pub what: &'static str,
-    /// What it may cost.
+    /// Loss of quality that it may cost.
     pub demand: Demand,
     /// Part of the quick subset.
     pub quick: bool,

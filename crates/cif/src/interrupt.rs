@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
-/// How long a command that saves nothing may take to end by itself.
+/// Time in which a command that saves nothing may end by itself.
 const GRACE: Duration = Duration::from_millis(1_500);
 
 /// Until [`watch`], signals end the process at once, and remove what it has not finished writing; those that it was

@@ -53,7 +53,7 @@ pub struct FoundMasks {
     pub loaded: bool,
 }
 
-/// How much of an instance the masks show.
+/// Vote of the masks for an instance.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Vote {
     /// Dense index.
@@ -71,7 +71,7 @@ pub struct Vote {
     pub chosen: bool,
 }
 
-/// What was found.
+/// Result of a query by masks.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Found {
     /// Instances with any vote, highest first.
@@ -82,7 +82,7 @@ pub struct Found {
     pub frames: usize,
 }
 
-/// How a rendered mask agrees with the detector's.
+/// Agreement of a rendered mask with the detector's.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct FrameAgreement {
     /// Frame of the capture.

@@ -9,7 +9,7 @@ use cif_output::{Place, folder_of};
 
 use crate::error::Error;
 
-/// What a command reads and what it is about to write: no file may be both, and none may be written twice.
+/// Files that a command reads and files that it is about to write: none may be both, and none may be written twice.
 #[derive(Debug)]
 pub struct Outputs {
     overwrite: bool,

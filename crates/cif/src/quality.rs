@@ -22,7 +22,7 @@ pub struct Quality {
 /// No shortcut.
 pub const FINAL: Quality = Quality { reduction: 1, sh_degree: None, min_opacity: 0.0 };
 
-/// What `--quality draft` stands for.
+/// Shortcuts of `--quality draft`.
 ///
 /// Faint Gaussians cost as much as others and show little. Smaller images are no part of it: the low-pass filter
 /// of 0.3 pixels then blurs twice as far, which costs several dB and, where deformation takes most of the time,

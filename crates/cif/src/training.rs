@@ -44,7 +44,7 @@ pub fn run(
     Ok(outcome)
 }
 
-/// What failed. The state is saved: everything up to the failed step is good, and hours may be in it.
+/// Error of a run that failed. Its state is saved: everything up to the failed step is good, and hours may be in it.
 fn stopped_by(error: &TrainError, trainer: &Trainer, destination: &mut Destination) -> Error {
     if trainer.steps_done() == 0 {
         return Error::plain(error);

@@ -22,10 +22,10 @@ pub use objects::{BACKGROUND, ObjectIds};
 pub(crate) use objects::{assign, explicit};
 pub use read::{Header, read, read_header};
 
-/// What the header of a Cryptomatte calls the hash of [`object_id`].
+/// Name of the hash of [`object_id`] in the header of a Cryptomatte.
 pub const HASH: &str = "MurmurHash3_32";
 
-/// What the header of a Cryptomatte calls [`id_as_float`].
+/// Name of the conversion of [`id_as_float`] in the header of a Cryptomatte.
 pub const CONVERSION: &str = "uint32_to_float32";
 
 /// Id of an object: MurmurHash3 (x86, 32 bits, seed 0) of its UTF-8 name, with the lowest bit of the exponent

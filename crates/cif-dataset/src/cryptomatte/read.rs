@@ -16,7 +16,7 @@ const MAX_PIXELS: u64 = 1 << 28;
 /// No lossless compression packs more than this into a byte; a header that claims more is not believed.
 const MAX_RATIO: u64 = 4096;
 
-/// What the header of a file says about its Cryptomatte.
+/// Cryptomatte metadata in the header of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Header {
     /// Name of the layer.

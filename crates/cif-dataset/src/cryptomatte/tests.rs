@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use super::*;
 use crate::InstanceLabel;
 
-/// What a test varies of a file of 4 x 2 pixels with the objects mug (left), lid and table (mixed) and rest.
+/// Properties that tests vary of a file of 4 x 2 pixels with the objects mug (left), lid and table (mixed) and rest.
 struct File {
     multi_part: bool,
     half: bool,

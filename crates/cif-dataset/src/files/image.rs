@@ -10,7 +10,7 @@ use image::{DynamicImage, ImageDecoder, ImageReader};
 use super::MAX_DEFLATE_RATIO;
 use crate::Error;
 
-/// What the header of an image says.
+/// Size of an image, and whether it has alpha, from its header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ImageHeader {
     pub(crate) width: u32,
@@ -54,7 +54,7 @@ pub(crate) fn probe(path: &Path) -> Result<ImageHeader, Error> {
     Ok(ImageHeader { width, height, has_alpha })
 }
 
-/// Whether the last chunk of a PNG file is there.
+/// True when a PNG file ends with its IEND chunk.
 fn ends_with_iend(path: &Path) -> Result<bool, Error> {
     let mut file = cif_input::open(path).map_err(Error::read(path))?;
     let size = file.metadata().map_err(Error::read(path))?.len();

@@ -13,7 +13,7 @@ use crate::Error;
 /// Larger masks than this are refused before anything is allocated.
 const MAX_PIXELS: u64 = 1 << 28;
 
-/// What the header of a mask says.
+/// Size of a mask and the largest id that it can hold, from its header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct MaskHeader {
     pub(crate) width: u32,

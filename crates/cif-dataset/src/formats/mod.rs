@@ -24,7 +24,7 @@ use crate::files::listing;
 use crate::points::RawPoints;
 use crate::{Error, Layout, OpenOptions, Split};
 
-/// What a reader is given.
+/// Input of a reader: the folder of the capture, and options.
 pub(crate) struct Source<'a> {
     pub(crate) root: &'a Path,
     pub(crate) options: &'a OpenOptions,

@@ -1,4 +1,4 @@
-//! What a 2D detector found for a prompt: one mask per frame, in the ways that detectors write them.
+//! Masks that a 2D detector found for a prompt: one per frame, in the ways that detectors write them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -47,7 +47,7 @@ pub struct ZigzagEntry {
     pub view: usize,
 }
 
-/// What [`write_zigzag`] wrote, as stored in `zigzag.json`.
+/// Index of the sequence that [`write_zigzag`] wrote, as stored in `zigzag.json`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ZigzagIndex {
     /// Camera names in the order of the sequence; one entry when the capture has no synchronised cameras.

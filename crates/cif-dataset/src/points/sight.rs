@@ -1,4 +1,4 @@
-//! Whether the training cameras look at the initial points.
+//! Check that the training cameras see the initial points.
 
 use glam::DVec3;
 
@@ -11,7 +11,7 @@ const LOOKED_FOR: usize = 2_000;
 /// but hardly ever less; a cloud in other coordinates than the cameras is often seen not at all.
 const FEWEST_SEEN: f64 = 0.02;
 
-/// What there is to say where the training cameras show next to none of the initial points.
+/// Warning where the training cameras see next to none of the initial points.
 pub(crate) fn unseen_warning(dataset: &Dataset) -> Option<String> {
     let positions = &dataset.points.positions;
     let cameras: Vec<_> =

@@ -14,7 +14,7 @@ pub enum CheckpointError {
     Read {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: io::Error,
     },
     /// The file does not begin as a safetensors file.
@@ -73,7 +73,7 @@ pub enum CheckpointError {
     Header {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The problem.
         problem: String,
     },
     /// A tensor is missing, of the wrong type or shape, or not known.
@@ -83,7 +83,7 @@ pub enum CheckpointError {
         path: PathBuf,
         /// Name of the tensor.
         tensor: String,
-        /// What is wrong.
+        /// The problem, as the predicate of the message.
         problem: String,
     },
     /// The file's values break a rule of [`crate::Field`].
@@ -107,9 +107,9 @@ pub enum CheckpointError {
     Write {
         /// The file that was to be written.
         path: PathBuf,
-        /// What is wrong, and what to do.
+        /// Problem and remedy.
         problem: String,
-        /// What the system said, if it was asked.
+        /// Error of the operating system, where there is one.
         source: Option<io::Error>,
     },
 }

@@ -170,7 +170,7 @@ pub(super) struct DenseJson {
 /// Time, translation x y z, quaternion w x y z.
 pub(super) const POSE_FLOATS: usize = 8;
 
-/// What a group takes from the tensors.
+/// Values of track groups in the tensors of a file.
 #[derive(Default)]
 pub(super) struct TrackArrays {
     pub(super) poses: Vec<[f64; POSE_FLOATS]>,

@@ -58,7 +58,7 @@ pub struct Checkpoint {
     pub training: Option<TrainingState>,
 }
 
-/// What a run needs beyond the field to go on exactly as if it had not been interrupted.
+/// State beside the field from which a run goes on exactly as if it had not been interrupted.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TrainingState {
     /// Counters, settings, random generators.

@@ -105,7 +105,7 @@ pub struct LinearLayout {
     pub biases: Range<usize>,
 }
 
-/// What a head writes.
+/// Parameter whose delta a head computes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum HeadKind {
     /// dx.
@@ -146,7 +146,7 @@ impl HeadKind {
 /// One head: `W2 ReLU(W1 r + b1) + b2`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct HeadLayout {
-    /// What it writes.
+    /// Parameter whose delta it computes.
     pub kind: HeadKind,
     /// W1, b1: width to width.
     pub hidden: LinearLayout,

@@ -279,7 +279,7 @@ impl<'a> TracksAtTime<'a> {
     }
 }
 
-/// How view-dependent colours follow a turn.
+/// Rotation of spherical-harmonics coefficients by the rotation of a pose.
 fn harmonics_rotation(rotation: DQuat) -> HarmonicsRotation<f32> {
     let rows = DMat3::from_quat(rotation).transpose().to_cols_array_2d();
     HarmonicsRotation::new(rows.map(|row| row.map(|value| value as f32)))

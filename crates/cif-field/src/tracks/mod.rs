@@ -37,7 +37,7 @@ pub struct Tracks {
 /// Gaussians that move together.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TrackGroup {
-    /// What the group is, for people: the object's name.
+    /// Name of the object, for people.
     pub name: String,
     /// True when the learned deformation moves the group before its track does; off for what was added to a
     /// trained scene.

@@ -7,10 +7,10 @@ use gltf::json::validation::Checked;
 use super::source::Source;
 use crate::GltfError;
 
-/// What the caller expects of an accessor.
+/// Count and component types that the caller expects of an accessor.
 #[derive(Clone, Copy)]
 pub(crate) struct Expected<'a> {
-    /// What it is for, for messages.
+    /// Node, mesh or attribute that uses it, for messages.
     pub(crate) object: &'a str,
     /// Number of elements; `None` for any.
     pub(crate) count: Option<usize>,

@@ -25,7 +25,7 @@ pub(crate) struct Curve {
     path: Path,
 }
 
-/// What a curve drives.
+/// Property of a node that an animation channel drives.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Path {
     Translation,

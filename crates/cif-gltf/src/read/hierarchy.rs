@@ -33,7 +33,7 @@ pub(crate) struct Placed {
     pub(crate) index: usize,
     /// Nodes from the root of the scene down to this one, itself included.
     pub(crate) chain: Vec<usize>,
-    /// What our exporter said about it.
+    /// Its `extras.cif`, where our exporter wrote it.
     pub(crate) cif: Option<Cif>,
 }
 

@@ -124,7 +124,7 @@ pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
     assemble(scene).map_err(|AssembleError { place, what }| source.invalid(place, what))
 }
 
-/// What our exporter wrote may have been changed since.
+/// Checks the `extras` of our exporter, which may have been changed since.
 fn check_world(world: &World) -> Result<(), String> {
     let codes = &world.time_codes;
     let ascending = |values: &[f64]| values.windows(2).all(|pair| pair[0] < pair[1]);

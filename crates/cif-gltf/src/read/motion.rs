@@ -53,7 +53,7 @@ pub(crate) struct Chain {
     pub(crate) ours: bool,
 }
 
-/// How a chain moves.
+/// Motion of a chain: rigid track, stretch and visibility.
 pub(crate) struct Movement {
     /// Its keys, and at rest the pose at the first moment at which the node can be seen.
     pub(crate) track: Track,

@@ -23,7 +23,7 @@ pub(crate) fn extension(primitive: &Primitive) -> Option<&Value> {
 }
 
 impl Source {
-    /// Whether a mesh has splats, and how many its positions announce.
+    /// Number of splats that the positions of a mesh announce; `None` for a mesh without splats.
     pub(crate) fn splat_count(&self, mesh: usize) -> Option<u64> {
         let primitives = &self.root.meshes.get(mesh)?.primitives;
         let mut counts =

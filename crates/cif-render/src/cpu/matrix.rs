@@ -26,12 +26,12 @@ pub(super) enum Left<'a> {
     Columns(&'a [f32]),
 }
 
-/// What a product is added to.
+/// Initial value to which a product is added.
 #[derive(Clone, Copy)]
 pub(super) enum Start<'a> {
     /// The same row of numbers everywhere.
     Bias(&'a [f32]),
-    /// What `out` holds.
+    /// The values that `out` holds.
     Out,
 }
 

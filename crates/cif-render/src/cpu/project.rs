@@ -33,7 +33,7 @@ pub(super) struct ViewConstants {
     sh_degree: u8,
     antialiased: bool,
     sort_metric: SortMetric,
-    /// Whether instances are drawn, and from what.
+    /// Source of the occupancy; `None` where instances are not drawn.
     occupancy: Option<OccupancySource>,
 }
 

@@ -24,7 +24,7 @@ use crate::GeometryPath;
 /// Undoes the scale of [`Splat::binary_factor`] in a product of two values that carry it.
 const FROM_BINARY: f32 = 2.0 * std::f32::consts::LN_2;
 
-/// What a tile's pixels ask of the splats.
+/// Cotangents of a tile's colours: gradients of the colour loss by them.
 pub(super) struct TileCotangents {
     /// dL/dcolour.
     pub(super) color: [TilePixels; 3],

@@ -141,7 +141,7 @@ pub(super) struct SplatInTile<S: Simd> {
     u0: [f32x16<S>; 2],
     /// u1 in the first pair of rows.
     u1: f32x16<S>,
-    /// What both lose per row.
+    /// Decrease of `u0` and of `u1` per row.
     l01: f32x16<S>,
     l11: f32x16<S>,
     /// Groups that the drawn ellipse of each pass may touch, of those asked for.
@@ -239,7 +239,7 @@ pub(super) struct BlendingRule<S: Simd> {
     min_transmittance: f32x16<S>,
 }
 
-/// What one splat did to the pixels of a group.
+/// Result of blending one splat into the pixels of a group.
 pub(super) struct Blended<S: Simd> {
     /// Blending weight alpha, clamped, also where it is not drawn.
     pub(super) alpha: f32x16<S>,

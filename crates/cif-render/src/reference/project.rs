@@ -76,7 +76,7 @@ pub struct Splat2d<R> {
     pub factor: [R; 3],
     /// Camera z, metres.
     pub depth: R,
-    /// What the blending order compares: z, or the distance to the camera centre, metres.
+    /// Sort key of the blending order: z, or the distance to the camera centre, metres.
     pub sort_key: R,
     /// Colour, clamped at 0.
     pub color: [R; 3],
@@ -312,7 +312,7 @@ pub fn project<R: Real>(
     })
 }
 
-/// What [`project_backward`] returns.
+/// Result of [`project_backward`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct ProjectGradient<R> {
     /// By the raw parameters of the Gaussian at its time.

@@ -14,7 +14,7 @@ use crate::constants::{MAX_ALPHA, MIN_ALPHA, MIN_TRANSMITTANCE};
 use crate::image::UNLABELLED;
 use crate::settings::{GeometryPath, InstanceNormalisation};
 
-/// What the instance pass of a training view needs.
+/// Labels, identities and normalisation for the instance pass of a training view.
 #[derive(Clone, Copy, Debug)]
 pub struct InstanceTarget<'a, R> {
     /// Dense instance index + 1 per pixel, 0 = unlabelled.

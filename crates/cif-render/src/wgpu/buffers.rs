@@ -234,7 +234,7 @@ pub struct Arriving<T> {
 }
 
 impl<T: Pod> Arriving<T> {
-    /// What has arrived, or the read-back itself when it is still under way; never waits.
+    /// The values once they have arrived, else the read-back itself, still under way; never waits.
     ///
     /// # Errors
     /// When the device is lost or a command was rejected.

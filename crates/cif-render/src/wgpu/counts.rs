@@ -24,7 +24,7 @@ crate::shared_struct! {
     pub struct LabelChunk {
         /// Dense instance index + 1, ascending; behind them 0.
         pub labels: [[u32; 4]; 3],
-        /// How many there are.
+        /// Number of labels in the pass.
         pub count: u32,
         /// Instances K: a row has one number more, the mass on all pixels.
         pub instances: u32,

@@ -16,7 +16,7 @@ const BACKENDS: wgpu::Backends =
 /// Uniform blocks of a kernel, at the most.
 pub(super) const MOST_UNIFORM_BLOCKS: u32 = 2;
 
-/// What an adapter is called and can do, for `cif info --gpu` and logs.
+/// Name, features and limits of an adapter, for `cif info --gpu` and logs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AdapterFacts {
     /// Name as the driver says it.
@@ -39,7 +39,7 @@ pub struct AdapterFacts {
     pub packed_half_floats: bool,
     /// Limits that decide how large a scene may be and how kernels are cut.
     pub limits: [(&'static str, u64); 6],
-    /// What is missing for the kernels to run; empty when they do.
+    /// Limits below those that the kernels need; empty when they run.
     pub missing: Vec<String>,
 }
 
@@ -270,14 +270,14 @@ impl Gpu {
         })
     }
 
-    /// Whether kernels work by subgroups, and why not.
+    /// Use of subgroups by kernels, or the reason why they are not used.
     #[must_use]
     pub fn subgroups(&self) -> &SubgroupUse {
         &self.subgroups
     }
 
-    /// Whether kernels find their constants in storage and not in uniform blocks. So it is where software stands in for
-    /// a GPU: Mesa's (22.3) compiles a kernel anew, at each dispatch, for the values of a uniform block that its
+    /// True when kernels find their constants in storage and not in uniform blocks. So it is where software stands in
+    /// for a GPU: Mesa's (22.3) compiles a kernel anew, at each dispatch, for the values of a uniform block that its
     /// branches depend on, and keeps every one of them until the kernel goes.
     #[must_use]
     pub fn constants_in_storage(&self) -> bool {
@@ -305,7 +305,7 @@ impl Gpu {
         &self.queue
     }
 
-    /// What the adapter is called and can do.
+    /// Name, features and limits of the adapter.
     #[must_use]
     pub fn facts(&self) -> &AdapterFacts {
         &self.facts

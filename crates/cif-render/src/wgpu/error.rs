@@ -1,4 +1,4 @@
-//! What can go wrong on a GPU, in words for the person at the keyboard.
+//! Errors of the GPU backend, in words for the person at the keyboard.
 
 /// Error of the wgpu backend.
 #[derive(Clone, Debug, thiserror::Error, PartialEq, Eq)]
@@ -11,7 +11,7 @@ pub enum GpuError {
     NoAdapter {
         /// Interfaces that were asked.
         backends: String,
-        /// What was found instead.
+        /// Adapters that were found, in words.
         found: String,
     },
     /// An adapter below what every kernel needs.
@@ -30,7 +30,7 @@ pub enum GpuError {
     NoDevice {
         /// Name of the adapter.
         adapter: String,
-        /// What the driver says.
+        /// Message of the driver.
         message: String,
     },
     /// A feature that is to be held back or not, and is none.
@@ -39,7 +39,7 @@ pub enum GpuError {
          timestamps, separated by commas"
     )]
     UnknownFeature {
-        /// What was named.
+        /// The unknown name.
         name: String,
     },
     /// Something does not fit the limits of the device.
@@ -48,7 +48,7 @@ pub enum GpuError {
          use {advice}, or the CPU with --backend cpu"
     )]
     TooLarge {
-        /// What was to be held.
+        /// Data that does not fit.
         what: String,
         /// Elements.
         count: u64,
@@ -58,7 +58,7 @@ pub enum GpuError {
         bytes: u128,
         /// Largest binding, bytes.
         limit: u64,
-        /// What would be smaller.
+        /// Change that would need less memory.
         advice: String,
     },
     /// A deformation network whose activations do not fit the memory of a workgroup.

@@ -1,4 +1,4 @@
-//! What no optimiser may take: bits of a word that kernels set, and whether steps wait for the host.
+//! Fault bits, by which a step with values that no optimiser may take is held back until the host has answered.
 //!
 //! Kernels get an array of words. The first holds the bits of the step under way, the second is not 0 from a step
 //! that must not be taken on: neither that step nor any recorded after it moves a parameter, until the host has

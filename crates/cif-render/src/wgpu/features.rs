@@ -28,7 +28,7 @@ impl GpuFeatures {
     /// The environment variable that holds features back.
     pub const VARIABLE: &str = "CIF_GPU_FEATURES";
 
-    /// What [`Self::VARIABLE`] allows; [`Self::USUAL`] where it is not set.
+    /// Features that [`Self::VARIABLE`] allows; [`Self::USUAL`] where it is not set.
     ///
     /// # Errors
     /// When it names a feature that is not there.

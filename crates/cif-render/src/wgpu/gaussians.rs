@@ -127,7 +127,7 @@ pub fn packed_sh(sh: &[f32; SH_FLOATS]) -> [u32; PACKED_SH_WORDS] {
     })
 }
 
-/// What [`packed_sh`] leaves of spherical harmonics.
+/// Spherical harmonics after [`packed_sh`]: the bands above the constant one rounded to 16-bit floats.
 #[must_use]
 pub fn packed_sh_values(sh: &[f32; SH_FLOATS]) -> [f32; SH_FLOATS] {
     std::array::from_fn(|at| if at < 3 { sh[at] } else { f16::from_bits(half_bits(sh[at])).to_f32() })

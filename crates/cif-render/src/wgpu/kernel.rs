@@ -23,7 +23,7 @@ pub struct Snippet {
     pub text: fn() -> String,
 }
 
-/// How a kernel sees a binding.
+/// Address space and access mode of a binding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Access {
     /// `var<uniform>`.
@@ -41,7 +41,7 @@ pub struct Module {
     pub name: &'static str,
     /// The file.
     pub text: &'static str,
-    /// What it may import.
+    /// Snippets that the file may import.
     pub imports: &'static [Snippet],
     /// Bindings of group 0, in order.
     pub bindings: &'static [Access],

@@ -31,7 +31,7 @@ use crate::RenderSettings;
 pub struct LabelInput<'a> {
     /// Dense instance index + 1 per pixel, 0 = unlabelled.
     pub labels: &'a GpuVec<u32>,
-    /// How many pixels are labelled.
+    /// Number of labelled pixels.
     pub labelled_pixels: usize,
     /// Weight of the view's mean instance loss; 0 differentiates nothing.
     pub weight: f32,
@@ -177,7 +177,7 @@ impl Arrays {
         })
     }
 
-    /// What `bin.wgsl` binds, before pairs have room and after.
+    /// Buffers that `bin.wgsl` binds, for its passes before pairs have room and after.
     fn bin_bindings<'a>(
         &'a self,
         uniform: &'a wgpu::Buffer,

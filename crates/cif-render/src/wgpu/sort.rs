@@ -8,7 +8,7 @@ use super::kernel::{Kernel, Stage, workgroups};
 use super::stages::{SCAN, SORT, entries};
 use super::view::{NONE, SCAN_BLOCK, SORT_BLOCK, ScanParameters, SortParameters, work};
 
-/// How many elements.
+/// Number of elements.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Count {
     /// Known here.

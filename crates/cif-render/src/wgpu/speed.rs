@@ -1,4 +1,4 @@
-//! What a device can do at most, measured: the floor that the times of stages are compared with.
+//! Peak throughput of a device, measured: the lower bounds of the times of stages are derived from it.
 
 use std::time::{Duration, Instant};
 
@@ -40,7 +40,7 @@ pub const SPEED: Module = Module {
     entries: &["copy_values", "multiply_add"],
 };
 
-/// What a device can do at most.
+/// Peak throughput of a device.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct DeviceSpeed {
     /// Bytes read and written per second by a copy.

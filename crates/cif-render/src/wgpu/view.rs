@@ -1,4 +1,4 @@
-//! What all stages share with Rust: the view, splats, work counts, and the constants of WGSL.
+//! Data that all stages share with Rust: the view, splats, work counts, and the constants of WGSL.
 
 use cif_field::SortMetric;
 use cif_field::gaussians::SH_FLOATS;
@@ -137,7 +137,7 @@ crate::shared_struct! {
 }
 
 crate::shared_struct! {
-    /// What a prefix sum works on.
+    /// Parameters of a prefix sum.
     pub struct ScanParameters {
         /// Elements, unless the work counts say it.
         pub count: u32,
@@ -149,7 +149,7 @@ crate::shared_struct! {
 }
 
 crate::shared_struct! {
-    /// What a pass of a radix sort works on.
+    /// Parameters of a pass of a radix sort.
     pub struct SortParameters {
         /// Elements, unless the work counts say it.
         pub count: u32,
@@ -292,7 +292,7 @@ pub const NUMBERS: Snippet =
 /// Spherical harmonics.
 pub const HARMONICS: Snippet =
     Snippet { name: "harmonics", text: || include_str!("shared/harmonics.wgsl").to_owned() };
-/// How projection reads spherical harmonics.
+/// WGSL function by which projection reads spherical harmonics, from 32-bit floats.
 pub(crate) const COEFFICIENTS: Snippet =
     Snippet { name: "coefficients", text: || include_str!("shared/coefficients.wgsl").to_owned() };
 /// As above, from 16-bit floats.

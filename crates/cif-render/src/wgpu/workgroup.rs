@@ -1,4 +1,4 @@
-//! What the invocations of a workgroup do together, in two forms of one interface: through workgroup memory, which
+//! Cooperation of the invocations of a workgroup, in two forms of one interface: through workgroup memory, which
 //! every device has, and by subgroups. A module imports `workgroup`, pastes `lane_builtins` into the parameters of its
 //! entry points and `lane` at their start; which form it gets is the device's. Drivers are not taken at their word: a
 //! device uses subgroups only after known numbers have come out right.
@@ -8,7 +8,7 @@ use super::device::Gpu;
 use super::error::GpuError;
 use super::kernel::{Access, Commands, Kernel, Module, Snippet};
 
-/// How the invocations of a workgroup work together.
+/// Means by which the invocations of a workgroup cooperate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Form {
     /// Through workgroup memory.
@@ -22,7 +22,7 @@ impl Form {
     /// Both.
     pub const ALL: [Self; 2] = [Self::Portable, Self::Subgroups];
 
-    /// What modules get under the names `workgroup`, `lane_builtins` and `lane`.
+    /// Snippets that modules import as `workgroup`, `lane_builtins` and `lane`.
     ///
     /// Subgroup built-ins are parameters and no members of a structure, for naga 30 misses those in HLSL; and it takes
     /// no `enable subgroups;`.
@@ -62,7 +62,7 @@ impl Form {
     }
 }
 
-/// Whether a device works by subgroups.
+/// Use of subgroups on a device, or the reason against it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum SubgroupUse {
     /// It does, and known numbers came out right.

@@ -22,7 +22,7 @@ use crate::support::{Cotangents, Mismatches, Worst, pixel_discontinuity, render}
 /// Relative width of the boundary band: above the rounding of a weight in single precision.
 pub(crate) const BAND: f64 = 1e-3;
 
-/// What one decision at a threshold can change of a pixel: 1/255 of the largest colour here (about 3).
+/// Largest change of a pixel by one decision at a threshold: 1/255 of the largest colour here (about 3).
 const ONE_DECISION: f64 = 0.013;
 
 pub(crate) const CHANNELS: Channels = Channels { depth: true, instances: true };
@@ -53,7 +53,7 @@ pub(crate) fn config() -> SyntheticConfig {
     }
 }
 
-/// What may differ.
+/// Largest differences that are allowed.
 #[derive(Clone, Copy)]
 pub(crate) struct Tolerances {
     /// Of a colour channel outside the boundary band.

@@ -232,7 +232,7 @@ fn many() -> SyntheticConfig {
     }
 }
 
-/// What the reference makes of a head, with gradients by pixels away from the boundary band.
+/// Results of the reference for a head, with gradients by pixels away from the boundary band.
 struct Expected {
     scene: SyntheticScene,
     head: Head,
@@ -410,7 +410,7 @@ fn fast_path_of_every_setting() {
     }
 }
 
-/// What a head gets of a view, by so many threads and within so much memory.
+/// Blended image and gradients of a head, with so many threads and so much memory for a band.
 fn head_on(
     threads: usize,
     memory: u64,

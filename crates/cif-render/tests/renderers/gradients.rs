@@ -4,7 +4,7 @@
 //! Differences are taken where the loss is smooth. Skipped, because a scene near them is replaced by the next
 //! seed: the blending order, ReLU at 0, plane nodes, the clamps of log-scales, Jacobian and colour, the floor of
 //! the antialiasing factor, the weights 1/255 and 0.99, the stop at transmittance 1e-4, and the floor of the
-//! label probability. What happens on either side of them is tested in `hard_cases.rs`.
+//! label probability. Both sides of them are tested in `hard_cases.rs`.
 
 use crate::support::{Case, Mismatches, check_gradients, compare_with_differences};
 use cif_field::{Heads, SortMetric};

@@ -50,7 +50,7 @@ fn assert_finite<R: Real>(name: &str, (forward, gradients): &(Forward<R>, SceneG
     }
 }
 
-/// What computed a number, a column of the table in `tests/README.md`.
+/// Implementation that computed a number, a column of the table in `tests/README.md`.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Column {
     /// Reference in double precision.
@@ -865,7 +865,7 @@ proptest! {
     }
 }
 
-/// What a fuzzed Gaussian is like.
+/// Shape of a fuzzed Gaussian.
 #[derive(Clone, Copy, Debug)]
 enum Shape {
     Needle,

@@ -142,7 +142,7 @@ fn on_gpu(scene: &SyntheticScene, settings: &RenderSettings, cotangents: &Cotang
     Some(seen_on_gpu(crate::on_gpu::run(&mut device, scene, settings, cotangents, |_| {}).unwrap()))
 }
 
-/// What came back of the GPU.
+/// Results that were read back from the GPU, in the common form.
 #[cfg(feature = "wgpu")]
 pub(crate) fn seen_on_gpu(seen: crate::on_gpu::Outcome) -> Seen {
     let three = |v: &[f32; 4]| [0, 1, 2].map(|k| f64::from(v[k]));

@@ -56,7 +56,7 @@ pub struct Prims {
     pub origin: Origin,
     /// Id and place in the instance table of objects that the file records; they are not given to others.
     pub reserved: BTreeMap<u16, usize>,
-    /// How objects that repeat the id of another are taken.
+    /// Treatment of objects that repeat the id of another.
     pub copies: Copies,
 }
 
@@ -84,7 +84,7 @@ impl Default for Prims {
     }
 }
 
-/// How objects that repeat the id of another are taken.
+/// Treatment of objects that repeat the id of another.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Copies {
     /// They keep id and name; a warning tells which one is the copy.
@@ -113,7 +113,7 @@ pub enum Timeline {
 /// An object of a file.
 #[derive(Clone, Debug)]
 pub struct Prim {
-    /// How messages name it, e.g. a path.
+    /// Name in messages, e.g. a path.
     pub place: String,
     /// Instance or background.
     pub identity: Identity,

@@ -61,7 +61,7 @@ pub fn one_hemisphere(samples: &mut [PoseSample]) {
     keys::one_hemisphere(samples);
 }
 
-/// How the frame of a piece lies in the frame of its object.
+/// Transform from the frame of a piece to the frame of its object, over time.
 #[derive(Clone, Debug)]
 pub enum Placement {
     /// `object_from_piece = track * baked`.

@@ -17,7 +17,7 @@ const SAME_PIXEL: f64 = 0.01;
 /// Time codes closer than this are the same.
 const SAME_CODE: f64 = 1e-3;
 
-/// How a camera differs.
+/// Kind of a camera's difference.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum CameraChangeKind {
@@ -36,7 +36,7 @@ pub enum CameraChangeKind {
 pub struct CameraChange {
     /// Its name.
     pub name: String,
-    /// What happened to it.
+    /// Kind of its difference.
     pub kind: CameraChangeKind,
 }
 

@@ -1,4 +1,4 @@
-//! What differs between two graphs, object by object.
+//! Differences between two graphs, object by object.
 //!
 //! Nodes are paired by id, else by name; the background with the background. Splats are paired by their rows in
 //! the field where both graphs come from the same one, else by position where their numbers agree. Differences
@@ -24,7 +24,7 @@ pub(crate) const SAME_PLACE: f64 = 1e-5;
 /// Turns below this are none, radians.
 pub(crate) const SAME_TURN: f64 = 1e-4;
 
-/// How an object differs.
+/// Kind of an object's difference.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ChangeKind {
@@ -53,7 +53,7 @@ impl FromTo {
     }
 }
 
-/// How far an object is from where it was, over all times.
+/// Displacement of an object from where it was, over all times.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Moved {
     /// Largest distance of the origin of its frame, world units.
@@ -67,7 +67,7 @@ pub struct Moved {
 /// Differences of one object.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct ObjectChange {
-    /// What happened to it.
+    /// Kind of its difference.
     pub kind: ChangeKind,
     /// Mask value; `None` for the background and where the file has none.
     pub id: Option<u16>,

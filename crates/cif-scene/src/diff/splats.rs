@@ -18,7 +18,7 @@ const SAME_MEAN: f32 = 1e-5;
 /// 1 minus the dot product of unit quaternions: a fifth of a degree.
 const SAME_ORIENTATION: f32 = 2e-6;
 
-/// How many splats of an object differ.
+/// Number of splats of an object that differ, by kind of difference.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize)]
 pub struct SplatChanges {
     /// Only in the second graph.
@@ -107,7 +107,7 @@ pub(crate) fn pair(first: &Node, second: &Node, same_rows: bool) -> SplatPairs {
     result
 }
 
-/// What differs between the splats of two nodes.
+/// Numbers of splats that differ between two nodes.
 pub(crate) fn compare(first: &Node, second: &Node, same_rows: bool) -> SplatChanges {
     let pairs = pair(first, second, same_rows);
     let (a, b) = (&first.splats, &second.splats);

@@ -81,7 +81,7 @@ pub(crate) fn key_codes(graphs: &[&SceneGraph], nodes: &[&Node]) -> Vec<f64> {
     codes
 }
 
-/// How a unit moved.
+/// Displacement of a unit, largest over the time codes.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Delta {
     /// Largest distance of its origin, world units.
@@ -99,7 +99,7 @@ pub(crate) fn step(before: &Unit<'_>, after: &Unit<'_>, code: f64) -> (DQuat, DV
     (rotation, b.translation - rotation * a.translation)
 }
 
-/// How a unit moved over the time codes; `None` for no more than rounding.
+/// Displacement of a unit over the time codes; `None` for no more than rounding.
 pub(crate) fn delta(before: &Unit<'_>, after: &Unit<'_>, codes: &[f64]) -> Option<Delta> {
     let turn = |a: DQuat, b: DQuat| 2.0 * (a * b.conjugate()).xyz().length().min(1.0).asin();
     let first = step(before, after, *codes.first()?);

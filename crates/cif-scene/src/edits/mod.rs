@@ -1,7 +1,7 @@
 //! Edits come home: what was changed in an exported file is applied to the field it was exported from.
 //!
 //! The graph that was exported is built again from the field, and compared with the edited one ([`crate::diff`]).
-//! What did not change keeps everything the field knows of it, its learned motion included:
+//! Unchanged objects keep everything the field knows of them, their learned motion included:
 //!
 //! | edit | in the field |
 //! |---|---|

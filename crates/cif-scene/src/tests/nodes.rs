@@ -1,4 +1,4 @@
-//! What nodes carry beside their motion: colliders, levels of detail, velocities, visibility.
+//! Properties of nodes beside their motion: colliders, levels of detail, velocities, visibility.
 
 use super::*;
 use cif_field::tracks::{NO_GROUP, Samples, TrackGroup, TrackPose};

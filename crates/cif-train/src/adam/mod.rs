@@ -64,7 +64,7 @@ pub enum RowRates {
 /// Longest row with different rates: the spherical harmonics.
 const MAX_SPLIT_WIDTH: usize = 48;
 
-/// What is the same for all floats of a step.
+/// Bias corrections of the moments, equal for all floats of a step.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct BiasCorrection {
     /// `1 / (1 - beta_1^t)`.

@@ -1,4 +1,4 @@
-//! What a step costs on this machine and this capture, from a few of them.
+//! Cost of a step on this machine and this capture, measured on a few of them.
 
 use std::sync::Arc;
 

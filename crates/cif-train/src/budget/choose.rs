@@ -28,7 +28,7 @@ const FEWEST_FINE_STEPS: f64 = 700.0;
 /// Shorter side that images keep at least, pixels.
 const SMALLEST_IMAGE: u32 = 64;
 
-/// What a run has to do besides its settings.
+/// Facts about a run, besides its settings, that decide its cost and the settings that may change.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Workload {
     /// More than one time.
@@ -61,7 +61,7 @@ pub struct Choice {
     pub base_s: f64,
     /// Expected time of the choice, seconds; less than the budget where more time would bring next to nothing.
     pub expected_s: f64,
-    /// What differs.
+    /// Settings that differ from those to start from.
     pub changes: Vec<Change>,
 }
 

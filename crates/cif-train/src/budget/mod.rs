@@ -55,7 +55,7 @@ impl Budget {
     }
 }
 
-/// What a run is to reach on the frames of its curve; nothing by default.
+/// Target scores of a run on the frames of its curve; none by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Targets {
     /// PSNR, dB.

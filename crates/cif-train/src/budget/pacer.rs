@@ -1,4 +1,4 @@
-//! How long each stage goes on: deadlines per stage, and step counts that follow what steps really cost.
+//! Pacing of stages: deadlines per stage, and step counts that follow the measured cost of steps.
 
 use super::Budget;
 use crate::clock::Seconds;

@@ -60,9 +60,9 @@ pub struct TrainConfig {
     pub instance: InstanceConfig,
     /// Instance-guided resampling.
     pub resample: ResampleConfig,
-    /// What a run may leave out where the capture does not call for it.
+    /// Effects that a run may leave out where the capture does not call for them.
     pub effects: EffectsConfig,
-    /// What is reported, evaluated and saved on the way.
+    /// Reports, evaluations and checkpoints on the way.
     pub report: ReportConfig,
 }
 
@@ -102,7 +102,7 @@ pub struct ModelConfig {
     pub channels: u32,
     /// Width of the network, default 64.
     pub width: u32,
-    /// What the network moves: position, scale, rotation by default; opacity and SH off.
+    /// Parameters that the network moves: position, scale, rotation by default; opacity and SH off.
     pub heads: Heads,
     /// Stored time rows: `compact` (default) or `compat`, all rows as the base code keeps them.
     pub time_encoding: TimeEncoding,
@@ -256,7 +256,7 @@ pub struct IdentityConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct InstanceConfig {
-    /// How occupancy starts, `constant` (default) or `copy_opacity` (A5).
+    /// Source of the initial occupancy, `constant` (default) or `copy_opacity` (A5).
     pub occupancy_start: OccupancyStart,
     /// Initial occupancy, (0, 1), default 0.02 (A5).
     pub occupancy: f32,
@@ -299,8 +299,8 @@ pub struct ResampleConfig {
     pub offset: f32,
 }
 
-/// What a run may leave out where the capture does not call for it. By default nothing is left out; `cif plan`
-/// shows what a capture calls for.
+/// Effects that a run may leave out where the capture does not call for them. By default nothing is left out; `cif
+/// plan` shows what a capture calls for.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct EffectsConfig {
@@ -342,7 +342,7 @@ pub struct EffectsConfig {
     pub exposure: bool,
 }
 
-/// What is reported, evaluated and saved on the way.
+/// Reports, evaluations and checkpoints on the way.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct ReportConfig {

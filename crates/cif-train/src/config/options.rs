@@ -53,7 +53,7 @@ impl From<InstanceGeometry> for GeometryPath {
     }
 }
 
-/// Whether rendered identities are divided by coverage before the logarithm (A3; methods reference 4.3).
+/// Division of rendered identities by coverage before the logarithm (A3; methods reference 4.3).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Normalisation {
@@ -73,7 +73,7 @@ impl From<Normalisation> for InstanceNormalisation {
     }
 }
 
-/// How occupancy starts (A5).
+/// Source of the initial occupancy (A5).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum OccupancyStart {
@@ -106,7 +106,7 @@ pub enum ScaleCorrection {
     Mcmc,
 }
 
-/// How an event's pairs are shared out among instances (A8).
+/// Shares of the instances in an event's pairs (A8).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum LabelShares {

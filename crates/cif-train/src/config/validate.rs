@@ -13,9 +13,9 @@ const MAX_BATCH: u32 = 1024;
 pub struct ConfigError {
     /// Dotted key, e.g. `resample.rate`.
     pub key: &'static str,
-    /// What was given.
+    /// The given value.
     pub value: String,
-    /// What would be accepted.
+    /// Values that would be accepted.
     pub expected: &'static str,
 }
 

@@ -1,18 +1,18 @@
-//! What holds Gaussians to known motion: travelling objects to a path and to moving as one rigid body,
-//! everything else to its place.
+//! Displacement loss, which holds Gaussians to known motion: travelling objects to a path and to moving as one rigid
+//! body, everything else to its place.
 
 use glam::{DMat3, DVec3};
 
 /// Motion that the Gaussians of one object are held to at a time.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {
-    /// How far the centre of the object is from its canonical place, metres.
+    /// Displacement of the object's centre from its canonical place, metres.
     pub shift: DVec3,
     /// Rotation of the object; see [`rotation`].
     pub rotation: DMat3,
 }
 
-/// How strongly Gaussians are held. A distance `r` costs `reach (sqrt(r^2 + reach^2) - reach)` in units of the
+/// Strength with which Gaussians are held. A distance `r` costs `reach (sqrt(r^2 + reach^2) - reach)` in units of the
 /// reach: as its square within the reach, as the distance beyond.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pull {

@@ -17,7 +17,7 @@ use crate::exposure::trained_exposures;
 use super::image::{psnr, ssim, unit_color};
 use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
 
-/// What is scored, and how it is rendered.
+/// Frames to score, and settings by which they are rendered.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct EvaluationOptions {
     /// Frames to score.
@@ -38,7 +38,7 @@ impl EvaluationOptions {
     }
 }
 
-/// What keeps a capture from being scored.
+/// Errors of scoring a capture.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum EvaluationError {

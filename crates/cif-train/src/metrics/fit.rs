@@ -1,4 +1,4 @@
-//! Whether a capture is the one that a scene was trained on, as far as the scene's record tells.
+//! Check that a capture is the one that a scene was trained on, as far as the scene's record tells.
 //!
 //! Compared is what decides where and when a view shows the scene: poses and times. Image sizes, splits and lenses may
 //! differ, and frames, cameras and masks may be missing or new. A scene without recorded cameras fits every capture.
@@ -16,7 +16,7 @@ const SAME_AXES: f64 = 1e-2;
 /// Instances that a message names at most.
 const MOST_NAMED: usize = 3;
 
-/// How much a misfit matters.
+/// Severity of a misfit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Severity {
     /// Pictures and scores say nothing about the scene.
@@ -28,9 +28,9 @@ pub enum Severity {
 /// Something in which a capture differs from what a scene recorded.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Misfit {
-    /// How much it matters.
+    /// Severity.
     pub severity: Severity,
-    /// What differs, by how much, and what to do.
+    /// The difference, its size and the remedy.
     pub message: String,
 }
 

@@ -11,7 +11,7 @@ use serde::Serialize;
 /// Pixels that an instance must occupy in both of two consecutive frames to be watched for switches.
 const MIN_SWITCH_PIXELS: u64 = 100;
 
-/// How often each (truth, prediction) pair of mask ids occurs in one frame.
+/// Confusion counts of one frame: pixels of each (truth, prediction) pair of mask ids.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FrameConfusion {
     /// View that the frame belongs to; consecutive frames of one view are compared for switches.

@@ -1,4 +1,4 @@
-//! How good a field is: image and instance metrics. Source: methods reference 9.
+//! Quality of a field: image and instance metrics. Source: methods reference 9.
 //!
 //! | module | answers |
 //! |---|---|

@@ -1,4 +1,4 @@
-//! What the user says of effects: `all`, `auto`, `none`, and single ones on or off.
+//! Choice of effects by the user: `all`, `auto`, `none`, and single ones on or off.
 
 use std::collections::BTreeMap;
 

@@ -1,4 +1,4 @@
-//! What a capture shows before anything is trained.
+//! Evidence for effects in a capture, collected before anything is trained.
 
 use std::collections::BTreeMap;
 
@@ -38,7 +38,7 @@ const PROPORTIONAL: std::ops::RangeInclusive<u8> = 24..=232;
 /// Points with such values, per channel, that a camera is judged by.
 const SAMPLES: usize = 60;
 
-/// What was found.
+/// Evidence found in a capture.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Evidence {
     /// Distinct times.
@@ -227,7 +227,7 @@ fn is_whole(observation: &Observation, others: &[Observation]) -> bool {
     !observation.cut && observation.area_px >= WHOLE * median
 }
 
-/// How many training cameras could be compared, and the largest factor between two of them in how bright they
+/// Number of training cameras that could be compared, and the largest factor between two of them in how bright they
 /// record the same points.
 fn exposures(
     dataset: &Dataset,

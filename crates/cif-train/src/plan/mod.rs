@@ -119,7 +119,7 @@ impl Serialize for EffectKind {
     }
 }
 
-/// What was decided of an effect.
+/// Decision on an effect.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Decision {
     /// Throughout.
@@ -151,13 +151,13 @@ impl Serialize for Decision {
 pub struct Effect {
     /// Which.
     pub effect: EffectKind,
-    /// What was decided.
+    /// Decision.
     pub decision: Decision,
     /// Why.
     pub evidence: String,
-    /// What it costs where it is on throughout, in time and memory.
+    /// Cost in time and memory where the effect is on throughout.
     pub cost: String,
-    /// What decides otherwise; empty where nothing can.
+    /// Flag that overrides the decision; empty where none can.
     pub flag: String,
 }
 
@@ -168,7 +168,7 @@ pub struct EffectPlan {
     pub effects: Vec<Effect>,
 }
 
-/// How far an effect goes.
+/// Extent to which an effect is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Extent {
     /// Not at all.
@@ -189,7 +189,7 @@ impl EffectPlan {
         Ok(Self { effects: decide(&evidence, config, choice) })
     }
 
-    /// What was decided of an effect.
+    /// Decision on an effect.
     #[must_use]
     pub fn decision(&self, kind: EffectKind) -> Option<&Decision> {
         self.effects.iter().find(|effect| effect.effect == kind).map(|effect| &effect.decision)
@@ -469,7 +469,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
     effects
 }
 
-/// Whether anything may move, and why.
+/// True when anything may move, and the reason.
 fn motion(found: &Evidence) -> (bool, String) {
     if found.times < 2 {
         return (false, "a single time".to_owned());
@@ -490,7 +490,7 @@ fn motion(found: &Evidence) -> (bool, String) {
     }
 }
 
-/// How fast things are, in words.
+/// Number of travelling instances, in words; empty where none travels.
 fn speed(found: &Evidence) -> String {
     match found.travelling.len() {
         0 => String::new(),

@@ -16,7 +16,7 @@ use crate::config::{LabelShares, ResampleConfig, ScaleCorrection, WeakSet};
 use crate::densify::in_world;
 use crate::estimate::most_probable;
 
-/// What an event needs to know beside the field.
+/// Inputs of a resampling event beside the field.
 #[derive(Clone, Copy, Debug)]
 pub struct ResampleContext<'a> {
     /// Settings.
@@ -51,7 +51,7 @@ pub struct Relocations {
     pub labels: usize,
 }
 
-/// What an event did.
+/// Rows and entries that a resampling event changed.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Relocated {
     /// Relocated rows: fresh moments.

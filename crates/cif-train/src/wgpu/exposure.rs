@@ -9,7 +9,7 @@ use crate::exposure::Exposures;
 /// Pixels of a workgroup.
 const WORKGROUP: usize = 256;
 
-/// What is learnt of the cameras, on the device: logarithms of gains and offsets, `[cameras, 6]`.
+/// Exposures learnt per camera, on the device: logarithms of gains and offsets, `[cameras, 6]`.
 #[derive(Debug)]
 pub(crate) struct CameraExposures {
     values: GpuVec<f32>,
@@ -51,7 +51,7 @@ impl CameraExposures {
 /// Recorded around the losses of a view, and after the last view of a step.
 #[derive(Debug)]
 pub(crate) struct GpuExposure {
-    /// What the camera makes of the colours of the view, `[pixels]`.
+    /// Colours of the view as the camera records them, `[pixels]`.
     pub(crate) recorded: GpuVec<[f32; 4]>,
     partial_sums: GpuVec<[f32; 4]>,
     settings: Uniform<ExposureSettings>,

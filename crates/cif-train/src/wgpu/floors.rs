@@ -10,7 +10,7 @@ use cif_field::gaussians::SH_FLOATS;
 use cif_render::wgpu::DeviceSpeed;
 use cif_render::wgpu::deform::{SPLITS, Shape};
 
-/// What a step works on; sums over its views unless said otherwise.
+/// Workload of a step; sums over its views unless said otherwise.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct StepShape {
     /// Views.
@@ -33,11 +33,11 @@ pub struct StepShape {
     pub identity_entries: f64,
     /// True when the loss has the structural similarity.
     pub similarity: bool,
-    /// How Gaussians move, if they do.
+    /// Workload of the deformation; `None` where Gaussians do not move.
     pub deformation: Option<DeformationShape>,
 }
 
-/// What a deformation works on.
+/// Workload of a deformation.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DeformationShape {
     /// Gaussians that are not held still.
@@ -71,7 +71,7 @@ impl DeformationShape {
     }
 }
 
-/// What a stage moves and computes at the least.
+/// Least memory traffic and arithmetic of a stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Floor {
     /// Bytes read and written.

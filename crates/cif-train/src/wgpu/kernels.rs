@@ -23,7 +23,7 @@ use crate::losses::held_out;
 use crate::losses::ssim::{C1, C2};
 
 cif_render::shared_struct! {
-    /// What the losses of a view depend on.
+    /// Parameters of the loss kernels for a view.
     pub struct LossSettings {
         /// Pixels of the view.
         pub pixels: u32,
@@ -53,7 +53,7 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
-    /// What the optimiser's step of the Gaussians depends on.
+    /// Parameters of the optimiser's step of the Gaussians.
     pub struct GaussianRates {
         /// Rates of the geometry with the correction of the first moment; 0 keeps still.
         pub geometry: [[f32; 4]; 3],
@@ -85,7 +85,7 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
-    /// What the optimiser's step of a flat group depends on.
+    /// Parameters of the optimiser's step of a flat group.
     pub struct GroupRates {
         /// Floats.
         pub floats: u32,
@@ -105,7 +105,7 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
-    /// What the optimiser's step of the planes depends on.
+    /// Parameters of the optimiser's step of the planes.
     pub struct PlaneRates {
         /// Planes.
         pub planes: u32,
@@ -133,7 +133,7 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
-    /// What the optimiser's step of exposures depends on.
+    /// Parameters of the optimiser's step of exposures.
     pub struct ExposureRates {
         /// Cameras.
         pub cameras: u32,
@@ -147,7 +147,7 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
-    /// How much is added.
+    /// Parameters of the kernel that accumulates gradients.
     pub struct Accumulation {
         /// Floats, or rows.
         pub count: u32,
@@ -161,7 +161,7 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
-    /// How rows are rearranged.
+    /// Parameters of the kernel that rearranges rows.
     pub struct Rearrangement {
         /// New rows.
         pub rows: u32,
@@ -189,7 +189,7 @@ pub const FRESH: u32 = 1 << 31;
 pub const RESTARTED: u32 = 1 << 30;
 
 cif_render::shared_struct! {
-    /// How a step is judged.
+    /// Parameters of the kernel that judges a step.
     pub struct Judgement {
         /// Slot of the view's losses.
         pub slot: u32,
@@ -203,7 +203,7 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
-    /// How Gaussians are held to known motion.
+    /// Parameters of the loss that holds Gaussians to known motion.
     pub struct Motion {
         /// Weight and reach (metres) of the pull to a path.
         pub path: [f32; 2],
@@ -317,7 +317,7 @@ pub const SSIM: Module = Module {
     entries: &["blur_rows", "compare", "blur_maps", "add_gradient"],
 };
 
-/// What cameras make of colours, and the way back.
+/// Exposure of colours per camera, and its backward pass.
 pub const EXPOSURE: Module = Module {
     name: "exposure",
     text: include_str!("exposure.wgsl"),

@@ -13,7 +13,7 @@ pub const SLOTS: usize = 64;
 /// Pixels of a workgroup.
 const WORKGROUP: usize = 256;
 
-/// What a view is compared with.
+/// Target image and labels that a view is compared with.
 #[derive(Debug)]
 pub struct GpuTarget {
     /// Red, green and blue bytes from the lowest, `[pixels]`.
@@ -52,7 +52,7 @@ impl GpuTarget {
     }
 }
 
-/// How a view is compared.
+/// Weights and switches of the losses of a view.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct LossWeights {
     /// Share of the structural dissimilarity.
@@ -229,7 +229,7 @@ impl GpuLosses {
     }
 }
 
-/// What a slot says of a view.
+/// Losses of a view, read from its slot.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct ViewLoss {
     /// Colour loss and mean squared error.

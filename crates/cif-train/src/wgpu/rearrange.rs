@@ -11,7 +11,7 @@ pub struct GpuRearranger {
     rearrange: Kernel,
 }
 
-/// What becomes of rows.
+/// Rule for the rows of an array when the set of Gaussians changes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct RowRule {
     /// Fresh rows are zeros instead of copies of their parent's.

@@ -15,7 +15,7 @@ pub(crate) const WIDTH: u32 = 48;
 /// Size of the images.
 pub(crate) const HEIGHT: u32 = 36;
 
-/// What the capture looks like.
+/// Parameters of the synthetic capture.
 #[derive(Clone, Copy)]
 pub(crate) struct Scene {
     /// Times; one for a static scene.
@@ -100,7 +100,7 @@ fn camera(angle: f64) -> PinholeCamera {
 /// Factors per channel of training cameras that disagree; the one held out sees their geometric mean.
 const GAINS: [[f64; 3]; 4] = [[0.95, 0.95, 0.95], [0.6, 0.65, 0.75], [0.9, 0.75, 0.6], [0.7, 0.9, 0.9]];
 
-/// What cameras that disagree make of a picture, relative to their mean.
+/// Gains per channel of a camera that disagrees, relative to the geometric mean of all.
 pub(crate) fn relative_gain(view: usize) -> [f64; 3] {
     std::array::from_fn(|channel| {
         let mean = GAINS.iter().map(|gain| gain[channel]).product::<f64>().powf(0.25);

@@ -26,7 +26,7 @@ fn guided() -> TrainConfig {
     config
 }
 
-/// How far the opaque Gaussians of an instance move until half-time, on average.
+/// Mean displacement of the opaque Gaussians of an instance until half-time.
 fn path(field: &Field, instance: usize) -> DVec3 {
     let [first, last] = [0.0, 0.5].map(|time| field.deformed(time).means);
     let (mut sum, mut weight) = (DVec3::ZERO, 0.0);
@@ -183,7 +183,7 @@ fn far_points_lead_no_path_astray() {
     assert!((followed - DVec3::new(TRAVEL, 0.0, 0.0)).length() < 0.15, "{followed}");
 }
 
-/// What a run warns of before its first step.
+/// Warnings of a run before its first step.
 fn warnings(dataset: &Dataset, config: &TrainConfig) -> Vec<String> {
     let mut messages = Vec::new();
     let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();

@@ -53,7 +53,7 @@ pub(super) fn parts(node: &Node) -> Option<&PartsMotion> {
     }
 }
 
-/// What no standard schema holds.
+/// Authors the properties that no standard schema holds.
 fn properties(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
     let (pxr, report) = (scene.pxr, &node.report);
     let int = |value: usize| i32::try_from(value).unwrap_or(i32::MAX);
@@ -143,7 +143,7 @@ fn contents(
     payload.save()
 }
 
-/// What every level of detail has.
+/// Authors the prims that all levels of detail share: proxies and colliders.
 fn shared(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, node: &Node) -> PyResult<()> {
     proxies::author(scene, layer, place, node)?;
     hulls::author(scene, layer, place, node)

@@ -104,7 +104,7 @@ impl<'a> Selection<'a> {
         }
     }
 
-    /// How opacities and colours of the node change.
+    /// Changes of opacities and colours of the node over time.
     pub(super) fn appearance(&self) -> &'a Appearance {
         &self.node.appearance
     }

@@ -1,4 +1,4 @@
-//! What a stage is made of.
+//! Authoring of a stage from a scene graph.
 
 mod camera_prims;
 mod hulls;
@@ -18,7 +18,7 @@ use crate::layer::{Layer, Variability};
 use crate::pxr::Pxr;
 use crate::{conventions, tokens};
 
-/// How the arrays of instances are kept.
+/// Storage of the arrays of instances: payloads or root layer, and levels of detail.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Storage<'a> {
     /// Folder for one layer per instance, and how the root layer calls it; `None` keeps all in the root layer.
@@ -27,7 +27,7 @@ pub(crate) struct Storage<'a> {
     pub(crate) levels: bool,
 }
 
-/// What every part of the writer sees.
+/// Context that all parts of the writer share.
 pub(crate) struct Scene<'a, 'py> {
     pub(crate) pxr: &'a Pxr<'py>,
     pub(crate) graph: &'a SceneGraph,

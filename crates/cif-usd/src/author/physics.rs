@@ -1,4 +1,4 @@
-//! What simulators do with an instance: the variant set `physics`, and gravity.
+//! Physics of an instance for simulators: the variant set `physics`, and gravity.
 //!
 //! Bodies, masses and recorded tracks live inside the variants: an opinion on the prim itself would win over them.
 

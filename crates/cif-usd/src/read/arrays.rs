@@ -9,7 +9,7 @@ use crate::pxr::Pxr;
 /// Times the size of its files that a stage may claim in memory. Arrays of a file compress a little, and one payload
 /// may serve many prims; claims beyond that are mistakes or attacks.
 const EXPANSION: u64 = 256;
-/// What any stage may claim, bytes.
+/// Bytes that a stage may claim in any case, on top of the multiple of its files.
 const ALLOWANCE: u64 = 64 << 20;
 
 /// Reads arrays, and keeps the sum of them inside a bound.

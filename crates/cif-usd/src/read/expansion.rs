@@ -1,5 +1,6 @@
-//! How many prims a stage will have, counted from what its layers say before anything is composed: references, payloads,
-//! inherits and instances may repeat prims that hold such arcs themselves, so that a few lines make billions.
+//! Number of prims of a stage, counted from the specs of its layers before anything is composed: references,
+//! payloads, inherits and instances may repeat prims that hold such arcs themselves, so that a few lines make
+//! billions.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::rc::Rc;
@@ -20,7 +21,7 @@ pub(super) struct Arc {
     pub(super) prim: String,
 }
 
-/// What a layer says about a prim, or about a variant of one.
+/// Prim spec of a layer, or of a variant in it.
 #[derive(Clone, Debug, Default)]
 pub(super) struct PrimSpec {
     /// Paths of the prims directly below.
@@ -32,7 +33,7 @@ pub(super) struct PrimSpec {
     pub(super) active: Option<bool>,
 }
 
-/// What a layer says.
+/// Prim specs, default prim and sublayers of a layer.
 #[derive(Clone, Debug, Default)]
 pub(super) struct LayerSpec {
     /// By path; the root is `/`.
@@ -45,7 +46,7 @@ pub(super) struct LayerSpec {
     pub(super) targets: BTreeMap<String, String>,
 }
 
-/// What instances count for.
+/// Counting of the prims of instances.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Instances {
     /// Their prims once, as usd-core composes them.
@@ -108,7 +109,7 @@ struct Size {
     levels: u32,
 }
 
-/// What all layers of a stack say about a prim.
+/// Prim specs of all layers of a stack, merged.
 #[derive(Default)]
 struct Merged {
     children: Vec<String>,
@@ -117,7 +118,7 @@ struct Merged {
     is_instance: bool,
 }
 
-/// What a size is the sum of.
+/// Kind of the parts that a size is the sum of.
 enum Part {
     Child,
     Arc,
@@ -141,7 +142,7 @@ struct Counting<'a> {
     /// Layer stacks: the key of their root layer, and all their layers, strongest first.
     stacks: Vec<(String, Rc<Vec<&'a LayerSpec>>)>,
     known: HashMap<Place, Size>,
-    /// What instances stand for, where it counts once.
+    /// Prototypes of instances that are still to be counted, where instances count once.
     prototypes: Vec<Place>,
 }
 

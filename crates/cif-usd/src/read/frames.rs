@@ -18,7 +18,7 @@ const MOST_FRAMES: f64 = 10_000.0;
 /// Transforms of a stage: from prims to the scene's own frame, which is the world unless the export placed it there.
 pub(super) struct Frames<'a, 'py> {
     pxr: &'a Pxr<'py>,
-    /// What brings the world into the scene's frame; `None` where they are one.
+    /// Transform from the world to the scene's frame; `None` where they are one.
     scene_from_world: Option<DAffine3>,
     /// The prim that places the scene, while it does so as exported.
     root: Option<Bound<'py, PyAny>>,
@@ -52,7 +52,7 @@ impl<'a, 'py> Frames<'a, 'py> {
         Ok(frames)
     }
 
-    /// Whether a prim only places the scene in the world, as exported.
+    /// True when a prim only places the scene in the world, as exported.
     fn is_root(&self, prim: &Bound<'py, PyAny>) -> PyResult<bool> {
         self.root.as_ref().map_or(Ok(false), |root| root.eq(prim))
     }
@@ -90,7 +90,7 @@ impl<'a, 'py> Frames<'a, 'py> {
         }
     }
 
-    /// Whether anything but `translate`, `scale` and `orient` is sampled, which are interpolated as poses are.
+    /// True when operations are sampled that are not interpolated as poses: all but `translate`, `scale`, `orient`.
     fn turns(&self, prim: &Bound<'py, PyAny>) -> PyResult<bool> {
         let xformable = self.pxr.usd_geom.getattr("Xformable")?.call1((prim,))?;
         for op in xformable.call_method0("GetOrderedXformOps")?.try_iter()? {
@@ -208,8 +208,8 @@ impl<'a, 'py> Frames<'a, 'py> {
         self.exact(&found.unwrap_or(Operations::None))
     }
 
-    /// Times at which anything between a prim and `end` is sampled. What is not linear between its keys is sampled
-    /// at every frame too.
+    /// Times at which anything between a prim and `end` is sampled. Motion that is not linear between its keys is
+    /// sampled at every frame too.
     fn times(&self, prim: &Bound<'py, PyAny>, end: Option<&Bound<'py, PyAny>>) -> PyResult<Vec<f64>> {
         let (mut times, mut movers, mut bent) = (Vec::new(), 0, false);
         for prim in self.chain(prim, end)? {
@@ -262,8 +262,8 @@ impl<'a, 'py> Frames<'a, 'py> {
         Ok(Some((Track { rest, samples }, false)))
     }
 
-    /// How a splat prim lies in the frame of its node; `None` where it collapses. `exact` tells whether the track is
-    /// that of the owner without loss.
+    /// Transform from a splat prim to the frame of its node; `None` where it collapses. `exact` tells whether the
+    /// track is that of the owner without loss.
     pub(super) fn placement(
         &self,
         prim: &Bound<'py, PyAny>,

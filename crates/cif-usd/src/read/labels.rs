@@ -1,4 +1,4 @@
-//! What a prim is called, whose it is, and when it can be seen.
+//! Names, labels, recorded identity and visibility of prims.
 
 use cif_scene::{MotionModel, VisibilitySample, naming};
 use pyo3::prelude::*;
@@ -7,7 +7,7 @@ use super::values::{attribute, plain, samples, text, value};
 use crate::pxr::Pxr;
 use crate::tokens::{self, instance};
 
-/// What our schema says about a prim.
+/// Properties of our schema on a prim.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct Recorded {
     pub(super) background: bool,

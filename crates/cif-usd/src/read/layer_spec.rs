@@ -1,4 +1,4 @@
-//! What a layer says about its prims, read without composing anything.
+//! Prim specs of a layer, read without composing anything.
 
 use std::collections::HashMap;
 
@@ -11,7 +11,7 @@ use super::expansion::{Arc, LayerSpec, MAX_LEVELS, PrimSpec};
 const ASSET_ARCS: [&str; 2] = ["references", "payload"];
 const PATH_ARCS: [&str; 2] = ["inheritPaths", "specializes"];
 
-/// What the value clips of a prim name.
+/// File that a value clip of a prim names: an asset, or a template of asset paths.
 pub(super) enum Clip {
     Asset(String),
     Template(String),

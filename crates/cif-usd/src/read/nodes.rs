@@ -15,7 +15,7 @@ use crate::{UsdError, primvars, tokens};
 pub(super) struct Owner<'py> {
     pub(super) prim: Bound<'py, PyAny>,
     pub(super) path: String,
-    /// What our schema says.
+    /// Properties of our schema on the prim.
     pub(super) recorded: Recorded,
     pub(super) splats: Vec<SplatPrim<'py>>,
 }

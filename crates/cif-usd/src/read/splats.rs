@@ -73,7 +73,7 @@ impl<'py> SplatPrim<'py> {
         })
     }
 
-    /// Whether it has positions at all.
+    /// True when it has positions at all.
     pub(super) fn has_positions(&self) -> PyResult<bool> {
         Ok(self.source("positions")?.is_some())
     }
@@ -110,7 +110,7 @@ impl<'py> SplatPrim<'py> {
         Ok(times)
     }
 
-    /// Whether it says how probable its instance is.
+    /// True when it holds the probability of its instance.
     pub(super) fn has_identities(&self) -> PyResult<bool> {
         Ok(attribute(&self.prim, tokens::PRIMVAR_IDENTITY)?.is_some())
     }
@@ -131,7 +131,7 @@ impl<'py> SplatPrim<'py> {
         Ok(Some((primvars::from_ints(&indices), widths.unwrap_or_default(), colors.unwrap_or_default())))
     }
 
-    /// Whether scales are sampled.
+    /// True when its scales are sampled.
     pub(super) fn samples_scales(&self) -> PyResult<bool> {
         match self.source("scales")? {
             Some(attribute) => Ok(!samples(&attribute)?.is_empty()),

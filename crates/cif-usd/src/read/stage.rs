@@ -20,7 +20,7 @@ use super::{cameras, open};
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, tokens};
 
-/// What every part of the reader sees.
+/// Context that all parts of the reader share.
 pub(super) struct Reading<'a, 'py> {
     pub(super) pxr: &'a Pxr<'py>,
     path: &'a Path,
@@ -47,7 +47,7 @@ impl Reading<'_, '_> {
     }
 }
 
-/// What our mark on a layer says.
+/// Our entry in the `customLayerData` of a layer.
 #[derive(Default)]
 struct Mark {
     ours: bool,

@@ -4,7 +4,7 @@ use cif_scene::Tolerance;
 
 use crate::quality::DRAFT;
 
-/// What a rung does.
+/// Work of a rung: training, storing, rendering or export.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Work {
     /// Trains with settings, each `key=value`, over those of the base; none is the base itself.
@@ -45,7 +45,7 @@ pub struct Rung {
     pub id: String,
     /// As tables and plots call it.
     pub label: String,
-    /// What it does.
+    /// Work that it does.
     pub work: Work,
 }
 
@@ -56,7 +56,7 @@ pub struct Ladder {
     pub name: &'static str,
     /// Heading.
     pub title: &'static str,
-    /// What is changed and what stays, in a sentence or two.
+    /// Settings that are changed and kept, in a sentence or two.
     pub about: &'static str,
     /// Ascending cost, as far as that is known before.
     pub rungs: Vec<Rung>,
@@ -100,7 +100,7 @@ pub const QUICK_BASE: [&str; 15] = [
     "report.curve_frames=4",
 ];
 
-/// What the base has of everything that rungs multiply.
+/// Settings of the base that rungs multiply.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Base {
     /// Fewer rungs.

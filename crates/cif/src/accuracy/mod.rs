@@ -1,4 +1,4 @@
-//! What accuracy costs: one scene trained, stored, rendered and exported in many ways, and the report of it.
+//! Cost of accuracy: one scene trained, stored, rendered and exported in many ways, and the report of it.
 //!
 //! | file | answers |
 //! |---|---|

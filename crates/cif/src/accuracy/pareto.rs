@@ -3,8 +3,8 @@
 /// Gains below this count as none: dB, and points of mIoU.
 const NOTHING: (f64, f64) = (0.02, 0.1);
 
-/// Whether each (cost, value) is on the front: no other one costs no more and gives no less, and one of the two
-/// strictly. Values that are missing are never on it.
+/// For each (cost, value), true when it is on the Pareto front: no other one costs no more and gives no less, and one
+/// of the two strictly. Values that are missing are never on it.
 #[must_use]
 pub(super) fn front(points: &[(f64, Option<f64>)]) -> Vec<bool> {
     let beats = |(cost, value): (f64, Option<f64>), (other_cost, other_value): (f64, Option<f64>)| {

@@ -106,7 +106,7 @@ fn padded(values: impl Iterator<Item = f64>) -> std::ops::Range<f64> {
 /// Size of the names of marks, pixels.
 const NAME_SIZE: i32 = 11;
 
-/// What is taken of a plot, pixels.
+/// Area of a plot that is taken, pixels.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct Area {
     left: i32,

@@ -1,4 +1,4 @@
-//! What is kept of a rung: one JSON file and its pictures, so that a report goes on where it was interrupted.
+//! Record of a rung: one JSON file and its pictures, so that a report goes on where it was interrupted.
 
 use std::path::{Path, PathBuf};
 
@@ -13,7 +13,7 @@ use crate::output;
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Record {
-    /// What was measured, in full: another value makes the record void.
+    /// Everything that the measurement depends on: another value makes the record void.
     pub fingerprint: Value,
     /// Processor time of training, all threads together, measuring not counted; of a frame or a file where
     /// nothing is trained; seconds.

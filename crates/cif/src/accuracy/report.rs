@@ -14,7 +14,7 @@ use super::record::{Folder, Record};
 use crate::error::Error;
 use crate::output;
 
-/// What a report is of.
+/// Subject of a report: capture, command and processor.
 #[derive(Clone, Debug)]
 pub struct Subject {
     /// Name of the capture.
@@ -67,7 +67,7 @@ struct Row<'a> {
     record: &'a Record,
     /// On the front of PSNR, of mIoU.
     front: [bool; 2],
-    /// What climbing to it from the rung below costs.
+    /// Cost and gain against the rung below, in words; `None` for the lowest.
     climb: Option<String>,
 }
 

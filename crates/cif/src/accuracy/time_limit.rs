@@ -1,4 +1,4 @@
-//! How many rungs fit into the time of a quick report.
+//! Time limit of a quick report: decides which rungs still fit.
 
 use cif_train::Clock;
 

@@ -91,8 +91,8 @@ struct Step {
     /// Vector instructions: `auto` takes the widest that the processor has
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
-    /// What does the steps. On a GPU that has timestamps the parts are timed there, one step at a time; counts
-    /// of what it does not count are 0
+    /// Backend that runs the steps. On a GPU that has timestamps the parts are timed there, one step at a time;
+    /// counts of what it does not count are 0
     #[cfg(feature = "wgpu")]
     #[arg(long, value_name = "BACKEND", default_value = "cpu")]
     backend: super::backend::Backend,
@@ -275,7 +275,7 @@ struct Series {
     steps: Vec<StepTimes>,
     /// The same views without the instance pass; empty in other stages.
     without: Vec<StepTimes>,
-    /// What stages took on a GPU, step by step.
+    /// Times of the stages on a GPU, step by step.
     #[cfg(feature = "wgpu")]
     device: Vec<StageTimes>,
 }
@@ -315,7 +315,7 @@ impl Series {
         Ok(series)
     }
 
-    /// What the instance pass adds to colour, `None` in other stages.
+    /// Overhead of the instance pass over colour; `None` in other stages.
     fn overhead(&self) -> Option<Overhead> {
         if self.without.is_empty() {
             return None;
@@ -333,7 +333,7 @@ impl Series {
     }
 }
 
-/// What the instance pass adds.
+/// Overhead of the instance pass.
 struct Overhead {
     /// Raster forward and backward.
     raster: Added,

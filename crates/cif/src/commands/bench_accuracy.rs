@@ -234,7 +234,7 @@ struct Bench {
 }
 
 impl Bench {
-    /// What is kept of a rung, measured where it is not kept yet; none when interrupted.
+    /// Record of a rung, measured where none is kept yet; none when interrupted.
     fn record(&mut self, rung: &Rung, heading: &str) -> Result<Option<Record>, Error> {
         if interrupt::requested() {
             return Ok(None);
@@ -282,7 +282,7 @@ impl Bench {
         })
     }
 
-    /// What an earlier run kept of a rung; of the base, also the scene must be there.
+    /// Record of a rung that an earlier run kept; of the base, also the scene must be there.
     fn kept(&self, rung: &Rung) -> Option<Record> {
         self.rungs
             .find(&rung.id, &self.fingerprint(rung))

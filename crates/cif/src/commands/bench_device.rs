@@ -1,4 +1,4 @@
-//! What the stages of a step take on a GPU, beside the least that they could: `cif bench step --backend wgpu`.
+//! GPU times of the stages of a step, beside the least that they could take: `cif bench step --backend wgpu`.
 
 use std::time::Duration;
 

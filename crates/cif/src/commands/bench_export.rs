@@ -67,7 +67,7 @@ struct ModelCount {
     nodes: usize,
 }
 
-/// What one format made of a rung.
+/// Size, time and deviations of a rung's file in one format.
 #[derive(Debug, Serialize)]
 struct WrittenFile {
     format: &'static str,

@@ -17,10 +17,10 @@ use crate::hard_captures::{Demand, HARD_CAPTURES, HardCapture, Unfit};
 use crate::settings::Layers;
 use crate::{interrupt, output};
 
-/// What scale and place may cost, dB.
+/// Largest loss that scale and place may cost, dB.
 const MAX_PSNR_LOSS: f64 = 0.3;
 
-/// What scale and place may cost, percent of mIoU.
+/// Largest loss that scale and place may cost, percent of mIoU.
 const MAX_MIOU_LOSS: f64 = 1.0;
 
 /// Runs of the capture itself, with a seed each: one alone says little of changes of tenths.
@@ -65,7 +65,7 @@ pub(super) struct BenchHardness {
     capture_options: CaptureOptions,
 }
 
-/// How a variant went.
+/// Result of a variant.
 #[derive(Clone, Debug, Default, Serialize)]
 struct Row {
     name: &'static str,
@@ -79,7 +79,7 @@ struct Row {
     gaussians: usize,
     rolled_back: u64,
     seconds: f64,
-    /// What stopped the run, what it lacks, or what it warned of.
+    /// Error that stopped the run, data that the capture lacks, and warnings.
     notes: Vec<String>,
 }
 

@@ -106,7 +106,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     Ok(())
 }
 
-/// What a scene records of the file: its name, not where it lies.
+/// Name by which a scene records the file, without its folder.
 fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }

@@ -186,7 +186,7 @@ fn print(facts: &Facts) {
     }
 }
 
-/// What the steps of the run worked on.
+/// Prints the work counts of the run.
 fn print_work(counts: &serde_json::Map<String, Value>) {
     for (row, (name, count)) in counts.iter().enumerate() {
         let heading = if row == 0 { "work of training" } else { "" };
@@ -194,7 +194,7 @@ fn print_work(counts: &serde_json::Map<String, Value>) {
     }
 }
 
-/// What the run reached when.
+/// Prints the curve of the run.
 fn print_curve(curve: &Value) {
     let Ok(curve) = serde_json::from_value::<Curve>(curve.clone()) else {
         println!("{:>28}  not readable", "curve");

@@ -43,7 +43,7 @@ pub(super) fn run(as_json: bool) -> Result<(), Error> {
     Ok(())
 }
 
-/// What is used of an adapter, in words.
+/// Features of an adapter that kernels use, in words.
 fn paths(adapter: &AdapterFacts, allowed: GpuFeatures) -> Vec<String> {
     let mut paths =
         vec!["32-bit floats, workgroup memory, no float atomics (results repeat to the bit)".to_owned()];

@@ -89,7 +89,7 @@ enum Command {
     Bench(bench::Bench),
 }
 
-/// How the machine is used; results never depend on the number of threads.
+/// Use of the machine; results never depend on the number of threads.
 #[derive(Clone, Copy, Debug, Args)]
 #[command(next_help_heading = "Machine")]
 struct Machine {
@@ -107,7 +107,7 @@ enum Simd {
     Avx512,
     /// AVX2 with FMA
     Avx2,
-    /// What every processor of this kind has
+    /// Baseline instructions of this kind of processor
     Portable,
 }
 

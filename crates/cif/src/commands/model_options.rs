@@ -5,7 +5,7 @@ use cif_scene::{MotionModel, SceneOptions};
 use cif_train::metrics::training_config;
 use clap::{Args, ValueEnum};
 
-/// How motion is simplified and what simulators get.
+/// Simplification of motion, and physics for simulators.
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Motion and colliders")]
 pub(super) struct ModelOptions {

@@ -1,4 +1,4 @@
-//! How motion reads in the tables of `cif export` and `cif bench export`.
+//! Columns of motion in the tables of `cif export` and `cif bench export`.
 
 use cif_scene::report::ReportRow;
 

@@ -17,7 +17,7 @@ use super::backend::Backend;
 #[cfg(feature = "wgpu")]
 use crate::error::Error;
 
-/// What renders.
+/// Backend that renders.
 pub(super) enum Painter {
     /// The processor.
     Cpu(Box<Renderer>),
@@ -26,7 +26,7 @@ pub(super) enum Painter {
     Gpu(Box<GpuRenderer>),
 }
 
-/// What is rendered first, to tell which is faster.
+/// View that is rendered first, to tell which backend is faster.
 #[cfg(feature = "wgpu")]
 pub(super) struct Sample<'a> {
     pub(super) field: &'a Field,
@@ -51,7 +51,7 @@ impl Painter {
         Self::Cpu(Box::new(Renderer::new(simd)))
     }
 
-    /// What was asked for; `auto` renders `sample` both ways where there is a GPU, and tells what is faster.
+    /// Opens the backend; `auto` renders `sample` on both where there is a GPU, and takes the faster.
     #[cfg(feature = "wgpu")]
     pub(super) fn choose(backend: Backend, simd: SimdLevel, sample: &Sample<'_>) -> Result<Self, Error> {
         let Some(gpu) = backend.open()? else { return Ok(Self::cpu(simd)) };

@@ -53,13 +53,13 @@ pub(super) struct Render {
     /// Folder to write into: DIR/WHAT/VIEW.png
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// What to write, comma separated [default: rgb, or nothing beside --exr]
+    /// Layers to write, comma separated [default: rgb, or nothing beside --exr]
     #[arg(long, value_delimiter = ',', value_name = "WHAT")]
     what: Vec<What>,
     /// Write DIR/exr/VIEW.exr: beauty, depth, motion, instances and Cryptomatte in one file per view
     #[arg(long)]
     exr: bool,
-    /// How much care is taken; what a draft loses is measured on some of the views and told
+    /// Quality of the pictures; what a draft loses is measured on some of the views and told
     #[arg(long, value_name = "QUALITY", default_value = "final")]
     quality: QualityName,
     /// Colours of the EXR files
@@ -73,8 +73,8 @@ pub(super) struct Render {
     /// Vector instructions: `auto` takes the widest that the processor has
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
-    /// What renders: `auto` measures the first view where there is a GPU, and tells what is faster. EXR files need the
-    /// processor
+    /// Backend that renders: `auto` measures the first view where there is a GPU, and tells what is faster. EXR files
+    /// need the processor
     #[cfg(feature = "wgpu")]
     #[arg(long, value_name = "BACKEND", default_value = "auto")]
     backend: super::backend::Backend,

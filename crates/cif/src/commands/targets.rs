@@ -69,7 +69,7 @@ impl FromArgMatches for Targets {
     }
 }
 
-/// How the files are written.
+/// Options for writing the files.
 #[derive(Debug, Args)]
 pub(super) struct Writing {
     /// Put the arrays of every object into a file of its own in OUT.usdc.payloads, loaded on demand;

@@ -103,7 +103,7 @@ pub(super) struct Train {
     /// rounding
     #[arg(long, value_name = "LEVEL", default_value = "auto", value_parser = Simd::parser())]
     simd: Simd,
-    /// What does the steps; results of the processor and of a GPU differ by rounding, and --resume goes on
+    /// Backend that runs the steps; results of the processor and of a GPU differ by rounding, and --resume goes on
     /// with either
     #[cfg(feature = "wgpu")]
     #[arg(long, value_name = "BACKEND", default_value = "cpu")]
@@ -370,7 +370,7 @@ fn load_source(path: &Path) -> Result<Checkpoint, Error> {
     Checkpoint::load(path).map_err(Error::plain)
 }
 
-/// What the capture calls for; the paper's settings stay as they are unless the user says otherwise.
+/// Effects that the capture calls for; the paper's settings stay as they are unless the user says otherwise.
 fn plan(command: &Train, dataset: &Dataset) -> Result<EffectPlan, Error> {
     let config = resolve(command, None, dataset.layout, None)?;
     let basis = if config.preset == Preset::Paper { Basis::All } else { Basis::Auto };

@@ -173,7 +173,7 @@ impl Goals {
         self.budget.is_some() || !self.targets().is_empty()
     }
 
-    /// What became of budget and targets.
+    /// Prints the time used of the budget, and the targets that were reached.
     pub(super) fn report(&self, timing: &Timing, trainer: &Trainer) {
         let curve = trainer.curve();
         if let Some(budget) = self.budget(timing) {

@@ -314,7 +314,7 @@ impl Renderer {
     }
 }
 
-/// What the colour loss asks of a tile's pixels.
+/// Gradients of the colour loss by the colours of a tile's pixels.
 fn tile_cotangents(place: &TilePlace, v_color: &[[f32; 3]], color: &[[f32; 3]]) -> TileCotangents {
     let zero = [[0.0; LANES]; GROUPS];
     let mut cotangents = TileCotangents { color: [zero; 3], remainder: zero };

@@ -18,7 +18,7 @@ use crate::{BlendRequest, Blending, Channels, RenderSettings, RenderedImage};
 /// Bytes of a band, unless said otherwise: a view of 1920 x 1080 pixels with all channels fits.
 pub(super) const BAND_MEMORY: u64 = 256 << 20;
 
-/// What to draw of a view in bands.
+/// Outputs to render of a view in bands.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct BandRequest<'a> {
     /// Outputs of the image.
@@ -90,8 +90,8 @@ impl RenderedBand {
 
 impl Renderer {
     /// Sets the memory that a band may take, in bytes, which decides how many rows are drawn at once. Pictures do not
-    /// depend on it. What the field and its projected Gaussians take, and a single tile of 16 x 16 pixels with all
-    /// Gaussians that reach it, come on top.
+    /// depend on it. The memory of the field and its projected Gaussians, and of a single tile of 16 x 16 pixels with
+    /// all Gaussians that reach it, comes on top.
     pub fn set_band_memory(&mut self, bytes: u64) {
         self.band_memory = bytes;
     }

@@ -19,7 +19,7 @@ use crate::constants::TILE;
 use crate::image::InstanceRanks;
 use crate::{Channels, RenderSettings, RenderedImage};
 
-/// What the instance pass reads of identities.
+/// Identities, with the probabilities and labelled shares that the instance pass reads.
 pub(super) struct DrawnIdentities<'a> {
     identities: &'a Identities,
     probabilities: Vec<f32>,

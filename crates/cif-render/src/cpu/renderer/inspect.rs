@@ -20,7 +20,7 @@ pub struct NotFinite {
     pub value: f32,
 }
 
-/// Whether arrays are looked at, and what was found.
+/// Search for values that are not finite: whether it is on, and the first one that was found.
 #[derive(Debug, Default)]
 pub(super) struct Inspection {
     on: bool,

@@ -68,7 +68,7 @@ pub struct ViewStatistics {
     pub instance_pairs: u64,
 }
 
-/// What the forward pass of a training view returns.
+/// Results of the forward pass of a training view.
 #[derive(Clone, Debug)]
 pub struct ForwardPass {
     /// Rendered colour on the background.

@@ -6,7 +6,7 @@ use crate::wgpu::gaussians::GEOMETRY_FLOATS;
 use crate::wgpu::{Commands, Gpu, GpuError, GpuGaussians, GpuVec, Kernel, Uniform, workgroups};
 
 crate::shared_struct! {
-    /// What rows are taken of.
+    /// Parameters of the kernels that gather and scatter moving rows.
     pub struct Moving {
         /// Rows that move.
         pub rows: u32,
@@ -86,7 +86,7 @@ impl MovingRows {
         })
     }
 
-    /// How many move.
+    /// Number of Gaussians that move.
     pub(super) fn len(&self) -> usize {
         self.rows.len()
     }

@@ -1,4 +1,4 @@
-//! What the kernels know of one deformation when they are compiled, and where its parameters lie for them.
+//! Shape of a deformation: constants with which its kernels are compiled, and the offsets of its parameters.
 
 use cif_field::Deformation as FieldDeformation;
 use cif_field::deformation::{HeadKind, HeadLayout, LinearLayout, MlpLayout, PLANES, PlaneLayout};

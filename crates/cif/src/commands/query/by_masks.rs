@@ -20,7 +20,7 @@ use crate::mask_query::{Agreement, Found, FoundMasks, Selection, agreement, find
 use crate::pictures::save_grey;
 use crate::{interrupt, output};
 
-/// What a detector found, and what to do with it.
+/// Masks that a detector found, and their use.
 #[derive(Debug, Args)]
 #[command(next_help_heading = "By masks")]
 pub(super) struct ByMasks {
