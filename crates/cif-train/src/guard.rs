@@ -88,7 +88,7 @@ fn first_beyond(values: &[f32], limit: f32) -> Option<usize> {
     })
 }
 
-fn fault(part: &'static str, tensor: &str, values: &[f32], limit: f32) -> Option<Fault> {
+pub(crate) fn fault(part: &'static str, tensor: &str, values: &[f32], limit: f32) -> Option<Fault> {
     let index = first_beyond(values, limit)?;
     Some(Fault { part, tensor: tensor.to_owned(), index, value: values[index].to_string() })
 }

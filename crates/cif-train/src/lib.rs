@@ -16,6 +16,7 @@
 //! | [`densify`] | cloning, splitting, pruning |
 //! | [`estimate`] | whose each Gaussian is, from masks |
 //! | [`resample`] | instance-guided resampling with volume conservation |
+//! | [`heads`] | what the instance stage learns, and how pixels tell it |
 //! | [`tracks`] | where objects travel, from masks alone |
 //! | [`metrics`] | how good a field is |
 //! | `wgpu` | losses and optimiser on the GPU, behind the feature of that name |
@@ -52,6 +53,7 @@ pub mod exposure;
 mod frames;
 mod guard;
 mod guidance;
+pub mod heads;
 pub mod losses;
 #[cfg(test)]
 mod measured;
@@ -77,6 +79,7 @@ pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, Stage, TrainEvent};
 pub use guard::{Fault, Hint};
+pub use heads::{Head, HeadLoss, HeadTensors, Pass, ValueHead};
 pub use plan::{EffectChoice, EffectPlan};
 pub use stop::{Start, Stop};
 pub use times::{StepTimes, Work};

@@ -2,15 +2,18 @@
 //!
 //! Engines compute steps on it; the run decides what falls on which step, and changes it between them.
 
+use std::sync::Arc;
+
 use cif_dataset::Dataset;
 use cif_field::Field;
 use cif_geometry::PixelGrid;
-use cif_render::{Gradients, InstanceSettings, OccupancySource, RenderSettings, RenderedImage, UNLABELLED};
+use cif_render::{Gradients, InstanceSettings, RenderSettings, RenderedImage, UNLABELLED};
 
-use crate::config::{Ablation, TrainConfig};
+use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::frames::FrameStore;
 use crate::guidance::{Guidance, Pulls};
+use crate::heads::{self, Head, HeadTensors, Pass, ValueHead};
 use crate::optimiser::Optimiser;
 use crate::progress::Progress;
 use crate::stop::Stop;
@@ -25,6 +28,9 @@ pub(crate) struct State {
     pub stop: Stop,
     pub field: Field,
     pub optimiser: Optimiser,
+    /// What the instance stage learns, with its own tensors from the start of that stage on.
+    pub head: Arc<dyn Head>,
+    pub head_tensors: HeadTensors,
     /// Sums for densification.
     pub statistics: DensifyStatistics,
     pub progress: Progress,
@@ -44,6 +50,7 @@ pub(crate) struct State {
 pub(crate) struct Kept {
     field: Field,
     optimiser: Optimiser,
+    head_tensors: HeadTensors,
     statistics: DensifyStatistics,
     progress: Progress,
     guidance: Guidance,
@@ -53,17 +60,22 @@ pub(crate) struct Kept {
 }
 
 impl State {
-    /// Settings of the instance pass.
-    pub(crate) fn instance_settings(&self) -> InstanceSettings {
-        InstanceSettings {
-            occupancy: if self.config.ablates(Ablation::OpacityOccupancy) {
-                OccupancySource::Opacity
-            } else {
-                OccupancySource::Own
-            },
-            geometry: self.config.instance.geometry.into(),
-            normalisation: self.config.instance.normalisation.into(),
+    /// Settings of the instance pass; `None` where the head blends values of its own by the weights of colour.
+    pub(crate) fn instance_settings(&self) -> Option<InstanceSettings> {
+        match self.head.pass(&self.config) {
+            Pass::Identities(settings) => Some(settings),
+            Pass::Values(_) => None,
         }
+    }
+
+    /// The head, where it blends values of its own.
+    pub(crate) fn value_head(&self) -> Option<&dyn ValueHead> {
+        heads::value_head(&self.head, &self.config)
+    }
+
+    /// The same once it has started: views then show its labels.
+    pub(crate) fn started_head(&self) -> Option<&dyn ValueHead> {
+        self.value_head().filter(|_| !self.head_tensors.is_empty())
     }
 
     /// Settings of a view without instances.
@@ -109,6 +121,7 @@ impl State {
         Kept {
             field: self.field.clone(),
             optimiser: self.optimiser.clone(),
+            head_tensors: self.head_tensors.clone(),
             statistics: self.statistics.clone(),
             progress: self.progress.clone(),
             guidance: self.guidance.clone(),
@@ -121,6 +134,7 @@ impl State {
     /// Stands where the copy was made, with no gradients.
     pub(crate) fn put_back(&mut self, kept: Kept) {
         (self.field, self.optimiser, self.statistics) = (kept.field, kept.optimiser, kept.statistics);
+        self.head_tensors = kept.head_tensors;
         (self.progress, self.guidance) = (kept.progress, kept.guidance);
         (self.unseen, self.label_pixels) = (kept.unseen, kept.label_pixels);
         self.times = kept.times;

@@ -6,9 +6,11 @@ use std::sync::Arc;
 use cif_render::RenderSettings;
 
 use crate::adam::PlaneWeights;
+use crate::config::TrainConfig;
 use crate::events::Stage;
 use crate::frames::TrainFrame;
 use crate::guard::Fault;
+use crate::heads::{Head, ValueHead, value_head};
 use crate::optimiser::StepRates;
 
 /// A view of a step.
@@ -32,6 +34,8 @@ pub(crate) struct StepPlan {
     pub labelled: usize,
     /// Settings of views with labels; those without have no instances.
     pub settings: RenderSettings,
+    /// True when a head that blends values of its own is trained.
+    pub trains_head: bool,
     /// False when only the instance loss is differentiated.
     pub trains_colors: bool,
     /// Weights of the pulls to paths, and to where Gaussians are.
@@ -56,6 +60,20 @@ impl StepPlan {
     /// Share of the colour loss that a view has.
     pub(crate) fn view_weight(&self) -> f32 {
         1.0 / self.views.len() as f32
+    }
+
+    /// The head that the step trains, where it blends values of its own.
+    pub(crate) fn head<'a>(
+        &self,
+        head: &'a Arc<dyn Head>,
+        config: &TrainConfig,
+    ) -> Option<&'a dyn ValueHead> {
+        value_head(head, config).filter(|_| self.trains_head)
+    }
+
+    /// Weight of a labelled pixel in the loss of a head that sums over them.
+    pub(crate) fn head_weight(&self, config: &TrainConfig) -> f32 {
+        config.loss.lambda_instance / self.labelled.max(1) as f32
     }
 
     /// Share of the labelled pixels of the step that a view has (A4).

@@ -1,18 +1,20 @@
 //! Steps on the processor: the definition of what an engine does. Nothing runs ahead.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 use std::time::Instant;
 
 use cif_field::Field;
 use cif_geometry::{PixelGrid, quaternion};
 use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
-use cif_render::{RenderSettings, RenderedImage};
+use cif_render::{BlendRequest, Channels, RenderSettings, RenderedImage};
 
 use super::{Changed, Engine, Views};
 use crate::densify::Rearrangement;
 use crate::error::TrainError;
 use crate::events::Stage;
 use crate::guard::{Fault, exposure_fault, gradient_fault, loss_fault, value_fault};
+use crate::heads::{self, HeadLoss, HeadTensors, ValueHead};
 use crate::losses::held_out::leave_out_held_out;
 use crate::losses::{SsimScratch, color_loss};
 use crate::resample::{Pair, Relocated};
@@ -57,6 +59,12 @@ impl Processor {
             fault = self.view(state, plan, view, reports);
         }
         state.times.add_render(&self.renderer.times());
+        let head = Arc::clone(&state.head);
+        if let Some(head) = plan.head(&head, &state.config) {
+            let seed = state.config.seed ^ u64::from(plan.iteration);
+            head.regularise(&mut state.head_tensors, &state.field, seed);
+            fault = fault.or_else(|| state.head_tensors.fault());
+        }
         fault = fault
             .or_else(|| gradient_fault(&state.gradients, &plan.rates))
             .or_else(|| exposure_fault(state.progress.exposures.as_ref()));
@@ -80,7 +88,11 @@ impl Processor {
                 None => exposures.reset(),
             }
         }
+        if let Some(head) = plan.head(&head, &state.config).filter(|_| fault.is_none()) {
+            state.head_tensors.step(head, plan.iteration, state.config.stages.instance);
+        }
         if fault.is_some() {
+            state.head_tensors.reset();
             state.gradients.reset();
         }
         state.gradients.screen.fill([0.0; 2]);
@@ -121,13 +133,13 @@ impl Processor {
         );
         lap(&mut state.times.losses, &mut since);
         let labelled = if with_instances { data.labelled as f64 } else { 0.0 };
-        let instance_loss = pass.instance_loss;
-        reports.push(ViewReport {
+        let mut instance_loss = pass.instance_loss;
+        let mut report = ViewReport {
             psnr: color.psnr(),
             color_loss: color.loss,
             instance_loss: labelled * instance_loss,
             unsupported: pass.unsupported_pixels as f64,
-        });
+        };
         if !plan.trains_colors {
             self.v_color.pixels.fill([0.0; 3]);
         }
@@ -141,6 +153,14 @@ impl Processor {
             let gradient = exposure.pull_back(&pass.color, &mut self.v_color);
             all.add(&frame.camera_name, &gradient);
         }
+        let head = Arc::clone(&state.head);
+        if let (Some(head), Some(labels)) = (plan.head(&head, &state.config), &data.labels) {
+            let weight = plan.head_weight(&state.config);
+            let HeadLoss { sum, unsupported } =
+                self.blend_head(head, (&mut state.head_tensors, &state.field), time, labels, weight);
+            (report.instance_loss, report.unsupported, instance_loss) = (sum, unsupported, sum);
+        }
+        reports.push(report);
         if let Some(fault) = self.fault_of_view(color.loss, instance_loss) {
             return Some(fault);
         }
@@ -163,6 +183,27 @@ impl Processor {
         state.times.add_view(gaussians, &statistics);
         state.progress.work.add_view(gaussians, &statistics);
         fault
+    }
+
+    /// Blends the values of a head over the view that was rendered last, and adds the gradients of its tensors.
+    fn blend_head(
+        &mut self,
+        head: &dyn ValueHead,
+        (tensors, field): (&mut HeadTensors, &Field),
+        time: f64,
+        labels: &PixelGrid<u16>,
+        weight: f32,
+    ) -> HeadLoss {
+        let values = head.values(tensors, field, time);
+        let (channels, blending) = (head.channels(field), head.blending());
+        let request = BlendRequest { values: &values[..], channels, blending };
+        let blended = self.renderer.blend(&request);
+        let mut v_blended = vec![0.0; blended.values.len()];
+        let loss = head.loss(tensors, &blended, labels, weight, &mut v_blended);
+        let mut v_values = vec![0.0; values.len()];
+        self.renderer.blend_backward(&request, &v_blended, &mut v_values, None);
+        head.values_backward(tensors, field, time, &v_values);
+        loss
     }
 
     /// A value that the renderer met, then a loss that is not finite.
@@ -262,8 +303,18 @@ impl Engine for Processor {
             state.stop.check()?;
             let frame = &state.dataset.frames[*index];
             let field = trial.unwrap_or(&state.field);
-            let rendered =
-                self.renderer.render(field, &frame.camera, frame.time, views.settings, views.channels);
+            let by_values = state.started_head().filter(|_| views.channels.instances);
+            let channels =
+                Channels { instances: by_values.is_none() && views.channels.instances, ..views.channels };
+            let mut rendered =
+                self.renderer.render(field, &frame.camera, frame.time, views.settings, channels);
+            if let Some(head) = by_values {
+                let values = head.values(&state.head_tensors, field, frame.time);
+                let (channels, blending) = (head.channels(field), head.blending());
+                let blended = self.renderer.blend(&BlendRequest { values: &values[..], channels, blending });
+                let image = heads::instance_image(head, &state.head_tensors, &blended, &rendered.alpha);
+                rendered.instances = Some(image);
+            }
             each(state.recorded(*index, rendered));
         }
         Ok(())

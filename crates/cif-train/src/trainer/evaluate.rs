@@ -161,10 +161,13 @@ impl Trainer {
     /// Renders frames of the capture and compares them.
     fn score(&mut self, frames: &[(usize, FrameData)]) -> Result<MeanScores, TrainError> {
         let settings = RenderSettings {
-            instances: self.state.field.identities.as_ref().map(|_| self.state.instance_settings()),
+            instances: self.state.field.identities.as_ref().and_then(|_| self.state.instance_settings()),
             ..self.state.color_settings()
         };
-        let channels = Channels { depth: false, instances: settings.instances.is_some() };
+        let channels = Channels {
+            depth: false,
+            instances: settings.instances.is_some() || self.state.started_head().is_some(),
+        };
         let (mut psnrs, mut ssims, mut labels) = (Vec::new(), Vec::new(), Vec::new());
         let indices: Vec<usize> = frames.iter().map(|(index, _)| *index).collect();
         let views = Views { frames: &indices, settings: &settings, channels };

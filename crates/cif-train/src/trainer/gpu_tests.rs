@@ -449,7 +449,7 @@ fn every_stage_of_a_step_has_a_floor() {
 
 fn drawn(trainer: &mut Trainer, trial: Option<&Field>) -> Vec<RenderedImage> {
     let settings = RenderSettings {
-        instances: trainer.state.field.identities.as_ref().map(|_| trainer.state.instance_settings()),
+        instances: trainer.state.field.identities.as_ref().and_then(|_| trainer.state.instance_settings()),
         ..trainer.state.color_settings()
     };
     let views = Views {

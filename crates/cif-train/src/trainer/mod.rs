@@ -63,6 +63,7 @@ use self::evaluate::MeasuredFrames;
 pub(crate) use self::initialize::automatic_time_nodes;
 pub use self::measure::InstancePass;
 use self::pacing::Pacing;
+use self::resume::SavedHead;
 use self::saving::Saving;
 use crate::clock::{Clock, SystemClock};
 use crate::config::TrainConfig;
@@ -75,6 +76,7 @@ use crate::events::{Stage, TrainEvent};
 use crate::exposure::Exposures;
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
+use crate::heads::{Cif, Head, HeadTensors};
 use crate::optimiser::Optimiser;
 use crate::progress::{Progress, Stages};
 use crate::state::State;
@@ -127,6 +129,8 @@ pub struct Trainer {
     pacing: Option<Pacing>,
     /// Warnings not sent yet.
     warnings: Vec<String>,
+    /// Head of a saved run, and its arrays, until it is set.
+    saved_head: Option<SavedHead>,
     /// Loss of the last step that was taken in.
     last_loss: StepLoss,
     /// Events of steps that were taken in, not sent yet.
@@ -190,11 +194,14 @@ impl Trainer {
             measured_frames,
             pacing: None,
             warnings,
+            saved_head: None,
             last_loss: StepLoss::default(),
             arrived: Vec::new(),
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
                 optimiser: Optimiser::new(&field),
+                head: Arc::new(Cif),
+                head_tensors: HeadTensors::default(),
                 statistics: DensifyStatistics::zeros(n),
                 guidance: Guidance::default(),
                 unseen: Vec::new(),
@@ -300,6 +307,16 @@ impl Trainer {
     /// Records what was planned for the capture, for the field's record.
     pub fn record_effects(&mut self, plan: serde_json::Value) {
         self.state.progress.effects = Some(plan);
+    }
+
+    /// Trains another head in the instance stage than the one of the paper. A run that was saved in or behind that stage
+    /// goes on with the head that it was saved with.
+    ///
+    /// # Errors
+    /// When the run was saved with another head.
+    pub fn set_head(&mut self, head: Arc<dyn Head>) -> Result<(), TrainError> {
+        self.state.head = head;
+        self.restore_head()
     }
 
     /// Reads time from another clock; times of the run and its curve follow it.

@@ -53,9 +53,10 @@ impl Trainer {
             labelled: views.iter().map(|view| view.frame.labelled).sum(),
             views,
             settings: RenderSettings {
-                instances: with_instances.then(|| self.state.instance_settings()),
+                instances: self.state.instance_settings().filter(|_| with_instances),
                 ..self.state.color_settings()
             },
+            trains_head: with_instances && self.state.value_head().is_some(),
             trains_colors: !in_instance_stage || instance.color_loss,
             pulls: self.guidance_weight(stage, iteration),
             rates: StepRates::at(config, stage, iteration, &self.state.field),

@@ -1,6 +1,7 @@
 //! Saving and resuming: everything that the next step depends on.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
@@ -15,8 +16,10 @@ use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::events::Stage;
+use crate::heads::{Cif, Head, HeadTensors, value_head};
 use crate::optimiser::Optimiser;
 use crate::progress::Progress;
+use crate::state::State;
 use crate::stop::Start;
 
 /// Version of the state.
@@ -31,6 +34,9 @@ pub(super) struct SavedState {
     pub(super) config: TrainConfig,
     pub(super) progress: Progress,
     capture: Capture,
+    /// Name of the head that the instance stage trains.
+    #[serde(default = "name_of_cif", skip_serializing_if = "is_cif")]
+    head: String,
     /// Steps per parameter group.
     pub(super) adam_steps: BTreeMap<String, u32>,
 }
@@ -154,11 +160,13 @@ impl Trainer {
         for (name, tensor) in self.state.guidance.tensors() {
             tensors.insert(name.to_owned(), tensor);
         }
+        tensors.extend(self.state.head_tensors.saved());
         let state = SavedState {
             version: VERSION,
             config: self.state.config.clone(),
             progress: self.state.progress.clone(),
             capture: Capture::of(&self.state.dataset),
+            head: self.state.head.name().to_owned(),
             adam_steps,
         };
         let json = serde_json::to_value(state).expect("the state holds only strings, numbers and lists");
@@ -200,8 +208,43 @@ impl Trainer {
             Some(StateTensor::F64(values)) if values.len() == instances => values,
             _ => return Err(unusable("tensor identity.label_pixels is missing or has the wrong shape")),
         };
+        if state.head != Cif.name() {
+            tensors.retain(|name, _| name.starts_with("head."));
+            trainer.saved_head = Some(SavedHead { name: state.head, tensors });
+        }
         Ok(trainer)
     }
+
+    /// Takes up the tensors of a saved head, once the run has it.
+    pub(super) fn restore_head(&mut self) -> Result<(), TrainError> {
+        let Some(mut saved) = self.saved_head.take() else { return Ok(()) };
+        if saved.name != self.state.head.name() {
+            return Err(unusable(format!("its head is {}, not {}", saved.name, self.state.head.name())));
+        }
+        let head = Arc::clone(&self.state.head);
+        let Some(head) = value_head(&head, &self.state.config) else { return Ok(()) };
+        if self.state.progress.stage == Stage::Instance {
+            let State { field, config, head_tensors, .. } = &mut self.state;
+            *head_tensors = HeadTensors::start(head, field, config.seed);
+            let restored = head_tensors.restore(&mut saved.tensors);
+            restored.ok_or_else(|| unusable(format!("the tensors of the head {} do not fit", saved.name)))?;
+        }
+        Ok(())
+    }
+}
+
+/// A head that a run was saved with.
+pub(super) struct SavedHead {
+    pub(super) name: String,
+    tensors: BTreeMap<String, StateTensor>,
+}
+
+fn name_of_cif() -> String {
+    Cif.name().to_owned()
+}
+
+fn is_cif(name: &String) -> bool {
+    *name == name_of_cif()
 }
 
 /// Moments and step counts of all parameter groups.

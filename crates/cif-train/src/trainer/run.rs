@@ -1,5 +1,7 @@
 //! How a run goes through its stages, and where it may be stopped.
 
+use std::sync::Arc;
+
 use cif_render::Gradients;
 
 use super::saving::Saving;
@@ -9,6 +11,7 @@ use crate::densify::DensifyStatistics;
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::heads::{self, HeadTensors};
 use crate::optimiser::Optimiser;
 use crate::progress::{AfterStep, Progress};
 use crate::schedule::falls_on;
@@ -55,6 +58,10 @@ impl Trainer {
     }
 
     fn run_stages(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
+        if let Some(saved) = &self.saved_head {
+            let reason = format!("it trains the head {}; set it first", saved.name);
+            return Err(TrainError::BadState { reason });
+        }
         let mut requests = Requests::default();
         self.saving = Saving::begin(self.state.config.report.checkpoint_seconds, self.clock.now().wall_s);
         for message in std::mem::take(&mut self.warnings) {
@@ -303,6 +310,21 @@ impl Trainer {
         self.state.progress.sh_start = self.state.field.sh_degree;
         self.state.progress.opacities_were_reset = false;
         self.state.statistics = DensifyStatistics::zeros(self.state.field.gaussians.len());
+        let head = Arc::clone(&self.state.head);
+        if let Some(head) = heads::value_head(&head, &self.state.config) {
+            match stage {
+                Stage::Instance => {
+                    self.state.head_tensors =
+                        HeadTensors::start(head, &self.state.field, self.state.config.seed);
+                }
+                Stage::Done if self.state.field.identities.is_some() => {
+                    let labels = head.label_of_rows(&self.state.head_tensors, &self.state.field);
+                    self.state.field.identities = Some(heads::identities(&labels));
+                    self.state.optimiser.start_identities(&self.state.field);
+                }
+                _ => {}
+            }
+        }
         self.engine.changed(Changed::Everything);
     }
 }

@@ -136,12 +136,16 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let iteration = self.state.progress.iteration;
-        let due = Due::after(
+        let mut due = Due::after(
             &self.state.config,
             stage,
             iteration,
             self.stages.iterations(&self.state.config, stage),
         );
+        if self.state.value_head().is_some() {
+            // Identity rows are those of the other head.
+            (due.estimates_identities, due.resamples) = (false, false);
+        }
         let judges = [self.judges_heads(stage, iteration), self.settles(stage, iteration)];
         if judges.contains(&true) || due.estimates_identities || self.engine.is_far_ahead() {
             self.fetch()?;
@@ -253,6 +257,7 @@ impl Trainer {
     fn rearrange(&mut self, change: Rearrangement) {
         self.engine.rearrange(&mut self.state, &change);
         self.state.statistics.gather(&change.origins);
+        self.state.head_tensors.gather(&change.parents, &change.origins);
         self.state.guidance.gather(&change.parents);
         self.gather_still(&change.parents);
         self.state.field.gaussians = change.gaussians;
@@ -290,6 +295,7 @@ impl Trainer {
         self.engine.relocate(&mut self.state, &relocations.pairs, &relocated);
         for pair in &relocations.pairs {
             self.state.guidance.copy(pair.weak, pair.source);
+            self.state.head_tensors.relocate(pair.weak, pair.source);
             self.copy_still(pair.weak, pair.source);
             self.state.unseen[pair.weak as usize] = self.state.unseen[pair.source as usize];
         }

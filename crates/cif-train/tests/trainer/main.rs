@@ -6,6 +6,7 @@
 //! | `training`, `effects`, `guidance` | whole runs: quality, resuming, threads, what is skipped, what masks tell |
 //! | `acceptance` | identities and their resampling keep what they promise |
 //! | `from_scene` | instances on the reconstruction of another run |
+//! | `heads` | a head declared by a test, on every engine |
 //! | `curve`, `pacing`, `measure` | error curves, budgets of time, measured steps |
 //! | `gpu` | runs on a GPU beside the same runs on the processor (`CIF_TEST_GPU=off|auto|require`) |
 #![allow(clippy::unwrap_used)] // Helpers of tests.
@@ -17,6 +18,7 @@ mod from_scene;
 #[cfg(feature = "wgpu")]
 mod gpu;
 mod guidance;
+mod heads;
 mod measure;
 mod pacing;
 #[path = "../support/mod.rs"]

@@ -155,7 +155,11 @@ impl GpuEngine {
                     state.times.tile_pairs += u64::from(view.counts.pairs);
                 }
                 self.make_room(recording.gaussians)?;
-                let views = results.iter().map(ViewResult::report).collect();
+                let mut views: Vec<ViewReport> = results.iter().map(ViewResult::report).collect();
+                for (view, loss) in views.iter_mut().zip(recording.head.iter().flat_map(|head| &head.losses))
+                {
+                    (view.instance_loss, view.unsupported) = (loss.sum, loss.unsupported);
+                }
                 return Ok(Some(StepReport { plan: recording.plan, views, fault: None }));
             }
             // It and those behind it moved nothing.
@@ -172,6 +176,9 @@ impl GpuEngine {
                 continue;
             }
             uncount(state, recording.moving);
+            if let Some(head) = &recording.head {
+                state.head_tensors = head.before.clone();
+            }
             for later in &mut self.again {
                 later.uncount(recording.moving);
             }

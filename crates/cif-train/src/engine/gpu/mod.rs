@@ -8,6 +8,7 @@
 //! |---|---|
 //! | `resident` | what lies on the device, fetching and sending |
 //! | `step`, `view` | one step, and one view of it |
+//! | `head` | the pass of a head that blends values of its own |
 //! | `flight` | steps on their way: what is read of them later, room for pairs, bad steps |
 //! | `diagnose` | where a bad step went wrong |
 //! | `rearrange` | changes of the set of Gaussians, with their rows staying there |
@@ -17,6 +18,7 @@
 mod diagnose;
 mod draw;
 mod flight;
+mod head;
 mod identities;
 mod rearrange;
 mod resident;
@@ -84,6 +86,8 @@ pub(crate) struct GpuEngine {
     faults: GpuVec<u32>,
     readback: Readback,
     flights: Flights,
+    /// A step that the head refused, until it is received.
+    refused: Option<StepReport>,
     /// Steps behind one that must not be taken, to be recorded again.
     again: Vec<Recording>,
     /// Most pairs and label slots that a view wanted so far, and of how many Gaussians.
@@ -182,6 +186,7 @@ impl GpuEngine {
             faults: GpuVec::zeros(gpu, "faults", faults::WORDS)?,
             readback: Readback::new(VIEW_WORDS),
             flights: Flights::default(),
+            refused: None,
             again: Vec::new(),
             wanted: [SMALLEST_ROOM; 2],
             wanted_of: 0,
@@ -219,7 +224,14 @@ impl Engine for GpuEngine {
             self.fetched = Some(counters(state));
         }
         self.send(state)?;
-        let recording = step::count(state, plan);
+        let head = match self.head_pass(state, &plan)? {
+            Err(fault) => {
+                self.refused = Some(StepReport { plan, views: Vec::new(), fault: Some(fault) });
+                return Ok(());
+            }
+            Ok(head) => head,
+        };
+        let recording = Recording { head, ..step::count(state, plan) };
         self.record(state, recording)?;
         self.ahead = true;
         self.since_fetch += 1;
@@ -227,7 +239,11 @@ impl Engine for GpuEngine {
     }
 
     fn receive(&mut self, state: &mut State, all: bool) -> Result<Option<StepReport>, TrainError> {
-        self.receive_step(state, all || self.waits)
+        if let Some(refused) = self.refused.take() {
+            return Ok(Some(refused));
+        }
+        let waits = self.waits || state.value_head().is_some();
+        self.receive_step(state, all || waits)
     }
 
     fn give_up(&mut self, state: &mut State) -> u32 {
@@ -305,6 +321,10 @@ impl Engine for GpuEngine {
         views: Views<'_>,
         each: &mut dyn FnMut(RenderedImage),
     ) -> Result<(), TrainError> {
+        if views.channels.instances && state.started_head().is_some() {
+            // A head decodes what is blended on the host.
+            return Processor::new(SimdLevel::Auto).draw(state, trial, views, each);
+        }
         self.draw_views(state, trial, views, each)
     }
 
