@@ -6,7 +6,7 @@
 use serde::{Deserialize, Serialize};
 
 use crate::clock::Seconds;
-use crate::events::Stage;
+use crate::stage::Stage;
 
 /// Fewest steps between two points of a stage.
 pub const MIN_GAP: u32 = 100;
@@ -117,6 +117,32 @@ impl Curve {
             (xx + (x - mean_x).powi(2), xy + (x - mean_x) * (y - mean_y))
         });
         (xx > 0.0).then(|| mean_y + xy / xx * ((step as f64).max(1.0).ln() - mean_x))
+    }
+}
+
+/// Target scores of a run on the frames of its curve; none by default.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Targets {
+    /// PSNR, dB.
+    pub psnr: Option<f64>,
+    /// mIoU, percent.
+    pub miou: Option<f64>,
+}
+
+impl Targets {
+    /// True when there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.psnr.is_none() && self.miou.is_none()
+    }
+
+    /// True when measured values reach all targets.
+    #[must_use]
+    pub fn reached_by(&self, psnr: Option<f64>, miou: Option<f64>) -> bool {
+        let reached = |target: Option<f64>, value: Option<f64>| {
+            target.is_none_or(|target| value.is_some_and(|value| value >= target))
+        };
+        reached(self.psnr, psnr) && reached(self.miou, miou)
     }
 }
 

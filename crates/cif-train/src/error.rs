@@ -4,9 +4,9 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
-use crate::Stage;
 use crate::config::ConfigError;
 use crate::guard::{Fault, Hint};
+use crate::stage::Stage;
 
 /// Errors of training.
 #[derive(Debug, Error)]

@@ -9,6 +9,7 @@
 //! | [`stop`] | how a run is asked to stop |
 //! | [`schedule`] | learning rates, spherical-harmonics degree |
 //! | [`losses`] | colour losses and their gradients |
+//! | [`fit`] | settings that fit a time budget |
 //! | [`budget`] | how a run fits into the time there is |
 //! | [`curve`] | what a run had reached when |
 //! | [`clock`] | where it reads time |
@@ -50,6 +51,7 @@ pub mod error;
 pub mod estimate;
 pub mod events;
 pub mod exposure;
+pub mod fit;
 mod frames;
 mod guard;
 mod guidance;
@@ -64,6 +66,7 @@ mod progress;
 mod random;
 pub mod resample;
 pub mod schedule;
+pub mod stage;
 mod state;
 mod step;
 pub mod stop;
@@ -77,10 +80,11 @@ pub use clock::{Clock, Seconds, SystemClock};
 pub use config::{Ablation, Preset, TrainConfig};
 pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
-pub use events::{Control, Outcome, Stage, TrainEvent};
+pub use events::{Control, Outcome, TrainEvent};
 pub use guard::{Fault, Hint};
 pub use heads::{Head, HeadLoss, HeadTensors, Pass, ValueHead};
 pub use plan::{EffectChoice, EffectPlan};
+pub use stage::Stage;
 pub use stop::{Start, Stop};
 pub use times::{StepTimes, Work};
 #[cfg(feature = "wgpu")]

@@ -10,8 +10,8 @@ use cif_render::Gradients;
 
 use crate::adam::{Moments, PlaneWeights, RowRates, step_planes};
 use crate::config::{Ablation, TrainConfig};
-use crate::events::Stage;
 use crate::schedule::{log_linear, schedule_steps};
+use crate::stage::Stage;
 use crate::times::{StepTimes, lap};
 
 /// Learning rates of one step, by parameter; those that are not listed keep still.

@@ -4,13 +4,12 @@ use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 
-use crate::budget::Targets;
 use crate::clock::Seconds;
 use crate::config::TrainConfig;
-use crate::curve::Curve;
-use crate::events::Stage;
+use crate::curve::{Curve, Targets};
 use crate::exposure::Exposures;
 use crate::guard::Rollbacks;
+use crate::stage::Stage;
 use crate::times::Work;
 
 /// Counters of a run; saved with its state.

@@ -1,7 +1,7 @@
 //! Schedules of settings over the step count. Source: methods reference 1.1 and 1.3.
 
 use crate::config::{Ablation, TrainConfig};
-use crate::events::Stage;
+use crate::stage::Stage;
 
 /// `exp((1 - r) ln first + r ln last)` with `r = step / steps`, clamped to [0, 1].
 #[must_use]

@@ -7,11 +7,11 @@ use cif_render::RenderSettings;
 
 use crate::adam::PlaneWeights;
 use crate::config::TrainConfig;
-use crate::events::Stage;
 use crate::frames::TrainFrame;
 use crate::guard::Fault;
 use crate::heads::{Head, ValueHead, value_head};
 use crate::optimiser::StepRates;
+use crate::stage::Stage;
 
 /// A view of a step.
 #[derive(Clone)]

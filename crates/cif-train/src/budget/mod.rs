@@ -1,23 +1,13 @@
-//! Training inside a time budget: settings that fit it, and stages that end on time.
-//!
-//! | file | answers |
-//! |---|---|
-//! | `calibrate` | what a step costs on this machine and this capture |
-//! | `choose` | which settings fit the budget, and what they give up |
-//! | `pacer` | how long each stage goes on, by measured progress |
+//! A time budget of a run, and stages that end on time.
 
-mod calibrate;
-mod choose;
 mod pacer;
 
 use serde::{Deserialize, Serialize};
 
 use crate::clock::Seconds;
 
-pub use calibrate::{Calibration, calibrate};
-pub(crate) use choose::weights;
-pub use choose::{Change, Choice, Workload, choose};
-pub use pacer::{Pacer, StageShare};
+pub(crate) use pacer::weights;
+pub use pacer::{COARSE, INSTANCE, Pacer, StageShare};
 
 /// Which time a budget counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -52,31 +42,5 @@ impl Budget {
             BudgetClock::Wall => spent.wall_s,
             BudgetClock::Cpu => spent.cpu_s / self.threads.max(1) as f64,
         }
-    }
-}
-
-/// Target scores of a run on the frames of its curve; none by default.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Targets {
-    /// PSNR, dB.
-    pub psnr: Option<f64>,
-    /// mIoU, percent.
-    pub miou: Option<f64>,
-}
-
-impl Targets {
-    /// True when there is none.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        self.psnr.is_none() && self.miou.is_none()
-    }
-
-    /// True when measured values reach all targets.
-    #[must_use]
-    pub fn reached_by(&self, psnr: Option<f64>, miou: Option<f64>) -> bool {
-        let reached = |target: Option<f64>, value: Option<f64>| {
-            target.is_none_or(|target| value.is_some_and(|value| value >= target))
-        };
-        reached(self.psnr, psnr) && reached(self.miou, miou)
     }
 }

@@ -2,7 +2,13 @@
 
 use super::Budget;
 use crate::clock::Seconds;
-use crate::events::Stage;
+use crate::stage::Stage;
+
+/// Cost of a coarse step relative to a fine one with as many Gaussians: no deformation.
+pub const COARSE: f64 = 0.35;
+
+/// The same of an instance step: the instance pass on top.
+pub const INSTANCE: f64 = 1.25;
 
 /// Share of the budget between two looks at what steps cost.
 const LOOK_EVERY: f64 = 0.01;
@@ -23,6 +29,20 @@ pub struct StageShare {
     pub stage: Stage,
     /// Expected time, any unit.
     pub weight: f64,
+}
+
+/// Weights of the stages for [`Pacer::enter`]: `steps` of each, in order.
+#[must_use]
+pub(crate) fn weights(steps: &[(Stage, u32)]) -> Vec<StageShare> {
+    let cost = |stage| match stage {
+        Stage::Coarse => COARSE,
+        Stage::Instance => INSTANCE,
+        _ => 1.0,
+    };
+    steps
+        .iter()
+        .map(|(stage, steps)| StageShare { stage: *stage, weight: f64::from(*steps) * cost(*stage) })
+        .collect()
 }
 
 /// Follows a budget. Knows nothing of training: it is told the time and answers with steps.

@@ -59,7 +59,7 @@ mod on_gpu {
     use crate::engine::gpu::GpuEngine;
     use crate::engine::processor::Processor;
     use crate::error::TrainError;
-    use crate::events::Stage;
+    use crate::stage::Stage;
 
     /// Time that a probe takes on either, seconds; one step is tried however long it takes.
     const SECONDS_EACH: f64 = 0.5;

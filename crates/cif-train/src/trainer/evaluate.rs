@@ -8,10 +8,11 @@ use crate::config::TrainConfig;
 use crate::curve::{CurveFrames, CurvePoint};
 use crate::engine::Views;
 use crate::error::TrainError;
-use crate::events::{Stage, TrainEvent};
+use crate::events::TrainEvent;
 use crate::metrics::evaluate::mask_ids;
 use crate::metrics::image::{psnr, ssim, unit_color};
 use crate::metrics::{FrameConfusion, instance_metrics};
+use crate::stage::Stage;
 
 /// PSNR that equal images count as, dB.
 const MAX_PSNR: f64 = 100.0;

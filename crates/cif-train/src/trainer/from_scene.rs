@@ -11,9 +11,9 @@ use super::resume::{SavedState, restore};
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
-use crate::events::Stage;
 use crate::exposure::trained_exposures;
 use crate::progress::{Progress, Source};
+use crate::stage::Stage;
 use crate::stop::Start;
 
 /// Times that differ by less are the same.

@@ -15,10 +15,11 @@ use crate::engine::Views;
 use crate::engine::gpu::GpuEngine;
 use crate::engine::processor::Processor;
 use crate::error::TrainError;
-use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::events::{Control, Outcome, TrainEvent};
 use crate::exposure::Exposures;
 use crate::guard::MAX_ROLLBACKS_IN_A_ROW;
 use crate::optimiser::Optimiser;
+use crate::stage::Stage;
 use crate::trainer::InstancePass;
 
 pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {

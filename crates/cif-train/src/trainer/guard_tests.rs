@@ -10,9 +10,10 @@ use tempfile::TempDir;
 use self::support::{Scene, capture, small_config};
 use super::Trainer;
 use crate::error::TrainError;
-use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::events::{Control, Outcome, TrainEvent};
 use crate::guard::{MAX_ROLLBACKS_IN_A_ROW, loss_fault};
 use crate::optimiser::Optimiser;
+use crate::stage::Stage;
 
 fn trainer(times: usize) -> (Trainer, TempDir) {
     let folder = tempfile::tempdir().unwrap();

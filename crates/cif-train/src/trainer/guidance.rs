@@ -12,10 +12,10 @@ use rand::RngExt;
 use super::Trainer;
 use super::plan_step::plane_weights;
 use crate::error::TrainError;
-use crate::events::Stage;
 use crate::guidance::Guide;
 use crate::optimiser::{Optimiser, StepRates};
 use crate::random::{Purpose, stream};
+use crate::stage::Stage;
 use crate::state::State;
 use crate::tracks::{Observation, Track, fit, observe, travels};
 

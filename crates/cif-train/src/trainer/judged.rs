@@ -12,9 +12,10 @@ use super::Trainer;
 use super::motions::{probe, probe_times};
 use crate::engine::{Changed, Views};
 use crate::error::TrainError;
-use crate::events::{Stage, TrainEvent};
+use crate::events::TrainEvent;
 use crate::losses::held_out::held_out;
 use crate::schedule::{falls_on, sh_degree};
+use crate::stage::Stage;
 
 /// Views that are compared.
 const VIEWS: usize = 8;

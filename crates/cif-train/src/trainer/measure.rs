@@ -12,7 +12,7 @@ use super::resume::check_instances;
 use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
-use crate::events::Stage;
+use crate::stage::Stage;
 use crate::times::StepTimes;
 
 /// Whether the steps of the instance stage blend identities.

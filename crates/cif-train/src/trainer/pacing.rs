@@ -7,11 +7,11 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
-use crate::budget::{Budget, Pacer, Targets, weights};
-use crate::curve::CurvePoint;
+use crate::budget::{Budget, Pacer, weights};
+use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
-use crate::events::Stage;
 use crate::progress::Goals;
+use crate::stage::Stage;
 
 /// Points of a stage before its trend is believed.
 const POINTS_OF_TREND: usize = 6;
@@ -43,7 +43,7 @@ pub(super) struct Pacing {
 
 impl Trainer {
     /// Makes the stages that are left end inside a budget, each with its share. Steps of the settings are where
-    /// it starts from, see [`crate::budget::choose`]; [`Self::config`] has those that came of it.
+    /// it starts from, see [`crate::fit::choose`]; [`Self::config`] has those that came of it.
     pub fn set_budget(&mut self, budget: Budget) {
         let fine = f64::from(self.stages.iterations(&self.state.config, Stage::Fine).max(1));
         let instance = f64::from(self.state.config.stages.instance.max(1));

@@ -8,11 +8,11 @@ use super::{InstancePass, Trainer};
 use crate::adam::PlaneWeights;
 use crate::config::{Ablation, TrainConfig};
 use crate::error::TrainError;
-use crate::events::Stage;
 use crate::exposure::RATES;
 use crate::optimiser::StepRates;
 use crate::random::{Purpose, stream};
 use crate::schedule::{log_linear, schedule_steps};
+use crate::stage::Stage;
 use crate::step::{StepPlan, StepView};
 
 /// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).

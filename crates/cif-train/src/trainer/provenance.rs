@@ -5,7 +5,7 @@ use serde_json::{Map, Value, json};
 
 use super::Trainer;
 use crate::config::Ablation;
-use crate::events::Stage;
+use crate::stage::Stage;
 
 /// The members of a JSON object that are not null.
 fn members(object: Value) -> Map<String, Value> {

@@ -15,10 +15,10 @@ use super::evaluate::MeasuredFrames;
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
-use crate::events::Stage;
 use crate::heads::{Cif, Head, HeadTensors, value_head};
 use crate::optimiser::Optimiser;
 use crate::progress::Progress;
+use crate::stage::Stage;
 use crate::state::State;
 use crate::stop::Start;
 

@@ -10,11 +10,12 @@ use crate::curve::MIN_GAP;
 use crate::densify::DensifyStatistics;
 use crate::engine::Changed;
 use crate::error::TrainError;
-use crate::events::{Control, Outcome, Stage, TrainEvent};
+use crate::events::{Control, Outcome, TrainEvent};
 use crate::heads::{self, HeadTensors};
 use crate::optimiser::Optimiser;
 use crate::progress::{AfterStep, Progress};
 use crate::schedule::falls_on;
+use crate::stage::Stage;
 use crate::step::StepLoss;
 
 /// Observer of a run.

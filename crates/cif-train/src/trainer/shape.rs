@@ -3,7 +3,7 @@
 use cif_render::constants::TILE;
 
 use super::Trainer;
-use crate::events::Stage;
+use crate::stage::Stage;
 use crate::times::StepTimes;
 use crate::wgpu::floors::{DeformationShape, StepShape};
 

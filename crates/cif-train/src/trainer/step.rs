@@ -12,12 +12,13 @@ use crate::densify::{DensifyStatistics, Rearrangement, add_gaussians, prune, res
 use crate::engine::processor::Processor;
 use crate::engine::{Views, validation};
 use crate::error::TrainError;
-use crate::events::{Stage, TrainEvent};
+use crate::events::TrainEvent;
 use crate::guard::{Hint, MAX_ROLLBACKS_IN_A_ROW};
 use crate::progress::AfterStep;
 use crate::random::{Purpose, stream};
 use crate::resample::{ResampleContext, apply, choose};
 use crate::schedule::Due;
+use crate::stage::Stage;
 use crate::step::{StepLoss, StepReport};
 use crate::times::lap;
 

@@ -19,8 +19,9 @@ use super::motions::{Limits, Motion, accumulate, probe, probe_times, put_to_rest
 use crate::config::EffectsConfig;
 use crate::engine::Changed;
 use crate::error::TrainError;
-use crate::events::{Stage, TrainEvent};
+use crate::events::TrainEvent;
 use crate::random::{Purpose, stream};
+use crate::stage::Stage;
 
 /// Motion, in limits, from which a Gaussian that stands still is handed back; more than 1, so that none goes back
 /// and forth.

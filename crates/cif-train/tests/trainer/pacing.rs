@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::support::{Scene, capture, small_config};
-use cif_train::budget::{Budget, BudgetClock, Targets, Workload, calibrate, choose};
+use cif_train::budget::{Budget, BudgetClock};
+use cif_train::curve::Targets;
+use cif_train::fit::{Workload, calibrate, choose};
 use cif_train::{Clock, Control, Outcome, Seconds, Stage, TrainConfig, TrainEvent, Trainer};
 
 /// A clock that moves on by a tenth of a second whenever it is read: a step reads it three times.

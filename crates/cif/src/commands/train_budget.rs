@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use cif_dataset::Dataset;
-use cif_train::budget::{Budget, BudgetClock, Choice, Targets, Workload, calibrate, choose};
+use cif_train::budget::{Budget, BudgetClock};
+use cif_train::curve::Targets;
+use cif_train::fit::{Choice, Workload, calibrate, choose};
 use cif_train::{Clock, Seconds, SystemClock, TrainConfig, Trainer};
 use clap::{Args, ValueEnum};
 

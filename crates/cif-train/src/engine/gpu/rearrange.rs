@@ -9,7 +9,7 @@ use cif_render::wgpu::{Commands, Gpu, GpuError, GpuGaussians, GpuVec};
 use super::GpuEngine;
 use super::resident::{Resident, ResidentIdentities, set_moments, statistic_rows, statistics_of};
 use crate::error::TrainError;
-use crate::events::Stage;
+use crate::stage::Stage;
 use crate::state::State;
 use crate::wgpu::rearrange::{GpuRearranger, RowRule};
 

@@ -11,7 +11,7 @@ use super::flight::{AboutView, LOSS_WORDS, ViewRead};
 use super::resident::Resident;
 use super::step::Recording;
 use crate::error::TrainError;
-use crate::events::Stage;
+use crate::stage::Stage;
 use crate::state::State;
 use crate::step::{StepPlan, StepView};
 use crate::times::StepTimes;

@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use cif_dataset::{Dataset, Split};
 
-use super::{Budget, BudgetClock};
+use crate::budget::{Budget, BudgetClock};
 use crate::clock::{Clock, Seconds};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
-use crate::events::Stage;
+use crate::stage::Stage;
 use crate::trainer::{InstancePass, Trainer};
 
 /// Training frames that steps are measured on; decoding more would cost more than it tells.

@@ -1,14 +1,8 @@
 //! Which settings fit a budget: steps, Gaussians and, where nothing else helps, resolution.
 
 use super::Calibration;
+use crate::budget::{COARSE, INSTANCE};
 use crate::config::TrainConfig;
-use crate::events::Stage;
-
-/// Cost of a coarse step relative to a fine one with as many Gaussians: no deformation.
-const COARSE: f64 = 0.35;
-
-/// The same of an instance step: the instance pass on top.
-const INSTANCE: f64 = 1.25;
 
 /// Mean Gaussians of the fine stage as a share of the most.
 const MEAN_GAUSSIANS: f64 = 0.8;
@@ -75,20 +69,6 @@ fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, r
     let coarse = f64::from(config.stages.coarse) * few * if work.is_dynamic { COARSE } else { 1.0 };
     let instance = f64::from(config.stages.instance) * INSTANCE * calibration.step_s(most, reduction);
     coarse + fine + if work.has_instances { instance } else { 0.0 }
-}
-
-/// Weights of the stages for [`super::Pacer::enter`]: `steps` of each, in order.
-#[must_use]
-pub(crate) fn weights(steps: &[(Stage, u32)]) -> Vec<super::StageShare> {
-    let cost = |stage| match stage {
-        Stage::Coarse => COARSE,
-        Stage::Instance => INSTANCE,
-        _ => 1.0,
-    };
-    steps
-        .iter()
-        .map(|(stage, steps)| super::StageShare { stage: *stage, weight: f64::from(*steps) * cost(*stage) })
-        .collect()
 }
 
 /// Settings like `base` that take about `seconds`.
