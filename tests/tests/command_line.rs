@@ -3,6 +3,9 @@
 use std::fs;
 use std::path::Path;
 
+#[path = "../../crates/cif-dataset/tests/support/mod.rs"]
+mod captures;
+
 use cif_test::capture;
 use cif_test::command::{Run, run};
 
@@ -119,6 +122,18 @@ fn missing_captures_and_scenes_are_named() {
     cif(folder.path(), "train empty -o a.cif").fails(1, &["empty", "dataset.json"]);
     cif(folder.path(), "eval empty empty").fails(1, &["cif train"]);
     assert_eq!(listing(folder.path()).len(), 1, "nothing was written");
+}
+
+#[test]
+fn presets_follow_the_layout_of_the_capture() {
+    let folder = captures::dnerf(2, 1);
+    let path = folder.path();
+    let steps = "--preset paper --set stages.coarse=1 --set stages.fine=1 --set stages.instance=0";
+    cif(path.parent().unwrap(), &format!("train {} -o {}/a.cif {steps}", path.display(), path.display()))
+        .succeeds();
+    let settings = fs::read_to_string(path.join("a.train.toml")).unwrap().replace(char::is_whitespace, "");
+    assert!(settings.contains("multipliers=[1,2,]"), "{settings}");
+    assert!(!settings.contains("downscale=2"), "images of D-NeRF are trained as they are: {settings}");
 }
 
 #[test]

@@ -10,9 +10,19 @@ use crate::files::{image, json, listing};
 use crate::formats::{self, Draft, Source, some_of};
 use crate::load::{centred, reduced_size};
 use crate::{
-    CaptureFrame, Dataset, Error, Frame, OpenOptions, PointCloud, PointSource, Split, camera_check,
+    CaptureFrame, Dataset, Error, Frame, Layout, OpenOptions, PointCloud, PointSource, Split, camera_check,
     cryptomatte, instances, layout, mask_files, points,
 };
+
+impl OpenOptions {
+    /// The layout that a folder is read as, without reading it.
+    ///
+    /// # Errors
+    /// When the folder is missing, nothing fits, two layouts fit, or the one of the options does not.
+    pub fn layout_of(&self, root: impl AsRef<Path>) -> Result<Layout, Error> {
+        layout::recognise(root.as_ref(), self.layout, &mut Vec::new())
+    }
+}
 
 impl Dataset {
     /// Opens a capture of any layout (see [`crate::Layout`]).

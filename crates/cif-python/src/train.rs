@@ -136,7 +136,10 @@ impl Run {
                         let config = cif_train::metrics::training_config(&state.field);
                         config.and_then(|config| config.downscale)
                     }
-                    None => self.typed.alone(Layout::HyperNerf)?.downscale,
+                    None => {
+                        let layout = OpenOptions::default().layout_of(&folder).map_err(Error::plain)?;
+                        self.typed.alone(layout)?.downscale
+                    }
                 };
                 let options = OpenOptions { downscale, ..OpenOptions::default() };
                 (cif_dataset::Dataset::open(&folder, &options).map_err(Error::plain)?, downscale)

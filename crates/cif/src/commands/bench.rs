@@ -134,7 +134,8 @@ fn step(command: &Step) -> Result<(), Error> {
     if !command.instances.is_empty() && command.stage.is_some_and(|stage| stage != StageName::Instance) {
         return Err(no_instances());
     }
-    resolve(command, None, Layout::HyperNerf)?;
+    let check = |layout| resolve(command, None, layout).map(drop);
+    let layout = command.capture_options.layout_after(&command.capture, check)?;
     let field = command.scene.as_deref().map(scene::load).transpose()?;
     let stage: Stage = match command.stage {
         Some(stage) => stage.into(),
@@ -148,7 +149,7 @@ fn step(command: &Step) -> Result<(), Error> {
     capture.downscale = capture.downscale.or(field.as_ref().and_then(scene::trained_downscale)).or(resolve(
         command,
         field.as_ref(),
-        Layout::HyperNerf,
+        layout,
     )?
     .downscale);
     let dataset = capture.open(&command.capture)?;

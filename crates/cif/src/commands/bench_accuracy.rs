@@ -71,11 +71,13 @@ pub(super) struct BenchAccuracy {
 }
 
 pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
-    base_config(command, cif_dataset::Layout::HyperNerf)?;
+    let check = |layout| base_config(command, layout).map(drop);
+    let layout = command.capture_options.layout_after(&command.capture, check)?;
+    let wanted = base_config(command, layout)?.downscale;
     let goes_on = command.output.join("rungs").is_dir();
     output::check_folder(&command.output, command.force || goes_on)?;
     let mut options = command.capture_options.clone();
-    options.downscale = options.downscale.or(base_config(command, cif_dataset::Layout::HyperNerf)?.downscale);
+    options.downscale = options.downscale.or(wanted);
     let mut dataset = options.open(&command.capture)?;
     if command.quick
         && options.downscale.is_none()

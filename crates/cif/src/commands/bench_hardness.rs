@@ -91,7 +91,8 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
             format!("the variants are {}", names.join(", ")),
         ));
     }
-    resolve(command, Layout::HyperNerf)?;
+    let check = |layout| resolve(command, layout).map(drop);
+    command.capture_options.layout_after(&command.capture, check)?;
     let dataset = command.capture_options.open(&command.capture)?;
     print_warnings(&dataset);
     if dataset.val_frames().is_empty() {

@@ -209,9 +209,9 @@ enum LayoutName {
 }
 
 impl CaptureOptions {
-    fn open(&self, capture: &std::path::Path) -> Result<cif_dataset::Dataset, Error> {
-        use cif_dataset::{Dataset, Layout, OpenOptions};
-        let options = OpenOptions {
+    fn options(&self) -> cif_dataset::OpenOptions {
+        use cif_dataset::Layout;
+        cif_dataset::OpenOptions {
             masks: self.masks.clone(),
             without_masks: self.no_masks,
             downscale: self.downscale,
@@ -223,8 +223,23 @@ impl CaptureOptions {
                 LayoutName::Nerfstudio => Layout::Nerfstudio,
                 LayoutName::Colmap => Layout::Colmap,
             }),
-        };
-        Dataset::open(capture, &options).map_err(Error::plain)
+        }
+    }
+
+    /// The layout that a capture is read as, once `check` has passed for it: wrong settings are told before a missing
+    /// capture, for which they are checked with a layout whose presets are those of all.
+    fn layout_after(
+        &self,
+        capture: &std::path::Path,
+        check: impl FnOnce(cif_dataset::Layout) -> Result<(), Error>,
+    ) -> Result<cif_dataset::Layout, Error> {
+        let layout = self.options().layout_of(capture).map_err(Error::plain);
+        check(*layout.as_ref().unwrap_or(&cif_dataset::Layout::Colmap))?;
+        layout
+    }
+
+    fn open(&self, capture: &std::path::Path) -> Result<cif_dataset::Dataset, Error> {
+        cif_dataset::Dataset::open(capture, &self.options()).map_err(Error::plain)
     }
 }
 

@@ -184,10 +184,10 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     let checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
     let source = command.from.as_deref().map(load_source).transpose()?;
     let base = source.as_ref().and_then(|source| cif_train::metrics::training_config(&source.field));
-    if checkpoint.is_none() {
-        // Typing errors show before a long look at the capture; the layout only shifts preset values.
-        resolve(command, base.as_ref(), Layout::HyperNerf, None)?;
-    }
+    let layout = command.capture_options.layout_after(&command.capture, |layout| match checkpoint {
+        Some(_) => Ok(()),
+        None => resolve(command, base.as_ref(), layout, None).map(drop),
+    })?;
 
     #[cfg(feature = "wgpu")]
     let gpu = command.backend.open()?;
@@ -195,7 +195,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     let mut capture = command.capture_options.clone();
     let wanted = match &checkpoint {
         Some(checkpoint) => scene::trained_downscale(&checkpoint.field),
-        None => resolve(command, base.as_ref(), Layout::HyperNerf, None)?.downscale,
+        None => resolve(command, base.as_ref(), layout, None)?.downscale,
     };
     capture.downscale = capture.downscale.or(wanted);
     let mut dataset = capture.open(&command.capture)?;
