@@ -193,6 +193,21 @@ impl TrackGroup {
         (a.rotation.slerp(b.rotation, fraction), a.translation.lerp(b.translation, fraction))
     }
 
+    /// Keys that decide the pose at a time, with their shares, which sum to 1; the same one twice at a key. `None` without
+    /// poses.
+    #[must_use]
+    pub fn keys(&self, time: f64) -> Option<[(usize, f64); 2]> {
+        let last = self.poses.len().checked_sub(1)?;
+        let after = self.poses.partition_point(|pose| pose.time <= time);
+        if after == 0 || after > last {
+            let key = if after == 0 { 0 } else { last };
+            return Some([(key, 1.0), (key, 0.0)]);
+        }
+        let (a, b) = (self.poses[after - 1].time, self.poses[after].time);
+        let fraction = (time - a) / (b - a);
+        Some([(after - 1, 1.0 - fraction), (after, fraction)])
+    }
+
     /// True when the group can be seen at a time.
     #[must_use]
     pub fn is_visible(&self, time: f64) -> bool {
@@ -221,6 +236,18 @@ impl Tracks {
     #[must_use]
     pub fn moves(&self) -> bool {
         self.groups.iter().any(TrackGroup::moves)
+    }
+
+    /// Poses of all groups.
+    #[must_use]
+    pub fn poses(&self) -> usize {
+        self.groups.iter().map(|group| group.poses.len()).sum()
+    }
+
+    /// True when groups do nothing but move as a whole, apart from the learned deformation: then poses have gradients.
+    #[must_use]
+    pub fn is_rigid(&self) -> bool {
+        self.groups.iter().all(|group| !group.deformed && !group.has_samples())
     }
 
     /// Group of a row.

@@ -24,6 +24,7 @@ mod channels;
 mod counts;
 mod deform;
 mod dense;
+mod groups;
 mod identity;
 mod labels;
 mod level;

@@ -3,11 +3,11 @@
 use crate::support::{pixel_discontinuity, render};
 use cif_field::tracks::{DenseTrack, NO_GROUP, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use cif_field::{Field, Heads};
-use cif_geometry::RigidTransform;
+use cif_geometry::{PixelGrid, RigidTransform};
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::reference::{self, Scene};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
-use cif_render::{Channels, InstanceSettings, RenderSettings, RenderedImage};
+use cif_render::{Channels, Gradients, InstanceSettings, RenderSettings, RenderedImage};
 use glam::{DMat3, DQuat, DVec3};
 
 const EVERYTHING: Channels = Channels { depth: true, instances: true };
@@ -178,11 +178,122 @@ fn a_scene_and_a_camera_that_move_together_give_the_same_image() {
 }
 
 #[test]
-#[should_panic(expected = "recorded motion has no gradients")]
-fn tracks_are_not_differentiated() {
+#[should_panic(expected = "sampled motion has no gradients")]
+fn sampled_tracks_are_not_differentiated() {
     let scene = tracked_scene(None);
     let mut renderer = Renderer::new(SimdLevel::Auto);
     let forward = renderer.forward(&scene.field, &scene.camera, 0.0, &settings(), Some(&scene.labels));
     let mut gradients = cif_render::Gradients::zeros(&scene.field);
     renderer.backward(&scene.field, &forward.color, 0.0, &mut gradients);
+}
+
+/// Two groups that turn and move, and Gaussians without one.
+fn posed_scene(heads: Option<Heads>) -> SyntheticScene {
+    let mut scene = generate(&SyntheticConfig { gaussians: 40, screen_size: (0.05, 0.2), ..config(heads) });
+    let n = scene.field.len() as u32;
+    let pivot = DVec3::new(0.1, -0.2, 0.3);
+    let group = |name: &str, angle: f64| TrackGroup {
+        deformed: false,
+        poses: [(0.0, 0.2), (0.5, 0.9), (1.0, 0.4)]
+            .map(|(time, share)| TrackPose {
+                time,
+                translation: pivot + share * DVec3::new(0.1, 0.05, -0.12),
+                rotation: DQuat::from_axis_angle(DVec3::new(1.0, 2.0, -2.0) / 3.0, share * angle),
+            })
+            .to_vec(),
+        ..TrackGroup::still(name, pivot)
+    };
+    let group_of = (0..n).map(|row| [0, 1, NO_GROUP][row as usize % 3]).collect();
+    scene.field.tracks = Some(Tracks { group_of, groups: vec![group("one", 0.8), group("two", -1.1)] });
+    scene.field.validate().unwrap();
+    scene
+}
+
+#[test]
+fn poses_and_their_gaussians_have_the_gradients_of_the_reference() {
+    for (heads, time) in [(None, 0.5), (None, 0.8), (Some(ALL_HEADS), 0.0)] {
+        let scene = posed_scene(heads);
+        let settings = RenderSettings { sh_degree: 3, ..RenderSettings::default() };
+        let weights: Vec<[f64; 3]> = (0..scene.camera.width * scene.camera.height)
+            .map(|k| std::array::from_fn(|c| (f64::from(k) * 0.37 + c as f64).sin()))
+            .collect();
+        let loss = |double: &Scene<f64>| -> f64 {
+            let forward = reference::render::forward(double, &scene.camera, time, &settings, None);
+            let pixels = forward.color.pixels.iter().flatten();
+            pixels.zip(weights.iter().flatten()).map(|(color, weight)| color * weight).sum()
+        };
+        let mut renderer = Renderer::new(SimdLevel::Auto);
+        renderer.forward(&scene.field, &scene.camera, time, &settings, None);
+        let v_color = PixelGrid::from_pixels(
+            scene.camera.width,
+            scene.camera.height,
+            weights.iter().map(|w| w.map(|w| w as f32)).collect(),
+        );
+        let mut gradients = Gradients::zeros(&scene.field);
+        renderer.backward(&scene.field, &v_color, 0.0, &mut gradients);
+        // By every key that decides the time.
+        let difference = |change: &dyn Fn(&mut Scene<f64>, f64)| {
+            let at = |step: f64| {
+                let mut double = Scene::<f64>::from_field(&scene.field);
+                change(&mut double, step);
+                loss(&double)
+            };
+            (at(1e-5) - at(-1e-5)) / 2e-5
+        };
+        let mut compared = 0;
+        for group in 0..2 {
+            let keys = scene.field.tracks.as_ref().unwrap().groups[group].keys(time).unwrap();
+            for (key, share) in keys.into_iter().filter(|(_, share)| *share > 0.0) {
+                let found = gradients.poses[3 * group + key];
+                assert_eq!(gradients.pose_views[3 * group + key], 1);
+                for axis in 0..3 {
+                    let mut unit = DVec3::ZERO;
+                    unit[axis] = 1.0;
+                    let moved = |double: &mut Scene<f64>, step: f64| {
+                        let pose = &mut double.tracks.as_mut().unwrap().groups[group].poses[key];
+                        pose.translation += step * unit;
+                    };
+                    let expected = difference(&moved);
+                    let actual = found.translation[axis];
+                    assert!((actual - expected).abs() < 2e-3 * (1.0 + expected.abs()), "{actual} {expected}");
+                    // Spherical interpolation is not linear in its ends.
+                    if share == 1.0 {
+                        let turned = |double: &mut Scene<f64>, step: f64| {
+                            let pose = &mut double.tracks.as_mut().unwrap().groups[group].poses[key];
+                            pose.rotation *= DQuat::from_scaled_axis(step * unit);
+                        };
+                        let expected = difference(&turned);
+                        let actual = found.turn[axis];
+                        assert!(
+                            (actual - expected).abs() < 2e-3 * (1.0 + expected.abs()),
+                            "{actual} {expected}"
+                        );
+                    }
+                    compared += 1;
+                }
+            }
+        }
+        assert!(compared >= 6);
+        let g = &gradients.gaussians;
+        for row in (0..scene.field.len()).filter(|row| row % 3 < 2) {
+            for k in 0..4 {
+                let cases: [(f32, &dyn Fn(&mut Scene<f64>, f64)); 3] = [
+                    (g.means[row][k % 3], &|double, step| {
+                        double.parameters.gaussians[row].mean[k % 3] += step;
+                    }),
+                    (g.quaternions[row][k], &|double, step| {
+                        double.parameters.gaussians[row].quaternion[k] += step;
+                    }),
+                    (g.sh_coefficients[row][3 + 7 * k], &|double, step| {
+                        double.parameters.gaussians[row].sh[3 + 7 * k] += step;
+                    }),
+                ];
+                for (actual, change) in cases {
+                    let expected = difference(change);
+                    let error = (f64::from(actual) - expected).abs();
+                    assert!(error < 2e-3 * (1.0 + expected.abs()), "row {row}, {k}: {actual} {expected}");
+                }
+            }
+        }
+    }
 }

@@ -1,12 +1,13 @@
 //! Gradients of the last forward pass.
 
 use cif_field::parameters::{OCCUPANCY_LOGITS, Parameter, SH_COEFFICIENTS};
-use cif_field::{Field, Gaussians};
+use cif_field::{Field, Gaussians, Tracks};
 use cif_geometry::PixelGrid;
 use fearless_simd::dispatch;
 use rayon::prelude::*;
 
 use super::super::deform::DeformationAtTime;
+use super::super::groups::groups_backward;
 use super::super::labels::{IdentityRows, TileLabels};
 use super::super::pixels::LANES;
 use super::super::project::{PosedGradient, SplatGradient, ViewConstants, project_backward};
@@ -81,7 +82,10 @@ impl Renderer {
         v_displacements: &[[f32; 3]],
         gradients: &mut Gradients,
     ) {
-        assert!(field.tracks.is_none(), "recorded motion has no gradients: trainers refuse such fields");
+        assert!(
+            field.tracks.as_ref().is_none_or(Tracks::is_rigid),
+            "sampled motion has no gradients: trainers refuse such fields"
+        );
         let (view, settings, time) = self.tape.view.expect("backward follows a forward pass");
         let mut times = self.times;
         let n = field.gaussians.len();
@@ -91,6 +95,18 @@ impl Renderer {
         timed(&mut times.project_backward, || {
             self.project_backward(field, &view, pairs, gradients, &mut v_posed);
         });
+        if let Some(tracks) = &field.tracks {
+            timed(&mut times.project_backward, || {
+                let at = tracks.at(time);
+                groups_backward(tracks, &at, time, &field.gaussians, &mut v_posed, gradients);
+            });
+        }
+        if !v_posed.sh_coefficients.is_empty() {
+            let total = gradients.gaussians.sh_coefficients.as_flattened_mut();
+            for (total, v) in total.iter_mut().zip(v_posed.sh_coefficients.as_flattened()) {
+                *total += v;
+            }
+        }
         self.inspect_posed_gradients(&v_posed, gradients);
         if let Some(deformation) = deformation {
             timed(&mut times.deform_backward, || {
@@ -107,8 +123,11 @@ impl Renderer {
                             .is_some_and(|v| v.iter().any(|v| *v != 0.0))
                     })
                 };
+                let is_grouped =
+                    |row: usize| field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
                 let active: Vec<u32> = (0..n as u32)
                     .filter(|&row| deformation.moves(row as usize) && has_gradient(row as usize))
+                    .filter(|&row| !is_grouped(row as usize))
                     .collect();
                 self.statistics.deformed_backward = active.len();
                 deformation.backward(
@@ -241,11 +260,15 @@ impl Renderer {
                         screen[row][axis] += half[axis] * v.mean[axis];
                     }
                     for axis in 0..3 {
-                        total.means[row][axis] += mean[axis];
                         total.log_scales[row][axis] += log_scale[axis];
                     }
-                    for axis in 0..4 {
-                        total.quaternions[row][axis] += quaternion[axis];
+                    if field.tracks.as_ref().and_then(|tracks| tracks.group(gaussian)).is_none() {
+                        for axis in 0..3 {
+                            total.means[row][axis] += mean[axis];
+                        }
+                        for axis in 0..4 {
+                            total.quaternions[row][axis] += quaternion[axis];
+                        }
                     }
                     total.opacity_logits[row] += opacity_logit;
                     total.occupancy_logits[row] += occupancy_logit;
@@ -255,12 +278,6 @@ impl Renderer {
                     of_view.opacity_logits[row] = opacity_logit;
                 });
             });
-        if moves_sh {
-            let total = gradients.gaussians.sh_coefficients.as_flattened_mut();
-            for (total, v) in total.iter_mut().zip(v_posed.sh_coefficients.as_flattened()) {
-                *total += v;
-            }
-        }
     }
 
     /// `v_mu_i^k = -(rho_i^k - p_i^k R_i)` (methods reference 4.2).
