@@ -60,6 +60,7 @@ pub mod losses;
 #[cfg(test)]
 mod measured;
 pub mod metrics;
+mod objects;
 mod optimiser;
 pub mod plan;
 mod progress;

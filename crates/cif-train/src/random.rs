@@ -19,6 +19,8 @@ pub(crate) enum Purpose {
     Guidance = 5,
     /// Gaussians that stand still and are looked at again.
     Still = 7,
+    /// Fits of objects.
+    Objects = 8,
 }
 
 /// The stream of a purpose; `counter` tells its uses apart.

@@ -91,6 +91,8 @@ fn statistics_count_visible_steps_only() {
         mlp: vec![],
         screen: vec![[3.0, 4.0], [1.0, 0.0]],
         radii: vec![7.0, 0.0],
+        poses: Vec::new(),
+        pose_views: Vec::new(),
     };
     let mut statistics = DensifyStatistics::zeros(2);
     statistics.add(&field_like);

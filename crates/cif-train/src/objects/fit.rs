@@ -1,0 +1,392 @@
+//! Poses and Gaussians of one object, moved together against its views and its priors.
+
+use std::collections::BTreeMap;
+
+use cif_geometry::quaternion;
+use cif_render::PoseGradient;
+use glam::{DQuat, DVec3};
+use rand::RngExt;
+use rand::seq::SliceRandom;
+use rand_pcg::Pcg64;
+
+use super::outline::Outline;
+use super::plane::Plane;
+use super::shape::{Adam, Pose, Shape};
+use super::view::{ObjectView, Seen};
+
+/// Rates of turns, radians, and of translations, of the size.
+const POSE_RATE: f64 = 0.02;
+
+/// Weight of accelerations and changes of turning, where an object is hardly seen.
+const ACCELERATION: f64 = 0.02;
+
+/// Acceleration that counts as large, of the size and in radians, per 60th of the sequence squared.
+const LARGE_ACCELERATION: f64 = 0.05;
+
+/// Visible share below which accelerations count.
+const HARDLY_SEEN: f64 = 0.3;
+
+/// Times between which nothing is said of accelerations.
+const GAP: usize = 8;
+
+/// Weight of the height of the lowest Gaussians above the plane.
+const CONTACT: f64 = 2.0;
+
+/// Weight of rolling without slip, and the slip that counts as large, radians.
+const ROLL: (f64, f64) = (0.05, 0.1);
+
+/// Background that losses are compared on.
+const GREY: [f32; 3] = [0.5; 3];
+
+/// Turns that poses may take.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Turns {
+    /// All.
+    Free,
+    /// About the normal of the plane.
+    Upright,
+    /// None but those they start with.
+    Given,
+}
+
+/// An object under way.
+pub(super) struct Fit<'a> {
+    pub(super) views: &'a [ObjectView],
+    pub(super) plane: Option<Plane>,
+    pub(super) outline: &'a Outline,
+    pub(super) poses: BTreeMap<usize, Pose>,
+    pub(super) shape: Shape,
+    pub(super) turns: Turns,
+    /// True where it is held to rolling without slip.
+    pub(super) rolls: bool,
+    /// Captured times of the sequence.
+    pub(super) times: usize,
+    /// True with one camera per time, so that distances are not observed.
+    pub(super) one_camera: bool,
+    pub(super) rng: Pcg64,
+    moments: BTreeMap<usize, [Adam; 2]>,
+}
+
+/// Tangent vector of a rotation, at most pi long.
+pub(super) fn log(rotation: DQuat) -> DVec3 {
+    let rotation = if rotation.w < 0.0 { -rotation } else { rotation };
+    rotation.to_scaled_axis()
+}
+
+/// Gaussians inside the masks of all times under some poses; `None` where there are none.
+pub(super) fn hull(
+    views: &[ObjectView],
+    poses: &BTreeMap<usize, Pose>,
+    size: f64,
+    count: usize,
+    near: f32,
+    rng: &mut Pcg64,
+) -> Option<Shape> {
+    /// Candidates, and the times that they are looked at.
+    const CANDIDATES: usize = 6000;
+    const TIMES: usize = 12;
+    let spread = (poses.len() / TIMES).max(1);
+    let looked: Vec<&ObjectView> = poses
+        .keys()
+        .step_by(spread)
+        .flat_map(|time| views.iter().filter(move |view| view.time_index == *time))
+        .filter(|view| !view.cut && view.visible >= 0.6)
+        .collect();
+    let mut found: Vec<(f64, [f32; 3], [f32; 3])> = Vec::with_capacity(CANDIDATES);
+    for _ in 0..CANDIDATES {
+        let direction = loop {
+            let d = DVec3::from(std::array::from_fn(|_| rng.random::<f64>() * 2.0 - 1.0));
+            if d.length_squared() <= 1.0 {
+                break d;
+            }
+        };
+        let place = 1.25 * size * direction;
+        let (mut inside, mut outside, mut color) = (0.0_f64, 0.0_f64, [0.0_f32; 3]);
+        for view in &looked {
+            let pose = &poses[&view.time_index];
+            match view.at(pose.rotation * place + pose.translation) {
+                Seen::Object(seen) => {
+                    inside += 1.0;
+                    (0..3).for_each(|k| color[k] += seen[k]);
+                }
+                Seen::Nothing => outside += 1.0,
+                Seen::Other | Seen::Outside => {}
+            }
+        }
+        let share = inside / (inside + outside).max(1.0);
+        if inside > 0.0 {
+            let color = color.map(|sum| sum / inside as f32);
+            found.push((share, place.to_array().map(|value| value as f32), color));
+        }
+    }
+    found.sort_by(|a, b| b.0.total_cmp(&a.0));
+    let good = found.iter().filter(|(share, ..)| *share > 0.8).count().max(count).min(found.len());
+    let mut taken: Vec<usize> = (0..good).collect();
+    taken.shuffle(rng);
+    taken.truncate(count);
+    let places: Vec<[f32; 3]> = taken.iter().map(|k| found[*k].1).collect();
+    let colors: Vec<[f32; 3]> = taken.iter().map(|k| found[*k].2).collect();
+    if places.len() < 8 { None } else { Shape::new(&places, &colors, size, near) }
+}
+
+impl<'a> Fit<'a> {
+    pub(super) fn new(
+        views: &'a [ObjectView],
+        (plane, outline): (Option<Plane>, &'a Outline),
+        times: usize,
+        poses: BTreeMap<usize, Pose>,
+        shape: Shape,
+        rng: Pcg64,
+    ) -> Self {
+        let one_camera = {
+            let mut seen = std::collections::BTreeSet::new();
+            views.iter().all(|view| seen.insert(view.time_index))
+        };
+        let (turns, rolls) = (Turns::Free, false);
+        Self {
+            views,
+            plane,
+            outline,
+            poses,
+            shape,
+            turns,
+            rolls,
+            times,
+            one_camera,
+            rng,
+            moments: BTreeMap::new(),
+        }
+    }
+
+    fn size(&self) -> f64 {
+        self.outline.size()
+    }
+
+    /// Reductions that steps take, coarse to fine, as places in the crops of a view.
+    pub(super) fn levels(&self) -> &'static [usize] {
+        let mut areas: Vec<f64> = self.views.iter().map(ObjectView::area).collect();
+        match super::view::median(&mut areas) {
+            area if area > 600.0 => &[2, 1, 0],
+            area if area > 120.0 => &[1, 0],
+            _ => &[0],
+        }
+    }
+
+    /// Times before and after one that have poses.
+    fn neighbours(&self, time: usize) -> [Option<usize>; 2] {
+        [
+            self.poses.range(..time).next_back().map(|(time, _)| *time),
+            self.poses.range(time + 1..).next().map(|(time, _)| *time),
+        ]
+    }
+
+    /// Loss of a view in its present pose.
+    pub(super) fn loss(&mut self, view: usize, level: usize) -> f64 {
+        let view = &self.views[view];
+        let Some(pose) = self.poses.get(&view.time_index) else { return 0.0 };
+        self.shape.loss(&view.crops[level], pose, GREY, 1.0, false).value
+    }
+
+    /// Mean loss over views, by their visible shares.
+    pub(super) fn mean_loss(&mut self, views: &[usize], level: usize) -> f64 {
+        let weights: f64 = views.iter().map(|view| self.views[*view].visible).sum();
+        let sum: f64 = views.iter().map(|view| self.views[*view].visible * self.loss(*view, level)).sum();
+        sum / weights.max(1e-12)
+    }
+
+    /// A step on a view: its Gaussians at `rate`, unless they stay, its pose and those beside it at `pose_rate`.
+    pub(super) fn step(&mut self, view: usize, level: usize, rate: Option<f64>, pose_rate: f64) {
+        let view = &self.views[view];
+        let time = view.time_index;
+        let Some(pose) = self.poses.get(&time).copied() else { return };
+        let background = std::array::from_fn(|_| self.rng.random::<f32>());
+        let weight = view.visible as f32;
+        let loss = self.shape.loss(&view.crops[level], &pose, background, weight, true);
+        let mut gradients = BTreeMap::from([(time, loss.pose)]);
+        self.accelerate(time, &mut gradients);
+        self.touch(time, &pose, &mut gradients);
+        self.roll(time, &mut gradients);
+        if let Some(rate) = rate {
+            self.shape.step(rate);
+        }
+        let size = self.size();
+        for (time, gradient) in gradients {
+            let moments = self.moments.entry(time).or_insert_with(|| [Adam::new(3), Adam::new(3)]);
+            let (mut turn, mut shift) = (DVec3::ZERO, DVec3::ZERO);
+            let [of_turns, of_shifts] = moments;
+            let values = |v: DVec3| v.to_array().into_iter();
+            of_turns.step(values(gradient.turn), POSE_RATE * pose_rate, |k, step| turn[k] = -step);
+            let rate = POSE_RATE * pose_rate * size;
+            of_shifts.step(values(gradient.translation), rate, |k, step| shift[k] = -step);
+            turn = match (self.turns, &self.plane) {
+                (Turns::Given, _) => DVec3::ZERO,
+                (Turns::Upright, Some(plane)) => plane.normal * plane.normal.dot(turn),
+                _ => turn,
+            };
+            if let Some(pose) = self.poses.get_mut(&time) {
+                pose.rotation = (DQuat::from_scaled_axis(turn) * pose.rotation).normalize();
+                pose.translation += shift;
+            }
+        }
+    }
+
+    /// Holds a time at which the object is hardly seen to even motion between its neighbours.
+    fn accelerate(&self, time: usize, gradients: &mut BTreeMap<usize, PoseGradient>) {
+        let seen = self.views.iter().filter(|view| view.time_index == time);
+        if seen.map(|view| view.visible).fold(0.0, f64::max) >= HARDLY_SEEN {
+            return;
+        }
+        let [Some(before), Some(after)] = self.neighbours(time) else { return };
+        let (h0, h1) = (time - before, after - time);
+        if h0 > GAP || h1 > GAP {
+            return;
+        }
+        let (h0, h1) = (h0 as f64, h1 as f64);
+        let per_step = 60.0 / self.times.max(1) as f64;
+        let scale = 2.0 / (h0 + h1) / (LARGE_ACCELERATION * per_step * per_step);
+        let [a, b, c] = [before, time, after].map(|time| self.poses[&time]);
+        let shares = [1.0 / h0, -1.0 / h0 - 1.0 / h1, 1.0 / h1];
+        let s = scale / self.size();
+        let e = s * (shares[0] * a.translation + shares[1] * b.translation + shares[2] * c.translation);
+        let v = ACCELERATION * e / (1.0 + e.length_squared()).sqrt() * s;
+        for (time, share) in [before, time, after].into_iter().zip(shares) {
+            gradients.entry(time).or_default().translation += share * v;
+        }
+        let (u0, u1) = (log(b.rotation * a.rotation.inverse()), log(c.rotation * b.rotation.inverse()));
+        if u0.length().max(u1.length()) > 2.5 {
+            return;
+        }
+        let e = scale * (u1 / h1 - u0 / h0);
+        let v = ACCELERATION * e / (1.0 + e.length_squared()).sqrt() * scale;
+        // The Jacobian of the logarithm is taken as 1.
+        for (time, share) in [before, time, after].into_iter().zip(shares) {
+            gradients.entry(time).or_default().turn += share * v;
+        }
+    }
+
+    /// Puts the lowest Gaussians onto the plane at times of contact, where one camera does not tell the distance.
+    fn touch(&mut self, time: usize, pose: &Pose, gradients: &mut BTreeMap<usize, PoseGradient>) {
+        let Some(plane) = self.plane.filter(|_| self.one_camera && !self.outline.air.contains(&time)) else {
+            return;
+        };
+        let size = self.size();
+        let g = self.shape.gaussians();
+        let normal = pose.rotation.inverse() * plane.normal;
+        let mut heights = Vec::with_capacity(g.len());
+        for row in 0..g.len() {
+            let mean = DVec3::from_array(g.means[row].map(f64::from));
+            let raw = g.quaternions[row].map(f64::from);
+            let unit = quaternion::try_normalize(raw).unwrap_or([1.0, 0.0, 0.0, 0.0]);
+            let rows = quaternion::to_rotation(unit);
+            let along: f64 = (0..3)
+                .map(|axis| {
+                    let part: f64 = (0..3).map(|k| normal[k] * rows[k][axis]).sum();
+                    (part * f64::from(g.log_scales[row][axis]).exp()).powi(2)
+                })
+                .sum();
+            heights.push(plane.height(pose.rotation * mean + pose.translation) - along.sqrt());
+        }
+        let lowest = heights.iter().copied().fold(f64::INFINITY, f64::min);
+        let opacity = |row: usize| 1.0 / (1.0 + f64::from(-g.opacity_logits[row]).exp());
+        let mut weights: Vec<f64> = heights
+            .iter()
+            .enumerate()
+            .map(|(row, height)| opacity(row) * (-(height - lowest) / (0.05 * size)).exp())
+            .collect();
+        let total: f64 = weights.iter().sum();
+        if !(total > 0.0) {
+            return;
+        }
+        weights.iter_mut().for_each(|weight| *weight /= total);
+        let height: f64 = heights.iter().zip(&weights).map(|(height, weight)| height * weight).sum();
+        let c = 2.0 * CONTACT * height / (size * size);
+        let mut lever = DVec3::ZERO;
+        let mut of_centres = Vec::with_capacity(g.len());
+        for (row, weight) in weights.iter().enumerate() {
+            let mean = DVec3::from_array(g.means[row].map(f64::from));
+            lever += *weight * (pose.rotation * mean);
+            of_centres.push(c * *weight * normal);
+        }
+        let gradient = gradients.entry(time).or_default();
+        gradient.translation += c * plane.normal;
+        gradient.turn += c * lever.cross(plane.normal);
+        self.shape.add_to_centres(&of_centres);
+    }
+
+    /// Holds a rolling object to turning as far as it goes.
+    fn roll(&self, time: usize, gradients: &mut BTreeMap<usize, PoseGradient>) {
+        let Some(plane) = self.plane.filter(|_| self.rolls) else { return };
+        let [before, after] = self.neighbours(time);
+        let radius = self.outline.height;
+        for (a, b) in [(before, Some(time)), (Some(time), after)] {
+            let (Some(a), Some(b)) = (a, b) else { continue };
+            let (first, second) = (self.poses[&a], self.poses[&b]);
+            let turn = plane.normal.cross(second.translation - first.translation) / radius;
+            if b - a > GAP || turn.length() > 2.5 {
+                continue;
+            }
+            let e = log(second.rotation * first.rotation.inverse()) - turn;
+            let v = ROLL.0 * e / (1.0 + e.length_squared() / (ROLL.1 * ROLL.1)).sqrt() / (ROLL.1 * ROLL.1);
+            let shift = plane.normal.cross(v) / radius;
+            let gradient = gradients.entry(b).or_default();
+            gradient.turn += v;
+            gradient.translation += shift;
+            let gradient = gradients.entry(a).or_default();
+            gradient.turn -= v;
+            gradient.translation -= shift;
+        }
+    }
+
+    /// Steps over views in a shuffled order, again and again; `rates` tell those of Gaussians and poses, and the level,
+    /// by the share of the steps done.
+    pub(super) fn steps(&mut self, views: &[usize], count: usize, rates: impl Fn(f64) -> (f64, f64, usize)) {
+        let mut order = views.to_vec();
+        for step in 0..count {
+            let place = step % order.len();
+            if place == 0 {
+                order.shuffle(&mut self.rng);
+            }
+            let (rate, pose_rate, level) = rates(step as f64 / count as f64);
+            self.step(order[place], level, Some(rate), pose_rate);
+        }
+    }
+
+    /// Pose at a time between or beyond those that have one.
+    pub(super) fn pose_at(&self, time: usize) -> Option<Pose> {
+        if let Some(pose) = self.poses.get(&time) {
+            return Some(*pose);
+        }
+        let [before, after] = self.neighbours(time);
+        Some(match (before, after) {
+            (Some(a), Some(b)) => {
+                let share = (time - a) as f64 / (b - a) as f64;
+                between(&self.poses[&a], &self.poses[&b], share)
+            }
+            (Some(a), None) => self.onward(a, self.neighbours(a)[0], time),
+            (None, Some(a)) => self.onward(a, self.neighbours(a)[1], time),
+            (None, None) => return None,
+        })
+    }
+
+    /// Goes on at the speed between two times, for a few steps at most.
+    fn onward(&self, near: usize, far: Option<usize>, time: usize) -> Pose {
+        let last = self.poses[&near];
+        let Some(far) = far else { return last };
+        let steps = (time as f64 - near as f64) / (near as f64 - far as f64);
+        let steps = steps.clamp(-6.0, 6.0);
+        let before = self.poses[&far];
+        let turn = log(last.rotation * before.rotation.inverse());
+        Pose {
+            rotation: (DQuat::from_scaled_axis(steps * turn) * last.rotation).normalize(),
+            translation: last.translation + steps * (last.translation - before.translation),
+        }
+    }
+}
+
+/// Pose between two.
+pub(super) fn between(a: &Pose, b: &Pose, share: f64) -> Pose {
+    Pose {
+        rotation: a.rotation.slerp(b.rotation, share),
+        translation: a.translation.lerp(b.translation, share),
+    }
+}

@@ -1,0 +1,187 @@
+//! Height, size and path of an object from the outlines of its masks and the plane it stands on.
+
+use std::collections::BTreeMap;
+
+use glam::{DMat2, DVec2, DVec3};
+
+use super::plane::Plane;
+use super::view::{ObjectView, median};
+
+/// How much larger than on the plane a mask may look before the object is taken to be off it.
+const AIR: f64 = 1.1;
+
+/// Share of the times in contact from which an object is taken to rest on the plane at all times.
+const GROUNDED: f64 = 0.9;
+
+/// Path and size of an object.
+#[derive(Clone, Debug)]
+pub(super) struct Outline {
+    /// Height of the centre above the plane in contact, and radius, metres.
+    pub(super) height: f64,
+    pub(super) radius: f64,
+    /// Mean overlap of the masks with their ellipses of equal moments: 1 for round things.
+    pub(super) roundness: f64,
+    /// Centre by time.
+    pub(super) path: BTreeMap<usize, DVec3>,
+    /// Times at which the object is off the plane.
+    pub(super) air: Vec<usize>,
+}
+
+impl Outline {
+    /// The larger of half height and radius.
+    pub(super) fn size(&self) -> f64 {
+        self.height.max(self.radius)
+    }
+}
+
+/// Reading of one mask.
+struct Reading {
+    height: f64,
+    radius: f64,
+    roundness: f64,
+}
+
+/// Outline of the views of an object on a plane; `None` where no mask is seen from above.
+pub(super) fn outline(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
+    let whole: Vec<&ObjectView> = match views.iter().filter(|view| view.is_whole()).collect::<Vec<_>>() {
+        whole if !whole.is_empty() => whole,
+        _ => match views.iter().filter(|view| !view.cut).collect::<Vec<_>>() {
+            uncut if !uncut.is_empty() => uncut,
+            _ => views.iter().collect(),
+        },
+    };
+    let mut grounded = whole.clone();
+    let mut medians = median_reading(&grounded, plane)?;
+    let mut in_contact = f64::INFINITY;
+    for _ in 0..3 {
+        let mut sizes: Vec<f64> =
+            whole.iter().filter_map(|view| implied_size(view, plane, medians.height)).collect();
+        sizes.sort_by(f64::total_cmp);
+        let low = *sizes.get((sizes.len() as f64 * 0.3) as usize)?;
+        let is_grounded = |view: &&&ObjectView| {
+            implied_size(view, plane, medians.height).is_some_and(|size| size <= AIR * low)
+        };
+        let found: Vec<&ObjectView> = whole.iter().filter(is_grounded).copied().collect();
+        let Some(reading) = median_reading(&found, plane) else { break };
+        (grounded, medians) = (found, reading);
+    }
+    if (grounded.len() as f64) < GROUNDED * whole.len() as f64 {
+        let mut sizes: Vec<f64> =
+            grounded.iter().filter_map(|view| implied_size(view, plane, medians.height)).collect();
+        in_contact = median(&mut sizes);
+    } else {
+        medians = median_reading(&whole, plane)?;
+    }
+    let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
+    for view in views {
+        let ray = view.camera.ray(view.centroid);
+        let Some(mut depth) = plane.meet(view.camera.centre(), ray, medians.height) else { continue };
+        let size = implied_size(view, plane, medians.height).unwrap_or(0.0);
+        let in_air = in_contact.is_finite() && !view.cut && size > AIR * in_contact;
+        if in_air {
+            depth *= in_contact / size;
+        }
+        let (sum, weight, air) = sums.entry(view.time_index).or_insert((DVec3::ZERO, 0.0, false));
+        *sum += view.area() * (view.camera.centre() + depth * ray);
+        *weight += view.area();
+        *air |= in_air;
+    }
+    Some(Outline {
+        height: medians.height,
+        radius: medians.radius,
+        roundness: medians.roundness,
+        air: sums.iter().filter(|(_, (_, _, air))| *air).map(|(time, _)| *time).collect(),
+        path: sums.into_iter().map(|(time, (sum, weight, _))| (time, sum / weight)).collect(),
+    })
+}
+
+/// Size that a mask implies if its object stands on the plane: the root of its area at that distance.
+fn implied_size(view: &ObjectView, plane: &Plane, height: f64) -> Option<f64> {
+    let depth = plane.meet(view.camera.centre(), view.camera.ray(view.centroid), height)?;
+    Some(view.area().sqrt() * depth / view.camera.focal_px.x)
+}
+
+fn median_reading(views: &[&ObjectView], plane: &Plane) -> Option<Reading> {
+    let readings: Vec<Reading> = views.iter().filter_map(|view| read(view, plane)).collect();
+    let of = |value: fn(&Reading) -> f64| median(&mut readings.iter().map(value).collect::<Vec<_>>());
+    (!readings.is_empty()).then(|| Reading {
+        height: of(|reading| reading.height),
+        radius: of(|reading| reading.radius),
+        roundness: of(|reading| reading.roundness),
+    })
+}
+
+/// Half height and radius of the upright cylinder, or the ellipsoid, on the plane that fills the extent of a mask along
+/// and across the image of the normal.
+fn read(view: &ObjectView, plane: &Plane) -> Option<Reading> {
+    let camera = &view.camera;
+    let ray = camera.ray(view.centroid);
+    let slope = plane.normal.dot(ray);
+    if slope > -1e-6 {
+        return None;
+    }
+    // Image of the way down at the centroid.
+    let rotation = camera.camera_from_world.rotation;
+    let (normal, ahead) = (rotation * plane.normal, rotation * ray);
+    let down = -(camera.focal_px * DVec2::new(normal.x - ahead.x * normal.z, normal.y - ahead.y * normal.z));
+    let down = down.try_normalize()?;
+    let across = DVec2::new(-down.y, down.x);
+    let turned = |x: f64, y: f64| {
+        let d = DVec2::new(x, y) - view.centroid;
+        DVec2::new(d.dot(down), d.dot(across))
+    };
+    let places: Vec<DVec2> =
+        view.pixels.iter().map(|[x, y]| turned(f64::from(*x) + 0.5, f64::from(*y) + 0.5)).collect();
+    let n = places.len() as f64;
+    let mean = places.iter().sum::<DVec2>() / n;
+    let mut moments = DMat2::ZERO;
+    for place in &places {
+        let d = *place - mean;
+        moments += DMat2::from_cols(d * d.x, d * d.y);
+    }
+    let moments = moments * (1.0 / (n - 1.0)) + DMat2::IDENTITY * (1.0 / 12.0);
+    let inverse = moments.inverse();
+    let (mut inside, mut joined) = (0.0, n);
+    for y in 0..view.size[1] {
+        for x in 0..view.size[0] {
+            let d = turned(f64::from(x) + 0.5, f64::from(y) + 0.5) - mean;
+            if d.dot(inverse * d) <= 4.0 {
+                // Pixels of both are counted once.
+                joined += 1.0;
+            }
+        }
+    }
+    for place in &places {
+        let d = *place - mean;
+        if d.dot(inverse * d) <= 4.0 {
+            inside += 1.0;
+        }
+    }
+    let roundness = inside / (joined - inside);
+    let share = 0.5 + 0.5 * ((roundness - 0.93) / 0.04).clamp(0.0, 1.0);
+    let range = |axis: usize| {
+        let mut values: Vec<f64> = places.iter().map(|place| place[axis]).collect();
+        values.sort_by(f64::total_cmp);
+        let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
+        at(0.99) - at(0.01)
+    };
+    let extent = |axis: usize, more: f64| {
+        share * 4.0 * moments.col(axis)[axis].sqrt() + (1.0 - share) * (range(axis) + more)
+    };
+    let (along, wide) = (extent(0, 0.5), extent(1, 0.0));
+    let sine = -slope / ray.length();
+    let cosine = (1.0 - sine * sine).max(1e-6).sqrt();
+    let focal = camera.focal_px.x;
+    let mut depth = plane.meet(camera.centre(), ray, 0.0)?;
+    let (mut height, mut radius) = (0.0, 0.0);
+    for _ in 0..20 {
+        radius = 0.5 * wide * depth / focal;
+        let extent = along * depth / focal;
+        let cylinder = ((extent - 2.0 * radius * sine) / cosine).max(0.3 * radius);
+        let ellipsoid =
+            ((0.5 * extent).powi(2) - (radius * sine).powi(2)).max((0.15 * radius).powi(2)).sqrt() / cosine;
+        height = share * ellipsoid + (1.0 - share) * 0.5 * cylinder;
+        depth = plane.meet(camera.centre(), ray, height)?;
+    }
+    Some(Reading { height, radius, roundness })
+}

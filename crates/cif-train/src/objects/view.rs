@@ -1,0 +1,233 @@
+//! An object as one frame shows it: a crop around its mask, at several resolutions.
+
+use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_render::UNLABELLED;
+use glam::DVec2;
+
+/// Pixels around the mask that belong to its crop.
+const MARGIN: u32 = 5;
+
+/// Masks of fewer pixels say nothing.
+const FEWEST_PIXELS: usize = 12;
+
+/// Share of a reduced pixel that the mask must have for its colour to count.
+const COLOR_SHARE: f32 = 0.3;
+
+/// The crop at a resolution.
+pub(super) struct Crop {
+    pub(super) camera: PinholeCamera,
+    /// Mean colour of the mask's share of each pixel, in [0, 1].
+    pub(super) colors: Vec<[f32; 3]>,
+    /// Share of each pixel that the mask has.
+    pub(super) mask: Vec<f32>,
+    /// Weight of the coverage of each pixel: 0 where other objects are, which may hide this one.
+    pub(super) known: Vec<f32>,
+    /// Pixels of the mask, at least 4.
+    pub(super) pixels: f32,
+}
+
+/// The object in a frame.
+pub(super) struct ObjectView {
+    pub(super) time_index: usize,
+    /// Number that tells cameras that stay in place apart.
+    pub(super) camera_key: [i64; 3],
+    pub(super) camera: PinholeCamera,
+    /// Pixels of the mask: columns and rows.
+    pub(super) pixels: Vec<[u32; 2]>,
+    /// Size of the image.
+    pub(super) size: [u32; 2],
+    pub(super) centroid: DVec2,
+    /// True when the mask touches the border of the image.
+    pub(super) cut: bool,
+    /// Share of the outline that touches other masks.
+    pub(super) touched: f64,
+    /// Visible share: area over the median area of the nearest whole masks, at most 1.
+    pub(super) visible: f64,
+    /// By reduction: 1, 2, 4.
+    pub(super) crops: [Crop; 3],
+    labels: PixelGrid<u16>,
+    label: u16,
+    colors: PixelGrid<[u8; 3]>,
+}
+
+/// Finding at a pixel of a frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Seen {
+    /// The object, in this colour.
+    Object([f32; 3]),
+    /// Another object, which may hide this one.
+    Other,
+    /// Neither.
+    Nothing,
+    /// Beyond the image, or behind the camera.
+    Outside,
+}
+
+impl ObjectView {
+    /// The view of a label (dense index + 1); `None` where it shows too little of it.
+    pub(super) fn new(
+        label: u16,
+        time_index: usize,
+        camera: &PinholeCamera,
+        labels: &PixelGrid<u16>,
+        colors: &PixelGrid<[u8; 3]>,
+    ) -> Option<Self> {
+        let (width, height) = (labels.width, labels.height);
+        let is_here = |x: u32, y: u32| *labels.at(x, y) == label;
+        let pixels: Vec<[u32; 2]> = (0..height)
+            .flat_map(|y| (0..width).map(move |x| [x, y]))
+            .filter(|[x, y]| is_here(*x, *y))
+            .collect();
+        if pixels.len() < FEWEST_PIXELS {
+            return None;
+        }
+        let (mut low, mut high) = ([u32::MAX; 2], [0; 2]);
+        let mut sum = DVec2::ZERO;
+        let (mut ring, mut touching) = (0_u32, 0_u32);
+        for [x, y] in &pixels {
+            low = [low[0].min(*x), low[1].min(*y)];
+            high = [high[0].max(*x), high[1].max(*y)];
+            sum += DVec2::new(f64::from(*x) + 0.5, f64::from(*y) + 0.5);
+            let beside = [(x.wrapping_sub(1), *y), (x + 1, *y), (*x, y.wrapping_sub(1)), (*x, y + 1)];
+            for (x, y) in beside.into_iter().filter(|(x, y)| *x < width && *y < height) {
+                let other = *labels.at(x, y);
+                ring += u32::from(other != label);
+                touching += u32::from(other != label && other != UNLABELLED);
+            }
+        }
+        let centre = camera.centre();
+        Some(Self {
+            time_index,
+            camera_key: (centre * 1e4).round().to_array().map(|value| value as i64),
+            camera: *camera,
+            size: [width, height],
+            centroid: sum / pixels.len() as f64,
+            cut: low[0] == 0 || low[1] == 0 || high[0] + 1 == width || high[1] + 1 == height,
+            touched: f64::from(touching) / f64::from(ring.max(1)),
+            visible: 1.0,
+            crops: [1, 2, 4].map(|factor| crop(factor, label, camera, (low, high), labels, colors)),
+            pixels,
+            labels: labels.clone(),
+            colors: colors.clone(),
+            label,
+        })
+    }
+
+    pub(super) fn area(&self) -> f64 {
+        self.pixels.len() as f64
+    }
+
+    /// True where the outline is the object's own.
+    pub(super) fn is_whole(&self) -> bool {
+        !self.cut && self.touched < 0.1
+    }
+
+    /// True where the mask may move a pose.
+    pub(super) fn is_reliable(&self) -> bool {
+        !self.cut && self.visible > 0.5
+    }
+
+    /// Finding where a point of the world is seen.
+    pub(super) fn at(&self, point: glam::DVec3) -> Seen {
+        let Some([x, y]) = self.camera.pixel_of(point) else { return Seen::Outside };
+        match *self.labels.at(x, y) {
+            label if label == self.label => Seen::Object(self.colors.at(x, y).map(|c| f32::from(c) / 255.0)),
+            UNLABELLED => Seen::Nothing,
+            _ => Seen::Other,
+        }
+    }
+}
+
+/// Sets the visible shares of views, which are in the order of times.
+pub(super) fn set_visible(views: &mut [ObjectView]) {
+    let areas = |whole: bool| -> Vec<(usize, f64)> {
+        let of = views.iter().filter(|view| !whole || view.is_whole());
+        of.map(|view| (view.time_index, view.area())).collect()
+    };
+    let known = match areas(true) {
+        whole if !whole.is_empty() => whole,
+        _ => areas(false),
+    };
+    for view in views {
+        let mut nearest = known.clone();
+        nearest.sort_by_key(|(time, _)| time.abs_diff(view.time_index));
+        let mut near: Vec<f64> = nearest.into_iter().take(5).map(|(_, area)| area).collect();
+        view.visible = (view.area() / median(&mut near)).min(1.0);
+    }
+}
+
+/// Middle value; 0 of nothing.
+pub(super) fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    match values.len() {
+        0 => 0.0,
+        n if n % 2 == 1 => values[n / 2],
+        n => 0.5 * (values[n / 2 - 1] + values[n / 2]),
+    }
+}
+
+fn crop(
+    factor: u32,
+    label: u16,
+    camera: &PinholeCamera,
+    (low, high): ([u32; 2], [u32; 2]),
+    labels: &PixelGrid<u16>,
+    colors: &PixelGrid<[u8; 3]>,
+) -> Crop {
+    let margin = MARGIN.max(2 * factor);
+    let sizes = [labels.width, labels.height];
+    let first = [0, 1].map(|axis| low[axis].saturating_sub(margin) / factor * factor);
+    let size = [0, 1].map(|axis| {
+        let end = ((high[axis] + 1 + margin).div_ceil(factor) * factor).min(sizes[axis]);
+        ((end - first[axis]) / factor).max(1)
+    });
+    let (mut means, mut mask, mut known) = (Vec::new(), Vec::new(), Vec::new());
+    let mut covered = 0.0;
+    for row in 0..size[1] {
+        for column in 0..size[0] {
+            let (mut sum, mut own, mut other) = ([0.0_f32; 3], 0.0_f32, 0.0_f32);
+            for y in first[1] + row * factor..(first[1] + (row + 1) * factor).min(sizes[1]) {
+                for x in first[0] + column * factor..(first[0] + (column + 1) * factor).min(sizes[0]) {
+                    let found = *labels.at(x, y);
+                    if found == label {
+                        own += 1.0;
+                        let color = colors.at(x, y);
+                        (0..3).for_each(|k| sum[k] += f32::from(color[k]) / 255.0);
+                    } else if found != UNLABELLED {
+                        other += 1.0;
+                    }
+                }
+            }
+            let all = (factor * factor) as f32;
+            let (share, hidden) = (own / all, other / all);
+            let weight = if hidden < 0.5 { 1.0 - hidden } else { 0.0 };
+            means.push(sum.map(|sum| sum / own.max(1e-6)));
+            covered += if weight > 0.0 { share } else { 0.0 };
+            mask.push(share);
+            known.push(weight);
+        }
+    }
+    let scale = f64::from(factor);
+    let offset = DVec2::new(f64::from(first[0]), f64::from(first[1]));
+    Crop {
+        camera: PinholeCamera {
+            width: size[0],
+            height: size[1],
+            focal_px: camera.focal_px / scale,
+            principal_px: (camera.principal_px - offset) / scale,
+            camera_from_world: camera.camera_from_world,
+        },
+        colors: means,
+        mask,
+        known,
+        pixels: covered.max(4.0),
+    }
+}
+
+impl Crop {
+    /// Weight of the colour of a pixel.
+    pub(super) fn color_weight(&self, pixel: usize) -> f32 {
+        let share = self.mask[pixel];
+        if share > COLOR_SHARE { share } else { 0.0 }
+    }
+}
