@@ -71,14 +71,40 @@ mod trial {
         let stop = crate::stop::Stop::when(|| false);
         let frames = super::FrameStore::open(&dataset, [1.0; 3], 1 << 30, &stop).unwrap();
         let mut out = serde_json::Map::new();
-        let only: Vec<u16> = std::env::var("ONLY").map(|s| s.split(',').map(|v| v.parse().unwrap()).collect()).unwrap_or_default();
+        let only: Vec<u16> = std::env::var("ONLY")
+            .map(|s| s.split(',').map(|v| v.parse().unwrap()).collect())
+            .unwrap_or_default();
         for (k, instance) in dataset.instances.iter().enumerate() {
-            if !only.is_empty() && !only.contains(&instance.id) { continue; }
+            if !only.is_empty() && !only.contains(&instance.id) {
+                continue;
+            }
             let start = std::time::Instant::now();
-            let fitted = super::fit(k as u16 + 1, &dataset, &frames, super::Surroundings { times: dataset.times.len(), near: 0.05, seed: 0, stop: &stop }).unwrap();
-            let Some(f) = fitted else { println!("{} {}: none, {:.1} s", instance.id, instance.label, start.elapsed().as_secs_f64()); continue };
-            println!("{} {}: {} {:?} size {:.4} error {:.4} {:.1} s", instance.id, instance.label, f.turns, f.rotation, f.size, f.error, start.elapsed().as_secs_f64());
-            let poses: Vec<_> = f.poses.iter().map(|(t, (q, c))| serde_json::json!([t, [q.w, q.x, q.y, q.z], c.to_array()])).collect();
+            let fitted = super::fit(
+                k as u16 + 1,
+                &dataset,
+                &frames,
+                super::Surroundings { times: dataset.times.len(), near: 0.05, seed: 0, stop: &stop },
+            )
+            .unwrap();
+            let Some(f) = fitted else {
+                println!("{} {}: none, {:.1} s", instance.id, instance.label, start.elapsed().as_secs_f64());
+                continue;
+            };
+            println!(
+                "{} {}: {} {:?} size {:.4} error {:.4} {:.1} s",
+                instance.id,
+                instance.label,
+                f.turns,
+                f.rotation,
+                f.size,
+                f.error,
+                start.elapsed().as_secs_f64()
+            );
+            let poses: Vec<_> = f
+                .poses
+                .iter()
+                .map(|(t, (q, c))| serde_json::json!([t, [q.w, q.x, q.y, q.z], c.to_array()]))
+                .collect();
             out.insert(instance.id.to_string(), poses.into());
         }
         std::fs::write("/tmp/poses.json", serde_json::to_string(&out).unwrap()).unwrap();

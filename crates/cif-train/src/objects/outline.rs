@@ -52,7 +52,6 @@ pub(super) fn outline(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
     };
     let mut grounded = whole.clone();
     let mut medians = median_reading(&grounded, plane)?;
-    let mut in_contact = f64::INFINITY;
     for _ in 0..3 {
         let mut sizes: Vec<f64> =
             whole.iter().filter_map(|view| implied_size(view, plane, medians.height)).collect();
@@ -65,11 +64,16 @@ pub(super) fn outline(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
         let Some(reading) = median_reading(&found, plane) else { break };
         (grounded, medians) = (found, reading);
     }
-    if (grounded.len() as f64) < GROUNDED * whole.len() as f64 {
-        let mut sizes: Vec<f64> =
-            grounded.iter().filter_map(|view| implied_size(view, plane, medians.height)).collect();
-        in_contact = median(&mut sizes);
-    } else {
+    let mut sizes: Vec<f64> =
+        grounded.iter().filter_map(|view| implied_size(view, plane, medians.height)).collect();
+    let in_contact = median(&mut sizes);
+    let looks_larger = |view: &ObjectView| {
+        !view.cut && implied_size(view, plane, medians.height).is_some_and(|size| size > AIR * in_contact)
+    };
+    let uncut = views.iter().filter(|view| !view.cut).count();
+    let larger = views.iter().filter(|view| looks_larger(view)).count();
+    let leaves = larger as f64 > (1.0 - GROUNDED) * uncut as f64;
+    if !leaves {
         medians = median_reading(&whole, plane)?;
     }
     let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
@@ -77,7 +81,7 @@ pub(super) fn outline(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
         let ray = view.camera.ray(view.centroid);
         let Some(mut depth) = plane.meet(view.camera.centre(), ray, medians.height) else { continue };
         let size = implied_size(view, plane, medians.height).unwrap_or(0.0);
-        let in_air = in_contact.is_finite() && !view.cut && size > AIR * in_contact;
+        let in_air = leaves && !view.cut && size > AIR * in_contact;
         if in_air {
             depth *= in_contact / size;
         }

@@ -41,8 +41,9 @@ const ROUND: f64 = 0.93;
 /// How much better rolling must be than sliding.
 const ROLL_GAIN: f64 = 0.97;
 
-/// Error by which rivals must be told apart, relative, and the turn from which they are rivals, degrees.
-const RIVAL: (f64, i32) = (1.02, 60);
+/// Error by which rivals must be told apart, relative: of most objects, and of round ones, whose shading prefers no
+/// turn; and the turn from which they are rivals, degrees.
+const RIVAL: ([f64; 2], i32) = ([1.02, 1.06], 60);
 
 /// Path in sizes below which an object stays in place: turns are a function of time then.
 const STAYS: f64 = 1.5;
@@ -220,7 +221,7 @@ pub(crate) fn fit_object(
     advance(&mut trials, 0, STEPS[0]);
     stop.check()?;
     let best = trials.iter().map(|trial| trial.losses[0]).fold(f64::INFINITY, f64::min);
-    trials.retain(|trial| trial.losses[0] <= HOPELESS * best);
+    trials.retain(|trial| trial.losses[0] <= HOPELESS * best || trial.way == Way::Roll(1.0));
     advance(&mut trials, STEPS[0], STEPS[1]);
     stop.check()?;
     trials.par_iter_mut().for_each(|trial| {
@@ -237,7 +238,7 @@ pub(crate) fn fit_object(
         trial.losses[1] = trial.fit.mean_loss(judged, level);
     });
     let in_contact = outline.air.is_empty();
-    let (way, rotation) = decide(&trials, outline.roundness > ROUND && in_contact);
+    let (way, rotation) = decide(&trials, outline.roundness > ROUND, in_contact);
     let place = trials.iter().position(|trial| trial.way == way).unwrap_or(0);
     let Trial { mut fit, losses, .. } = trials.swap_remove(place);
     drop(trials);
@@ -288,7 +289,7 @@ fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) -> (Vec<usize
 }
 
 /// The way of turning that is kept, and whether the pictures tell it.
-fn decide(trials: &[Trial<'_>], may_roll: bool) -> (Way, Rotation) {
+fn decide(trials: &[Trial<'_>], is_round: bool, in_contact: bool) -> (Way, Rotation) {
     let best = |wanted: &dyn Fn(&Way) -> bool| {
         let of = trials.iter().filter(|trial| wanted(&trial.way));
         of.min_by(|a, b| a.losses[1].total_cmp(&b.losses[1]))
@@ -309,9 +310,9 @@ fn decide(trials: &[Trial<'_>], may_roll: bool) -> (Way, Rotation) {
         difference.min(360 - difference) >= RIVAL.1
     };
     let rival = best(&|way| matches!(way, Way::Slide(other) if apart(*other)));
-    if rival.is_some_and(|(_, error)| error < RIVAL.0 * slide_error) {
+    if rival.is_some_and(|(_, error)| error < RIVAL.0[usize::from(is_round)] * slide_error) {
         let has = |wanted: &Way| trials.iter().any(|trial| trial.way == *wanted);
-        if may_roll && has(&Way::Roll(1.0)) {
+        if is_round && in_contact && has(&Way::Roll(1.0)) {
             return (Way::Roll(1.0), Rotation::Assumed);
         }
         if has(&Way::Slide(0)) {
