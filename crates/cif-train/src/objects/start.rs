@@ -239,11 +239,15 @@ pub(crate) fn fit_object(
     });
     let in_contact = outline.air.is_empty();
     let (way, rotation) = decide(&trials, outline.roundness > ROUND, in_contact);
-    let place = trials.iter().position(|trial| trial.way == way).unwrap_or(0);
+    // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
+    let rolls_unseen = rotation == Rotation::Assumed && matches!(way, Way::Roll(_));
+    let fitted = if rolls_unseen { Way::Slide(0) } else { way.clone() };
+    let place = trials.iter().position(|trial| trial.way == fitted).unwrap_or(0);
     let Trial { mut fit, losses, .. } = trials.swap_remove(place);
     drop(trials);
     (fit.turns, fit.rolls) = match (rotation, &way) {
-        (Rotation::Assumed, _) => (Turns::Given, false),
+        (Rotation::Assumed, Way::Slide(_)) => (Turns::Given, false),
+        (Rotation::Assumed, Way::Roll(_)) => (Turns::Free, false),
         (_, Way::Roll(_)) => (Turns::Free, true),
         (_, Way::Slide(_)) => (Turns::Free, false),
     };
@@ -258,6 +262,15 @@ pub(crate) fn fit_object(
         (0.6 * decay, 1.5 * decay, level)
     });
     stop.check()?;
+    if rolls_unseen {
+        roll_along(&mut fit, plane, outline.height);
+        let mut rng = stream(seed, Purpose::Objects, u64::from(label));
+        if let Some(shape) = hull(views, &fit.poses, outline.size(), GAUSSIANS, near, &mut rng) {
+            fit.shape = shape;
+            fit.turns = Turns::Given;
+            fit.steps(&all, STEPS[1], |share| (0.6 * 0.2_f64.powf(share), 0.1, 0));
+        }
+    }
     let turns = match way {
         Way::Slide(degrees) => format!("slides, turning {degrees} deg"),
         Way::Roll(factor) => format!("rolls with {factor:.2} of its height"),
@@ -321,6 +334,27 @@ fn decide(trials: &[Trial<'_>], is_round: bool, in_contact: bool) -> (Way, Rotat
         return (slide, Rotation::Assumed);
     }
     (slide, Rotation::Observed)
+}
+
+/// Turns an object as it rolls without slip along its path, about its middle.
+fn roll_along(fit: &mut Fit<'_>, plane: &Plane, radius: f64) {
+    let g = fit.shape.gaussians();
+    let weight = |row: usize| 1.0 / (1.0 + f64::from(-g.opacity_logits[row]).exp());
+    let total: f64 = (0..g.len()).map(weight).sum();
+    let sum: DVec3 =
+        (0..g.len()).map(|row| weight(row) * DVec3::from_array(g.means[row].map(f64::from))).sum();
+    let middle = sum / total.max(1e-9);
+    let mut rotation = DQuat::IDENTITY;
+    let mut last: Option<DVec3> = None;
+    for pose in fit.poses.values_mut() {
+        let place = pose.rotation * middle + pose.translation;
+        if let Some(last) = last {
+            let turn = plane.normal.cross(place - last) / radius;
+            rotation = (DQuat::from_scaled_axis(turn) * rotation).normalize();
+        }
+        *pose = Pose { rotation, translation: place };
+        last = Some(place);
+    }
 }
 
 /// Adds the times that are seen but not reliable, nearest first.
