@@ -66,13 +66,18 @@ impl Gradients {
         tensors
     }
 
+    /// Sets the gradients of poses to zero.
+    pub fn reset_poses(&mut self) {
+        self.poses.fill(PoseGradient::default());
+        self.pose_views.fill(0);
+    }
+
     /// Sets everything to zero; the shape is kept.
     pub fn reset(&mut self) {
         for (_, values) in self.tensors_mut() {
             values.fill(0.0);
         }
-        self.poses.fill(PoseGradient::default());
-        self.pose_views.fill(0);
+        self.reset_poses();
         self.screen.fill([0.0; 2]);
         self.radii.fill(0.0);
     }

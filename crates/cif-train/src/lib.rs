@@ -63,6 +63,7 @@ pub mod metrics;
 mod objects;
 mod optimiser;
 pub mod plan;
+mod poses;
 mod progress;
 mod random;
 pub mod resample;

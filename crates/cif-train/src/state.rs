@@ -15,6 +15,7 @@ use crate::frames::FrameStore;
 use crate::guidance::{Guidance, Pulls};
 use crate::heads::{self, Head, HeadTensors, Pass, ValueHead};
 use crate::optimiser::Optimiser;
+use crate::poses::PoseMoments;
 use crate::progress::Progress;
 use crate::stop::Stop;
 use crate::times::StepTimes;
@@ -28,6 +29,8 @@ pub(crate) struct State {
     pub stop: Stop,
     pub field: Field,
     pub optimiser: Optimiser,
+    /// Moments of the poses of groups.
+    pub pose_moments: PoseMoments,
     /// What the instance stage learns, with its own tensors from the start of that stage on.
     pub head: Arc<dyn Head>,
     pub head_tensors: HeadTensors,
@@ -50,6 +53,7 @@ pub(crate) struct State {
 pub(crate) struct Kept {
     field: Field,
     optimiser: Optimiser,
+    pose_moments: PoseMoments,
     head_tensors: HeadTensors,
     statistics: DensifyStatistics,
     progress: Progress,
@@ -121,6 +125,7 @@ impl State {
         Kept {
             field: self.field.clone(),
             optimiser: self.optimiser.clone(),
+            pose_moments: self.pose_moments.clone(),
             head_tensors: self.head_tensors.clone(),
             statistics: self.statistics.clone(),
             progress: self.progress.clone(),
@@ -134,7 +139,7 @@ impl State {
     /// Stands where the copy was made, with no gradients.
     pub(crate) fn put_back(&mut self, kept: Kept) {
         (self.field, self.optimiser, self.statistics) = (kept.field, kept.optimiser, kept.statistics);
-        self.head_tensors = kept.head_tensors;
+        (self.pose_moments, self.head_tensors) = (kept.pose_moments, kept.head_tensors);
         (self.progress, self.guidance) = (kept.progress, kept.guidance);
         (self.unseen, self.label_pixels) = (kept.unseen, kept.label_pixels);
         self.times = kept.times;

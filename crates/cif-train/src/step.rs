@@ -41,6 +41,8 @@ pub(crate) struct StepPlan {
     /// Weights of the pulls to paths, and to where Gaussians are.
     pub pulls: [f32; 2],
     pub rates: StepRates,
+    /// Rate of the poses of groups; 0 where they stay.
+    pub pose_rate: f64,
     /// Learning rate of the exposures; `None` where none are learnt.
     pub exposure_rate: Option<f32>,
     pub weights: PlaneWeights,

@@ -189,6 +189,9 @@ pub struct MotionConfig {
     pub stillness: f32,
     /// Steps that teach the deformation the paths before the fine stage, default 300.
     pub rehearsal: u32,
+    /// True where travelling objects that are rigid move by a trained pose per time instead of the network; needs
+    /// `guidance`; default true.
+    pub rigid: bool,
     /// Gaussians that a travelling object starts with, default 300.
     pub gaussians: u32,
     /// Training frames in which more than half of the instances, two or more, are this many times farther than

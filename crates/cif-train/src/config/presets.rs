@@ -196,6 +196,7 @@ impl Default for MotionConfig {
         Self {
             guidance: 10.0,
             guidance_end: 0.1,
+            rigid: true,
             stillness: 1.0,
             rehearsal: 300,
             gaussians: 300,

@@ -7,7 +7,7 @@ use std::time::Instant;
 use cif_field::Field;
 use cif_geometry::{PixelGrid, quaternion};
 use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
-use cif_render::{BlendRequest, Channels, RenderSettings, RenderedImage};
+use cif_render::{BlendRequest, Channels, Gradients, RenderSettings, RenderedImage};
 
 use super::{Changed, Engine, Views};
 use crate::densify::Rearrangement;
@@ -16,6 +16,7 @@ use crate::guard::{Fault, exposure_fault, gradient_fault, loss_fault, value_faul
 use crate::heads::{self, HeadLoss, HeadTensors, ValueHead};
 use crate::losses::held_out::leave_out_held_out;
 use crate::losses::{SsimScratch, color_loss};
+use crate::poses::{object_sizes, pose_fault};
 use crate::resample::{Pair, Relocated};
 use crate::stage::Stage;
 use crate::state::State;
@@ -67,6 +68,7 @@ impl Processor {
         }
         fault = fault
             .or_else(|| gradient_fault(&state.gradients, &plan.rates))
+            .or_else(|| pose_fault(&state.gradients.poses))
             .or_else(|| exposure_fault(state.progress.exposures.as_ref()));
         if fault.is_none() {
             if plan.counts_statistics {
@@ -82,6 +84,13 @@ impl Processor {
                 return Err(TrainError::NotFinite { stage, iteration, tensor: parameter.name });
             }
         }
+        if let Some(tracks) = state.field.tracks.as_mut().filter(|_| fault.is_none() && plan.pose_rate > 0.0)
+        {
+            let Gradients { poses, pose_views, .. } = &state.gradients;
+            let sizes = object_sizes(tracks, &state.field.gaussians);
+            state.pose_moments.step(tracks, &sizes, poses, pose_views, plan.pose_rate);
+        }
+        state.gradients.reset_poses();
         if let Some(exposures) = &mut state.progress.exposures {
             match plan.exposure_rate.filter(|_| fault.is_none()) {
                 Some(rate) => exposures.step(rate),

@@ -294,7 +294,7 @@ impl<'a> Fit<'a> {
             .map(|(row, height)| opacity(row) * (-(height - lowest) / (0.05 * size)).exp())
             .collect();
         let total: f64 = weights.iter().sum();
-        if !(total > 0.0) {
+        if total <= 0.0 || total.is_nan() {
             return;
         }
         weights.iter_mut().for_each(|weight| *weight /= total);

@@ -11,6 +11,9 @@ use super::view::Crop;
 /// Rates of centres (of the size), log-scales, quaternions, opacities and colours.
 const RATES: [f64; 5] = [0.01, 0.02, 0.01, 0.05, 0.02];
 
+/// Standard deviation that 150 Gaussians start with, of the size.
+const START: f64 = 0.15;
+
 /// Range of standard deviations, of the size.
 const SCALES: [f64; 2] = [0.02, 0.3];
 
@@ -82,7 +85,9 @@ impl Shape {
     pub(super) fn new(places: &[[f32; 3]], colors: &[[f32; 3]], size: f64, near: f32) -> Option<Self> {
         let mut gaussians = Gaussians::from_points(places, colors).ok()?;
         let n = gaussians.len();
-        gaussians.log_scales.fill([(0.15 * size).ln() as f32; 3]);
+        // As many as 150 overlap at this size; more are smaller.
+        let spread = START * size * (150.0 / n as f64).cbrt();
+        gaussians.log_scales.fill([spread.ln() as f32; 3]);
         gaussians.opacity_logits.fill(0.0);
         let field = Field {
             gaussians,
@@ -196,7 +201,7 @@ impl Shape {
         let (g, v) = (&mut self.field.gaussians, &self.gradients.gaussians);
         let [means, scales, quaternions, opacities, colors] = &mut self.moments;
         let single = |values: &[f32]| values.iter().map(|v| f64::from(*v)).collect::<Vec<_>>();
-        let mut take = |moments: &mut Adam, values: &mut [f32], gradients: &[f32], rate: f64| {
+        let take = |moments: &mut Adam, values: &mut [f32], gradients: &[f32], rate: f64| {
             moments.step(single(gradients).into_iter(), rate, |k, step| values[k] -= step as f32);
         };
         let [of_means, of_scales, of_quaternions, of_opacities, of_colors] = RATES.map(|r| r * rate);

@@ -70,8 +70,8 @@ pub(crate) struct Fitted {
     pub(crate) poses: BTreeMap<usize, (DQuat, DVec3)>,
     /// In the frame of the object.
     pub(crate) gaussians: Gaussians,
-    /// The larger of half height and radius, metres.
-    pub(crate) size: f64,
+    /// Pose at the time that shows most of it.
+    pub(crate) reference: (DQuat, DVec3),
     pub(crate) rotation: Rotation,
     /// Error on pixels that were left out.
     pub(crate) error: f64,
@@ -101,6 +101,8 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) times: usize,
     pub(crate) near: f32,
     pub(crate) seed: u64,
+    /// Gaussians that an object leaves with.
+    pub(crate) gaussians: usize,
     pub(crate) stop: &'a Stop,
 }
 
@@ -155,7 +157,7 @@ pub(crate) fn fit_object(
     outline: &Outline,
     surroundings: Surroundings<'_>,
 ) -> Result<Option<Fitted>, TrainError> {
-    let Surroundings { times, near, seed, stop } = surroundings;
+    let Surroundings { times, near, seed, gaussians, stop } = surroundings;
     let path = smooth(&outline.path, views, times);
     let reliable: Vec<usize> = (0..views.len())
         .filter(|view| views[*view].is_reliable() && path.contains_key(&views[*view].time_index))
@@ -271,6 +273,13 @@ pub(crate) fn fit_object(
             fit.steps(&all, STEPS[1], |share| (0.6 * 0.2_f64.powf(share), 0.1, 0));
         }
     }
+    // More Gaussians, in poses that hardly move any more.
+    let mut rng = stream(seed, Purpose::Objects, u64::from(label));
+    if let Some(shape) = hull(views, &fit.poses, outline.size(), gaussians, near, &mut rng) {
+        fit.shape = shape;
+        fit.steps(&all, STEPS[1], |share| (0.6 * 0.05_f64.powf(share), 0.1, 0));
+    }
+    stop.check()?;
     let turns = match way {
         Way::Slide(degrees) => format!("slides, turning {degrees} deg"),
         Way::Roll(factor) => format!("rolls with {factor:.2} of its height"),
@@ -278,7 +287,10 @@ pub(crate) fn fit_object(
     Ok(Some(Fitted {
         poses: fit.poses.iter().map(|(time, pose)| (*time, (pose.rotation, pose.translation))).collect(),
         gaussians: fit.shape.gaussians().clone(),
-        size: outline.size(),
+        reference: fit
+            .poses
+            .get(&reference)
+            .map_or((DQuat::IDENTITY, DVec3::ZERO), |p| (p.rotation, p.translation)),
         rotation,
         error: losses[1],
         turns,

@@ -14,6 +14,7 @@ use super::plan_step::plane_weights;
 use crate::error::TrainError;
 use crate::guidance::Guide;
 use crate::optimiser::{Optimiser, StepRates};
+use crate::poses::PoseMoments;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
 use crate::state::State;
@@ -112,12 +113,19 @@ impl Trainer {
             let observations = self.observe(true)?;
             for (of, observations) in observations.iter().enumerate() {
                 if self.state.guidance.travelling[of + 1]
+                    && !self.add_object(of as u16 + 1)?
                     && let Some(track) = fit(observations)
                 {
                     self.inject(of as u16 + 1, track, observations)?;
                 }
             }
         }
+        let n = self.state.field.len();
+        self.state.guidance.guide_of.resize(n, 0);
+        if let Some(tracks) = &mut self.state.field.tracks {
+            tracks.group_of.resize(n, cif_field::tracks::NO_GROUP);
+        }
+        self.state.pose_moments = PoseMoments::zeros(self.state.field.tracks.as_ref());
         self.rehearse()
     }
 

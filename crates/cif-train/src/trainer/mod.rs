@@ -10,6 +10,7 @@
 //! | `changes` | where cameras that stay in place see the capture change |
 //! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
+//! | `objects` | which objects move as a whole, and how they join the field |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `resume` | what is saved, and how a run resumes |
@@ -38,6 +39,7 @@ mod initialize;
 mod judged;
 mod measure;
 mod motions;
+mod objects;
 mod pacing;
 mod plan_step;
 mod provenance;
@@ -78,6 +80,7 @@ use crate::frames::FrameStore;
 use crate::guidance::Guidance;
 use crate::heads::{Cif, Head, HeadTensors};
 use crate::optimiser::Optimiser;
+use crate::poses::PoseMoments;
 use crate::progress::{Progress, Stages};
 use crate::stage::Stage;
 use crate::state::State;
@@ -167,7 +170,7 @@ impl Trainer {
         field: Field,
         progress: Option<Progress>,
     ) -> Result<Self, TrainError> {
-        if let Some(tracks) = &field.tracks {
+        if let Some(tracks) = field.tracks.as_ref().filter(|tracks| !tracks.is_rigid()) {
             return Err(TrainError::RecordedMotion { groups: tracks.groups.len() });
         }
         let budget = u64::from(config.frame_memory_mib) << 20;
@@ -201,6 +204,7 @@ impl Trainer {
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
                 optimiser: Optimiser::new(&field),
+                pose_moments: PoseMoments::zeros(field.tracks.as_ref()),
                 head: Arc::new(Cif),
                 head_tensors: HeadTensors::default(),
                 statistics: DensifyStatistics::zeros(n),

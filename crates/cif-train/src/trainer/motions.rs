@@ -112,7 +112,8 @@ fn set_still(field: &mut Field, motions: &[Motion], to: bool, wanted: impl Fn(us
     deformation.still.resize(motions.len(), false);
     let mut changed = 0;
     for (row, motion) in motions.iter().enumerate() {
-        if deformation.still[row] != to && wanted(row) {
+        let is_grouped = field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
+        if deformation.still[row] != to && wanted(row) && !is_grouped {
             motion.mean.add_to(&mut field.gaussians, row, if to { 1.0 } else { -1.0 });
             deformation.still[row] = to;
             changed += 1;

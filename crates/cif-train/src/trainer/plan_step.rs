@@ -60,6 +60,7 @@ impl Trainer {
             trains_colors: !in_instance_stage || instance.color_loss,
             pulls: self.guidance_weight(stage, iteration),
             rates: StepRates::at(config, stage, iteration, &self.state.field),
+            pose_rate: self.pose_rate(stage, iteration),
             exposure_rate: self
                 .state
                 .progress

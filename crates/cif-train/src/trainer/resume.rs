@@ -161,6 +161,9 @@ impl Trainer {
             tensors.insert(name.to_owned(), tensor);
         }
         tensors.extend(self.state.head_tensors.saved());
+        for (name, tensor) in self.state.pose_moments.saved() {
+            tensors.insert(name.to_owned(), tensor);
+        }
         let state = SavedState {
             version: VERSION,
             config: self.state.config.clone(),
@@ -197,6 +200,8 @@ impl Trainer {
             radius: floats(&mut tensors, "densify.radius", n)?,
         };
         trainer.restore_guidance(&mut tensors)?;
+        let moments = trainer.state.pose_moments.restore(&mut tensors);
+        moments.ok_or_else(|| unusable("the moments of poses do not fit"))?;
         if trainer.state.progress.stage == Stage::Coarse {
             trainer.find_travelling()?;
         }

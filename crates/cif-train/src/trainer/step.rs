@@ -261,6 +261,9 @@ impl Trainer {
         self.state.head_tensors.gather(&change.parents, &change.origins);
         self.state.guidance.gather(&change.parents);
         self.gather_still(&change.parents);
+        if let Some(tracks) = &mut self.state.field.tracks {
+            *tracks = tracks.gather(&change.parents);
+        }
         self.state.field.gaussians = change.gaussians;
         self.state.gradients = Gradients::zeros(&self.state.field);
     }
@@ -298,6 +301,9 @@ impl Trainer {
             self.state.guidance.copy(pair.weak, pair.source);
             self.state.head_tensors.relocate(pair.weak, pair.source);
             self.copy_still(pair.weak, pair.source);
+            if let Some(tracks) = &mut self.state.field.tracks {
+                tracks.group_of[pair.weak as usize] = tracks.group_of[pair.source as usize];
+            }
             self.state.unseen[pair.weak as usize] = self.state.unseen[pair.source as usize];
         }
         self.state.gradients = Gradients::zeros(&self.state.field);

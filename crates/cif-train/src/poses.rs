@@ -1,0 +1,136 @@
+//! Optimiser of the poses of groups: one tangent vector of turn and translation per key. Source: methods reference of
+//! motion, 2.1.
+
+use std::collections::BTreeMap;
+
+use cif_field::checkpoint::StateTensor;
+use cif_field::{Gaussians, Tracks};
+use cif_render::PoseGradient;
+use glam::{DQuat, DVec3};
+
+use crate::guard::Fault;
+
+/// Decays of the moments: a pose is visited rarely, so they are short.
+const DECAY: [f64; 2] = [0.9, 0.99];
+
+/// Keeps steps finite where gradients vanish.
+const EPSILON: f64 = 1e-15;
+
+/// Values of a pose: turn, translation.
+const WIDTH: usize = 6;
+
+/// Moments of all poses, in the order of the groups and their keys. Those of a pose advance only when a view of its
+/// time is drawn.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct PoseMoments {
+    first: Vec<[f64; WIDTH]>,
+    second: Vec<[f64; WIDTH]>,
+    steps: Vec<u32>,
+}
+
+impl PoseMoments {
+    /// Zero moments of the poses of some tracks.
+    pub(crate) fn zeros(tracks: Option<&Tracks>) -> Self {
+        let poses = tracks.map_or(0, Tracks::poses);
+        Self { first: vec![[0.0; WIDTH]; poses], second: vec![[0.0; WIDTH]; poses], steps: vec![0; poses] }
+    }
+
+    /// Moves the poses that views were drawn of: turns at `rate` radians, translations at as much of the `sizes` of the
+    /// groups, metres.
+    pub(crate) fn step(
+        &mut self,
+        tracks: &mut Tracks,
+        sizes: &[f64],
+        gradients: &[PoseGradient],
+        views: &[u32],
+        rate: f64,
+    ) {
+        let mut index = 0;
+        for (group, size) in tracks.groups.iter_mut().zip(sizes) {
+            for pose in &mut group.poses {
+                let place = index;
+                index += 1;
+                if views[place] == 0 {
+                    continue;
+                }
+                self.steps[place] += 1;
+                let steps = self.steps[place].min(10_000) as i32;
+                let bias = DECAY.map(|decay| 1.0 - decay.powi(steps));
+                let PoseGradient { turn, translation } = gradients[place];
+                let mut taken = [0.0; WIDTH];
+                let values = turn.to_array().into_iter().chain(translation.to_array());
+                for (k, g) in values.enumerate() {
+                    let (first, second) = (&mut self.first[place][k], &mut self.second[place][k]);
+                    *first = DECAY[0] * *first + (1.0 - DECAY[0]) * g;
+                    *second = DECAY[1] * *second + (1.0 - DECAY[1]) * g * g;
+                    taken[k] = (*first / bias[0]) / ((*second / bias[1]).sqrt() + EPSILON);
+                }
+                let turn = -rate * DVec3::from_slice(&taken[..3]);
+                pose.rotation = (pose.rotation * DQuat::from_scaled_axis(turn)).normalize();
+                pose.translation -= rate * size * DVec3::from_slice(&taken[3..]);
+            }
+        }
+    }
+
+    /// Arrays of a saved run, by name; none without poses.
+    pub(crate) fn saved(&self) -> Vec<(&'static str, StateTensor)> {
+        if self.steps.is_empty() {
+            return Vec::new();
+        }
+        vec![
+            ("poses.first", StateTensor::F64(self.first.as_flattened().to_vec())),
+            ("poses.second", StateTensor::F64(self.second.as_flattened().to_vec())),
+            ("poses.steps", StateTensor::U32(self.steps.clone())),
+        ]
+    }
+
+    /// Takes the arrays of [`Self::saved`] out of a saved run; `None` when they do not fit. A run that was saved
+    /// without poses keeps zero moments.
+    pub(crate) fn restore(&mut self, saved: &mut BTreeMap<String, StateTensor>) -> Option<()> {
+        let Some(steps) = saved.remove("poses.steps") else { return Some(()) };
+        let (first, second) = (saved.remove("poses.first")?, saved.remove("poses.second")?);
+        let (StateTensor::F64(first), StateTensor::F64(second), StateTensor::U32(steps)) =
+            (first, second, steps)
+        else {
+            return None;
+        };
+        let poses = self.steps.len();
+        let fits = steps.len() == poses && first.len() == WIDTH * poses && second.len() == WIDTH * poses;
+        let is_finite = first.iter().chain(&second).all(|value| value.is_finite());
+        (fits && is_finite).then(|| {
+            self.first = first.as_chunks().0.to_vec();
+            self.second = second.as_chunks().0.to_vec();
+            self.steps = steps;
+        })
+    }
+}
+
+/// Half of the largest extent of the Gaussians of every group, metres.
+pub(crate) fn object_sizes(tracks: &Tracks, gaussians: &Gaussians) -> Vec<f64> {
+    let mut bounds = vec![[[f32::INFINITY; 3], [f32::NEG_INFINITY; 3]]; tracks.groups.len()];
+    for (row, mean) in gaussians.means.iter().enumerate() {
+        let Some(group) = tracks.group(row) else { continue };
+        let [low, high] = &mut bounds[group];
+        for axis in 0..3 {
+            low[axis] = low[axis].min(mean[axis]);
+            high[axis] = high[axis].max(mean[axis]);
+        }
+    }
+    let half = |[low, high]: [[f32; 3]; 2]| {
+        (0..3).map(|axis| 0.5 * f64::from(high[axis] - low[axis])).fold(0.0, f64::max)
+    };
+    bounds.into_iter().map(|bounds| half(bounds).max(0.0)).collect()
+}
+
+/// The first gradient of a pose that is not finite.
+pub(crate) fn pose_fault(gradients: &[PoseGradient]) -> Option<Fault> {
+    let is_bad = |pose: &PoseGradient| !(pose.turn.is_finite() && pose.translation.is_finite());
+    let index = gradients.iter().position(is_bad)?;
+    let PoseGradient { turn, translation } = gradients[index];
+    Some(Fault {
+        part: "gradients",
+        tensor: "gradient of poses".to_owned(),
+        index,
+        value: format!("{turn} {translation}"),
+    })
+}
