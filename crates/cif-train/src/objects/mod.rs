@@ -16,6 +16,8 @@ mod path;
 mod plane;
 mod shape;
 mod start;
+#[cfg(test)]
+mod tests;
 mod view;
 
 use cif_dataset::Dataset;

@@ -171,11 +171,7 @@ impl Trainer {
         }
         let fine_steps = f64::from(self.stages.iterations(&self.state.config, Stage::Fine));
         let from = (f64::from(self.state.config.effects.still_from) * fine_steps).round() as u32;
-        let told = if self.state.guidance.knows_what_travels() {
-            self.state.config.effects.still_told
-        } else {
-            from
-        };
+        let told = if self.knows_what_travels() { self.state.config.effects.still_told } else { from };
         from.min(told).max(1)
     }
 
@@ -187,7 +183,12 @@ impl Trainer {
             && iteration == self.first_test()
             && TOLD_STEPS * f64::from(iteration) <= f64::from(fine_steps)
             && !self.shows_changes
-            && self.state.guidance.knows_what_travels()
+            && self.knows_what_travels()
+    }
+
+    /// True when Gaussians of travelling objects are told from the others.
+    fn knows_what_travels(&self) -> bool {
+        self.state.guidance.knows_what_travels() || self.state.field.tracks.is_some()
     }
 
     /// What cameras that stay in place see at each Gaussian, where it is in the mean; empty without such cameras.

@@ -78,6 +78,7 @@ fn masks_tell_early_what_stands_still() {
     let dataset = dataset(folder.path(), 12);
     let mut config = guided();
     (config.effects.still_every, config.effects.still_told) = (100, 15);
+    config.motion.rigid = false;
     // Step and share of Gaussians that stand still after each test of the fine stage.
     let tests = |config: &TrainConfig| {
         let mut tests = Vec::new();

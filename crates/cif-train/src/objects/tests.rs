@@ -1,0 +1,195 @@
+//! Objects whose motion is known, rendered and found again.
+
+use std::collections::BTreeMap;
+
+use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
+use cif_field::{Field, Gaussians};
+use cif_geometry::{PinholeCamera, PixelGrid, RigidTransform};
+use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::{Channels, RenderSettings, synthetic};
+use glam::{DMat3, DQuat, DVec2, DVec3};
+use rand::RngExt;
+
+use super::plane::Plane;
+use super::start::{Fitted, Rotation, Surroundings, fit_object};
+use super::view::{ObjectView, set_visible};
+use super::{outline, plane};
+use crate::random::{Purpose, stream};
+use crate::stop::Stop;
+
+const TIMES: usize = 30;
+const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };
+
+/// A camera on an arc above the floor.
+fn camera(time: usize) -> PinholeCamera {
+    let angle = 0.5 + 0.9 * time as f64 / TIMES as f64;
+    let centre = DVec3::new(1.1 * angle.sin(), -1.1 * angle.cos(), 0.8);
+    let forward = (DVec3::new(0.0, 0.0, 0.05) - centre).normalize();
+    let right = forward.cross(DVec3::Z).normalize();
+    let rotation = DMat3::from_cols(right, forward.cross(right), forward).transpose();
+    PinholeCamera {
+        width: 160,
+        height: 120,
+        focal_px: DVec2::splat(330.0),
+        principal_px: DVec2::new(80.0, 60.0),
+        camera_from_world: RigidTransform { rotation, translation: -(rotation * centre) },
+    }
+}
+
+/// Opaque Gaussians at places around the origin, in colours of these places.
+fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f32) -> Gaussians {
+    let means: Vec<[f32; 3]> = places.iter().map(|p| p.to_array().map(|v| v as f32)).collect();
+    let colors: Vec<[f32; 3]> = places.iter().map(|p| color(*p)).collect();
+    let mut gaussians = Gaussians::from_points(&means, &colors).unwrap();
+    gaussians.log_scales.fill([size.ln(); 3]);
+    gaussians.opacity_logits.fill(4.0);
+    gaussians
+}
+
+/// Views of a solid on its way.
+fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)]) -> Vec<ObjectView> {
+    let n = gaussians.len();
+    let time = |k: usize| k as f64 / (TIMES - 1) as f64;
+    let poses = poses.iter().enumerate();
+    let poses = poses.map(|(k, (rotation, translation))| TrackPose {
+        time: time(k),
+        translation: *translation,
+        rotation: *rotation,
+    });
+    let group =
+        TrackGroup { deformed: false, poses: poses.collect(), ..TrackGroup::still("solid", DVec3::ZERO) };
+    let scene = synthetic::generate(&synthetic::SyntheticConfig::default()).field;
+    let field = Field {
+        gaussians,
+        identities: None,
+        deformation: None,
+        tracks: Some(Tracks { group_of: vec![0; n], groups: vec![group] }),
+        ..scene
+    };
+    let settings = RenderSettings { sh_degree: 0, background: [0.6, 0.6, 0.55], ..RenderSettings::default() };
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    let mut views = Vec::new();
+    for k in 0..TIMES {
+        let camera = camera(k);
+        let channels = Channels { depth: false, instances: false };
+        let image = renderer.render(&field, &camera, time(k), &settings, channels);
+        let labels = image.alpha.map(|alpha| u16::from(*alpha > 0.5));
+        let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
+        let bytes: PixelGrid<[u8; 3]> = bytes;
+        views.extend(ObjectView::new(1, k, &camera, &labels, &bytes));
+    }
+    set_visible(&mut views);
+    views
+}
+
+fn fit(views: &[ObjectView]) -> Fitted {
+    let outline = outline::outline(views, &FLOOR).unwrap();
+    let stop = Stop::when(|| false);
+    let surroundings = Surroundings { times: TIMES, near: 0.05, seed: 0, gaussians: 150, stop: &stop };
+    fit_object(1, views, &FLOOR, &outline, surroundings).unwrap().unwrap()
+}
+
+/// Largest error of turns relative to the first pose, degrees, and mean error of displacements, metres.
+fn errors(found: &BTreeMap<usize, (DQuat, DVec3)>, truth: &[(DQuat, DVec3)]) -> (f64, f64) {
+    let (first, last) = (found[&0], truth[0]);
+    let (mut turn, mut shift) = (0.0_f64, 0.0);
+    for (time, (rotation, place)) in found {
+        let expected = truth[*time].0 * last.0.inverse();
+        let actual = *rotation * first.0.inverse();
+        turn = turn.max(actual.angle_between(expected).to_degrees());
+        // The middle of what was found need not be that of the truth.
+        let offset = first.0.inverse() * (last.1 - first.1);
+        shift += (*rotation * offset + *place - truth[*time].1).length();
+    }
+    (turn, shift / found.len() as f64)
+}
+
+fn box_places() -> Vec<DVec3> {
+    let mut rng = stream(0, Purpose::Objects, 9);
+    (0..1500)
+        .map(|k| {
+            let mut p = DVec3::from(std::array::from_fn(|_| 0.045 * (2.0 * rng.random::<f64>() - 1.0)));
+            p[k % 3] = if (k / 3) % 2 == 0 { 0.045 } else { -0.045 };
+            p
+        })
+        .collect()
+}
+
+/// Patches of colour.
+fn patches(p: DVec3) -> [f32; 3] {
+    let cell = (p * 40.0).floor();
+    std::array::from_fn(|k| {
+        let wave = (cell.x * (2.1 + k as f64) + cell.y * 3.7 + cell.z * (5.3 - k as f64)).sin();
+        (0.5 + 0.45 * wave) as f32
+    })
+}
+
+#[test]
+fn a_textured_box_that_slides_and_turns_is_found() {
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+        .map(|k| {
+            let share = k as f64 / (TIMES - 1) as f64;
+            let share = share * share * (3.0 - 2.0 * share);
+            (DQuat::from_rotation_z(1.4 * share), DVec3::new(-0.2 + 0.4 * share, 0.1 * share, 0.05))
+        })
+        .collect();
+    let fitted = fit(&views(solid(&box_places(), patches, 0.006), &truth));
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(turn < 4.0 && shift < 0.006, "{turn} deg, {shift} m, {}", fitted.turns);
+    assert_eq!(fitted.rotation, Rotation::Observed);
+    assert!(fitted.error < 0.1, "{}", fitted.error);
+}
+
+fn sphere_places(radius: f64) -> Vec<DVec3> {
+    let mut rng = stream(0, Purpose::Objects, 10);
+    (0..1200)
+        .map(|_| {
+            let z = 2.0 * rng.random::<f64>() - 1.0;
+            let angle = std::f64::consts::TAU * rng.random::<f64>();
+            let flat = (1.0 - z * z).sqrt();
+            radius * DVec3::new(flat * angle.cos(), flat * angle.sin(), z)
+        })
+        .collect()
+}
+
+/// Rolls without slip, with a radius up to the middle of its outermost Gaussians and their thickness.
+fn rolling(radius: f64) -> Vec<(DQuat, DVec3)> {
+    (0..TIMES)
+        .map(|k| {
+            let way = 0.4 * k as f64 / (TIMES - 1) as f64;
+            (DQuat::from_rotation_y(way / radius), DVec3::new(-0.2 + way, 0.0, radius))
+        })
+        .collect()
+}
+
+#[test]
+fn a_textured_ball_is_found_to_roll_and_a_plain_one_is_assumed_to() {
+    let truth = rolling(0.057);
+    let textured = fit(&views(solid(&sphere_places(0.05), patches, 0.006), &truth));
+    let (turn, shift) = errors(&textured.poses, &truth);
+    assert!(turn < 25.0 && shift < 0.01, "{turn} deg, {shift} m, {}", textured.turns);
+    assert!(textured.turns.starts_with("rolls"), "{}", textured.turns);
+    let plain = fit(&views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth));
+    assert_eq!(plain.rotation, Rotation::Assumed);
+    assert!(plain.turns.starts_with("rolls"), "{}", plain.turns);
+    assert!(errors(&plain.poses, &truth).1 < 0.01);
+}
+
+#[test]
+fn the_support_is_found_among_other_points() {
+    let mut rng = stream(0, Purpose::Objects, 11);
+    let points: Vec<DVec3> = (0..400)
+        .map(|k| {
+            let p = DVec3::from(std::array::from_fn(|_| 2.0 * rng.random::<f64>() - 1.0));
+            if k % 2 == 0 { DVec3::new(p.x, p.y, 0.3 + 0.001 * p.z) } else { p }
+        })
+        .collect();
+    let rng = || stream(0, Purpose::Objects, 0);
+    let above = [DVec3::new(0.0, 0.0, 2.0)];
+    let found = plane::support(&points, &above, 0.005, rng()).unwrap();
+    assert!(found.normal.dot(DVec3::Z) > 0.999 && (found.offset - 0.3).abs() < 0.01, "{found:?}");
+    let below = plane::support(&points, &[DVec3::new(0.0, 0.0, -2.0)], 0.005, rng()).unwrap();
+    assert!(below.normal.dot(DVec3::Z) < -0.999, "the normal looks at the cameras");
+    let loose: Vec<DVec3> = points.iter().copied().skip(1).step_by(2).collect();
+    assert!(plane::support(&loose, &above, 0.005, rng()).is_none());
+}
