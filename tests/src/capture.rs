@@ -3,11 +3,14 @@
 
 use std::f64::consts::TAU;
 use std::fs;
+use std::io::Write;
 use std::path::Path;
 
 use glam::DVec3;
 use image::{GrayImage, Luma, Rgb, RgbImage};
 use serde_json::json;
+use zip::ZipWriter;
+use zip::write::SimpleFileOptions;
 
 /// Image width, pixels.
 pub const WIDTH: u32 = 40;
@@ -80,7 +83,50 @@ pub fn write(folder: &Path, frames: usize) {
             { "id": STANDING, "label": "blue ball", "category": "ball" },
         ]),
     );
-    fs::write(folder.join("points.npy"), npy(&points())).expect("the points can be written");
+    let points = points();
+    let data: Vec<u8> = points.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    fs::write(folder.join("points.npy"), npy("<f4", &[points.len(), 3], &data))
+        .expect("the points can be written");
+}
+
+/// Writes the known motion of a capture of so many images: `motion.json`, and `tracks.npz` with 16 points per ball.
+///
+/// # Panics
+/// When the folder cannot be written.
+pub fn write_motion(folder: &Path, frames: usize) {
+    let times: Vec<f64> = (0..frames).map(|frame| frame as f64 / (frames.max(2) - 1) as f64).collect();
+    let mut instances = serde_json::Map::new();
+    let mut tracks = Vec::new();
+    for (id, label, motion) in [(ROLLING, "red ball", "rigid"), (STANDING, "blue ball", "static")] {
+        let centres: Vec<DVec3> = times.iter().map(|time| centre(id, *time)).collect();
+        let matrix = |at: &DVec3| {
+            json!([[1.0, 0.0, 0.0, at.x], [0.0, 1.0, 0.0, at.y], [0.0, 0.0, 1.0, at.z], [0.0, 0.0, 0.0, 1.0]])
+        };
+        let corner = |sign: f64| -> Vec<[f64; 3]> {
+            centres.iter().map(|centre| (*centre + sign * RADIUS).to_array()).collect()
+        };
+        let entry = json!({
+            "label": label, "motion": motion, "matrix": centres.iter().map(matrix).collect::<Vec<_>>(),
+            "aabb_min": corner(-1.0), "aabb_max": corner(1.0),
+        });
+        instances.insert(id.to_string(), entry);
+        for normal in sphere(16) {
+            tracks.extend(centres.iter().map(|centre| (*centre + normal * RADIUS).as_vec3().to_array()));
+        }
+    }
+    let steps: Vec<_> = times.iter().map(|time| json!({ "time": time })).collect();
+    save(folder, "motion.json", &json!({ "frames": steps, "instances": instances }));
+    let ids = [ROLLING, STANDING].map(|id| i64::from(id).to_le_bytes()).concat();
+    let points: Vec<u8> = tracks.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+    let mut zip =
+        ZipWriter::new(fs::File::create(folder.join("tracks.npz")).expect("the tracks can be made"));
+    for (name, array) in
+        [("ids.npy", npy("<i8", &[2], &ids)), ("points.npy", npy("<f4", &[2, 16, frames, 3], &points))]
+    {
+        zip.start_file(name, SimpleFileOptions::default()).expect("the tracks can be written");
+        zip.write_all(&array).expect("the tracks can be written");
+    }
+    zip.finish().expect("the tracks can be written");
 }
 
 /// Rewrites a JSON file of a capture.
@@ -174,21 +220,31 @@ fn points() -> Vec<[f32; 3]> {
         }
     }
     for id in [ROLLING, STANDING] {
-        for index in 0..120 {
-            // Fibonacci sphere.
-            let z = 1.0 - (2.0 * f64::from(index) + 1.0) / 120.0;
-            let angle = TAU * 0.618_033_988_749_895 * f64::from(index);
-            let ring = (1.0 - z * z).sqrt();
-            let normal = DVec3::new(ring * angle.cos(), ring * angle.sin(), z);
-            points.push((centre(id, 0.0) + normal * RADIUS).as_vec3().to_array());
-        }
+        points.extend(surface(id, 0.0, 120).iter().map(|point| point.as_vec3().to_array()));
     }
     points
 }
 
-/// A version 1.0 NumPy file of shape `[N, 3]`, little-endian float.
-fn npy(points: &[[f32; 3]]) -> Vec<u8> {
-    let mut header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({}, 3), }}", points.len());
+/// Points on a ball at a normalised time, world, metres.
+#[must_use]
+pub fn surface(id: u16, time: f64, count: u32) -> Vec<DVec3> {
+    sphere(count).map(|normal| centre(id, time) + normal * RADIUS).collect()
+}
+
+/// Unit vectors, spread evenly (Fibonacci sphere).
+fn sphere(count: u32) -> impl Iterator<Item = DVec3> {
+    (0..count).map(move |index| {
+        let z = 1.0 - (2.0 * f64::from(index) + 1.0) / f64::from(count);
+        let angle = TAU * 0.618_033_988_749_895 * f64::from(index);
+        let ring = (1.0 - z * z).sqrt();
+        DVec3::new(ring * angle.cos(), ring * angle.sin(), z)
+    })
+}
+
+/// A version 1.0 NumPy file of these elements.
+fn npy(descr: &str, shape: &[usize], data: &[u8]) -> Vec<u8> {
+    let shape: String = shape.iter().map(|length| format!("{length}, ")).collect();
+    let mut header = format!("{{'descr': '{descr}', 'fortran_order': False, 'shape': ({shape}), }}");
     while (10 + header.len() + 1) % 64 != 0 {
         header.push(' ');
     }
@@ -196,7 +252,7 @@ fn npy(points: &[[f32; 3]]) -> Vec<u8> {
     let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
     bytes.extend((header.len() as u16).to_le_bytes());
     bytes.extend(header.as_bytes());
-    bytes.extend(points.iter().flatten().flat_map(|value| value.to_le_bytes()));
+    bytes.extend(data);
     bytes
 }
 

@@ -6,9 +6,11 @@ use std::process::{Child, Command, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
-use cif_field::Checkpoint;
-use cif_test::capture;
+use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
+use cif_field::{Checkpoint, Field, Gaussians, Identities, Instance, SortMetric, Timeline};
+use cif_test::capture::{self, ROLLING, STANDING};
 use cif_test::command::{Run, run};
+use glam::DQuat;
 use serde_json::Value;
 
 const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
@@ -309,4 +311,95 @@ fn a_full_disk_leaves_the_old_scene() {
     let line = format!("trap '' XFSZ; ulimit -f 40; exec {CIF} train table -o scene.cif --force {TINY}");
     run("bash", path, ["-c", line.as_str()]).fails(1, &["scene.cif", "space"]);
     assert_eq!(fs::read_to_string(path.join("scene.cif")).unwrap(), "an older scene");
+}
+
+/// The two balls of a capture of eight images, each of which stays, or follows its true path.
+fn balls(follows: bool) -> Field {
+    let times: Vec<f64> = (0..8).map(|frame| f64::from(frame) / 7.0).collect();
+    let (mut positions, mut identities, mut tracks) = (Vec::new(), Identities::empty(), Tracks::default());
+    for (owner, id) in [ROLLING, STANDING].into_iter().enumerate() {
+        for point in capture::surface(id, 0.0, 100) {
+            positions.push(point.as_vec3().to_array());
+            identities.push_certain(Some(owner as u16));
+            tracks.group_of.push(owner as u32);
+        }
+        let pose = |time: &f64| TrackPose {
+            time: *time,
+            translation: capture::centre(id, *time),
+            rotation: DQuat::IDENTITY,
+        };
+        let poses = if follows { times.iter().map(pose).collect() } else { Vec::new() };
+        tracks.groups.push(TrackGroup { poses, ..TrackGroup::still("ball", capture::centre(id, 0.0)) });
+    }
+    let mut gaussians =
+        Gaussians::from_points(&positions, &[[0.5; 3]; 200]).expect("as many colours as points");
+    gaussians.log_scales.fill([0.002_f32.ln(); 3]);
+    gaussians.opacity_logits.fill(3.0);
+    gaussians.occupancy_logits.fill(3.0);
+    let instance = |id| Instance { id, label: format!("ball {id}"), category: "ball".to_owned() };
+    Field {
+        gaussians,
+        deformation: None,
+        tracks: Some(tracks),
+        identities: Some(identities),
+        instances: [ROLLING, STANDING].map(instance).to_vec(),
+        timeline: Timeline { times, frames_per_second: 24.0 },
+        cameras: Vec::new(),
+        sh_degree: 0,
+        background: [1.0; 3],
+        sort_metric: SortMetric::Z,
+        extent: 1.0,
+        record: Default::default(),
+    }
+}
+
+#[test]
+fn motion_is_measured_against_followed_points() {
+    let folder = with_capture(8);
+    let path = folder.path();
+    capture::write_motion(&path.join("table"), 8);
+    balls(true).save(path.join("rolls.cif")).unwrap();
+    balls(false).save(path.join("still.cif")).unwrap();
+    let motion = |line: &str| json(&cif(path, line).succeeds().stdout)["motion"].clone();
+    let number = |value: &Value| value.as_f64().unwrap_or_else(|| panic!("{value} is no number"));
+
+    // Pairs of eight times are three steps apart in the mean, and the ball rolls half a metre in seven.
+    let rest = 500.0 * 3.0 / 7.0;
+    let rolls = motion("eval rolls.cif table --json -");
+    let red = &rolls["instances"][0];
+    assert_eq!((&red["id"], &red["label"], &red["truth"]), (&3.into(), &"red ball".into(), &"rigid".into()));
+    assert_eq!((&red["model"], &red["moves"], &red["times"]), (&"rigid".into(), &true.into(), &8.into()));
+    // The tolerance of an export is 0.2 % of a ball of half a metre.
+    assert!(number(&red["error_mm"]) < 1.0 && number(&red["rotation_deg"]) < 0.1, "{red:#}");
+    assert!((number(&red["rest_mm"]) - rest).abs() < 0.01, "{red:#}");
+    assert_eq!((&red["within_10_mm"], &red["within_50_mm"]), (&100.0.into(), &100.0.into()));
+    // The box of a ball without its outermost splats.
+    assert!(number(&red["box_iou"]) > 75.0, "{red:#}");
+    let blue = &rolls["instances"][1];
+    assert_eq!((&blue["model"], &blue["moves"]), (&"static".into(), &false.into()));
+    assert!(number(&blue["error_mm"]) < 1e-3 && blue["rotation_deg"].is_null(), "{blue:#}");
+    assert_eq!((&rolls["moving"]["instances"], &rolls["resting"]["instances"]), (&1.into(), &1.into()));
+    assert_eq!(rolls["moving"]["error_mm"], red["error_mm"]);
+    assert!(number(&rolls["seconds"]) > 0.0);
+
+    let still = motion("eval still.cif table --json -");
+    let red = &still["instances"][0];
+    assert!((number(&red["error_mm"]) - rest).abs() < 0.01, "{red:#}");
+    assert_eq!((&red["within_50_mm"], &red["error_mm"]), (&0.0.into(), &still["moving"]["error_mm"]));
+    let table = cif(path, "eval still.cif table").succeeds().stdout;
+    for words in ["unmoved, mm", "214.3", "moving, mean of 1", "resting, mean of 1", "measured in"] {
+        assert!(table.contains(words), "{words} in {table}");
+    }
+
+    // Known motion is read, not written; damage is told before anything is rendered.
+    cif(path, "eval still.cif table --json table/tracks.npz --force").fails(2, &["is read by this command"]);
+    assert!(motion("eval still.cif table --no-masks --json -").is_null(), "nobody knows what is seen");
+    let tracks = path.join("table/tracks.npz");
+    let bytes = fs::read(&tracks).unwrap();
+    fs::write(&tracks, &bytes[..bytes.len() / 2]).unwrap();
+    cif(path, "eval still.cif table --images pictures").fails(1, &["tracks.npz", "copy it again"]);
+    assert!(!path.join("pictures").exists());
+    fs::remove_file(&tracks).unwrap();
+    assert!(motion("eval still.cif table --json -").is_null());
+    assert!(!cif(path, "eval still.cif table").succeeds().stdout.contains("unmoved"));
 }

@@ -9,8 +9,9 @@
 //! | COLMAP | `sparse/0` | every eighth image |
 //!
 //! Masks are PNG files of instance ids, 0 for unlabelled, or EXR files with a [`cryptomatte`]; labels come from
-//! `instances.json`, which may also lie in the mask folder, or from the Cryptomatte. Named groups of held-out frames come from `splits.json`. All cameras are ideal pinholes
-//! in this project's axes once a frame is loaded; times are normalised to [0, 1].
+//! `instances.json`, which may also lie in the mask folder, or from the Cryptomatte. Named groups of held-out frames
+//! come from `splits.json`, known motion from `motion.json` and `tracks.npz` (see [`motion_truth`]). All cameras are
+//! ideal pinholes in this project's axes once a frame is loaded; times are normalised to [0, 1].
 //!
 //! ```no_run
 //! use cif_dataset::{Dataset, OpenOptions};
@@ -37,6 +38,7 @@ mod lens_removal;
 mod load;
 mod mask_files;
 pub mod masks;
+pub mod motion_truth;
 mod open;
 mod placement;
 mod points;
@@ -48,4 +50,5 @@ pub use dataset::{
     Dataset, Frame, FrameData, InstanceLabel, Layout, OpenOptions, PointCloud, PointSource, Split,
 };
 pub use error::Error;
+pub use motion_truth::{MotionTruth, TrueMotion};
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

@@ -179,3 +179,16 @@ fn masks_of_another_folder_score_the_same_frames() {
     assert_eq!(Some(mask), exact.load_mask(2).unwrap());
     holds(&dataset.with_masks(Path::new("mask_x")).unwrap_err().to_string(), &["mask_x", "masks_tracker"]);
 }
+
+#[test]
+fn motion_counts_at_times_at_which_enough_of_an_instance_is_seen() {
+    let folder = hypernerf(3);
+    // Of instance 2, 19 pixels are too few and 20 enough.
+    for (k, pixels) in [19, 20].into_iter().enumerate() {
+        let path = folder.path().join(format!("masks/{k:06}.png"));
+        write_mask(&path, WIDTH, HEIGHT, |x, y| if y == 0 && x < pixels { 2 } else { 0 });
+    }
+    let truth = cif_dataset::MotionTruth { times: vec![0.0, 0.5, 1.0], ..Default::default() };
+    let seen = truth.seen_steps(&open(&folder)).unwrap();
+    assert_eq!(seen.into_iter().collect::<Vec<_>>(), [(1, vec![2]), (2, vec![1, 2])]);
+}

@@ -51,6 +51,14 @@ impl RigidTransform {
     }
 }
 
+/// Angle of the rotation that turns one rotation into the other, radians, 0 to pi; exact near zero, where the arc cosine
+/// of the trace is not.
+#[must_use]
+pub fn angle_between(a: &DMat3, b: &DMat3) -> f64 {
+    let chord = (*a - *b).to_cols_array().iter().map(|value| value * value).sum::<f64>().sqrt();
+    2.0 * (chord / 8.0_f64.sqrt()).min(1.0).asin()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -74,5 +82,14 @@ mod tests {
             ..RigidTransform::IDENTITY
         };
         assert!(mirror.orthonormality_error().is_infinite());
+    }
+
+    #[test]
+    fn angles_are_exact_small_and_large() {
+        let a = DMat3::from_axis_angle(DVec3::new(1.0, 2.0, -1.0).normalize(), 0.4);
+        for angle in [0.0, 1e-9, 0.3, 2.0, std::f64::consts::PI] {
+            let b = a * DMat3::from_rotation_z(angle);
+            assert!((angle_between(&a, &b) - angle).abs() < 1e-7 * angle.max(1e-3), "{angle}");
+        }
     }
 }

@@ -9,6 +9,7 @@
 //! | [`frames`] | the moved Gaussians of every sampled time |
 //! | [`procrustes`] | robust rigid alignment of two point sets |
 //! | [`motion`] | how well standing still and one rigid body fit a group of Gaussians |
+//! | [`motion_scores`] | how well the motion of a graph follows known surface points |
 //! | [`parts`] | a few rigid parts, found by clustering the paths of Gaussians |
 //! | [`keys`] | fewer samples of a track inside an error bound |
 //! | [`placement`] | where a node's splats are at any time |
@@ -58,6 +59,7 @@ pub mod label_pattern;
 pub mod level_of_detail;
 mod loose;
 pub mod motion;
+pub mod motion_scores;
 pub mod naming;
 mod node;
 pub mod options;
@@ -93,6 +95,7 @@ pub use graph::{
 };
 pub use label_pattern::LabelPattern;
 pub use level_of_detail::level_of_detail;
+pub use motion_scores::{InstanceMotion, MotionErrors, MotionScores, motion_scores};
 pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
 pub use placement::PlacedSplats;
 pub use query::{LabelMatch, LabelQuery, QueryError, query};

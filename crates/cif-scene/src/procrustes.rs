@@ -41,6 +41,11 @@ pub fn weighted_procrustes(
     Some(RigidTransform { rotation, translation: target_mean - rotation * source_mean })
 }
 
+/// The rotation nearest to a matrix, in the Frobenius norm; `None` where the matrix fixes none.
+pub(crate) fn polar_rotation(matrix: &DMat3) -> Option<DMat3> {
+    rotation_of(&matrix.transpose())
+}
+
 /// Rotation R that maximises `trace(R H)` for `H = sum w s t^T`; `None` when H fixes none.
 fn rotation_of(covariance: &DMat3) -> Option<DMat3> {
     let h = Matrix3::from_column_slice(&covariance.to_cols_array());

@@ -1,46 +1,15 @@
-//! Exported motion against known motion.
-//!
-//! Known motion comes as `motion.json`: `frames` (normalised `time` of every step) and, per mask id in
-//! `instances`, `label`, `motion` (`static`, `rigid`, ...), `matrix` (object to world, 4 x 4, row by row, one
-//! per step), `aabb_min` and `aabb_max` (world box, one per step).
+//! Exported motion against known motion: that of `motion.json` of a capture (see [`cif_dataset::motion_truth`]).
 //!
 //! An exported object has a frame of its own, so the two are aligned at the first exported time; what is
 //! compared is how they move from there. Translation is compared at the centre of the object's box, so that a
 //! wrong turn far from the object's origin is not counted twice.
 
-use std::collections::BTreeMap;
-use std::path::Path;
-
+use cif_dataset::{MotionTruth, TrueMotion};
 use cif_geometry::RigidTransform;
+use cif_geometry::transform::angle_between;
 use cif_scene::{CaptureFrame, MotionModel, NodeKind, SceneGraph};
-use glam::{DMat3, DVec3};
-use serde::{Deserialize, Serialize};
-
-use crate::error::Error;
-
-/// Largest difference between an exported time and a known one that still counts as the same.
-const SAME_TIME: f64 = 1e-4;
-
-/// Known motion of a capture.
-#[derive(Debug, Deserialize)]
-pub struct GroundTruth {
-    frames: Vec<TimeStep>,
-    instances: BTreeMap<u16, KnownMotion>,
-}
-
-#[derive(Debug, Deserialize)]
-struct TimeStep {
-    time: f64,
-}
-
-#[derive(Debug, Deserialize)]
-struct KnownMotion {
-    label: String,
-    motion: String,
-    matrix: Vec<[[f64; 4]; 4]>,
-    aabb_min: Vec<[f64; 3]>,
-    aabb_max: Vec<[f64; 3]>,
-}
+use glam::DMat3;
+use serde::Serialize;
 
 /// Error of an exported object's motion against its known motion.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -65,32 +34,6 @@ pub struct MotionError {
     pub rotation_max_deg: f64,
 }
 
-/// Reads `motion.json`.
-///
-/// # Errors
-/// When it cannot be read, or is not in the format.
-pub fn read(path: &Path) -> Result<GroundTruth, Error> {
-    let text = cif_input::read_to_string(path).map_err(Error::io("read the known motion", path))?;
-    let truth: GroundTruth = serde_json::from_str(&text).map_err(|error| {
-        Error::failed(
-            format!("{}: {error}", path.display()),
-            "expected `frames` with times, and `instances` with `label`, `motion`, `matrix`, `aabb_min` and \
-             `aabb_max`",
-        )
-    })?;
-    for (id, known) in &truth.instances {
-        let lengths = [known.matrix.len(), known.aabb_min.len(), known.aabb_max.len()];
-        if lengths != [truth.frames.len(); 3] {
-            return Err(Error::plain(format!(
-                "{}: instance {id} has {lengths:?} matrices and boxes for {} time steps",
-                path.display(),
-                truth.frames.len()
-            )));
-        }
-    }
-    Ok(truth)
-}
-
 /// A pose of the scene where it is in the world of the capture, in which motion is known.
 fn in_world(frame: &CaptureFrame, pose: &RigidTransform) -> RigidTransform {
     RigidTransform { translation: frame.capture_from_dataset(pose.translation), ..*pose }
@@ -100,15 +43,17 @@ fn in_world(frame: &CaptureFrame, pose: &RigidTransform) -> RigidTransform {
 ///
 /// `meters_per_unit` of the scene turns world units into millimetres.
 #[must_use]
-pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
-    let step_of = steps(graph, truth);
+pub fn compare(graph: &SceneGraph, truth: &MotionTruth) -> Vec<MotionError> {
+    let codes = &graph.time_codes;
+    let frames: Vec<usize> = codes.samples.iter().map(|code| *code as usize).collect();
+    let step_of = truth.steps_at(&codes.times, &frames);
     graph
         .nodes
         .iter()
         .filter_map(|node| {
             let NodeKind::Instance { id, .. } = node.kind else { return None };
             let known = truth.instances.get(&id)?;
-            if known.motion != "rigid" && known.motion != "static" {
+            if known.kind != "rigid" && known.kind != "static" {
                 return None;
             }
             // (exported pose, index of the known time), in time order, where the object exists.
@@ -126,7 +71,7 @@ pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
             let mut error = MotionError {
                 id,
                 label: known.label.clone(),
-                truth: known.motion.clone(),
+                truth: known.kind.clone(),
                 model: node.model(),
                 samples: pairs.len(),
                 translation_rms_mm: 0.0,
@@ -136,11 +81,11 @@ pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
             };
             let to_mm = 1000.0 * graph.meters_per_unit;
             let &(world_from_local, step) = pairs.first()?;
-            let world_from_object = known.pose(step);
+            let world_from_object = pose(known, step);
             let local_from_object = world_from_local.inverse().compose(&world_from_object);
-            let centre_in_object = world_from_object.inverse().apply(known.centre(step));
+            let centre_in_object = world_from_object.inverse().apply(known.boxes[step].centre());
             for (world_from_local, step) in &pairs {
-                let expected = known.pose(*step);
+                let expected = pose(known, *step);
                 let exported = world_from_local.compose(&local_from_object);
                 let distance =
                     (exported.apply(centre_in_object) - expected.apply(centre_in_object)).length() * to_mm;
@@ -157,55 +102,24 @@ pub fn compare(graph: &SceneGraph, truth: &GroundTruth) -> Vec<MotionError> {
         .collect()
 }
 
-impl KnownMotion {
-    fn pose(&self, step: usize) -> RigidTransform {
-        let rows = &self.matrix[step];
-        let row = |index: usize| DVec3::new(rows[index][0], rows[index][1], rows[index][2]);
-        let mut columns = DMat3::from_cols(row(0), row(1), row(2)).transpose();
-        // A scale belongs to the object, not to its motion.
-        columns.x_axis = columns.x_axis.normalize_or_zero();
-        columns.y_axis = columns.y_axis.normalize_or_zero();
-        columns.z_axis = columns.z_axis.normalize_or_zero();
-        RigidTransform { rotation: columns, translation: DVec3::new(rows[0][3], rows[1][3], rows[2][3]) }
+/// Pose of an object at a step.
+fn pose(known: &TrueMotion, step: usize) -> RigidTransform {
+    let matrix = &known.world_from_object[step];
+    // A scale belongs to the object, not to its motion.
+    let axis = |column: glam::DVec4| column.truncate().normalize_or_zero();
+    RigidTransform {
+        rotation: DMat3::from_cols(axis(matrix.x_axis), axis(matrix.y_axis), axis(matrix.z_axis)),
+        translation: matrix.w_axis.truncate(),
     }
-
-    fn centre(&self, step: usize) -> DVec3 {
-        (DVec3::from(self.aabb_min[step]) + DVec3::from(self.aabb_max[step])) / 2.0
-    }
-}
-
-/// Known time step of every exported sample. Times count where they are the same on both sides; layouts that
-/// normalise time otherwise (Neu3D divides by the number of frames) are matched frame by frame instead.
-fn steps(graph: &SceneGraph, truth: &GroundTruth) -> Vec<Option<usize>> {
-    let by_time: Vec<Option<usize>> =
-        graph.time_codes.times.iter().map(|time| step_at(truth, *time)).collect();
-    if by_time.iter().all(Option::is_some) {
-        return by_time;
-    }
-    let mut ascending: Vec<usize> = (0..truth.frames.len()).collect();
-    ascending.sort_by(|a, b| truth.frames[*a].time.total_cmp(&truth.frames[*b].time).then(a.cmp(b)));
-    let frame = |code: f64| ascending.get(code as usize).copied();
-    let codes = &graph.time_codes.samples;
-    let frames_fit = codes.iter().all(|code| code.fract() == 0.0 && frame(*code).is_some());
-    if frames_fit { codes.iter().map(|code| frame(*code)).collect() } else { by_time }
-}
-
-fn step_at(truth: &GroundTruth, time: f64) -> Option<usize> {
-    truth.frames.iter().position(|step| (step.time - time).abs() < SAME_TIME)
-}
-
-/// Angle of the rotation that turns one into the other, radians; exact near zero, where the arc cosine of
-/// the trace is not.
-fn angle_between(a: &DMat3, b: &DMat3) -> f64 {
-    let chord = (*a - *b).to_cols_array().iter().map(|value| value * value).sum::<f64>().sqrt();
-    2.0 * (chord / 8.0_f64.sqrt()).min(1.0).asin()
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use cif_geometry::Bounds;
     use cif_scene::{Motion, MotionReport, Node, PoseSample, ResidualStatistics, Splats, TimeCodes, UpAxis};
-    use glam::DQuat;
+    use glam::{DMat4, DQuat, DVec3};
 
     use super::*;
 
@@ -270,26 +184,23 @@ mod tests {
         }
     }
 
-    fn truth(motion: &str) -> GroundTruth {
-        let rows = |pose: &RigidTransform| {
-            let (r, t) = (pose.rotation.transpose().to_cols_array_2d(), pose.translation);
-            std::array::from_fn(|i| match i {
-                3 => [0.0, 0.0, 0.0, 1.0],
-                i => [r[i][0], r[i][1], r[i][2], t[i]],
-            })
-        };
+    fn truth(kind: &str) -> MotionTruth {
         let poses: Vec<RigidTransform> = (0..3).map(object_pose).collect();
         // The box is centred half a metre beside the object's origin.
-        let centres: Vec<DVec3> = poses.iter().map(|pose| pose.apply(DVec3::X * 0.5)).collect();
-        let known = KnownMotion {
+        let centres = poses.iter().map(|pose| pose.apply(DVec3::X * 0.5));
+        let known = TrueMotion {
             label: "box".into(),
-            motion: motion.into(),
-            matrix: poses.iter().map(rows).collect(),
-            aabb_min: centres.iter().map(|c| (*c - DVec3::splat(0.1)).to_array()).collect(),
-            aabb_max: centres.iter().map(|c| (*c + DVec3::splat(0.1)).to_array()).collect(),
+            kind: kind.into(),
+            world_from_object: poses
+                .iter()
+                .map(|pose| DMat4::from_mat3_translation(pose.rotation, pose.translation))
+                .collect(),
+            boxes: centres
+                .map(|centre| Bounds { low: centre - DVec3::splat(0.1), high: centre + DVec3::splat(0.1) })
+                .collect(),
+            points: Vec::new(),
         };
-        let frames = (0..3).map(|step| TimeStep { time: f64::from(step) / 2.0 }).collect();
-        GroundTruth { frames, instances: BTreeMap::from([(4, known)]) }
+        MotionTruth { times: vec![0.0, 0.5, 1.0], instances: BTreeMap::from([(4, known)]) }
     }
 
     /// The true motion, seen from a local frame that is turned and moved against the object's own; at the
@@ -364,26 +275,5 @@ mod tests {
     #[test]
     fn objects_that_deform_have_no_pose_to_compare() {
         assert!(compare(&exported(DVec3::ZERO, 0.0), &truth("deforming")).is_empty());
-    }
-
-    #[test]
-    fn angles_are_exact_small_and_large() {
-        let a = DMat3::from_axis_angle(DVec3::new(1.0, 2.0, -1.0).normalize(), 0.4);
-        for angle in [0.0, 1e-9, 0.3, 2.0, std::f64::consts::PI] {
-            let b = a * DMat3::from_rotation_z(angle);
-            assert!((angle_between(&a, &b) - angle).abs() < 1e-7 * angle.max(1e-3), "{angle}");
-        }
-    }
-
-    #[test]
-    fn files_of_another_kind_are_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("motion.json");
-        std::fs::write(&path, r#"{"frames": []}"#).unwrap();
-        assert!(read(&path).unwrap_err().to_string().contains("instances"));
-        let short = r#"{"frames": [{"time": 0}], "instances": {"1": {"label": "a", "motion": "rigid",
-            "matrix": [], "aabb_min": [], "aabb_max": []}}}"#;
-        std::fs::write(&path, short).unwrap();
-        assert!(read(&path).unwrap_err().to_string().contains("instance 1"));
     }
 }

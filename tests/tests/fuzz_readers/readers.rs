@@ -5,7 +5,7 @@ use std::path::Path;
 use std::sync::OnceLock;
 
 use cif_dataset::cryptomatte::{CONVERSION, HASH, id_as_float, layer_key, object_id};
-use cif_dataset::{Dataset, OpenOptions};
+use cif_dataset::{Dataset, MotionTruth, OpenOptions};
 use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose, Tracks};
 use cif_field::{
     Checkpoint, Deformation, DeformationConfig, Field, Gaussians, Heads, Identities, Instance,
@@ -79,16 +79,15 @@ pub(crate) fn all() -> Vec<Reader> {
             name: "known-motion",
             file: "motion.json",
             form: Form::Json,
-            write: |folder| {
-                let instance = json!({
-                    "label": "mug", "motion": "rigid", "matrix": [DMAT_IDENTITY, DMAT_IDENTITY],
-                    "aabb_min": vec![[0.0; 3]; 2], "aabb_max": vec![[1.0; 3]; 2],
-                });
-                let truth =
-                    json!({ "frames": [{ "time": 0.0 }, { "time": 1.0 }], "instances": { "3": instance } });
-                fs::write(folder.join("motion.json"), truth.to_string()).unwrap();
-            },
-            read: |folder| shown(cif::ground_truth::read(&folder.join("motion.json"))),
+            write: |folder| capture::write_motion(folder, 3),
+            read: known_motion,
+        },
+        Reader {
+            name: "known-motion-tracks",
+            file: "tracks.npz",
+            form: Form::Binary,
+            write: |folder| capture::write_motion(folder, 3),
+            read: known_motion,
         },
         Reader {
             name: "settings",
@@ -176,9 +175,10 @@ pub(crate) fn all() -> Vec<Reader> {
     ]
 }
 
-/// Rows of a matrix that changes nothing.
-const DMAT_IDENTITY: [[f64; 4]; 4] =
-    [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]];
+fn known_motion(folder: &Path) -> Result<(), String> {
+    let mut truth = MotionTruth::read(&folder.join("motion.json")).map_err(|error| error.to_string())?;
+    shown(truth.add_tracks(&folder.join("tracks.npz")))
+}
 
 fn shown<T, E: std::fmt::Display>(result: Result<T, E>) -> Result<(), String> {
     result.map(drop).map_err(|error| error.to_string())

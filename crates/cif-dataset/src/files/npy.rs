@@ -1,13 +1,24 @@
-//! Two-dimensional NumPy arrays of floats.
+//! NumPy arrays of numbers: `.npy` files and members of `.npz` archives.
 
+use std::io::{Cursor, Read};
 use std::path::Path;
 
-use npyz::{NpyFile, Order};
+use npyz::{Deserialize, NpyFile, Order};
+use zip::ZipArchive;
 
+use super::MAX_DEFLATE_RATIO;
 use crate::Error;
 
 /// Longest header text accepted; NumPy writes about 120 bytes.
 const MAX_HEADER: usize = 4096;
+
+/// An array of any number of dimensions.
+pub(crate) struct Array {
+    /// Lengths of the dimensions.
+    pub(crate) shape: Vec<usize>,
+    /// Values in C order: the last dimension varies fastest.
+    pub(crate) values: Vec<f64>,
+}
 
 /// A matrix, row by row.
 pub(crate) struct Matrix {
@@ -17,46 +28,122 @@ pub(crate) struct Matrix {
     pub(crate) values: Vec<f64>,
 }
 
+/// Types that the elements of an array may have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Elements {
+    /// Floats of 4 or 8 bytes.
+    Floats,
+    /// Integers of 1 to 8 bytes, signed or not, of which those below 2^53 are exact.
+    Integers,
+}
+
 /// Reads a matrix of 4- or 8-byte floats.
 ///
 /// # Errors
 /// When the file is not such a matrix, or shorter than its header claims.
 pub(crate) fn read_matrix(path: &Path) -> Result<Matrix, Error> {
     let bytes = cif_input::read(path).map_err(Error::read(path))?;
-    check_header(&bytes).map_err(|problem| Error::invalid(path, problem))?;
-    let file = NpyFile::new(bytes.as_slice())
-        .map_err(|error| Error::invalid(path, format!("not a NumPy array ({error})")))?;
-    let (rows, columns) = match *file.shape() {
-        [rows, columns] => (rows as usize, columns as usize),
-        ref shape => {
-            return Err(Error::invalid(path, format!("shape {shape:?} where two dimensions are expected")));
-        }
-    };
+    let Array { shape, values } =
+        parse(&bytes, Elements::Floats).map_err(|problem| Error::invalid(path, problem))?;
+    match *shape {
+        [rows, columns] => Ok(Matrix { rows, columns, values }),
+        _ => Err(Error::invalid(path, format!("shape {shape:?} where two dimensions are expected"))),
+    }
+}
+
+/// An opened `.npz` archive.
+pub(crate) struct Archive<'a> {
+    path: &'a Path,
+    zip: ZipArchive<Cursor<Vec<u8>>>,
+    /// Bytes that a member can hold at most.
+    limit: u64,
+}
+
+impl<'a> Archive<'a> {
+    /// Opens an archive as `numpy.savez` and `numpy.savez_compressed` write them.
+    ///
+    /// # Errors
+    /// When the file cannot be read, or is no archive.
+    pub(crate) fn open(path: &'a Path) -> Result<Self, Error> {
+        let bytes = cif_input::read(path).map_err(Error::read(path))?;
+        let limit = (bytes.len() as u64).saturating_mul(MAX_DEFLATE_RATIO);
+        let zip = ZipArchive::new(Cursor::new(bytes)).map_err(|error| {
+            Error::invalid(path, format!("not a NumPy archive (.npz), or cut short ({error}); copy it again"))
+        })?;
+        Ok(Self { path, zip, limit })
+    }
+
+    /// Reads an array by its name.
+    ///
+    /// # Errors
+    /// When the archive lacks it, or it is damaged or of other elements.
+    pub(crate) fn array(&mut self, name: &str, elements: Elements) -> Result<Array, Error> {
+        let path = self.path;
+        let invalid = |problem: String| Error::invalid(path, format!("array `{name}`: {problem}"));
+        let damaged = |error: &dyn std::fmt::Display| invalid(format!("damaged ({error}); copy it again"));
+        let index = self.zip.index_for_name(&format!("{name}.npy"));
+        let index = index.ok_or_else(|| invalid("missing; write the file with numpy.savez again".into()))?;
+        let member = self.zip.by_index(index).map_err(|error| damaged(&error))?;
+        let mut bytes = Vec::new();
+        member.take(self.limit).read_to_end(&mut bytes).map_err(|error| damaged(&error))?;
+        parse(&bytes, elements).map_err(invalid)
+    }
+}
+
+/// Reads the bytes of a `.npy` file; the error is the problem alone.
+fn parse(bytes: &[u8], elements: Elements) -> Result<Array, String> {
+    check_header(bytes)?;
+    let file = NpyFile::new(bytes).map_err(|error| format!("not a NumPy array ({error})"))?;
+    let shape: Vec<usize> = file.shape().iter().map(|length| *length as usize).collect();
     let order = file.order();
-    let short = |error| Error::invalid(path, format!("cut short or damaged ({error}); copy it again"));
-    let values: Vec<f64> = match file.try_data::<f64>() {
-        Ok(data) => data.collect::<Result<_, _>>().map_err(short)?,
-        Err(file) => match file.try_data::<f32>() {
-            Ok(data) => data.map(|v| v.map(f64::from)).collect::<Result<_, _>>().map_err(short)?,
-            Err(file) => {
-                return Err(Error::invalid(
-                    path,
-                    format!(
-                        "elements of type {} where 4- or 8-byte floats are expected",
-                        file.dtype().descr()
-                    ),
-                ));
+    let values = match elements {
+        Elements::Floats => values::<f64>(file, |v| v).or_else(|file| values::<f32>(file, f64::from)),
+        Elements::Integers => values::<i64>(file, |v| v as f64)
+            .or_else(|file| values::<u64>(file, |v| v as f64))
+            .or_else(|file| values::<i32>(file, f64::from))
+            .or_else(|file| values::<u32>(file, f64::from))
+            .or_else(|file| values::<i16>(file, f64::from))
+            .or_else(|file| values::<u16>(file, f64::from))
+            .or_else(|file| values::<i8>(file, f64::from))
+            .or_else(|file| values::<u8>(file, f64::from)),
+    };
+    let values = values.unwrap_or_else(|file| {
+        let expected = match elements {
+            Elements::Floats => "4- or 8-byte floats",
+            Elements::Integers => "integers",
+        };
+        Err(format!("elements of type {} where {expected} are expected", file.dtype().descr()))
+    })?;
+    let values = if order == Order::Fortran { in_c_order(&shape, &values) } else { values };
+    Ok(Array { shape, values })
+}
+
+/// The values of an array whose elements are of a type; the file itself where they are of another.
+fn values<T: Deserialize>(
+    file: NpyFile<&[u8]>,
+    as_float: fn(T) -> f64,
+) -> Result<Result<Vec<f64>, String>, NpyFile<&[u8]>> {
+    let data = file.try_data::<T>()?;
+    let values = data.map(|value| value.map(as_float)).collect::<Result<_, _>>();
+    Ok(values.map_err(|error| format!("cut short or damaged ({error}); copy it again")))
+}
+
+/// Values whose first dimension varies fastest, so that the last one does.
+fn in_c_order(shape: &[usize], values: &[f64]) -> Vec<f64> {
+    let mut index = vec![0; shape.len()];
+    (0..values.len())
+        .map(|_| {
+            let place = shape.iter().zip(&index).rev().fold(0, |place, (length, at)| place * length + at);
+            for (at, length) in index.iter_mut().zip(shape).rev() {
+                *at += 1;
+                if *at < *length {
+                    break;
+                }
+                *at = 0;
             }
-        },
-    };
-    let values = match order {
-        Order::C => values,
-        Order::Fortran => (0..rows)
-            .flat_map(|r| (0..columns).map(move |c| (r, c)))
-            .map(|(r, c)| values[c * rows + r])
-            .collect(),
-    };
-    Ok(Matrix { rows, columns, values })
+            values[place]
+        })
+        .collect()
 }
 
 /// Rejects headers that would make the parser allocate, recurse or overflow.
@@ -98,4 +185,55 @@ fn check_header(bytes: &[u8]) -> Result<(), String> {
             .ok_or_else(|| "its header claims more elements than the file holds; copy it again".to_owned())?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A version 1.0 file.
+    fn file(descr: &str, fortran: &str, shape: &str, data: &[u8]) -> Vec<u8> {
+        let header = format!("{{'descr': '{descr}', 'fortran_order': {fortran}, 'shape': {shape}, }}\n");
+        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+        bytes.extend((header.len() as u16).to_le_bytes());
+        bytes.extend(header.as_bytes());
+        bytes.extend(data);
+        bytes
+    }
+
+    #[test]
+    fn arrays_of_three_dimensions_are_read_in_either_order() {
+        let data: Vec<u8> = (0..12).flat_map(|k| (k as f32).to_le_bytes()).collect();
+        let c = parse(&file("<f4", "False", "(2, 3, 2)", &data), Elements::Floats).unwrap();
+        assert_eq!((c.shape, c.values), (vec![2, 3, 2], (0..12).map(f64::from).collect()));
+        let f = parse(&file("<f4", "True", "(2, 3, 2)", &data), Elements::Floats).unwrap();
+        // Element (i, j, k) lies at i + 2 (j + 3 k).
+        let expected = [0.0, 6.0, 2.0, 8.0, 4.0, 10.0, 1.0, 7.0, 3.0, 9.0, 5.0, 11.0];
+        assert_eq!((f.shape, f.values), (vec![2, 3, 2], expected.to_vec()));
+    }
+
+    #[test]
+    fn integers_of_any_width_are_read_and_floats_are_told_apart() {
+        for (descr, data) in [
+            ("<i8", 7_i64.to_le_bytes().to_vec()),
+            ("<u8", 7_u64.to_le_bytes().to_vec()),
+            ("<i4", 7_i32.to_le_bytes().to_vec()),
+            ("<u2", 7_u16.to_le_bytes().to_vec()),
+            ("|u1", vec![7]),
+        ] {
+            let array = parse(&file(descr, "False", "(1,)", &data), Elements::Integers).unwrap();
+            assert_eq!((array.shape, array.values), (vec![1], vec![7.0]), "{descr}");
+        }
+        let floats = file("<f8", "False", "(1,)", &7_f64.to_le_bytes());
+        let told = parse(&floats, Elements::Integers).err().unwrap();
+        assert!(told.contains("integers are expected"), "{told}");
+    }
+
+    #[test]
+    fn short_files_are_refused() {
+        let told = parse(&file("<f8", "False", "(2, 1)", &[0; 12]), Elements::Floats).err().unwrap();
+        assert!(told.contains("cut short"), "{told}");
+        let told = parse(&file("<f8", "False", "(2, 100000)", &[0; 12]), Elements::Floats).err().unwrap();
+        assert!(told.contains("more elements than the file holds"), "{told}");
+    }
 }

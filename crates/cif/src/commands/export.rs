@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use cif_dataset::MotionTruth;
 use cif_field::Field;
 use cif_scene::{FrameRange, MotionModel, SceneFormat, SceneGraph, SceneOptions, Tolerance, UpAxis};
 use clap::{ArgGroup, Args};
@@ -96,7 +97,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         outputs.text(path)?;
     }
     command.targets.check(&command.writing, command.force, &mut outputs)?;
-    let truth = command.ground_truth.as_deref().map(ground_truth::read).transpose()?;
+    let truth = command.ground_truth.as_deref().map(MotionTruth::read).transpose().map_err(Error::plain)?;
     let field = scene::load(&command.scene)?;
     let notes = command.targets.iter().filter_map(|target| target.format.note_on_place());
     scene::note_frame(&scene::frame(&field)?, notes);

@@ -9,6 +9,7 @@ mod bench_hardness;
 mod check;
 mod diff;
 mod eval;
+mod eval_motion;
 mod export;
 mod import;
 mod info;
