@@ -187,6 +187,9 @@ fn sampled_tracks_are_not_differentiated() {
     renderer.backward(&scene.field, &forward.color, 0.0, &mut gradients);
 }
 
+/// A change of a parameter by a step.
+type Change<'a> = &'a dyn Fn(&mut Scene<f64>, f64);
+
 /// Two groups that turn and move, and Gaussians without one.
 fn posed_scene(heads: Option<Heads>) -> SyntheticScene {
     let mut scene = generate(&SyntheticConfig { gaussians: 40, screen_size: (0.05, 0.2), ..config(heads) });
@@ -277,7 +280,7 @@ fn poses_and_their_gaussians_have_the_gradients_of_the_reference() {
         let g = &gradients.gaussians;
         for row in (0..scene.field.len()).filter(|row| row % 3 < 2) {
             for k in 0..4 {
-                let cases: [(f32, &dyn Fn(&mut Scene<f64>, f64)); 3] = [
+                let cases: [(f32, Change<'_>); 3] = [
                     (g.means[row][k % 3], &|double, step| {
                         double.parameters.gaussians[row].mean[k % 3] += step;
                     }),

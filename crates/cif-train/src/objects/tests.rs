@@ -172,7 +172,9 @@ fn a_textured_ball_is_found_to_roll_and_a_plain_one_is_assumed_to() {
     let plain = fit(&views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth));
     assert_eq!(plain.rotation, Rotation::Assumed);
     assert!(plain.turns.starts_with("rolls"), "{}", plain.turns);
-    assert!(errors(&plain.poses, &truth).1 < 0.01);
+    let (turn, shift) = errors(&plain.poses, &truth);
+    // Nothing but its outline, of 30 pixels, tells how far it went: 400 degrees.
+    assert!(turn < 60.0 && shift < 0.015, "{turn} deg, {shift} m");
 }
 
 #[test]

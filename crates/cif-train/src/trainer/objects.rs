@@ -10,7 +10,7 @@ use crate::schedule::log_linear;
 use crate::stage::Stage;
 
 /// Error on pixels that were left out beyond which an object is not taken to be rigid.
-const MOST_ERROR: f64 = 0.12;
+const MOST_ERROR: f64 = 0.2;
 
 /// Rates of poses at the start and the end of the fine stage, radians, and shares of the size of the object.
 const RATES: [f32; 2] = [0.004, 2e-4];

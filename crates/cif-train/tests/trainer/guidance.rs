@@ -113,6 +113,57 @@ fn masks_tell_early_what_stands_still() {
 }
 
 #[test]
+fn a_rigid_object_moves_by_poses_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = dataset(folder.path(), 12);
+    let mut config = guided();
+    (config.effects.still_every, config.effects.still_told) = (100, 15);
+    let mut warnings = Vec::new();
+    let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+    let mut saved = None;
+    trainer
+        .run(&mut |event, view| {
+            match event {
+                TrainEvent::Warning { message } => warnings.push(message.clone()),
+                TrainEvent::Densified { stage: Stage::Fine, iteration, .. } if *iteration > 100 => {
+                    saved.get_or_insert_with(|| view.checkpoint(true));
+                }
+                _ => {}
+            }
+            Control::Continue
+        })
+        .unwrap();
+    assert!(warnings.iter().any(|w| w.contains("ball 9 moves as a whole")), "{warnings:?}");
+    let field = trainer.into_field();
+    field.validate().unwrap();
+    let tracks = field.tracks.as_ref().unwrap();
+    assert_eq!((tracks.groups.len(), tracks.groups[0].poses.len()), (1, 12));
+    // Where the ball is, from the first time to half-time.
+    let place = |time: f64| tracks.groups[0].pose(time).1;
+    let followed = place(0.5) - place(0.0);
+    assert!((followed - DVec3::new(TRAVEL, 0.0, 0.0)).length() < 0.1, "{followed}");
+    let rows: Vec<usize> = (0..field.len()).filter(|row| tracks.group(*row).is_some()).collect();
+    assert!(rows.len() >= 50, "{}", rows.len());
+    let still = &field.deformation.as_ref().unwrap().still;
+    assert!(rows.iter().all(|row| still[*row]), "the network leaves them alone");
+    let ball = field.members(2);
+    let of_ball = ball.iter().filter(|row| tracks.group(**row as usize).is_some()).count();
+    assert!(10 * of_ball > 8 * rows.len(), "{of_ball} of {}", rows.len());
+    // Saved inside the fine stage, it goes on bit for bit.
+    let checkpoint = saved.expect("Gaussians were added");
+    let path = folder.path().join("inside.cif");
+    checkpoint.save(&path).unwrap();
+    let mut resumed = Trainer::resume(dataset, Checkpoint::load(&path).unwrap()).unwrap();
+    #[cfg(feature = "wgpu")]
+    if let Some(gpu) = cif_render::wgpu::testing::gpu() {
+        let error = resumed.use_gpu(&gpu).unwrap_err().to_string();
+        assert!(error.contains("move by poses"), "{error}");
+    }
+    assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
+    assert!(without_record(&resumed.into_field()) == without_record(&field));
+}
+
+#[test]
 fn neither_threads_nor_interruptions_change_the_result() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = dataset(folder.path(), 6);
