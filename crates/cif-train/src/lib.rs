@@ -17,6 +17,8 @@
 //! | [`densify`] | cloning, splitting, pruning |
 //! | [`estimate`] | whose each Gaussian is, from masks |
 //! | [`resample`] | instance-guided resampling with volume conservation |
+//! | `engine` | what computes the steps of a run: the processor, or a GPU |
+//! | `objects` | how rigid objects get poses, before the scene is trained |
 //! | [`heads`] | what the instance stage learns, and how pixels tell it |
 //! | [`tracks`] | where objects travel, from masks alone |
 //! | [`metrics`] | how good a field is |
