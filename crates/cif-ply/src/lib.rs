@@ -51,6 +51,10 @@ impl SceneFormat for Ply {
         None
     }
 
+    fn options(&self) -> &'static [&'static str] {
+        &["time_code"]
+    }
+
     fn note_on_place(&self) -> Option<&'static str> {
         Some(
             "splats of PLY files, which are single precision, stay in that frame; the comments `world offset` and \

@@ -3,6 +3,8 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::Deserialize;
+
 use crate::{
     LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneGraph, query, search,
 };
@@ -31,6 +33,11 @@ pub trait SceneFormat: Sync {
     /// Advice on a scene that lies elsewhere in the world of its capture, where files do not place it.
     fn note_on_place(&self) -> Option<&'static str> {
         None
+    }
+
+    /// Keys of [`ExportOptions`], beside `force`, that a single file of this format knows.
+    fn options(&self) -> &'static [&'static str] {
+        &[]
     }
 
     /// True when the name of a file says that it is of this format.
@@ -147,7 +154,8 @@ pub fn ending_of<'a>(path: &Path, endings: &'a [Ending]) -> Option<&'a Ending> {
 }
 
 /// Where the arrays of instances go.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Payloads {
     /// Beside files of text, so that they stay readable; inside others.
     #[default]
@@ -160,7 +168,8 @@ pub enum Payloads {
 }
 
 /// Options for writing a graph. A format ignores those that it does not know.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct ExportOptions {
     /// Replace existing files even when they were not written by cif.
     pub force: bool,

@@ -85,6 +85,10 @@ impl SceneFormat for Usd {
         Some(MotionModel::Dense)
     }
 
+    fn options(&self) -> &'static [&'static str] {
+        &["payloads", "levels_of_detail"]
+    }
+
     fn check_target(&self, path: &Path, options: &ExportOptions) -> Result<(), FormatError> {
         Ok(check_target(path, *options)?)
     }
