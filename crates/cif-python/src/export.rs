@@ -77,12 +77,12 @@ fn export_options(
     let Some(options) = options else { return Ok(ExportOptions { force, ..ExportOptions::default() }) };
     for key in options.keys() {
         let key = key.str()?;
-        if !format.options().contains(&key.to_str()?) {
-            let known = match format.options() {
+        if !format.about().options.contains(&key.to_str()?) {
+            let known = match format.about().options {
                 [] => "none".to_owned(),
                 known => known.join(", "),
             };
-            let message = format!("options: '{key}' is no option of {}; known: {known}", format.name());
+            let message = format!("options: '{key}' is no option of {}; known: {known}", format.about().name);
             return Err(PyValueError::new_err(message));
         }
     }

@@ -14,40 +14,17 @@ pub type FormatError = Box<dyn std::error::Error + Send + Sync>;
 
 /// A file format of scene graphs.
 pub trait SceneFormat: Sync {
-    /// Name of the format, e.g. `glTF`.
-    fn name(&self) -> &'static str;
-
-    /// The name as flags, keys and Python have it, e.g. `gltf`.
-    fn key(&self) -> &'static str;
-
-    /// Endings of its files.
-    fn endings(&self) -> &'static [Ending];
-
-    /// Description of the files, in one or two sentences for the help of the command.
-    fn about(&self) -> &'static str;
-
-    /// The most expensive motion that a file holds: graphs are built with no more than this. `None` for formats that
-    /// hold one moment, to which any motion leads.
-    fn most_expensive_motion(&self) -> Option<MotionModel>;
-
-    /// Advice on a scene that lies elsewhere in the world of its capture, where files do not place it.
-    fn note_on_place(&self) -> Option<&'static str> {
-        None
-    }
-
-    /// Keys of [`ExportOptions`], beside `force`, that a single file of this format knows.
-    fn options(&self) -> &'static [&'static str] {
-        &[]
-    }
+    /// Facts about the format.
+    fn about(&self) -> &'static About;
 
     /// True when the name of a file says that it is of this format.
     fn recognises(&self, path: &Path) -> bool {
-        ending_of(path, self.endings()).is_some()
+        ending_of(path, self.about().endings).is_some()
     }
 
     /// True when a file of this name can be written.
     fn writes(&self, path: &Path) -> bool {
-        ending_of(path, self.endings()).is_some_and(|ending| ending.written)
+        ending_of(path, self.about().endings).is_some_and(|ending| ending.written)
     }
 
     /// True when the output is a folder of several files.
@@ -96,7 +73,11 @@ pub trait SceneFormat: Sync {
         object: &str,
         label: &str,
         category: Option<&str>,
-    ) -> Result<Relabelled, FormatError>;
+    ) -> Result<Relabelled, FormatError> {
+        let _ = (output, object, label, category);
+        let (path, name) = (path.display(), self.about().name);
+        Err(format!("{path}: {name} holds no labels; label the scene that it was exported from").into())
+    }
 
     /// Objects of a file whose label, class or name matches.
     ///
@@ -125,6 +106,26 @@ pub trait SceneFormat: Sync {
             search(&self.read(path, options)?, wanted, &path.display().to_string(), str::to_owned);
         Ok(found?)
     }
+}
+
+/// Facts about a format.
+#[derive(Clone, Copy, Debug)]
+pub struct About {
+    /// Name of the format, e.g. `glTF`.
+    pub name: &'static str,
+    /// The name as flags, keys and Python have it, e.g. `gltf`.
+    pub key: &'static str,
+    /// Endings of its files; the first is taken where nobody says.
+    pub endings: &'static [Ending],
+    /// Description of the files, in one or two sentences for the help of the command.
+    pub files: &'static str,
+    /// The most expensive motion that a file holds: graphs are built with no more than this. `None` for formats that
+    /// hold one moment, to which any motion leads.
+    pub most_expensive_motion: Option<MotionModel>,
+    /// Advice on a scene that lies elsewhere in the world of its capture, where files do not place it.
+    pub note_on_place: Option<&'static str>,
+    /// Keys of [`ExportOptions`], beside `force`, that a single file of this format knows.
+    pub options: &'static [&'static str],
 }
 
 /// An ending of file names.

@@ -84,7 +84,7 @@ pub use edits::import_edits;
 pub use error::SceneError;
 pub use field_from_graph::field_from_graph;
 pub use format::{
-    Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
+    About, Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
 };
 pub use graph::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample,

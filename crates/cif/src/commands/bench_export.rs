@@ -111,7 +111,7 @@ fn measure(
     let share = |row: &ReportRow| row.motion.residual.decisive / row.motion.tolerance;
     let shares: Vec<f64> = nodes.iter().map(share).filter(|share| share.is_finite()).collect();
     Ok(WrittenFile {
-        format: format.name(),
+        format: format.about().name,
         bytes: written.bytes,
         seconds,
         samples: nodes.iter().map(|row| row.motion.samples).sum(),
@@ -132,7 +132,7 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
     // A format that does not work is told once, and left out of all rungs.
-    let moving = FORMATS.into_iter().filter(|format| format.most_expensive_motion().is_some());
+    let moving = FORMATS.into_iter().filter(|format| format.about().most_expensive_motion.is_some());
     let mut formats: Vec<&dyn SceneFormat> = if command.no_files { Vec::new() } else { moving.collect() };
     let mut rungs = Vec::new();
     for &tolerance in &command.tolerances {
@@ -142,8 +142,8 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
         let mut rung = Rung::of(tolerance, start.elapsed().as_secs_f64(), &graph);
         formats.retain(|format| {
             // One file without text, which is what takes the least room.
-            let ending = format.endings().iter().find(|ending| ending.kind != "text");
-            let ending = ending.map_or_else(|| format.key(), |ending| ending.name);
+            let ending = format.about().endings.iter().find(|ending| ending.kind != "text");
+            let ending = ending.map_or_else(|| format.about().key, |ending| ending.name);
             let path = folder.path().join(format!("rung_{}.{ending}", rungs.len()));
             match measure(*format, &field, &graph, &options, &path) {
                 Ok(file) => {
@@ -151,7 +151,7 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
                     true
                 }
                 Err(reason) => {
-                    eprintln!("note: no {} files are measured: {reason}", format.name());
+                    eprintln!("note: no {} files are measured: {reason}", format.about().name);
                     false
                 }
             }
