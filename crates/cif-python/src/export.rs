@@ -120,7 +120,7 @@ pub(crate) fn export<'py>(
     let writing = export_options(format, options, force)?;
     let scene = scene_options(py, scene)?;
     format.check_target(path, &writing).map_err(cif_error)?;
-    let graph = build(py, field, &formats::held_by(format, &scene), motion)?;
+    let graph = build(py, field, &format.held(&scene), motion)?;
     let summary = py.detach(|| format.write(&graph, path, &writing)).map_err(cif_error)?;
     let out = PyDict::new(py);
     out.set_item("path", summary.path)?;

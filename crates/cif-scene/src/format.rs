@@ -3,10 +3,12 @@
 
 use std::path::{Path, PathBuf};
 
+use cif_field::Field;
 use serde::Deserialize;
 
 use crate::{
-    LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneGraph, query, search,
+    LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneError, SceneGraph,
+    SceneOptions, build, query, search,
 };
 
 /// Why a format refuses; the message names the file and what to do.
@@ -25,6 +27,29 @@ pub trait SceneFormat: Sync {
     /// True when a file of this name can be written.
     fn writes(&self, path: &Path) -> bool {
         ending_of(path, self.about().endings).is_some_and(|ending| ending.written)
+    }
+
+    /// Options of graphs that the format can hold.
+    fn held(&self, options: &SceneOptions) -> SceneOptions {
+        let most = self.about().most_expensive_motion.unwrap_or(options.most_expensive_motion);
+        SceneOptions { most_expensive_motion: options.most_expensive_motion.min(most), ..options.clone() }
+    }
+
+    /// The graph of a field as the format can hold it; `None` where that is the graph that was built already.
+    ///
+    /// # Errors
+    /// As [`build`](fn@build).
+    fn rebuilt(
+        &self,
+        field: &Field,
+        graph: &SceneGraph,
+        options: &SceneOptions,
+    ) -> Result<Option<SceneGraph>, SceneError> {
+        let too_much = |most| graph.nodes.iter().any(|node| node.model() > most);
+        if !self.about().most_expensive_motion.is_some_and(too_much) {
+            return Ok(None);
+        }
+        build(field, &self.held(options)).map(Some)
     }
 
     /// True when the output is a folder of several files.

@@ -119,30 +119,6 @@ pub fn read_both(first: &Path, second: &Path) -> Result<[SceneGraph; 2], Error> 
     Ok([graph(first)?, graph(second)?])
 }
 
-/// Options of graphs that a format can hold.
-#[must_use]
-pub fn held_by(format: &dyn SceneFormat, options: &SceneOptions) -> SceneOptions {
-    let most = format.about().most_expensive_motion.unwrap_or(options.most_expensive_motion);
-    SceneOptions { most_expensive_motion: options.most_expensive_motion.min(most), ..options.clone() }
-}
-
-/// The graph of a field as a format can hold it; `None` where that is the graph that was built already.
-///
-/// # Errors
-/// When it cannot be built.
-pub fn rebuilt_for(
-    format: &dyn SceneFormat,
-    field: &Field,
-    graph: &SceneGraph,
-    options: &SceneOptions,
-) -> Result<Option<SceneGraph>, Error> {
-    let too_much = |most| graph.nodes.iter().any(|node| node.model() > most);
-    if !format.about().most_expensive_motion.is_some_and(too_much) {
-        return Ok(None);
-    }
-    cif_scene::build(field, &held_by(format, options)).map(Some).map_err(Error::plain)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

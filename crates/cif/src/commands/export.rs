@@ -12,7 +12,7 @@ use super::query::code_at;
 use super::targets::{Targets, Writing};
 use super::{motion_table, scene};
 use crate::error::Error;
-use crate::formats::{self, FORMATS};
+use crate::formats::FORMATS;
 use crate::ground_truth::{self, MotionError};
 use crate::output::{self, Outputs};
 
@@ -102,7 +102,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     scene::note_frame(&scene::frame(&field)?, notes);
     // The graph is as rich as the richest of the formats.
     let asked = options(command, &field);
-    let held = command.targets.iter().map(|target| formats::held_by(target.format, &asked));
+    let held = command.targets.iter().map(|target| target.format.held(&asked));
     let options = held.max_by_key(|held| held.most_expensive_motion).unwrap_or_else(|| asked.clone());
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
     for warning in &graph.warnings {
@@ -112,7 +112,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let writing = command.writing.options(command.force, |time| code_at(&codes.times, &codes.samples, time));
     let mut rebuilt: Vec<(&dyn SceneFormat, SceneGraph)> = Vec::new();
     for target in command.targets.iter() {
-        let other = formats::rebuilt_for(target.format, &field, &graph, &options)?;
+        let other = target.format.rebuilt(&field, &graph, &options).map_err(Error::plain)?;
         let held = other.as_ref().unwrap_or(&graph);
         let written = target.format.write(held, &target.path, &writing).map_err(Error::plain)?;
         target.tell(&written);
