@@ -54,6 +54,24 @@ def test_outputs_that_cannot_be(field: cif.Field, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["folder.usda"]
 
 
+def test_options_of_an_export(field: cif.Field, tmp_path: Path) -> None:
+    for name, keywords, message in [
+        ("a.usda", {"tolerence": "1%"}, r"unknown field `tolerence`, expected .*`tolerance`"),
+        ("a.usda", {"most_expensive_motion": "slow"}, r"`slow`, expected .*`rigid`"),
+        ("a.usda", {"options": {"payload": "separate"}}, r"'payload' is no option of USD; known: payloads"),
+        ("a.usda", {"options": {"payloads": "far"}}, r"`far`, expected .*`by-kind`"),
+        ("a.glb", {"options": {"payloads": "separate"}}, r"no option of glTF; known: none"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            field.export(tmp_path / name, **keywords)
+    assert not list(tmp_path.iterdir())
+    field.export(tmp_path / "a.usdc", options={"payloads": "separate", "levels_of_detail": False})
+    assert any((tmp_path / "a.usdc.payloads").iterdir())
+    coarse = field.export(tmp_path / "b.usdc", tolerance=0.5, frames=(0, 1), up_axis="y")
+    assert coarse["samples"] == 2
+    assert field.export(tmp_path / "a.ply", options={"time_code": 1})["samples"] == 1
+
+
 def test_inputs_that_are_not_there(tmp_path: Path) -> None:
     with pytest.raises(cif.CifError, match=r"none\.usda: no such file"):
         cif.query_stage(tmp_path / "none.usda", "mug")

@@ -6,7 +6,7 @@ use std::process::Command;
 use serde_json::Value;
 
 /// Row of every crate; 0 is the lowest.
-const ROWS: [(&str, u32); 14] = [
+const ROWS: [(&str, u32); 15] = [
     ("cif-geometry", 0),
     ("cif-output", 0),
     ("cif-input", 0),
@@ -19,8 +19,9 @@ const ROWS: [(&str, u32); 14] = [
     ("cif-gltf", 4),
     ("cif-ply", 4),
     ("cif-exr", 4),
-    ("cif", 5),
-    ("cif-python", 6),
+    ("cif-bench", 5),
+    ("cif", 6),
+    ("cif-python", 7),
 ];
 
 /// Packages that are not part of the product and may use all of it.

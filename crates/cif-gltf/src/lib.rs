@@ -40,11 +40,13 @@ mod write;
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::{Ending, FormatError, MotionModel, ReadOptions, SceneGraph};
+use cif_scene::{About, Ending, FormatError, MotionModel, ReadOptions, SceneGraph};
 
 pub use cif_scene::format::{ExportOptions, ExportSummary, Relabelled, SceneFormat};
 pub use error::GltfError;
+pub use read::read_scene;
 pub use relabel::relabel;
+pub use write::{check_target, export};
 
 /// The extension that holds the splats.
 pub const EXTENSION: &str = "KHR_gaussian_splatting";
@@ -70,26 +72,17 @@ const GENERATOR_PREFIX: &str = "cif ";
 pub struct Gltf;
 
 impl SceneFormat for Gltf {
-    fn name(&self) -> &'static str {
-        "glTF"
-    }
-
-    fn key(&self) -> &'static str {
-        "gltf"
-    }
-
-    fn endings(&self) -> &'static [Ending] {
-        const ENDINGS: [Ending; 2] =
-            [Ending::written("glb", "one file"), Ending::written("gltf", "text beside a .bin")];
-        &ENDINGS
-    }
-
-    fn about(&self) -> &'static str {
-        "Objects that deform move as a few rigid parts; the table says what that misses"
-    }
-
-    fn most_expensive_motion(&self) -> Option<MotionModel> {
-        Some(MOST_EXPENSIVE_MOTION)
+    fn about(&self) -> &'static About {
+        const ABOUT: About = About {
+            name: "glTF",
+            key: "gltf",
+            endings: &[Ending::written("glb", "one file"), Ending::written("gltf", "text beside a .bin")],
+            files: "Objects that deform move as a few rigid parts; the table says what that misses",
+            most_expensive_motion: Some(MOST_EXPENSIVE_MOTION),
+            note_on_place: None,
+            options: &[],
+        };
+        &ABOUT
     }
 
     fn files(&self, path: &Path) -> Vec<PathBuf> {
@@ -123,39 +116,4 @@ impl SceneFormat for Gltf {
     ) -> Result<Relabelled, FormatError> {
         Ok(relabel(path, output, object, label, category)?)
     }
-}
-
-/// Writes a scene to a `.glb`, or to a `.gltf` with a `.bin` beside it: to temporary files in the same folder,
-/// then renamed.
-///
-/// # Errors
-/// Unknown ending, missing folder, a file there that is not ours (without [`ExportOptions::force`]), a node with
-/// dense motion, values that are not finite, disk full. Nothing existing is touched then.
-pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result<ExportSummary, GltfError> {
-    write::export(graph, path, options)
-}
-
-/// Checks everything about an output that can be checked before the work starts.
-///
-/// # Errors
-/// As [`export`].
-pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), GltfError> {
-    write::check_target(path, options)
-}
-
-/// Reads a `.glb` or `.gltf` with `KHR_gaussian_splatting` as a scene.
-///
-/// Our own files come back as the graph that was written, with the edits that were made to them: float exact,
-/// without proxies and colliders. Of other files every node with splats becomes an instance that is labelled by
-/// the node's name, occupied and certain of its identity; a node that is turned but does not move gets a rigid
-/// track of one sample; scales that are not 1 are worked into the splats. The world then has glTF's axes and
-/// units (+y up, metres), 24 time codes per second, and [`cif_scene::Origin`] is empty. Rows count the splats of
-/// such a file; in files of ours, splats that were added have [`cif_scene::Splats::NO_ROW`]. Whatever could not
-/// be taken over is said in [`SceneGraph::warnings`].
-///
-/// # Errors
-/// Missing, truncated or inconsistent files, buffers outside the file's folder, extensions that must be known,
-/// values that are not finite; each names the object of the file.
-pub fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
-    read::read_scene(path)
 }

@@ -43,7 +43,11 @@ pub(crate) fn files(path: &Path) -> Vec<PathBuf> {
     std::iter::once(path.to_owned()).chain(text.then(|| buffer_path(path))).collect()
 }
 
-pub(crate) fn check_target(path: &Path, options: ExportOptions) -> Result<(), GltfError> {
+/// Checks everything about an output that can be checked before the work starts.
+///
+/// # Errors
+/// As [`export`].
+pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), GltfError> {
     checked_kind(path, options).map(|_| ())
 }
 
@@ -100,11 +104,13 @@ fn is_ours(path: &Path) -> bool {
     document.is_some_and(|document| document.asset.generator.starts_with(GENERATOR_PREFIX))
 }
 
-pub(crate) fn export(
-    graph: &SceneGraph,
-    path: &Path,
-    options: ExportOptions,
-) -> Result<ExportSummary, GltfError> {
+/// Writes a scene to a `.glb`, or to a `.gltf` with a `.bin` beside it: to temporary files in the same folder,
+/// then renamed.
+///
+/// # Errors
+/// Unknown ending, missing folder, a file there that is not ours (without [`ExportOptions::force`]), a node with
+/// dense motion, values that are not finite, disk full. Nothing existing is touched then.
+pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result<ExportSummary, GltfError> {
     let (kind, target) = checked_kind(path, options)?;
     let mut authored = author(graph)?;
     let failed = |source: io::Error| FileError::Write { path: path.to_owned(), source };

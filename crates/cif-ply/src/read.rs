@@ -41,7 +41,13 @@ impl PropertyAccess for Ignored {
     }
 }
 
-pub(crate) fn read(path: &Path) -> Result<SceneGraph, PlyError> {
+/// Reads splats: INRIA layout, ASCII or binary of either byte order, properties in any order, spherical harmonics
+/// of degree 0 to 3. They become one still object that carries the file's name, occupied and certain of its
+/// identity, in the axes of the file; `rows` count the splats of the file.
+///
+/// # Errors
+/// No PLY, cut off, or without what a splat needs; the message says what is missing.
+pub fn read(path: &Path) -> Result<SceneGraph, PlyError> {
     let failed = |source| FileError::Read { path: path.to_owned(), source };
     let invalid = |what: String| PlyError::Invalid { path: path.to_owned(), what };
     let file = cif_input::open(path).map_err(failed)?;

@@ -28,7 +28,11 @@ fn is_ply(path: &Path) -> bool {
     path.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"))
 }
 
-pub(crate) fn check_target(path: &Path, options: &ExportOptions) -> Result<(), PlyError> {
+/// Checks everything about an output that can be checked before the work starts.
+///
+/// # Errors
+/// As [`export`].
+pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), PlyError> {
     let several = options.split || options.sequence;
     if !several {
         return if is_ply(path) { check_file(path, options.force) } else { Err(extension(path)) };
@@ -73,14 +77,16 @@ struct Job<'a> {
     nodes: Vec<&'a Node>,
 }
 
-pub(crate) fn export(
-    graph: &SceneGraph,
-    path: &Path,
-    options: &ExportOptions,
-) -> Result<ExportSummary, PlyError> {
+/// Writes a scene: to the file `path` (`.ply`), or with [`ExportOptions::split`] or [`ExportOptions::sequence`]
+/// into the folder `path`, which is created. Each file is written beside its place and renamed.
+///
+/// # Errors
+/// A name that does not fit, a missing folder, files that are not ours (without [`ExportOptions::force`]), nothing
+/// visible at that time, disk full.
+pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result<ExportSummary, PlyError> {
     check_target(path, options)?;
     let jobs =
-        jobs(graph, path, options).map_err(|source| FileError::Write { path: path.to_owned(), source })?;
+        jobs(graph, path, &options).map_err(|source| FileError::Write { path: path.to_owned(), source })?;
     for job in &jobs {
         // Folders that do not exist yet hold nothing.
         if folder_of(&job.path).is_dir() {

@@ -1,10 +1,11 @@
-//! numpy arrays in and out.
+//! numpy arrays, lists and dictionaries in and out.
 
 use numpy::{
     Element, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
 /// Rows of an `[N, C]` array; other shapes are refused by name.
 pub(crate) fn rows<T: Element + Copy, const C: usize>(
@@ -62,4 +63,13 @@ pub(crate) fn color_image<T: Element, const C: usize>(
 pub(crate) fn to_python<'py>(py: Python<'py>, value: &impl serde::Serialize) -> PyResult<Bound<'py, PyAny>> {
     let text = serde_json::to_string(value).map_err(crate::error::cif_error)?;
     py.import("json")?.call_method1("loads", (text,))
+}
+
+/// A dictionary as a value.
+pub(crate) fn from_python<T: serde::de::DeserializeOwned>(
+    name: &str,
+    dictionary: &Bound<'_, PyDict>,
+) -> PyResult<T> {
+    let text: String = dictionary.py().import("json")?.call_method1("dumps", (dictionary,))?.extract()?;
+    serde_json::from_str(&text).map_err(|error| PyValueError::new_err(format!("{name}: {error}")))
 }

@@ -4,7 +4,8 @@ use std::path::{Path, PathBuf};
 
 use cif::formats;
 use cif_scene::{
-    ExportOptions, LabelQuery, MotionModel, MotionSource, Payloads, ReadOptions, SceneGraph, SceneOptions,
+    ExportOptions, FrameRange, LabelQuery, MotionSource, ReadOptions, SceneFormat, SceneGraph, SceneOptions,
+    Tolerance,
 };
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
@@ -53,27 +54,39 @@ impl MotionSource for CallableMotion<'_> {
     }
 }
 
-pub(crate) fn motion_model(name: &str) -> PyResult<MotionModel> {
-    match name {
-        "static" => Ok(MotionModel::Static),
-        "rigid" => Ok(MotionModel::Rigid),
-        "parts" => Ok(MotionModel::Parts),
-        "dense" => Ok(MotionModel::Dense),
-        _ => {
-            Err(PyValueError::new_err(format!("motion model '{name}': choose static, rigid, parts or dense")))
-        }
+/// Options of a scene by their names; a tolerance is spelled as for the command, frames are (first, last).
+fn scene_options(py: Python<'_>, options: Option<&Bound<'_, PyDict>>) -> PyResult<SceneOptions> {
+    let Some(options) = options else { return Ok(SceneOptions::default()) };
+    if let Some(tolerance) = options.get_item("tolerance")? {
+        let tolerance: Tolerance = tolerance.str()?.to_str()?.parse().map_err(cif_error)?;
+        options.set_item("tolerance", arrays::to_python(py, &tolerance)?)?;
     }
+    if let Some(frames) = options.get_item("frames")?.filter(|frames| !frames.is_none()) {
+        let (first, last) = frames.extract()?;
+        options.set_item("frames", arrays::to_python(py, &FrameRange { first, last })?)?;
+    }
+    arrays::from_python("export", options)
 }
 
-pub(crate) fn payloads(name: &str) -> PyResult<Payloads> {
-    match name {
-        "by-kind" => Ok(Payloads::ByKind),
-        "separate" => Ok(Payloads::Separate),
-        "single-file" => Ok(Payloads::SingleFile),
-        _ => {
-            Err(PyValueError::new_err(format!("payloads '{name}': choose by-kind, separate or single-file")))
+/// Options of a file by their names; those of other formats are refused.
+fn export_options(
+    format: &dyn SceneFormat,
+    options: Option<&Bound<'_, PyDict>>,
+    force: bool,
+) -> PyResult<ExportOptions> {
+    let Some(options) = options else { return Ok(ExportOptions { force, ..ExportOptions::default() }) };
+    for key in options.keys() {
+        let key = key.str()?;
+        if !format.about().options.contains(&key.to_str()?) {
+            let known = match format.about().options {
+                [] => "none".to_owned(),
+                known => known.join(", "),
+            };
+            let message = format!("options: '{key}' is no option of {}; known: {known}", format.about().name);
+            return Err(PyValueError::new_err(message));
         }
     }
+    Ok(ExportOptions { force, ..arrays::from_python("options", options)? })
 }
 
 fn build(
@@ -98,13 +111,16 @@ pub(crate) fn export<'py>(
     py: Python<'py>,
     field: &Field,
     path: &Path,
-    options: &SceneOptions,
     motion: Option<Bound<'py, PyAny>>,
-    writing: ExportOptions,
+    options: Option<&Bound<'py, PyDict>>,
+    force: bool,
+    scene: Option<&Bound<'py, PyDict>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let format = formats::format_of(path).map_err(|error| cif_error(error.with_help()))?;
+    let writing = export_options(format, options, force)?;
+    let scene = scene_options(py, scene)?;
     format.check_target(path, &writing).map_err(cif_error)?;
-    let graph = build(py, field, &formats::held_by(format, options), motion)?;
+    let graph = build(py, field, &format.held(&scene), motion)?;
     let summary = py.detach(|| format.write(&graph, path, &writing)).map_err(cif_error)?;
     let out = PyDict::new(py);
     out.set_item("path", summary.path)?;

@@ -350,53 +350,17 @@ impl Field {
         export::find(py, self, label, time_code)
     }
 
-    #[pyo3(signature = (path, *, tolerance="0.2%", motion=None, most_expensive_motion="dense", frames=None,
-                        frame_step=1, up_axis="z", background_threshold=None, proxy_points=None, max_parts=8,
-                        reduce_keys=true, hulls=1, background_hulls=0, payloads="by-kind",
-                        levels_of_detail=true, force=false))]
-    #[expect(clippy::too_many_arguments, reason = "keyword arguments of a method")]
+    #[pyo3(signature = (path, *, motion=None, options=None, force=false, **scene))]
     fn export<'py>(
         &self,
         py: Python<'py>,
         path: PathBuf,
-        tolerance: &str,
         motion: Option<Bound<'py, PyAny>>,
-        most_expensive_motion: &str,
-        frames: Option<(usize, usize)>,
-        frame_step: usize,
-        up_axis: &str,
-        background_threshold: Option<f32>,
-        proxy_points: Option<usize>,
-        max_parts: usize,
-        reduce_keys: bool,
-        hulls: usize,
-        background_hulls: usize,
-        payloads: &str,
-        levels_of_detail: bool,
+        options: Option<Bound<'py, PyDict>>,
         force: bool,
+        scene: Option<Bound<'py, PyDict>>,
     ) -> PyResult<Bound<'py, PyDict>> {
-        let defaults = cif_scene::SceneOptions::default();
-        let options = cif_scene::SceneOptions {
-            tolerance: tolerance.parse().map_err(cif_error)?,
-            most_expensive_motion: export::motion_model(most_expensive_motion)?,
-            frames: frames.map(|(first, last)| cif_scene::FrameRange { first, last }),
-            frame_step,
-            up_axis: up_axis.parse().map_err(cif_error)?,
-            background_threshold: background_threshold.unwrap_or(defaults.background_threshold),
-            proxy_points: proxy_points.unwrap_or(defaults.proxy_points),
-            max_parts,
-            reduce_keys,
-            hulls_per_instance: hulls,
-            background_hulls,
-            ..defaults
-        };
-        let writing = cif_scene::ExportOptions {
-            force,
-            payloads: export::payloads(payloads)?,
-            levels_of_detail,
-            ..cif_scene::ExportOptions::default()
-        };
-        export::export(py, self, &path, &options, motion, writing)
+        export::export(py, self, &path, motion, options.as_ref(), force, scene.as_ref())
     }
 }
 

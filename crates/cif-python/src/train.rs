@@ -215,8 +215,7 @@ pub(crate) fn train(
     }
     let mut flat = Vec::new();
     if let Some(settings) = settings {
-        let text: String = py.import("json")?.call_method1("dumps", (settings,))?.extract()?;
-        flatten("", serde_json::from_str(&text).map_err(cif_error)?, &mut flat)?;
+        flatten("", arrays::from_python("settings", &settings)?, &mut flat)?;
     }
     if let Some(seed) = seed {
         flat.push(("seed".to_owned(), i64::from(seed).into()));

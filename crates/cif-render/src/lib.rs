@@ -8,6 +8,7 @@
 //! | [`gradients`] | where gradients of all parameters are kept |
 //! | [`image`] | what comes out per pixel |
 //! | [`motion`] | how far a Gaussian moves on screen between two views |
+//! | [`quality`] | renders that take shortcuts |
 //! | [`reference`] | the readable oracle, generic over `f32` and `f64` |
 //! | [`cpu`] | the fast path: tiles, SIMD, threads |
 //! | `wgpu` | the GPU path, with the feature of that name |
@@ -20,6 +21,7 @@ pub mod gradients;
 pub mod image;
 pub mod motion;
 pub mod poses;
+pub mod quality;
 pub mod reference;
 pub mod settings;
 pub mod synthetic;

@@ -3,8 +3,12 @@
 
 use std::path::{Path, PathBuf};
 
+use cif_field::Field;
+use serde::Deserialize;
+
 use crate::{
-    LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneGraph, query, search,
+    LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneError, SceneGraph,
+    SceneOptions, build, query, search,
 };
 
 /// Why a format refuses; the message names the file and what to do.
@@ -12,35 +16,40 @@ pub type FormatError = Box<dyn std::error::Error + Send + Sync>;
 
 /// A file format of scene graphs.
 pub trait SceneFormat: Sync {
-    /// Name of the format, e.g. `glTF`.
-    fn name(&self) -> &'static str;
-
-    /// The name as flags, keys and Python have it, e.g. `gltf`.
-    fn key(&self) -> &'static str;
-
-    /// Endings of its files.
-    fn endings(&self) -> &'static [Ending];
-
-    /// Description of the files, in one or two sentences for the help of the command.
-    fn about(&self) -> &'static str;
-
-    /// The most expensive motion that a file holds: graphs are built with no more than this. `None` for formats that
-    /// hold one moment, to which any motion leads.
-    fn most_expensive_motion(&self) -> Option<MotionModel>;
-
-    /// Advice on a scene that lies elsewhere in the world of its capture, where files do not place it.
-    fn note_on_place(&self) -> Option<&'static str> {
-        None
-    }
+    /// Facts about the format.
+    fn about(&self) -> &'static About;
 
     /// True when the name of a file says that it is of this format.
     fn recognises(&self, path: &Path) -> bool {
-        ending_of(path, self.endings()).is_some()
+        ending_of(path, self.about().endings).is_some()
     }
 
     /// True when a file of this name can be written.
     fn writes(&self, path: &Path) -> bool {
-        ending_of(path, self.endings()).is_some_and(|ending| ending.written)
+        ending_of(path, self.about().endings).is_some_and(|ending| ending.written)
+    }
+
+    /// Options of graphs that the format can hold.
+    fn held(&self, options: &SceneOptions) -> SceneOptions {
+        let most = self.about().most_expensive_motion.unwrap_or(options.most_expensive_motion);
+        SceneOptions { most_expensive_motion: options.most_expensive_motion.min(most), ..options.clone() }
+    }
+
+    /// The graph of a field as the format can hold it; `None` where that is the graph that was built already.
+    ///
+    /// # Errors
+    /// As [`build`](fn@build).
+    fn rebuilt(
+        &self,
+        field: &Field,
+        graph: &SceneGraph,
+        options: &SceneOptions,
+    ) -> Result<Option<SceneGraph>, SceneError> {
+        let too_much = |most| graph.nodes.iter().any(|node| node.model() > most);
+        if !self.about().most_expensive_motion.is_some_and(too_much) {
+            return Ok(None);
+        }
+        build(field, &self.held(options)).map(Some)
     }
 
     /// True when the output is a folder of several files.
@@ -89,7 +98,11 @@ pub trait SceneFormat: Sync {
         object: &str,
         label: &str,
         category: Option<&str>,
-    ) -> Result<Relabelled, FormatError>;
+    ) -> Result<Relabelled, FormatError> {
+        let _ = (output, object, label, category);
+        let (path, name) = (path.display(), self.about().name);
+        Err(format!("{path}: {name} holds no labels; label the scene that it was exported from").into())
+    }
 
     /// Objects of a file whose label, class or name matches.
     ///
@@ -120,6 +133,26 @@ pub trait SceneFormat: Sync {
     }
 }
 
+/// Facts about a format.
+#[derive(Clone, Copy, Debug)]
+pub struct About {
+    /// Name of the format, e.g. `glTF`.
+    pub name: &'static str,
+    /// The name as flags, keys and Python have it, e.g. `gltf`.
+    pub key: &'static str,
+    /// Endings of its files; the first is taken where nobody says.
+    pub endings: &'static [Ending],
+    /// Description of the files, in one or two sentences for the help of the command.
+    pub files: &'static str,
+    /// The most expensive motion that a file holds: graphs are built with no more than this. `None` for formats that
+    /// hold one moment, to which any motion leads.
+    pub most_expensive_motion: Option<MotionModel>,
+    /// Advice on a scene that lies elsewhere in the world of its capture, where files do not place it.
+    pub note_on_place: Option<&'static str>,
+    /// Keys of [`ExportOptions`], beside `force`, that a single file of this format knows.
+    pub options: &'static [&'static str],
+}
+
 /// An ending of file names.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Ending {
@@ -147,7 +180,8 @@ pub fn ending_of<'a>(path: &Path, endings: &'a [Ending]) -> Option<&'a Ending> {
 }
 
 /// Where the arrays of instances go.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 pub enum Payloads {
     /// Beside files of text, so that they stay readable; inside others.
     #[default]
@@ -160,7 +194,8 @@ pub enum Payloads {
 }
 
 /// Options for writing a graph. A format ignores those that it does not know.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct ExportOptions {
     /// Replace existing files even when they were not written by cif.
     pub force: bool,

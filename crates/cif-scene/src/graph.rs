@@ -6,9 +6,11 @@ use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::choose::{DENSE_BYTES, POSE_BYTES};
+use crate::motion::choose::{DENSE_BYTES, POSE_BYTES};
+use crate::motion::placement;
 use crate::report::MotionReport;
-use crate::{SceneOptions, UpAxis, extent, placement};
+use crate::shape::extent;
+use crate::{SceneOptions, UpAxis};
 
 /// A scene, ready to be written in any format.
 #[derive(Clone, Debug, PartialEq)]

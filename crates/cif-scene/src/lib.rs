@@ -4,28 +4,29 @@
 //! |---|---|
 //! | [`options`] | what an export may vary |
 //! | [`graph`] | what a scene is made of: nodes, motion, splats, cameras, timeline |
-//! | [`assignment`] | which node a Gaussian belongs to |
-//! | [`source`] | where the moved Gaussians come from |
-//! | [`frames`] | the moved Gaussians of every sampled time |
-//! | [`procrustes`] | robust rigid alignment of two point sets |
+//! | [`world`] | where a graph lies in the world of its capture |
+//! | [`naming`] | names that every format accepts |
+//! | [`build::assignment`] | which node a Gaussian belongs to |
+//! | [`build::source`] | where the moved Gaussians come from |
+//! | [`build::frames`] | the moved Gaussians of every sampled time |
+//! | [`build::camera_tracks`] | recorded cameras as tracks over time |
 //! | [`motion`] | how well standing still and one rigid body fit a group of Gaussians |
 //! | [`motion_scores`] | how well the motion of a graph follows known surface points |
-//! | [`parts`] | a few rigid parts, found by clustering the paths of Gaussians |
-//! | [`keys`] | fewer samples of a track inside an error bound |
-//! | [`placement`] | where a node's splats are at any time |
-//! | [`extent`] | boxes that hold the 3-sigma ellipsoids |
-//! | [`convex_hull`] | convex hulls with few corners |
-//! | [`colliders`] | one or several hulls around most of what a node shows |
-//! | [`world`] | where a graph lies in the world of its capture |
-//! | [`level_of_detail`] | the most important splats of a node |
-//! | [`velocity`] | how fast a node moves |
+//! | [`motion::procrustes`] | robust rigid alignment of two point sets |
+//! | [`motion::parts`] | a few rigid parts, found by clustering the paths of Gaussians |
+//! | [`motion::keys`] | fewer samples of a track inside an error bound |
+//! | [`motion::placement`] | where a node's splats are at any time |
+//! | [`motion::velocity`] | how fast a node moves |
 //! | [`appearance`] | opacities and colours that change over time, and when a node is hidden by them |
-//! | [`proxy`] | a light point cloud standing in for the splats |
-//! | [`camera_tracks`] | recorded cameras as tracks over time |
-//! | [`naming`] | names that every format accepts |
+//! | [`shape::extent`] | boxes that hold the 3-sigma ellipsoids |
+//! | [`shape::convex_hull`] | convex hulls with few corners |
+//! | [`shape::colliders`] | one or several hulls around most of what a node shows |
+//! | [`shape::level_of_detail`] | the most important splats of a node |
+//! | [`shape::proxy`] | a light point cloud standing in for the splats |
 //! | [`report`] | what the chosen motion models cost and miss |
-//! | [`label_pattern`] | labels with wildcards |
 //! | [`query`] | nodes by label |
+//! | [`query::label_pattern`] | labels with wildcards |
+//! | [`query::search`](mod@query::search) | nodes by label, class, time and place |
 //! | [`diff`] | what differs between two graphs, object by object |
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
 //! | [`format`](mod@format) | what a file format does for graphs |
@@ -38,71 +39,51 @@
 
 pub mod appearance;
 pub mod assemble;
-pub mod assignment;
 pub mod build;
-pub mod camera_tracks;
-mod choose;
-pub mod colliders;
-pub mod convex_hull;
-mod dense;
 pub mod diff;
 pub mod edits;
 pub mod error;
-pub mod extent;
 pub mod field_from_graph;
 pub mod files;
 pub mod format;
-pub mod frames;
 pub mod graph;
-pub mod keys;
-pub mod label_pattern;
-pub mod level_of_detail;
-mod loose;
 pub mod motion;
 pub mod motion_scores;
 pub mod naming;
-mod node;
 pub mod options;
-pub mod parts;
-pub mod placement;
-pub mod procrustes;
-pub mod proxy;
 pub mod query;
 pub mod report;
-pub mod search;
-pub mod source;
+pub mod shape;
 #[cfg(test)]
 mod testing;
 #[cfg(test)]
 mod tests;
-mod time_map;
-pub mod velocity;
-mod visibility;
 pub mod world;
 
+pub use build::source::MotionSource;
 pub use build::{build, build_from};
 pub use diff::{ChangeKind, ObjectChange, SceneDiff};
 pub use edits::import_edits;
 pub use error::SceneError;
 pub use field_from_graph::field_from_graph;
 pub use format::{
-    Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
+    About, Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
 };
 pub use graph::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample,
     IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion,
     PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
-pub use label_pattern::LabelPattern;
-pub use level_of_detail::level_of_detail;
+pub use motion::placement::PlacedSplats;
+pub use motion::velocity::Velocity;
 pub use motion_scores::{InstanceMotion, MotionErrors, MotionScores, motion_scores};
 pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
-pub use placement::PlacedSplats;
+pub use query::label_pattern::LabelPattern;
+pub use query::search::{self, ObjectMatch, ObjectQuery, VolumeOf, When, search};
 pub use query::{LabelMatch, LabelQuery, QueryError, query};
 pub use report::{MotionReport, ResidualStatistics};
-pub use search::{ObjectMatch, ObjectQuery, VolumeOf, When, search};
-pub use source::MotionSource;
-pub use velocity::Velocity;
+pub use shape::extent;
+pub use shape::level_of_detail::level_of_detail;
 pub use world::frame_of;
 
 /// Where coordinates lie in the world of the capture; see [`world`].

@@ -48,41 +48,46 @@ mod write;
 use std::path::Path;
 
 use cif_scene::{
-    Ending, FormatError, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, SceneGraph,
+    About, Ending, FormatError, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, SceneGraph,
 };
 
 pub use cif_scene::format::{ExportOptions, ExportSummary, Payloads, ReadOptions, Relabelled, SceneFormat};
 pub use error::UsdError;
+
+/// Calls a function of the modules that need the feature `python`, where it is on.
+macro_rules! with_usd {
+    ($($function:ident)::+($($argument:ident),*)) => {{
+        #[cfg(feature = "python")]
+        return $($function)::+($($argument),*);
+        #[cfg(not(feature = "python"))]
+        {
+            let _ = ($($argument),*);
+            Err(UsdError::NotBuilt)
+        }
+    }};
+}
 
 /// Stages: `.usda`, `.usdc`, `.usdz`.
 #[derive(Clone, Copy, Debug)]
 pub struct Usd;
 
 impl SceneFormat for Usd {
-    fn name(&self) -> &'static str {
-        "USD"
-    }
-
-    fn key(&self) -> &'static str {
-        "usd"
-    }
-
-    fn endings(&self) -> &'static [Ending] {
-        const ENDINGS: [Ending; 4] = [
-            Ending::written("usda", "text"),
-            Ending::written("usdc", "binary"),
-            Ending::written("usdz", "package"),
-            Ending { name: "usd", kind: "text or binary", written: false },
-        ];
-        &ENDINGS
-    }
-
-    fn about(&self) -> &'static str {
-        "One prim per object"
-    }
-
-    fn most_expensive_motion(&self) -> Option<MotionModel> {
-        Some(MotionModel::Dense)
+    fn about(&self) -> &'static About {
+        const ABOUT: About = About {
+            name: "USD",
+            key: "usd",
+            endings: &[
+                Ending::written("usda", "text"),
+                Ending::written("usdc", "binary"),
+                Ending::written("usdz", "package"),
+                Ending { name: "usd", kind: "text or binary", written: false },
+            ],
+            files: "One prim per object",
+            most_expensive_motion: Some(MotionModel::Dense),
+            note_on_place: None,
+            options: &["payloads", "levels_of_detail"],
+        };
+        &ABOUT
     }
 
     fn check_target(&self, path: &Path, options: &ExportOptions) -> Result<(), FormatError> {
@@ -138,13 +143,7 @@ impl SceneFormat for Usd {
 /// Unknown extension, missing folder, a file there that is not ours (without [`ExportOptions::force`]),
 /// usd-core missing or too old, disk full. Nothing existing is touched then.
 pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result<ExportSummary, UsdError> {
-    #[cfg(feature = "python")]
-    return write::export(graph, path, options);
-    #[cfg(not(feature = "python"))]
-    {
-        let _ = (graph, path, options);
-        Err(UsdError::NotBuilt)
-    }
+    with_usd!(write::export(graph, path, options))
 }
 
 /// Checks everything about an output that can be checked before the work starts: extension, folder, what is
@@ -153,13 +152,7 @@ pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result
 /// # Errors
 /// As [`export`].
 pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError> {
-    #[cfg(feature = "python")]
-    return write::check_target(path, options);
-    #[cfg(not(feature = "python"))]
-    {
-        let _ = (path, options);
-        Err(UsdError::NotBuilt)
-    }
+    with_usd!(write::check_target(path, options))
 }
 
 /// Prims of a stage whose semantic labels match, in stage order. Labels, transforms and boxes are taken at
@@ -169,13 +162,7 @@ pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError>
 /// Missing or unreadable file, no usd-core, bad pattern, layers that are missing or lie outside the stage's folder, more
 /// prims than can be composed, or a label that nothing carries (the error lists those that are known).
 pub fn query(path: &Path, query: &LabelQuery, options: ReadOptions) -> Result<Vec<LabelMatch>, UsdError> {
-    #[cfg(feature = "python")]
-    return read::query::query(path, query, options);
-    #[cfg(not(feature = "python"))]
-    {
-        let _ = (path, query, options);
-        Err(UsdError::NotBuilt)
-    }
+    with_usd!(read::query::query(path, query, options))
 }
 
 /// Prims of any stage with semantic labels that meet every condition, in stage order; foreign stages need no splats.
@@ -184,13 +171,7 @@ pub fn query(path: &Path, query: &LabelQuery, options: ReadOptions) -> Result<Ve
 /// # Errors
 /// As [`query`].
 pub fn search(path: &Path, wanted: &ObjectQuery, options: ReadOptions) -> Result<Vec<ObjectMatch>, UsdError> {
-    #[cfg(feature = "python")]
-    return find::search(path, wanted, options);
-    #[cfg(not(feature = "python"))]
-    {
-        let _ = (path, wanted, options);
-        Err(UsdError::NotBuilt)
-    }
+    with_usd!(find::search(path, wanted, options))
 }
 
 /// Gives an object of a stage another label, and another class where one is given: as semantic labels, display name
@@ -207,13 +188,7 @@ pub fn relabel(
     label: &str,
     category: Option<&str>,
 ) -> Result<Relabelled, UsdError> {
-    #[cfg(feature = "python")]
-    return relabel::relabel(path, output, object, label, category);
-    #[cfg(not(feature = "python"))]
-    {
-        let _ = (path, output, object, label, category);
-        Err(UsdError::NotBuilt)
-    }
+    with_usd!(relabel::relabel(path, output, object, label, category))
 }
 
 /// Reads a stage as a scene graph: one of ours exactly, also when it was edited, and any stage with Gaussian splats.
@@ -248,13 +223,7 @@ pub fn read_scene(path: &Path) -> Result<SceneGraph, UsdError> {
 /// # Errors
 /// As [`read_scene`].
 pub fn read_scene_with(path: &Path, options: ReadOptions) -> Result<SceneGraph, UsdError> {
-    #[cfg(feature = "python")]
-    return read::scene(path, options);
-    #[cfg(not(feature = "python"))]
-    {
-        let _ = (path, options);
-        Err(UsdError::NotBuilt)
-    }
+    with_usd!(read::scene(path, options))
 }
 
 /// Version of the usd-core in use, e.g. `26.11`.

@@ -58,6 +58,15 @@ impl From<cif_render::wgpu::GpuError> for Error {
     }
 }
 
+impl From<cif_bench::Error> for Error {
+    fn from(error: cif_bench::Error) -> Self {
+        match error {
+            cif_bench::Error::Io { action, path, source } => Self::Io { action, path, source },
+            other => Self::plain(other),
+        }
+    }
+}
+
 impl From<cif_exr::ExrError> for Error {
     fn from(error: cif_exr::ExrError) -> Self {
         Self::plain(error)

@@ -63,8 +63,8 @@ fn unknown_ending(path: &Path, known: &str) -> Error {
 pub fn endings() -> String {
     let of_format = |format: &&dyn SceneFormat| {
         let endings: Vec<String> =
-            format.endings().iter().map(|ending| format!(".{}", ending.name)).collect();
-        format!("{} ({})", endings.join(", "), format.name())
+            format.about().endings.iter().map(|ending| format!(".{}", ending.name)).collect();
+        format!("{} ({})", endings.join(", "), format.about().name)
     };
     let mut all: Vec<String> = FORMATS.iter().map(of_format).collect();
     let last = all.pop().unwrap_or_default();
@@ -119,30 +119,6 @@ pub fn read_both(first: &Path, second: &Path) -> Result<[SceneGraph; 2], Error> 
     Ok([graph(first)?, graph(second)?])
 }
 
-/// Options of graphs that a format can hold.
-#[must_use]
-pub fn held_by(format: &dyn SceneFormat, options: &SceneOptions) -> SceneOptions {
-    let most = format.most_expensive_motion().unwrap_or(options.most_expensive_motion);
-    SceneOptions { most_expensive_motion: options.most_expensive_motion.min(most), ..options.clone() }
-}
-
-/// The graph of a field as a format can hold it; `None` where that is the graph that was built already.
-///
-/// # Errors
-/// When it cannot be built.
-pub fn rebuilt_for(
-    format: &dyn SceneFormat,
-    field: &Field,
-    graph: &SceneGraph,
-    options: &SceneOptions,
-) -> Result<Option<SceneGraph>, Error> {
-    let too_much = |most| graph.nodes.iter().any(|node| node.model() > most);
-    if !format.most_expensive_motion().is_some_and(too_much) {
-        return Ok(None);
-    }
-    cif_scene::build(field, &held_by(format, options)).map(Some).map_err(Error::plain)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -150,17 +126,17 @@ mod tests {
     #[test]
     fn every_ending_belongs_to_one_format() {
         for format in FORMATS {
-            for ending in format.endings() {
+            for ending in format.about().endings {
                 let name = format!("scene.{}", ending.name.to_uppercase());
                 let path = Path::new(&name);
                 assert_eq!(FORMATS.iter().filter(|other| other.recognises(path)).count(), 1, "{name}");
-                assert_eq!(format_of(path).unwrap().key(), format.key());
+                assert_eq!(format_of(path).unwrap().about().key, format.about().key);
                 assert_eq!(format.writes(path), ending.written, "{name}");
             }
             assert!(
-                format.endings()[0].written,
+                format.about().endings[0].written,
                 "{}: the first ending is taken where nobody says",
-                format.name()
+                format.about().name
             );
         }
         assert!(matches!(Content::of(Path::new("a.cif")), Ok(Content::Field)));

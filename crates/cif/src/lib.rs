@@ -3,14 +3,12 @@
 //!
 //! | module | answers |
 //! |---|---|
-//! | [`accuracy`] | what accuracy costs, as a report |
 //! | [`commands`] | one file per subcommand |
 //! | [`settings`] | preset, file, flags: which value counts |
 //! | [`training`] | runs that save into a file |
 //! | [`destination`] | that file: saved into by one run, never over what others put there |
 //! | [`lock`] | who writes a file |
 //! | [`progress`] | bars, plain lines and JSON lines of a training run |
-//! | [`quality`] | renders that take shortcuts |
 //! | [`interrupt`] | what Ctrl-C and SIGTERM do |
 //! | [`output`] | files written whole, never over existing ones |
 //! | [`pictures`] | instance, depth and error colours, panels, PNG files |
@@ -20,10 +18,8 @@
 //! | [`mask_query`] | which objects 2D masks show |
 //! | [`detector`] | a command that makes such masks |
 //! | [`ground_truth`] | exported motion against known motion |
-//! | [`hard_captures`] | captures changed in ways that must not matter or must not break a run |
 //! | [`error`] | what is reported, and the exit code |
 
-pub mod accuracy;
 #[cfg(feature = "wgpu")]
 pub mod backend;
 pub mod camera_file;
@@ -33,14 +29,12 @@ pub mod detector;
 pub mod error;
 pub mod formats;
 pub mod ground_truth;
-pub mod hard_captures;
 pub mod interrupt;
 pub mod lock;
 pub mod mask_query;
 pub mod output;
 pub mod pictures;
 pub mod progress;
-pub mod quality;
 pub mod settings;
 pub mod training;
 

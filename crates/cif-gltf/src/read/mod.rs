@@ -38,7 +38,20 @@ mod objects;
 mod source;
 mod splats;
 
-pub(crate) fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
+/// Reads a `.glb` or `.gltf` with `KHR_gaussian_splatting` as a scene.
+///
+/// Our own files come back as the graph that was written, with the edits that were made to them: float exact,
+/// without proxies and colliders. Of other files every node with splats becomes an instance that is labelled by
+/// the node's name, occupied and certain of its identity; a node that is turned but does not move gets a rigid
+/// track of one sample; scales that are not 1 are worked into the splats. The world then has glTF's axes and
+/// units (+y up, metres), 24 time codes per second, and [`cif_scene::Origin`] is empty. Rows count the splats of
+/// such a file; in files of ours, splats that were added have [`cif_scene::Splats::NO_ROW`]. Whatever could not
+/// be taken over is said in [`SceneGraph::warnings`].
+///
+/// # Errors
+/// Missing, truncated or inconsistent files, buffers outside the file's folder, extensions that must be known,
+/// values that are not finite; each names the object of the file.
+pub fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
     let source = Source::open(path)?;
     let mut warnings = Vec::new();
     let hierarchy = Hierarchy::read(&source, &mut warnings)?;

@@ -7,10 +7,11 @@ Conventions: right-handed world in metres; cameras look along +z with x right an
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 __version__: str
 
@@ -73,6 +74,52 @@ class Dataset:
         """Load image uint8 [H, W, 3] and mask uint16 [H, W] (None without one); alpha goes onto background."""
     def summary(self) -> dict[str, Any]:
         """Return counts of everything, for a first look."""
+
+class SceneOptions(TypedDict, total=False):
+    """Options of an exported scene, whatever the format."""
+
+    tolerance: str | float
+    """Largest error of a simplified motion: "0.2%" of the size of the object (the default), or world units."""
+    appearance_tolerance: float
+    """Largest RMS error of opacities and colours that change over time; 0 keeps them at every frame."""
+    most_expensive_motion: Literal["static", "rigid", "parts", "dense"]
+    min_opacity: float
+    """Splats below this opacity are left out; by default 1/255."""
+    min_occupancy: float
+    """Splats below this occupancy are left out."""
+    background_threshold: float
+    """Splats with less instance mass are background too."""
+    max_parts: int
+    """Most rigid parts of an object."""
+    reduce_keys: bool
+    """Leave out samples that interpolation reproduces inside the tolerance; on by default."""
+    hulls_per_instance: int
+    """Most convex colliders of an object; by default 1."""
+    background_hulls: int
+    """Most convex colliders of the background; by default 0."""
+    frames: tuple[int, int] | None
+    """First and last frame; by default all."""
+    frame_step: int
+    """Every how many frames motion is sampled."""
+    up_axis: Literal["y", "z"]
+    """Axis to declare; the data is not turned."""
+    meters_per_unit: float
+    proxy_points: int
+    """Most points of the stand-in of an object; 0 for none."""
+
+class UsdOptions(TypedDict, total=False):
+    """Options of USD files."""
+
+    payloads: Literal["by-kind", "separate", "single-file"]
+    """Where the arrays of objects go: beside the stage, into it, or (by-kind) beside .usda alone."""
+    levels_of_detail: bool
+    """Add variants with half and a quarter of the splats; on by default."""
+
+class PlyOptions(TypedDict, total=False):
+    """Options of PLY files."""
+
+    time_code: float | None
+    """The frame that is written; by default the first."""
 
 class Field:
     """A dynamic Gaussian field with instances: N Gaussians, K instances."""
@@ -160,34 +207,22 @@ class Field:
         self,
         path: str | os.PathLike[str],
         *,
-        tolerance: str = "0.2%",
         motion: Callable[[float], tuple[NDArray[np.float32], NDArray[np.float32]]] | None = None,
-        most_expensive_motion: str = "dense",
-        frames: tuple[int, int] | None = None,
-        frame_step: int = 1,
-        up_axis: str = "z",
-        background_threshold: float | None = None,
-        proxy_points: int | None = None,
-        max_parts: int = 8,
-        reduce_keys: bool = True,
-        hulls: int = 1,
-        background_hulls: int = 0,
-        payloads: Literal["by-kind", "separate", "single-file"] = "by-kind",
-        levels_of_detail: bool = True,
+        options: UsdOptions | PlyOptions | None = None,
         force: bool = False,
+        **scene: Unpack[SceneOptions],
     ) -> dict[str, Any]:
         """Write the scene with one prim or node per object.
 
         The ending decides the format: .usda, .usdc, .usdz (USD), .glb, .gltf (glTF) or .ply (splats).
         glTF holds rigid motion only: what deforms leaves as a few rigid parts; the motion table says what that
-        misses. PLY holds all splats as they stand at the first exported frame.
+        misses. PLY holds all splats as they stand at one frame.
 
         motion replaces the trained deformation by a function of time that returns means [N, 3] and quaternions
-        [N, 4]. most_expensive_motion is static, rigid, parts or dense. hulls and background_hulls are the most
-        convex colliders of an object and of the background. payloads puts the arrays of objects beside the
-        stage (by-kind: for .usda) or into it; levels_of_detail adds variants with half and a quarter of the
-        splats. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
-        replaced with force.
+        [N, 4]. options are those of the format, as in {"payloads": "separate"}; other keyword arguments are
+        options of the scene, whatever the format, as in tolerance="0.5%". Unknown ones raise ValueError. The
+        answer holds the motion table, sizes and warnings. A file that cif did not write is only replaced with
+        force.
         """
 
 def main(arguments: Sequence[str | os.PathLike[str]]) -> int:

@@ -5,7 +5,7 @@
 //!
 //! | module | answers |
 //! |---|---|
-//! | [`scene`] | parameters and gradients as plain scalars, addressed by group and index |
+//! | [`scene`] | parameters and gradients as plain scalars, addressed by parameter and index |
 //! | [`deform`] | where a Gaussian is at a time |
 //! | [`tracks`] | where recorded motion carries it |
 //! | [`project`] | what it looks like in a view: [`Splat2d`] |
@@ -38,7 +38,7 @@ pub use identity::IdentityProbabilities;
 pub use project::{Splat2d, SplatGradient, View};
 pub use rasterize::{InstanceTarget, PixelState, RasterGradients};
 pub use render::{Forward, SceneGradients, backward, count_identities, forward, render, splats_backward};
-pub use scene::{Gaussian, ParameterGroup, Parameters, Scene};
+pub use scene::{Gaussian, Parameters, Scene};
 
 /// A constant of [`crate::constants`] in the scalar of the evaluation: its `f32` value exactly, so that all
 /// precisions share the same thresholds.

@@ -1,6 +1,10 @@
 //! The parameters of a field in the scalar of the evaluation, and gradients of the same shape.
 
 use cif_field::gaussians::SH_FLOATS;
+use cif_field::parameters::{
+    LOG_CALIBRATIONS, LOG_SCALES, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, Parameter,
+    QUATERNIONS, SH_COEFFICIENTS, TABLE,
+};
 use cif_field::{Deformation, Field, Tracks};
 use cif_geometry::Real;
 
@@ -39,55 +43,6 @@ impl<R: Real> Gaussian<R> {
     }
 }
 
-/// A group of parameters; within a group, scalars are numbered row by row.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum ParameterGroup {
-    /// `[N, 3]`.
-    Means,
-    /// `[N, 3]`.
-    LogScales,
-    /// `[N, 4]`.
-    Quaternions,
-    /// `[N]`.
-    OpacityLogits,
-    /// `[N]`.
-    OccupancyLogits,
-    /// `[N, 48]`.
-    ShCoefficients,
-    /// One per identity entry.
-    LogCalibrations,
-    /// All plane nodes.
-    Planes,
-    /// All weights and biases.
-    Mlp,
-}
-
-impl ParameterGroup {
-    /// Every group.
-    pub const ALL: [Self; 9] = [
-        Self::Means,
-        Self::LogScales,
-        Self::Quaternions,
-        Self::OpacityLogits,
-        Self::OccupancyLogits,
-        Self::ShCoefficients,
-        Self::LogCalibrations,
-        Self::Planes,
-        Self::Mlp,
-    ];
-
-    /// Scalars per Gaussian; 0 for groups that are not per Gaussian.
-    fn row_len(self) -> usize {
-        match self {
-            Self::Means | Self::LogScales => 3,
-            Self::Quaternions => 4,
-            Self::OpacityLogits | Self::OccupancyLogits => 1,
-            Self::ShCoefficients => SH_FLOATS,
-            Self::LogCalibrations | Self::Planes | Self::Mlp => 0,
-        }
-    }
-}
-
 /// All learnable scalars of a scene, or their gradients.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parameters<R> {
@@ -113,58 +68,61 @@ impl<R: Real> Parameters<R> {
         }
     }
 
-    /// Scalars in a group.
+    /// Scalars of a parameter, numbered row by row.
     #[must_use]
-    pub fn len(&self, group: ParameterGroup) -> usize {
-        match group {
-            ParameterGroup::LogCalibrations => self.log_calibrations.len(),
-            ParameterGroup::Planes => self.planes.len(),
-            ParameterGroup::Mlp => self.mlp.len(),
-            _ => self.gaussians.len() * group.row_len(),
+    pub fn len(&self, parameter: Parameter) -> usize {
+        match parameter {
+            LOG_CALIBRATIONS => self.log_calibrations.len(),
+            PLANES => self.planes.len(),
+            MLP => self.mlp.len(),
+            _ => self.gaussians.len() * parameter.width(),
         }
     }
 
     /// True when there is nothing at all.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        ParameterGroup::ALL.iter().all(|group| self.len(*group) == 0)
+        TABLE.into_iter().all(|parameter| self.len(parameter) == 0)
     }
 
-    /// Scalar `index` of a group.
+    /// Scalar `index` of a parameter.
     ///
     /// # Panics
-    /// When the index is not below [`Self::len`].
+    /// When the index is not below [`Self::len`], or the parameter is not in the table.
     #[must_use]
-    pub fn get(&self, group: ParameterGroup, index: usize) -> R {
-        let row = |len: usize| (&self.gaussians[index / len], index % len);
-        match group {
-            ParameterGroup::Means => row(3).0.mean[row(3).1],
-            ParameterGroup::LogScales => row(3).0.log_scale[row(3).1],
-            ParameterGroup::Quaternions => row(4).0.quaternion[row(4).1],
-            ParameterGroup::OpacityLogits => self.gaussians[index].opacity_logit,
-            ParameterGroup::OccupancyLogits => self.gaussians[index].occupancy_logit,
-            ParameterGroup::ShCoefficients => row(SH_FLOATS).0.sh[row(SH_FLOATS).1],
-            ParameterGroup::LogCalibrations => self.log_calibrations[index],
-            ParameterGroup::Planes => self.planes[index],
-            ParameterGroup::Mlp => self.mlp[index],
+    pub fn get(&self, parameter: Parameter, index: usize) -> R {
+        let (row, column) = (index / parameter.width(), index % parameter.width());
+        match parameter {
+            MEANS => self.gaussians[row].mean[column],
+            LOG_SCALES => self.gaussians[row].log_scale[column],
+            QUATERNIONS => self.gaussians[row].quaternion[column],
+            OPACITY_LOGITS => self.gaussians[row].opacity_logit,
+            OCCUPANCY_LOGITS => self.gaussians[row].occupancy_logit,
+            SH_COEFFICIENTS => self.gaussians[row].sh[column],
+            LOG_CALIBRATIONS => self.log_calibrations[row],
+            PLANES => self.planes[row],
+            MLP => self.mlp[row],
+            _ => panic!("the reference has no {}", parameter.name),
         }
     }
 
-    /// Scalar `index` of a group, for writing.
+    /// As [`Self::get`], for writing.
     ///
     /// # Panics
-    /// When the index is not below [`Self::len`].
-    pub fn get_mut(&mut self, group: ParameterGroup, index: usize) -> &mut R {
-        match group {
-            ParameterGroup::Means => &mut self.gaussians[index / 3].mean[index % 3],
-            ParameterGroup::LogScales => &mut self.gaussians[index / 3].log_scale[index % 3],
-            ParameterGroup::Quaternions => &mut self.gaussians[index / 4].quaternion[index % 4],
-            ParameterGroup::OpacityLogits => &mut self.gaussians[index].opacity_logit,
-            ParameterGroup::OccupancyLogits => &mut self.gaussians[index].occupancy_logit,
-            ParameterGroup::ShCoefficients => &mut self.gaussians[index / SH_FLOATS].sh[index % SH_FLOATS],
-            ParameterGroup::LogCalibrations => &mut self.log_calibrations[index],
-            ParameterGroup::Planes => &mut self.planes[index],
-            ParameterGroup::Mlp => &mut self.mlp[index],
+    /// As [`Self::get`].
+    pub fn get_mut(&mut self, parameter: Parameter, index: usize) -> &mut R {
+        let (row, column) = (index / parameter.width(), index % parameter.width());
+        match parameter {
+            MEANS => &mut self.gaussians[row].mean[column],
+            LOG_SCALES => &mut self.gaussians[row].log_scale[column],
+            QUATERNIONS => &mut self.gaussians[row].quaternion[column],
+            OPACITY_LOGITS => &mut self.gaussians[row].opacity_logit,
+            OCCUPANCY_LOGITS => &mut self.gaussians[row].occupancy_logit,
+            SH_COEFFICIENTS => &mut self.gaussians[row].sh[column],
+            LOG_CALIBRATIONS => &mut self.log_calibrations[row],
+            PLANES => &mut self.planes[row],
+            MLP => &mut self.mlp[row],
+            _ => panic!("the reference has no {}", parameter.name),
         }
     }
 }

@@ -10,8 +10,8 @@ use super::layout::Shared;
 use super::rasterizer::{PosedInput, Rasterizer};
 use super::stages::entries;
 use super::view::{
-    BACKWARD, BLEND_CHANNELS, COLOR_PASS, CONSTANTS, FORWARD, INSTANCE_PASS, NUMBERS, OCCUPANCY_NONE,
-    PARTIAL_SUMS, SPLAT, TILE_STAGING, VIEW,
+    BLEND_CHANNELS, COLOR_PASS, CONSTANTS, INSTANCE_PASS, NUMBERS, OCCUPANCY_NONE, PARTIAL_SUMS, SPLAT,
+    TILE_BACKWARD, TILE_FORWARD, TILE_STAGING, VIEW,
 };
 use crate::{BlendRequest, Blending, GeometryPath};
 
@@ -59,8 +59,8 @@ const WITH_WEIGHTS: Snippet = Snippet {
 pub const BLEND: Module = Module {
     name: "blend",
     text: include_str!("blend.wgsl"),
-    imports: &[CONSTANTS, VIEW, SPLAT, FORWARD, BLEND_CHUNK, TILE_STAGING, BLEND_VALUES],
-    bindings: &[UniformAccess, UniformAccess, Read, Read, Read, Read, ReadWrite],
+    imports: &[CONSTANTS, VIEW, SPLAT, BLEND_CHUNK, TILE_STAGING, TILE_FORWARD, BLEND_VALUES],
+    bindings: &[UniformAccess, Read, Read, Read, UniformAccess, Read, ReadWrite],
     entries: &["blend"],
 };
 
@@ -72,14 +72,14 @@ pub const BLEND_BACKWARD: Module = Module {
         CONSTANTS,
         VIEW,
         SPLAT,
-        BACKWARD,
         BLEND_CHUNK,
         TILE_STAGING,
+        TILE_BACKWARD,
         BLEND_VALUES,
         PARTIAL_SUMS,
         VALUES_ONLY,
     ],
-    bindings: &[UniformAccess, UniformAccess, Read, Read, Read, Read, Read, Read, ReadWrite],
+    bindings: &[UniformAccess, Read, Read, Read, UniformAccess, Read, Read, Read, ReadWrite],
     entries: &["blend_backward"],
 };
 
@@ -89,9 +89,9 @@ pub const BLEND_BACKWARD_WEIGHTS: Module = Module {
         CONSTANTS,
         VIEW,
         SPLAT,
-        BACKWARD,
         BLEND_CHUNK,
         TILE_STAGING,
+        TILE_BACKWARD,
         BLEND_VALUES,
         PARTIAL_SUMS,
         WITH_WEIGHTS,
@@ -199,10 +199,10 @@ impl Rasterizer {
                 &kernels.blend,
                 &[
                     self.uniform.buffer(),
-                    kernels.chunks[chunk].1.buffer(),
                     self.arrays.splats.buffer(),
                     self.arrays.entries.buffer(),
                     self.arrays.tile_ranges.buffer(),
+                    kernels.chunks[chunk].1.buffer(),
                     request.values.buffer(),
                     blended.buffer(),
                 ],
@@ -253,10 +253,10 @@ impl Rasterizer {
                 backward,
                 &[
                     view,
-                    constants,
                     arrays.splats.buffer(),
                     arrays.entries.buffer(),
                     arrays.tile_ranges.buffer(),
+                    constants,
                     request.values.buffer(),
                     v_blended.buffer(),
                     weights.map_or(v_blended, |weights| weights.blended).buffer(),

@@ -7,28 +7,19 @@
 
 #import constants
 #import blend_variant
-#import direction
-#import view
-#import splat
-#import blend_chunk
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> chunk: BlendChunk;
-@group(0) @binding(2) var<storage, read> splats: array<Splat>;
-@group(0) @binding(3) var<storage, read> entries: array<vec4u>;
-@group(0) @binding(4) var<storage, read> tile_ranges: array<vec2u>;
-@group(0) @binding(5) var<storage, read> values: array<f32>;
 @group(0) @binding(6) var<storage, read> v_blended: array<f32>;
 // Read where gradients go through the weights.
 @group(0) @binding(7) var<storage, read> blended: array<f32>;
 @group(0) @binding(8) var<storage, read_write> pair_sums: array<f32>;
-#import tile_staging
+#import tile_backward
 #import blend_values
-#import partial_sums
 
 struct Pixel {
     centre: vec2f,
     // The pass while it lets light through.
     open: u32,
+    // Values that are blended have none.
+    label: u32,
     transmittance: f32,
     v_blended: vec4f,
     // Q - E_i.
@@ -63,21 +54,29 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
 }
 
 // Adds what a splat does to a pixel to its sums, and steps the pixel.
-fn add(splat: Staged, own: vec4f, passes: u32, p: ptr<function, Pixel>, sums: ptr<function, Sums>) {
+fn add(
+    splat: Staged,
+    own: vec4f,
+    quadrant: u32,
+    passes: u32,
+    behind: u32,
+    p: ptr<function, Pixel>,
+    sums: ptr<function, Sums>,
+) -> f32 {
     if ((passes & (*p).open) == 0u) {
-        return;
+        return 0.0;
     }
     let u = whitened(splat.factor.xyz, splat.mean - (*p).centre);
     let unclamped = strength_of(splat) * exp(-0.5 * dot(u, u));
     let alpha = min(MAX_ALPHA, unclamped);
     if (alpha < MIN_ALPHA) {
-        return;
+        return 0.0;
     }
     let weight = (*p).transmittance * alpha;
     let next = (*p).transmittance - weight;
     if (next < MIN_TRANSMITTANCE) {
         (*p).open = 0u;
-        return;
+        return 0.0;
     }
     (*sums).values += weight * (*p).v_blended;
     if (WITH_WEIGHTS) {
@@ -90,88 +89,38 @@ fn add(splat: Staged, own: vec4f, passes: u32, p: ptr<function, Pixel>, sums: pt
         }
     }
     (*p).transmittance = next;
+    return 0.0;
 }
 
-// Nothing reaches these pairs.
-fn clear_pairs(first: u32, end: u32) {
-    for (var index = first; index < end; index += 64u) {
-        for (var value = 0u; value < SUMS; value += 1u) {
-            pair_sums[entries[index].x * PAIR_SUMS + value] = 0.0;
-        }
+fn stage_more(count: u32, local: u32) {
+    if (WITH_WEIGHTS) {
+        stage_values(count, local);
     }
 }
+
+fn leave(sums: Sums, at: u32) {
+    partial_sums[at] = sums.values.x;
+    partial_sums[at + 64u] = sums.values.y;
+    partial_sums[at + 128u] = sums.values.z;
+    partial_sums[at + 192u] = sums.values.w;
+    if (WITH_WEIGHTS) {
+        partial_sums[at + 256u] = sums.first.x;
+        partial_sums[at + 320u] = sums.first.y;
+        partial_sums[at + 384u] = sums.first.z;
+        partial_sums[at + 448u] = sums.first.w;
+        partial_sums[at + 512u] = sums.second.x;
+        partial_sums[at + 576u] = sums.second.y;
+    }
+}
+
+// No labels, no responsibilities.
+fn begin_tile(labels: vec4u, local: u32) {}
+fn longest_of_rows() -> u32 { return 0u; }
+fn keep_responsibility(responsibility: vec4f, at: u32) {}
+fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32, longest_row: u32) {}
+fn clear_row(entry: vec4u) {}
 
 @compute @workgroup_size(64)
 fn blend_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    let tile = vec2u(workgroup.x, view.first_row + workgroup.y);
-    let range = tile_ranges[workgroup.y * view.tiles.x + workgroup.x];
-    var p0 = pixel_of(tile, 0u, local);
-    var p1 = pixel_of(tile, 1u, local);
-    var p2 = pixel_of(tile, 2u, local);
-    var p3 = pixel_of(tile, 3u, local);
-    for (var first = range.x; first < range.y; first += STAGED) {
-        let open = vec4u(p0.open, p1.open, p2.open, p3.open);
-        let alive = stage_tile(first, range.y, tile, open, local);
-        if (alive == 0u) {
-            clear_pairs(first + local, range.y);
-            break;
-        }
-        let staged_count = min(STAGED, range.y - first);
-        if (WITH_WEIGHTS) {
-            stage_values(staged_count, local);
-        }
-        // Loops that end at their foot: software that walks both sides of every branch goes through others once more.
-        var batch = 0u;
-        loop {
-            let count = min(BATCH, staged_count - batch);
-            var k = 0u;
-            loop {
-                let splat = staged[batch + k];
-                let own = staged_values[batch + k];
-                let passes = atomicLoad(&staged_passes[batch + k]) & alive;
-                var sums: Sums;
-                if ((passes & 3u) != 0u) {
-                    add(splat, own, passes & 3u, &p0, &sums);
-                }
-                if ((passes & 12u) != 0u) {
-                    add(splat, own, (passes >> 2u) & 3u, &p1, &sums);
-                }
-                if ((passes & 48u) != 0u) {
-                    add(splat, own, (passes >> 4u) & 3u, &p2, &sums);
-                }
-                if ((passes & 192u) != 0u) {
-                    add(splat, own, (passes >> 6u) & 3u, &p3, &sums);
-                }
-                let at = k * SUMS * 64u + local;
-                partial_sums[at] = sums.values.x;
-                partial_sums[at + 64u] = sums.values.y;
-                partial_sums[at + 128u] = sums.values.z;
-                partial_sums[at + 192u] = sums.values.w;
-                if (WITH_WEIGHTS) {
-                    partial_sums[at + 256u] = sums.first.x;
-                    partial_sums[at + 320u] = sums.first.y;
-                    partial_sums[at + 384u] = sums.first.z;
-                    partial_sums[at + 448u] = sums.first.w;
-                    partial_sums[at + 512u] = sums.second.x;
-                    partial_sums[at + 576u] = sums.second.y;
-                }
-                continuing {
-                    k += 1u;
-                    break if k >= count;
-                }
-            }
-            workgroupBarrier();
-
-            let own = local / (64u / BATCH);
-            let part = local % (64u / BATCH);
-            if (own < count && part < SUMS) {
-                pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = sum_of(own * SUMS + part, local);
-            }
-            workgroupBarrier();
-            continuing {
-                batch += BATCH;
-                break if batch >= staged_count;
-            }
-        }
-    }
+    differentiate_tile(workgroup, local);
 }

@@ -6,19 +6,12 @@
 
 #import constants
 #import variant
-#import direction
-#import view
-#import splat
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> splats: array<Splat>;
-@group(0) @binding(2) var<storage, read> entries: array<vec4u>;
-@group(0) @binding(3) var<storage, read> tile_ranges: array<vec2u>;
 @group(0) @binding(4) var<storage, read> labels: array<u32>;
 @group(0) @binding(5) var<storage, read> row_offsets: array<u32>;
 @group(0) @binding(6) var<storage, read> identities: array<vec2u>;
 @group(0) @binding(7) var<storage, read_write> colors: array<vec4f>;
 @group(0) @binding(8) var<storage, read_write> blended: array<vec4f>;
-#import tile_staging
+#import tile_forward
 #import identity
 
 struct Pixel {
@@ -50,8 +43,9 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
     return p;
 }
 
-// Adds a splat to a pixel; `behind` is the position after it in the list of the tile.
-fn blend(splat: Staged, passes: u32, identity: f32, behind: u32, p: ptr<function, Pixel>) {
+// Adds a splat to a pixel.
+fn add(splat: Staged, values: vec4f, quadrant: u32, passes: u32, behind: u32, p: ptr<function, Pixel>) {
+    let identity = values[quadrant];
     let open = passes & (*p).open;
     if (open == 0u) {
         return;
@@ -98,51 +92,5 @@ fn write(p: Pixel) {
 
 @compute @workgroup_size(64)
 fn rasterize(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    let tile = vec2u(workgroup.x, view.first_row + workgroup.y);
-    let range = tile_ranges[workgroup.y * view.tiles.x + workgroup.x];
-    var p0 = pixel_of(tile, 0u, local);
-    var p1 = pixel_of(tile, 1u, local);
-    var p2 = pixel_of(tile, 2u, local);
-    var p3 = pixel_of(tile, 3u, local);
-    let own_labels = vec4u(p0.label, p1.label, p2.label, p3.label);
-    for (var first = range.x; first < range.y; first += STAGED) {
-        let open = vec4u(p0.open, p1.open, p2.open, p3.open);
-        let alive = stage_tile(first, range.y, tile, open, local);
-        if (alive == 0u) {
-            break;
-        }
-        let count = min(STAGED, range.y - first);
-        // A loop that ends at its foot: software that walks both sides of every branch goes through others once more.
-        var k = 0u;
-        loop {
-            let splat = staged[k];
-            let behind = first - range.x + k + 1u;
-            let passes = atomicLoad(&staged_passes[k]) & alive;
-            var identity = vec4f(0.0);
-            if (WITH_INSTANCES && (passes & INSTANCE_IN_TILE) != 0u) {
-                identity = probabilities_of(splat.row_first, splat.row_end, own_labels);
-            }
-            if ((passes & 3u) != 0u) {
-                blend(splat, passes & 3u, identity.x, behind, &p0);
-            }
-            if ((passes & 12u) != 0u) {
-                blend(splat, (passes >> 2u) & 3u, identity.y, behind, &p1);
-            }
-            if ((passes & 48u) != 0u) {
-                blend(splat, (passes >> 4u) & 3u, identity.z, behind, &p2);
-            }
-            if ((passes & 192u) != 0u) {
-                blend(splat, (passes >> 6u) & 3u, identity.w, behind, &p3);
-            }
-            continuing {
-                k += 1u;
-                break if k >= count;
-            }
-        }
-        workgroupBarrier();
-    }
-    write(p0);
-    write(p1);
-    write(p2);
-    write(p3);
+    blend_tile(workgroup, local);
 }

@@ -1,33 +1,22 @@
-// Gradient of a tile, front to back: transmittances are replayed as the forward pass made them and never divided. A
-// workgroup is a tile, an invocation a pixel of each of its quadrants. For four splats at a time, invocations first sum
-// over their own pixels and leave that in workgroup memory; then each takes a sum of a splat over all invocations, in a
-// fixed order: no atomics, one store per (tile, splat) pair and sum. Sums by subgroups would take ten instructions where
-// this takes a store and a load. Rust twin: cpu/rasterize_backward.rs. Source: methods reference 3.2, 4.2.
+// Gradient of a tile, front to back: transmittances are replayed as the forward pass made them and never divided.
+// See tile_backward for how it is summed. Rust twin: cpu/rasterize_backward.rs. Source: methods reference 3.2, 4.2.
 //
 // A pair's ten sums, with u = L d: v_sigma u0, v_sigma u1 (mean); v_sigma u0 u0, u0 u1, u1 u1 (covariance); v_colour;
 // v_sigma of colour; weighted q. And per entry of its identity row the weighted responsibility for that label.
 
 #import constants
 #import variant
-#import direction
-#import view
-#import splat
-@group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<storage, read> splats: array<Splat>;
-@group(0) @binding(2) var<storage, read> entries: array<vec4u>;
-@group(0) @binding(3) var<storage, read> tile_ranges: array<vec2u>;
 @group(0) @binding(4) var<storage, read> row_offsets: array<u32>;
 @group(0) @binding(5) var<storage, read> identities: array<vec2u>;
 @group(0) @binding(6) var<storage, read> cotangents: array<vec4f>;
 @group(0) @binding(7) var<storage, read_write> pair_sums: array<f32>;
 @group(0) @binding(8) var<storage, read_write> label_mass: array<f32>;
-#import tile_staging
 #import identity
 
 // Splats that are summed at a time, and their sums.
 const BATCH: u32 = 4u;
 const SUMS: u32 = GRADIENT_SUMS;
-#import partial_sums
+#import tile_backward
 
 // Weighted r of every splat of the batch, by invocation, a quadrant each.
 var<workgroup> responsibilities: array<vec4f, BATCH * 64u>;
@@ -83,8 +72,7 @@ fn pixel_of(tile: vec2u, quadrant: u32, local: u32) -> Pixel {
     return p;
 }
 
-// What a splat does to a pixel at u: T alpha, v_sigma of colour, weighted q, weighted r; steps the pixel. `behind` is
-// the position after it in the list of the tile.
+// What a splat does to a pixel at u: T alpha, v_sigma of colour, weighted q, weighted r; steps the pixel.
 fn replay(
     splat: Staged,
     passes: u32,
@@ -150,14 +138,15 @@ fn replay(
 // Adds what a splat does to a pixel to its sums; returns the weighted r.
 fn add(
     splat: Staged,
+    values: vec4f,
+    quadrant: u32,
     passes: u32,
-    identity: f32,
     behind: u32,
     p: ptr<function, Pixel>,
     sums: ptr<function, Sums>,
 ) -> f32 {
     let u = whitened(splat.factor.xyz, splat.mean - (*p).centre);
-    let share = replay(splat, passes, identity, behind, u, p);
+    let share = replay(splat, passes, values[quadrant], behind, u, p);
     let v_mean = share.y + view.mean_geometry * share.z;
     let v_covariance = share.y + view.full_geometry * share.z;
     (*sums).first += vec4f(v_mean * u, v_covariance * u.x * u);
@@ -226,106 +215,46 @@ fn sum_responsibilities(own: u32, part: u32, local: u32, count: u32, batch: u32,
     }
 }
 
-// Nothing reaches these pairs.
-fn clear_pairs(first: u32, end: u32) {
-    for (var index = first; index < end; index += 64u) {
-        let entry = entries[index];
-        for (var value = 0u; value < GRADIENT_SUMS; value += 1u) {
-            pair_sums[entry.x * PAIR_SUMS + value] = 0.0;
+fn clear_row(entry: vec4u) {
+    if (WITH_INSTANCES) {
+        let row = row_range(entry.y & INDEX_MASK);
+        for (var k = 0u; k < row.y - row.x; k += 1u) {
+            label_mass[entry.z + k] = 0.0;
         }
-        if (WITH_INSTANCES) {
-            let row = entry.y & INDEX_MASK;
-            let length = row_offsets[row + 1u] - row_offsets[row];
-            for (var k = 0u; k < length; k += 1u) {
-                label_mass[entry.z + k] = 0.0;
-            }
-        }
+    }
+}
+
+fn begin_tile(labels: vec4u, local: u32) {
+    pixel_labels[local] = labels.xz | (labels.yw << vec2u(16u));
+}
+
+fn longest_of_rows() -> u32 {
+    if (!WITH_INSTANCES) {
+        return 0u;
+    }
+    return workgroupUniformLoad(&longest);
+}
+
+fn leave(sums: Sums, at: u32) {
+    partial_sums[at] = sums.first.x;
+    partial_sums[at + 64u] = sums.first.y;
+    partial_sums[at + 128u] = sums.first.z;
+    partial_sums[at + 192u] = sums.first.w;
+    partial_sums[at + 256u] = sums.second.x;
+    partial_sums[at + 320u] = sums.second.y;
+    partial_sums[at + 384u] = sums.second.z;
+    partial_sums[at + 448u] = sums.second.w;
+    partial_sums[at + 512u] = sums.third.x;
+    partial_sums[at + 576u] = sums.third.y;
+}
+
+fn keep_responsibility(responsibility: vec4f, at: u32) {
+    if (WITH_INSTANCES) {
+        responsibilities[at] = responsibility;
     }
 }
 
 @compute @workgroup_size(64)
 fn rasterize_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invocation_index) local: u32) {
-    let tile = workgroup.xy;
-    let range = tile_ranges[tile.y * view.tiles.x + tile.x];
-    var p0 = pixel_of(tile, 0u, local);
-    var p1 = pixel_of(tile, 1u, local);
-    var p2 = pixel_of(tile, 2u, local);
-    var p3 = pixel_of(tile, 3u, local);
-    let labels = vec4u(p0.label, p1.label, p2.label, p3.label);
-    pixel_labels[local] = labels.xz | (labels.yw << vec2u(16u));
-    for (var first = range.x; first < range.y; first += STAGED) {
-        let open = vec4u(p0.open, p1.open, p2.open, p3.open);
-        let alive = stage_tile(first, range.y, tile, open, local);
-        if (alive == 0u) {
-            clear_pairs(first + local, range.y);
-            break;
-        }
-        var longest_row = 0u;
-        if (WITH_INSTANCES) {
-            longest_row = workgroupUniformLoad(&longest);
-        }
-        let staged_count = min(STAGED, range.y - first);
-        // Loops that end at their foot: software that walks both sides of every branch goes through others once more.
-        var batch = 0u;
-        loop {
-            let count = min(BATCH, staged_count - batch);
-            var k = 0u;
-            loop {
-                let splat = staged[batch + k];
-                let behind = first - range.x + batch + k + 1u;
-                let passes = atomicLoad(&staged_passes[batch + k]) & alive;
-                var identity = vec4f(0.0);
-                if (WITH_INSTANCES && (passes & INSTANCE_IN_TILE) != 0u) {
-                    identity = probabilities_of(splat.row_first, splat.row_end, labels);
-                }
-                var sums: Sums;
-                var responsibility = vec4f(0.0);
-                if ((passes & 3u) != 0u) {
-                    responsibility.x = add(splat, passes & 3u, identity.x, behind, &p0, &sums);
-                }
-                if ((passes & 12u) != 0u) {
-                    responsibility.y = add(splat, (passes >> 2u) & 3u, identity.y, behind, &p1, &sums);
-                }
-                if ((passes & 48u) != 0u) {
-                    responsibility.z = add(splat, (passes >> 4u) & 3u, identity.z, behind, &p2, &sums);
-                }
-                if ((passes & 192u) != 0u) {
-                    responsibility.w = add(splat, (passes >> 6u) & 3u, identity.w, behind, &p3, &sums);
-                }
-                let at = k * GRADIENT_SUMS * 64u + local;
-                partial_sums[at] = sums.first.x;
-                partial_sums[at + 64u] = sums.first.y;
-                partial_sums[at + 128u] = sums.first.z;
-                partial_sums[at + 192u] = sums.first.w;
-                partial_sums[at + 256u] = sums.second.x;
-                partial_sums[at + 320u] = sums.second.y;
-                partial_sums[at + 384u] = sums.second.z;
-                partial_sums[at + 448u] = sums.second.w;
-                partial_sums[at + 512u] = sums.third.x;
-                partial_sums[at + 576u] = sums.third.y;
-                if (WITH_INSTANCES) {
-                    responsibilities[k * 64u + local] = responsibility;
-                }
-                continuing {
-                    k += 1u;
-                    break if k >= count;
-                }
-            }
-            workgroupBarrier();
-
-            let own = local / 16u;
-            let part = local % 16u;
-            if (own < count && part < GRADIENT_SUMS) {
-                pair_sums[staged[batch + own].pair * PAIR_SUMS + part] = sum_of(own * SUMS + part, local);
-            }
-            workgroupBarrier();
-            if (longest_row > 0u) {
-                sum_responsibilities(own, part, local, count, batch, longest_row);
-            }
-            continuing {
-                batch += BATCH;
-                break if batch >= staged_count;
-            }
-        }
-    }
+    differentiate_tile(workgroup, local);
 }

@@ -5,9 +5,9 @@ use super::error::GpuError;
 use super::kernel::Access::{Read, ReadWrite, Uniform};
 use super::kernel::{Kernel, Module};
 use super::view::{
-    BACKWARD, COEFFICIENTS, COLOR_ONLY, CONSTANTS, FOOTPRINT, FORWARD, HARMONICS, IDENTITY, NUMBERS,
-    PACKED_COEFFICIENTS, PARTIAL_SUMS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, TILE_STAGING, TILES, VIEW,
-    WITH_INSTANCES,
+    COEFFICIENTS, COLOR_ONLY, CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, PACKED_COEFFICIENTS,
+    PARTIAL_SUMS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, TILE_BACKWARD, TILE_FORWARD, TILE_STAGING, TILES,
+    VIEW, WITH_INSTANCES,
 };
 
 /// Projection.
@@ -72,14 +72,16 @@ pub const RANGES: Module = Module {
 pub const RASTERIZE: Module = Module {
     name: "rasterize",
     text: include_str!("rasterize.wgsl"),
-    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, FORWARD, TILE_STAGING, IDENTITY],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, TILE_FORWARD, IDENTITY],
     bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize"],
 };
 
 /// Blending of colour alone.
-pub const RASTERIZE_COLOR: Module =
-    Module { imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, FORWARD, TILE_STAGING, IDENTITY], ..RASTERIZE };
+pub const RASTERIZE_COLOR: Module = Module {
+    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, TILE_FORWARD, IDENTITY],
+    ..RASTERIZE
+};
 
 /// Instance images.
 pub const DENSE: Module = Module {
@@ -103,14 +105,14 @@ pub const COTANGENTS: Module = Module {
 pub const RASTERIZE_BACKWARD: Module = Module {
     name: "rasterize_backward",
     text: include_str!("rasterize_backward.wgsl"),
-    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY, PARTIAL_SUMS],
+    imports: &[CONSTANTS, WITH_INSTANCES, VIEW, SPLAT, TILE_STAGING, TILE_BACKWARD, IDENTITY, PARTIAL_SUMS],
     bindings: &[Uniform, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["rasterize_backward"],
 };
 
 /// Gradients of pairs from colour alone.
 pub const RASTERIZE_BACKWARD_COLOR: Module = Module {
-    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, BACKWARD, TILE_STAGING, IDENTITY, PARTIAL_SUMS],
+    imports: &[CONSTANTS, COLOR_ONLY, VIEW, SPLAT, TILE_STAGING, TILE_BACKWARD, IDENTITY, PARTIAL_SUMS],
     ..RASTERIZE_BACKWARD
 };
 

@@ -306,6 +306,10 @@ pub(crate) const TILES: Snippet =
     Snippet { name: "tiles", text: || include_str!("shared/tiles.wgsl").to_owned() };
 pub(crate) const TILE_STAGING: Snippet =
     Snippet { name: "tile_staging", text: || include_str!("shared/tile_staging.wgsl").to_owned() };
+pub(crate) const TILE_FORWARD: Snippet =
+    Snippet { name: "tile_forward", text: || include_str!("shared/tile_forward.wgsl").to_owned() };
+pub(crate) const TILE_BACKWARD: Snippet =
+    Snippet { name: "tile_backward", text: || include_str!("shared/tile_backward.wgsl").to_owned() };
 pub(crate) const PARTIAL_SUMS: Snippet =
     Snippet { name: "partial_sums", text: || include_str!("shared/partial_sums.wgsl").to_owned() };
 pub(crate) const IDENTITY: Snippet =
@@ -316,12 +320,6 @@ pub(crate) const WITH_INSTANCES: Snippet =
 /// As above.
 pub(crate) const COLOR_ONLY: Snippet =
     Snippet { name: "variant", text: || "const WITH_INSTANCES: bool = false;\n".to_owned() };
-/// Declares that what gradients need is staged, or is not.
-pub(crate) const BACKWARD: Snippet =
-    Snippet { name: "direction", text: || "const BACKWARD: bool = true;\n".to_owned() };
-/// As above.
-pub(crate) const FORWARD: Snippet =
-    Snippet { name: "direction", text: || "const BACKWARD: bool = false;\n".to_owned() };
 pub(crate) const SCAN_PARAMETERS: Snippet =
     Snippet { name: "scan_parameters", text: || structures(&[ScanParameters::layout()]) };
 pub(crate) const SORT_PARAMETERS: Snippet =

@@ -4,12 +4,13 @@
 //! form the boundary band: the two precisions may decide differently there. They take part in the comparison of
 //! images with the tolerance that one decision can cost, and not in gradients (no cotangent, no label).
 
+use cif_field::parameters::{MEANS, OCCUPANCY_LOGITS, SH_COEFFICIENTS, TABLE};
 use cif_field::{Field, Heads, SortMetric};
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
 use cif_render::reference::dense::rasterize_dense;
 use cif_render::reference::rasterize::{footprint, weight};
-use cif_render::reference::{self, Forward, ParameterGroup, Scene, SceneGradients};
+use cif_render::reference::{self, Forward, Scene, SceneGradients};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::{
     BlendRequest, Blending, Channels, GeometryPath, Gradients, InstanceNormalisation, InstanceSettings,
@@ -60,7 +61,7 @@ pub(crate) struct Tolerances {
     pub(crate) color: f64,
     /// Of a gradient, relative.
     pub(crate) gradient: f64,
-    /// Of a gradient, over the largest of its group.
+    /// Of a gradient, over the largest of its parameter.
     pub(crate) smallest_gradient: f64,
     /// Of a gradient by a projected centre, relative.
     pub(crate) screen: f64,
@@ -169,17 +170,20 @@ impl Expected {
         worst: &mut Worst,
     ) {
         let parameters = &self.gradients.parameters;
-        for group in ParameterGroup::ALL {
+        for parameter in TABLE {
             let values: Vec<f64> =
-                (0..parameters.len(group)).map(|index| parameters.get(group, index)).collect();
+                (0..parameters.len(parameter)).map(|index| parameters.get(parameter, index)).collect();
             // Sums of terms of both signs are as exact as their largest term, not as their result.
             let largest = values.iter().fold(0.0_f64, |largest, value| largest.max(value.abs()));
             let absolute = tolerances.smallest_gradient * largest + 1e-9;
             for (index, e) in values.into_iter().enumerate() {
-                let a = actual.gradient(group, index);
-                mismatches.compare(&format!("{group:?}"), index, e, a, tolerances.gradient, absolute);
+                let a = actual.gradient(parameter, index);
+                mismatches.compare(parameter.name, index, e, a, tolerances.gradient, absolute);
                 if largest > 0.0 {
-                    worst.see(&format!("gradient of {group:?} over the largest"), (e - a).abs() / largest);
+                    worst.see(
+                        &format!("gradient of {} over the largest", parameter.name),
+                        (e - a).abs() / largest,
+                    );
                 }
             }
         }
@@ -493,10 +497,14 @@ fn poison_never_spreads() {
             let name = format!("group {group}, {poison}");
             assert!(forward.color.pixels.as_flattened().iter().all(|c| c.is_finite()), "{name}: colour");
             assert!(forward.instance_loss.is_finite(), "{name}: loss");
-            for group in ParameterGroup::ALL {
+            for parameter in TABLE {
                 let double = Scene::<f64>::from_field(&scene.field);
-                for index in 0..double.parameters.len(group) {
-                    assert!(fast_gradient(&gradients, group, index).is_finite(), "{name}: {group:?} {index}");
+                for index in 0..double.parameters.len(parameter) {
+                    assert!(
+                        fast_gradient(&gradients, parameter, index).is_finite(),
+                        "{name}: {} {index}",
+                        parameter.name
+                    );
                 }
             }
             assert!(gradients.screen.as_flattened().iter().chain(&gradients.radii).all(|v| v.is_finite()));
@@ -762,12 +770,13 @@ fn gradients_of_views_add_up() {
     for _ in 0..2 {
         forward_and_backward(SimdLevel::Auto, &synthetic, &settings(), &cotangents, &mut twice);
     }
-    for group in [ParameterGroup::Means, ParameterGroup::ShCoefficients, ParameterGroup::OccupancyLogits] {
+    for parameter in [MEANS, SH_COEFFICIENTS, OCCUPANCY_LOGITS] {
         for index in 0..once.gaussians.len() {
             assert_eq!(
-                2.0 * fast_gradient(&once, group, index),
-                fast_gradient(&twice, group, index),
-                "{group:?} {index}"
+                2.0 * fast_gradient(&once, parameter, index),
+                fast_gradient(&twice, parameter, index),
+                "{} {index}",
+                parameter.name
             );
         }
     }

@@ -4,10 +4,11 @@
 //! Differences are taken where the loss is smooth, see `gradients.rs` for what is skipped. Pixels in the boundary band,
 //! see `agreement.rs`, carry no gradient and are not compared.
 
+use cif_field::parameters::{Parameter, TABLE};
 use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
 use cif_render::reference::Parameters;
 use cif_render::reference::blend::{blend, blend_backward};
-use cif_render::reference::{Forward, ParameterGroup, Scene, splats_backward};
+use cif_render::reference::{Forward, Scene, splats_backward};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::{
     BlendRequest, BlendedImage, Blending, GeometryPath, Gradients, InstanceSettings, OccupancySource,
@@ -16,6 +17,7 @@ use cif_render::{
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
+use crate::renderers::fast_gradient;
 use crate::support::{Case, Mismatches, compare_with_differences, pixel_discontinuity, render};
 
 const BOTH: [Blending; 2] = [Blending::Color, Blending::Own];
@@ -113,7 +115,7 @@ fn check_paths(name: &str, case: &Case, channels: usize, magnitude: f64, paths: 
                 }
                 head.loss(&forward, &head.values)
             };
-            compare_with_differences(&case.scene, &ParameterGroup::ALL, &analytic, loss, &mut mismatches);
+            compare_with_differences(&case.scene, &TABLE, &analytic, loss, &mut mismatches);
         }
         mismatches.finish(&format!("{name}, C = {channels}, {blending:?}"));
     }
@@ -293,11 +295,11 @@ impl Expected {
 
     fn compare_values(&self, actual: &[f32], relative: f64, mismatches: &mut Mismatches) {
         assert_eq!(actual.len(), self.v_values.len());
-        compare_group("values", &self.v_values, |index| f64::from(actual[index]), relative, mismatches);
+        compare_scalars("values", &self.v_values, |index| f64::from(actual[index]), relative, mismatches);
     }
 }
 
-fn compare_group(
+fn compare_scalars(
     name: &str,
     expected: &[f64],
     actual: impl Fn(usize) -> f64,
@@ -311,25 +313,9 @@ fn compare_group(
     }
 }
 
-/// Scalars of a group.
-fn of_group(parameters: &Parameters<f64>, group: ParameterGroup) -> Vec<f64> {
-    (0..parameters.len(group)).map(|index| parameters.get(group, index)).collect()
-}
-
-/// Scalar `index` of a group of the fast path's gradients.
-fn fast(gradients: &Gradients, group: ParameterGroup, index: usize) -> f64 {
-    let g = &gradients.gaussians;
-    f64::from(match group {
-        ParameterGroup::Means => g.means.as_flattened()[index],
-        ParameterGroup::LogScales => g.log_scales.as_flattened()[index],
-        ParameterGroup::Quaternions => g.quaternions.as_flattened()[index],
-        ParameterGroup::OpacityLogits => g.opacity_logits[index],
-        ParameterGroup::OccupancyLogits => g.occupancy_logits[index],
-        ParameterGroup::ShCoefficients => g.sh_coefficients.as_flattened()[index],
-        ParameterGroup::LogCalibrations => gradients.log_calibrations[index],
-        ParameterGroup::Planes => gradients.planes[index],
-        ParameterGroup::Mlp => gradients.mlp[index],
-    })
+/// Scalars of a parameter.
+fn scalars_of(parameters: &Parameters<f64>, parameter: Parameter) -> Vec<f64> {
+    (0..parameters.len(parameter)).map(|index| parameters.get(parameter, index)).collect()
 }
 
 const PATHS: [GeometryPath; 3] = [GeometryPath::Full, GeometryPath::MeansOnly, GeometryPath::Off];
@@ -365,11 +351,11 @@ fn check_fast_path(
                 };
                 renderer.blend_backward(&request, &v_blended, &mut v_values, Some(weights));
                 assert_eq!(v_values, frozen, "the weights do not change what the values get");
-                for group in ParameterGroup::ALL {
-                    let of_group = of_group(parameters, group);
-                    let actual = |index| fast(&gradients, group, index);
-                    let name = format!("{group:?} {geometry:?}");
-                    compare_group(&name, &of_group, actual, 1e-3, &mut mismatches);
+                for parameter in TABLE {
+                    let expected = scalars_of(parameters, parameter);
+                    let actual = |index| fast_gradient(&gradients, parameter, index);
+                    let name = format!("{} {geometry:?}", parameter.name);
+                    compare_scalars(&name, &expected, actual, 1e-3, &mut mismatches);
                 }
             }
             mismatches.finish(&format!("{name}, C = {channels}, {blending:?}, {simd:?}"));
@@ -507,6 +493,7 @@ fn scenes_without_gaussians() {
 
 #[cfg(feature = "wgpu")]
 mod gpu {
+    use cif_field::parameters::{LOG_SCALES, MEANS, OCCUPANCY_LOGITS, OPACITY_LOGITS, QUATERNIONS};
     use cif_render::wgpu::{
         BlendWeightGradients, Commands, DeviceIdentities, Gpu, GpuError, GpuGaussians, GpuVec, Rasterizer,
         ViewInput,
@@ -583,17 +570,19 @@ mod gpu {
                 let path = [Some(*geometry)];
                 let actual = run(&mut device, &expected, &settings, &path).expect("the view is drawn");
                 expected.compare_values(&actual.v_values, 1e-3, &mut mismatches);
-                let places: [(ParameterGroup, usize, usize); 5] = [
-                    (ParameterGroup::Means, 3, 0),
-                    (ParameterGroup::OpacityLogits, 1, 3),
-                    (ParameterGroup::LogScales, 3, 4),
-                    (ParameterGroup::OccupancyLogits, 1, 7),
-                    (ParameterGroup::Quaternions, 4, 8),
+                let places: [(Parameter, usize); 5] = [
+                    (MEANS, 0),
+                    (OPACITY_LOGITS, 3),
+                    (LOG_SCALES, 4),
+                    (OCCUPANCY_LOGITS, 7),
+                    (QUATERNIONS, 8),
                 ];
-                for (group, width, first) in places {
-                    let at = |index: usize| f64::from(actual.posed[index / width][first + index % width]);
-                    let name = format!("{group:?} {geometry:?}");
-                    compare_group(&name, &of_group(parameters, group), at, 2e-3, &mut mismatches);
+                for (parameter, first) in places {
+                    let at = |index: usize| {
+                        f64::from(actual.posed[index / parameter.width()][first + index % parameter.width()])
+                    };
+                    let name = format!("{} {geometry:?}", parameter.name);
+                    compare_scalars(&name, &scalars_of(parameters, parameter), at, 2e-3, &mut mismatches);
                 }
             }
             mismatches.finish(&format!("{name}, C = {channels}, {blending:?}"));

@@ -7,10 +7,14 @@
 //! label probability. Both sides of them are tested in `hard_cases.rs`.
 
 use crate::support::{Case, Mismatches, check_gradients, compare_with_differences};
+use cif_field::parameters::{
+    LOG_CALIBRATIONS, LOG_SCALES, MEANS, OCCUPANCY_LOGITS, OPACITY_LOGITS, Parameter, QUATERNIONS,
+    SH_COEFFICIENTS,
+};
 use cif_field::{Heads, SortMetric};
 use cif_render::reference::cross_entropy::instance_loss;
 use cif_render::reference::rasterize::rasterize;
-use cif_render::reference::{InstanceTarget, ParameterGroup, Scene};
+use cif_render::reference::{InstanceTarget, Scene};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig};
 use cif_render::{GeometryPath, InstanceNormalisation, InstanceSettings, OccupancySource, RenderSettings};
 
@@ -164,17 +168,11 @@ fn opacity_as_occupancy() {
     }
 }
 
-/// Geometry groups that the instance loss may or may not reach.
-const GEOMETRY: [ParameterGroup; 3] =
-    [ParameterGroup::Means, ParameterGroup::LogScales, ParameterGroup::Quaternions];
+/// Geometry that the instance loss may or may not reach.
+const GEOMETRY: [Parameter; 3] = [MEANS, LOG_SCALES, QUATERNIONS];
 
 /// Groups that the geometry switch leaves alone.
-const OTHERS: [ParameterGroup; 4] = [
-    ParameterGroup::OpacityLogits,
-    ParameterGroup::OccupancyLogits,
-    ParameterGroup::ShCoefficients,
-    ParameterGroup::LogCalibrations,
-];
+const OTHERS: [Parameter; 4] = [OPACITY_LOGITS, OCCUPANCY_LOGITS, SH_COEFFICIENTS, LOG_CALIBRATIONS];
 
 #[test]
 fn instance_loss_without_geometry() {
@@ -281,6 +279,6 @@ fn the_harness_notices_a_wrong_gradient() {
     analytic.gaussians[visible].log_scale[1] *= 1.0 + 1e-5;
     let loss = |scene: &Scene<f64>| case.cotangents.loss(&case.render(scene));
     let mut mismatches = Mismatches::default();
-    compare_with_differences(&case.scene, &[ParameterGroup::LogScales], &analytic, loss, &mut mismatches);
+    compare_with_differences(&case.scene, &[LOG_SCALES], &analytic, loss, &mut mismatches);
     mismatches.finish("perturbed on purpose");
 }

@@ -1,15 +1,14 @@
 //! Numerically hard cases of rendering, through every renderer in both directions; numbers are rows of methods
 //! reference 7. `tests/README.md` lists them with the worst errors that these tests print.
 
+use cif_field::parameters::{LOG_SCALES, MLP, OCCUPANCY_LOGITS, PLANES, Parameter, TABLE};
 use cif_field::{Field, Identities};
 use cif_geometry::scalar::{logit, sigmoid};
 use cif_geometry::{PinholeCamera, PixelGrid, Real};
 use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
 use cif_render::reference::project::{project, project_backward};
 use cif_render::reference::rasterize::{footprint, weight};
-use cif_render::reference::{
-    self, Forward, ParameterGroup as Group, Scene, SceneGradients, Splat2d, SplatGradient, View,
-};
+use cif_render::reference::{self, Forward, Scene, SceneGradients, Splat2d, SplatGradient, View};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
 use cif_render::{InstanceSettings, RenderSettings};
 use proptest::prelude::*;
@@ -42,10 +41,10 @@ fn run<R: Real>(field: &Field, settings: &RenderSettings) -> (Forward<R>, SceneG
 fn assert_finite<R: Real>(name: &str, (forward, gradients): &(Forward<R>, SceneGradients<R>)) {
     let pixels = forward.color.pixels.as_flattened().iter().chain(&forward.depth.pixels);
     assert!(pixels.chain([&forward.loss.mean]).all(|value| value.is_finite()), "{name}: image");
-    for group in Group::ALL {
-        for index in 0..gradients.parameters.len(group) {
-            let v = gradients.parameters.get(group, index);
-            assert!(v.is_finite(), "{name}: {group:?} {index} is {v}");
+    for parameter in TABLE {
+        for index in 0..gradients.parameters.len(parameter) {
+            let v = gradients.parameters.get(parameter, index);
+            assert!(v.is_finite(), "{name}: {} {index} is {v}", parameter.name);
         }
     }
 }
@@ -99,15 +98,15 @@ fn assert_seen_finite(name: &str, field: &Field, seen: &Seen) {
     assert!(seen.colors.as_flattened().iter().all(|value| value.is_finite()), "{name}, {path:?}: colour");
     assert!(seen.loss.is_none_or(|loss| loss.0.is_finite()), "{name}, {path:?}: loss");
     let parameters = Scene::<f32>::from_field(field).parameters;
-    for group in Group::ALL {
-        let mut values = (0..parameters.len(group)).map(|index| seen.gradient(group, index));
-        assert!(values.all(|value| value.is_finite()), "{name}: {group:?} of {path:?}");
+    for parameter in TABLE {
+        let mut values = (0..parameters.len(parameter)).map(|index| seen.gradient(parameter, index));
+        assert!(values.all(|value| value.is_finite()), "{name}: {} of {path:?}", parameter.name);
     }
     let screen = seen.screen.as_flattened().iter().chain(&seen.radii);
     assert!(screen.into_iter().all(|v| v.is_finite()), "{name}, {path:?}: screen");
 }
 
-/// Largest errors of a view: of colours, and of gradients as a share of the largest of their group.
+/// Largest errors of a view: of colours, and of gradients as a share of the largest of their parameter.
 #[derive(Clone, Default)]
 struct Errors {
     /// Of the `f64` reference against central differences of its loss.
@@ -157,41 +156,42 @@ fn errors(
         }
         worst
     };
-    let largest_of =
-        |group| (0..gradients.len(group)).map(|k| gradients.get(group, k).abs()).fold(0.0, f64::max);
-    // A group whose gradient vanishes, such as the rotation of a sphere, is measured by the others.
-    let floor = 1e-2 * Group::ALL.map(largest_of).into_iter().fold(1e-7, f64::max);
-    let of_gradients = |groups: &[Group], slack: f64, actual: &mut dyn FnMut(Group, usize) -> f64| {
-        let mut worst = 0.0_f64;
-        for group in groups {
-            let largest = largest_of(*group).max(floor);
-            for index in 0..gradients.len(*group) {
-                let difference = (actual(*group, index) - gradients.get(*group, index)).abs();
-                worst = worst.max((difference - slack).max(0.0) / largest);
-            }
-        }
-        worst
+    let largest_of = |parameter| {
+        (0..gradients.len(parameter)).map(|k| gradients.get(parameter, k).abs()).fold(0.0, f64::max)
     };
+    // A parameter whose gradient vanishes, such as the rotation of a sphere, is measured by the others.
+    let floor = 1e-2 * TABLE.map(largest_of).into_iter().fold(1e-7, f64::max);
+    let of_gradients =
+        |parameters: &[Parameter], slack: f64, actual: &mut dyn FnMut(Parameter, usize) -> f64| {
+            let mut worst = 0.0_f64;
+            for parameter in parameters {
+                let largest = largest_of(*parameter).max(floor);
+                for index in 0..gradients.len(*parameter) {
+                    let difference = (actual(*parameter, index) - gradients.get(*parameter, index)).abs();
+                    worst = worst.max((difference - slack).max(0.0) / largest);
+                }
+            }
+            worst
+        };
 
     let mut found = Errors::default();
     for seen in everywhere(&view, settings, &cotangents) {
         assert_seen_finite(name, field, &seen);
-        let backward = of_gradients(&Group::ALL, 0.0, &mut |group, index| seen.gradient(group, index));
+        let backward = of_gradients(&TABLE, 0.0, &mut |parameter, index| seen.gradient(parameter, index));
         found.of.push((Column::of(seen.path), [of_color(&seen.colors), backward]));
     }
     if with_differences && field.len() <= FEW {
         let mut moved = scene.clone();
-        let of_gaussians =
-            Group::ALL.into_iter().filter(|group| !matches!(group, Group::Planes | Group::Mlp));
-        let of_gaussians: Vec<Group> = of_gaussians.collect();
-        found.differences = Some(of_gradients(&of_gaussians, ABSOLUTE, &mut |group, index| {
-            let value = scene.parameters.get(group, index);
+        let of_gaussians = TABLE.into_iter().filter(|parameter| !matches!(*parameter, PLANES | MLP));
+        let of_gaussians: Vec<Parameter> = of_gaussians.collect();
+        found.differences = Some(of_gradients(&of_gaussians, ABSOLUTE, &mut |parameter, index| {
+            let value = scene.parameters.get(parameter, index);
             let mut at = |offset: f64| {
-                *moved.parameters.get_mut(group, index) = value + offset;
+                *moved.parameters.get_mut(parameter, index) = value + offset;
                 cotangents.loss(&render(&moved))
             };
             let slope = (at(STEP) - at(-STEP)) / ((value + STEP) - (value - STEP));
-            *moved.parameters.get_mut(group, index) = value;
+            *moved.parameters.get_mut(parameter, index) = value;
             slope
         }));
     }
@@ -422,7 +422,7 @@ fn row_15_deformed_scales_are_clamped_too() {
         assert_seen_finite("spike", &scene.field, &seen);
         let along = |axis: usize| {
             let rows = 0..scene.field.len();
-            rows.map(|row| seen.gradient(Group::LogScales, 3 * row + axis)).collect::<Vec<f64>>()
+            rows.map(|row| seen.gradient(LOG_SCALES, 3 * row + axis)).collect::<Vec<f64>>()
         };
         assert!(along(0).iter().all(|v| *v == 0.0) && along(1).iter().any(|v| *v != 0.0), "{:?}", seen.path);
     }
@@ -745,7 +745,7 @@ fn row_7_the_last_contributor_keeps_its_responsibility() {
             1e-6,
         );
         for seen in everywhere(&plain(&field), &settings(), &Cotangents::random(5, 16, 16)) {
-            let v = seen.gradient(Group::OccupancyLogits, 0);
+            let v = seen.gradient(OCCUPANCY_LOGITS, 0);
             worst(7, Column::of(seen.path), Way::Backward, "one Gaussian", relative(v), 2e-6);
         }
     }
@@ -837,7 +837,7 @@ proptest! {
     /// Poison in any parameter either renders cleanly or culls the Gaussian.
     #[test]
     fn poison_never_spreads(
-        group in 0_usize..6,
+        parameter in 0_usize..6,
         index in 0_usize..48,
         poison in prop::sample::select(vec![
             f32::NAN, f32::INFINITY, f32::NEG_INFINITY, f32::MAX, f32::MIN, 1e-40, 0.0, 1e20, -1e20, 100.0, -100.0,
@@ -846,7 +846,7 @@ proptest! {
     ) {
         let mut field = one();
         let gaussians = &mut field.gaussians;
-        match group {
+        match parameter {
             0 => gaussians.means[0][index % 3] = poison,
             1 => gaussians.log_scales[0][index % 3] = poison,
             2 => gaussians.quaternions[0][index % 4] = poison,
@@ -858,7 +858,7 @@ proptest! {
         let double = run::<f64>(&field, &settings);
         let single = run::<f32>(&field, &settings);
         // A colour of 1e20 is drawn as asked; its gradient by the direction may overflow single precision.
-        if group != 5 || poison.abs() < 1e19 {
+        if parameter != 5 || poison.abs() < 1e19 {
             assert_finite("poison", &single);
             assert_finite("poison", &double);
         }

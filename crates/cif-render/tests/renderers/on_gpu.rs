@@ -3,8 +3,11 @@
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 
 use cif_field::Deformation;
+use cif_field::parameters::{
+    LOG_CALIBRATIONS, LOG_SCALES, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, Parameter,
+    QUATERNIONS, SH_COEFFICIENTS,
+};
 use cif_render::RenderSettings;
-use cif_render::reference::ParameterGroup;
 use cif_render::synthetic::SyntheticScene;
 use cif_render::wgpu::deform::fixed_sum;
 use cif_render::wgpu::{
@@ -135,19 +138,20 @@ pub(crate) fn run(
 }
 
 impl Outcome {
-    /// Gradient by scalar `index` of a group; 0 where nothing has moved the group.
-    pub(crate) fn gradient(&self, group: ParameterGroup, index: usize) -> f64 {
+    /// Gradient by scalar `index` of a parameter; 0 where nothing has moved it.
+    pub(crate) fn gradient(&self, parameter: Parameter, index: usize) -> f64 {
         let [planes, network] = &self.deformation;
-        f64::from(match group {
-            ParameterGroup::Means => self.geometry[index / 3][index % 3],
-            ParameterGroup::LogScales => self.geometry[index / 3][4 + index % 3],
-            ParameterGroup::Quaternions => self.geometry[index / 4][8 + index % 4],
-            ParameterGroup::OpacityLogits => self.geometry[index][3],
-            ParameterGroup::OccupancyLogits => self.geometry[index][7],
-            ParameterGroup::ShCoefficients => self.sh.as_flattened()[index],
-            ParameterGroup::LogCalibrations => self.calibrations.get(index).copied().unwrap_or(0.0),
-            ParameterGroup::Planes => return planes.get(index).copied().unwrap_or(0.0),
-            ParameterGroup::Mlp => return network.get(index).copied().unwrap_or(0.0),
+        f64::from(match parameter {
+            MEANS => self.geometry[index / 3][index % 3],
+            LOG_SCALES => self.geometry[index / 3][4 + index % 3],
+            QUATERNIONS => self.geometry[index / 4][8 + index % 4],
+            OPACITY_LOGITS => self.geometry[index][3],
+            OCCUPANCY_LOGITS => self.geometry[index][7],
+            SH_COEFFICIENTS => self.sh.as_flattened()[index],
+            LOG_CALIBRATIONS => self.calibrations.get(index).copied().unwrap_or(0.0),
+            PLANES => return planes.get(index).copied().unwrap_or(0.0),
+            MLP => return network.get(index).copied().unwrap_or(0.0),
+            _ => panic!("no gradient of {}", parameter.name),
         })
     }
 }

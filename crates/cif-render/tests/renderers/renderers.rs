@@ -1,7 +1,8 @@
 //! A training view through every renderer, in one form that is compared with the reference in double precision.
 
+use cif_field::parameters::Parameter;
 use cif_render::cpu::{ForwardPass, Renderer, SimdLevel};
-use cif_render::reference::{ParameterGroup, Scene};
+use cif_render::reference::Scene;
 use cif_render::synthetic::SyntheticScene;
 use cif_render::{Gradients, RenderSettings};
 
@@ -18,8 +19,8 @@ pub(crate) enum Path {
     Gpu,
 }
 
-/// Gradient of a group at an index.
-type GradientAt = Box<dyn Fn(ParameterGroup, usize) -> f64>;
+/// Gradient of a parameter at an index.
+type GradientAt = Box<dyn Fn(Parameter, usize) -> f64>;
 
 /// Everything that comes back of a training view.
 pub(crate) struct Seen {
@@ -40,9 +41,9 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
-    /// Gradient by scalar `index` of a group.
-    pub(crate) fn gradient(&self, group: ParameterGroup, index: usize) -> f64 {
-        (self.gradient)(group, index)
+    /// Gradient by scalar `index` of a parameter.
+    pub(crate) fn gradient(&self, parameter: Parameter, index: usize) -> f64 {
+        (self.gradient)(parameter, index)
     }
 }
 
@@ -119,20 +120,10 @@ pub(crate) fn forward_and_backward(
     forward
 }
 
-/// Scalar `index` of a group of the fast path's gradients.
-pub(crate) fn fast_gradient(gradients: &Gradients, group: ParameterGroup, index: usize) -> f64 {
-    let g = &gradients.gaussians;
-    f64::from(match group {
-        ParameterGroup::Means => g.means.as_flattened()[index],
-        ParameterGroup::LogScales => g.log_scales.as_flattened()[index],
-        ParameterGroup::Quaternions => g.quaternions.as_flattened()[index],
-        ParameterGroup::OpacityLogits => g.opacity_logits[index],
-        ParameterGroup::OccupancyLogits => g.occupancy_logits[index],
-        ParameterGroup::ShCoefficients => g.sh_coefficients.as_flattened()[index],
-        ParameterGroup::LogCalibrations => gradients.log_calibrations[index],
-        ParameterGroup::Planes => gradients.planes[index],
-        ParameterGroup::Mlp => gradients.mlp[index],
-    })
+/// Scalar `index` of a parameter of the fast path's gradients.
+pub(crate) fn fast_gradient(gradients: &Gradients, parameter: Parameter, index: usize) -> f64 {
+    let tensor = gradients.tensors().into_iter().find(|(other, _)| *other == parameter);
+    f64::from(tensor.expect("a parameter of the table").1[index])
 }
 
 /// The view on the GPU, where there is one.
@@ -157,7 +148,7 @@ pub(crate) fn seen_on_gpu(seen: crate::on_gpu::Outcome) -> Seen {
         loss: None,
         screen: seen.screen.iter().map(|v| [0, 1].map(|k| f64::from(v[k]))).collect(),
         radii: seen.screen.iter().map(|v| if v[3] > 0.0 { f64::from(v[2]) } else { 0.0 }).collect(),
-        gradient: Box::new(move |group, index| seen.gradient(group, index)),
+        gradient: Box::new(move |parameter, index| seen.gradient(parameter, index)),
     }
 }
 

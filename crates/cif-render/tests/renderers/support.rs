@@ -1,5 +1,6 @@
 //! Finite differences on the `f64` reference, away from its discontinuities.
 
+use cif_field::parameters::{Parameter, TABLE};
 use std::collections::BTreeMap;
 
 use cif_geometry::{PinholeCamera, PixelGrid, Real, spherical_harmonics};
@@ -8,7 +9,7 @@ use cif_render::constants::{
     LOG_SCALE_RANGE, MAX_ALPHA, MIN_ALPHA, MIN_LABEL_PROBABILITY, MIN_TRANSMITTANCE,
 };
 use cif_render::reference::rasterize::{footprint, weight};
-use cif_render::reference::{self, Forward, ParameterGroup, Parameters, Scene};
+use cif_render::reference::{self, Forward, Parameters, Scene};
 use cif_render::synthetic::{SyntheticConfig, SyntheticScene, generate};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -294,7 +295,7 @@ impl Mismatches {
             "{name}: {} of {} disagree\n{:>20} {:>6} {:>20} {:>20} {:>10}\n{}",
             self.rows.len(),
             self.compared,
-            "group",
+            "parameter",
             "index",
             "expected",
             "actual",
@@ -304,27 +305,27 @@ impl Mismatches {
     }
 }
 
-/// Compares `analytic` with central differences of `loss` for every scalar of `groups`.
+/// Compares `analytic` with central differences of `loss` for every scalar of `parameters`.
 pub(crate) fn compare_with_differences(
     scene: &Scene<f64>,
-    groups: &[ParameterGroup],
+    parameters: &[Parameter],
     analytic: &Parameters<f64>,
     loss: impl Fn(&Scene<f64>) -> f64,
     mismatches: &mut Mismatches,
 ) {
     let mut perturbed = scene.clone();
-    for &group in groups {
-        for index in 0..scene.parameters.len(group) {
-            let value = scene.parameters.get(group, index);
+    for &parameter in parameters {
+        for index in 0..scene.parameters.len(parameter) {
+            let value = scene.parameters.get(parameter, index);
             let mut at = |offset: f64| {
-                *perturbed.parameters.get_mut(group, index) = value + offset;
+                *perturbed.parameters.get_mut(parameter, index) = value + offset;
                 loss(&perturbed)
             };
             // The step that is really taken, after rounding.
             let numerical = (at(STEP) - at(-STEP)) / ((value + STEP) - (value - STEP));
-            *perturbed.parameters.get_mut(group, index) = value;
-            let analytic = analytic.get(group, index);
-            mismatches.compare(&format!("{group:?}"), index, numerical, analytic, RELATIVE, ABSOLUTE);
+            *perturbed.parameters.get_mut(parameter, index) = value;
+            let analytic = analytic.get(parameter, index);
+            mismatches.compare(parameter.name, index, numerical, analytic, RELATIVE, ABSOLUTE);
         }
     }
 }
@@ -344,21 +345,22 @@ pub(crate) fn compare_precisions(case: &Case, expected: &Parameters<f64>, mismat
     let scene = Scene::<f32>::from_field(&case.synthetic.field);
     let forward = render(&scene, &case.synthetic, &case.settings);
     let single = case.cotangents.backward(&scene, &forward).parameters;
-    for group in ParameterGroup::ALL {
-        for index in 0..expected.len(group) {
-            let (expected, actual) = (expected.get(group, index), f64::from(single.get(group, index)));
-            mismatches.compare(&format!("{group:?} f32"), index, expected, actual, 1e-3, 2e-6);
+    for parameter in TABLE {
+        for index in 0..expected.len(parameter) {
+            let (expected, actual) =
+                (expected.get(parameter, index), f64::from(single.get(parameter, index)));
+            mismatches.compare(&format!("{} f32", parameter.name), index, expected, actual, 1e-3, 2e-6);
         }
     }
 }
 
-/// Every group against differences of the whole loss, then the other precision.
+/// Every parameter against differences of the whole loss, then the other precision.
 pub(crate) fn check_gradients(name: &str, case: &Case) {
     let analytic = case.cotangents.backward(&case.scene, &case.forward).parameters;
     let mut mismatches = Mismatches::default();
     compare_radial(&case.scene, &analytic, &mut mismatches);
     let loss = |scene: &Scene<f64>| case.cotangents.loss(&case.render(scene));
-    compare_with_differences(&case.scene, &ParameterGroup::ALL, &analytic, loss, &mut mismatches);
+    compare_with_differences(&case.scene, &TABLE, &analytic, loss, &mut mismatches);
     compare_precisions(case, &analytic, &mut mismatches);
     mismatches.finish(name);
 }

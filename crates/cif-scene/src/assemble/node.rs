@@ -9,7 +9,8 @@ use crate::graph::{
     Appearance, AppearanceSample, DenseMotion, DenseSample, Motion, Node, NodeKind, Part, PartsMotion, Splats,
 };
 use crate::report::MotionReport;
-use crate::{PoseSample, extent, naming};
+use crate::shape::extent;
+use crate::{PoseSample, naming};
 
 /// The node; its frames are still to be told.
 pub(super) fn node(mut prim: Prim, kind: NodeKind, name: String) -> Node {

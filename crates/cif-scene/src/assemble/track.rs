@@ -4,7 +4,7 @@ use glam::{DAffine3, DQuat, DVec3};
 
 use crate::PoseSample;
 use crate::graph::pose_at;
-use crate::keys;
+use crate::motion::keys;
 
 /// A frame that moves rigidly in another.
 #[derive(Clone, Debug, PartialEq)]

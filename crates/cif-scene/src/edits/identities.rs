@@ -5,7 +5,8 @@ use std::collections::BTreeMap;
 use cif_field::{Field, Identities, Instance};
 
 use super::{Plan, instance_of};
-use crate::{SceneGraph, assignment};
+use crate::SceneGraph;
+use crate::build::assignment;
 
 /// Instance of the base table (or one added after it), or none.
 pub(super) type Owner = Option<u16>;

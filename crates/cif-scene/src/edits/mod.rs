@@ -28,7 +28,7 @@ use crate::diff::splats::{SplatPairs, coefficients, is_faded, is_recoloured, is_
 use crate::diff::units::{Unit, delta, key_codes, matching, step};
 use crate::diff::{Pair, SceneDiff, diff, pairs, same_rows, visibility_differs};
 use crate::field_from_graph::{InstanceTable, NodeRows, log_scale, logit, rows_of};
-use crate::time_map::TimeMap;
+use crate::motion::time_map::TimeMap;
 use crate::{Node, NodeKind, SceneError, SceneGraph, build, naming};
 use identities::{Owner, RowIdentity, unseen_members};
 use parts::subset;

@@ -23,7 +23,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use self::carry::{Anchored, Placed};
-use crate::procrustes::{polar_rotation, weighted_procrustes};
+use crate::motion::procrustes::{polar_rotation, weighted_procrustes};
 use crate::{MotionModel, Node, NodeKind, SceneGraph};
 
 /// First times of an instance at most.

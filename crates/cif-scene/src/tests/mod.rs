@@ -185,7 +185,7 @@ fn bending_is_dense_and_reproduces_the_trained_splats() {
             assert!((at - motion::vector(expected.means[row as usize])).length() < 1e-5);
         }
         assert!(sample.scales.is_some(), "scales change");
-        let again = extent::ellipsoid_bounds(
+        let again = crate::shape::extent::ellipsoid_bounds(
             &RigidTransform::IDENTITY,
             &sample.means,
             &sample.orientations,

@@ -4,7 +4,7 @@ use super::*;
 use cif_field::tracks::{NO_GROUP, Samples, TrackGroup, TrackPose};
 use cif_field::{Owner, Tracks};
 
-use crate::convex_hull::HullMesh;
+use crate::shape::convex_hull::HullMesh;
 
 /// A node of round splats at these places.
 pub(super) fn node(means: &[DVec3]) -> Node {
@@ -52,10 +52,10 @@ fn a_collider_holds_its_splats_and_no_stragglers() {
         node.splats.means[k] = (points[k] * 4.0).to_array().map(|v| v as f32);
     }
     node.splats.scales[5] = [2.0, 0.001, 0.001];
-    let hulls = colliders::colliders(&node, 1);
+    let hulls = crate::shape::colliders::colliders(&node, 1);
     assert_eq!(hulls.len(), 1);
     let mesh = mesh(&hulls[0]);
-    assert!(mesh.points.len() <= convex_hull::MAX_CORNERS);
+    assert!(mesh.points.len() <= crate::shape::convex_hull::MAX_CORNERS);
     let body: Vec<DVec3> =
         (0..500).filter(|k| k % 7 != 0).map(|k| motion::vector(node.splats.means[k])).collect();
     assert!(share_inside(&hulls, &body) >= 0.99, "{}", share_inside(&hulls, &body));
@@ -79,18 +79,18 @@ fn shares_held(hulls: &[ConvexHull], node: &Node) -> [f64; 2] {
 #[test]
 fn large_nodes_are_enclosed_by_what_a_sample_of_them_says() {
     let node = node(&cloud(90_000, DVec3::new(0.4, 0.2, 0.1)));
-    let hulls = colliders::colliders(&node, 1);
+    let hulls = crate::shape::colliders::colliders(&node, 1);
     let shares = shares_held(&hulls, &node);
-    assert!(shares.iter().all(|share| *share >= colliders::ENCLOSED - 5e-3), "{shares:?}");
+    assert!(shares.iter().all(|share| *share >= crate::shape::colliders::ENCLOSED - 5e-3), "{shares:?}");
     assert!(mesh(&hulls[0]).volume() < 1.5 * 0.4 * 0.2 * 0.1);
 }
 
 #[test]
 fn colliders_enclose_their_splats_by_opacity_and_by_sight() {
     let enclosed = |node: &Node, hulls: usize| {
-        let hulls = colliders::colliders(node, hulls);
+        let hulls = crate::shape::colliders::colliders(node, hulls);
         let shares = shares_held(&hulls, node);
-        assert!(shares.iter().all(|share| *share >= colliders::ENCLOSED - 1e-9), "{shares:?}");
+        assert!(shares.iter().all(|share| *share >= crate::shape::colliders::ENCLOSED - 1e-9), "{shares:?}");
         hulls.iter().map(|hull| mesh(hull).volume()).sum::<f64>()
     };
     let ball = |count: usize, radius: f64| {
@@ -137,12 +137,13 @@ fn concave_nodes_fall_into_hulls() {
     points.extend(cloud(300, DVec3::new(0.1, 1.0, 0.1)).iter().map(|p| *p + DVec3::new(-0.45, 0.55, 0.0)));
     let node = node(&points);
     let volume = |hulls: &[ConvexHull]| hulls.iter().map(|hull| mesh(hull).volume()).sum::<f64>();
-    let (one, several) = (colliders::colliders(&node, 1), colliders::colliders(&node, 4));
+    let (one, several) =
+        (crate::shape::colliders::colliders(&node, 1), crate::shape::colliders::colliders(&node, 4));
     assert!(several.len() > 1 && several.len() <= 4);
     assert!(volume(&several) < 0.5 * volume(&one), "{} {}", volume(&several), volume(&one));
     assert!(share_inside(&several, &points) >= 0.99);
     // A convex body stays in one piece.
-    assert_eq!(colliders::colliders(&super::nodes::node(&cloud(600, DVec3::ONE)), 4).len(), 1);
+    assert_eq!(crate::shape::colliders::colliders(&super::nodes::node(&cloud(600, DVec3::ONE)), 4).len(), 1);
 }
 
 #[test]
@@ -150,14 +151,18 @@ fn flat_small_and_glassy_nodes_have_colliders() {
     let flat: Vec<DVec3> = cloud(100, DVec3::new(1.0, 1.0, 0.0));
     let mut sheet = node(&flat);
     sheet.splats.scales.fill([0.02, 0.02, 1e-9]);
-    assert!(share_inside(&colliders::colliders(&sheet, 1), &flat) >= 0.99);
-    assert_eq!(colliders::colliders(&node(&[DVec3::ONE]), 1).len(), 1, "one ellipsoid has an extent");
+    assert!(share_inside(&crate::shape::colliders::colliders(&sheet, 1), &flat) >= 0.99);
+    assert_eq!(
+        crate::shape::colliders::colliders(&node(&[DVec3::ONE]), 1).len(),
+        1,
+        "one ellipsoid has an extent"
+    );
     let glass_points = cloud(50, DVec3::ONE);
     let mut glass = node(&glass_points);
     glass.splats.opacities.fill(0.05);
-    assert!(share_inside(&colliders::colliders(&glass, 1), &glass_points) >= 0.99);
-    assert!(colliders::colliders(&glass, 0).is_empty());
-    assert!(colliders::colliders(&node(&[]), 1).is_empty());
+    assert!(share_inside(&crate::shape::colliders::colliders(&glass, 1), &glass_points) >= 0.99);
+    assert!(crate::shape::colliders::colliders(&glass, 0).is_empty());
+    assert!(crate::shape::colliders::colliders(&node(&[]), 1).is_empty());
 }
 
 #[test]

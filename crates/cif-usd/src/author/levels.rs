@@ -46,7 +46,7 @@ enum Picked {
 
 /// The splats of a node that a level keeps, ascending; `None` for all.
 pub(super) fn kept(node: &Node, level: &Level) -> Option<Vec<u32>> {
-    (level.share < 1.0).then(|| cif_scene::level_of_detail::level_of_detail(node, level.share))
+    (level.share < 1.0).then(|| cif_scene::level_of_detail(node, level.share))
 }
 
 /// Those of a node, or of one of its parts, among the splats that a level keeps.

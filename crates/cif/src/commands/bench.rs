@@ -4,6 +4,8 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
+#[cfg(feature = "wgpu")]
+use cif_bench::device::{OnDevice, StageTimes};
 use cif_dataset::{Dataset, Layout};
 use cif_field::Field;
 #[cfg(feature = "wgpu")]
@@ -15,8 +17,6 @@ use cif_train::{InstancePass, Stage, StepTimes, TrainConfig, Trainer};
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::{Map, Value, json};
 
-#[cfg(feature = "wgpu")]
-use super::bench_device::{OnDevice, StageTimes};
 use super::{CaptureOptions, Simd, print_warnings, scene, train};
 use crate::error::Error;
 use crate::output::{self, Outputs};
@@ -267,7 +267,7 @@ fn beside_processor(
         ..trainer.step_shape(&measured.steps)
     };
     let wall = |series: &Series| cost(&series.steps, |step| step.total).mean;
-    OnDevice::new(gpu, &measured.device, &shape, [wall(measured), wall(&on_processor)])
+    Ok(OnDevice::new(gpu, &measured.device, &shape, [wall(measured), wall(&on_processor)])?)
 }
 
 /// Measured steps with one table of instances.

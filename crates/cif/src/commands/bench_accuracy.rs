@@ -4,25 +4,26 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
+use cif_bench::accuracy::ladders::{BASE, Base, NAMES, QUICK_BASE};
+use cif_bench::accuracy::measure::{self, Training};
+use cif_bench::accuracy::record::{Folder, Record};
+use cif_bench::accuracy::report::{self, Measured, Subject};
+use cif_bench::accuracy::time_limit::{QUICK_SECONDS, TimeLimit};
+use cif_bench::accuracy::{Rung, Work, ladders};
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
 use cif_geometry::PinholeCamera;
 use cif_render::RenderedImage;
+use cif_render::quality::{FINAL, Quality};
 use cif_train::config::InstanceGeometry;
-use cif_train::metrics::trained_settings;
-use cif_train::{Preset, SystemClock, TrainConfig, Trainer};
+use cif_train::metrics::{FrameView, trained_settings};
+use cif_train::{Preset, Stop, SystemClock, TrainConfig, Trainer};
 use clap::Args;
 use serde_json::{Value, json};
 
 use super::{CaptureOptions, print_warnings, train};
-use crate::accuracy::ladders::{BASE, Base, NAMES, QUICK_BASE};
-use crate::accuracy::measure::{self, Training};
-use crate::accuracy::record::{Folder, Record};
-use crate::accuracy::report::{self, Measured, Subject};
-use crate::accuracy::time_limit::{QUICK_SECONDS, TimeLimit};
-use crate::accuracy::{Rung, Work, ladders};
 use crate::error::Error;
-use crate::quality::{FINAL, Quality};
+use crate::pictures::{Picture, instance_picture, rgb_picture};
 use crate::settings::Layers;
 use crate::{interrupt, output};
 
@@ -345,7 +346,7 @@ impl Bench {
             Work::Store { planes, splats, centres } => {
                 let (stored, bytes) = measure::store(field, planes, splats, centres);
                 let settings = trained_settings(field);
-                measure::score(&stored, &settings, &self.dataset, &rung.id, &self.rungs, &mut record)?;
+                measure::score(&stored, &settings, &self.dataset, &rung.id, &self.rungs, &draw, &mut record)?;
                 record.bytes = Some(bytes);
             }
             Work::Render { reduction: 1, sh_degree: None, min_opacity }
@@ -387,16 +388,17 @@ impl Bench {
         };
         let training = Training { id: &rung.id, dataset, config };
         let mut last = 0;
-        let trained = measure::train(&self.rungs, training, &mut |done, whole| {
-            let percent = 100 * done / whole.max(1);
-            if percent > last {
-                last = percent;
-                self.show(&format!("{heading}: {percent} %"), false);
-            }
-        })?;
+        let trained =
+            measure::train(&self.rungs, training, &Stop::when(interrupt::requested), &mut |done, whole| {
+                let percent = 100 * done / whole.max(1);
+                if percent > last {
+                    last = percent;
+                    self.show(&format!("{heading}: {percent} %"), false);
+                }
+            })?;
         let Some((field, mut record)) = trained else { return Ok(None) };
         let scored = trained_settings(&field);
-        measure::score(&field, &scored, &self.dataset, &rung.id, &self.rungs, &mut record)?;
+        measure::score(&field, &scored, &self.dataset, &rung.id, &self.rungs, &draw, &mut record)?;
         record.settings = settings;
         if rung.id == BASE {
             field.save(self.base_file()).map_err(Error::plain)?;
@@ -466,6 +468,15 @@ fn exact<'a>(
     known.as_ref()
 }
 
+/// Pictures of a view for the report.
+fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
+    let mut pictures = vec![("", rgb_picture(&view.rendered.color))];
+    if let (Some(ids), Some(layers)) = (view.predicted, &view.rendered.instances) {
+        pictures.push((".instances", instance_picture(ids, &layers.foreground)));
+    }
+    pictures
+}
+
 /// A record in a line.
 fn told(record: &Record) -> String {
     let mut parts = Vec::new();
@@ -482,4 +493,41 @@ fn told(record: &Record) -> String {
         add(record.residual, &|value| format!("residual {value:.2e}"));
     }
     parts.join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_of_rungs_exist_and_can_work() {
+        let base = Base {
+            quick: false,
+            steps: [300, 7_000, 1_500],
+            until: [4_000, 1_250],
+            gaussians: 12_000,
+            points: 20_000,
+            nodes: 64,
+            width: 64,
+            sh_degree: 3,
+            downscale: 1,
+            is_dynamic: true,
+            has_instances: true,
+            instances_move_geometry: false,
+        };
+        let mut trained = 0;
+        for rung in ladders(&base).into_iter().flat_map(|ladder| ladder.rungs) {
+            let Work::Train(settings) = rung.work else { continue };
+            let mut layers = Layers::new(TrainConfig::default());
+            for setting in settings.iter().filter(|setting| !setting.starts_with("downscale")) {
+                layers.assignment(setting).unwrap();
+            }
+            layers.finish().validate().unwrap();
+            trained += 1;
+        }
+        assert!(trained > 20);
+        let mut layers = Layers::new(TrainConfig::default());
+        QUICK_BASE.iter().for_each(|setting| layers.assignment(setting).unwrap());
+        layers.finish().validate().unwrap();
+    }
 }

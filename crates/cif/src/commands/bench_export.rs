@@ -1,18 +1,17 @@
 //! `cif bench export`: what accuracy of motion costs in samples, bytes and time.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
-use cif_field::Field;
+use cif_bench::export::{Rung, measure};
 use cif_scene::report::ReportRow;
-use cif_scene::{ExportOptions, MotionModel, SceneFormat, SceneGraph, SceneOptions, Tolerance};
+use cif_scene::{SceneFormat, SceneOptions, Tolerance};
 use clap::Args;
-use serde::Serialize;
 
 use super::model_options::ModelOptions;
 use super::{motion_table, scene};
 use crate::error::Error;
-use crate::formats::{self, FORMATS};
+use crate::formats::FORMATS;
 use crate::output::{self, Outputs};
 
 /// Tell what accuracy of motion costs
@@ -47,80 +46,6 @@ pub(super) struct BenchExport {
     force: bool,
 }
 
-/// One tolerance.
-#[derive(Debug, Serialize)]
-struct Rung {
-    tolerance: Tolerance,
-    /// Seconds for the scene graph.
-    graph_seconds: f64,
-    samples: usize,
-    motion_bytes: usize,
-    models: Vec<ModelCount>,
-    nodes: Vec<ReportRow>,
-    files: Vec<WrittenFile>,
-}
-
-/// Nodes of one model.
-#[derive(Debug, Serialize)]
-struct ModelCount {
-    model: MotionModel,
-    nodes: usize,
-}
-
-/// Size, time and deviations of a rung's file in one format.
-#[derive(Debug, Serialize)]
-struct WrittenFile {
-    format: &'static str,
-    bytes: u64,
-    seconds: f64,
-    /// Samples in the file.
-    samples: usize,
-    /// Largest decisive residual of a node, as a share of what the tolerance allows it.
-    worst_share: f64,
-    /// Nodes that miss more than the tolerance allows.
-    nodes_outside: usize,
-    /// The scene as this format holds it, where that is another one.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    simplified: Option<Simplified>,
-}
-
-/// A scene without the motion that a format does not know.
-#[derive(Debug, Serialize)]
-struct Simplified {
-    /// Seconds for the scene graph.
-    graph_seconds: f64,
-    nodes: Vec<ReportRow>,
-}
-
-/// Writes a rung; a graph with motion that the format does not know is built again without it.
-fn measure(
-    format: &dyn SceneFormat,
-    field: &Field,
-    graph: &SceneGraph,
-    options: &SceneOptions,
-    path: &Path,
-) -> Result<WrittenFile, String> {
-    let start = Instant::now();
-    let rebuilt = formats::rebuilt_for(format, field, graph, options).map_err(|error| error.to_string())?;
-    let graph_seconds = start.elapsed().as_secs_f64();
-    let start = Instant::now();
-    let held = rebuilt.as_ref().unwrap_or(graph);
-    let written = format.write(held, path, &ExportOptions::default()).map_err(|error| error.to_string())?;
-    let seconds = start.elapsed().as_secs_f64();
-    let nodes = held.motion_table();
-    let share = |row: &ReportRow| row.motion.residual.decisive / row.motion.tolerance;
-    let shares: Vec<f64> = nodes.iter().map(share).filter(|share| share.is_finite()).collect();
-    Ok(WrittenFile {
-        format: format.name(),
-        bytes: written.bytes,
-        seconds,
-        samples: nodes.iter().map(|row| row.motion.samples).sum(),
-        worst_share: shares.iter().copied().fold(0.0, f64::max),
-        nodes_outside: shares.iter().filter(|share| **share > 1.0).count(),
-        simplified: rebuilt.is_some().then_some(Simplified { graph_seconds, nodes }),
-    })
-}
-
 pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let to_stdout = command.json.as_deref().is_some_and(output::is_stdout);
     if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
@@ -132,7 +57,7 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
     // A format that does not work is told once, and left out of all rungs.
-    let moving = FORMATS.into_iter().filter(|format| format.most_expensive_motion().is_some());
+    let moving = FORMATS.into_iter().filter(|format| format.about().most_expensive_motion.is_some());
     let mut formats: Vec<&dyn SceneFormat> = if command.no_files { Vec::new() } else { moving.collect() };
     let mut rungs = Vec::new();
     for &tolerance in &command.tolerances {
@@ -142,8 +67,8 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
         let mut rung = Rung::of(tolerance, start.elapsed().as_secs_f64(), &graph);
         formats.retain(|format| {
             // One file without text, which is what takes the least room.
-            let ending = format.endings().iter().find(|ending| ending.kind != "text");
-            let ending = ending.map_or_else(|| format.key(), |ending| ending.name);
+            let ending = format.about().endings.iter().find(|ending| ending.kind != "text");
+            let ending = ending.map_or_else(|| format.about().key, |ending| ending.name);
             let path = folder.path().join(format!("rung_{}.{ending}", rungs.len()));
             match measure(*format, &field, &graph, &options, &path) {
                 Ok(file) => {
@@ -151,7 +76,7 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
                     true
                 }
                 Err(reason) => {
-                    eprintln!("note: no {} files are measured: {reason}", format.name());
+                    eprintln!("note: no {} files are measured: {reason}", format.about().name);
                     false
                 }
             }
@@ -168,23 +93,6 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
         output::write_file(path, text.as_bytes())?;
     }
     Ok(())
-}
-
-impl Rung {
-    fn of(tolerance: Tolerance, graph_seconds: f64, graph: &SceneGraph) -> Self {
-        let nodes = graph.motion_table();
-        let count = |model| nodes.iter().filter(|row| row.motion.model == model).count();
-        let models = [MotionModel::Static, MotionModel::Rigid, MotionModel::Parts, MotionModel::Dense];
-        Self {
-            tolerance,
-            graph_seconds,
-            samples: nodes.iter().map(|row| row.motion.samples).sum(),
-            motion_bytes: nodes.iter().map(|row| row.motion.motion_bytes).sum(),
-            models: models.map(|model| ModelCount { model, nodes: count(model) }).into(),
-            nodes,
-            files: Vec::new(),
-        }
-    }
 }
 
 fn name_of(tolerance: Tolerance) -> String {

@@ -1,27 +1,18 @@
 //! `cif bench hardness`: trains a capture that was changed in ways which must not matter or must not break.
 
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
 
+use cif_bench::hard_captures::{HARD_CAPTURES, HardCapture, Unfit};
+use cif_bench::hardness::{self, MAX_MIOU_LOSS, MAX_PSNR_LOSS, Row, mean_of, number, signed};
 use cif_dataset::{Dataset, Layout};
-use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
-use cif_train::{Control, Outcome, Start, Stop, TrainConfig, TrainEvent, Trainer};
+use cif_train::{Stop, TrainConfig};
 use clap::Args;
-use serde::Serialize;
 use serde_json::json;
 
 use super::{CaptureOptions, print_warnings, train};
 use crate::error::Error;
-use crate::hard_captures::{Demand, HARD_CAPTURES, HardCapture, Unfit};
 use crate::settings::Layers;
 use crate::{interrupt, output};
-
-/// Largest loss that scale and place may cost, dB.
-const MAX_PSNR_LOSS: f64 = 0.3;
-
-/// Largest loss that scale and place may cost, percent of mIoU.
-const MAX_MIOU_LOSS: f64 = 1.0;
 
 /// Runs of the capture itself, with a seed each: one alone says little of changes of tenths.
 const BASELINE_RUNS: u64 = 3;
@@ -63,24 +54,6 @@ pub(super) struct BenchHardness {
     set: Vec<String>,
     #[command(flatten)]
     capture_options: CaptureOptions,
-}
-
-/// Result of a variant.
-#[derive(Clone, Debug, Default, Serialize)]
-struct Row {
-    name: &'static str,
-    what: &'static str,
-    /// `same`, `ok`, `differs`, `failed` or `skipped`.
-    verdict: &'static str,
-    psnr: Option<f64>,
-    psnr_change: Option<f64>,
-    miou: Option<f64>,
-    miou_change: Option<f64>,
-    gaussians: usize,
-    rolled_back: u64,
-    seconds: f64,
-    /// Error that stopped the run, data that the capture lacks, and warnings.
-    notes: Vec<String>,
 }
 
 pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
@@ -144,20 +117,9 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
                 row.verdict = "skipped";
                 row.notes.push(format!("the capture has no {what}").replace("no a ", "no "));
             }
-            Err(Unfit::Failed(error)) => return Err(error),
+            Err(Unfit::Failed(error)) => return Err(error.into()),
         }
-        let change = |now: Option<f64>, before: Option<f64>| Some(now? - before?);
-        row.psnr_change = change(row.psnr, baseline.psnr);
-        row.miou_change = change(row.miou, baseline.miou);
-        if hard.demand == Demand::Same && row.verdict == "ok" {
-            // Written so that a missing score counts as a difference.
-            let within = |change: Option<f64>, known: Option<f64>, limit: f64| {
-                known.is_none() || change.is_some_and(|change| change.abs() < limit)
-            };
-            let same = within(row.psnr_change, baseline.psnr, MAX_PSNR_LOSS)
-                && within(row.miou_change, baseline.miou, MAX_MIOU_LOSS);
-            row.verdict = if same { "same" } else { "differs" };
-        }
+        row.judge(&baseline, hard.demand);
         tell(&row);
         rows.push(row);
     }
@@ -171,24 +133,6 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
         format!("{} of {} variants went wrong: {}", bad.len(), rows.len() - 1, bad.join(", ")),
         format!("{} says how", command.output.join("report.md").display()),
     ))
-}
-
-/// Mean scores of runs that differ in their seed, with a note of their range; the rest is that of the first.
-fn mean_of(runs: &[Row]) -> Row {
-    let mut mean = runs[0].clone();
-    let mut ranges = Vec::new();
-    let mut score = |name: &str, unit: &str, of: fn(&Row) -> Option<f64>| {
-        let values: Vec<f64> = runs.iter().filter_map(of).collect();
-        if values.is_empty() {
-            return None;
-        }
-        let range = values.iter().fold((f64::MAX, f64::MIN), |(low, high), v| (low.min(*v), high.max(*v)));
-        ranges.push(format!("{name} {:.2} to {:.2} {unit}", range.0, range.1));
-        Some(values.iter().sum::<f64>() / values.len() as f64)
-    };
-    (mean.psnr, mean.miou) = (score("PSNR", "dB", |row| row.psnr), score("mIoU", "%", |row| row.miou));
-    mean.notes.push(format!("mean of {} seeds: {}", runs.len(), ranges.join(", ")));
-    mean
 }
 
 /// Settings of the preset, then what was typed.
@@ -210,75 +154,16 @@ fn resolve(command: &BenchHardness, layout: Layout) -> Result<TrainConfig, Error
     layers.validated()
 }
 
-/// Trains and scores one capture; whatever goes wrong is noted.
-///
-/// # Errors
-/// Only when interrupted.
+/// As [`hardness::measure`], until Ctrl-C.
 fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(), Error> {
-    let start = Instant::now();
-    // A panic is a finding here, not an end.
-    let result = catch_unwind(AssertUnwindSafe(|| train_and_score(row, dataset, config)));
+    hardness::measure(row, dataset, config, &Stop::when(interrupt::requested));
     if interrupt::requested() {
         return Err(Error::Interrupted {
             message: "interrupted; no report was written".to_owned(),
             help: None,
         });
     }
-    row.seconds = start.elapsed().as_secs_f64();
-    match result {
-        Ok(Ok(())) => {}
-        Ok(Err(message)) => {
-            row.verdict = "failed";
-            row.notes.push(message);
-        }
-        Err(_) => {
-            row.verdict = "failed";
-            row.notes.push("panicked".to_owned());
-        }
-    }
     Ok(())
-}
-
-fn train_and_score(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(), String> {
-    let start = Start { dataset: dataset.clone(), stop: Stop::when(interrupt::requested) };
-    let mut trainer = Trainer::new(start, config.clone()).map_err(|error| error.to_string())?;
-    let mut notes = Vec::new();
-    let outcome = trainer.run(&mut |event, _| {
-        if let TrainEvent::Warning { message } = event {
-            notes.push(message.clone());
-        }
-        Control::Continue
-    });
-    row.rolled_back = trainer.rolled_back();
-    row.notes.append(&mut notes);
-    match outcome {
-        Ok(Outcome::Finished) => {}
-        Ok(Outcome::Interrupted) => return Ok(()),
-        Err(error) => return Err(error.to_string()),
-    }
-    let field = trainer.into_field();
-    row.gaussians = field.len();
-    field.validate().map_err(|error| error.to_string())?;
-    let options = EvaluationOptions::held_out(&field);
-    let scores =
-        evaluate::<EvaluationError>(&field, dataset, &options, |_| Ok(())).map_err(|e| e.to_string())?;
-    (row.psnr, row.miou) = (scores.overall.psnr, scores.overall.instance.miou);
-    if row.psnr.is_some_and(|psnr| !psnr.is_finite()) {
-        return Err("a held-out view has values that are not finite".to_owned());
-    }
-    Ok(())
-}
-
-fn number(value: Option<f64>) -> String {
-    value.map_or("n/a".to_owned(), |value| format!("{value:.2}"))
-}
-
-fn signed(value: Option<f64>) -> String {
-    // What rounds to nothing has no sign.
-    value.map_or(
-        String::new(),
-        |value| if value.abs() < 0.005 { "0.00".to_owned() } else { format!("{value:+.2}") },
-    )
 }
 
 fn tell(row: &Row) {
@@ -346,27 +231,4 @@ fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> 
 
 fn write(path: &Path, text: &str) -> Result<(), Error> {
     output::write_file(path, text.as_bytes())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_capture_itself_is_the_mean_of_its_seeds() {
-        let run =
-            |psnr: f64, miou: Option<f64>| Row { psnr: Some(psnr), miou, gaussians: 7, ..Row::default() };
-        let mean = mean_of(&[run(28.0, Some(96.0)), run(28.5, Some(97.5)), run(29.0, Some(96.0))]);
-        assert_eq!((mean.psnr, mean.miou, mean.gaussians), (Some(28.5), Some(96.5), 7));
-        assert_eq!(mean.notes, ["mean of 3 seeds: PSNR 28.00 to 29.00 dB, mIoU 96.00 to 97.50 %"]);
-        let colour_only = mean_of(&[run(28.0, None), run(29.0, None)]);
-        assert_eq!((colour_only.psnr, colour_only.miou), (Some(28.5), None));
-        assert_eq!(colour_only.notes, ["mean of 2 seeds: PSNR 28.00 to 29.00 dB"]);
-    }
-
-    #[test]
-    fn changes_have_a_sign_unless_they_round_to_nothing() {
-        let texts = [-0.004, 0.0, 0.004, -0.006, 0.16].map(|value| signed(Some(value)));
-        assert_eq!(texts, ["0.00", "0.00", "0.00", "-0.01", "+0.16"]);
-    }
 }

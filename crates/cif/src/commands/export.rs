@@ -13,7 +13,7 @@ use super::query::code_at;
 use super::targets::{Targets, Writing};
 use super::{motion_table, scene};
 use crate::error::Error;
-use crate::formats::{self, FORMATS};
+use crate::formats::FORMATS;
 use crate::ground_truth::{self, MotionError};
 use crate::output::{self, Outputs};
 
@@ -21,7 +21,7 @@ use crate::output::{self, Outputs};
 #[derive(Debug, Args)]
 #[command(
     group = ArgGroup::new("result").required(true).multiple(true)
-        .args(FORMATS.iter().map(|format| format.key()).chain(["report", "report_json"])),
+        .args(FORMATS.iter().map(|format| format.about().key).chain(["report", "report_json"])),
     after_help = "\
 Every object gets the cheapest motion that stays inside the tolerance: static, rigid, parts (a few
 rigid bodies), or dense (a path for every splat). Samples that interpolation reproduces inside the
@@ -99,11 +99,11 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     command.targets.check(&command.writing, command.force, &mut outputs)?;
     let truth = command.ground_truth.as_deref().map(MotionTruth::read).transpose().map_err(Error::plain)?;
     let field = scene::load(&command.scene)?;
-    let notes = command.targets.iter().filter_map(|target| target.format.note_on_place());
+    let notes = command.targets.iter().filter_map(|target| target.format.about().note_on_place);
     scene::note_frame(&scene::frame(&field)?, notes);
     // The graph is as rich as the richest of the formats.
     let asked = options(command, &field);
-    let held = command.targets.iter().map(|target| formats::held_by(target.format, &asked));
+    let held = command.targets.iter().map(|target| target.format.held(&asked));
     let options = held.max_by_key(|held| held.most_expensive_motion).unwrap_or_else(|| asked.clone());
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
     for warning in &graph.warnings {
@@ -113,7 +113,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let writing = command.writing.options(command.force, |time| code_at(&codes.times, &codes.samples, time));
     let mut rebuilt: Vec<(&dyn SceneFormat, SceneGraph)> = Vec::new();
     for target in command.targets.iter() {
-        let other = formats::rebuilt_for(target.format, &field, &graph, &options)?;
+        let other = target.format.rebuilt(&field, &graph, &options).map_err(Error::plain)?;
         let held = other.as_ref().unwrap_or(&graph);
         let written = target.format.write(held, &target.path, &writing).map_err(Error::plain)?;
         target.tell(&written);
@@ -122,10 +122,12 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
     let mut tables = json!({ "motion": graph.motion_table(), "ground_truth": errors });
     let simplifies = |most: MotionModel| most < MotionModel::Dense;
-    for format in FORMATS.into_iter().filter(|format| format.most_expensive_motion().is_some_and(simplifies))
+    for format in
+        FORMATS.into_iter().filter(|format| format.about().most_expensive_motion.is_some_and(simplifies))
     {
-        let table = rebuilt.iter().find(|(other, _)| other.key() == format.key());
-        tables[format!("{}_motion", format.key())] = json!(table.map(|(_, graph)| graph.motion_table()));
+        let table = rebuilt.iter().find(|(other, _)| other.about().key == format.about().key);
+        tables[format!("{}_motion", format.about().key)] =
+            json!(table.map(|(_, graph)| graph.motion_table()));
     }
     if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
         output::write_file(path, format!("{tables:#}\n").as_bytes())?;
@@ -135,7 +137,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     } else {
         print_motion(&graph);
         for (format, graph) in &rebuilt {
-            println!("motion in the {}, which holds no motion splat by splat:", format.name());
+            println!("motion in the {}, which holds no motion splat by splat:", format.about().name);
             print_motion(graph);
         }
         if let Some(errors) = &errors {

@@ -2,8 +2,6 @@
 
 mod bench;
 mod bench_accuracy;
-#[cfg(feature = "wgpu")]
-mod bench_device;
 mod bench_export;
 mod bench_hardness;
 mod check;

@@ -9,6 +9,7 @@ use cif_field::Field;
 use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::constants::MIN_COVERAGE;
 use cif_render::cpu::{BandRequest, Renderer};
+use cif_render::quality::{self, Quality};
 use cif_render::{Channels, RenderSettings, RenderedImage, screen_motion};
 use cif_scene::files::folder_of;
 use cif_scene::naming::instance_name;
@@ -25,7 +26,6 @@ use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
 use crate::output::Outputs;
-use crate::quality::{self, Quality};
 use crate::{interrupt, output};
 
 /// Render a scene from captured or new views

@@ -21,13 +21,13 @@ pub(super) struct Target {
 
 impl std::fmt::Debug for Target {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        write!(f, "--{} {}", self.format.key(), self.path.display())
+        write!(f, "--{} {}", self.format.about().key, self.path.display())
     }
 }
 
 /// Endings that are written, e.g. `.usda (text)`.
 fn written(format: &dyn SceneFormat) -> Vec<String> {
-    let endings = format.endings().iter().filter(|ending| ending.written);
+    let endings = format.about().endings.iter().filter(|ending| ending.written);
     endings.map(|ending| format!(".{} ({})", ending.name, ending.kind)).collect()
 }
 
@@ -36,12 +36,12 @@ impl Args for Targets {
         FORMATS.into_iter().fold(command, |command, format| {
             let help = format!(
                 "{} to write; the ending decides: {}. {}",
-                format.name(),
+                format.about().name,
                 written(format).join(", "),
-                format.about()
+                format.about().files
             );
-            let arg = Arg::new(format.key())
-                .long(format.key())
+            let arg = Arg::new(format.about().key)
+                .long(format.about().key)
                 .value_name("OUT")
                 .value_parser(value_parser!(PathBuf))
                 .help(help);
@@ -57,7 +57,7 @@ impl Args for Targets {
 impl FromArgMatches for Targets {
     fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
         let given = FORMATS.into_iter().filter_map(|format| {
-            let path = matches.get_one::<PathBuf>(format.key())?.clone();
+            let path = matches.get_one::<PathBuf>(format.about().key)?.clone();
             Some(Target { format, path })
         });
         Ok(Self(given.collect()))
@@ -144,7 +144,7 @@ impl Target {
             ));
         }
         if !folder && !format.writes(path) {
-            let or_folder = match format.most_expensive_motion() {
+            let or_folder = match format.about().most_expensive_motion {
                 Some(_) => "",
                 None => ", or write into a folder with --ply-split or --ply-sequence",
             };
@@ -164,7 +164,7 @@ impl Target {
     /// Tells what was written.
     pub(super) fn tell(&self, summary: &ExportSummary) {
         for lost in &summary.not_held {
-            eprintln!("warning: {} does not hold everything of {lost}", self.format.name());
+            eprintln!("warning: {} does not hold everything of {lost}", self.format.about().name);
         }
         let files = match summary.files.len() {
             0 | 1 => String::new(),

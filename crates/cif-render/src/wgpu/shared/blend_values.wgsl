@@ -1,5 +1,9 @@
 // Four channels of the values of Gaussians and of pixels, `[rows, C]` each, and the pass that they are blended with.
 
+#import blend_chunk
+@group(0) @binding(4) var<uniform> chunk: BlendChunk;
+@group(0) @binding(5) var<storage, read> values: array<f32>;
+
 // Values of the staged splats.
 var<workgroup> staged_values: array<vec4f, STAGED>;
 
@@ -21,7 +25,7 @@ fn before(first: u32, end: u32, found: vec4f) -> vec4f {
     return select(vec4f(0.0), found, vec4u(first) + vec4u(0u, 1u, 2u, 3u) < vec4u(end));
 }
 
-// Stages the values of the splats. Every invocation of the workgroup must come here, after `stage_tile`.
+// Stages the values of the splats.
 fn stage_values(count: u32, local: u32) {
     if (local < count) {
         let first = staged[local].row_first;
@@ -30,6 +34,10 @@ fn stage_values(count: u32, local: u32) {
         staged_values[local] = before(first, end, vec4f(values[at.x], values[at.y], values[at.z], values[at.w]));
     }
     workgroupBarrier();
+}
+
+fn values_of(place: u32, splat: Staged, passes: u32, labels: vec4u) -> vec4f {
+    return staged_values[place];
 }
 
 // Peak of the blending weight.

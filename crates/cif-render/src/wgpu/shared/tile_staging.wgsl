@@ -1,6 +1,13 @@
 // Splats of a tile in workgroup memory, in order, with the quadrants that each pass draws them in: two bits per
 // quadrant, 0 and 1 above, 2 and 3 below. The module says which passes it draws, `drawn_passes`, and where the values of
-// a Gaussian begin and end, `row_range`.
+// a Gaussian begin and end, `row_range`; its own bindings follow those below.
+
+#import view
+#import splat
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> splats: array<Splat>;
+@group(0) @binding(2) var<storage, read> entries: array<vec4u>;
+@group(0) @binding(3) var<storage, read> tile_ranges: array<vec2u>;
 
 const STAGED: u32 = 16u;
 // Bits of the instance pass.

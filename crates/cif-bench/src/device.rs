@@ -1,4 +1,4 @@
-//! GPU times of the stages of a step, beside the least that they could take: `cif bench step --backend wgpu`.
+//! GPU times of the stages of a step, beside the least that they could take.
 
 use std::time::Duration;
 
@@ -6,13 +6,13 @@ use cif_render::wgpu::{DeviceSpeed, Gpu};
 use cif_train::wgpu::floors::{StepShape, floor};
 use serde_json::{Value, json};
 
-use crate::error::Error;
+use crate::Error;
 
 /// Stages of one step and what they took, in the order in which they ran.
-pub(super) type StageTimes = Vec<(&'static str, Duration)>;
+pub type StageTimes = Vec<(&'static str, Duration)>;
 
 /// Steps on a GPU.
-pub(super) struct OnDevice {
+pub struct OnDevice {
     name: String,
     subgroups: String,
     speed: DeviceSpeed,
@@ -34,12 +34,10 @@ struct StageRow {
 impl OnDevice {
     /// From the stages of every measured step, what they worked on, and the mean wall time of a step here and on the
     /// processor.
-    pub(super) fn new(
-        gpu: &Gpu,
-        steps: &[StageTimes],
-        shape: &StepShape,
-        step_ms: [f64; 2],
-    ) -> Result<Self, Error> {
+    ///
+    /// # Errors
+    /// When the speed of the device cannot be measured.
+    pub fn new(gpu: &Gpu, steps: &[StageTimes], shape: &StepShape, step_ms: [f64; 2]) -> Result<Self, Error> {
         let speed = DeviceSpeed::measure(gpu).map_err(Error::plain)?;
         Ok(Self {
             name: format!("{} ({})", gpu.facts().name, gpu.facts().interface),
@@ -50,7 +48,9 @@ impl OnDevice {
         })
     }
 
-    pub(super) fn json(&self) -> Value {
+    /// As JSON.
+    #[must_use]
+    pub fn json(&self) -> Value {
         let stages: Vec<Value> = self
             .stages
             .iter()
@@ -79,7 +79,8 @@ impl OnDevice {
         })
     }
 
-    pub(super) fn print(&self) {
+    /// Prints them as a table.
+    pub fn print(&self) {
         println!(
             "\n{}: {:.1} GB/s by a copy, {:.1} GFLOP/s by multiplying and adding; subgroups are {}",
             self.name,
@@ -91,8 +92,9 @@ impl OnDevice {
         if self.stages.is_empty() {
             println!("it has no timestamps, so its stages are not timed");
         } else {
-            let mut table =
-                super::table(["stage on the device", "ms", "floor ms", "of floor", "by", "MB", "MFLOP"]);
+            let heading = ["stage on the device", "ms", "floor ms", "of floor", "by", "MB", "MFLOP"];
+            let mut table = comfy_table::Table::new();
+            table.load_style(comfy_table::presets::NOTHING).set_header(heading);
             for row in &self.stages {
                 table.add_row([
                     row.name.to_owned(),

@@ -6,8 +6,7 @@ use cif_train::Curve;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::error::Error;
-use crate::output;
+use crate::error::{Error, write_file};
 
 /// A measured rung.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -82,7 +81,7 @@ impl Folder {
     /// When it cannot be written.
     pub fn keep(&self, id: &str, record: &Record) -> Result<(), Error> {
         let text = serde_json::to_string_pretty(record).expect("records are plain data");
-        output::write_file(&self.file(&format!("{id}.json")), text.as_bytes())
+        write_file(&self.file(&format!("{id}.json")), text.as_bytes())
     }
 }
 

@@ -1,6 +1,7 @@
 //! A light point cloud standing in for the splats.
 
-use crate::{PointProxy, Splats, extent::SIGMAS};
+use super::extent::SIGMAS;
+use crate::{PointProxy, Splats};
 
 /// Picks at most `count` splats, spread over the node and denser where the splats are more important.
 ///

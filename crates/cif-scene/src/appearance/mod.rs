@@ -5,15 +5,17 @@
 //! Where the trained ones leave them by more than [`crate::SceneOptions::appearance_tolerance`], samples stand beside
 //! them, no more than linear interpolation needs to stay inside the tolerance.
 
+pub(crate) mod visibility;
+
 use cif_field::gaussians::SH_FLOATS;
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use glam::DQuat;
 use rayon::prelude::*;
 
+use crate::build::frames::Frames;
 use crate::build::sigmoid;
-use crate::frames::Frames;
 use crate::graph::{Appearance, AppearanceSample, Motion, is_visible_at, pose_at};
-use crate::keys;
+use crate::motion::keys;
 use crate::{Node, VisibilitySample};
 
 /// Opacities over time.

@@ -7,7 +7,7 @@ use cif_geometry::{LensDistortion, PixelGrid, RigidTransform};
 use glam::{DMat3, DVec3};
 use image::{ImageBuffer, Luma, Rgb};
 
-use crate::error::Error;
+use crate::Error;
 
 /// Loss of quality that a change may cost.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -4,18 +4,19 @@ use cif_field::{Field, Gaussians, Identities};
 use cif_geometry::RigidTransform;
 use glam::DVec3;
 
-use crate::assignment::Identity;
+use crate::build::assignment::Identity;
+use crate::build::frames::Frames;
 use crate::build::sigmoid;
-use crate::choose::Chosen;
-use crate::dense::positive_scales;
-use crate::frames::Frames;
 use crate::graph::{
     Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part, PartsMotion,
     SHARES_PER_SPLAT, Splats,
 };
+use crate::motion::choose::Chosen;
+use crate::motion::dense::positive_scales;
 use crate::motion::{MeanShape, MovingGroup, ResidualSum, add_turns_between, trimmed_box, vector};
+use crate::naming;
 use crate::report::{MotionReport, ResidualStatistics};
-use crate::{extent, naming};
+use crate::shape::extent;
 
 /// Kind, names and class of a node.
 pub(crate) struct Naming {

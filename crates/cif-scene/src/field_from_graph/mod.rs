@@ -17,7 +17,7 @@ use cif_geometry::{Bounds, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::graph::{AppearanceSample, DenseMotion, Motion, Node, NodeKind, PoseSample, SceneGraph, pose_at};
-use crate::time_map::TimeMap;
+use crate::motion::time_map::TimeMap;
 use crate::{CameraTrack, SceneError};
 
 /// Turns below this leave spherical harmonics as they are, radians.

@@ -2,13 +2,13 @@
 
 use cif_geometry::{RigidTransform, quaternion};
 
-use crate::extent;
-use crate::frames::Frame;
+use crate::build::frames::Frame;
 use crate::graph::DenseSample;
-use crate::keys;
+use crate::motion::keys;
+use crate::motion::placement::{angle_between, normalized_lerp};
 use crate::motion::{MovingGroup, dot, quaternion_of, trimmed_rms, vector};
-use crate::placement::{angle_between, normalized_lerp};
-use crate::proxy::systematic;
+use crate::shape::extent;
+use crate::shape::proxy::systematic;
 
 /// Relative change of a scale over time that makes scales sampled.
 const SAME_SCALE: f64 = 1e-4;

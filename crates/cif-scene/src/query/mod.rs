@@ -1,5 +1,8 @@
 //! Nodes by label.
 
+pub mod label_pattern;
+pub mod search;
+
 use cif_geometry::Bounds;
 use serde::Serialize;
 

@@ -7,15 +7,25 @@
 //!
 //! Parts of a body are groups of their own, with the same two passes.
 
+pub(crate) mod choose;
+pub(crate) mod dense;
+pub mod keys;
+pub(crate) mod loose;
+pub mod parts;
+pub mod placement;
+pub mod procrustes;
+pub(crate) mod time_map;
+pub mod velocity;
+
 use cif_geometry::{RigidTransform, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::PoseSample;
-use crate::frames::Frame;
-use crate::keys::one_hemisphere;
-use crate::procrustes::{residuals, robust_procrustes, weighted_quantile};
-use crate::proxy::systematic;
+use crate::build::frames::Frame;
+use crate::motion::keys::one_hemisphere;
+use crate::motion::procrustes::{residuals, robust_procrustes, weighted_quantile};
 use crate::report::{ResidualStatistics, TimeResidual};
+use crate::shape::proxy::systematic;
 
 /// Most points that a pose is fitted to; residuals are taken over all.
 const FIT_POINTS: usize = 4096;
@@ -33,7 +43,7 @@ pub struct MovingGroup {
     pub pivot: DVec3,
     /// True when one rigid body may be fitted; the background is not one body.
     pub is_body: bool,
-    /// True where all but the outliers stand still as far as a picture shows ([`crate::loose`]).
+    /// True where all but the outliers stand still as far as a picture shows ([`crate::motion::loose`]).
     pub stands_still: bool,
     /// Share of the weight that may be outliers.
     pub trim: f64,
@@ -135,7 +145,7 @@ impl MeanShape {
 /// weight that it is taken over; zero without weight.
 ///
 /// The value at the edge counts with the part of its weight that is inside, so that smaller values never give
-/// a larger RMS, and the triangle inequality holds (see [`crate::keys`]).
+/// a larger RMS, and the triangle inequality holds (see [`crate::motion::keys`]).
 pub(crate) fn trimmed_rms(distances: &[f64], weights: &[f64], trim: f64) -> (f64, f64) {
     let total: f64 = weights.iter().sum();
     if total <= 0.0 {

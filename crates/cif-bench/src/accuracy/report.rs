@@ -11,8 +11,7 @@ use super::ladders::{BASE, Ladder, Work};
 use super::pareto::{Climb, amount, front, sentence};
 use super::plots::{Plot, Series, svg};
 use super::record::{Folder, Record};
-use crate::error::Error;
-use crate::output;
+use crate::error::{Error, write_file};
 
 /// Subject of a report: capture, command and processor.
 #[derive(Clone, Debug)]
@@ -128,12 +127,12 @@ pub fn write(folder: &Path, rungs: &Folder, subject: &Subject, measured: &Measur
     let rows = rows(measured);
     let plots = plots(measured, &rows);
     for (name, _, text) in &plots {
-        output::write_file(&folder.join(format!("{name}.svg")), text.as_bytes())?;
+        write_file(&folder.join(format!("{name}.svg")), text.as_bytes())?;
     }
-    output::write_file(&folder.join("report.json"), format!("{:#}\n", json_of(subject, &rows)).as_bytes())?;
-    output::write_file(&folder.join("rungs.csv"), csv(&rows).as_bytes())?;
+    write_file(&folder.join("report.json"), format!("{:#}\n", json_of(subject, &rows)).as_bytes())?;
+    write_file(&folder.join("rungs.csv"), csv(&rows).as_bytes())?;
     let page = page(rungs, subject, measured, &rows, &plots)?;
-    output::write_file(&folder.join("report.html"), page.as_bytes())
+    write_file(&folder.join("report.html"), page.as_bytes())
 }
 
 fn json_of(subject: &Subject, rows: &[Row<'_>]) -> Value {

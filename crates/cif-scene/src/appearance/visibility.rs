@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use cif_field::Field;
 
 use crate::VisibilitySample;
-use crate::time_map::TimeMap;
+use crate::motion::time_map::TimeMap;
 
 /// Changes of visibility of rows of a field: they are seen while any of them is. Empty where they always are.
 pub(crate) fn of_rows(field: &Field, rows: &[u32]) -> Vec<VisibilitySample> {

@@ -7,7 +7,7 @@
 //! fitting motions and choosing parts, and the best way is kept. Gaussians that several parts fit equally well
 //! follow their neighbours, so that parts hang together.
 //!
-//! Nothing is drawn at random. Outliers weigh in by the kernel of [`crate::procrustes`]; they make no parts
+//! Nothing is drawn at random. Outliers weigh in by the kernel of [`crate::motion::procrustes`]; they make no parts
 //! of their own unless they are many enough.
 
 use cif_geometry::RigidTransform;
@@ -16,10 +16,10 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
-use crate::frames::Frame;
+use crate::build::frames::Frame;
+use crate::motion::procrustes::{weighted_procrustes, weighted_quantile};
 use crate::motion::{trimmed_rms, vector};
-use crate::procrustes::{weighted_procrustes, weighted_quantile};
-use crate::proxy::systematic;
+use crate::shape::proxy::systematic;
 
 /// Gaussians that parts are found from.
 const SAMPLED_GAUSSIANS: usize = 512;

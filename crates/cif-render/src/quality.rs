@@ -5,8 +5,9 @@ use std::borrow::Cow;
 use cif_field::Field;
 use cif_geometry::scalar::logit;
 use cif_geometry::{PinholeCamera, PixelGrid};
-use cif_render::cpu::Renderer;
-use cif_render::{Channels, InstanceImage, RenderSettings, RenderedImage};
+
+use crate::cpu::Renderer;
+use crate::{Channels, InstanceImage, RenderSettings, RenderedImage};
 
 /// Shortcuts of a render.
 #[derive(Clone, Copy, Debug, PartialEq)]

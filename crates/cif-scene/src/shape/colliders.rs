@@ -13,8 +13,8 @@ use cif_geometry::quaternion;
 use glam::DVec3;
 use nalgebra::Matrix3;
 
-use crate::convex_hull::{self, HullMesh};
-use crate::procrustes::weighted_quantile;
+use crate::motion::procrustes::weighted_quantile;
+use crate::shape::convex_hull::{self, HullMesh};
 use crate::{ConvexHull, Motion, Node, Splats};
 
 /// Share of the opacity, and of what is seen, that colliders hold at least: what strays and what few corners cut off

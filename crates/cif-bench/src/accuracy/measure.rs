@@ -6,10 +6,11 @@ use cif_dataset::{Dataset, Split};
 use cif_field::{Checkpoint, Field};
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::quality::Quality;
 use cif_render::{Channels, RenderSettings, RenderedImage, reference};
 use cif_scene::{ExportOptions, SceneFormat, SceneOptions, Tolerance};
 use cif_train::metrics::image::psnr;
-use cif_train::metrics::{EvaluationError, EvaluationOptions, Scores, evaluate, trained_settings};
+use cif_train::metrics::{EvaluationError, EvaluationOptions, FrameView, Scores, evaluate, trained_settings};
 use cif_train::{
     Clock, Control, Outcome, Seconds, Start, Stop, SystemClock, TrainConfig, TrainError, Trainer,
 };
@@ -18,12 +19,7 @@ use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 
 use super::record::{Folder, Record};
-use crate::error::Error;
-use crate::formats;
-use crate::interrupt;
-use crate::output;
-use crate::pictures::{Picture, instance_picture, rgb_picture};
-use crate::quality::Quality;
+use crate::error::{Error, write_file};
 
 /// An error that evaluation can pass on.
 struct Failure(Error);
@@ -44,13 +40,20 @@ pub struct Training<'a> {
     pub config: TrainConfig,
 }
 
-/// Trains a rung, going on where it was interrupted. The scene and its time; none when interrupted now.
+/// An 8-bit display-referred picture.
+type Picture = PixelGrid<[u8; 3]>;
+
+/// Draws a view as pictures, each with what is put behind the identifier of the rung to name it.
+pub type Draw<'a> = &'a dyn Fn(&FrameView<'_>) -> Vec<(&'static str, Picture)>;
+
+/// Trains a rung, going on where it was interrupted. The scene and its time; none when `stop` says so.
 ///
 /// # Errors
 /// When a setting cannot work, or training fails.
 pub fn train(
     folder: &Folder,
     training: Training<'_>,
+    stop: &Stop,
     tell: &mut dyn FnMut(u64, u64),
 ) -> Result<Option<(Field, Record)>, Error> {
     let partial = folder.file(&format!("{}.partial.cif", training.id));
@@ -58,7 +61,7 @@ pub fn train(
         true => Checkpoint::load(&partial).ok(),
         false => None,
     };
-    let start = || Start { dataset: training.dataset.clone(), stop: Stop::when(interrupt::requested) };
+    let start = || Start { dataset: training.dataset.clone(), stop: stop.clone() };
     let resumed = begun.and_then(|checkpoint| Trainer::resume(start(), checkpoint).ok());
     let mut trainer = match resumed {
         // Settings may have changed since.
@@ -114,6 +117,7 @@ pub fn score(
     dataset: &Dataset,
     id: &str,
     folder: &Folder,
+    draw: Draw<'_>,
     record: &mut Record,
 ) -> Result<(), Error> {
     let shown = shown_frame(dataset).map(|index| dataset.frames[index].name.clone());
@@ -122,14 +126,10 @@ pub fn score(
         if Some(&view.frame.name) != shown.as_ref() {
             return Ok(());
         }
-        let mut keep = |name: String, picture: &Picture| -> Result<(), Failure> {
-            save(&folder.file(&name), picture).map_err(Failure)?;
+        for (suffix, picture) in draw(&view) {
+            let name = format!("{id}{suffix}.png");
+            save(&folder.file(&name), &picture).map_err(Failure)?;
             record.pictures.push(name);
-            Ok(())
-        };
-        keep(format!("{id}.png"), &rgb_picture(&view.rendered.color))?;
-        if let (Some(ids), Some(layers)) = (view.predicted, &view.rendered.instances) {
-            keep(format!("{id}.instances.png"), &instance_picture(ids, &layers.foreground))?;
         }
         Ok(())
     })
@@ -154,7 +154,7 @@ fn save(path: &Path, picture: &Picture) -> Result<(), Error> {
     PngEncoder::new(&mut bytes)
         .write_image(picture.pixels.as_flattened(), picture.width, picture.height, ExtendedColorType::Rgb8)
         .map_err(|error| Error::plain(format!("cannot encode {}: {error}", path.display())))?;
-    output::write_file(path, &bytes)
+    write_file(path, &bytes)
 }
 
 /// Saves the captured picture of the frame that all rungs show.
@@ -320,7 +320,7 @@ pub fn export(field: &Field, tolerance: Tolerance, record: &mut Record) -> Resul
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
     let format: &dyn SceneFormat = &cif_gltf::Gltf;
-    let options = formats::held_by(format, &SceneOptions { tolerance, ..SceneOptions::default() });
+    let options = format.held(&SceneOptions { tolerance, ..SceneOptions::default() });
     let clock = SystemClock::start();
     let start = clock.now();
     let graph = cif_scene::build(field, &options).map_err(Error::plain)?;

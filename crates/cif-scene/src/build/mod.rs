@@ -1,20 +1,26 @@
 //! From a field to a scene graph.
 
+pub mod assignment;
+pub mod camera_tracks;
+pub mod frames;
+pub(crate) mod node;
+pub mod source;
+
 use cif_field::{Field, Gaussians};
 use cif_geometry::quaternion;
 use glam::DVec3;
 
+use crate::appearance::visibility;
 use crate::appearance::{self, Opacities, Thinning};
-use crate::assignment::Identity;
-use crate::frames::{Frame, Frames};
+use crate::build::assignment::Identity;
+use crate::build::frames::{Frame, Frames};
+use crate::build::node::{Naming, NodeInput};
+use crate::build::source::FieldMotion;
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::motion::{MovingGroup, trimmed_box, vector};
-use crate::node::{self, Naming, NodeInput};
-use crate::source::FieldMotion;
-use crate::{
-    MotionModel, MotionSource, SceneError, SceneOptions, assignment, camera_tracks, choose, colliders, loose,
-    naming, proxy, visibility, world,
-};
+use crate::motion::{choose, loose};
+use crate::shape::{colliders, proxy};
+use crate::{MotionModel, MotionSource, SceneError, SceneOptions, naming, world};
 
 /// Share of an instance's weight that may be outliers when a motion model is chosen.
 const INSTANCE_TRIM: f64 = 0.05;

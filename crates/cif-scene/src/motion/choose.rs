@@ -7,12 +7,12 @@ use cif_geometry::RigidTransform;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::dense;
-use crate::frames::{Frame, Frames};
+use crate::build::frames::{Frame, Frames};
 use crate::graph::{DenseSample, PoseSample, pose_at};
-use crate::keys::{self, Moments};
+use crate::motion::dense;
+use crate::motion::keys::{self, Moments};
+use crate::motion::parts::{self, Partition};
 use crate::motion::{MovingGroup, ResidualSum, trimmed_box};
-use crate::parts::{self, Partition};
 use crate::{MotionModel, SceneOptions};
 
 /// Partitions that are fitted to all Gaussians and times before a group is given up to dense motion.

@@ -1,0 +1,7 @@
+//! Solids and points around what a node shows.
+
+pub mod colliders;
+pub mod convex_hull;
+pub mod extent;
+pub mod level_of_detail;
+pub mod proxy;
