@@ -196,8 +196,8 @@ impl MotionTruth {
     }
 
     /// Step of each of `times` (normalised, ascending), which are those of the frames `frames` of the capture. Times
-    /// count where they are the same on both sides; layouts that normalise time otherwise (Neu3D divides by the number
-    /// of frames) are matched frame by frame instead.
+    /// count where they are the same on both sides; layouts that normalise time otherwise (Neu3D divides by the
+    /// number of frames) are matched frame by frame instead.
     #[must_use]
     pub fn steps_at(&self, times: &[f64], frames: &[usize]) -> Vec<Option<usize>> {
         let step_at = |time: f64| self.times.iter().position(|step| (step - time).abs() < SAME_TIME);

@@ -27,7 +27,8 @@ const NEIGHBOURS: usize = 3;
 /// Log-scales are clamped to this range when activated, as the renderer does (methods reference 7, row 14).
 pub const LOG_SCALE_RANGE: (f32, f32) = (-20.0, 10.0);
 
-/// Logit beyond that of the smallest positive number in single precision: its sigmoid is 0, and that of its opposite 1.
+/// Logit beyond that of the smallest positive number in single precision: its sigmoid is 0, and that of its
+/// opposite 1.
 const SATURATED_LOGIT: f64 = 104.0;
 
 /// Raw logit of a probability; finite for 0 and 1 too, where the sigmoid of it is 0 and 1 again in single precision.

@@ -74,7 +74,8 @@ impl PinholeCamera {
         (p.z > 0.0).then(|| (self.focal_px * DVec2::new(p.x, p.y) / p.z + self.principal_px, p.z))
     }
 
-    /// Column and row of the pixel that shows a world point; `None` where it is behind the camera or beyond the image.
+    /// Column and row of the pixel that shows a world point; `None` where it is behind the camera or beyond the
+    /// image.
     #[must_use]
     pub fn pixel_of(&self, point_in_world: DVec3) -> Option<[u32; 2]> {
         let (pixel, _) = self.project(point_in_world)?;

@@ -51,8 +51,8 @@ impl RigidTransform {
     }
 }
 
-/// Angle of the rotation that turns one rotation into the other, radians, 0 to pi; exact near zero, where the arc cosine
-/// of the trace is not.
+/// Angle of the rotation that turns one rotation into the other, radians, 0 to pi; exact near zero, where the arc
+/// cosine of the trace is not.
 #[must_use]
 pub fn angle_between(a: &DMat3, b: &DMat3) -> f64 {
     let chord = (*a - *b).to_cols_array().iter().map(|value| value * value).sum::<f64>().sqrt();

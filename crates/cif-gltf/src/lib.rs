@@ -14,8 +14,8 @@
 //! Layout of a file: the node `World` brings our axes and units to those of glTF; below it stand one node per
 //! instance, one for the background, and `Cameras`. A rigid instance is a mesh of one point primitive with
 //! splats; one that moves in parts has a child node per part. One animation holds all motion. Splats carry the
-//! attributes [`ROW`], [`OCCUPANCY`], [`IDENTITY`], [`INSTANCE_IDS`] and [`INSTANCE_SHARES`] besides those of the extension, so that an edited file can
-//! be traced home.
+//! attributes [`ROW`], [`OCCUPANCY`], [`IDENTITY`], [`INSTANCE_IDS`] and [`INSTANCE_SHARES`] besides those of the
+//! extension, so that an edited file can be traced home.
 //!
 //! Proxies and colliders of the graph are not written: the points of the splats stand in where the extension is
 //! not known.

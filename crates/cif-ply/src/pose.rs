@@ -9,8 +9,8 @@ use glam::{DQuat, DVec3};
 use std::ops::Range;
 
 /// The splats of a node at a time code, world frame: centres, orientations and spherical harmonics are turned with
-/// the node and its parts, opacities and colours are those of the time. Dense motion takes its nearest sample. Visibility
-/// does not count.
+/// the node and its parts, opacities and colours are those of the time. Dense motion takes its nearest sample.
+/// Visibility does not count.
 #[must_use]
 pub fn world_splats(node: &Node, time_code: f64) -> Splats {
     let pose = pose_at(node.track(), node.pivot, time_code);

@@ -1,5 +1,6 @@
-//! Long work beside the interpreter: it runs in a thread of its own, while the thread that asked for it answers signals
-//! and callbacks. So signals stay with the handlers that the program has, and Ctrl-C is a `KeyboardInterrupt`.
+//! Long work beside the interpreter: it runs in a thread of its own, while the thread that asked for it answers
+//! signals and callbacks. So signals stay with the handlers that the program has, and Ctrl-C is a
+//! `KeyboardInterrupt`.
 
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;

@@ -174,22 +174,23 @@ impl Run {
 
 /// Train a field on a capture, and return it.
 ///
-/// dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes, at
-/// the end of each stage and in the end, its settings beside it; without, it is only returned.
+/// dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes,
+/// at the end of each stage and in the end, its settings beside it; without, it is only returned.
 ///
 /// preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as the
 /// capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are single
-/// settings by their keys in the settings file, dotted or as dictionaries: {"stages.fine": 500} or {"stages": {"fine":
-/// 500}}. seed makes runs repeatable: same seed and settings, same field. backend is "cpu", "wgpu" (a GPU) or "auto".
+/// settings by their keys in the settings file, dotted or as dictionaries: {"stages.fine": 500} or {"stages":
+/// {"fine": 500}}. seed makes runs repeatable: same seed and settings, same field. backend is "cpu", "wgpu" (a GPU)
+/// or "auto".
 ///
 /// callback is called in this thread with a dictionary for each event of the run; its "event" is "stage_started",
 /// "step" (every report.step_every steps: stage, iteration, iterations, loss, psnr, gaussians, eta_s), "evaluated",
 /// "warning", "finished" and more. When it returns False the run stops and the field as it is then is returned. An
-/// exception in it stops the run and is raised, as is KeyboardInterrupt on Ctrl-C. In all three cases the run is saved
-/// to output first, and resume=True goes on with it, with the settings of the file.
+/// exception in it stops the run and is raised, as is KeyboardInterrupt on Ctrl-C. In all three cases the run is
+/// saved to output first, and resume=True goes on with it, with the settings of the file.
 ///
-/// An output that exists is refused without force or resume. Raises CifError when the capture, a setting or the output
-/// is not as it should be. Other Python threads run meanwhile.
+/// An output that exists is refused without force or resume. Raises CifError when the capture, a setting or the
+/// output is not as it should be. Other Python threads run meanwhile.
 #[pyfunction]
 #[pyo3(signature = (dataset, output=None, *, preset=None, effects=None, settings=None, seed=None, backend="cpu",
                     callback=None, resume=false, force=false))]

@@ -16,8 +16,8 @@ pub struct Gradients {
     pub mlp: Vec<f32>,
     /// Gradient of each entry of `Identities::log_calibrations`; empty without identities.
     pub log_calibrations: Vec<f32>,
-    /// Gradients by the poses of groups that move as a whole, group after group, by turns in the frame of the group and
-    /// translations in the world, summed over views between two keys by their shares; empty without tracks.
+    /// Gradients by the poses of groups that move as a whole, group after group, by turns in the frame of the group
+    /// and translations in the world, summed over views between two keys by their shares; empty without tracks.
     pub poses: Vec<PoseGradient>,
     /// Views of the step that each pose was a key of.
     pub pose_views: Vec<u32>,

@@ -2,8 +2,8 @@
 //!
 //! A Gaussian of a group has its centre x, quaternion q and harmonics s in the frame of the group; posed they are
 //! `X = R (x - p) + c`, `Q = r q` and the turned harmonics. A turn is differentiated by a tangent vector w of
-//! `R exp(w)`, in the frame of the group, where all it takes is what reaches the Gaussians in that frame; by the tangent of
-//! `exp(w) R`, in the world, it is `R` times that.
+//! `R exp(w)`, in the frame of the group, where all it takes is what reaches the Gaussians in that frame; by the
+//! tangent of `exp(w) R`, in the world, it is `R` times that.
 
 use std::sync::OnceLock;
 

@@ -71,8 +71,8 @@ pub trait SceneFormat: Sync {
     /// Writes a graph: beside its place, and then moved there.
     ///
     /// # Errors
-    /// A name that does not fit, a missing folder, a file there that is not ours (without [`ExportOptions::force`]), a
-    /// graph that the format does not hold, disk full. Nothing existing is touched then.
+    /// A name that does not fit, a missing folder, a file there that is not ours (without [`ExportOptions::force`]),
+    /// a graph that the format does not hold, disk full. Nothing existing is touched then.
     fn write(
         &self,
         graph: &SceneGraph,
@@ -86,11 +86,12 @@ pub trait SceneFormat: Sync {
     /// Missing, damaged or foreign files without splats.
     fn read(&self, path: &Path, options: ReadOptions) -> Result<SceneGraph, FormatError>;
 
-    /// Gives an object of a file another label, and another class where one is given. `object` is a mask value or what
-    /// the file calls it. The result takes the place of `output`, which may be `path` itself.
+    /// Gives an object of a file another label, and another class where one is given. `object` is a mask value or
+    /// what the file calls it. The result takes the place of `output`, which may be `path` itself.
     ///
     /// # Errors
-    /// No such object or several, formats without labels, and as [`SceneFormat::read`]. Nothing existing is touched then.
+    /// No such object or several, formats without labels, and as [`SceneFormat::read`]. Nothing existing is touched
+    /// then.
     fn relabel(
         &self,
         path: &Path,
@@ -207,8 +208,8 @@ pub struct ExportOptions {
     pub time_code: Option<f64>,
     /// Formats of one moment: a file per object, in a folder.
     pub split: bool,
-    /// Formats of one moment: a file per sampled time code, numbered by it, in a folder; with `split`, in a folder per
-    /// object.
+    /// Formats of one moment: a file per sampled time code, numbered by it, in a folder; with `split`, in a folder
+    /// per object.
     pub sequence: bool,
 }
 

@@ -288,7 +288,8 @@ pub struct DenseMotion {
     pub samples: Vec<DenseSample>,
 }
 
-/// Splats of a node at one time code; between samples centres and scales are interpolated linearly; arrays parallel to [`Node::splats`].
+/// Splats of a node at one time code; between samples centres and scales are interpolated linearly; arrays parallel
+/// to [`Node::splats`].
 #[derive(Clone, Debug, PartialEq)]
 pub struct DenseSample {
     /// Time code.
@@ -358,8 +359,8 @@ pub type IdentityShares = [IdentityShare; SHARES_PER_SPLAT];
 pub struct IdentityShare {
     /// Mask value of the instance; 0 for an unused place.
     pub id: u16,
-    /// Probability of the instance times the share of the splat's image that was labelled at all: what is missing to 1
-    /// over all instances was seen outside of every mask.
+    /// Probability of the instance times the share of the splat's image that was labelled at all: what is missing to
+    /// 1 over all instances was seen outside of every mask.
     pub share: f32,
 }
 
@@ -379,8 +380,8 @@ impl Splats {
         self.means.is_empty()
     }
 
-    /// Adds splats; the higher degree of the two is kept, the other is filled up with zeros, and so are identities that
-    /// only one of them has.
+    /// Adds splats; the higher degree of the two is kept, the other is filled up with zeros, and so are identities
+    /// that only one of them has.
     pub fn append(&mut self, mut more: Self) {
         if self.is_empty() {
             *self = more;

@@ -116,8 +116,8 @@ impl FromStr for FrameRange {
 pub struct SceneOptions {
     /// Largest residual of a simplified motion. Default 0.2 % of the instance size.
     pub tolerance: Tolerance,
-    /// Largest RMS error of opacities and colours that change over time, in units of opacity and of spherical-harmonics
-    /// coefficients; 0 keeps them at every sampled frame. Default 0.01.
+    /// Largest RMS error of opacities and colours that change over time, in units of opacity and of
+    /// spherical-harmonics coefficients; 0 keeps them at every sampled frame. Default 0.01.
     pub appearance_tolerance: f64,
     /// The most expensive motion model that may be chosen; what is lost is only reported then. `rigid` keeps
     /// every instance a rigid body; `parts` is for formats that hold no dense motion. Default dense.
@@ -127,8 +127,8 @@ pub struct SceneOptions {
     /// Gaussians below this occupancy are left out. Default 0: none.
     pub min_occupancy: f32,
     /// Gaussians whose instance mass (occupancy times probability of the most probable instance) is below
-    /// this are background, unless they are enclosed by an instance (see [`crate::build::assignment`]). Default 0: the
-    /// share of labelled pixels decides alone. Colour is drawn by opacity, so that many splats of an object keep
+    /// this are background, unless they are enclosed by an instance (see [`crate::build::assignment`]). Default 0:
+    /// the share of labelled pixels decides alone. Colour is drawn by opacity, so that many splats of an object keep
     /// occupancies near their start of 0.02; a threshold above leaves their colour behind when the object moves.
     pub background_threshold: f32,
     /// Most rigid parts of an instance, 2 to 64; what needs more becomes dense. Default 8.

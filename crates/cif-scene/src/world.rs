@@ -1,8 +1,9 @@
 //! Where a graph lies in the world of its capture.
 //!
 //! Captures far from their origin, or in units far from metres, are trained in a frame of their own, where single
-//! precision is fine enough (see [`cif_dataset::CaptureFrame`]). Graphs keep it: `x_graph = scale (x_world - offset)`.
-//! Files place the whole scene, each in its way, and queries answer in the world.
+//! precision is fine enough (see [`cif_dataset::CaptureFrame`]). Graphs keep it:
+//! `x_graph = scale (x_world - offset)`. Files place the whole scene, each in its way, and queries answer in the
+//! world.
 
 use cif_dataset::CaptureFrame;
 use cif_field::Field;

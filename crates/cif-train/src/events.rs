@@ -164,8 +164,8 @@ pub enum TrainEvent {
         /// One sentence.
         message: String,
     },
-    /// A checkpoint is wanted now: `report.checkpoint_seconds` or `report.checkpoint_every` says so, a stage has ended,
-    /// or [`Control::Save`] was returned.
+    /// A checkpoint is wanted now: `report.checkpoint_seconds` or `report.checkpoint_every` says so, a stage has
+    /// ended, or [`Control::Save`] was returned.
     CheckpointDue {
         /// Stage.
         stage: Stage,
@@ -208,6 +208,7 @@ pub enum Control {
 pub enum Outcome {
     /// All stages are done.
     Finished,
-    /// The observer or a [`Stop`](crate::Stop) stopped it; [`Trainer::checkpoint`](crate::Trainer::checkpoint) with state can be resumed.
+    /// The observer or a [`Stop`](crate::Stop) stopped it; [`Trainer::checkpoint`](crate::Trainer::checkpoint) with
+    /// state can be resumed.
     Interrupted,
 }

@@ -142,7 +142,7 @@ impl Exposures {
         }
     }
 
-    /// What is recorded in the scene: exposures by camera.
+    /// Exposures by camera, as recorded in the scene.
     pub(crate) fn by_camera(&self) -> BTreeMap<&str, Exposure> {
         self.cameras.iter().map(|camera| (camera.as_str(), self.at(camera))).collect()
     }

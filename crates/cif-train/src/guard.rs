@@ -4,8 +4,8 @@
 //! parameters and moments exactly as they were. The run then goes on with the next views, since a single view
 //! may be at fault; after [`MAX_ROLLBACKS_IN_A_ROW`] bad steps it stops.
 //!
-//! [`Trainer::set_debug_validation`](crate::Trainer::set_debug_validation) also looks at every array on the way from the field to the gradients and
-//! back, which tells where the value first appeared.
+//! [`Trainer::set_debug_validation`](crate::Trainer::set_debug_validation) also looks at every array on the way from
+//! the field to the gradients and back, which tells where the value first appeared.
 
 use cif_field::Field;
 use cif_render::Gradients;
@@ -64,7 +64,7 @@ pub(crate) struct Rollbacks {
     pub total: u64,
     /// Since the last good step.
     pub in_a_row: u32,
-    /// What was found last.
+    /// Description of the fault that was found last.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub last: Option<String>,
 }
@@ -144,7 +144,7 @@ pub(crate) fn moment_fault(optimiser: &Optimiser) -> Option<Fault> {
     })
 }
 
-/// What to try next.
+/// Advice for a run that diverged.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Hint {
     /// Look more closely.

@@ -52,7 +52,7 @@ impl Guidance {
         }
     }
 
-    /// What a saved state needs to hold; nothing without guidance.
+    /// Tensors that a saved state has to hold; none without guidance.
     pub(crate) fn tensors(&self) -> Vec<(&'static str, StateTensor)> {
         if self.guide_of.is_empty() {
             return Vec::new();
@@ -71,7 +71,8 @@ impl Guidance {
         ]
     }
 
-    /// What [`Self::tensors`] stored, for `n` Gaussians and as many times as given; `None` when it does not fit.
+    /// Restores what [`Self::tensors`] stored, for `n` Gaussians and `times` captured times; `None` when it does not
+    /// fit.
     pub(crate) fn restore(
         &mut self,
         tensors: &mut BTreeMap<String, StateTensor>,

@@ -35,8 +35,8 @@ impl PoseMoments {
         Self { first: vec![[0.0; WIDTH]; poses], second: vec![[0.0; WIDTH]; poses], steps: vec![0; poses] }
     }
 
-    /// Moves the poses that views were drawn of: turns at `rate` radians, translations at as much of the `sizes` of the
-    /// groups, metres.
+    /// Moves the poses that views were drawn of: turns at `rate` radians, translations at as much of the `sizes` of
+    /// the groups, metres.
     pub(crate) fn step(
         &mut self,
         tracks: &mut Tracks,

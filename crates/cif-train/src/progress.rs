@@ -29,10 +29,10 @@ pub(crate) struct Progress {
     /// Processor time per stage, all threads together, seconds.
     #[serde(default)]
     pub cpu_s: BTreeMap<String, f64>,
-    /// What was reached when.
+    /// Quality over the run, as measured so far.
     #[serde(default)]
     pub curve: Curve,
-    /// What is to be reached.
+    /// Targets of the run, and their state.
     #[serde(default)]
     pub goals: Goals,
     /// Spherical-harmonics degree at the start of the stage.
@@ -46,16 +46,16 @@ pub(crate) struct Progress {
     /// Rung of the ladder of limits that held at the last test for Gaussians that stand still.
     #[serde(default)]
     pub still_rung: u32,
-    /// What the steps worked on.
+    /// Work done by the steps.
     #[serde(default)]
     pub work: Work,
-    /// What each camera makes of colours, where cameras disagree.
+    /// Exposures of the cameras, where there are any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub exposures: Option<Exposures>,
-    /// What was planned for the capture, as recorded.
+    /// Plan that was made for the capture, as recorded.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub effects: Option<serde_json::Value>,
-    /// What is still to follow the last step, where a stop came in between.
+    /// Next part of the work after the last step, where it is not complete.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub after_step: Option<AfterStep>,
     /// True when opacities were reset in this stage.
@@ -72,11 +72,11 @@ pub(crate) struct Progress {
     pub source: Option<Source>,
 }
 
-/// What a run is held to; saved with its state, but for the budget, which is one of a single call.
+/// Goals of a run, saved with its state; the budget is not among them, since it belongs to a single call.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub(crate) struct Goals {
-    /// What is to be reached.
+    /// Values to reach.
     pub targets: Targets,
     /// True when all of it was.
     pub reached: bool,
@@ -84,7 +84,7 @@ pub(crate) struct Goals {
     pub doubted: bool,
 }
 
-/// What follows a step, in order; each is done as a whole or not at all.
+/// Parts of the work that follows a step, in order; each is done as a whole or not at all.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum AfterStep {
@@ -104,11 +104,11 @@ pub(crate) enum AfterStep {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(crate) struct Source {
-    /// What it was called, without its folder.
+    /// Its name, without the folder.
     pub scene: String,
     /// Its Gaussians.
     pub gaussians: usize,
-    /// What it recorded of its own training; null where it recorded nothing.
+    /// Record of its own training; null where it has none.
     pub train: serde_json::Value,
 }
 
@@ -122,7 +122,7 @@ const MAX_STEPS: u64 = 1 << 48;
 const MAX_PSNR: f64 = 100.0;
 
 impl Progress {
-    /// What no run leads to, in progress that was read.
+    /// Description of a value that no run leads to, in progress that was read; `None` where there is none.
     pub(crate) fn problem(&self) -> Option<&'static str> {
         let degrees = [self.sh_start, self.sh_judged, self.sh_cap.unwrap_or(0)];
         let steps = self.steps.values().chain([&self.total_steps]);
@@ -198,7 +198,7 @@ impl Progress {
     }
 }
 
-/// What decides which stages a run has.
+/// Properties of the capture that decide which stages a run has.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Stages {
     /// More than one time.

@@ -31,7 +31,7 @@ pub(crate) struct State {
     pub optimiser: Optimiser,
     /// Moments of the poses of groups.
     pub pose_moments: PoseMoments,
-    /// What the instance stage learns, with its own tensors from the start of that stage on.
+    /// Head that the instance stage trains, with its own tensors from the start of that stage on.
     pub head: Arc<dyn Head>,
     pub head_tensors: HeadTensors,
     /// Sums for densification.

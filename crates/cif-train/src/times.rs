@@ -48,8 +48,8 @@ pub struct StepTimes {
     pub instance_pairs: u64,
 }
 
-/// What the steps of a run worked on, summed over their views: zeros prove what did not run. Steps on a GPU are
-/// not counted.
+/// Work done by the steps of a run, summed over their views: zeros prove what did not run. Steps on a GPU are not
+/// counted.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Work {

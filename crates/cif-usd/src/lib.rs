@@ -18,9 +18,9 @@
 //! `SemanticsLabelsAPI` in the taxonomies `class` (category and human label) and `instance` (unique name),
 //! `CifInstanceAPI` (`schemas/cif`), and the children `Splats` (`ParticleField3DGaussianSplat`), `Proxy` (`Points`
 //! drawn by a `PointInstancer`, purpose proxy) and `Collider` (`Mesh`, purpose guide). Where it moves in parts, every
-//! part is an `Xform` under it with such children of its own. The variant set `lod` chooses how many splats are loaded,
-//! `physics` how simulators treat the instance. Arrays stand in the root layer or, by payload, in one layer per
-//! instance.
+//! part is an `Xform` under it with such children of its own. The variant set `lod` chooses how many splats are
+//! loaded, `physics` how simulators treat the instance. Arrays stand in the root layer or, by payload, in one layer
+//! per instance.
 
 pub mod conventions;
 pub mod error;
@@ -159,8 +159,8 @@ pub fn check_target(path: &Path, options: ExportOptions) -> Result<(), UsdError>
 /// the query's time code, or at the default time.
 ///
 /// # Errors
-/// Missing or unreadable file, no usd-core, bad pattern, layers that are missing or lie outside the stage's folder, more
-/// prims than can be composed, or a label that nothing carries (the error lists those that are known).
+/// Missing or unreadable file, no usd-core, bad pattern, layers that are missing or lie outside the stage's folder,
+/// more prims than can be composed, or a label that nothing carries (the error lists those that are known).
 pub fn query(path: &Path, query: &LabelQuery, options: ReadOptions) -> Result<Vec<LabelMatch>, UsdError> {
     with_usd!(read::query::query(path, query, options))
 }
@@ -213,7 +213,8 @@ pub fn relabel(
 ///
 /// # Errors
 /// Missing or unreadable file, no usd-core, no splats, values that make no sense (the error names the prim),
-/// layers that are missing or lie outside the stage's folder, more prims than can be composed, another layout of ours.
+/// layers that are missing or lie outside the stage's folder, more prims than can be composed, another layout of
+/// ours.
 pub fn read_scene(path: &Path) -> Result<SceneGraph, UsdError> {
     read_scene_with(path, ReadOptions::default())
 }

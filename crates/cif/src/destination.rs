@@ -12,8 +12,8 @@ use crate::error::Error;
 use crate::lock::Lock;
 use crate::output;
 
-/// Bytes by which the contents of a file are recognised. The header of a scene comes first, with the times of its run,
-/// so that no two states are alike.
+/// Bytes by which the contents of a file are recognised. The header of a scene comes first, with the times of its
+/// run, so that no two states are alike.
 const RECOGNISED_BYTES: u64 = 8 << 20;
 
 /// Treatment of a scene that is there when a run begins.

@@ -1,5 +1,5 @@
-//! Requests to stop: Ctrl-C, SIGTERM and SIGHUP where the process is the command's own, else whatever the process asks
-//! through a [`Session`].
+//! Requests to stop: Ctrl-C, SIGTERM and SIGHUP where the process is the command's own, else whatever the process
+//! asks through a [`Session`].
 //!
 //! Until a command has something to save, signals end the process, and remove what it has not finished writing.
 

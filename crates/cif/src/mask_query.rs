@@ -8,8 +8,8 @@
 //!   in the masks would have a vote of an eighth. Chosen are the instances above 1/2, else the best if it is above
 //!   1/5;
 //! - score of a Gaussian: `a_i / d_i`, its part of colour inside the masks;
-//! - rendered mask: `F > A / 2` with `F = sum over the chosen Gaussians of W_i` and the instance coverage A, where the
-//!   pixel belongs to any instance at all (foreground at least 1/2; without it, faint stray occupancy on the
+//! - rendered mask: `F > A / 2` with `F = sum over the chosen Gaussians of W_i` and the instance coverage A, where
+//!   the pixel belongs to any instance at all (foreground at least 1/2; without it, faint stray occupancy on the
 //!   background would count).
 
 use std::collections::BTreeSet;

@@ -221,7 +221,8 @@ pub fn rescue_file(path: &Path) -> io::Result<PathBuf> {
     file.into_temp_path().keep().map_err(|error| error.error)
 }
 
-/// A file that is written piece by piece, to a temporary one in the same folder, which is removed when this is dropped.
+/// A file that is written piece by piece, to a temporary one in the same folder, which is removed when this is
+/// dropped.
 pub(crate) struct NewFile {
     path: PathBuf,
     new: cif_output::NewFile,

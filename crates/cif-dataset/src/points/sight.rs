@@ -7,8 +7,8 @@ use crate::{Dataset, PointSource};
 /// Points that are looked for, spread evenly over the cloud.
 const LOOKED_FOR: usize = 2_000;
 
-/// Share of the points that a training camera should show. Reconstructions of large places show a part in few cameras,
-/// but hardly ever less; a cloud in other coordinates than the cameras is often seen not at all.
+/// Share of the points that a training camera should show. Reconstructions of large places show a part in few
+/// cameras, but hardly ever less; a cloud in other coordinates than the cameras is often seen not at all.
 const FEWEST_SEEN: f64 = 0.02;
 
 /// Warning where the training cameras see next to none of the initial points.

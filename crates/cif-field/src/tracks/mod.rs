@@ -11,8 +11,8 @@
 //!    with it, and so does the view-dependent colour,
 //! 4. not drawn while the group is hidden.
 //!
-//! Between samples, translations, dense samples, opacities and colours are linear and rotations spherical; outside the samples the
-//! nearest one holds. Times are normalised as in [`crate::Timeline`].
+//! Between samples, translations, dense samples, opacities and colours are linear and rotations spherical; outside
+//! the samples the nearest one holds. Times are normalised as in [`crate::Timeline`].
 
 mod apply;
 
@@ -193,8 +193,8 @@ impl TrackGroup {
         (a.rotation.slerp(b.rotation, fraction), a.translation.lerp(b.translation, fraction))
     }
 
-    /// Keys that decide the pose at a time, with their shares, which sum to 1; the same one twice at a key. `None` without
-    /// poses.
+    /// Keys that decide the pose at a time, with their shares, which sum to 1; the same one twice at a key. `None`
+    /// without poses.
     #[must_use]
     pub fn keys(&self, time: f64) -> Option<[(usize, f64); 2]> {
         let last = self.poses.len().checked_sub(1)?;
@@ -244,7 +244,8 @@ impl Tracks {
         self.groups.iter().map(|group| group.poses.len()).sum()
     }
 
-    /// True when groups do nothing but move as a whole, apart from the learned deformation: then poses have gradients.
+    /// True when groups do nothing but move as a whole, apart from the learned deformation: then poses have
+    /// gradients.
     #[must_use]
     pub fn is_rigid(&self) -> bool {
         self.groups.iter().all(|group| !group.deformed && !group.has_samples())

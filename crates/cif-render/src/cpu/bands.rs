@@ -18,8 +18,8 @@ impl Band {
 }
 
 /// Bands of a view from top to bottom, each as high as fits into a budget in bytes: `tile_bytes` for every tile, and
-/// those of the (tile, splat) pairs of the rectangles around the drawn ellipses, of which real pairs are a part. A row
-/// of tiles that does not fit is drawn in parts; a part has at least one tile.
+/// those of the (tile, splat) pairs of the rectangles around the drawn ellipses, of which real pairs are a part. A
+/// row of tiles that does not fit is drawn in parts; a part has at least one tile.
 pub(super) fn bands(splats: &[Splat], whole: TileRegion, tile_bytes: u64, budget: u64) -> Vec<Band> {
     let row_bytes = u64::from(whole.columns) * tile_bytes;
     let pairs = pairs_along(1, splats, &whole);

@@ -59,8 +59,8 @@ impl BlendCotangents {
     }
 }
 
-/// Writes the gradients of the values of every entry, `[entries, C]`, and with `WEIGHTS` of its splat, to the strength
-/// of the blending and to that geometry.
+/// Writes the gradients of the values of every entry, `[entries, C]`, and with `WEIGHTS` of its splat, to the
+/// strength of the blending and to that geometry.
 #[simd]
 pub(super) fn blend_tile_backward<S: Simd, const WEIGHTS: bool>(
     simd: S,

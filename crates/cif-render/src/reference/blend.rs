@@ -45,8 +45,8 @@ fn contributors<'a, R: Real>(
     found
 }
 
-/// Blends values over an image of `width` x `height`. `splats` are indexed by Gaussian, `order` lists the visible ones
-/// front to back.
+/// Blends values over an image of `width` x `height`. `splats` are indexed by Gaussian, `order` lists the visible
+/// ones front to back.
 #[must_use]
 pub fn blend<R: Real>(
     splats: &[Option<Splat2d<R>>],
@@ -80,8 +80,8 @@ pub struct BlendGradients<R> {
 /// Backward pass of [`blend`]: `v_blended` is the gradient by the image, `[height, width, C]`. With `weights`, the
 /// gradient also goes through the blending weights, to the strength (opacity or occupancy) and to that geometry.
 ///
-/// `v_v_i = T_i alpha_i v_B`; with `e_i = v_B . v_i` and `B_i = alpha_{i+1} e_{i+1} + (1 - alpha_{i+1}) B_{i+1}`, what
-/// lies behind i as it were seen without i and all before it, `v_alpha_i = T_i (e_i - B_i)`.
+/// `v_v_i = T_i alpha_i v_B`; with `e_i = v_B . v_i` and `B_i = alpha_{i+1} e_{i+1} + (1 - alpha_{i+1}) B_{i+1}`,
+/// what lies behind i as it were seen without i and all before it, `v_alpha_i = T_i (e_i - B_i)`.
 #[must_use]
 pub fn blend_backward<R: Real>(
     splats: &[Option<Splat2d<R>>],

@@ -135,8 +135,8 @@ impl Gpu {
     }
 
     /// Opens the best adapter: discrete before integrated before virtual before software. The environment variable
-    /// `WGPU_ADAPTER_NAME` restricts the choice to adapters whose name contains it, and `CIF_GPU_FEATURES` what is used
-    /// of them, see [`GpuFeatures::from_environment`].
+    /// `WGPU_ADAPTER_NAME` restricts the choice to adapters whose name contains it, and `CIF_GPU_FEATURES` what is
+    /// used of them, see [`GpuFeatures::from_environment`].
     ///
     /// # Errors
     /// When there is none, when it is below the core limits of WebGPU, or when the driver refuses.

@@ -116,8 +116,9 @@ pub fn gaussians(geometry: &[[f32; GEOMETRY_FLOATS]], sh_coefficients: Vec<[f32;
     Gaussians { sh_coefficients, ..gaussians }
 }
 
-/// Spherical harmonics with the bands above the constant one in 16-bit floats, two to a word: 104 bytes instead of 192.
-/// Rounding is to 11 bits; what is larger than a 16-bit float becomes the largest. Source: methods reference 11.
+/// Spherical harmonics with the bands above the constant one in 16-bit floats, two to a word: 104 bytes instead
+/// of 192. Rounding is to 11 bits; what is larger than a 16-bit float becomes the largest. Source: methods
+/// reference 11.
 #[must_use]
 pub fn packed_sh(sh: &[f32; SH_FLOATS]) -> [u32; PACKED_SH_WORDS] {
     let half = |at: usize| sh.get(at).map_or(0, |value| u32::from(half_bits(*value)));

@@ -1,9 +1,10 @@
 //! Compute kernels from embedded WGSL files.
 //!
 //! A [`Module`] is one WGSL file with what it imports and the bindings it declares, in order. Line by line,
-//! `#import name` is replaced by the snippet of that name, once; snippets may import others. `#paste name` is replaced
-//! each time. Constants and structures that Rust knows are snippets made by [`constants`] and [`structures`], so that
-//! nothing is typed twice; what exists in two forms is chosen for the device, see [`super::workgroup`].
+//! `#import name` is replaced by the snippet of that name, once; snippets may import others. `#paste name` is
+//! replaced each time. Constants and structures that Rust knows are snippets made by [`constants`] and
+//! [`structures`], so that nothing is typed twice; what exists in two forms is chosen for the device, see
+//! [`super::workgroup`].
 //!
 //! A [`Kernel`] is one entry point of a module on a device. [`Commands`] records dispatches, grouped into stages
 //! that are timed on the device where it has timestamps.

@@ -2,10 +2,10 @@
 //!
 //! A view goes through [`Rasterizer::project`] and [`Rasterizer::rasterize`], then
 //! [`Rasterizer::render_instances`] or [`Rasterizer::backward`]; other values per Gaussian through
-//! [`Rasterizer::list_tiles`], which rasterizing begins with, [`Rasterizer::blend`] and [`Rasterizer::blend_backward`].
-//! Each records commands; nothing waits but [`Rasterizer::measure`], which makes room for the pairs of a view. A trainer
-//! does not wait: it reads [`Rasterizer::counts`] when they arrive, and draws a view again whose pairs did not fit, for
-//! it drew nothing.
+//! [`Rasterizer::list_tiles`], which rasterizing begins with, [`Rasterizer::blend`] and
+//! [`Rasterizer::blend_backward`]. Each records commands; nothing waits but [`Rasterizer::measure`], which makes room
+//! for the pairs of a view. A trainer does not wait: it reads [`Rasterizer::counts`] when they arrive, and draws a
+//! view again whose pairs did not fit, for it drew nothing.
 //!
 //! Memory grows with need: per Gaussian 64 + 4 x 9 bytes for a view and 48 + 48 + 192 + 16 for gradients, per pair 40
 //! and 48, per label slot 4, per pixel 32 and 48.
@@ -252,8 +252,8 @@ impl Rasterizer {
         })
     }
 
-    /// Records projection, depth order and tile counts of a view. Views of one rasterizer go into submissions of their
-    /// own, as they share their constants.
+    /// Records projection, depth order and tile counts of a view. Views of one rasterizer go into submissions of
+    /// their own, as they share their constants.
     ///
     /// # Errors
     /// When arrays exceed what the device binds, with the arithmetic.
@@ -820,8 +820,8 @@ impl Rasterizer {
         &self.arrays.colors
     }
 
-    /// Per pixel: blended depth D, probability M_y of the pixel's label, final instance transmittance, and the position
-    /// in the list of the tile after the last splat that supports the label.
+    /// Per pixel: blended depth D, probability M_y of the pixel's label, final instance transmittance, and the
+    /// position in the list of the tile after the last splat that supports the label.
     #[must_use]
     pub fn blended(&self) -> &GpuVec<[f32; 4]> {
         &self.arrays.blended

@@ -94,8 +94,8 @@ impl GpuRenderer {
         self.packed_sh.is_some()
     }
 
-    /// Sets the memory that a band may take beside its (tile, Gaussian) pairs, in bytes, on the device and off it, which
-    /// decides how many rows are drawn at once. Pictures do not depend on it.
+    /// Sets the memory that a band may take beside its (tile, Gaussian) pairs, in bytes, on the device and off it,
+    /// which decides how many rows are drawn at once. Pictures do not depend on it.
     pub fn set_band_memory(&mut self, bytes: u64) {
         self.band_memory = bytes;
     }
@@ -205,8 +205,8 @@ fn pixel_bytes(channels: Channels) -> u64 {
 }
 
 impl Rasterizer {
-    /// Draws a view for looking at or measuring, after what `commands` hold, and reads it; instances where `identities`
-    /// are given. Waits for the device.
+    /// Draws a view for looking at or measuring, after what `commands` hold, and reads it; instances where
+    /// `identities` are given. Waits for the device.
     ///
     /// # Errors
     /// When the view exceeds what the device binds, with the arithmetic; when the device is out of memory or lost.

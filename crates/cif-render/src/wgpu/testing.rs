@@ -32,8 +32,8 @@ pub fn gpu() -> Option<Gpu> {
     }
 }
 
-/// The GPU for a test of kernels that exist in two forms: in the form that it works in, then in the other, where it has
-/// subgroups; that one with constants in uniform blocks, in software too. Empty where [`gpu`] is `None`.
+/// The GPU for a test of kernels that exist in two forms: in the form that it works in, then in the other, where it
+/// has subgroups; that one with constants in uniform blocks, in software too. Empty where [`gpu`] is `None`.
 ///
 /// # Panics
 /// As [`gpu`].

@@ -1,5 +1,5 @@
-//! Parses and validates WGSL modules without a GPU, compares what they declare with what Rust believes, and translates
-//! them for Metal and Direct3D.
+//! Parses and validates WGSL modules without a GPU, compares what they declare with what Rust believes, and
+//! translates them for Metal and Direct3D.
 
 use std::fmt::Write as _;
 
@@ -20,8 +20,8 @@ const MAX_WORKGROUP_BYTES: u32 = 16_384;
 const MAX_INVOCATIONS: u32 = 256;
 
 /// Checks that a module is valid WGSL, without any optional feature and in the form with subgroups, that its bindings
-/// and entry points are the listed ones, that structures lie as in Rust, that every entry point keeps to the core limits
-/// of WebGPU, and that Metal and Direct3D can be given it.
+/// and entry points are the listed ones, that structures lie as in Rust, that every entry point keeps to the core
+/// limits of WebGPU, and that Metal and Direct3D can be given it.
 ///
 /// # Errors
 /// With everything that is wrong, a line each.

@@ -1,7 +1,7 @@
 //! Cooperation of the invocations of a workgroup, in two forms of one interface: through workgroup memory, which
-//! every device has, and by subgroups. A module imports `workgroup`, pastes `lane_builtins` into the parameters of its
-//! entry points and `lane` at their start; which form it gets is the device's. Drivers are not taken at their word: a
-//! device uses subgroups only after known numbers have come out right.
+//! every device has, and by subgroups. A module imports `workgroup`, pastes `lane_builtins` into the parameters of
+//! its entry points and `lane` at their start; which form it gets is the device's. Drivers are not taken at their
+//! word: a device uses subgroups only after known numbers have come out right.
 
 use super::buffers::GpuVec;
 use super::device::Gpu;
@@ -24,8 +24,8 @@ impl Form {
 
     /// Snippets that modules import as `workgroup`, `lane_builtins` and `lane`.
     ///
-    /// Subgroup built-ins are parameters and no members of a structure, for naga 30 misses those in HLSL; and it takes
-    /// no `enable subgroups;`.
+    /// Subgroup built-ins are parameters and no members of a structure, for naga 30 misses those in HLSL; and it
+    /// takes no `enable subgroups;`.
     #[must_use]
     pub fn snippets(self) -> &'static [Snippet; 3] {
         match self {

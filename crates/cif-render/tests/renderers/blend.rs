@@ -1,8 +1,8 @@
 //! C values per Gaussian, blended and differentiated: the reference against central differences in double precision,
 //! then the fast path and the GPU against the reference.
 //!
-//! Differences are taken where the loss is smooth, see `gradients.rs` for what is skipped. Pixels in the boundary band,
-//! see `agreement.rs`, carry no gradient and are not compared.
+//! Differences are taken where the loss is smooth, see `gradients.rs` for what is skipped. Pixels in the boundary
+//! band, see `agreement.rs`, carry no gradient and are not compared.
 
 use cif_field::parameters::{Parameter, TABLE};
 use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};

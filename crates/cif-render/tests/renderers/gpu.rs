@@ -338,8 +338,8 @@ fn compact_pictures_are_within_half_a_level() {
     assert!(least > 5e-5, "the coefficients really are rounded: {least}");
 }
 
-/// Nothing depends on the order in which the device runs workgroups; and subgroups, where they are there, sum integers
-/// alone of what is drawn, so that it is the same without them.
+/// Nothing depends on the order in which the device runs workgroups; and subgroups, where they are there, sum
+/// integers alone of what is drawn, so that it is the same without them.
 #[test]
 fn two_runs_give_the_same_bits() {
     let Some(mut device) = device() else { return };

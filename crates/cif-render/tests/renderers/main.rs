@@ -1,5 +1,5 @@
-//! Views through every renderer: the reference in both precisions, the fast path at every level of vector instructions
-//! that this processor has, and the GPU where there is one (`CIF_TEST_GPU=off|auto|require`).
+//! Views through every renderer: the reference in both precisions, the fast path at every level of vector
+//! instructions that this processor has, and the GPU where there is one (`CIF_TEST_GPU=off|auto|require`).
 //!
 //! | module | holds |
 //! |---|---|

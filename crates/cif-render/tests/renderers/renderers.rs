@@ -28,8 +28,8 @@ pub(crate) struct Seen {
     pub(crate) path: Path,
     /// Colours, `[H, W]`.
     pub(crate) colors: Vec<[f64; 3]>,
-    /// Colour transmittance, blended depth (m), label probability and instance transmittance, `[H, W]`, of renderers that
-    /// keep them.
+    /// Colour transmittance, blended depth (m), label probability and instance transmittance, `[H, W]`, of renderers
+    /// that keep them.
     pub(crate) blended: Option<Vec<[f64; 4]>>,
     /// Mean instance loss with the labelled and the unsupported pixels, of renderers that sum it.
     pub(crate) loss: Option<(f64, usize, usize)>,

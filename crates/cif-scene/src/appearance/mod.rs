@@ -1,9 +1,9 @@
 //! Opacities and colours that change over time.
 //!
-//! A node keeps one opacity and one colour per splat, which stand wherever only one time is read: the mean opacity over
-//! the times at which the node is visible (while any of its Gaussians can be drawn), and the colour at the first time.
-//! Where the trained ones leave them by more than [`crate::SceneOptions::appearance_tolerance`], samples stand beside
-//! them, no more than linear interpolation needs to stay inside the tolerance.
+//! A node keeps one opacity and one colour per splat, which stand wherever only one time is read: the mean opacity
+//! over the times at which the node is visible (while any of its Gaussians can be drawn), and the colour at the first
+//! time. Where the trained ones leave them by more than [`crate::SceneOptions::appearance_tolerance`], samples stand
+//! beside them, no more than linear interpolation needs to stay inside the tolerance.
 
 pub(crate) mod visibility;
 

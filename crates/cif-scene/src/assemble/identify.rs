@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use super::{AssembleError, Copies, Identity, Prim, PrimName};
 use crate::NodeKind;
 
-/// Kind of every prim, and whether it is a copy that got an id of its own: recorded ids stay, others get the lowest free
-/// ones and places behind all recorded ones.
+/// Kind of every prim, and whether it is a copy that got an id of its own: recorded ids stay, others get the lowest
+/// free ones and places behind all recorded ones.
 pub(super) fn kinds(
     prims: &[Prim],
     reserved: &BTreeMap<u16, usize>,

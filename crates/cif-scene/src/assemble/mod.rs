@@ -1,5 +1,5 @@
-//! Scene graphs from what readers find in files: the one place that makes nodes, unique names, ids, extents, baked maps,
-//! mean occupancies and motion models, whatever the format.
+//! Scene graphs from what readers find in files: the one place that makes nodes, unique names, ids, extents, baked
+//! maps, mean occupancies and motion models, whatever the format.
 //!
 //! A reader yields [`Prims`]: named objects with sampled transforms, splats and what the file says about them, in the
 //! frame of the scene. Only the `conventions.rs` of a format swaps axes, before anything comes here.

@@ -47,8 +47,8 @@ impl Track {
         }
     }
 
-    /// Pivot of a frame whose track is `poses`: as recorded, unless the frame stands elsewhere by more than rounding to
-    /// the single precision of files.
+    /// Pivot of a frame whose track is `poses`: as recorded, unless the frame stands elsewhere by more than rounding
+    /// to the single precision of files.
     pub(super) fn pivot(&self, recorded: Option<DVec3>, poses: &[PoseSample]) -> DVec3 {
         let rest = self.rest.translation;
         let holds = |pivot: &DVec3| !poses.is_empty() || pivot.as_vec3() == rest.as_vec3();

@@ -3,16 +3,16 @@
 //! 1. A Gaussian's instance is its most probable one (ties to the lowest index).
 //! 2. It is *background* when the part of its image that was seen on labelled pixels (see
 //!    [`cif_field::Identities::labelled_shares`]) is below that at which the silhouette of its instance is best, or
-//!    when its instance mass gamma = pi p_max is below [`SceneOptions::background_threshold`], where one is asked for.
-//!    Pixels without a label give no loss, so Gaussians outside all masks have identity rows too (methods reference
-//!    4.4, 5.4 and A2).
+//!    when its instance mass gamma = pi p_max is below [`SceneOptions::background_threshold`], where one is asked
+//!    for. Pixels without a label give no loss, so Gaussians outside all masks have identity rows too (methods
+//!    reference 4.4, 5.4 and A2).
 //!
 //!    The silhouette: with d the image of a Gaussian (opacity times area) and s its labelled share, the Gaussians O
 //!    that an instance owns cover sum_O d s of what its masks show and sum_O d (1 - s) beside it. The intersection
-//!    over union of both, sum_O d s / (sum d s + sum_O d (1 - s)) over all Gaussians of the instance, is largest where
-//!    O has those with s > v / (1 + v), v the largest value itself (Dinkelbach's method for ratios). So a compact
-//!    object takes what lies in its masks by about half, and a wire narrower than the Gaussians that draw it takes
-//!    softer ones too, without which it would not be seen.
+//!    over union of both, sum_O d s / (sum d s + sum_O d (1 - s)) over all Gaussians of the instance, is largest
+//!    where O has those with s > v / (1 + v), v the largest value itself (Dinkelbach's method for ratios). So a
+//!    compact object takes what lies in its masks by about half, and a wire narrower than the Gaussians that draw it
+//!    takes softer ones too, without which it would not be seen.
 //! 3. Gaussians inside an object are hardly ever seen, so that they keep their first occupancy. One below the
 //!    threshold that lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of
 //!    that instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.

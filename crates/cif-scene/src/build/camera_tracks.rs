@@ -5,8 +5,8 @@ use cif_field::RecordedCamera;
 use crate::{CameraSample, CameraTrack, naming};
 
 /// One track per camera name; views at one time under one name go to tracks of their own (`name_2`, ...),
-/// trained views first. `time_code` gives the time code of a time index, later ones to later times, `None` outside the
-/// exported range.
+/// trained views first. `time_code` gives the time code of a time index, later ones to later times, `None` outside
+/// the exported range.
 #[must_use]
 pub fn camera_tracks(
     cameras: &[RecordedCamera],

@@ -249,8 +249,8 @@ struct NodeRows {
     moves: Vec<bool>,
 }
 
-/// Rows of every node: instances in the order of the table, then of the background what stands still and what moves, if
-/// the motion may be dense; empty ones left out.
+/// Rows of every node: instances in the order of the table, then of the background what stands still and what moves,
+/// if the motion may be dense; empty ones left out.
 fn rows_of_nodes(
     field: &Field,
     visible: &[u32],

@@ -4,8 +4,8 @@
 //! a group of [`Tracks`] relative to there. Rigid tracks keep their keys; parts are sampled at the keys of both
 //! levels and at all sampled time codes; dense samples stay samples. Instances keep their ids, nodes without
 //! one get the next that is free, and every Gaussian belongs to its node ([`cif_field::Owner`]). Identity rows
-//! that the file has come back; without them Gaussians of instances are certain of theirs, and those of the background
-//! add to no label. Opacities and colours that change become samples of the groups.
+//! that the file has come back; without them Gaussians of instances are certain of theirs, and those of the
+//! background add to no label. Opacities and colours that change become samples of the groups.
 
 use std::collections::{BTreeMap, BTreeSet};
 

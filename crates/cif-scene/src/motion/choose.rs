@@ -195,8 +195,8 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
     FittedParts { order, parts, residual }
 }
 
-/// The cheapest model inside the tolerance, no more expensive than allowed; trembling that no picture shows may be some
-/// tolerances large. Parts that are not chosen stay for
+/// The cheapest model inside the tolerance, no more expensive than allowed; trembling that no picture shows may be
+/// some tolerances large. Parts that are not chosen stay for
 /// the report.
 fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptions) -> MotionModel {
     let limit = options.most_expensive_motion;

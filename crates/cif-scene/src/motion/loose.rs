@@ -1,9 +1,9 @@
 //! Splats that move or deform as far as a picture shows, told from those that stand still.
 //!
 //! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, though
-//! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections and things without a
-//! mask do move. The two leave as nodes of their own: one constant, and one with a path for every splat, so that a few
-//! moving splats neither freeze nor make thousands of others move.
+//! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections
+//! and things without a mask do move. The two leave as nodes of their own: one constant, and one with a path for
+//! every splat, so that a few moving splats neither freeze nor make thousands of others move.
 
 use cif_geometry::quaternion;
 use glam::DVec3;
@@ -12,9 +12,10 @@ use rayon::prelude::*;
 use crate::build::frames::Frames;
 use crate::motion::{dot, vector};
 
-/// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the middle
-/// one of the three: flat splats are seen from their broad side), of its size in logarithms, and of its direction in
-/// radians, as far as it is not round. An image changes by about that share of the splat's contrast at most.
+/// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the
+/// middle one of the three: flat splats are seen from their broad side), of its size in logarithms, and of its
+/// direction in radians, as far as it is not round. An image changes by about that share of the splat's contrast at
+/// most.
 const LEAST_CHANGE: f64 = 0.3;
 
 /// Ranges of place and size of one splat over time, and its largest turn since the first.

@@ -3,8 +3,8 @@
 //! A point of an instance at a first time is carried to another by the splats of the node: the mean over its four
 //! nearest splats at the first time, each moving the point by its own pose. First times are eight, spread evenly over
 //! those at which the instance was seen, and other times are all others at which it was. At times at which it was not
-//! seen nobody can know where it is, so they do not count. Rotations of symmetric objects are not excused: their followed
-//! points tell them apart.
+//! seen nobody can know where it is, so they do not count. Rotations of symmetric objects are not excused: their
+//! followed points tell them apart.
 //!
 //! | module | answers |
 //! |---|---|
@@ -32,8 +32,8 @@ const FIRST_TIMES: usize = 8;
 /// Mean path of the followed points, metres, above which an instance moves.
 const LEAST_PATH: f64 = 1e-4;
 
-/// Errors of motion. Distances are of followed surface points in the world, over all pairs of times; `None` is nothing
-/// to measure.
+/// Errors of motion. Distances are of followed surface points in the world, over all pairs of times; `None` is
+/// nothing to measure.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize)]
 pub struct MotionErrors {
     /// Mean distance between carried and true points, millimetres.

@@ -16,8 +16,8 @@ pub(super) fn reach(turn: DQuat, scale: DVec3) -> DVec3 {
     DVec3::new(axes.row(0).length(), axes.row(1).length(), axes.row(2).length())
 }
 
-/// Box around splats that reach so far along each axis, without the outermost 2 % of the opacity on each side. At least
-/// one splat.
+/// Box around splats that reach so far along each axis, without the outermost 2 % of the opacity on each side. At
+/// least one splat.
 pub(super) fn around(means: &[DVec3], reaches: &[DVec3], opacities: &[f32]) -> Bounds {
     let weights: Vec<f64> = opacities.iter().map(|opacity| f64::from(*opacity).max(LEAST_OPACITY)).collect();
     let side =

@@ -269,8 +269,8 @@ pub struct InstanceConfig {
     pub calibration_limit: f32,
     /// Loss normalisation, `none` (default) or `coverage` (A3).
     pub normalisation: Normalisation,
-    /// Geometry that the instance loss trains, `full`, `means_only` or `off` (A6); default `off`, `full` in the preset
-    /// `paper`.
+    /// Geometry that the instance loss trains, `full`, `means_only` or `off` (A6); default `off`, `full` in the
+    /// preset `paper`.
     pub geometry: InstanceGeometry,
     /// True when the colour loss goes on, default yes (A15).
     pub color_loss: bool,

@@ -47,7 +47,7 @@ pub(crate) struct Views<'a> {
     pub channels: Channels,
 }
 
-/// What computes steps.
+/// Computes the steps of a run.
 pub(crate) trait Engine: Any + Send {
     /// Name of the GPU; `None` for the processor.
     fn gpu_name(&self) -> Option<&str>;
@@ -79,8 +79,8 @@ pub(crate) trait Engine: Any + Send {
     /// Takes the state as changed by the run.
     fn changed(&mut self, what: Changed);
 
-    /// Brings to the state what changes of the set of Gaussians are decided from; with `relocates`, what relocations are
-    /// decided from too. Every step was received.
+    /// Brings to the state what changes of the set of Gaussians are decided from; with `relocates`, what relocations
+    /// are decided from too. Every step was received.
     ///
     /// # Errors
     /// When the engine fails.
@@ -92,8 +92,8 @@ pub(crate) trait Engine: Any + Send {
     /// Moments of the Gaussians follow relocations.
     fn relocate(&mut self, state: &mut State, pairs: &[Pair], relocated: &Relocated);
 
-    /// Takes the changes since [`Self::begin_changes`]; `resets_opacities` tells whether opacities were reset among them.
-    /// `None` when they failed.
+    /// Takes the changes since [`Self::begin_changes`]; `resets_opacities` tells whether opacities were reset among
+    /// them. `None` when they failed.
     ///
     /// # Errors
     /// When the engine fails.

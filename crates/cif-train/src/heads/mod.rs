@@ -1,8 +1,8 @@
 //! Heads: what the instance stage learns about instances, and how pixels tell it back.
 //!
 //! The head of the paper is [`Cif`]. A head of another system declares tensors of its own ([`Parameter`]s, beside the
-//! table of the field), the C values that they give every Gaussian, a loss on these values blended over a view, and how
-//! a blended pixel decodes to a label. Its tensors follow the Gaussians when these are cloned, split, pruned or
+//! table of the field), the C values that they give every Gaussian, a loss on these values blended over a view, and
+//! how a blended pixel decodes to a label. Its tensors follow the Gaussians when these are cloned, split, pruned or
 //! relocated, are saved with the run, and are stepped by the same optimiser, whichever engine blends.
 //!
 //! Source: methods reference 8.
@@ -72,8 +72,8 @@ pub trait ValueHead: Send + Sync {
     fn values_backward(&self, tensors: &mut HeadTensors, field: &Field, time: f64, v_values: &[f32]);
 
     /// Loss of a view. `v_blended`, `[height, width, C]` and zero, becomes its gradient times `weight` by the blended
-    /// values; gradients by tensors that the loss itself uses are added. Labels are dense indices + 1, 0 where there is
-    /// none.
+    /// values; gradients by tensors that the loss itself uses are added. Labels are dense indices + 1, 0 where there
+    /// is none.
     fn loss(
         &self,
         tensors: &mut HeadTensors,

@@ -1,7 +1,8 @@
 //! Check that a capture is the one that a scene was trained on, as far as the scene's record tells.
 //!
-//! Compared is what decides where and when a view shows the scene: poses and times. Image sizes, splits and lenses may
-//! differ, and frames, cameras and masks may be missing or new. A scene without recorded cameras fits every capture.
+//! Compared is what decides where and when a view shows the scene: poses and times. Image sizes, splits and lenses
+//! may differ, and frames, cameras and masks may be missing or new. A scene without recorded cameras fits every
+//! capture.
 
 use cif_dataset::{Dataset, Frame, InstanceLabel, Split};
 use cif_field::{Field, RecordedCamera};
@@ -34,8 +35,8 @@ pub struct Misfit {
     pub message: String,
 }
 
-/// Compares the views of a split, and the instances, with what a scene recorded of its own capture. Nothing is compared
-/// where the scene records no cameras.
+/// Compares the views of a split, and the instances, with what a scene recorded of its own capture. Nothing is
+/// compared where the scene records no cameras.
 #[must_use]
 pub fn misfits(field: &Field, dataset: &Dataset, split: Split) -> Vec<Misfit> {
     let frames: Vec<&Frame> = dataset.frames.iter().filter(|frame| frame.split == split).collect();

@@ -337,8 +337,8 @@ impl<'a> Fit<'a> {
         }
     }
 
-    /// Steps over views in a shuffled order, again and again; `rates` tell those of Gaussians and poses, and the level,
-    /// by the share of the steps done.
+    /// Steps over views in a shuffled order, again and again; `rates` tell those of Gaussians and poses, and the
+    /// level, by the share of the steps done.
     pub(super) fn steps(&mut self, views: &[usize], count: usize, rates: impl Fn(f64) -> (f64, f64, usize)) {
         let mut order = views.to_vec();
         for step in 0..count {

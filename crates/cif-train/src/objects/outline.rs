@@ -7,7 +7,7 @@ use glam::{DMat2, DVec2, DVec3};
 use super::plane::Plane;
 use super::view::{ObjectView, median};
 
-/// How much larger than on the plane a mask may look before the object is taken to be off it.
+/// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
 
 /// Share of the times in contact from which an object is taken to rest on the plane at all times.
@@ -115,8 +115,8 @@ fn median_reading(views: &[&ObjectView], plane: &Plane) -> Option<Reading> {
     })
 }
 
-/// Half height and radius of the upright cylinder, or the ellipsoid, on the plane that fills the extent of a mask along
-/// and across the image of the normal.
+/// Half height and radius of the upright cylinder, or the ellipsoid, on the plane that fills the extent of a mask
+/// along and across the image of the normal.
 fn read(view: &ObjectView, plane: &Plane) -> Option<Reading> {
     let camera = &view.camera;
     let ray = camera.ray(view.centroid);

@@ -1,5 +1,5 @@
-//! How an object starts: ways of turning along its path are tried, the one that explains pixels it was not fitted to is
-//! kept, times that hardly show the object are added, and everything is trained together.
+//! Start of an object: ways of turning along its path are tried, the one that explains pixels it was not fitted to
+//! is kept, times that hardly show the object are added, and everything is trained together.
 
 use std::collections::BTreeMap;
 
@@ -38,7 +38,7 @@ const ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
 /// Roundness of masks from which an object may roll.
 const ROUND: f64 = 0.93;
 
-/// How much better rolling must be than sliding.
+/// Largest error of rolling, relative to that of sliding, at which rolling is preferred.
 const ROLL_GAIN: f64 = 0.97;
 
 /// Error by which rivals must be told apart, relative: of most objects, and of round ones, whose shading prefers no
@@ -54,7 +54,7 @@ const JOINT: usize = 2500;
 /// Pose-only steps of a time that is added.
 const ADDED: usize = 30;
 
-/// How the turns of an object are known.
+/// Evidence for the turns of an object: seen in pictures, or assumed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Rotation {
     /// The pictures tell.
@@ -297,7 +297,8 @@ pub(crate) fn fit_object(
     }))
 }
 
-/// Views to fit to, and views left out: a camera in the middle where there are several at a time, else every fourth time.
+/// Views to fit to, and views left out: a camera in the middle where there are several at a time, else every fourth
+/// time.
 fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) -> (Vec<usize>, Vec<usize>) {
     if reliable.len() > good.len() {
         let mut cameras: Vec<[i64; 3]> = reliable.iter().map(|view| views[*view].camera_key).collect();

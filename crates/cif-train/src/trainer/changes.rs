@@ -22,7 +22,7 @@ const RANGE: [u8; 2] = [8, 24];
 const WINDOW: u32 = 2;
 const FEWEST_PIXELS: u32 = 3;
 
-/// What is seen to happen at a point.
+/// Change that the cameras see at a point.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sight {
     /// No camera has it in its image.
@@ -89,7 +89,7 @@ impl Changes {
         Ok(Self { views })
     }
 
-    /// What the cameras see at a point of the world.
+    /// Classifies a point of the world by the change that the cameras see there.
     pub(super) fn at(&self, point: [f32; 3]) -> Sight {
         let point = DVec3::from(point.map(f64::from));
         let (mut seen, mut changing) = (0, 0);

@@ -43,13 +43,13 @@ fn trainer_with(gpu: Option<&Gpu>, edit: impl FnOnce(&mut TrainConfig)) -> (Trai
     (trainer, folder)
 }
 
-/// What steps change, brought to the host.
+/// Field, optimiser, statistics and exposures, after fetching them to the host.
 fn state(trainer: &mut Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
     trainer.fetch().unwrap();
     host(trainer)
 }
 
-/// What the host has of it.
+/// The same as the host holds them, without fetching.
 fn host(trainer: &Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
     let exposures = trainer.state.progress.exposures.clone().unwrap();
     (

@@ -1,6 +1,7 @@
-//! What has to show that it helps: degrees of spherical harmonics and the optional outputs of the deformation. They
-//! are judged on pixels of training views that the colour loss leaves out, at half of the fine stage: sooner they
-//! have not learnt what they are worth, and later nothing is left to make good for what is taken back.
+//! Judgement of degrees of spherical harmonics and of the optional outputs of the deformation, which have to show
+//! that they help. They are judged on pixels of training views that the colour loss leaves out, at half of the fine
+//! stage: sooner they have not learnt what they are worth, and later nothing is left to make good for what is taken
+//! back.
 
 use cif_field::deformation::HeadKind;
 use cif_field::parameters::MLP;
@@ -39,8 +40,8 @@ impl Trainer {
             || self.tests_to_come(stage, iteration)
     }
 
-    /// True when a step keeps the pixels that are judged by out of the colour gradient of a frame of the capture: while
-    /// anything is still to be judged, and where the frame is one of those that are judged by.
+    /// True when a step keeps the pixels that are judged by out of the colour gradient of a frame of the capture:
+    /// while anything is still to be judged, and where the frame is one of those that are judged by.
     pub(super) fn leaves_out_judged(&self, stage: Stage, iteration: u32, frame: usize) -> bool {
         judged_views(self.state.frames.len()).any(|view| self.state.frames.index(view) == frame)
             && self.judges(stage, iteration)
@@ -166,8 +167,8 @@ impl Trainer {
         Ok(())
     }
 
-    /// Mean squared colour error of the field, or of a `trial` in its stead, over the held-out pixels of evenly spread
-    /// training views.
+    /// Mean squared colour error of the field, or of a `trial` in its stead, over the held-out pixels of evenly
+    /// spread training views.
     pub(super) fn judged_error(
         &mut self,
         trial: Option<&Field>,
@@ -199,7 +200,7 @@ impl Trainer {
 /// A field without an output of its deformation.
 struct Trial {
     field: Field,
-    /// What the output took of the network's floats.
+    /// Range of the removed output in the floats of the full network.
     removed: std::ops::Range<usize>,
 }
 

@@ -15,7 +15,7 @@ use crate::error::TrainError;
 use crate::stage::Stage;
 use crate::times::StepTimes;
 
-/// Whether the steps of the instance stage blend identities.
+/// Switch for the blending of identities in the steps of the instance stage.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum InstancePass {
     /// As in training.

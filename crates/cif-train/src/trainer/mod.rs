@@ -91,7 +91,7 @@ use crate::times::{StepTimes, Work};
 /// Names that a warning lists at most.
 const MOST_NAMES: usize = 8;
 
-/// What is told of frames that were left out.
+/// Warning that names the frames left out of training; `None` without such frames.
 fn misfit_warning(dataset: &Dataset, left_out: &[usize]) -> Option<String> {
     let names: Vec<&str> =
         left_out.iter().take(MOST_NAMES).map(|index| dataset.frames[*index].name.as_str()).collect();
@@ -314,8 +314,8 @@ impl Trainer {
         self.state.progress.effects = Some(plan);
     }
 
-    /// Trains another head in the instance stage than the one of the paper. A run that was saved in or behind that stage
-    /// goes on with the head that it was saved with.
+    /// Trains another head in the instance stage than the one of the paper. A run that was saved in or behind that
+    /// stage goes on with the head that it was saved with.
     ///
     /// # Errors
     /// When the run was saved with another head.
@@ -329,7 +329,7 @@ impl Trainer {
         self.clock = clock;
     }
 
-    /// What the run reached when, so far.
+    /// Quality of the field over the run, as measured so far.
     #[must_use]
     pub fn curve(&self) -> &Curve {
         &self.state.progress.curve
@@ -354,7 +354,7 @@ impl Trainer {
         self.state.times
     }
 
-    /// What the steps of the whole run worked on, over interruptions.
+    /// Work done by the steps of the whole run, including those before interruptions.
     #[must_use]
     pub fn work(&self) -> Work {
         self.state.progress.work
@@ -366,7 +366,7 @@ impl Trainer {
     }
 }
 
-/// What an observer may look at during an event.
+/// Read access to the trainer for an observer during an event.
 pub struct TrainerView<'a> {
     pub(crate) trainer: &'a Trainer,
 }

@@ -1,4 +1,4 @@
-//! What the deformation network does to Gaussians over time: measured, held against limits, and taken out of it.
+//! Motion that the deformation network gives Gaussians: measured, held against limits, and taken out of it.
 
 use std::collections::BTreeMap;
 
@@ -15,15 +15,15 @@ const CHUNK: usize = 4_096;
 /// Side of the cells in which Gaussians have neighbours, relative to the extent.
 const AROUND: f32 = 0.02;
 
-/// Cells from the origin up to which neighbouring cells are told apart: whole numbers beyond are not all exact in double
-/// precision. What lies farther away is put into the last cell.
+/// Cells from the origin up to which neighbouring cells are told apart: whole numbers beyond are not all exact in
+/// double precision. What lies farther away is put into the last cell.
 const FARTHEST_CELL: f64 = 9.0e15;
 
 /// Share of its neighbours that must move for a Gaussian to be kept awake, and fewest of them.
 const RESTLESS: f64 = 0.2;
 const FEWEST_MOVING: u32 = 3;
 
-/// What the network does to a Gaussian over the probe times.
+/// Mean and spread of the deltas that the network gives a Gaussian over the probe times.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct Motion {
     /// Mean of the deltas.
@@ -125,7 +125,7 @@ fn set_still(field: &mut Field, motions: &[Motion], to: bool, wanted: impl Fn(us
     changed
 }
 
-/// What the network does to rows over some times, whether they stand still or not.
+/// Motions that the network gives rows over some times, also rows that are marked as still.
 pub(super) fn probe(
     deformation: &Deformation,
     gaussians: &Gaussians,

@@ -1,4 +1,5 @@
-//! Objects that move as a whole: fitted before the fine stage, given Gaussians in a group that moves by trained poses.
+//! Objects that move as a whole: fitted before the fine stage, given Gaussians in a group that moves by trained
+//! poses.
 
 use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose, Tracks};
 use glam::DVec3;

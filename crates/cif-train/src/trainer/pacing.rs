@@ -70,7 +70,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// What the run is to reach.
+    /// Targets of the run.
     #[must_use]
     pub fn targets(&self) -> Targets {
         self.state.progress.goals.targets
@@ -208,7 +208,7 @@ impl Trainer {
         Some(message)
     }
 
-    /// What to say of targets at the end; none when there are none or all were reached.
+    /// Message about the targets missed at the end; `None` when there are no targets or all were reached.
     pub(super) fn missed_targets(&self) -> Option<String> {
         let goals = &self.state.progress.goals;
         if goals.targets.is_empty() || goals.reached {

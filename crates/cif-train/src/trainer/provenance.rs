@@ -1,4 +1,4 @@
-//! How a field came about, as recorded in it.
+//! Record of the training run that produced a field, stored with the field.
 
 use cif_field::{Drawing, Record, Run};
 use serde_json::{Map, Value, json};

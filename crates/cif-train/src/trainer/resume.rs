@@ -41,7 +41,7 @@ pub(super) struct SavedState {
     pub(super) adam_steps: BTreeMap<String, u32>,
 }
 
-/// What must be equal for a run to go on.
+/// Properties of the capture that must be equal for a saved run to be resumed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct Capture {

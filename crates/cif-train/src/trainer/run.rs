@@ -1,4 +1,4 @@
-//! How a run goes through its stages, and where it may be stopped.
+//! Sequence of the stages of a run, and the points at which it may be stopped.
 
 use std::sync::Arc;
 
@@ -24,7 +24,7 @@ type Observer<'a> = dyn FnMut(&TrainEvent, &TrainerView<'_>) -> Control + 'a;
 /// Share of unsupported pixels from which the user is told (methods reference 4.4).
 const MANY_UNSUPPORTED: f64 = 0.01;
 
-/// What the observer asked for since it was last obeyed.
+/// Requests of the observer that have not been carried out yet.
 #[derive(Default)]
 struct Requests {
     save: bool,
@@ -43,8 +43,8 @@ impl Requests {
 
 impl Trainer {
     /// Runs all stages that are left; `observer` sees every event and may stop the run, as may the
-    /// [`Stop`](crate::Stop) that it was begun with, which is asked between events too. Whatever stops it, the run can
-    /// be saved and resumed.
+    /// [`Stop`](crate::Stop) that it was begun with, which is asked between events too. Whatever stops it, the run
+    /// can be saved and resumed.
     ///
     /// # Errors
     /// When a frame cannot be read, or too many steps in a row leave the finite numbers; the field then still is

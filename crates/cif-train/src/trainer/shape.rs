@@ -8,7 +8,7 @@ use crate::times::StepTimes;
 use crate::wgpu::floors::{DeformationShape, StepShape};
 
 impl Trainer {
-    /// What a step of the present stage works on, mean over measured `steps`. Pixels are those of a mean frame;
+    /// Size of a step of the present stage, mean over measured `steps`. Pixels are those of a mean frame;
     /// evaluated pairs are 0 where none of the steps counts them, as those on a GPU do not.
     #[must_use]
     pub fn step_shape(&self, steps: &[StepTimes]) -> StepShape {

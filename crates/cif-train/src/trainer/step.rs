@@ -101,8 +101,8 @@ impl Trainer {
         drawn.map_err(|error| self.engine_failed(error))
     }
 
-    /// Takes in a step: its losses, or its fault. Too many bad steps in a row end the run, which then stands before the
-    /// last of them.
+    /// Takes in a step: its losses, or its fault. Too many bad steps in a row end the run, which then stands before
+    /// the last of them.
     fn take_in(&mut self, report: StepReport) -> Result<(), TrainError> {
         let StepReport { plan, views, fault } = report;
         let Some(fault) = fault else {
@@ -130,7 +130,7 @@ impl Trainer {
         Err(TrainError::Diverged { stage, iteration, in_a_row, fault, hint })
     }
 
-    /// What changes the field behind a step, from where a stop cut it short.
+    /// Makes the changes of the field that follow a step; goes on where a stop interrupted them.
     pub(super) fn finish_step(
         &mut self,
         stage: Stage,

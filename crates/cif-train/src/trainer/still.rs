@@ -27,11 +27,12 @@ use crate::stage::Stage;
 /// and forth.
 const RELEASE: f32 = 2.0;
 
-/// Where masks tell the travelling objects: loss, dB on held-out pixels, up to which everything else is taken to stand
-/// still on the first test.
+/// Where masks tell the travelling objects: loss, dB on held-out pixels, up to which everything else is taken to
+/// stand still on the first test.
 const TOLD_LOSS: f64 = 0.1;
 
-/// How much longer the fine stage must be for that, so that what settled too early can make up for it.
+/// Fewest steps of the fine stage for that, in steps before the first test: what settled too early needs time to
+/// recover.
 const TOLD_STEPS: f64 = 15.0;
 
 /// Rungs of the ladder of limits, each half of the one above.
@@ -191,7 +192,7 @@ impl Trainer {
         self.state.guidance.knows_what_travels() || self.state.field.tracks.is_some()
     }
 
-    /// What cameras that stay in place see at each Gaussian, where it is in the mean; empty without such cameras.
+    /// Change that cameras which stay in place see at the mean position of each Gaussian; empty without such cameras.
     fn sights(&mut self, motions: &[Motion]) -> Result<Vec<Sight>, TrainError> {
         if !self.shows_changes {
             return Ok(Vec::new());

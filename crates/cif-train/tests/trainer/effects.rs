@@ -27,7 +27,8 @@ fn still_config() -> TrainConfig {
     config
 }
 
-/// Mean score of a run and of another with the next seed: between seeds, runs of so few steps waver by half a decibel.
+/// Mean score of a run and of another with the next seed: between seeds, runs of so few steps waver by half a
+/// decibel.
 fn mean_score(run: &Trainer, config: &TrainConfig) -> f64 {
     let next = TrainConfig { seed: config.seed + 1, ..config.clone() };
     (score(run) + score(&train(run.dataset().clone(), next))) / 2.0

@@ -181,7 +181,8 @@ fn exposures_of_cameras_that_disagree_are_found_as_on_the_processor() {
     }
 }
 
-/// Settings of a few steps under which everything that may be skipped is judged, and outputs and degrees are taken back.
+/// Settings of a few steps under which everything that may be skipped is judged, and outputs and degrees are taken
+/// back.
 fn judging_config() -> TrainConfig {
     let mut config = small_config();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (40, 110, 60);

@@ -25,7 +25,7 @@ const SCORES: Parameter = Parameter {
     on_copy: OnCopy::Same,
 };
 
-/// What every pixel has on top of them.
+/// Biases that every pixel adds to the blended scores.
 const BIAS: Parameter = Parameter { name: "bias", rate: "bias", rows: Rows::Fixed, shape: &[], ..SCORES };
 
 /// Scores of classes, blended like colour, and a softmax over them.

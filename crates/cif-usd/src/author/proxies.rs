@@ -1,8 +1,8 @@
 //! Point proxies: stand-ins that every viewer can draw.
 //!
-//! A simulator that makes a shape of every geometric primitive, as MuJoCo does whatever its purpose, refuses a stage with
-//! bare `Points`. So the points are the prototype of a `PointInstancer` that draws them once, in the form that its
-//! documentation gives: traversals skip prototypes below an `over`, while viewers find them by relationship.
+//! A simulator that makes a shape of every geometric primitive, as MuJoCo does whatever its purpose, refuses a stage
+//! with bare `Points`. So the points are the prototype of a `PointInstancer` that draws them once, in the form that
+//! its documentation gives: traversals skip prototypes below an `over`, while viewers find them by relationship.
 
 use cif_scene::{Motion, Node};
 use pyo3::prelude::*;

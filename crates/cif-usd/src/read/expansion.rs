@@ -8,8 +8,8 @@ use std::rc::Rc;
 /// Most prims of a stage that is opened. usd-core takes some 40 us and 1 KB for each that it composes.
 pub(crate) const MAX_PRIMS: u64 = 250_000;
 
-/// Deepest nesting of prims, a reference counted like a level. usd-core follows both by calling itself, which takes up to
-/// 2 KB of stack a level, and threads have 2 MB; stages of people have a few dozen levels.
+/// Deepest nesting of prims, a reference counted like a level. usd-core follows both by calling itself, which takes
+/// up to 2 KB of stack a level, and threads have 2 MB; stages of people have a few dozen levels.
 pub(crate) const MAX_LEVELS: u32 = 500;
 
 /// A reference, payload, inherit or specialise.

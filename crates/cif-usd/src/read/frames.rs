@@ -181,8 +181,8 @@ impl<'a, 'py> Frames<'a, 'py> {
         }
     }
 
-    /// Exact track of `prim` in the frame of `end` (that of the scene for `None`), where only one prim between them has
-    /// operations, and those are ours.
+    /// Exact track of `prim` in the frame of `end` (that of the scene for `None`), where only one prim between them
+    /// has operations, and those are ours.
     fn exact_between(
         &self,
         prim: &Bound<'py, PyAny>,

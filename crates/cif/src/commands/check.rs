@@ -105,8 +105,8 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
     ))
 }
 
-/// Most pixels of a view in which Gaussians are looked for: 4096 x 4096, which take about 1 GiB. Larger views are looked
-/// at in this size, in which Gaussians appear no less.
+/// Most pixels of a view in which Gaussians are looked for: 4096 x 4096, which take about 1 GiB. Larger views are
+/// looked at in this size, in which Gaussians appear no less.
 const MAX_CHECKED_PIXELS: f64 = 16_777_216.0;
 
 /// The view, at a size at which Gaussians are looked for.

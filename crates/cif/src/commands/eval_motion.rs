@@ -20,7 +20,8 @@ pub(super) struct Motion {
     seconds: f64,
 }
 
-/// Builds the scene graph of a field and measures its motion; `None`, with a warning, where there is nothing to export.
+/// Builds the scene graph of a field and measures its motion; `None`, with a warning, where there is nothing to
+/// export.
 ///
 /// # Errors
 /// When a mask cannot be decoded, or the field is inconsistent.

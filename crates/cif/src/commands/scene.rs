@@ -35,8 +35,8 @@ pub(super) fn frame(field: &Field) -> Result<CaptureFrame, Error> {
     cif_scene::frame_of(field).map_err(Error::plain)
 }
 
-/// Says where a scene lies in the world of its capture, where that is not at its origin; `notes` tell of formats whose
-/// files do not place it.
+/// Says where a scene lies in the world of its capture, where that is not at its origin; `notes` tell of formats
+/// whose files do not place it.
 pub(super) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &'static str>) {
     if frame.is_identity() {
         return;

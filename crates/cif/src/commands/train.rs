@@ -280,8 +280,8 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     logged
 }
 
-/// Checks that no file is written twice or both read and written, but for the settings, which may be those of an earlier
-/// run. [`Destination`] looks at what is there.
+/// Checks that no file is written twice or both read and written, but for the settings, which may be those of an
+/// earlier run. [`Destination`] looks at what is there.
 fn check_outputs(command: &Train) -> Result<(), Error> {
     let settings_path = &command.output.with_extension("train.toml");
     let mut outputs = Outputs::new(command.force || command.resume);

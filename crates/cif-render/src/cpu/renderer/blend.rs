@@ -99,9 +99,9 @@ impl Renderer {
         }
     }
 
-    /// Adds the gradients of the values; returns those of (tile, splat) pairs where they go `through` the weights of a
-    /// blended image to some geometry. The former are kept for as many tiles at a time as the memory of a band holds,
-    /// which changes no sum.
+    /// Adds the gradients of the values; returns those of (tile, splat) pairs where they go `through` the weights of
+    /// a blended image to some geometry. The former are kept for as many tiles at a time as the memory of a band
+    /// holds, which changes no sum.
     fn blend_pairs_backward(
         &self,
         request: &BlendRequest<'_>,
@@ -166,7 +166,8 @@ impl Renderer {
         });
     }
 
-    /// Adds the values of a range of pairs, `[pairs, C]`, to those of their Gaussians, `[N, C]`, in the order of tiles.
+    /// Adds the values of a range of pairs, `[pairs, C]`, to those of their Gaussians, `[N, C]`, in the order of
+    /// tiles.
     fn gather_pairs(
         &self,
         rank_of: &[u32],

@@ -27,7 +27,7 @@ pub(super) const VIEW_WORDS: usize = LOSS_WORDS + GpuStatistics::WORDS + faults:
 /// Words of the losses of a view.
 pub(super) const LOSS_WORDS: usize = 8;
 
-/// What the host knows of a view.
+/// Properties of a view that the host knows without reading from the device.
 #[derive(Clone, Copy)]
 pub(super) struct AboutView {
     pub(super) pixels: usize,
@@ -48,7 +48,7 @@ enum Words {
     Here(Vec<u32>),
 }
 
-/// What arrived of a view.
+/// Properties of a view with the losses, counts and faults that the device returned for it.
 pub(super) struct ViewResult {
     pub(super) about: AboutView,
     pub(super) loss: ViewLoss,

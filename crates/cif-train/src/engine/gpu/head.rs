@@ -22,7 +22,8 @@ pub(super) struct HeadPass {
 }
 
 impl GpuEngine {
-    /// Trains the head of a step, where it blends values of its own; tells a fault that keeps the step from being taken.
+    /// Trains the head of a step, where it blends values of its own; tells a fault that keeps the step from being
+    /// taken.
     pub(super) fn head_pass(
         &mut self,
         state: &mut State,

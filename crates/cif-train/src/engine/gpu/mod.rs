@@ -105,7 +105,7 @@ pub(crate) struct GpuEngine {
     waits: bool,
     /// Times every stage, where the device can.
     timestamps: Option<Timestamps>,
-    /// What they took, until it is asked for.
+    /// Times of the stages, collected until they are taken.
     stage_times: Vec<(&'static str, Duration)>,
 }
 
@@ -158,8 +158,8 @@ fn refuse_too_large(
 }
 
 impl GpuEngine {
-    /// An engine for a capture, its settings, and a field of as many Gaussians with the `deformation` that it has or will
-    /// have.
+    /// An engine for a capture, its settings, and a field of as many Gaussians with the `deformation` that it has or
+    /// will have.
     ///
     /// # Errors
     /// When the scene may grow beyond what the device holds, with the arithmetic; when the driver rejects a kernel.

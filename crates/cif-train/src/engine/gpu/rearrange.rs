@@ -1,6 +1,6 @@
 //! Densification, pruning, opacity resets and relocations with the rows staying on the device. The host decides as it
-//! does for itself, from geometry and statistics, 64 bytes of each Gaussian, and for relocations from the deformation and
-//! the calibrations, too; harmonics and moments, 672 bytes, are moved there.
+//! does for itself, from geometry and statistics, 64 bytes of each Gaussian, and for relocations from the deformation
+//! and the calibrations, too; harmonics and moments, 672 bytes, are moved there.
 
 use cif_field::parameters::{LOG_CALIBRATIONS, OPACITY_LOGITS, OnCopy};
 use cif_render::wgpu::gaussians::{COLUMNS, gaussians, geometry, geometry_column};
@@ -13,7 +13,7 @@ use crate::stage::Stage;
 use crate::state::State;
 use crate::wgpu::rearrange::{GpuRearranger, RowRule};
 
-/// What the host decides from.
+/// Arrays of the device from which the host decides changes.
 struct Basis {
     geometry: Vec<[f32; 12]>,
     statistics: Vec<[f32; 4]>,
@@ -24,8 +24,8 @@ struct Basis {
 }
 
 impl GpuEngine {
-    /// Brings the basis of changes to the state, where the device is ahead of it; colours stay those that were fetched
-    /// last, until the next fetch.
+    /// Brings the basis of changes to the state, where the device is ahead of it; colours stay those that were
+    /// fetched last, until the next fetch.
     pub(super) fn take_basis(&mut self, state: &mut State, relocates: bool) -> Result<(), TrainError> {
         let Some(resident) = self.resident.as_ref().filter(|_| self.ahead) else { return Ok(()) };
         let Basis { geometry, statistics, deformation, calibrations } =

@@ -1,4 +1,4 @@
-//! What lies on the device: the field, its moments and gradients.
+//! Training data on the device: the field, its moments and gradients.
 
 use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES, Parameter, Rows};
 use cif_field::{Gaussians, Identities};
@@ -16,7 +16,7 @@ use crate::state::State;
 use crate::wgpu::exposure::CameraExposures;
 use crate::wgpu::optimiser::GpuMoments;
 
-/// What the host has changed since it was sent.
+/// Parts that the host has changed since they were sent to the device.
 #[derive(Clone, Copy, Debug, Default)]
 pub(super) struct Stale {
     pub(super) gaussians: bool,

@@ -29,7 +29,7 @@ impl GaussianStep {
     }
 }
 
-/// What stops a step whatever moves.
+/// Faults that stop a step regardless of the parameters that it moves.
 const ALWAYS: u32 = fault::NO_ROOM | fault::COLOR_LOSS | fault::INSTANCE_LOSS;
 
 impl GpuEngine {
