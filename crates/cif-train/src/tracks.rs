@@ -133,22 +133,8 @@ pub fn travels(observations: &[Observation]) -> bool {
         })
         .collect();
     misses.sort_by(f64::total_cmp);
-    misses[misses.len() / 2] > TRAVEL || moves_at_times(observations, point)
+    misses[misses.len() / 2] > TRAVEL
 }
-
-/// True when an instance that rests most of the time is elsewhere for a while, by masks that are not cut.
-fn moves_at_times(observations: &[Observation], point: DVec3) -> bool {
-    let uncut: Vec<&Observation> = observations.iter().filter(|o| !o.cut).collect();
-    let away = uncut.iter().filter(|o| {
-        let seen = o.camera.project(point).map(|(pixel, _)| (pixel - o.centroid_px).length());
-        seen.is_none_or(|miss| miss > AWAY * o.radius_px())
-    });
-    uncut.len() >= FEWEST && away.count() as f64 > AWAY_SHARE * uncut.len() as f64
-}
-
-/// Miss in radii, and share of the times, from which an instance moves at times.
-const AWAY: f64 = 0.8;
-const AWAY_SHARE: f64 = 0.2;
 
 /// Median miss of the best fixed point, in radii of the mask, from which an instance travels.
 const TRAVEL: f64 = 0.3;
