@@ -7,7 +7,7 @@ use std::sync::Arc;
 use cif_dataset::Dataset;
 use cif_field::Field;
 use cif_geometry::PixelGrid;
-use cif_render::{Gradients, InstanceSettings, RenderSettings, RenderedImage, UNLABELLED};
+use cif_render::{Blending, Gradients, InstanceSettings, RenderSettings, RenderedImage, UNLABELLED};
 
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
@@ -64,11 +64,12 @@ pub(crate) struct Kept {
 }
 
 impl State {
-    /// Settings of the instance pass; `None` where the head blends values of its own by the weights of colour.
+    /// Settings of the instance pass, or of the weights of a head that blends values of its own by those; `None` where it
+    /// blends them like colour.
     pub(crate) fn instance_settings(&self) -> Option<InstanceSettings> {
         match self.head.pass(&self.config) {
             Pass::Identities(settings) => Some(settings),
-            Pass::Values(_) => None,
+            Pass::Values(head) => (head.blending() == Blending::Own).then(InstanceSettings::default),
         }
     }
 

@@ -64,6 +64,11 @@ impl StepPlan {
         1.0 / self.views.len() as f32
     }
 
+    /// True when a view trains identity rows.
+    pub(crate) fn trains_instances(&self, view: &StepView) -> bool {
+        self.settings.instances.is_some() && !self.trains_head && view.frame.labelled > 0
+    }
+
     /// The head that the step trains, where it blends values of its own.
     pub(crate) fn head<'a>(
         &self,

@@ -119,11 +119,11 @@ impl Processor {
     ) -> Option<Fault> {
         let frame = &state.dataset.frames[view.index];
         let (time, data) = (frame.time, &*view.frame);
-        let with_instances = plan.settings.instances.is_some() && data.labelled > 0;
+        let with_instances = plan.trains_instances(view);
         let labels = data.labels.as_ref().filter(|_| with_instances);
         let with_instances = labels.is_some();
-        let settings =
-            RenderSettings { instances: plan.settings.instances.filter(|_| with_instances), ..plan.settings };
+        let instances = plan.settings.instances.filter(|_| with_instances || plan.trains_head);
+        let settings = RenderSettings { instances, ..plan.settings };
         let pass = self.renderer.forward(&state.field, &frame.camera, time, &settings, labels);
         let mut since = Instant::now();
         let exposure = state.progress.exposures.as_ref().map(|all| all.at(&frame.camera_name));
@@ -318,6 +318,8 @@ impl Engine for Processor {
             let mut rendered =
                 self.renderer.render(field, &frame.camera, frame.time, views.settings, channels);
             if let Some(head) = by_values {
+                // A picture without instances leaves no weights of theirs behind.
+                self.renderer.prepare(field, &frame.camera, frame.time, views.settings);
                 let values = head.values(&state.head_tensors, field, frame.time);
                 let (channels, blending) = (head.channels(field), head.blending());
                 let blended = self.renderer.blend(&BlendRequest { values: &values[..], channels, blending });
