@@ -21,7 +21,7 @@ pub(crate) fn step(
         return Ok(StepReport { plan, views: Vec::new(), fault: Some(fault) });
     }
     let before = (state.field.clone(), state.optimiser.clone(), state.statistics.clone());
-    let exposures = state.progress.exposures.clone();
+    let own = (state.pose_moments.clone(), state.head_tensors.clone(), state.progress.exposures.clone());
     engine.inspect(true);
     let report = inspected(engine, state, plan);
     engine.inspect(false);
@@ -31,7 +31,7 @@ pub(crate) fn step(
     }
     if report.fault.is_some() {
         (state.field, state.optimiser, state.statistics) = before;
-        state.progress.exposures = exposures;
+        (state.pose_moments, state.head_tensors, state.progress.exposures) = own;
         engine.changed(Changed::Everything);
     }
     Ok(report)
