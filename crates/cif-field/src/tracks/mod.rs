@@ -178,19 +178,14 @@ impl TrackGroup {
     /// Turn and place of the pivot at a time.
     #[must_use]
     pub fn pose(&self, time: f64) -> (DQuat, DVec3) {
-        let (Some(first), Some(last)) = (self.poses.first(), self.poses.last()) else {
+        let Some([(before, _), (after, share)]) = self.keys(time) else {
             return (DQuat::IDENTITY, self.pivot);
         };
-        let after = self.poses.partition_point(|pose| pose.time <= time);
-        if after == 0 {
-            return (first.rotation, first.translation);
+        let (a, b) = (&self.poses[before], &self.poses[after]);
+        if before == after {
+            return (a.rotation, a.translation);
         }
-        if after == self.poses.len() {
-            return (last.rotation, last.translation);
-        }
-        let (a, b) = (&self.poses[after - 1], &self.poses[after]);
-        let fraction = (time - a.time) / (b.time - a.time);
-        (a.rotation.slerp(b.rotation, fraction), a.translation.lerp(b.translation, fraction))
+        (a.rotation.slerp(b.rotation, share), a.translation.lerp(b.translation, share))
     }
 
     /// Keys that decide the pose at a time, with their shares, which sum to 1; the same one twice at a key. `None`

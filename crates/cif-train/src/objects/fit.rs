@@ -172,6 +172,12 @@ impl<'a> Fit<'a> {
         }
     }
 
+    /// Reduction at which trials are compared: the last but one, where there are several.
+    pub(super) fn trial_level(&self) -> usize {
+        let levels = self.levels();
+        levels[levels.len().saturating_sub(2)]
+    }
+
     /// Times before and after one that have poses.
     fn neighbours(&self, time: usize) -> [Option<usize>; 2] {
         [

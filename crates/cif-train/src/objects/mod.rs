@@ -51,8 +51,7 @@ pub(crate) fn fit(
         let frame = &dataset.frames[frames.index(k)];
         cameras.push(frame.camera.centre());
         let data = frames.get(dataset, k)?;
-        let Some(labels) = &data.labels else { continue };
-        views.extend(ObjectView::new(label, frame.time_index, &frame.camera, labels, &data.image));
+        views.extend(ObjectView::new(label, frame.time_index, &frame.camera, &data));
     }
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);

@@ -106,6 +106,17 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) stop: &'a Stop,
 }
 
+/// Turns of a ball that rolls without slip from place to place.
+fn rolled(places: &[DVec3], normal: DVec3, radius: f64) -> Vec<DQuat> {
+    let mut rotations = vec![DQuat::IDENTITY];
+    for pair in places.windows(2) {
+        let turn = normal.cross(pair[1] - pair[0]) / radius;
+        let last = rotations[rotations.len() - 1];
+        rotations.push((DQuat::from_scaled_axis(turn) * last).normalize());
+    }
+    rotations
+}
+
 /// Turns along a path of every time, relative to a reference time.
 fn turns(
     way: &Way,
@@ -134,12 +145,7 @@ fn turns(
                 .collect()
         }
         Way::Roll(factor) => {
-            let mut rotations = vec![DQuat::IDENTITY];
-            for pair in places.windows(2) {
-                let turn = *factor / outline.height * normal.cross(pair[1] - pair[0]);
-                let last = rotations[rotations.len() - 1];
-                rotations.push((DQuat::from_scaled_axis(turn) * last).normalize());
-            }
+            let rotations = rolled(&places, normal, outline.height / factor);
             let back = rotations[origin].inverse();
             rotations.into_iter().map(|rotation| rotation * back).collect()
         }
@@ -209,8 +215,7 @@ pub(crate) fn fit_object(
     }
     let advance = |trials: &mut Vec<Trial<'_>>, from: usize, to: usize| {
         trials.par_iter_mut().for_each(|trial| {
-            let levels = trial.fit.levels();
-            let level = levels[levels.len().saturating_sub(2).min(levels.len() - 1)];
+            let level = trial.fit.trial_level();
             trial.fit.steps(&train, to - from, |share| {
                 let done = from as f64 + share * (to - from) as f64;
                 let rate = if done < 0.5 * STEPS[1] as f64 { 1.0 } else { 0.5 };
@@ -234,8 +239,7 @@ pub(crate) fn fit_object(
                 }
             }
         }
-        let levels = trial.fit.levels();
-        let level = levels[levels.len().saturating_sub(2).min(levels.len() - 1)];
+        let level = trial.fit.trial_level();
         let judged = if left_out.is_empty() { &train } else { &left_out };
         trial.losses[1] = trial.fit.mean_loss(judged, level);
     });
@@ -357,16 +361,11 @@ fn roll_along(fit: &mut Fit<'_>, plane: &Plane, radius: f64) {
     let sum: DVec3 =
         (0..g.len()).map(|row| weight(row) * DVec3::from_array(g.means[row].map(f64::from))).sum();
     let middle = sum / total.max(1e-9);
-    let mut rotation = DQuat::IDENTITY;
-    let mut last: Option<DVec3> = None;
-    for pose in fit.poses.values_mut() {
-        let place = pose.rotation * middle + pose.translation;
-        if let Some(last) = last {
-            let turn = plane.normal.cross(place - last) / radius;
-            rotation = (DQuat::from_scaled_axis(turn) * rotation).normalize();
-        }
-        *pose = Pose { rotation, translation: place };
-        last = Some(place);
+    let places: Vec<DVec3> =
+        fit.poses.values().map(|pose| pose.rotation * middle + pose.translation).collect();
+    let rotations = rolled(&places, plane.normal, radius);
+    for ((pose, rotation), translation) in fit.poses.values_mut().zip(rotations).zip(places) {
+        *pose = Pose { rotation, translation };
     }
 }
 

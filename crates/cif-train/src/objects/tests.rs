@@ -1,10 +1,11 @@
 //! Objects whose motion is known, rendered and found again.
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 
 use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
 use cif_field::{Field, Gaussians};
-use cif_geometry::{PinholeCamera, PixelGrid, RigidTransform};
+use cif_geometry::{PinholeCamera, RigidTransform};
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, RenderSettings, synthetic};
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -14,6 +15,7 @@ use super::plane::Plane;
 use super::start::{Fitted, Rotation, Surroundings, fit_object};
 use super::view::{ObjectView, set_visible};
 use super::{outline, plane};
+use crate::frames::TrainFrame;
 use crate::random::{Purpose, stream};
 use crate::stop::Stop;
 
@@ -75,8 +77,8 @@ fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)]) -> Vec<ObjectView> {
         let image = renderer.render(&field, &camera, time(k), &settings, channels);
         let labels = image.alpha.map(|alpha| u16::from(*alpha > 0.5));
         let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
-        let bytes: PixelGrid<[u8; 3]> = bytes;
-        views.extend(ObjectView::new(1, k, &camera, &labels, &bytes));
+        let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0 });
+        views.extend(ObjectView::new(1, k, &camera, &frame));
     }
     set_visible(&mut views);
     views

@@ -1,8 +1,12 @@
 //! An object as one frame shows it: a crop around its mask, at several resolutions.
 
+use std::sync::Arc;
+
 use cif_geometry::{PinholeCamera, PixelGrid};
 use cif_render::UNLABELLED;
 use glam::DVec2;
+
+use crate::frames::TrainFrame;
 
 /// Pixels around the mask that belong to its crop.
 const MARGIN: u32 = 5;
@@ -45,9 +49,8 @@ pub(super) struct ObjectView {
     pub(super) visible: f64,
     /// By reduction: 1, 2, 4.
     pub(super) crops: [Crop; 3],
-    labels: PixelGrid<u16>,
     label: u16,
-    colors: PixelGrid<[u8; 3]>,
+    frame: Arc<TrainFrame>,
 }
 
 /// Finding at a pixel of a frame.
@@ -69,9 +72,9 @@ impl ObjectView {
         label: u16,
         time_index: usize,
         camera: &PinholeCamera,
-        labels: &PixelGrid<u16>,
-        colors: &PixelGrid<[u8; 3]>,
+        frame: &Arc<TrainFrame>,
     ) -> Option<Self> {
+        let (labels, colors) = (frame.labels.as_ref()?, &frame.image);
         let (width, height) = (labels.width, labels.height);
         let is_here = |x: u32, y: u32| *labels.at(x, y) == label;
         let pixels: Vec<[u32; 2]> = (0..height)
@@ -107,9 +110,8 @@ impl ObjectView {
             visible: 1.0,
             crops: [1, 2, 4].map(|factor| crop(factor, label, camera, (low, high), labels, colors)),
             pixels,
-            labels: labels.clone(),
-            colors: colors.clone(),
             label,
+            frame: Arc::clone(frame),
         })
     }
 
@@ -130,8 +132,10 @@ impl ObjectView {
     /// Finding where a point of the world is seen.
     pub(super) fn at(&self, point: glam::DVec3) -> Seen {
         let Some([x, y]) = self.camera.pixel_of(point) else { return Seen::Outside };
-        match *self.labels.at(x, y) {
-            label if label == self.label => Seen::Object(self.colors.at(x, y).map(|c| f32::from(c) / 255.0)),
+        match self.frame.labels.as_ref().map_or(UNLABELLED, |labels| *labels.at(x, y)) {
+            label if label == self.label => {
+                Seen::Object(self.frame.image.at(x, y).map(|c| f32::from(c) / 255.0))
+            }
             UNLABELLED => Seen::Nothing,
             _ => Seen::Other,
         }
