@@ -57,14 +57,26 @@ pub(super) struct Fit<'a> {
     pub(super) poses: BTreeMap<usize, Pose>,
     pub(super) shape: Shape,
     pub(super) turns: Turns,
-    /// True where it is held to rolling without slip.
-    pub(super) rolls: bool,
+    /// Radius, metres, with which it is held to rolling without slip.
+    pub(super) rolls: Option<f64>,
     /// Captured times of the sequence.
     pub(super) times: usize,
+    /// Distance from the camera from which Gaussians are drawn.
+    pub(super) near: f32,
     /// True with one camera per time, so that distances are not observed.
     pub(super) one_camera: bool,
     pub(super) rng: Pcg64,
-    moments: BTreeMap<usize, [Adam; 2]>,
+    /// True where it stands on the plane at times that are not in the air.
+    pub(super) touches: bool,
+    moments: BTreeMap<usize, PoseMoments>,
+}
+
+/// Moments of turns and translations.
+pub(super) type PoseMoments = [Adam; 2];
+
+/// Moments of a pose that has not moved yet.
+pub(super) fn fresh_moments() -> PoseMoments {
+    [Adam::new(3), Adam::new(3)]
 }
 
 /// Tangent vector of a rotation, at most pi long.
@@ -82,16 +94,27 @@ pub(super) fn hull(
     near: f32,
     rng: &mut Pcg64,
 ) -> Option<Shape> {
+    hull_within(views, poses, (size, None), count, near, rng)
+}
+
+/// The same, of places within a bound.
+pub(super) fn hull_within(
+    views: &[ObjectView],
+    poses: &BTreeMap<usize, Pose>,
+    (size, bound): (f64, Option<&dyn Fn(DVec3) -> bool>),
+    count: usize,
+    near: f32,
+    rng: &mut Pcg64,
+) -> Option<Shape> {
     /// Candidates, and the times that they are looked at.
     const CANDIDATES: usize = 6000;
     const TIMES: usize = 12;
     let spread = (poses.len() / TIMES).max(1);
-    let looked: Vec<&ObjectView> = poses
-        .keys()
-        .step_by(spread)
-        .flat_map(|time| views.iter().filter(move |view| view.time_index == *time))
-        .filter(|view| !view.cut && view.visible >= 0.6)
-        .collect();
+    let all = || poses.keys().step_by(spread).flat_map(|t| views.iter().filter(|view| view.time_index == *t));
+    let mut looked: Vec<&ObjectView> = all().filter(|view| !view.cut && view.visible >= 0.6).collect();
+    if looked.is_empty() {
+        looked = all().collect();
+    }
     let mut found: Vec<(f64, [f32; 3], [f32; 3])> = Vec::with_capacity(CANDIDATES);
     for _ in 0..CANDIDATES {
         let direction = loop {
@@ -101,6 +124,9 @@ pub(super) fn hull(
             }
         };
         let place = 1.25 * size * direction;
+        if bound.is_some_and(|bound| !bound(place)) {
+            continue;
+        }
         let (mut inside, mut outside, mut color) = (0.0_f64, 0.0_f64, [0.0_f32; 3]);
         for view in &looked {
             let pose = &poses[&view.time_index];
@@ -133,7 +159,7 @@ impl<'a> Fit<'a> {
     pub(super) fn new(
         views: &'a [ObjectView],
         (plane, outline): (Option<Plane>, &'a Outline),
-        times: usize,
+        (times, near): (usize, f32),
         poses: BTreeMap<usize, Pose>,
         shape: Shape,
         rng: Pcg64,
@@ -142,7 +168,7 @@ impl<'a> Fit<'a> {
             let mut seen = std::collections::BTreeSet::new();
             views.iter().all(|view| seen.insert(view.time_index))
         };
-        let (turns, rolls) = (Turns::Free, false);
+        let (turns, rolls) = (Turns::Free, None);
         Self {
             views,
             plane,
@@ -152,8 +178,10 @@ impl<'a> Fit<'a> {
             turns,
             rolls,
             times,
+            near,
             one_camera,
             rng,
+            touches: true,
             moments: BTreeMap::new(),
         }
     }
@@ -193,6 +221,29 @@ impl<'a> Fit<'a> {
         self.shape.loss(&view.crops[level], pose, GREY, 1.0, false).value
     }
 
+    /// Loss of a view in a pose, by a shape of one's own.
+    pub(super) fn loss_with(&self, shape: &mut Shape, view: usize, level: usize, pose: &Pose) -> f64 {
+        shape.loss(&self.views[view].crops[level], pose, GREY, 1.0, false).value
+    }
+
+    /// A step of a pose that is not among those of the fit yet; the shape stays.
+    pub(super) fn pose_step(
+        &self,
+        shape: &mut Shape,
+        view: usize,
+        level: usize,
+        (pose, moments): (&mut Pose, &mut PoseMoments),
+        rate: f64,
+    ) {
+        let view = &self.views[view];
+        let mut gradient = shape.loss(&view.crops[level], pose, GREY, view.visible as f32, true).pose;
+        if let Some((of_pose, _)) = self.contact(shape, view.time_index, pose) {
+            gradient.turn += of_pose.turn;
+            gradient.translation += of_pose.translation;
+        }
+        *pose = self.moved(pose, &gradient, moments, rate);
+    }
+
     /// Mean loss over views, by their visible shares.
     pub(super) fn mean_loss(&mut self, views: &[usize], level: usize) -> f64 {
         let weights: f64 = views.iter().map(|view| self.views[*view].visible).sum();
@@ -210,29 +261,41 @@ impl<'a> Fit<'a> {
         let loss = self.shape.loss(&view.crops[level], &pose, background, weight, true);
         let mut gradients = BTreeMap::from([(time, loss.pose)]);
         self.accelerate(time, &mut gradients);
-        self.touch(time, &pose, &mut gradients);
+        if let Some((of_pose, of_centres)) = self.contact(&self.shape, time, &pose) {
+            let gradient = gradients.entry(time).or_default();
+            gradient.turn += of_pose.turn;
+            gradient.translation += of_pose.translation;
+            self.shape.add_to_centres(&of_centres);
+        }
         self.roll(time, &mut gradients);
         if let Some(rate) = rate {
             self.shape.step(rate);
         }
-        let size = self.size();
         for (time, gradient) in gradients {
-            let moments = self.moments.entry(time).or_insert_with(|| [Adam::new(3), Adam::new(3)]);
-            let (mut turn, mut shift) = (DVec3::ZERO, DVec3::ZERO);
-            let [of_turns, of_shifts] = moments;
-            let values = |v: DVec3| v.to_array().into_iter();
-            of_turns.step(values(gradient.turn), POSE_RATE * pose_rate, |k, step| turn[k] = -step);
-            let rate = POSE_RATE * pose_rate * size;
-            of_shifts.step(values(gradient.translation), rate, |k, step| shift[k] = -step);
-            turn = match (self.turns, &self.plane) {
-                (Turns::Given, _) => DVec3::ZERO,
-                (Turns::Upright, Some(plane)) => plane.normal * plane.normal.dot(turn),
-                _ => turn,
-            };
-            if let Some(pose) = self.poses.get_mut(&time) {
-                pose.rotation = (DQuat::from_scaled_axis(turn) * pose.rotation).normalize();
-                pose.translation += shift;
-            }
+            let Some(pose) = self.poses.get(&time) else { continue };
+            let mut moments = self.moments.remove(&time).unwrap_or_else(fresh_moments);
+            let moved = self.moved(pose, &gradient, &mut moments, pose_rate);
+            self.moments.insert(time, moments);
+            self.poses.insert(time, moved);
+        }
+    }
+
+    /// A pose after a step against its gradient.
+    fn moved(&self, pose: &Pose, gradient: &PoseGradient, moments: &mut PoseMoments, rate: f64) -> Pose {
+        let (mut turn, mut shift) = (DVec3::ZERO, DVec3::ZERO);
+        let [of_turns, of_shifts] = moments;
+        let values = |v: DVec3| v.to_array().into_iter();
+        of_turns.step(values(gradient.turn), POSE_RATE * rate, |k, step| turn[k] = -step);
+        let rate = POSE_RATE * rate * self.size();
+        of_shifts.step(values(gradient.translation), rate, |k, step| shift[k] = -step);
+        turn = match (self.turns, &self.plane) {
+            (Turns::Given, _) => DVec3::ZERO,
+            (Turns::Upright, Some(plane)) => plane.normal * plane.normal.dot(turn),
+            _ => turn,
+        };
+        Pose {
+            rotation: (DQuat::from_scaled_axis(turn) * pose.rotation).normalize(),
+            translation: pose.translation + shift,
         }
     }
 
@@ -270,13 +333,12 @@ impl<'a> Fit<'a> {
         }
     }
 
-    /// Puts the lowest Gaussians onto the plane at times of contact, where one camera does not tell the distance.
-    fn touch(&mut self, time: usize, pose: &Pose, gradients: &mut BTreeMap<usize, PoseGradient>) {
-        let Some(plane) = self.plane.filter(|_| self.one_camera && !self.outline.air.contains(&time)) else {
-            return;
-        };
+    /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane; `None` at times off
+    /// the plane, and where several cameras tell the distance.
+    fn contact(&self, shape: &Shape, time: usize, pose: &Pose) -> Option<(PoseGradient, Vec<DVec3>)> {
+        let plane = self.plane.filter(|_| self.touches && self.one_camera && !self.outline.air.contains(&time))?;
         let size = self.size();
-        let g = self.shape.gaussians();
+        let g = shape.gaussians();
         let normal = pose.rotation.inverse() * plane.normal;
         let mut heights = Vec::with_capacity(g.len());
         for row in 0..g.len() {
@@ -301,7 +363,7 @@ impl<'a> Fit<'a> {
             .collect();
         let total: f64 = weights.iter().sum();
         if total <= 0.0 || total.is_nan() {
-            return;
+            return None;
         }
         weights.iter_mut().for_each(|weight| *weight /= total);
         let height: f64 = heights.iter().zip(&weights).map(|(height, weight)| height * weight).sum();
@@ -313,17 +375,13 @@ impl<'a> Fit<'a> {
             lever += *weight * (pose.rotation * mean);
             of_centres.push(c * *weight * normal);
         }
-        let gradient = gradients.entry(time).or_default();
-        gradient.translation += c * plane.normal;
-        gradient.turn += c * lever.cross(plane.normal);
-        self.shape.add_to_centres(&of_centres);
+        Some((PoseGradient { turn: c * lever.cross(plane.normal), translation: c * plane.normal }, of_centres))
     }
 
     /// Holds a rolling object to turning as far as it goes.
     fn roll(&self, time: usize, gradients: &mut BTreeMap<usize, PoseGradient>) {
-        let Some(plane) = self.plane.filter(|_| self.rolls) else { return };
+        let (Some(plane), Some(radius)) = (self.plane, self.rolls) else { return };
         let [before, after] = self.neighbours(time);
-        let radius = self.outline.height;
         for (a, b) in [(before, Some(time)), (Some(time), after)] {
             let (Some(a), Some(b)) = (a, b) else { continue };
             let (first, second) = (self.poses[&a], self.poses[&b]);
@@ -347,7 +405,7 @@ impl<'a> Fit<'a> {
     /// level, by the share of the steps done.
     pub(super) fn steps(&mut self, views: &[usize], count: usize, rates: impl Fn(f64) -> (f64, f64, usize)) {
         let mut order = views.to_vec();
-        for step in 0..count {
+        for step in 0..if order.is_empty() { 0 } else { count } {
             let place = step % order.len();
             if place == 0 {
                 order.shuffle(&mut self.rng);

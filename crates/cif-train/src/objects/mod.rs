@@ -8,9 +8,12 @@
 //! | `outline`, `path` | how large an object is, and where it goes |
 //! | `shape` | its Gaussians alone, against crops |
 //! | `fit` | its poses and Gaussians, moved together |
-//! | `start` | how it turns, and everything in order |
+//! | `ways` | which ways of moving are tried |
+//! | `follow` | how it moves from time to time |
+//! | `start` | which way is kept, and everything in order |
 
 mod fit;
+mod follow;
 mod outline;
 mod path;
 mod plane;
@@ -19,6 +22,7 @@ mod start;
 #[cfg(test)]
 mod tests;
 mod view;
+mod ways;
 
 use cif_dataset::Dataset;
 use glam::DVec3;
@@ -57,7 +61,7 @@ pub(crate) fn fit(
     view::set_visible(&mut views);
     let rng = stream(surroundings.seed, Purpose::Objects, 0);
     let tolerance = ON_PLANE * dataset.extent();
-    let Some(plane) = plane::support(&points, &cameras, tolerance, rng) else { return Ok(None) };
-    let Some(outline) = outline::outline(&views, &plane) else { return Ok(None) };
-    start::fit_object(label, &views, &plane, &outline, surroundings)
+    let plane = plane::support(&points, &cameras, tolerance, rng);
+    let Some(outline) = outline::outline(&views, plane.as_ref()) else { return Ok(None) };
+    start::fit_object(label, &views, plane.as_ref(), &outline, surroundings)
 }

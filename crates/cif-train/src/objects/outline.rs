@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DMat2, DVec2, DVec3};
+use glam::{DMat2, DMat3, DVec2, DVec3};
 
 use super::plane::Plane;
 use super::view::{ObjectView, median};
@@ -12,6 +12,11 @@ const AIR: f64 = 1.1;
 
 /// Share of the times in contact from which an object is taken to rest on the plane at all times.
 const GROUNDED: f64 = 0.9;
+
+/// Difference of the apparent size of an object that leaves the plane from that in contact, up to which it touches
+/// the plane, and the fewest times in a row that do.
+const SAME_SIZE: f64 = 0.03;
+const SHORTEST_RUN: usize = 3;
 
 /// Path and size of an object.
 #[derive(Clone, Debug)]
@@ -23,7 +28,7 @@ pub(super) struct Outline {
     pub(super) roundness: f64,
     /// Centre by time.
     pub(super) path: BTreeMap<usize, DVec3>,
-    /// Times at which the object is off the plane.
+    /// Times at which the object is off the plane, or may be.
     pub(super) air: Vec<usize>,
 }
 
@@ -41,8 +46,60 @@ struct Reading {
     roundness: f64,
 }
 
+/// The point nearest to rays through the middles of masks, by weights; `None` where they are parallel.
+pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64)>) -> Option<DVec3> {
+    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
+    for (view, weight) in views {
+        let d = view.camera.ray(view.centroid).normalize();
+        let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
+        normal += weight * across;
+        right += weight * across * view.camera.centre();
+    }
+    (normal.determinant().abs() > 1e-9).then(|| normal.inverse() * right)
+}
+
+/// Outline of the views of an object, on a plane where there is one, or seen by several cameras at a time; `None`
+/// where neither tells where it is.
+pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>) -> Option<Outline> {
+    let met = meetings(views);
+    let mut outline = plane.and_then(|plane| on_plane(views, plane));
+    if met.is_empty() {
+        return outline;
+    }
+    let radius_of = |view: &ObjectView| {
+        let depth = view.camera.project(*met.get(&view.time_index)?)?.1;
+        Some((view.area() / std::f64::consts::PI).sqrt() * depth / view.camera.focal_px.x)
+    };
+    let mut radii: Vec<f64> = views.iter().filter(|view| view.is_whole()).filter_map(radius_of).collect();
+    if radii.is_empty() {
+        radii = views.iter().filter_map(radius_of).collect();
+    }
+    let radius = median(&mut radii);
+    let found = outline.get_or_insert_with(|| Outline {
+        height: radius,
+        radius,
+        roundness: 0.0,
+        path: BTreeMap::new(),
+        air: Vec::new(),
+    });
+    found.air.clear();
+    found.path.extend(met);
+    outline
+}
+
+/// Centres at times that several cameras see, where their rays meet.
+fn meetings(views: &[ObjectView]) -> BTreeMap<usize, DVec3> {
+    let mut times: BTreeMap<usize, Vec<(&ObjectView, f64)>> = BTreeMap::new();
+    for view in views.iter().filter(|view| !view.cut) {
+        let weight = view.visible.powi(2) * (1.0 - 0.9 * view.touched);
+        times.entry(view.time_index).or_default().push((view, weight));
+    }
+    let several = times.into_iter().filter(|(_, views)| views.len() > 1);
+    several.filter_map(|(time, views)| Some((time, meeting_point(views.into_iter())?))).collect()
+}
+
 /// Outline of the views of an object on a plane; `None` where no mask is seen from above.
-pub(super) fn outline(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
+fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
     let whole: Vec<&ObjectView> = match views.iter().filter(|view| view.is_whole()).collect::<Vec<_>>() {
         whole if !whole.is_empty() => whole,
         _ => match views.iter().filter(|view| !view.cut).collect::<Vec<_>>() {
@@ -81,20 +138,23 @@ pub(super) fn outline(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
         let ray = view.camera.ray(view.centroid);
         let Some(mut depth) = plane.meet(view.camera.centre(), ray, medians.height) else { continue };
         let size = implied_size(view, plane, medians.height).unwrap_or(0.0);
-        let in_air = leaves && !view.cut && size > AIR * in_contact;
-        if in_air {
+        if leaves && !view.cut && size > in_contact {
             depth *= in_contact / size;
         }
-        let (sum, weight, air) = sums.entry(view.time_index).or_insert((DVec3::ZERO, 0.0, false));
+        let (sum, weight, touches) = sums.entry(view.time_index).or_insert((DVec3::ZERO, 0.0, false));
         *sum += view.area() * (view.camera.centre() + depth * ray);
         *weight += view.area();
-        *air |= in_air;
+        *touches |= !leaves || (!view.cut && (size / in_contact - 1.0).abs() < SAME_SIZE);
     }
+    let touching: Vec<(usize, bool)> = sums.iter().map(|(time, (_, _, touches))| (*time, *touches)).collect();
+    let runs = touching.chunk_by(|a, b| a.1 == b.1);
+    let off = runs.filter(|run| !run[0].1 || (leaves && run.len() < SHORTEST_RUN));
+    let air: Vec<usize> = off.flatten().map(|(time, _)| *time).collect();
     Some(Outline {
         height: medians.height,
         radius: medians.radius,
         roundness: medians.roundness,
-        air: sums.iter().filter(|(_, (_, _, air))| *air).map(|(time, _)| *time).collect(),
+        air,
         path: sums.into_iter().map(|(time, (sum, weight, _))| (time, sum / weight)).collect(),
     })
 }

@@ -86,7 +86,7 @@ impl Shape {
         let mut gaussians = Gaussians::from_points(places, colors).ok()?;
         let n = gaussians.len();
         // As many as 150 overlap at this size; more are smaller.
-        let spread = START * size * (150.0 / n as f64).cbrt();
+        let spread = START * size * (150.0 / n as f64).sqrt();
         gaussians.log_scales.fill([spread.ln() as f32; 3]);
         gaussians.opacity_logits.fill(0.0);
         let field = Field {
@@ -111,6 +111,19 @@ impl Shape {
             settings: RenderSettings { sh_degree: 0, near, deform: false, ..RenderSettings::default() },
             size,
         })
+    }
+
+    /// The same Gaussians, with an optimiser and a renderer of their own.
+    pub(super) fn copied(&self) -> Self {
+        let n = self.len();
+        Self {
+            field: self.field.clone(),
+            gradients: Gradients::zeros(&self.field),
+            moments: [3 * n, 3 * n, 4 * n, n, 3 * n].map(Adam::new),
+            renderer: Renderer::new(SimdLevel::Auto),
+            settings: self.settings,
+            size: self.size,
+        }
     }
 
     pub(super) fn gaussians(&self) -> &Gaussians {

@@ -85,10 +85,10 @@ fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)]) -> Vec<ObjectView> {
 }
 
 fn fit(views: &[ObjectView]) -> Fitted {
-    let outline = outline::outline(views, &FLOOR).unwrap();
+    let outline = outline::outline(views, Some(&FLOOR)).unwrap();
     let stop = Stop::when(|| false);
     let surroundings = Surroundings { times: TIMES, near: 0.05, seed: 0, gaussians: 150, stop: &stop };
-    fit_object(1, views, &FLOOR, &outline, surroundings).unwrap().unwrap()
+    fit_object(1, views, Some(&FLOOR), &outline, surroundings).unwrap().unwrap()
 }
 
 /// Largest error of turns relative to the first pose, degrees, and mean error of displacements, metres.

@@ -142,20 +142,25 @@ impl ObjectView {
     }
 }
 
-/// Sets the visible shares of views, which are in the order of times.
+/// Sets the visible shares of views, which are in the order of times: each camera that stays in place is compared
+/// with itself, for others are at other distances.
 pub(super) fn set_visible(views: &mut [ObjectView]) {
-    let areas = |whole: bool| -> Vec<(usize, f64)> {
-        let of = views.iter().filter(|view| !whole || view.is_whole());
-        of.map(|view| (view.time_index, view.area())).collect()
-    };
-    let known = match areas(true) {
-        whole if !whole.is_empty() => whole,
-        _ => areas(false),
-    };
+    let known: Vec<(bool, [i64; 3], usize, f64)> =
+        views.iter().map(|v| (v.is_whole(), v.camera_key, v.time_index, v.area())).collect();
+    let has_whole = known.iter().any(|(whole, ..)| *whole);
     for view in views {
-        let mut nearest = known.clone();
-        nearest.sort_by_key(|(time, _)| time.abs_diff(view.time_index));
-        let mut near: Vec<f64> = nearest.into_iter().take(5).map(|(_, area)| area).collect();
+        let of_camera = |whole: bool| {
+            let own = known.iter().filter(|(w, camera, ..)| (*w || !whole) && *camera == view.camera_key);
+            own.copied().collect::<Vec<_>>()
+        };
+        let stays = of_camera(false).len() > 2;
+        let mut nearest = match of_camera(true) {
+            own if stays && own.len() > 2 => own,
+            _ if stays => of_camera(false),
+            _ => known.iter().filter(|(whole, ..)| *whole || !has_whole).copied().collect(),
+        };
+        nearest.sort_by_key(|(_, _, time, _)| time.abs_diff(view.time_index));
+        let mut near: Vec<f64> = nearest.into_iter().take(5).map(|(.., area)| area).collect();
         view.visible = (view.area() / median(&mut near)).min(1.0);
     }
 }

@@ -43,6 +43,7 @@ impl Trainer {
         self.state.guidance.travelling = std::iter::once(false)
             .chain(observations.iter().map(|observations| travels(observations)))
             .collect();
+        self.find_other_movers()?;
         let names: Vec<&str> = (0..observations.len())
             .filter(|k| self.state.guidance.travelling[k + 1])
             .map(|k| self.state.field.instances[k].label.as_str())
@@ -111,9 +112,10 @@ impl Trainer {
         self.state.guidance.guide_of = vec![0; self.state.field.gaussians.len()];
         if self.state.guidance.travelling.contains(&true) {
             let observations = self.observe(true)?;
+            self.fit_travelling()?;
             for (of, observations) in observations.iter().enumerate() {
                 if self.state.guidance.travelling[of + 1]
-                    && !self.add_object(of as u16 + 1)?
+                    && !self.add_object(of as u16 + 1)
                     && let Some(track) = fit(observations)
                 {
                     self.inject(of as u16 + 1, track, observations)?;

@@ -51,6 +51,7 @@ mod shape;
 mod step;
 mod still;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use cif_dataset::Dataset;
@@ -79,6 +80,7 @@ use crate::exposure::Exposures;
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
 use crate::heads::{Cif, Head, HeadTensors};
+use crate::objects::Fitted;
 use crate::optimiser::Optimiser;
 use crate::poses::PoseMoments;
 use crate::progress::{Progress, Stages};
@@ -137,6 +139,8 @@ pub struct Trainer {
     saved_head: Option<SavedHead>,
     /// Loss of the last step that was taken in.
     last_loss: StepLoss,
+    /// Objects that move as a whole, by label, until the fine stage gives them Gaussians.
+    fits: BTreeMap<u16, Fitted>,
     /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
 }
@@ -200,6 +204,7 @@ impl Trainer {
             warnings,
             saved_head: None,
             last_loss: StepLoss::default(),
+            fits: BTreeMap::new(),
             arrived: Vec::new(),
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),

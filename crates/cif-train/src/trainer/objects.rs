@@ -3,6 +3,7 @@
 
 use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose, Tracks};
 use glam::DVec3;
+use rayon::prelude::*;
 
 use super::Trainer;
 use crate::error::TrainError;
@@ -20,11 +21,34 @@ const RATES: [f32; 2] = [0.004, 2e-4];
 const FROZEN: u32 = 300;
 
 impl Trainer {
-    /// Fits a travelling object (a label: dense index + 1) and gives it a group with Gaussians; false where it is not
-    /// rigid, or its masks do not tell enough.
-    pub(super) fn add_object(&mut self, label: u16) -> Result<bool, TrainError> {
-        if !self.state.config.motion.rigid || self.engine.gpu_name().is_some() {
-            return Ok(false);
+    /// Finds objects that move although no path of theirs shows it: a little, late, or in place.
+    pub(super) fn find_other_movers(&mut self) -> Result<(), TrainError> {
+        let travelling = &self.state.guidance.travelling;
+        let others: Vec<u16> = (1..travelling.len()).filter(|k| !travelling[*k]).map(|k| k as u16).collect();
+        for (label, fitted) in self.fit_objects(&others)? {
+            self.state.guidance.travelling[usize::from(label)] = true;
+            self.fits.insert(label, fitted);
+        }
+        Ok(())
+    }
+
+    /// Fits the travelling objects that were not fitted yet.
+    pub(super) fn fit_travelling(&mut self) -> Result<(), TrainError> {
+        let travelling = self.state.guidance.travelling.iter().enumerate().filter(|(_, travels)| **travels);
+        let rest: Vec<u16> = travelling
+            .map(|(label, _)| label as u16)
+            .filter(|label| !self.fits.contains_key(label))
+            .collect();
+        let fits = self.fit_objects(&rest)?;
+        self.fits.extend(fits);
+        Ok(())
+    }
+
+    /// Rigid motions of objects (labels: dense index + 1), without those that rest, are not rigid, or whose masks do
+    /// not tell enough.
+    fn fit_objects(&self, labels: &[u16]) -> Result<Vec<(u16, Fitted)>, TrainError> {
+        if !self.state.config.motion.rigid {
+            return Ok(Vec::new());
         }
         let state = &self.state;
         let surroundings = Surroundings {
@@ -34,9 +58,20 @@ impl Trainer {
             gaussians: state.config.motion.gaussians as usize,
             stop: &state.stop,
         };
-        let fitted = objects::fit(label, &state.dataset, &state.frames, surroundings)?;
-        let name = state.field.instances[usize::from(label) - 1].label.clone();
-        let Some(fitted) = fitted.filter(|fitted| fitted.error <= MOST_ERROR) else { return Ok(false) };
+        let fits: Vec<Option<(u16, Fitted)>> = labels
+            .par_iter()
+            .map(|label| {
+                let fitted = objects::fit(*label, &state.dataset, &state.frames, surroundings)?;
+                Ok(fitted.filter(|fitted| fitted.error <= MOST_ERROR).map(|fitted| (*label, fitted)))
+            })
+            .collect::<Result<_, TrainError>>()?;
+        Ok(fits.into_iter().flatten().collect())
+    }
+
+    /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not.
+    pub(super) fn add_object(&mut self, label: u16) -> bool {
+        let Some(fitted) = self.fits.remove(&label) else { return false };
+        let name = self.state.field.instances[usize::from(label) - 1].label.clone();
         let how = match fitted.rotation {
             Rotation::Observed => "",
             Rotation::Assumed => ", which the pictures do not tell: assumed",
@@ -46,7 +81,7 @@ impl Trainer {
             fitted.turns, fitted.error
         ));
         self.join(name, &fitted);
-        Ok(true)
+        true
     }
 
     /// Adds the Gaussians of an object to the field, where the best of its poses puts them, in a group of their own.

@@ -1,0 +1,179 @@
+//! Ways in which an object may move: what its path and the plane suggest, and what following it from time to time
+//! found.
+
+use std::collections::BTreeMap;
+
+use glam::{DQuat, DVec3};
+
+use super::outline::Outline;
+use super::shape::Pose;
+use super::view::{ObjectView, median};
+
+/// Turns of slides, degrees apart.
+const SLIDE: i32 = 30;
+
+/// Turns in place, degrees.
+const SPINS: [i32; 12] = [-240, -200, -160, -120, -80, -40, 40, 80, 120, 160, 200, 240];
+
+/// Rolling radii tried of balls, of the height.
+const ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
+
+/// Rolling radii tried of other things, whose height tells it less well.
+const OTHER_ROLLS: [f64; 12] = [0.64, 0.68, 0.72, 0.76, 0.8, 0.84, 0.88, 0.92, 0.96, 1.0, 1.04, 1.08];
+
+/// Roundness of masks from which an object may roll as a ball.
+const ROUND: f64 = 0.93;
+
+/// Pixels of a mask from which its texture may show a turn.
+const TEXTURED: f64 = 400.0;
+
+/// Path in sizes below which an object may turn in place.
+const STAYS: f64 = 1.5;
+
+/// A way of moving.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Way {
+    /// Not at all.
+    Rest,
+    /// Along the path, turning about the normal, degrees in all.
+    Slide(i32),
+    /// In place, turning about the normal at a constant rate, degrees in all.
+    Spin(i32),
+    /// Along the path without slip, with this radius of the height.
+    Roll(f64),
+    /// As following it from time to time found.
+    Followed,
+}
+
+impl Way {
+    /// The way in words.
+    pub(super) fn told(self) -> String {
+        match self {
+            Self::Rest => "rests".to_owned(),
+            Self::Slide(degrees) => format!("slides, turning {degrees} deg"),
+            Self::Spin(degrees) => format!("turns {degrees} deg in place"),
+            Self::Roll(factor) => format!("rolls with {factor:.2} of its height"),
+            Self::Followed => "followed from time to time".to_owned(),
+        }
+    }
+
+    /// Turn about the normal, degrees, of ways that are told apart by it.
+    pub(super) fn degrees(self) -> Option<i32> {
+        match self {
+            Self::Slide(degrees) | Self::Spin(degrees) => Some(degrees),
+            _ => None,
+        }
+    }
+}
+
+/// Paths that ways follow.
+pub(super) struct Paths<'a> {
+    /// Centre at reliable times, smoothed.
+    pub(super) along: BTreeMap<usize, DVec3>,
+    /// Centre, had it stayed in place.
+    pub(super) place: DVec3,
+    pub(super) outline: &'a Outline,
+    /// Direction away from the support; `None` where there is no plane.
+    pub(super) normal: Option<DVec3>,
+    /// Time at which all ways have the same pose.
+    pub(super) reference: usize,
+    /// Poses that following found, where it did.
+    pub(super) followed: Option<BTreeMap<usize, Pose>>,
+}
+
+/// True where masks are round enough for a ball.
+pub(super) fn is_round(outline: &Outline) -> bool {
+    outline.roundness > ROUND
+}
+
+impl Paths<'_> {
+    /// Length of the path, metres.
+    fn length(&self) -> f64 {
+        let places: Vec<DVec3> = self.along.values().copied().collect();
+        places.windows(2).map(|pair| (pair[1] - pair[0]).length()).sum()
+    }
+
+    /// Ways of moving along the path worth a trial, beside sliding without a turn.
+    pub(super) fn ways(&self) -> Vec<Way> {
+        let mut ways = Vec::new();
+        if self.normal.is_some() {
+            if self.length() < STAYS * self.outline.size() {
+                ways.extend(SPINS.map(Way::Spin));
+            } else {
+                ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
+                if is_round(self.outline) {
+                    ways.extend(ROLLS.map(Way::Roll));
+                } else {
+                    ways.extend(OTHER_ROLLS.map(Way::Roll));
+                }
+            }
+        }
+        if self.followed.is_some() {
+            ways.push(Way::Followed);
+        }
+        ways
+    }
+
+    /// True where an object may turn in place without a change of its outline, and texture would show it.
+    pub(super) fn may_turn_unseen(&self, views: &[ObjectView]) -> bool {
+        let mut areas: Vec<f64> = views.iter().map(ObjectView::area).collect();
+        self.normal.is_some() && is_round(self.outline) && median(&mut areas) >= TEXTURED
+    }
+
+    /// Ways of turning in place, and resting.
+    pub(super) fn spins(&self) -> Vec<Way> {
+        std::iter::once(Way::Rest).chain(SPINS.map(Way::Spin)).collect()
+    }
+
+    /// Poses of a way at the times of the path.
+    pub(super) fn poses(&self, way: Way) -> BTreeMap<usize, Pose> {
+        let normal = self.normal.unwrap_or(DVec3::ZERO);
+        let times: Vec<usize> = self.along.keys().copied().collect();
+        let places: Vec<DVec3> = self.along.values().copied().collect();
+        let origin = times.iter().position(|time| *time == self.reference).unwrap_or(0);
+        let turned = |shares: &[f64], degrees: i32| -> Vec<DQuat> {
+            let whole = (shares[shares.len() - 1] - shares[0]).max(1e-9);
+            let angle = f64::from(degrees).to_radians();
+            let of = |share: &f64| DQuat::from_scaled_axis(normal * angle * (share - shares[origin]) / whole);
+            shares.iter().map(of).collect()
+        };
+        let rotations = match way {
+            Way::Rest => vec![DQuat::IDENTITY; times.len()],
+            Way::Slide(degrees) => {
+                let mut lengths = vec![0.0];
+                for pair in places.windows(2) {
+                    lengths.push(lengths[lengths.len() - 1] + (pair[1] - pair[0]).length());
+                }
+                turned(&lengths, degrees)
+            }
+            Way::Spin(degrees) => {
+                let steps: Vec<f64> = times.iter().map(|time| *time as f64).collect();
+                turned(&steps, degrees)
+            }
+            Way::Roll(factor) => {
+                let rotations = rolled(&places, normal, self.outline.height / factor);
+                let back = rotations[origin].inverse();
+                rotations.into_iter().map(|rotation| rotation * back).collect()
+            }
+            Way::Followed => {
+                let followed = self.followed.iter().flatten();
+                return followed.filter(|(time, _)| self.along.contains_key(time)).map(|(t, p)| (*t, *p)).collect();
+            }
+        };
+        let stays = matches!(way, Way::Rest | Way::Spin(_));
+        let place = |k: usize| if stays { self.place } else { places[k] };
+        let pose = |(k, rotation)| (times[k], Pose { rotation, translation: place(k) });
+        rotations.into_iter().enumerate().map(pose).collect()
+    }
+}
+
+/// Turns of a ball that rolls without slip from place to place.
+pub(super) fn rolled(places: &[DVec3], normal: DVec3, radius: f64) -> Vec<DQuat> {
+    let mut rotations = vec![DQuat::IDENTITY];
+    for pair in places.windows(2) {
+        let turn = normal.cross(pair[1] - pair[0]) / radius;
+        let last = rotations[rotations.len() - 1];
+        rotations.push((DQuat::from_scaled_axis(turn) * last).normalize());
+    }
+    rotations
+}
