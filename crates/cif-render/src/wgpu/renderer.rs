@@ -189,7 +189,7 @@ impl GpuRenderer {
             (&self.canonical).into()
         };
         let (gpu, rasterizer) = (&self.gpu, &mut self.rasterizer);
-        let sh = self.packed_sh.as_ref().map_or(Coefficients::Full(posed.sh), Coefficients::Packed);
+        let sh = self.packed_sh.as_ref().map_or(posed.coefficients(), Coefficients::Packed);
         rasterizer.project_rows(gpu, &mut commands, (posed.geometry, sh), identities, &input, Some(rows))?;
         rasterizer.draw_projected(gpu, commands, identities, with_depth)
     }
