@@ -23,7 +23,7 @@ impl Trainer {
     /// Fits a travelling object (a label: dense index + 1) and gives it a group with Gaussians; false where it is not
     /// rigid, or its masks do not tell enough.
     pub(super) fn add_object(&mut self, label: u16) -> Result<bool, TrainError> {
-        if !self.state.config.motion.rigid || self.engine.gpu_name().is_some() {
+        if !self.state.config.motion.rigid {
             return Ok(false);
         }
         let state = &self.state;
