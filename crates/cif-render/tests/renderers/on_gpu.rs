@@ -9,6 +9,7 @@ use cif_field::parameters::{
 };
 use cif_render::synthetic::SyntheticScene;
 use cif_render::wgpu::deform::fixed_sum;
+use cif_render::wgpu::poses::pose;
 use cif_render::wgpu::{
     Commands, DeformationGradients, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuPoses,
     GpuStatistics, GpuVec, LabelInput, Rasterizer, Splat, ViewInput, testing,
@@ -87,14 +88,8 @@ pub(crate) fn run(
     let faults = GpuVec::<u32>::zeros(gpu, "faults", 4)?;
     let input = ViewInput { camera: &scene.camera, settings, labels };
     let mut commands = Commands::new(gpu, None);
-    let moved = match &deformation {
-        Some((deformation, _)) => deformation.pose(gpu, &mut commands, scene.time, &gaussians, &posed),
-        None => (&gaussians).into(),
-    };
-    let moved = match &groups {
-        Some(groups) => groups.carry(gpu, &mut commands, scene.time, &gaussians, moved, &posed),
-        None => moved,
-    };
+    let motion = (deformation.as_ref().map(|(deformation, _)| deformation), groups.as_ref());
+    let moved = pose(gpu, &mut commands, scene.time, motion, &gaussians, &posed);
     rasterizer.project(gpu, &mut commands, moved, identities.as_ref(), &input)?;
     rasterizer.measure(gpu, commands)?;
     let mut splats = rasterizer.splats().read(gpu)?;

@@ -7,6 +7,8 @@ use cif_geometry::{PixelGrid, RigidTransform};
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::reference::{self, Scene};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
+#[cfg(feature = "wgpu")]
+use cif_render::wgpu::GpuRenderer;
 use cif_render::{Channels, Gradients, InstanceSettings, RenderSettings, RenderedImage};
 use glam::{DMat3, DQuat, DVec3};
 
@@ -316,6 +318,27 @@ fn hidden_groups_and_groups_without_poses_are_drawn_on_a_gpu_as_on_the_processor
         }
         assert_eq!(gradients.pose_views, expected.pose_views);
         assert_eq!(gradients.pose_views.iter().sum::<u32>(), views);
+    }
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn pictures_of_groups_on_a_gpu_are_those_of_the_processor() {
+    let Some(device) = crate::on_gpu::device() else { return };
+    let sampled = tracked_scene(Some(ALL_HEADS));
+    for scene in posed_views().iter().chain([&sampled]) {
+        for settings in [settings(), RenderSettings { deform: false, ..settings() }] {
+            let mut renderer = GpuRenderer::compact(&device.0, &scene.field).unwrap();
+            let mut expected = Renderer::new(SimdLevel::Auto);
+            for time in [scene.time, 0.35] {
+                let (field, camera) = (&scene.field, &scene.camera);
+                let found = renderer.render(field, camera, time, &settings, EVERYTHING).unwrap();
+                let expected = expected.render(field, camera, time, &settings, EVERYTHING);
+                let values = found.color.pixels.iter().flatten().zip(expected.color.pixels.iter().flatten());
+                let off = values.filter(|(a, b)| (**a - **b).abs() > 1e-4).count();
+                assert!(off < 10, "{off} values differ at {time}");
+            }
+        }
     }
 }
 

@@ -85,12 +85,17 @@ fn adam_poses(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
         atomicStore(&highest[local], 0u);
     }
     workgroupBarrier();
+    var low = vec3u(0xffffffffu);
+    var high = vec3u(0u);
     for (var member = of_group.members.x + local; member < of_group.members.y; member += INVOCATIONS) {
         let mean = canonical[3u * members[member].x].xyz;
-        for (var axis = 0u; axis < 3u; axis++) {
-            atomicMin(&lowest[axis], ordered(mean[axis]));
-            atomicMax(&highest[axis], ordered(mean[axis]));
-        }
+        let place = vec3u(ordered(mean.x), ordered(mean.y), ordered(mean.z));
+        low = min(low, place);
+        high = max(high, place);
+    }
+    for (var axis = 0u; axis < 3u; axis++) {
+        atomicMin(&lowest[axis], low[axis]);
+        atomicMax(&highest[axis], high[axis]);
     }
     workgroupBarrier();
     var size = 0.0;

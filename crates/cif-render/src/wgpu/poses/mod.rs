@@ -15,6 +15,7 @@ use cif_field::Tracks;
 use cif_field::tracks::{HIDDEN_LOGIT, NO_GROUP, TrackGroup};
 use glam::DQuat;
 
+use super::deform::GpuDeformation;
 use super::faults::FAULTS;
 use super::gaussians::GpuGaussians;
 use super::kernel::Constant;
@@ -279,7 +280,7 @@ impl GpuPoses {
 
     /// Records where the groups put their Gaussians at a time in 0..=1, into `posed`: `moved` is what the deformation
     /// makes of the `canonical` ones, `posed` itself or these. One time per submission: it is written at once.
-    pub fn carry<'a>(
+    fn carry<'a>(
         &'a self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
@@ -336,7 +337,7 @@ impl GpuPoses {
     }
 
     /// Records what the gradients of the view in `rasterizer` are in the frames of the groups, and adds those by the
-    /// poses to [`Self::gradients`]; the view was recorded after [`Self::carry`]. What no optimiser may take is a bit
+    /// poses to [`Self::gradients`]; the view was recorded after [`pose`]. What no optimiser may take is a bit
     /// of the first word of `faults`.
     pub fn backward(
         &self,
@@ -374,6 +375,26 @@ impl GpuPoses {
             stage.dispatch(&self.backward, &backward, [self.groups.len() as u32, GROUP_PARTS, 1]);
             stage.dispatch(&self.sum, &sum, workgroups(self.groups.len(), 64));
         });
+    }
+}
+
+/// Records where Gaussians are at a time in 0..=1, into `posed`, which has as many rows as `canonical` where anything
+/// moves them: the deformation, then groups; what is to be drawn then. One time per submission: it is written at once.
+pub fn pose<'a>(
+    gpu: &Gpu,
+    commands: &mut Commands<'_>,
+    time: f64,
+    (deformation, groups): (Option<&GpuDeformation>, Option<&'a GpuPoses>),
+    canonical: &'a GpuGaussians,
+    posed: &'a GpuGaussians,
+) -> PosedInput<'a> {
+    let moved = match deformation {
+        Some(deformation) => deformation.pose(gpu, commands, time, canonical, posed),
+        None => canonical.into(),
+    };
+    match groups {
+        Some(groups) => groups.carry(gpu, commands, time, canonical, moved, posed),
+        None => moved,
     }
 }
 

@@ -2,6 +2,7 @@
 
 use cif_field::Field;
 use cif_render::RenderedImage;
+use cif_render::wgpu::poses;
 use cif_render::wgpu::{
     Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuPoses, PosedInput, ViewInput,
 };
@@ -105,14 +106,8 @@ impl StandIn {
         time: f64,
         of_field: Option<&GpuDeformation>,
     ) -> PosedInput<'a> {
-        let (canonical, posed) = (&self.canonical, &self.posed);
-        let moved = match self.deformation.as_ref().or(of_field) {
-            Some(deformation) if self.moves => deformation.pose(gpu, commands, time, canonical, posed),
-            _ => canonical.into(),
-        };
-        match &self.groups {
-            Some(groups) => groups.carry(gpu, commands, time, canonical, moved, posed),
-            None => moved,
-        }
+        let deformation = self.deformation.as_ref().or(of_field).filter(|_| self.moves);
+        let motion = (deformation, self.groups.as_ref());
+        poses::pose(gpu, commands, time, motion, &self.canonical, &self.posed)
     }
 }

@@ -4,6 +4,7 @@ use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES, Parameter, Rows};
 use cif_field::{Field, Gaussians, Identities};
 use cif_render::wgpu::deform::DeformationGradients;
 use cif_render::wgpu::gaussians::{gaussians, geometry};
+use cif_render::wgpu::poses;
 use cif_render::wgpu::{
     Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuPoses, GpuVec, PosedInput,
 };
@@ -146,15 +147,9 @@ impl ResidentIdentities {
 impl Resident {
     /// The Gaussians at a time in 0..=1, deformed if the field moves, and where their groups are.
     pub(super) fn pose(&self, gpu: &Gpu, commands: &mut Commands<'_>, time: f64) -> PosedInput<'_> {
-        let (canonical, posed) = (&self.canonical, &self.posed);
-        let moved = match &self.deformation {
-            Some(deformation) => deformation.parameters.pose(gpu, commands, time, canonical, posed),
-            None => canonical.into(),
-        };
-        match &self.poses {
-            Some(poses) => poses.groups.carry(gpu, commands, time, canonical, moved, posed),
-            None => moved,
-        }
+        let deformation = self.deformation.as_ref().map(|resident| &resident.parameters);
+        let groups = self.poses.as_ref().map(|resident| &resident.groups);
+        poses::pose(gpu, commands, time, (deformation, groups), &self.canonical, &self.posed)
     }
 
     /// Nothing yet.
