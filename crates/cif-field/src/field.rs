@@ -71,6 +71,16 @@ impl Field {
         posed
     }
 
+    /// Gaussians that the deformation network leaves alone, `[N]`: those that stand still, and those of groups that are
+    /// exempt from it; empty when it moves all.
+    #[must_use]
+    pub fn left_alone(&self) -> Vec<bool> {
+        let Some(deformation) = &self.deformation else { return Vec::new() };
+        let Some(tracks) = &self.tracks else { return deformation.still.clone() };
+        let is_exempt = |row: usize| tracks.group(row).is_some_and(|group| !tracks.groups[group].deformed);
+        (0..self.len()).map(|row| deformation.is_still(row) || is_exempt(row)).collect()
+    }
+
     /// True when Gaussians move or deform over time, by learning or by record.
     #[must_use]
     pub fn moves(&self) -> bool {

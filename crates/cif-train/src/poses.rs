@@ -11,21 +11,24 @@ use glam::{DQuat, DVec3};
 use crate::guard::Fault;
 
 /// Decays of the moments: a pose is visited rarely, so they are short.
-const DECAY: [f64; 2] = [0.9, 0.99];
+pub(crate) const DECAY: [f64; 2] = [0.9, 0.99];
 
 /// Keeps steps finite where gradients vanish.
-const EPSILON: f64 = 1e-15;
+pub(crate) const EPSILON: f64 = 1e-15;
 
 /// Values of a pose: turn, translation.
 const WIDTH: usize = 6;
+
+/// Steps of a pose after which the correction of its moments is that of so many.
+pub(crate) const COUNTED_STEPS: u32 = 10_000;
 
 /// Moments of all poses, in the order of the groups and their keys. Those of a pose advance only when a view of its
 /// time is drawn.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct PoseMoments {
-    first: Vec<[f64; WIDTH]>,
-    second: Vec<[f64; WIDTH]>,
-    steps: Vec<u32>,
+    pub first: Vec<[f64; WIDTH]>,
+    pub second: Vec<[f64; WIDTH]>,
+    pub steps: Vec<u32>,
 }
 
 impl PoseMoments {
@@ -54,7 +57,7 @@ impl PoseMoments {
                     continue;
                 }
                 self.steps[place] += 1;
-                let steps = self.steps[place].min(10_000) as i32;
+                let steps = self.steps[place].min(COUNTED_STEPS) as i32;
                 let bias = DECAY.map(|decay| 1.0 - decay.powi(steps));
                 let PoseGradient { turn, translation } = gradients[place];
                 let mut taken = [0.0; WIDTH];

@@ -20,6 +20,8 @@ pub const COLOR_LOSS: u32 = 1 << 30;
 pub const INSTANCE_LOSS: u32 = 1 << 29;
 /// Gradient of exposures.
 pub const EXPOSURES: u32 = 1 << 28;
+/// Gradient of poses.
+pub const POSES: u32 = 1 << 27;
 
 /// Bit of the gradient of a parameter: its place in the table.
 ///
@@ -44,6 +46,7 @@ pub const FAULTS: Snippet = Snippet {
             ("COLOR_LOSS_FAULT", Constant::Unsigned(COLOR_LOSS)),
             ("INSTANCE_LOSS_FAULT", Constant::Unsigned(INSTANCE_LOSS)),
             ("EXPOSURES_FAULT", Constant::Unsigned(EXPOSURES)),
+            ("POSES_FAULT", Constant::Unsigned(POSES)),
             ("LARGEST_GRADIENT", Constant::Unsigned(MAX_GRADIENT.to_bits())),
         ]);
         let columns: String = COLUMNS

@@ -11,6 +11,7 @@
 //! | [`counts`] | label mass of Gaussians |
 //! | [`blend`] | other values per Gaussian, and back |
 //! | [`deform`] | canonical Gaussians to the time of a view, and back |
+//! | [`poses`] | groups of Gaussians that move as a whole |
 //! | [`buffers`] | typed arrays that grow, uploads and read-backs |
 //! | [`layout`] | structures that Rust and WGSL share |
 //! | [`testing`] | the GPU that tests run on |
@@ -39,6 +40,7 @@ pub mod gaussians;
 pub mod identities;
 pub mod kernel;
 pub mod layout;
+pub mod poses;
 pub mod rasterizer;
 pub mod renderer;
 pub mod sort;
@@ -65,6 +67,7 @@ pub use kernel::{
     structures, workgroups,
 };
 pub use layout::{Layout, Member, Shared, WgslType};
+pub use poses::GpuPoses;
 pub use rasterizer::{GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput};
 pub use renderer::GpuRenderer;
 pub use sort::{Count, RadixSort, Scan, SortArrays};
@@ -76,6 +79,7 @@ pub use workgroup::{Form, SubgroupUse};
 pub const MODULES: &[&Module] = &[
     &stages::PROJECT,
     &stages::PROJECT_PACKED,
+    &stages::PROJECT_TURNED,
     &stages::SCAN,
     &stages::SORT,
     &stages::BIN,
@@ -90,6 +94,7 @@ pub const MODULES: &[&Module] = &[
     &stages::GATHER_GRADIENTS,
     &stages::IDENTITY_BACKWARD,
     &stages::PROJECT_BACKWARD,
+    &stages::PROJECT_BACKWARD_TURNED,
     &blend::BLEND,
     &blend::BLEND_BACKWARD,
     &blend::BLEND_BACKWARD_WEIGHTS,
@@ -97,6 +102,9 @@ pub const MODULES: &[&Module] = &[
     &blend::GATHER_VALUES_WEIGHTS,
     &counts::COUNT_LABELS,
     &counts::GATHER_COUNTS,
+    &poses::POSES,
+    &poses::POSES_BACKWARD,
+    &poses::POSES_SUM,
     &workgroup::SELF_CHECK,
     &speed::SPEED,
 ];
@@ -109,4 +117,9 @@ pub const LAYOUTS: &[fn() -> Layout] = &[
     view::SortParameters::layout,
     blend::BlendChunk::layout,
     counts::LabelChunk::layout,
+    poses::GroupSizes::layout,
+    poses::GroupView::layout,
+    poses::Pose::layout,
+    poses::GroupFrame::layout,
+    poses::PoseSum::layout,
 ];

@@ -12,6 +12,7 @@
 @group(0) @binding(4) var<storage, read_write> depth_keys: array<u32>;
 @group(0) @binding(5) var<storage, read_write> depth_order: array<u32>;
 #import coefficients
+#import directions
 #import footprint
 
 fn color_of(row: u32, direction: vec3f) -> vec3f {
@@ -59,7 +60,7 @@ fn splat_of(row: u32) -> Splat {
         return s;
     }
     let direction = view_direction(a.xyz);
-    let color = color_of(row, direction.xyz);
+    let color = color_of(row, into_frame(row, direction.xyz));
     if (!are_finite(color)) {
         return s;
     }

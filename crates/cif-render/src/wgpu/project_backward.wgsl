@@ -11,10 +11,11 @@
 @group(0) @binding(1) var<storage, read> posed: array<vec4f>;
 @group(0) @binding(2) var<storage, read> sh: array<f32>;
 @group(0) @binding(3) var<storage, read> splats: array<Splat>;
-@group(0) @binding(4) var<storage, read> splat_gradients: array<vec4f>;
 @group(0) @binding(5) var<storage, read_write> v_posed: array<vec4f>;
 @group(0) @binding(6) var<storage, read_write> v_sh: array<f32>;
 @group(0) @binding(7) var<storage, read_write> screen: array<vec4f>;
+#import splat_gradients
+#import directions
 #import footprint
 
 fn quaternion_backward(unit: vec4f, norm: f32, v0: vec3f, v1: vec3f, v2: vec3f) -> vec4f {
@@ -51,6 +52,7 @@ fn project_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
     let g0 = splat_gradients[3u * row];
     let g1 = splat_gradients[3u * row + 1u];
     let g2 = splat_gradients[3u * row + 2u];
+    keep_torque(row, vec3f(0.0));
     let v_mean2d = g0.xy;
     screen[row] = vec4f(0.5 * vec2f(view.size) * v_mean2d, splat.radius, 1.0);
     if (all(g0 == vec4f(0.0)) && all(g1 == vec4f(0.0)) && all(g2.xy == vec2f(0.0))) {
@@ -146,10 +148,11 @@ fn project_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
     let v_color = select(g1.yzw, vec3f(0.0), splat.color.xyz <= vec3f(0.0));
     if (any(v_color != vec3f(0.0))) {
         let direction = view_direction(a.xyz);
-        let basis = harmonics(direction.xyz, view.sh_degree);
-        let gradient = harmonics_gradient(direction.xyz, view.sh_degree);
+        let in_frame = into_frame(row, direction.xyz);
+        let basis = harmonics(in_frame, view.sh_degree);
+        let gradient = harmonics_gradient(in_frame, view.sh_degree);
         let count = (view.sh_degree + 1u) * (view.sh_degree + 1u);
-        var v_direction = vec3f(0.0);
+        var v_in_frame = vec3f(0.0);
         for (var m = 0u; m < count; m += 1u) {
             let at = row * SH_FLOATS + m * 3u;
             let v = basis[m] * v_color;
@@ -157,9 +160,11 @@ fn project_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
             v_sh[at + 1u] = v.y;
             v_sh[at + 2u] = v.z;
             if (m > 0u) {
-                v_direction += gradient[m] * dot(vec3f(sh[at], sh[at + 1u], sh[at + 2u]), v_color);
+                v_in_frame += gradient[m] * dot(vec3f(sh[at], sh[at + 1u], sh[at + 2u]), v_color);
             }
         }
+        keep_torque(row, cross(v_in_frame, in_frame));
+        let v_direction = out_of_frame(row, v_in_frame);
         v_mean += (v_direction - direction.xyz * dot(direction.xyz, v_direction)) / direction.w;
     }
 

@@ -22,7 +22,7 @@ use super::gaussians::{GEOMETRY_FLOATS, GpuGaussians, PACKED_SH_WORDS};
 use super::identities::DeviceIdentities;
 use super::kernel::{Commands, workgroups};
 use super::sort::{Count, RadixSort, Scan, SortArrays};
-use super::stages::{Kernels, PROJECT_PACKED, entries};
+use super::stages::{Kernels, PROJECT_BACKWARD_TURNED, PROJECT_PACKED, PROJECT_TURNED, entries};
 use super::view::{PAIR_SUMS, Splat, View, work};
 use crate::RenderSettings;
 
@@ -44,11 +44,20 @@ pub struct PosedInput<'a> {
     pub geometry: &'a GpuVec<[f32; GEOMETRY_FLOATS]>,
     /// As in [`GpuGaussians::sh`].
     pub sh: &'a GpuVec<[f32; SH_FLOATS]>,
+    /// Turns of the frames that the spherical harmonics are in, unit quaternions (w, x, y, z); `None` where all are
+    /// in that of the world.
+    pub turns: Option<&'a GpuVec<[f32; 4]>>,
 }
 
 impl<'a> From<&'a GpuGaussians> for PosedInput<'a> {
     fn from(gaussians: &'a GpuGaussians) -> Self {
-        Self { geometry: &gaussians.geometry, sh: &gaussians.sh }
+        Self { geometry: &gaussians.geometry, sh: &gaussians.sh, turns: None }
+    }
+}
+
+impl<'a> PosedInput<'a> {
+    pub(super) fn coefficients(self) -> Coefficients<'a> {
+        self.turns.map_or(Coefficients::Full(self.sh), |turns| Coefficients::Turned(self.sh, turns))
     }
 }
 
@@ -59,6 +68,8 @@ pub(super) enum Coefficients<'a> {
     Full(&'a GpuVec<[f32; SH_FLOATS]>),
     /// As [`super::gaussians::packed_sh`] makes them.
     Packed(&'a GpuVec<[u32; PACKED_SH_WORDS]>),
+    /// As in [`GpuGaussians::sh`], in frames that are turned as in [`PosedInput::turns`].
+    Turned(&'a GpuVec<[f32; SH_FLOATS]>, &'a GpuVec<[f32; 4]>),
 }
 
 /// A view to be drawn.
@@ -268,8 +279,8 @@ impl Rasterizer {
         identities: Option<&DeviceIdentities>,
         input: &ViewInput<'_>,
     ) -> Result<(), GpuError> {
-        let PosedInput { geometry, sh } = gaussians;
-        self.project_rows(gpu, commands, (geometry, Coefficients::Full(sh)), identities, input, None)
+        let posed = (gaussians.geometry, gaussians.coefficients());
+        self.project_rows(gpu, commands, posed, identities, input, None)
     }
 
     /// As [`Self::project`], of so many `rows` of tiles from the first on where they are given. For pictures:
@@ -290,9 +301,10 @@ impl Rasterizer {
         rows: Option<[u32; 2]>,
     ) -> Result<(), GpuError> {
         let (geometry, sh) = gaussians;
-        let (sh, packed) = match sh {
-            Coefficients::Full(sh) => (sh.buffer(), false),
-            Coefficients::Packed(sh) => (sh.buffer(), true),
+        let (sh, turns, variant) = match sh {
+            Coefficients::Full(sh) => (sh.buffer(), None, 0),
+            Coefficients::Packed(sh) => (sh.buffer(), None, 1),
+            Coefficients::Turned(sh, turns) => (sh.buffer(), Some(turns.buffer()), 2),
         };
         let n = geometry.len();
         let mut view = View::new(input.camera, input.settings, n);
@@ -328,27 +340,30 @@ impl Rasterizer {
         let rows = identities.map_or(&arrays.no_labels, |identities| &identities.row_offsets);
         commands.clear(&arrays.work);
         let uniform = self.uniform.buffer();
-        if packed && self.kernels.project_packed.is_none() {
+        if variant == 1 && self.kernels.project_packed.is_none() {
             let [kernel] = entries(gpu, &PROJECT_PACKED)?;
             self.kernels.project_packed = Some(kernel);
         }
-        let kernel = match &self.kernels.project_packed {
-            Some(kernel) if packed => kernel,
+        if variant == 2 && self.kernels.turned.is_none() {
+            let [[forward], [backward]] =
+                [entries(gpu, &PROJECT_TURNED)?, entries(gpu, &PROJECT_BACKWARD_TURNED)?];
+            self.kernels.turned = Some([forward, backward]);
+        }
+        let kernel = match (variant, &self.kernels.project_packed, &self.kernels.turned) {
+            (1, Some(packed), _) => packed,
+            (2, _, Some([turned, _])) => turned,
             _ => &self.kernels.project,
         };
-        let project = self.cache.get(
-            gpu,
-            ("project", u32::from(packed)),
-            kernel,
-            &[
-                uniform,
-                geometry.buffer(),
-                sh,
-                arrays.splats.buffer(),
-                arrays.depth.keys[0].buffer(),
-                arrays.depth.values[0].buffer(),
-            ],
-        );
+        let mut buffers = vec![
+            uniform,
+            geometry.buffer(),
+            sh,
+            arrays.splats.buffer(),
+            arrays.depth.keys[0].buffer(),
+            arrays.depth.values[0].buffer(),
+        ];
+        buffers.extend(turns);
+        let project = self.cache.get(gpu, ("project", variant), kernel, &buffers);
         commands.stage("project", |stage| stage.dispatch(kernel, &project, workgroups(n, 64)));
 
         let mut sorted = Ok(0);
@@ -747,22 +762,22 @@ impl Rasterizer {
         gaussians: PosedInput<'_>,
     ) {
         let (arrays, gradients) = (&self.arrays, &self.gradients);
-        let kernel = &self.kernels.project_backward;
-        let project = self.cache.get(
-            gpu,
-            ("project_backward", 0),
-            kernel,
-            &[
-                self.uniform.buffer(),
-                gaussians.geometry.buffer(),
-                gaussians.sh.buffer(),
-                arrays.splats.buffer(),
-                arrays.splat_gradients.buffer(),
-                gradients.gaussians.geometry.buffer(),
-                gradients.gaussians.sh.buffer(),
-                gradients.screen.buffer(),
-            ],
-        );
+        let (variant, kernel) = match (gaussians.turns, &self.kernels.turned) {
+            (Some(_), Some([_, turned])) => (1, turned),
+            _ => (0, &self.kernels.project_backward),
+        };
+        let mut buffers = vec![
+            self.uniform.buffer(),
+            gaussians.geometry.buffer(),
+            gaussians.sh.buffer(),
+            arrays.splats.buffer(),
+            arrays.splat_gradients.buffer(),
+            gradients.gaussians.geometry.buffer(),
+            gradients.gaussians.sh.buffer(),
+            gradients.screen.buffer(),
+        ];
+        buffers.extend(gaussians.turns.map(GpuVec::buffer));
+        let project = self.cache.get(gpu, ("project_backward", variant), kernel, &buffers);
         commands.stage("project backward", |stage| {
             stage.dispatch(kernel, &project, workgroups(self.view.gaussians as usize, 64));
         });
@@ -837,6 +852,12 @@ impl Rasterizer {
     #[must_use]
     pub fn foregrounds(&self) -> &GpuVec<f32> {
         &self.arrays.foregrounds
+    }
+
+    /// Gradients of the splats, three rows each; of Gaussians whose harmonics are in turned frames, the first of them
+    /// holds the gradient by the turn that comes through the colour, once the backward pass is done.
+    pub(super) fn splat_gradients(&self) -> &GpuVec<[f32; 4]> {
+        &self.arrays.splat_gradients
     }
 
     /// Gradients of the last backward pass.

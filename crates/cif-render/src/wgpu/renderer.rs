@@ -1,4 +1,5 @@
-//! Renders fields on a GPU. Gaussians are posed on the device; those of fields with recorded motion by the processor.
+//! Renders fields on a GPU. Gaussians are posed on the device; those of fields with groups that do more than move as a
+//! whole by the processor.
 
 use cif_field::Field;
 use cif_geometry::{PinholeCamera, PixelGrid};
@@ -10,6 +11,7 @@ use super::error::GpuError;
 use super::gaussians::{GpuGaussians, PACKED_SH_WORDS, geometry, packed_sh};
 use super::identities::DeviceIdentities;
 use super::kernel::Commands;
+use super::poses::{self, GpuPoses};
 use super::rasterizer::{Coefficients, PosedInput, Rasterizer, ViewInput};
 use crate::constants::{MIN_COVERAGE, TILE};
 use crate::cpu::{Renderer, SimdLevel};
@@ -26,6 +28,8 @@ pub struct GpuRenderer {
     canonical: GpuGaussians,
     packed_sh: Option<GpuVec<[u32; PACKED_SH_WORDS]>>,
     deformation: Option<GpuDeformation>,
+    /// Groups that move as a whole and do nothing else.
+    groups: Option<GpuPoses>,
     /// At the time of the view, where anything moves.
     posed: GpuGaussians,
     identities: Option<DeviceIdentities>,
@@ -60,8 +64,13 @@ impl GpuRenderer {
             .as_ref()
             .map(|identities| DeviceIdentities::from_identities(gpu, identities, field.instances.len()))
             .transpose()?;
-        let learned = field.deformation.as_ref().filter(|_| field.tracks.is_none());
-        let deformation = learned.map(|deformation| GpuDeformation::new(gpu, deformation)).transpose()?;
+        let rigid = field.tracks.as_ref().filter(|tracks| tracks.is_rigid());
+        let groups = rigid.map(|tracks| GpuPoses::new(gpu, tracks)).transpose()?;
+        let learned = field.deformation.as_ref().filter(|_| field.tracks.is_none() || groups.is_some());
+        let mut deformation = learned.map(|deformation| GpuDeformation::new(gpu, deformation)).transpose()?;
+        if let (Some(deformation), Some(_)) = (&mut deformation, &groups) {
+            deformation.set_still(gpu, &field.left_alone())?;
+        }
         let packs = compact
             && gpu.facts().packed_half_floats
             && field.tracks.is_none()
@@ -81,6 +90,7 @@ impl GpuRenderer {
             canonical,
             packed_sh,
             deformation,
+            groups,
             posed: GpuGaussians::zeros(gpu, 0)?,
             identities,
             band_memory: BAND_MEMORY,
@@ -170,7 +180,7 @@ impl GpuRenderer {
         let input = ViewInput { camera, settings, labels: None };
         let identities = self.identities.as_ref().filter(|_| settings.instances.is_some());
         let mut commands = Commands::new(&self.gpu, None);
-        let posed: PosedInput<'_> = if field.tracks.is_some() {
+        let posed: PosedInput<'_> = if field.tracks.is_some() && self.groups.is_none() {
             let poser = &mut self.poser;
             let moved = if settings.deform || field.deformation.is_none() {
                 poser.deform(field, time)
@@ -179,17 +189,19 @@ impl GpuRenderer {
             };
             self.posed.replace(&self.gpu, &moved)?;
             (&self.posed).into()
-        } else if let Some(deformation) = self.deformation.as_ref().filter(|_| settings.deform) {
-            self.posed.geometry.resize(&self.gpu, self.canonical.len())?;
-            if deformation.moves_sh() {
+        } else {
+            let deformation = self.deformation.as_ref().filter(|_| settings.deform);
+            if deformation.is_some() || self.groups.is_some() {
+                self.posed.geometry.resize(&self.gpu, self.canonical.len())?;
+            }
+            if deformation.is_some_and(GpuDeformation::moves_sh) {
                 self.posed.sh.resize(&self.gpu, self.canonical.len())?;
             }
-            deformation.pose(&self.gpu, &mut commands, time, &self.canonical, &self.posed)
-        } else {
-            (&self.canonical).into()
+            let motion = (deformation, self.groups.as_ref());
+            poses::pose(&self.gpu, &mut commands, time, motion, &self.canonical, &self.posed)
         };
         let (gpu, rasterizer) = (&self.gpu, &mut self.rasterizer);
-        let sh = self.packed_sh.as_ref().map_or(Coefficients::Full(posed.sh), Coefficients::Packed);
+        let sh = self.packed_sh.as_ref().map_or(posed.coefficients(), Coefficients::Packed);
         rasterizer.project_rows(gpu, &mut commands, (posed.geometry, sh), identities, &input, Some(rows))?;
         rasterizer.draw_projected(gpu, commands, identities, with_depth)
     }

@@ -5,23 +5,33 @@ use super::error::GpuError;
 use super::kernel::Access::{Read, ReadWrite, Uniform};
 use super::kernel::{Kernel, Module};
 use super::view::{
-    COEFFICIENTS, COLOR_ONLY, CONSTANTS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS, PACKED_COEFFICIENTS,
-    PARTIAL_SUMS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, TILE_BACKWARD, TILE_FORWARD, TILE_STAGING, TILES,
-    VIEW, WITH_INSTANCES,
+    COEFFICIENTS, COLOR_ONLY, CONSTANTS, DIRECTIONS, FOOTPRINT, HARMONICS, IDENTITY, NUMBERS,
+    PACKED_COEFFICIENTS, PARTIAL_SUMS, SCAN_PARAMETERS, SORT_PARAMETERS, SPLAT, SPLAT_GRADIENTS,
+    TILE_BACKWARD, TILE_FORWARD, TILE_STAGING, TILES, TORQUES, TURNED_DIRECTIONS, TURNS, VIEW,
+    WITH_INSTANCES,
 };
 
 /// Projection.
 pub const PROJECT: Module = Module {
     name: "project",
     text: include_str!("project.wgsl"),
-    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, COEFFICIENTS],
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, COEFFICIENTS, DIRECTIONS],
     bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["project"],
 };
 
 /// Projection of Gaussians whose spherical harmonics are in 16-bit floats.
-pub const PROJECT_PACKED: Module =
-    Module { imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, PACKED_COEFFICIENTS], ..PROJECT };
+pub const PROJECT_PACKED: Module = Module {
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, PACKED_COEFFICIENTS, DIRECTIONS],
+    ..PROJECT
+};
+
+/// Projection of Gaussians whose spherical harmonics are in frames of groups.
+pub const PROJECT_TURNED: Module = Module {
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, COEFFICIENTS, TURNS],
+    bindings: &[Uniform, Read, Read, ReadWrite, ReadWrite, ReadWrite, Read],
+    ..PROJECT
+};
 
 /// Prefix sum.
 pub const SCAN: Module = Module {
@@ -138,9 +148,16 @@ pub const IDENTITY_BACKWARD: Module = Module {
 pub const PROJECT_BACKWARD: Module = Module {
     name: "project_backward",
     text: include_str!("project_backward.wgsl"),
-    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT],
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, SPLAT_GRADIENTS, DIRECTIONS],
     bindings: &[Uniform, Read, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite],
     entries: &["project_backward"],
+};
+
+/// Gradients of Gaussians whose spherical harmonics are in frames of groups.
+pub const PROJECT_BACKWARD_TURNED: Module = Module {
+    imports: &[CONSTANTS, NUMBERS, HARMONICS, VIEW, FOOTPRINT, TORQUES, TURNED_DIRECTIONS],
+    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite, Read],
+    ..PROJECT_BACKWARD
 };
 
 /// Kernels of rendering.
@@ -149,6 +166,8 @@ pub(crate) struct Kernels {
     pub(crate) project: Kernel,
     /// Compiled when the first of them is drawn.
     pub(crate) project_packed: Option<Kernel>,
+    /// With its backward pass; likewise.
+    pub(crate) turned: Option<[Kernel; 2]>,
     pub(crate) count: Kernel,
     pub(crate) gather: Kernel,
     pub(crate) plan: Kernel,
@@ -172,6 +191,7 @@ impl Kernels {
         Ok(Self {
             project: one(&PROJECT)?,
             project_packed: None,
+            turned: None,
             count,
             gather,
             plan,

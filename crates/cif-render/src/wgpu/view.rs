@@ -298,6 +298,26 @@ pub(crate) const COEFFICIENTS: Snippet =
 /// As above, from 16-bit floats.
 pub(crate) const PACKED_COEFFICIENTS: Snippet =
     Snippet { name: "coefficients", text: || include_str!("shared/packed_coefficients.wgsl").to_owned() };
+/// WGSL functions by which projection turns directions of view into the frame of harmonics: nowhere.
+pub(crate) const DIRECTIONS: Snippet =
+    Snippet { name: "directions", text: || include_str!("shared/directions.wgsl").to_owned() };
+/// As above, into the frames of groups.
+pub(crate) const TURNED_DIRECTIONS: Snippet =
+    Snippet { name: "directions", text: || include_str!("shared/turned_directions.wgsl").to_owned() };
+/// The same with the turns that they read.
+pub(crate) const TURNS: Snippet = Snippet {
+    name: "directions",
+    text: || {
+        let turned = (TURNED_DIRECTIONS.text)();
+        format!("@group(0) @binding(6) var<storage, read> turns: array<vec4f>;\n{turned}")
+    },
+};
+/// Gradients of splats as the backward projection reads them.
+pub(crate) const SPLAT_GRADIENTS: Snippet =
+    Snippet { name: "splat_gradients", text: || include_str!("shared/splat_gradients.wgsl").to_owned() };
+/// As above, with gradients by turns kept in them.
+pub(crate) const TORQUES: Snippet =
+    Snippet { name: "splat_gradients", text: || include_str!("shared/torques.wgsl").to_owned() };
 pub(crate) const FOOTPRINT: Snippet =
     Snippet { name: "footprint", text: || include_str!("shared/footprint.wgsl").to_owned() };
 pub(crate) const SPLAT: Snippet =

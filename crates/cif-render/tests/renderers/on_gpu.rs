@@ -7,13 +7,15 @@ use cif_field::parameters::{
     LOG_CALIBRATIONS, LOG_SCALES, MEANS, MLP, OCCUPANCY_LOGITS, OPACITY_LOGITS, PLANES, Parameter,
     QUATERNIONS, SH_COEFFICIENTS,
 };
-use cif_render::RenderSettings;
 use cif_render::synthetic::SyntheticScene;
 use cif_render::wgpu::deform::fixed_sum;
+use cif_render::wgpu::poses::pose;
 use cif_render::wgpu::{
-    Commands, DeformationGradients, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians,
+    Commands, DeformationGradients, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuPoses,
     GpuStatistics, GpuVec, LabelInput, Rasterizer, Splat, ViewInput, testing,
 };
+use cif_render::{PoseGradient, RenderSettings};
+use glam::DVec3;
 
 use crate::support::Cotangents;
 
@@ -43,6 +45,8 @@ pub(crate) struct Outcome {
     pub(crate) calibrations: Vec<f32>,
     /// By the nodes of the planes and the weights of the network; empty without deformation.
     pub(crate) deformation: [Vec<f64>; 2],
+    /// By the poses of groups, with the views that each was a key of; empty without groups.
+    pub(crate) poses: Vec<(PoseGradient, u32)>,
     pub(crate) statistics: GpuStatistics,
     pub(crate) tile_ranges: Vec<[u32; 2]>,
     pub(crate) entries: Vec<[u32; 4]>,
@@ -72,20 +76,20 @@ pub(crate) fn run(
     let n = gaussians.len();
     let mut deformation = match scene.field.deformation.as_ref().filter(|_| settings.deform) {
         Some(deformation) => {
-            let deformation = GpuDeformation::new(gpu, deformation)?;
+            let mut deformation = GpuDeformation::new(gpu, deformation)?;
+            deformation.set_still(gpu, &scene.field.left_alone())?;
             let gradients = DeformationGradients::zeros(gpu, &deformation)?;
             Some((deformation, gradients))
         }
         None => None,
     };
+    let groups = scene.field.tracks.as_ref().map(|tracks| GpuPoses::new(gpu, tracks)).transpose()?;
     let [posed, v_canonical] = [GpuGaussians::zeros(gpu, n)?, GpuGaussians::zeros(gpu, n)?];
     let faults = GpuVec::<u32>::zeros(gpu, "faults", 4)?;
     let input = ViewInput { camera: &scene.camera, settings, labels };
     let mut commands = Commands::new(gpu, None);
-    let moved = match &deformation {
-        Some((deformation, _)) => deformation.pose(gpu, &mut commands, scene.time, &gaussians, &posed),
-        None => (&gaussians).into(),
-    };
+    let motion = (deformation.as_ref().map(|(deformation, _)| deformation), groups.as_ref());
+    let moved = pose(gpu, &mut commands, scene.time, motion, &gaussians, &posed);
     rasterizer.project(gpu, &mut commands, moved, identities.as_ref(), &input)?;
     rasterizer.measure(gpu, commands)?;
     let mut splats = rasterizer.splats().read(gpu)?;
@@ -97,6 +101,9 @@ pub(crate) fn run(
     let mut commands = Commands::new(gpu, None);
     rasterizer.rasterize(gpu, &mut commands, identities.as_ref(), labels)?;
     rasterizer.backward(gpu, &mut commands, moved, identities.as_ref(), labels, &v_colors)?;
+    if let Some(groups) = &groups {
+        groups.backward(gpu, &mut commands, &gaussians, rasterizer, &faults);
+    }
     if let Some((deformation, gradients)) = &mut deformation {
         let (at, v_posed) = ((&*deformation, scene.time), &rasterizer.gradients().gaussians);
         gradients.backward(gpu, &mut commands, at, &gaussians, v_posed, &v_canonical, &faults);
@@ -104,7 +111,7 @@ pub(crate) fn run(
     let counts = rasterizer.read_statistics(gpu, &mut commands);
     commands.submit();
     let statistics = GpuStatistics::of(&counts.start().wait(gpu)?);
-    assert_eq!(faults.read(gpu)?[0], 0, "faults of the deformation");
+    assert_eq!(faults.read(gpu)?[0], 0, "faults of deformation and poses");
     let gradients = rasterizer.gradients();
     let v_geometry = if deformation.is_some() { &v_canonical } else { &gradients.gaussians };
     let deformation = match (&deformation, &scene.field.deformation) {
@@ -117,7 +124,16 @@ pub(crate) fn run(
         }
         _ => Default::default(),
     };
+    let vector = |v: [f32; 4]| DVec3::from_slice(&v.map(f64::from));
+    let by_poses = groups.map(|groups| groups.gradients.read(gpu)).transpose()?.unwrap_or_default();
     Ok(Outcome {
+        poses: by_poses
+            .iter()
+            .map(|sum| {
+                let gradient = PoseGradient { turn: vector(sum.turn), translation: vector(sum.translation) };
+                (gradient, sum.turn[3] as u32)
+            })
+            .collect(),
         colors: rasterizer.colors().read(gpu)?,
         blended: rasterizer.blended().read(gpu)?,
         splats,

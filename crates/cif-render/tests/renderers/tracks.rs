@@ -7,6 +7,8 @@ use cif_geometry::{PixelGrid, RigidTransform};
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::reference::{self, Scene};
 use cif_render::synthetic::{ALL_HEADS, SyntheticConfig, SyntheticScene, generate};
+#[cfg(feature = "wgpu")]
+use cif_render::wgpu::GpuRenderer;
 use cif_render::{Channels, Gradients, InstanceSettings, RenderSettings, RenderedImage};
 use glam::{DMat3, DQuat, DVec3};
 
@@ -212,90 +214,200 @@ fn posed_scene(heads: Option<Heads>) -> SyntheticScene {
     scene
 }
 
+/// Weights of the loss by which poses are differentiated.
+fn weights(scene: &SyntheticScene) -> PixelGrid<[f64; 3]> {
+    let (width, height) = (scene.camera.width, scene.camera.height);
+    let weight = |k: u32| std::array::from_fn(|c| (f64::from(k) * 0.37 + c as f64).sin());
+    PixelGrid::from_pixels(width, height, (0..width * height).map(weight).collect())
+}
+
+/// Gradients of the fast path.
+fn on_processor(scene: &SyntheticScene, settings: &RenderSettings) -> Gradients {
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    renderer.forward(&scene.field, &scene.camera, scene.time, settings, None);
+    let mut gradients = Gradients::zeros(&scene.field);
+    let v_color = weights(scene).map(|weight| weight.map(|w| w as f32));
+    renderer.backward(&scene.field, &v_color, 0.0, &mut gradients);
+    gradients
+}
+
+/// Those of the GPU, where there is one, with the colours that it draws.
+#[cfg(feature = "wgpu")]
+fn on_gpu(scene: &SyntheticScene, settings: &RenderSettings) -> Option<(Gradients, Vec<[f32; 4]>)> {
+    let mut device = crate::on_gpu::device()?;
+    let color = weights(scene);
+    let cotangents = crate::support::Cotangents { color, depth: None, alpha: None, instance_weight: 0.0 };
+    let seen = crate::on_gpu::run(&mut device, scene, settings, &cotangents, |_| {}).unwrap();
+    let [planes, mlp] = seen.deformation.map(|values| values.iter().map(|v| *v as f32).collect());
+    let (poses, pose_views) = seen.poses.into_iter().unzip();
+    let gaussians = cif_render::wgpu::gaussians::gaussians(&seen.geometry, seen.sh);
+    let zeros = Gradients::zeros(&scene.field);
+    Some((Gradients { gaussians, planes, mlp, poses, pose_views, ..zeros }, seen.colors))
+}
+
+/// Views at keys and between, with and without other Gaussians that deform.
+fn posed_views() -> Vec<SyntheticScene> {
+    let views = [(None, 0.5), (None, 0.8), (Some(ALL_HEADS), 0.0), (Some(ALL_HEADS), 0.3)];
+    views.map(|(heads, time)| SyntheticScene { time, ..posed_scene(heads) }).into()
+}
+
+fn colored() -> RenderSettings {
+    RenderSettings { sh_degree: 3, ..RenderSettings::default() }
+}
+
 #[test]
 fn poses_and_their_gaussians_have_the_gradients_of_the_reference() {
-    for (heads, time) in [(None, 0.5), (None, 0.8), (Some(ALL_HEADS), 0.0)] {
-        let scene = posed_scene(heads);
-        let settings = RenderSettings { sh_degree: 3, ..RenderSettings::default() };
-        let weights: Vec<[f64; 3]> = (0..scene.camera.width * scene.camera.height)
-            .map(|k| std::array::from_fn(|c| (f64::from(k) * 0.37 + c as f64).sin()))
-            .collect();
-        let loss = |double: &Scene<f64>| -> f64 {
-            let forward = reference::render::forward(double, &scene.camera, time, &settings, None);
-            let pixels = forward.color.pixels.iter().flatten();
-            pixels.zip(weights.iter().flatten()).map(|(color, weight)| color * weight).sum()
-        };
-        let mut renderer = Renderer::new(SimdLevel::Auto);
-        renderer.forward(&scene.field, &scene.camera, time, &settings, None);
-        let v_color = PixelGrid::from_pixels(
-            scene.camera.width,
-            scene.camera.height,
-            weights.iter().map(|w| w.map(|w| w as f32)).collect(),
-        );
-        let mut gradients = Gradients::zeros(&scene.field);
-        renderer.backward(&scene.field, &v_color, 0.0, &mut gradients);
-        // By every key that decides the time.
-        let difference = |change: &dyn Fn(&mut Scene<f64>, f64)| {
-            let at = |step: f64| {
-                let mut double = Scene::<f64>::from_field(&scene.field);
-                change(&mut double, step);
-                loss(&double)
-            };
-            (at(1e-5) - at(-1e-5)) / 2e-5
-        };
+    for scene in posed_views() {
+        check_gradients(&scene, &on_processor(&scene, &colored()));
+    }
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn poses_and_their_gaussians_have_the_gradients_of_the_reference_on_a_gpu() {
+    for scene in posed_views() {
+        let Some((gradients, colors)) = on_gpu(&scene, &colored()) else { return };
+        let forward = render(&Scene::<f64>::from_field(&scene.field), &scene, &colored());
         let mut compared = 0;
-        for group in 0..2 {
-            let keys = scene.field.tracks.as_ref().unwrap().groups[group].keys(time).unwrap();
-            for (key, share) in keys.into_iter().filter(|(_, share)| *share > 0.0) {
-                let found = gradients.poses[3 * group + key];
-                assert_eq!(gradients.pose_views[3 * group + key], 1);
-                for axis in 0..3 {
-                    let mut unit = DVec3::ZERO;
-                    unit[axis] = 1.0;
-                    let moved = |double: &mut Scene<f64>, step: f64| {
-                        let pose = &mut double.tracks.as_mut().unwrap().groups[group].poses[key];
-                        pose.translation += step * unit;
-                    };
-                    let expected = difference(&moved);
-                    let actual = found.translation[axis];
-                    assert!((actual - expected).abs() < 2e-3 * (1.0 + expected.abs()), "{actual} {expected}");
-                    // Spherical interpolation is not linear in its ends.
-                    if share == 1.0 {
-                        let turned = |double: &mut Scene<f64>, step: f64| {
-                            let pose = &mut double.tracks.as_mut().unwrap().groups[group].poses[key];
-                            pose.rotation *= DQuat::from_scaled_axis(step * unit);
-                        };
-                        let expected = difference(&turned);
-                        let actual = found.turn[axis];
-                        assert!(
-                            (actual - expected).abs() < 2e-3 * (1.0 + expected.abs()),
-                            "{actual} {expected}"
-                        );
-                    }
-                    compared += 1;
-                }
+        for (position, (found, expected)) in colors.iter().zip(&forward.color.pixels).enumerate() {
+            if pixel_discontinuity(&forward, position, 1e-3).is_none() {
+                compared += 1;
+                let error = (0..3).map(|c| (f64::from(found[c]) - expected[c]).abs()).fold(0.0, f64::max);
+                assert!(error < 3e-5, "pixel {position}: {found:?} {expected:?}");
             }
         }
-        assert!(compared >= 6);
-        let g = &gradients.gaussians;
-        for row in (0..scene.field.len()).filter(|row| row % 3 < 2) {
-            for k in 0..4 {
-                let cases: [(f32, Change<'_>); 3] = [
-                    (g.means[row][k % 3], &|double, step| {
-                        double.parameters.gaussians[row].mean[k % 3] += step;
-                    }),
-                    (g.quaternions[row][k], &|double, step| {
-                        double.parameters.gaussians[row].quaternion[k] += step;
-                    }),
-                    (g.sh_coefficients[row][3 + 7 * k], &|double, step| {
-                        double.parameters.gaussians[row].sh[3 + 7 * k] += step;
-                    }),
-                ];
-                for (actual, change) in cases {
-                    let expected = difference(change);
-                    let error = (f64::from(actual) - expected).abs();
-                    assert!(error < 2e-3 * (1.0 + expected.abs()), "row {row}, {k}: {actual} {expected}");
+        assert!(compared > 1000, "{compared} pixels are clear of thresholds");
+        check_gradients(&scene, &gradients);
+        let expected = on_processor(&scene, &colored());
+        assert_eq!(gradients.pose_views, expected.pose_views);
+        for name in ["turn", "translation"] {
+            let part = |pose: &cif_render::PoseGradient| match name {
+                "turn" => pose.turn,
+                _ => pose.translation,
+            };
+            let largest = expected.poses.iter().map(|pose| part(pose).length()).fold(0.0, f64::max);
+            let differences = gradients.poses.iter().zip(&expected.poses);
+            let worst = differences.map(|(a, b)| (part(a) - part(b)).length() / largest).fold(0.0, f64::max);
+            eprintln!("{name} at {}: worst error {worst:.1e} of the largest, {largest:.2e}", scene.time);
+            assert!(worst < 1e-4, "{name} at {}: {worst:.1e} of the largest", scene.time);
+        }
+        let again = on_gpu(&scene, &colored()).map(|(gradients, _)| gradients);
+        assert!(again.as_ref() == Some(&gradients), "the same on every run");
+    }
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn hidden_groups_and_groups_without_poses_are_drawn_on_a_gpu_as_on_the_processor() {
+    for (time, views) in [(0.2, 2), (0.7, 0)] {
+        let mut scene = SyntheticScene { time, ..posed_scene(None) };
+        let tracks = scene.field.tracks.as_mut().unwrap();
+        tracks.groups[0].visibility =
+            [(0.0, true), (0.5, false)].map(|(time, visible)| VisibilityStep { time, visible }).into();
+        tracks.groups[1].poses.clear();
+        // One that has no Gaussians.
+        tracks.groups.insert(1, TrackGroup { deformed: false, ..TrackGroup::still("none", DVec3::X) });
+        tracks.group_of.iter_mut().filter(|group| **group == 1).for_each(|group| *group = 2);
+        scene.field.validate().unwrap();
+        let Some((gradients, colors)) = on_gpu(&scene, &colored()) else { return };
+        let expected = on_processor(&scene, &colored());
+        let mut renderer = Renderer::new(SimdLevel::Auto);
+        let image = renderer.render(&scene.field, &scene.camera, time, &colored(), Channels::default());
+        for (found, expected) in colors.iter().zip(&image.color.pixels) {
+            assert!((0..3).all(|c| (found[c] - expected[c]).abs() < 1e-4), "{found:?} {expected:?}");
+        }
+        assert_eq!(gradients.pose_views, expected.pose_views);
+        assert_eq!(gradients.pose_views.iter().sum::<u32>(), views);
+    }
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn pictures_of_groups_on_a_gpu_are_those_of_the_processor() {
+    let Some(device) = crate::on_gpu::device() else { return };
+    let sampled = tracked_scene(Some(ALL_HEADS));
+    for scene in posed_views().iter().chain([&sampled]) {
+        for settings in [settings(), RenderSettings { deform: false, ..settings() }] {
+            let mut renderer = GpuRenderer::compact(&device.0, &scene.field).unwrap();
+            let mut expected = Renderer::new(SimdLevel::Auto);
+            for time in [scene.time, 0.35] {
+                let (field, camera) = (&scene.field, &scene.camera);
+                let found = renderer.render(field, camera, time, &settings, EVERYTHING).unwrap();
+                let expected = expected.render(field, camera, time, &settings, EVERYTHING);
+                let values = found.color.pixels.iter().flatten().zip(expected.color.pixels.iter().flatten());
+                let off = values.filter(|(a, b)| (**a - **b).abs() > 1e-4).count();
+                assert!(off < 10, "{off} values differ at {time}");
+            }
+        }
+    }
+}
+
+/// Gradients by poses, and by the Gaussians of groups, against differences of the reference.
+fn check_gradients(scene: &SyntheticScene, gradients: &Gradients) {
+    let weights = weights(scene);
+    let loss = |double: &Scene<f64>| -> f64 {
+        let forward = reference::render::forward(double, &scene.camera, scene.time, &colored(), None);
+        let pixels = forward.color.pixels.iter().flatten();
+        pixels.zip(weights.pixels.iter().flatten()).map(|(color, weight)| color * weight).sum()
+    };
+    // By every key that decides the time.
+    let difference = |change: &dyn Fn(&mut Scene<f64>, f64)| {
+        let at = |step: f64| {
+            let mut double = Scene::<f64>::from_field(&scene.field);
+            change(&mut double, step);
+            loss(&double)
+        };
+        (at(1e-5) - at(-1e-5)) / 2e-5
+    };
+    let mut compared = 0;
+    for group in 0..2 {
+        let keys = scene.field.tracks.as_ref().unwrap().groups[group].keys(scene.time).unwrap();
+        for (key, share) in keys.into_iter().filter(|(_, share)| *share > 0.0) {
+            let found = gradients.poses[3 * group + key];
+            assert_eq!(gradients.pose_views[3 * group + key], 1);
+            for axis in 0..3 {
+                let mut unit = DVec3::ZERO;
+                unit[axis] = 1.0;
+                let moved = |double: &mut Scene<f64>, step: f64| {
+                    let pose = &mut double.tracks.as_mut().unwrap().groups[group].poses[key];
+                    pose.translation += step * unit;
+                };
+                let expected = difference(&moved);
+                let actual = found.translation[axis];
+                assert!((actual - expected).abs() < 2e-3 * (1.0 + expected.abs()), "{actual} {expected}");
+                // Spherical interpolation is not linear in its ends.
+                if share == 1.0 {
+                    let turned = |double: &mut Scene<f64>, step: f64| {
+                        let pose = &mut double.tracks.as_mut().unwrap().groups[group].poses[key];
+                        pose.rotation *= DQuat::from_scaled_axis(step * unit);
+                    };
+                    let expected = difference(&turned);
+                    let actual = found.turn[axis];
+                    assert!((actual - expected).abs() < 2e-3 * (1.0 + expected.abs()), "{actual} {expected}");
                 }
+                compared += 1;
+            }
+        }
+    }
+    assert!(compared >= 6);
+    let g = &gradients.gaussians;
+    for row in (0..scene.field.len()).filter(|row| row % 3 < 2) {
+        for k in 0..4 {
+            let cases: [(f32, Change<'_>); 3] = [
+                (g.means[row][k % 3], &|double, step| {
+                    double.parameters.gaussians[row].mean[k % 3] += step;
+                }),
+                (g.quaternions[row][k], &|double, step| {
+                    double.parameters.gaussians[row].quaternion[k] += step;
+                }),
+                (g.sh_coefficients[row][3 + 7 * k], &|double, step| {
+                    double.parameters.gaussians[row].sh[3 + 7 * k] += step;
+                }),
+            ];
+            for (actual, change) in cases {
+                let expected = difference(change);
+                let error = (f64::from(actual) - expected).abs();
+                assert!(error < 2e-3 * (1.0 + expected.abs()), "row {row}, {k}: {actual} {expected}");
             }
         }
     }

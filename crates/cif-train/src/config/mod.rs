@@ -190,7 +190,7 @@ pub struct MotionConfig {
     /// Steps that teach the deformation the paths before the fine stage, default 300.
     pub rehearsal: u32,
     /// True where travelling objects that are rigid move by a trained pose per time instead of the network; needs
-    /// `guidance`, and steps on the processor; default true.
+    /// `guidance`; default true.
     pub rigid: bool,
     /// Gaussians that a travelling object starts with, default 300.
     pub gaussians: u32,

@@ -102,10 +102,6 @@ mod on_gpu {
         /// kernel.
         pub fn use_gpu(&mut self, gpu: &Gpu) -> Result<(), TrainError> {
             let state = &self.state;
-            if state.field.tracks.is_some() {
-                let problem = "objects of this run move by poses, which steps on a GPU do not train yet; go on with --backend cpu";
-                return Err(TrainError::Device(problem.into()));
-            }
             let capture = (&state.dataset, &state.config);
             let fresh = match &state.field.deformation {
                 None if self.stages.is_dynamic => {

@@ -26,7 +26,7 @@ pub(super) fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     trainer_with(gpu, |_| {})
 }
 
-fn trainer_with(gpu: Option<&Gpu>, edit: impl FnOnce(&mut TrainConfig)) -> (Trainer, TempDir) {
+pub(super) fn trainer_with(gpu: Option<&Gpu>, edit: impl FnOnce(&mut TrainConfig)) -> (Trainer, TempDir) {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 3, views: 2, ..Scene::default() });
     let mut config = small_config();
@@ -44,7 +44,7 @@ fn trainer_with(gpu: Option<&Gpu>, edit: impl FnOnce(&mut TrainConfig)) -> (Trai
 }
 
 /// Field, optimiser, statistics and exposures, after fetching them to the host.
-fn state(trainer: &mut Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
+pub(super) fn state(trainer: &mut Trainer) -> (Field, Optimiser, DensifyStatistics, Exposures) {
     trainer.fetch().unwrap();
     host(trainer)
 }
@@ -67,7 +67,7 @@ pub(super) fn step(trainer: &mut Trainer) -> (Result<(), TrainError>, Vec<TrainE
     (result, events)
 }
 
-fn device(trainer: &mut Trainer) -> &mut GpuEngine {
+pub(super) fn device(trainer: &mut Trainer) -> &mut GpuEngine {
     GpuEngine::of(&mut *trainer.engine)
 }
 
@@ -448,7 +448,7 @@ fn every_stage_of_a_step_has_a_floor() {
     }
 }
 
-fn drawn(trainer: &mut Trainer, trial: Option<&Field>) -> Vec<RenderedImage> {
+pub(super) fn drawn(trainer: &mut Trainer, trial: Option<&Field>) -> Vec<RenderedImage> {
     let settings = RenderSettings {
         instances: trainer.state.field.identities.as_ref().and_then(|_| trainer.state.instance_settings()),
         ..trainer.state.color_settings()
@@ -464,14 +464,14 @@ fn drawn(trainer: &mut Trainer, trial: Option<&Field>) -> Vec<RenderedImage> {
 }
 
 /// The same on the processor, which has what was fetched last.
-fn on_processor<T>(trainer: &mut Trainer, work: impl FnOnce(&mut Trainer) -> T) -> T {
+pub(super) fn on_processor<T>(trainer: &mut Trainer, work: impl FnOnce(&mut Trainer) -> T) -> T {
     let engine = std::mem::replace(&mut trainer.engine, Box::new(Processor::new(trainer.simd)));
     let result = work(trainer);
     trainer.engine = engine;
     result
 }
 
-fn assert_alike(found: &[RenderedImage], expected: &[RenderedImage], what: &str) {
+pub(super) fn assert_alike(found: &[RenderedImage], expected: &[RenderedImage], what: &str) {
     assert_eq!(found.len(), expected.len());
     for (found, expected) in found.iter().zip(expected) {
         let (a, b) = (found.color.pixels.as_flattened(), expected.color.pixels.as_flattened());

@@ -30,6 +30,9 @@ mod evaluate;
 mod from_scene;
 #[cfg(test)]
 #[cfg(feature = "wgpu")]
+mod gpu_pose_tests;
+#[cfg(test)]
+#[cfg(feature = "wgpu")]
 mod gpu_tests;
 #[cfg(test)]
 mod guard_tests;

@@ -8,6 +8,7 @@ use cif_render::wgpu::Access::{Read, ReadWrite, Uniform};
 use cif_render::wgpu::deform::FIXED_POINT;
 use cif_render::wgpu::faults::FAULTS;
 use cif_render::wgpu::gaussians::{GEOMETRY_FLOATS, geometry_column};
+use cif_render::wgpu::poses::{GROUPS, QUATERNIONS as QUATERNION_PRODUCTS};
 use cif_render::wgpu::view::INSTANCE_PASS;
 use cif_render::wgpu::{
     Constant, Gpu, GpuError, GpuStatistics, Kernel, Layout, MAX_WORKGROUPS, Module, Shared, Snippet,
@@ -21,6 +22,7 @@ use crate::exposure::WIDTH as EXPOSURE_FLOATS;
 use crate::losses::displacement::NO_ROTATION;
 use crate::losses::held_out;
 use crate::losses::ssim::{C1, C2};
+use crate::poses;
 
 cif_render::shared_struct! {
     /// Parameters of the loss kernels for a view.
@@ -147,6 +149,32 @@ cif_render::shared_struct! {
 }
 
 cif_render::shared_struct! {
+    /// Parameters of the optimiser's step of poses.
+    pub struct PoseRates {
+        /// Rate of turns in radians, and of translations in sizes; 0 keeps still.
+        pub rate: f32,
+        /// Pads to 16 bytes.
+        pub unused: u32,
+        /// As above.
+        pub unused_too: [u32; 2],
+    }
+}
+
+cif_render::shared_struct! {
+    /// Moments of a pose.
+    pub struct PoseState {
+        /// Decaying mean of the gradient by the turn, and steps done.
+        pub first_turn: [f32; 4],
+        /// Of the gradient by the translation; one more float.
+        pub first_translation: [f32; 4],
+        /// Decaying mean of the squares; one more float.
+        pub second_turn: [f32; 4],
+        /// As above.
+        pub second_translation: [f32; 4],
+    }
+}
+
+cif_render::shared_struct! {
     /// Parameters of the kernel that accumulates gradients.
     pub struct Accumulation {
         /// Floats, or rows.
@@ -227,6 +255,7 @@ pub fn fault_name(found: u32) -> (&'static str, String) {
     }
     let (part, name) = match 1_u32.checked_shl(lowest) {
         Some(fault::EXPOSURES) => ("gradients", "gradient of exposures"),
+        Some(fault::POSES) => ("gradients", "gradient of poses"),
         Some(fault::COLOR_LOSS) => ("losses", "colour loss"),
         Some(fault::INSTANCE_LOSS) => ("losses", "instance loss"),
         _ => ("optimiser", "learning rate"),
@@ -268,6 +297,12 @@ const CONSTANTS: Snippet = Snippet {
             ("JUDGED_ROW", Constant::Unsigned(held_out::FIRST.1)),
             ("PLANES_FAULT", Constant::Unsigned(fault::bit(&PLANES))),
             ("MAX_WORKGROUPS", Constant::Unsigned(MAX_WORKGROUPS)),
+            ("POSE_DECAY_1", Constant::Float(poses::DECAY[0] as f32)),
+            ("POSE_DECAY_2", Constant::Float(poses::DECAY[1] as f32)),
+            ("POSE_SHARE_1", Constant::Float((1.0 - poses::DECAY[0]) as f32)),
+            ("POSE_SHARE_2", Constant::Float((1.0 - poses::DECAY[1]) as f32)),
+            ("POSE_EPSILON", Constant::Float(poses::EPSILON as f32)),
+            ("POSE_STEPS", Constant::Float(poses::COUNTED_STEPS as f32)),
         ])
     },
 };
@@ -282,6 +317,8 @@ const EXPOSURE_SETTINGS: Snippet =
     Snippet { name: "exposure_settings", text: || structures(&[ExposureSettings::layout()]) };
 const EXPOSURE_RATES: Snippet =
     Snippet { name: "exposure_rates", text: || structures(&[ExposureRates::layout()]) };
+const POSE_RATES: Snippet =
+    Snippet { name: "pose_rates", text: || structures(&[PoseRates::layout(), PoseState::layout()]) };
 const ACCUMULATION: Snippet =
     Snippet { name: "accumulation", text: || structures(&[Accumulation::layout()]) };
 const REARRANGEMENT: Snippet =
@@ -333,6 +370,15 @@ pub const ADAM_EXPOSURES: Module = Module {
     imports: &[CONSTANTS, EXPOSURE_RATES, ADAM],
     bindings: &[Uniform, ReadWrite, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
     entries: &["adam_exposures"],
+};
+
+/// Optimiser of poses.
+pub const ADAM_POSES: Module = Module {
+    name: "adam_poses",
+    text: include_str!("adam_poses.wgsl"),
+    imports: &[CONSTANTS, GROUPS, QUATERNION_PRODUCTS, POSE_RATES],
+    bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
+    entries: &["adam_poses"],
 };
 
 /// Optimiser of what Gaussians have.
@@ -414,6 +460,7 @@ pub const MODULES: &[&Module] = &[
     &SSIM,
     &EXPOSURE,
     &ADAM_EXPOSURES,
+    &ADAM_POSES,
     &ADAM_GAUSSIANS,
     &ADAM_NETWORK,
     &ADAM_PLANES,
@@ -432,6 +479,8 @@ pub const LAYOUTS: &[fn() -> Layout] = &[
     PlaneRates::layout,
     ExposureSettings::layout,
     ExposureRates::layout,
+    PoseRates::layout,
+    PoseState::layout,
     Accumulation::layout,
     Judgement::layout,
     Rearrangement::layout,

@@ -10,11 +10,11 @@
 //! | `rearrange.wgsl` | rows after a change of the set of Gaussians |
 //! | `identity.wgsl` | probabilities of the identity rows |
 //! | `accumulate.wgsl` | sums over the views of a step, statistics of densification |
-//! | `adam_gaussians.wgsl`, `adam_planes.wgsl`, `adam_network.wgsl`, `adam_exposures.wgsl` | the optimiser |
+//! | `adam_gaussians.wgsl`, `adam_planes.wgsl`, `adam_network.wgsl`, `adam_exposures.wgsl`, `adam_poses.wgsl` | the optimiser |
 //! | `displacement.wgsl` | holds travelling objects to their paths, everything else to its place |
 //! | `kernels` | the files, and what they share with Rust |
 //! | `floors` | what the stages of a step move and compute at the least |
-//! | `losses`, `exposure`, `judge`, `motion`, `optimiser`, `rearrange` | recording them |
+//! | `losses`, `exposure`, `judge`, `motion`, `optimiser`, `poses`, `rearrange` | recording them |
 
 pub(crate) mod exposure;
 pub mod floors;
@@ -23,6 +23,7 @@ pub mod kernels;
 pub mod losses;
 pub mod motion;
 pub mod optimiser;
+pub(crate) mod poses;
 pub mod rearrange;
 
 #[cfg(test)]

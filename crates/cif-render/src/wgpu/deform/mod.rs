@@ -260,7 +260,7 @@ impl GpuDeformation {
     ) -> PosedInput<'a> {
         self.forward(gpu, commands, time, canonical, posed);
         let sh = if self.moves_sh() { &posed.sh } else { &canonical.sh };
-        PosedInput { geometry: &posed.geometry, sh }
+        PosedInput { geometry: &posed.geometry, sh, turns: None }
     }
 
     /// Records the moving of `canonical` to `time` in [0, 1] into `posed`, which has as many rows; only a head that

@@ -2,8 +2,9 @@
 
 use cif_field::Field;
 use cif_render::RenderedImage;
+use cif_render::wgpu::poses;
 use cif_render::wgpu::{
-    Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, PosedInput, ViewInput,
+    Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuPoses, PosedInput, ViewInput,
 };
 
 use super::super::Views;
@@ -69,6 +70,7 @@ struct StandIn {
     posed: GpuGaussians,
     deformation: Option<GpuDeformation>,
     moves: bool,
+    groups: Option<GpuPoses>,
 }
 
 impl StandIn {
@@ -76,12 +78,16 @@ impl StandIn {
         let n = trial.len();
         let mut posed = GpuGaussians::zeros(gpu, 0)?;
         let mut own = None;
-        if let Some(deformation) = &trial.deformation {
+        if trial.deformation.is_some() || trial.tracks.is_some() {
             posed.geometry.resize(gpu, n)?;
+        }
+        if let Some(deformation) = &trial.deformation {
             posed.sh.resize(gpu, if deformation.config.heads.sh { n } else { 0 })?;
             match of_field.filter(|resident| *resident.parameters.config() == deformation.config) {
-                Some(resident) => resident.parameters.set_still(gpu, &deformation.still)?,
-                None => own = Some(GpuDeformation::new(gpu, deformation)?),
+                Some(resident) => resident.parameters.set_still(gpu, &trial.left_alone())?,
+                None => {
+                    own.insert(GpuDeformation::new(gpu, deformation)?).set_still(gpu, &trial.left_alone())?
+                }
             }
         }
         Ok(Self {
@@ -89,6 +95,7 @@ impl StandIn {
             posed,
             deformation: own,
             moves: trial.deformation.is_some(),
+            groups: trial.tracks.as_ref().map(|tracks| GpuPoses::new(gpu, tracks)).transpose()?,
         })
     }
 
@@ -99,11 +106,8 @@ impl StandIn {
         time: f64,
         of_field: Option<&GpuDeformation>,
     ) -> PosedInput<'a> {
-        match self.deformation.as_ref().or(of_field) {
-            Some(deformation) if self.moves => {
-                deformation.pose(gpu, commands, time, &self.canonical, &self.posed)
-            }
-            _ => (&self.canonical).into(),
-        }
+        let deformation = self.deformation.as_ref().or(of_field).filter(|_| self.moves);
+        let motion = (deformation, self.groups.as_ref());
+        poses::pose(gpu, commands, time, motion, &self.canonical, &self.posed)
     }
 }

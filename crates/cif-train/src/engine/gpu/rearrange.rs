@@ -63,9 +63,10 @@ impl GpuEngine {
         let State { field, optimiser, statistics, .. } = state;
         resident.canonical.geometry.replace(&self.gpu, &geometry(&field.gaussians))?;
         resident.statistics.replace(&self.gpu, &statistic_rows(statistics))?;
-        if let (Some(resident), Some(deformation)) = (&mut resident.deformation, &field.deformation) {
-            resident.parameters.set_still(&self.gpu, &deformation.still)?;
+        if let Some(deformation) = &mut resident.deformation {
+            deformation.parameters.set_still(&self.gpu, &field.left_alone())?;
         }
+        resident.set_members(&self.gpu, field)?;
         if let Some(rows) = field.identities.as_ref().filter(|_| state.progress.stage == Stage::Instance) {
             let instances = field.instances.len();
             resident.identities = Some(ResidentIdentities::send(&self.gpu, rows, instances, optimiser)?);

@@ -1,11 +1,12 @@
 //! Training data on the device: the field, its moments and gradients.
 
 use cif_field::parameters::{LOG_CALIBRATIONS, MLP, PLANES, Parameter, Rows};
-use cif_field::{Gaussians, Identities};
+use cif_field::{Field, Gaussians, Identities};
 use cif_render::wgpu::deform::DeformationGradients;
 use cif_render::wgpu::gaussians::{gaussians, geometry};
+use cif_render::wgpu::poses;
 use cif_render::wgpu::{
-    Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuVec, PosedInput,
+    Commands, DeviceIdentities, Gpu, GpuDeformation, GpuError, GpuGaussians, GpuPoses, GpuVec, PosedInput,
 };
 
 use crate::adam::Moments;
@@ -15,6 +16,7 @@ use crate::optimiser::Optimiser;
 use crate::state::State;
 use crate::wgpu::exposure::CameraExposures;
 use crate::wgpu::optimiser::GpuMoments;
+use crate::wgpu::poses::GpuPoseOptimiser;
 
 /// Parts that the host has changed since they were sent to the device.
 #[derive(Clone, Copy, Debug, Default)]
@@ -23,11 +25,12 @@ pub(super) struct Stale {
     pub(super) identities: bool,
     pub(super) deformation: bool,
     pub(super) exposures: bool,
+    pub(super) poses: bool,
 }
 
 impl Stale {
     pub(super) const EVERYTHING: Self =
-        Self { gaussians: true, identities: true, deformation: true, exposures: true };
+        Self { gaussians: true, identities: true, deformation: true, exposures: true, poses: true };
 }
 
 /// The deformation with its moments (planes, network) and gradients.
@@ -46,6 +49,12 @@ pub(super) struct ResidentIdentities {
     pub(super) moments: GpuMoments,
 }
 
+/// Groups that move as a whole, with the moments of their poses.
+pub(super) struct ResidentPoses {
+    pub(super) groups: GpuPoses,
+    pub(super) optimiser: GpuPoseOptimiser,
+}
+
 /// Everything of a run that stays on the device.
 pub(super) struct Resident {
     pub(super) canonical: GpuGaussians,
@@ -61,6 +70,7 @@ pub(super) struct Resident {
     pub(super) deformation: Option<ResidentDeformation>,
     pub(super) identities: Option<ResidentIdentities>,
     pub(super) exposures: Option<CameraExposures>,
+    pub(super) poses: Option<ResidentPoses>,
 }
 
 /// Moments of a parameter of the table.
@@ -135,10 +145,11 @@ impl ResidentIdentities {
 }
 
 impl Resident {
-    /// The Gaussians at a time in 0..=1, deformed if the field moves.
+    /// The Gaussians at a time in 0..=1, deformed if the field moves, and where their groups are.
     pub(super) fn pose(&self, gpu: &Gpu, commands: &mut Commands<'_>, time: f64) -> PosedInput<'_> {
-        let Some(deformation) = &self.deformation else { return (&self.canonical).into() };
-        deformation.parameters.pose(gpu, commands, time, &self.canonical, &self.posed)
+        let deformation = self.deformation.as_ref().map(|resident| &resident.parameters);
+        let groups = self.poses.as_ref().map(|resident| &resident.groups);
+        poses::pose(gpu, commands, time, (deformation, groups), &self.canonical, &self.posed)
     }
 
     /// Nothing yet.
@@ -154,6 +165,7 @@ impl Resident {
             deformation: None,
             identities: None,
             exposures: None,
+            poses: None,
         })
     }
 
@@ -172,11 +184,6 @@ impl Resident {
             self.posed.sh.resize(gpu, if moves_sh { n } else { 0 })?;
             self.screen = GpuVec::zeros(gpu, "screen gradients", n)?;
             self.statistics.replace(gpu, &statistic_rows(statistics))?;
-        }
-        if let (true, Some(deformation), Some(resident)) =
-            (stale.gaussians && !stale.deformation, &field.deformation, &mut self.deformation)
-        {
-            resident.parameters.set_still(gpu, &deformation.still)?;
         }
         if stale.deformation {
             self.deformation = match &field.deformation {
@@ -198,6 +205,20 @@ impl Resident {
                 }
             };
         }
+        if let Some(resident) = self.deformation.as_mut().filter(|_| stale.gaussians) {
+            resident.parameters.set_still(gpu, &field.left_alone())?;
+        }
+        if stale.poses {
+            self.poses = match &field.tracks {
+                None => None,
+                Some(tracks) => Some(ResidentPoses {
+                    groups: GpuPoses::new(gpu, tracks)?,
+                    optimiser: GpuPoseOptimiser::new(gpu, &state.pose_moments)?,
+                }),
+            };
+        } else if stale.gaussians {
+            self.set_members(gpu, field)?;
+        }
         if stale.exposures {
             let exposures = state.progress.exposures.as_ref();
             self.exposures =
@@ -210,6 +231,14 @@ impl Resident {
             };
         }
         Ok(())
+    }
+
+    /// Takes the Gaussians of a field for the groups, which stay.
+    pub(super) fn set_members(&mut self, gpu: &Gpu, field: &Field) -> Result<(), GpuError> {
+        match (&mut self.poses, &field.tracks) {
+            (Some(poses), Some(tracks)) => poses.groups.set_members(gpu, tracks),
+            _ => Ok(()),
+        }
     }
 
     /// Reads everything that steps change, waiting for the device.
@@ -244,6 +273,10 @@ impl Resident {
             ]),
         };
         let of_cameras = self.exposures.as_ref().map(|resident| resident.read(gpu)).transpose()?;
+        let poses = match &self.poses {
+            None => None,
+            Some(resident) => Some((resident.groups.read(gpu)?, resident.optimiser.read(gpu)?)),
+        };
         let State { field, optimiser, statistics, progress, .. } = state;
         let exposures = progress.exposures.as_mut();
         debug_assert_eq!(geometry(&field.gaussians).len(), parameters.0.len(), "the set changes on the host");
@@ -254,6 +287,9 @@ impl Resident {
         *statistics = statistics_of(&rows);
         if let (Some(target), Some(arrays)) = (exposures, of_cameras) {
             [target.values, target.first, target.second] = arrays;
+        }
+        if let (Some(tracks), Some((groups, moments))) = (&mut field.tracks, poses) {
+            (tracks.groups, state.pose_moments) = (groups, moments);
         }
         if let (Some(target), Some(([planes, first, second], [mlp, mlp_first, mlp_second]))) =
             (&mut field.deformation, deformation)

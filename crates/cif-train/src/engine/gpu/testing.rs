@@ -2,6 +2,8 @@
 
 use std::any::Any;
 
+use cif_render::wgpu::poses::PoseSum;
+
 use super::{FETCH_EVERY, GpuEngine};
 use crate::engine::Engine;
 
@@ -23,6 +25,13 @@ impl GpuEngine {
             }
             None => resident.exposures.as_ref().unwrap().gradients().write(&self.gpu, 7, &[value]),
         }
+    }
+
+    /// Puts a value into the gradient of the first pose of the next step.
+    pub(crate) fn damage_poses(&mut self, value: f32) {
+        let poses = self.resident.as_ref().and_then(|resident| resident.poses.as_ref()).expect("groups");
+        let sum = PoseSum { turn: [0.0, value, 0.0, 1.0], translation: [0.0; 4] };
+        poses.groups.gradients.write(&self.gpu, 0, &[sum]);
     }
 
     /// Pairs and label slots that views wanted so far.

@@ -30,7 +30,7 @@ impl GaussianStep {
 }
 
 /// Faults that stop a step regardless of the parameters that it moves.
-const ALWAYS: u32 = fault::NO_ROOM | fault::COLOR_LOSS | fault::INSTANCE_LOSS;
+const ALWAYS: u32 = fault::NO_ROOM | fault::COLOR_LOSS | fault::INSTANCE_LOSS | fault::POSES;
 
 impl GpuEngine {
     /// One view, forward and backward; after the last one of a step, the optimiser.
@@ -124,6 +124,9 @@ impl GpuEngine {
         }
         rasterizer.backward(gpu, &mut commands, posed, rows, labels, &losses.v_colors)?;
 
+        if let Some(poses) = &resident.poses {
+            poses.groups.backward(gpu, &mut commands, &resident.canonical, rasterizer, faults);
+        }
         let gradients = rasterizer.gradients();
         if let Some(deformation) = &mut resident.deformation {
             optimiser.add_gaussians(
@@ -202,6 +205,10 @@ impl GpuEngine {
                     &identities.moments,
                     faults,
                 );
+            }
+            if let Some(poses) = &resident.poses {
+                let of = (&poses.groups, &resident.canonical);
+                poses.optimiser.step(gpu, &mut commands, plan.pose_rate, of, faults);
             }
             if let Some(cameras) = &resident.exposures {
                 exposure.step(gpu, &mut commands, recording.exposures, cameras, faults);
