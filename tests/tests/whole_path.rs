@@ -118,6 +118,23 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     // glTF and PLY need nothing else; both come back as scenes with the same objects.
     cif(path, "export scene.cif --gltf out.gltf --ply out.ply").succeeds();
     cif(path, "export scene.cif --gltf out.gltf").fails(1, &["out.gltf exists", "--force"]);
+
+    // What a file loses is told on held-out images, as `cif eval` scores them.
+    let line = "export scene.cif --gltf checked.glb --check --capture table --json";
+    let checked = &json(&cif(path, line).succeeds().stdout)["check"][0]["held_out"];
+    let (before, after) = (&checked["scene"], &checked["file"]);
+    assert_eq!((checked["frames"].as_u64(), before["psnr"].as_f64()), (Some(6), Some(number("psnr"))));
+    assert_eq!(before["miou"].as_f64(), Some(number("miou")));
+    let lost = before["psnr"].as_f64().unwrap() - after["psnr"].as_f64().unwrap();
+    assert_eq!(checked["psnr_lost"].as_f64(), Some(lost));
+    assert!((-0.2..3.0).contains(&lost), "{checked:#}");
+    let objects = checked["objects"].as_array().unwrap();
+    let labels: Vec<&str> = objects.iter().filter_map(|object| object["label"].as_str()).collect();
+    assert_eq!(labels, ["everything else", "red ball", "blue ball"]);
+    assert!(
+        objects[1..].iter().all(|object| object["psnr_lost"].is_number() && object["iou_lost"].is_number())
+    );
+
     let text = fs::read_to_string(path.join("out.gltf")).unwrap();
     assert!(text.contains("KHR_gaussian_splatting:ROTATION") && text.contains("red ball"));
     assert!(path.join("out.bin").metadata().unwrap().len() > 10_000);

@@ -9,6 +9,7 @@ mod diff;
 mod eval;
 mod eval_motion;
 mod export;
+mod export_check;
 mod import;
 mod info;
 #[cfg(feature = "wgpu")]

@@ -230,14 +230,14 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
             Painter::Cpu(renderer) => {
                 let request = BandRequest { channels, ..BandRequest::default() };
                 renderer.render_bands(&field, &view.camera, time, &settings, &request, |band| {
-                    go_on()?;
+                    interrupt::go_on()?;
                     files.add(&band.image)
                 })?;
             }
             #[cfg(feature = "wgpu")]
             Painter::Gpu(renderer) => {
                 renderer.render_bands(&field, &view.camera, time, &settings, channels, |_, band| {
-                    go_on()?;
+                    interrupt::go_on()?;
                     files.add(&band)
                 })?;
             }
@@ -245,15 +245,6 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         files.finish()?;
     }
     eprintln!("rendered {} views into {}", views.len(), command.output.display());
-    Ok(())
-}
-
-/// # Errors
-/// After Ctrl-C.
-fn go_on() -> Result<(), Error> {
-    if interrupt::requested() {
-        return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
-    }
     Ok(())
 }
 
@@ -446,7 +437,7 @@ fn write_exr(
     let request = BandRequest { channels, ranks: cif_exr::cryptomatte::RANKS, values: moved.as_deref() };
     cif_exr::write(&path, &frame, |file| {
         renderer.render_bands(field, &view.camera, frame.time, settings, &request, |band| {
-            go_on()?;
+            interrupt::go_on()?;
             let image = &band.image;
             let motion = motion(band.blended, image);
             let (first_row, ranks) = (band.first_row, band.ranks.as_ref());
