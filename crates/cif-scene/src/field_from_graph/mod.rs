@@ -249,6 +249,7 @@ impl NodeRows {
         let always_visible = visibility.iter().all(|step| step.visible);
         let group = TrackGroup {
             poses: path.poses(times),
+            rotation: node.report.rotation.filter(|_| matches!(node.motion, Motion::Rigid(_))),
             visibility: if always_visible { Vec::new() } else { visibility },
             opacities,
             colors,

@@ -2,7 +2,7 @@
 
 use super::*;
 use cif_field::tracks::{NO_GROUP, Samples, TrackGroup, TrackPose};
-use cif_field::{Owner, Tracks};
+use cif_field::{Owner, RotationEvidence, Tracks};
 
 use crate::shape::convex_hull::HullMesh;
 
@@ -310,6 +310,7 @@ fn what_changes_over_time_comes_back_from_the_graph() {
             .iter()
             .map(|time| TrackPose { time: *time, translation: DVec3::X * *time, rotation: turn(*time) })
             .collect(),
+        rotation: Some(RotationEvidence::Assumed),
         opacities: Some(Samples { times: times.clone(), values: opacities }),
         colors: Some(Samples { times: times.clone(), values: colors }),
         ..TrackGroup::still("changing", DVec3::ZERO)
@@ -320,7 +321,10 @@ fn what_changes_over_time_comes_back_from_the_graph() {
     let graph = build(&field, &options).unwrap();
     let node = &graph.nodes[0];
     assert_eq!((node.model(), node.appearance.colors.len()), (MotionModel::Rigid, FRAMES));
+    let evidence: Vec<_> = graph.nodes.iter().map(|node| node.report.rotation).collect();
+    assert_eq!(evidence, [Some(RotationEvidence::Assumed), None, None], "of what follows the track alone");
     let back = field_from_graph(&graph, "graph").unwrap();
+    assert_eq!(back.tracks.as_ref().unwrap().groups[0].rotation, Some(RotationEvidence::Assumed));
     for time in &times {
         let (a, b) = (field.deformed(*time), back.deformed(*time));
         for row in 0..n {
