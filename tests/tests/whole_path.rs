@@ -6,7 +6,8 @@ use std::process::{Child, Command, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
-use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
+use cif_dataset::CaptureFrame;
+use cif_field::tracks::{DenseTrack, RotationEvidence, TrackGroup, TrackPose, Tracks};
 use cif_field::{Checkpoint, Field, Gaussians, Identities, Instance, SortMetric, Timeline};
 use cif_test::capture::{self, ROLLING, STANDING};
 use cif_test::command::{Run, run};
@@ -118,6 +119,11 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     // glTF and PLY need nothing else; both come back as scenes with the same objects.
     cif(path, "export scene.cif --gltf out.gltf --ply out.ply").succeeds();
     cif(path, "export scene.cif --gltf out.gltf").fails(1, &["out.gltf exists", "--force"]);
+
+    let facts = json(&cif(path, "info scene.cif --json").succeeds().stdout);
+    let motion = &facts["instances"][0]["motion"];
+    assert_eq!(motion["model"], "free", "the deformation moves it: {facts:#}");
+    assert!(motion["moving"].as_u64() <= facts["instances"][0]["gaussians"].as_u64(), "{motion}");
 
     // What a file loses is told on held-out images, as `cif eval` scores them.
     let line = "export scene.cif --gltf checked.glb --check --capture table --json";
@@ -419,4 +425,46 @@ fn motion_is_measured_against_followed_points() {
     fs::remove_file(&tracks).unwrap();
     assert!(motion("eval still.cif table --json -").is_null());
     assert!(!cif(path, "eval still.cif table").succeeds().stdout.contains("unmoved"));
+}
+
+#[test]
+fn objects_tell_how_they_move() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let mut field = balls(true);
+    let groups = &mut field.tracks.as_mut().unwrap().groups;
+    for (k, pose) in groups[0].poses.iter_mut().enumerate() {
+        pose.rotation = DQuat::from_rotation_y(0.25 * k as f64);
+    }
+    groups[0].rotation = Some(RotationEvidence::Assumed);
+    groups[1].poses.clear();
+    field.save(path.join("scene.cif")).unwrap();
+    let facts = json(&cif(path, "info scene.cif --json").succeeds().stdout);
+    let [rolling, standing] = [0, 1].map(|k| &facts["instances"][k]);
+    assert_eq!(rolling["gaussians"], 100);
+    let motion = &rolling["motion"];
+    assert_eq!((&motion["model"], &motion["poses"]), (&"rigid".into(), &8.into()), "{facts:#}");
+    assert_eq!(motion["rotation"], "assumed");
+    let travel = capture::centre(ROLLING, 1.0).distance(capture::centre(ROLLING, 0.0));
+    assert!((motion["moves"].as_f64().unwrap() - travel).abs() < 1e-9, "{motion}");
+    assert!((motion["turns_deg"].as_f64().unwrap() - 1.75_f64.to_degrees()).abs() < 1e-3, "{motion}");
+    assert_eq!(standing["motion"], serde_json::json!({ "model": "static" }));
+    let text = cif(path, "info scene.cif").succeeds().stdout;
+    assert!(
+        text.contains("100 Gaussians  rigid, 8 poses, moves 0.500, turns 100.3 deg, rotation assumed"),
+        "{text}"
+    );
+    assert!(text.contains("100 Gaussians  static"), "{text}");
+    // Distances are those of the capture's world.
+    field.record.frame = CaptureFrame { offset: [1e6, 0.0, 0.0], scale: 0.1 };
+    let groups = &mut field.tracks.as_mut().unwrap().groups;
+    groups[1].dense = Some(DenseTrack {
+        times: vec![0.0, 1.0],
+        means: vec![[0.0; 3]; 200],
+        quaternions: vec![[1.0, 0.0, 0.0, 0.0]; 200],
+        log_scales: None,
+    });
+    field.save(path.join("far.cif")).unwrap();
+    let text = cif(path, "info far.cif").succeeds().stdout;
+    assert!(text.contains("moves 5.000") && text.contains("dense, 2 samples"), "{text}");
 }

@@ -18,6 +18,7 @@ mod label;
 mod masks;
 mod model_options;
 mod motion_table;
+mod object_motion;
 mod painter;
 mod plan;
 mod query;
