@@ -468,3 +468,59 @@ fn objects_tell_how_they_move() {
     let text = cif(path, "info far.cif").succeeds().stdout;
     assert!(text.contains("moves 5.000") && text.contains("dense, 2 samples"), "{text}");
 }
+
+#[test]
+fn paths_of_moving_objects_are_drawn() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let mut field = balls(true);
+    field.background = [0.0; 3];
+    field.save(path.join("scene.cif")).unwrap();
+    fs::write(
+        path.join("views.json"),
+        r#"[{"name": "above", "width": 320, "height": 240, "vertical_fov_deg": 50,
+             "position": [0, -1, 1.5], "look_at": [0, 0, 0]}]"#,
+    )
+    .unwrap();
+    let picture = |what: &str, time: f64| {
+        cif(
+            path,
+            &format!("render scene.cif --camera views.json --what {what} --time {time} -o out --force"),
+        )
+        .succeeds();
+        image::open(path.join(format!("out/{what}/above.png"))).unwrap().into_rgb8()
+    };
+    // Edges are soft: most of a colour counts.
+    let is_mostly = |pixel: [u8; 3], color: [u8; 3]| {
+        pixel
+            .iter()
+            .zip(color)
+            .all(|(value, color)| *value <= color && 10 * u32::from(*value) >= 7 * u32::from(color))
+    };
+    let count = |what: &str, time: f64, color: [u8; 3]| {
+        picture(what, time).pixels().filter(|pixel| is_mostly(pixel.0, color)).count()
+    };
+    let [rolling, standing] = [ROLLING, STANDING].map(cif::pictures::instance_color);
+    // All of the way is behind at the end; at the start it is fainter, and to come.
+    let (start, end) = (count("tracks", 0.0, rolling), count("tracks", 1.0, rolling));
+    assert!(start > 5 && end > start + 20, "{start} {end}");
+    assert_eq!((count("rgb", 1.0, rolling), count("tracks", 1.0, standing)), (0, 0));
+    // Axes turn with the object.
+    let axes = |field: &Field| {
+        field.save(path.join("scene.cif")).unwrap();
+        let picture = picture("tracks", 1.0);
+        let of_x = picture.enumerate_pixels().filter(|(.., pixel)| is_mostly(pixel.0, [230, 60, 60]));
+        of_x.map(|(x, y, _)| (x, y)).collect::<Vec<_>>()
+    };
+    let unturned = axes(&field);
+    assert!(unturned.len() > 3, "{unturned:?}");
+    for pose in &mut field.tracks.as_mut().unwrap().groups[0].poses {
+        pose.rotation = DQuat::from_rotation_z(pose.time * 2.0);
+    }
+    let turned = axes(&field);
+    let same = turned.iter().filter(|pixel| unturned.contains(pixel)).count();
+    assert!(turned.len() > 3 && 2 * same < turned.len(), "{same} of {}", turned.len());
+    field.identities = None;
+    field.save(path.join("scene.cif")).unwrap();
+    cif(path, "render scene.cif --camera views.json --what tracks -o none").fails(1, &["without masks"]);
+}

@@ -28,6 +28,7 @@ mod scene;
 mod targets;
 mod train;
 mod train_budget;
+mod trajectories;
 
 use cif_render::cpu::SimdLevel;
 use clap::builder::{EnumValueParser, TypedValueParser};

@@ -70,7 +70,7 @@ fn group_of(field: &Field, row: u32) -> Option<&TrackGroup> {
 }
 
 /// The group that more than half of the rows belong to.
-fn followed<'a>(field: &'a Field, rows: &[u32]) -> Option<&'a TrackGroup> {
+pub(super) fn followed<'a>(field: &'a Field, rows: &[u32]) -> Option<&'a TrackGroup> {
     let groups = &field.tracks.as_ref()?.groups;
     let in_group = |group: &&TrackGroup| {
         let own = rows.iter().filter(|row| group_of(field, **row).is_some_and(|of| std::ptr::eq(of, *group)));
