@@ -212,6 +212,24 @@ fn levels_of_detail_nest_and_keep_the_important() {
 }
 
 #[test]
+fn members_are_those_of_the_nodes() {
+    let mut field = field(3);
+    field.gaussians.opacity_logits[7] = -9.0;
+    let options = SceneOptions::default();
+    let members = crate::build::assignment::members(&field, &options);
+    let graph = build(&field, &options).unwrap();
+    assert_eq!((members.len(), members[0].len()), (3, 59), "one is too faint to be drawn");
+    for (node, members) in graph.nodes.iter().zip(&members) {
+        let mut rows = node.splats.rows.clone();
+        rows.sort_unstable();
+        assert_eq!(&rows, members, "{}", node.name);
+    }
+    field.identities = None;
+    let none = crate::build::assignment::members(&field, &options);
+    assert!(none.len() == 3 && none.iter().all(Vec::is_empty));
+}
+
+#[test]
 fn velocities_are_those_of_the_track() {
     let field = field(1);
     let motion = |time: f64| RigidTransform {

@@ -6,6 +6,8 @@ use std::path::PathBuf;
 use cif_dataset::{Dataset, PointSource, Split};
 use cif_field::{Checkpoint, Field};
 use cif_geometry::Bounds;
+use cif_scene::SceneOptions;
+use cif_scene::build::assignment::members;
 use cif_train::Curve;
 use clap::Args;
 use glam::DVec3;
@@ -111,12 +113,7 @@ fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
 fn scene_facts(checkpoint: &Checkpoint) -> Facts {
     let field: &Field = &checkpoint.field;
     let means = Bounds::around(field.gaussians.means.iter().map(|p| DVec3::from(p.map(f64::from))));
-    let mut owned: Vec<Vec<u32>> = vec![Vec::new(); field.instances.len()];
-    for (row, owner) in field.instance_of_gaussians().unwrap_or_default().into_iter().enumerate() {
-        if let Some(owner) = owner {
-            owned[usize::from(owner)].push(row as u32);
-        }
-    }
+    let owned = members(field, &SceneOptions::default());
     let instances: Vec<Value> = field
         .instances
         .iter()

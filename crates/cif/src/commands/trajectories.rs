@@ -3,6 +3,8 @@
 use cif_field::{Field, TrackGroup};
 use cif_geometry::PinholeCamera;
 use cif_render::cpu::{Renderer, SimdLevel};
+use cif_scene::SceneOptions;
+use cif_scene::build::assignment::members;
 use glam::{DVec2, DVec3};
 
 use super::object_motion::followed;
@@ -11,8 +13,9 @@ use crate::pictures::{Polyline, instance_color};
 /// Most times that a path is drawn through.
 const MOST_TIMES: usize = 200;
 
-/// Length on screen below which a path is that of an object at rest, pixels.
-const AT_REST: f64 = 3.0;
+/// Length on screen below which a path is that of an object at rest, as a share of the image's height, and the least,
+/// pixels.
+const AT_REST: (f64, f64) = (0.015, 3.0);
 
 /// Turn below which an object that stays in place is at rest, radians.
 const UNTURNED: f64 = 0.02;
@@ -56,17 +59,14 @@ impl<'a> Trajectories<'a> {
         let count = captured.len().min(MOST_TIMES);
         let times: Vec<f64> =
             (0..count).map(|k| captured[k * (captured.len() - 1) / count.saturating_sub(1).max(1)]).collect();
+        let rows = members(field, &SceneOptions::default());
         let mut objects: Vec<Object> = field
             .instances
             .iter()
-            .map(|instance| Object { id: instance.id, rows: Vec::new(), path: Vec::new(), radius: 0.0 })
+            .zip(rows)
+            .filter(|(_, rows)| !rows.is_empty() && !times.is_empty())
+            .map(|(instance, rows)| Object { id: instance.id, rows, path: Vec::new(), radius: 0.0 })
             .collect();
-        for (row, owner) in field.instance_of_gaussians().unwrap_or_default().into_iter().enumerate() {
-            if let Some(owner) = owner {
-                objects[usize::from(owner)].rows.push(row as u32);
-            }
-        }
-        objects.retain(|object| !object.rows.is_empty() && !times.is_empty());
         let weights: Vec<f64> = (0..field.len()).map(|row| f64::from(field.gaussians.opacity(row))).collect();
         let mut renderer = Renderer::new(simd);
         for time in &times {
@@ -80,13 +80,14 @@ impl<'a> Trajectories<'a> {
 
     /// Lines over the view of a camera at a time.
     pub(super) fn lines(&self, camera: &PinholeCamera, time: f64) -> Vec<Polyline> {
-        let width = (WIDTH.0 * f64::from(camera.height)).max(WIDTH.1);
+        let pixels = |(share, least): (f64, f64)| (share * f64::from(camera.height)).max(least);
+        let (width, at_rest) = (pixels(WIDTH), pixels(AT_REST));
         let mut lines = Vec::new();
         for object in &self.objects {
             let project = |point: &DVec3| camera.project(*point).map(|(pixel, _)| pixel);
             let group = followed(self.field, &object.rows).filter(|group| !group.poses.is_empty());
             let seen: Vec<DVec2> = object.path.iter().filter_map(project).collect();
-            let travels = seen.iter().any(|pixel| pixel.distance(seen[0]) >= AT_REST);
+            let travels = seen.iter().any(|pixel| pixel.distance(seen[0]) >= at_rest);
             if !travels && !group.is_some_and(turns) {
                 continue;
             }
