@@ -37,9 +37,9 @@ tolerance are left out. The table tells which motion was chosen, and what it mis
   cif export table.cif --report --ground-truth motion.json
 
 --check reads every file back as `cif import` would and draws it beside the scene, from cameras that
-the scene recorded and, with --capture, from those of held-out images. PSNR of an object is that of
-the pixels where the scene shows it; IoU compares where it shows, with the scene or with the masks of
-the held-out images. A PLY is compared at its moment.
+the scene recorded and, with --capture, from those of held-out images. PSNR of an object is over the
+pixels where the scene shows it; IoU is against where the scene shows it, or against the masks of the
+held-out images. A PLY is compared at its moment, and has no objects.
 
   cif export table.cif --usd table.usda --check --capture captures/table"
 )]
