@@ -356,7 +356,7 @@ fn print_held_out(found: &HeldOutLoss, field: &Field) {
     println!("{table}");
 }
 
-/// What the second is worse by.
+/// Amount by which the second is worse.
 fn lost([before, after]: [Option<f64>; 2]) -> Option<f64> {
     Some(before? - after?)
 }
