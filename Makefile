@@ -57,7 +57,7 @@ demo: build
 	$(BIN)/cif info $(DEMO_CAPTURE)
 	$(BIN)/cif train $(DEMO_CAPTURE) -o $(OUT)/scene.cif --preset draft --force
 	$(BIN)/cif eval $(OUT)/scene.cif $(DEMO_CAPTURE) --json $(OUT)/metrics.json --images $(OUT)/comparison --force
-	$(BIN)/cif export $(OUT)/scene.cif --usd $(OUT)/out.usda --force
+	$(BIN)/cif export $(OUT)/scene.cif --usd $(OUT)/out.usda --check --capture $(DEMO_CAPTURE) --force
 	$(BIN)/cif query $(OUT)/out.usda --label "$(DEMO_LABEL)" --time 36
 	$(BIN)/cif render $(OUT)/scene.cif --capture $(DEMO_CAPTURE) --split val --what rgb,instance-color,depth-color -o $(OUT)/views --force
 	@echo

@@ -97,6 +97,33 @@ def test_motion_model_is_the_cheapest(stage: Usd.Stage) -> None:
             assert splats_of(stage, name).GetAttribute(attribute).GetNumTimeSamples() == 0, name
 
 
+def centre_of_mass(mesh: Usd.Prim) -> np.ndarray:
+    """Of a closed mesh of triangles, filled evenly, in its own frame."""
+    corners = np.array(mesh.GetAttribute("points").Get(), np.float64)
+    a, b, c = corners[np.array(mesh.GetAttribute("faceVertexIndices").Get()).reshape(-1, 3)].swapaxes(0, 1)
+    volumes = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6
+    return np.einsum("i,ij->j", volumes, a + b + c) / 4 / volumes.sum()
+
+
+def test_dynamic_bodies_start_as_the_object_moved(stage: Usd.Stage) -> None:
+    """UsdPhysics wants the velocity of the centre of mass in the space of the prim's transform, and degrees."""
+    car = stage.GetPrimAtPath("/World/toy_car_002")
+    before, after = (UsdGeom.Xformable(car).ComputeLocalToWorldTransform(k) for k in [0, 1])
+    centre = Gf.Vec3d(*centre_of_mass(stage.GetPrimAtPath("/World/toy_car_002/Collider")))
+    assert centre.GetLength() > 1e-4
+    # In a layer of its own: others read the same file.
+    with Usd.EditContext(stage, stage.GetSessionLayer()):
+        car.GetVariantSet("physics").SetVariantSelection("dynamic")
+    linear, angular = (
+        np.array(car.GetAttribute(f"physics:{name}").Get()) for name in ["velocity", "angularVelocity"]
+    )
+    expected = 12 * np.array(after.Transform(centre) - before.Transform(centre))
+    assert np.allclose(linear, expected, atol=1e-4 * np.linalg.norm(expected))
+    # 2.5 radians about z over all frames.
+    assert np.allclose(angular, [0, 0, np.degrees(2.5) * 12 / (FRAMES - 1)], atol=0.5)
+    assert not car.GetAttribute("physics:kinematicEnabled").Get()
+
+
 def test_every_sampled_attribute_has_a_default(stage: Usd.Stage) -> None:
     sampled = 0
     for prim in stage.Traverse():

@@ -104,6 +104,7 @@ fn a_target_stops_a_run() {
 fn a_report_holds_its_ladders_and_goes_on_where_it_stopped() {
     let folder = with_capture();
     let path = folder.path();
+    capture::write_motion(&path.join("table"), 8);
     let short = "--set stages.coarse=5 --set stages.fine=20 --set stages.instance=10";
     let line = format!(
         "bench accuracy table -o report --quick --ladders sh,storage,precision,render,export {short} {SMALL}"
@@ -122,12 +123,17 @@ fn a_report_holds_its_ladders_and_goes_on_where_it_stopped() {
         "Export tolerance",
         "<svg",
         "data:image/png",
+        "Motion of objects",
+        "<td>red ball</td>",
     ] {
         assert!(page.contains(word), "{word}");
     }
     let report = json(&fs::read_to_string(path.join("report/report.json")).unwrap());
     let rungs = report["rungs"].as_array().unwrap();
     assert_eq!(rungs.len(), 19);
+    let moving = report["motion"]["instances"].as_array().unwrap();
+    assert_eq!(moving.len(), 2);
+    assert!(moving[0]["error_mm"].is_number(), "{moving:?}");
     let rung =
         |id: &str| rungs.iter().find(|rung| rung["id"] == id).unwrap_or_else(|| panic!("{id}: {report:#}"));
     assert!(rungs.iter().any(|rung| rung["front_psnr"] == true));

@@ -187,6 +187,55 @@ fn a_file_becomes_a_scene_of_its_own() {
 }
 
 #[test]
+fn exports_are_checked_against_the_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let mut field = learned();
+    let camera = field.cameras[0].clone();
+    let seen = |time_index| RecordedCamera { time_index, ..camera.clone() };
+    field.cameras = (0..field.timeline.times.len()).map(seen).collect();
+    field.save(path.join("base.cif")).unwrap();
+    let check = |line: &str| {
+        let run = cif(path, &format!("export base.cif {line} --check --json --force")).succeeds();
+        parsed(&run.stdout)["check"].as_array().unwrap().clone()
+    };
+    let number = |value: &Value| value.as_f64().unwrap_or_else(|| panic!("no number: {value}"));
+
+    // A close export loses next to nothing, of any object; a PLY shows its moment.
+    let close = check("--gltf out.glb --ply out.ply --ply-time 1");
+    let [gltf, ply] = &close[..] else { panic!("{close:#?}") };
+    let views = field.cameras.len().min(12);
+    assert_eq!((&gltf["format"], &gltf["against_scene"]["views"]), (&json!("gltf"), &json!(views)));
+    let scene = &gltf["against_scene"];
+    assert!(number(&scene["psnr"]) > 30.0 && number(&scene["miou"]) > 90.0, "{gltf:#}");
+    let labels: Vec<&str> =
+        scene["objects"].as_array().unwrap().iter().filter_map(|object| object["label"].as_str()).collect();
+    assert_eq!(labels, ["everything else", "red mug", "cereal box", "spoon"]);
+    let last = field.timeline.times.len() - 1;
+    assert_eq!(ply["time_code"].as_f64(), Some(last as f64));
+    assert!(ply["against_scene"]["psnr"].as_f64().is_none_or(|psnr| psnr > 40.0), "{ply:#}");
+    assert!(ply["against_scene"]["miou"].is_null(), "no objects, no IoU: {ply:#}");
+    assert!(gltf["held_out"].is_null() && number(&gltf["seconds"]) > 0.0);
+
+    // One that stands still, or holds another time than is asked for, is told.
+    let still = &check("--gltf still.glb --motion static --check-views 2")[0]["against_scene"];
+    assert_eq!(still["views"], json!(2));
+    assert!(number(&still["psnr"]) < number(&scene["psnr"]) - 3.0, "{still:#}");
+    let part = &check(&format!("--gltf part.glb --frames {last}:{last}"))[0]["against_scene"];
+    assert_eq!(part["views"], json!(1));
+    assert!(part["psnr"].as_f64().is_none_or(|psnr| psnr > 40.0), "{part:#}");
+
+    let told = cif(path, "export base.cif --gltf told.glb --check").succeeds().stdout;
+    assert!(told.contains("told.glb read back in") && told.contains("cereal box"), "{told}");
+    cif(path, "export base.cif --report --check").fails(2, &["--check", "--gltf"]);
+    cif(path, "export base.cif --ply all --ply-split --check").fails(2, &["--ply-split"]);
+    cif(path, "export base.cif --gltf a.glb --capture .").fails(2, &["--check"]);
+    Field { cameras: Vec::new(), ..field }.save(path.join("unseen.cif")).unwrap();
+    cif(path, "export unseen.cif --gltf a.glb --check").fails(1, &["no cameras", "--capture"]);
+    assert!(!path.join("a.glb").exists());
+}
+
+#[test]
 fn mistakes_are_explained_and_nothing_is_overwritten() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path();

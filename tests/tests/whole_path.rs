@@ -6,7 +6,8 @@ use std::process::{Child, Command, Stdio};
 use std::thread::sleep;
 use std::time::Duration;
 
-use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
+use cif_dataset::CaptureFrame;
+use cif_field::tracks::{DenseTrack, RotationEvidence, TrackGroup, TrackPose, Tracks};
 use cif_field::{Checkpoint, Field, Gaussians, Identities, Instance, SortMetric, Timeline};
 use cif_test::capture::{self, ROLLING, STANDING};
 use cif_test::command::{Run, run};
@@ -118,6 +119,28 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     // glTF and PLY need nothing else; both come back as scenes with the same objects.
     cif(path, "export scene.cif --gltf out.gltf --ply out.ply").succeeds();
     cif(path, "export scene.cif --gltf out.gltf").fails(1, &["out.gltf exists", "--force"]);
+
+    let facts = json(&cif(path, "info scene.cif --json").succeeds().stdout);
+    let motion = &facts["instances"][0]["motion"];
+    assert_eq!(motion["model"], "free", "the deformation moves it: {facts:#}");
+    assert!(motion["moving"].as_u64() <= facts["instances"][0]["gaussians"].as_u64(), "{motion}");
+
+    // What a file loses is told on held-out images, as `cif eval` scores them.
+    let line = "export scene.cif --gltf checked.glb --check --capture table --json";
+    let checked = &json(&cif(path, line).succeeds().stdout)["check"][0]["held_out"];
+    let (before, after) = (&checked["scene"], &checked["file"]);
+    assert_eq!((checked["frames"].as_u64(), before["psnr"].as_f64()), (Some(6), Some(number("psnr"))));
+    assert_eq!(before["miou"].as_f64(), Some(number("miou")));
+    let lost = before["psnr"].as_f64().unwrap() - after["psnr"].as_f64().unwrap();
+    assert_eq!(checked["psnr_lost"].as_f64(), Some(lost));
+    assert!((-0.2..3.0).contains(&lost), "{checked:#}");
+    let objects = checked["objects"].as_array().unwrap();
+    let labels: Vec<&str> = objects.iter().filter_map(|object| object["label"].as_str()).collect();
+    assert_eq!(labels, ["everything else", "red ball", "blue ball"]);
+    assert!(
+        objects[1..].iter().all(|object| object["psnr_lost"].is_number() && object["iou_lost"].is_number())
+    );
+
     let text = fs::read_to_string(path.join("out.gltf")).unwrap();
     assert!(text.contains("KHR_gaussian_splatting:ROTATION") && text.contains("red ball"));
     assert!(path.join("out.bin").metadata().unwrap().len() > 10_000);
@@ -402,4 +425,102 @@ fn motion_is_measured_against_followed_points() {
     fs::remove_file(&tracks).unwrap();
     assert!(motion("eval still.cif table --json -").is_null());
     assert!(!cif(path, "eval still.cif table").succeeds().stdout.contains("unmoved"));
+}
+
+#[test]
+fn objects_tell_how_they_move() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let mut field = balls(true);
+    let groups = &mut field.tracks.as_mut().unwrap().groups;
+    for (k, pose) in groups[0].poses.iter_mut().enumerate() {
+        pose.rotation = DQuat::from_rotation_y(0.25 * k as f64);
+    }
+    groups[0].rotation = Some(RotationEvidence::Assumed);
+    groups[1].poses.clear();
+    field.save(path.join("scene.cif")).unwrap();
+    let facts = json(&cif(path, "info scene.cif --json").succeeds().stdout);
+    let [rolling, standing] = [0, 1].map(|k| &facts["instances"][k]);
+    assert_eq!(rolling["gaussians"], 100);
+    let motion = &rolling["motion"];
+    assert_eq!((&motion["model"], &motion["poses"]), (&"rigid".into(), &8.into()), "{facts:#}");
+    assert_eq!(motion["rotation"], "assumed");
+    let travel = capture::centre(ROLLING, 1.0).distance(capture::centre(ROLLING, 0.0));
+    assert!((motion["moves"].as_f64().unwrap() - travel).abs() < 1e-9, "{motion}");
+    assert!((motion["turns_deg"].as_f64().unwrap() - 1.75_f64.to_degrees()).abs() < 1e-3, "{motion}");
+    assert_eq!(standing["motion"], serde_json::json!({ "model": "static" }));
+    let text = cif(path, "info scene.cif").succeeds().stdout;
+    assert!(
+        text.contains("100 Gaussians  rigid, 8 poses, moves 0.500, turns 100.3 deg, rotation assumed"),
+        "{text}"
+    );
+    assert!(text.contains("100 Gaussians  static"), "{text}");
+    // Distances are those of the capture's world.
+    field.record.frame = CaptureFrame { offset: [1e6, 0.0, 0.0], scale: 0.1 };
+    let groups = &mut field.tracks.as_mut().unwrap().groups;
+    groups[1].dense = Some(DenseTrack {
+        times: vec![0.0, 1.0],
+        means: vec![[0.0; 3]; 200],
+        quaternions: vec![[1.0, 0.0, 0.0, 0.0]; 200],
+        log_scales: None,
+    });
+    field.save(path.join("far.cif")).unwrap();
+    let text = cif(path, "info far.cif").succeeds().stdout;
+    assert!(text.contains("moves 5.000") && text.contains("dense, 2 samples"), "{text}");
+}
+
+#[test]
+fn paths_of_moving_objects_are_drawn() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    let mut field = balls(true);
+    field.background = [0.0; 3];
+    field.save(path.join("scene.cif")).unwrap();
+    fs::write(
+        path.join("views.json"),
+        r#"[{"name": "above", "width": 320, "height": 240, "vertical_fov_deg": 50,
+             "position": [0, -1, 1.5], "look_at": [0, 0, 0]}]"#,
+    )
+    .unwrap();
+    let picture = |what: &str, time: f64| {
+        cif(
+            path,
+            &format!("render scene.cif --camera views.json --what {what} --time {time} -o out --force"),
+        )
+        .succeeds();
+        image::open(path.join(format!("out/{what}/above.png"))).unwrap().into_rgb8()
+    };
+    // Edges are soft: most of a colour counts.
+    let is_mostly = |pixel: [u8; 3], color: [u8; 3]| {
+        pixel
+            .iter()
+            .zip(color)
+            .all(|(value, color)| *value <= color && 10 * u32::from(*value) >= 7 * u32::from(color))
+    };
+    let count = |what: &str, time: f64, color: [u8; 3]| {
+        picture(what, time).pixels().filter(|pixel| is_mostly(pixel.0, color)).count()
+    };
+    let [rolling, standing] = [ROLLING, STANDING].map(cif::pictures::instance_color);
+    // All of the way is behind at the end; at the start it is fainter, and to come.
+    let (start, end) = (count("tracks", 0.0, rolling), count("tracks", 1.0, rolling));
+    assert!(start > 5 && end > start + 20, "{start} {end}");
+    assert_eq!((count("rgb", 1.0, rolling), count("tracks", 1.0, standing)), (0, 0));
+    // Axes turn with the object.
+    let axes = |field: &Field| {
+        field.save(path.join("scene.cif")).unwrap();
+        let picture = picture("tracks", 1.0);
+        let of_x = picture.enumerate_pixels().filter(|(.., pixel)| is_mostly(pixel.0, [230, 60, 60]));
+        of_x.map(|(x, y, _)| (x, y)).collect::<Vec<_>>()
+    };
+    let unturned = axes(&field);
+    assert!(unturned.len() > 3, "{unturned:?}");
+    for pose in &mut field.tracks.as_mut().unwrap().groups[0].poses {
+        pose.rotation = DQuat::from_rotation_z(pose.time * 2.0);
+    }
+    let turned = axes(&field);
+    let same = turned.iter().filter(|pixel| unturned.contains(pixel)).count();
+    assert!(turned.len() > 3 && 2 * same < turned.len(), "{same} of {}", turned.len());
+    field.identities = None;
+    field.save(path.join("scene.cif")).unwrap();
+    cif(path, "render scene.cif --camera views.json --what tracks -o none").fails(1, &["without masks"]);
 }

@@ -1,5 +1,6 @@
 //! Small scenes for tests.
 
+use cif_field::RotationEvidence;
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use cif_scene::{
@@ -223,6 +224,7 @@ fn node(
         mean_occupancy: numbers.between(0.0, 1.0) as f32,
         report: MotionReport {
             model,
+            rotation: (model == MotionModel::Rigid).then_some(RotationEvidence::Assumed),
             gaussians: splats.len(),
             size: numbers.between(0.1, 2.0),
             tolerance: 0.01,

@@ -65,7 +65,7 @@ pub use build::{build, build_from};
 pub use diff::{ChangeKind, ObjectChange, SceneDiff};
 pub use edits::import_edits;
 pub use error::SceneError;
-pub use field_from_graph::field_from_graph;
+pub use field_from_graph::{field_from_graph, time_in_field};
 pub use format::{
     About, Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
 };

@@ -1,5 +1,6 @@
 //! Cost and residuals of the chosen motion models.
 
+use cif_field::RotationEvidence;
 use cif_geometry::Bounds;
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
@@ -44,6 +45,9 @@ pub struct TimeResidual {
 pub struct MotionReport {
     /// Chosen model.
     pub model: MotionModel,
+    /// Evidence for the rotations of a rigid node; `None` where it is not known, and for other models.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rotation: Option<RotationEvidence>,
     /// Gaussians of the node.
     pub gaussians: usize,
     /// Diagonal of the box of the centres at the reference time, outermost 2 % of the weight left out, world
@@ -77,6 +81,7 @@ impl PartialEq for MotionReport {
         let known = |report: &Self| {
             let Self {
                 model,
+                rotation,
                 gaussians,
                 size,
                 tolerance,
@@ -90,7 +95,7 @@ impl PartialEq for MotionReport {
                 seconds: _,
             } = report.clone();
             let residuals = (residual, static_residual, rigid_residual, parts_residual);
-            (model, gaussians, size, tolerance, residuals, parts, samples, motion_bytes)
+            (model, rotation, gaussians, size, tolerance, residuals, parts, samples, motion_bytes)
         };
         known(self) == known(other)
     }
@@ -103,6 +108,7 @@ impl MotionReport {
         let centres = splats.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)));
         Self {
             model: motion.model(),
+            rotation: None,
             gaussians: splats.len(),
             size: Bounds::around(centres).size().length(),
             tolerance: 0.0,

@@ -62,6 +62,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
     };
     let report = MotionReport {
         model: if samples > 1 { MotionModel::Dense } else { MotionModel::Static },
+        rotation: None,
         gaussians: count,
         size: 1.0,
         tolerance: 0.01,

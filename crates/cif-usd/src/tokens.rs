@@ -108,6 +108,8 @@ pub mod instance {
     pub const MEAN_OCCUPANCY: &str = "cif:meanOccupancy";
     /// Chosen motion model.
     pub const MODEL: &str = "cif:motion:model";
+    /// Evidence for the rotations of a rigid instance: `observed` or `assumed`.
+    pub const ROTATION: &str = "cif:motion:rotation";
     /// Largest residual allowed.
     pub const TOLERANCE: &str = "cif:motion:tolerance";
     /// Size of the instance.
@@ -126,7 +128,7 @@ pub mod instance {
     pub const REPORT: &str = "cif:motion:report";
 
     /// Every property with its type.
-    pub const ALL: [(&str, &str); 17] = [
+    pub const ALL: [(&str, &str); 18] = [
         (KIND, "token"),
         (ID, "int"),
         (INDEX, "int"),
@@ -136,6 +138,7 @@ pub mod instance {
         (SOURCE_FRAMES, "int2"),
         (MEAN_OCCUPANCY, "float"),
         (MODEL, "token"),
+        (ROTATION, "token"),
         (TOLERANCE, "double"),
         (SIZE, "double"),
         (RESIDUAL_RMS, "double"),

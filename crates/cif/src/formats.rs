@@ -91,6 +91,20 @@ pub fn read(path: &Path, options: ReadOptions) -> Result<SceneGraph, Error> {
     }
 }
 
+/// The field that shows what a file shows, as `cif import` makes it without a base.
+///
+/// # Errors
+/// When what was read from `path` does not fit together.
+pub fn field_of(graph: &SceneGraph, path: &Path) -> Result<Field, Error> {
+    cif_scene::field_from_graph(graph, &name_of(path)).map_err(Error::plain)
+}
+
+/// Name by which a scene records a file, without its folder.
+#[must_use]
+pub fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
 /// Reads two files of any format to be compared. A `.cif` beside a file that was exported becomes the graph that
 /// it would be exported as with the same options.
 ///

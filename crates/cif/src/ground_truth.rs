@@ -128,6 +128,7 @@ mod tests {
         let count = track.len();
         let report = MotionReport {
             model: MotionModel::Rigid,
+            rotation: None,
             gaussians: 0,
             size: 1.0,
             tolerance: 0.01,

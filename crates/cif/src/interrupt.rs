@@ -7,6 +7,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::Duration;
 
+use crate::error::Error;
+
 /// Time in which a command that saves nothing may end by itself.
 const GRACE: Duration = Duration::from_millis(1_500);
 
@@ -119,6 +121,17 @@ pub fn watch_and_save() {
 #[must_use]
 pub fn requested() -> bool {
     REQUESTS.requested()
+}
+
+/// Goes on, unless the command is asked to stop.
+///
+/// # Errors
+/// After Ctrl-C.
+pub fn go_on() -> Result<(), Error> {
+    if requested() {
+        return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
+    }
+    Ok(())
 }
 
 /// A command inside a process of others, which passes requests on. All commands that run at a time share them.

@@ -149,7 +149,11 @@ pub fn shown_frame(dataset: &Dataset) -> Option<usize> {
     held_out.get(held_out.len() / 2).copied()
 }
 
-fn save(path: &Path, picture: &Picture) -> Result<(), Error> {
+/// Writes a picture as PNG.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn save(path: &Path, picture: &Picture) -> Result<(), Error> {
     let mut bytes = Vec::new();
     PngEncoder::new(&mut bytes)
         .write_image(picture.pixels.as_flattened(), picture.width, picture.height, ExtendedColorType::Rgb8)

@@ -1,7 +1,7 @@
 //! The report: a page that needs nothing else, JSON, and a table for spreadsheets.
 
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
@@ -28,6 +28,21 @@ pub struct Subject {
     pub simd: String,
     /// Rungs that are not measured yet.
     pub missing: usize,
+    /// Motion of the objects of the base; `None` where nothing moves or the base is not there.
+    pub motion: Option<Motion>,
+}
+
+/// Motion of the objects of a scene.
+#[derive(Clone, Debug, Default)]
+pub struct Motion {
+    /// Scores against known motion; null where it is not known.
+    pub scores: Value,
+    /// Headings of their table.
+    pub headings: Vec<&'static str>,
+    /// Rows of their table.
+    pub rows: Vec<Vec<String>>,
+    /// Picture of the paths of the objects, where any moves.
+    pub picture: Option<PathBuf>,
 }
 
 /// Ladders with what was measured of their rungs, in their order.
@@ -160,6 +175,7 @@ fn json_of(subject: &Subject, rows: &[Row<'_>]) -> Value {
         "threads": subject.threads,
         "simd": subject.simd,
         "rungs_missing": subject.missing,
+        "motion": subject.motion.as_ref().map(|motion| &motion.scores),
         "rungs": rungs,
     })
 }
@@ -339,6 +355,9 @@ fn page(
         debug_assert_eq!(ladder.rungs.len(), records.len());
         let _ = write!(page, "<a href=\"#{}\">{}</a>", ladder.name, escape(ladder.title));
     }
+    if subject.motion.is_some() {
+        page += "<a href=\"#motion\">Motion of objects</a>";
+    }
     page += "</nav>\n</header>\n<main>\n";
     page += SUMMARY_OPEN;
     for line in summary(rows) {
@@ -371,10 +390,44 @@ fn page(
         page += "</section>\n";
         debug_assert!(records.len() >= of_ladder.len());
     }
+    if let Some(motion) = &subject.motion {
+        motion_section(&mut page, motion)?;
+    }
     page += "</main>\n<footer>PSNR and SSIM are means over the held-out frames; mIoU is over pairs of instance and \
              frame. Processor time counts all threads together and no measuring. Filled dots mark the fronts: no other \
              trained rung is both cheaper and better.</footer>\n</body>\n</html>\n";
     Ok(page)
+}
+
+/// Scores of the motion of objects, and a picture of their paths.
+fn motion_section(page: &mut String, motion: &Motion) -> Result<(), Error> {
+    page.push_str("<section id=\"motion\">\n<h2>Motion of objects</h2>\n");
+    if !motion.rows.is_empty() {
+        page.push_str(
+            "<p>Of the base as it is exported by default, against the followed surface points of the capture: mean \
+             distance from the true points, the same had nothing moved, and shares of points within a distance.</p>\n\
+             <div class=\"wide\"><table>\n<thead><tr>",
+        );
+        for heading in &motion.headings {
+            let _ = write!(page, "<th>{}</th>", escape(heading));
+        }
+        page.push_str("</tr></thead>\n<tbody>\n");
+        for row in &motion.rows {
+            page.push_str("<tr>");
+            for cell in row {
+                let _ = write!(page, "<td>{}</td>", escape(cell));
+            }
+            page.push_str("</tr>\n");
+        }
+        page.push_str("</tbody></table></div>\n");
+    }
+    if let Some(path) = &motion.picture {
+        page.push_str("<div class=\"pictures\">\n");
+        picture(page, path, "paths of the objects of the base, the way to come fainter")?;
+        page.push_str("</div>\n");
+    }
+    page.push_str("</section>\n");
+    Ok(())
 }
 
 const SUMMARY_OPEN: &str = "<section id=\"summary\">\n<h2>In short</h2>\n<ul class=\"climbs\">\n";
@@ -579,7 +632,14 @@ mod tests {
             threads: 2,
             simd: "Avx2".into(),
             missing: 1,
+            motion: Some(Motion {
+                scores: json!({ "instances": [{ "id": 3 }] }),
+                headings: vec!["instance", "< 10 mm"],
+                rows: vec![vec!["red <mug>".into(), "97.5".into()]],
+                picture: Some(rungs.file("paths.png")),
+            }),
         };
+        std::fs::write(rungs.file("paths.png"), b"paths").unwrap();
         let measured = measured();
         write(folder.path(), &rungs, &subject, &measured).unwrap();
         let page = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
@@ -593,9 +653,15 @@ mod tests {
             assert!(!loaded.contains(outside), "{outside}");
         }
         assert!(page.contains("1 rungs are not measured yet") && page.contains("●"));
+        for part in ["<section id=\"motion\"", "<th>&lt; 10 mm</th>", "<td>red &lt;mug&gt;</td><td>97.5</td>"]
+        {
+            assert!(page.contains(part), "{part}");
+        }
+        assert!(page.contains(&STANDARD.encode(b"paths")));
         let report: Value =
             serde_json::from_str(&std::fs::read_to_string(folder.path().join("report.json")).unwrap())
                 .unwrap();
+        assert_eq!(report["motion"]["instances"][0]["id"], 3);
         let rungs = report["rungs"].as_array().unwrap();
         let present: usize = measured.iter().flat_map(|(_, records)| records).flatten().count();
         assert_eq!(rungs.len(), present);
@@ -603,6 +669,10 @@ mod tests {
         let table = std::fs::read_to_string(folder.path().join("rungs.csv")).unwrap();
         assert_eq!(table.lines().count(), present + 1);
         assert!(folder.path().join("overview-psnr.svg").is_file());
+        let still = Subject { motion: None, ..subject };
+        write(folder.path(), &Folder::inside(folder.path()).unwrap(), &still, &measured).unwrap();
+        let page = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
+        assert!(!page.contains("#motion"));
     }
 
     #[test]

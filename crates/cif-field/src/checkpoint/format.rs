@@ -6,16 +6,19 @@ use serde::{Deserialize, Serialize};
 use glam::{DQuat, DVec3};
 
 use crate::gaussians::SH_FLOATS;
-use crate::tracks::{DenseTrack, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use crate::tracks::{DenseTrack, RotationEvidence, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Timeline};
 
 /// Newest version of the layout, which this crate writes where it is needed; it reads all up to it.
 ///
 /// 1 is the first; 2 adds recorded motion ([`crate::Tracks`]); 3 adds Gaussians that stand still
 /// ([`crate::Deformation::still`]); 4 adds recorded opacities and colours ([`crate::TrackGroup::opacities`]), and
-/// identity rows without entries or with an owner ([`crate::Owner`]). A field without these is written as 1 to 3, so
-/// that older software reads it.
-pub const FORMAT: u32 = 4;
+/// identity rows without entries or with an owner ([`crate::Owner`]); 5 adds evidence for rotations
+/// ([`crate::TrackGroup::rotation`]). A field without these is written as 1 to 4, so that older software reads it.
+pub const FORMAT: u32 = 5;
+
+/// The layout before evidence for rotations.
+const FORMAT_WITH_APPEARANCE: u32 = 4;
 
 /// The layout before recorded opacities, colours and owners.
 const FORMAT_WITH_STILL: u32 = 3;
@@ -28,8 +31,10 @@ const FORMAT_WITHOUT_TRACKS: u32 = 1;
 
 /// Oldest layout that holds a field.
 pub(super) fn format_of(field: &Field) -> u32 {
-    if has_appearance(field) || has_owners(field) {
+    if has_evidence(field) {
         FORMAT
+    } else if has_appearance(field) || has_owners(field) {
+        FORMAT_WITH_APPEARANCE
     } else if stands_still(field) {
         FORMAT_WITH_STILL
     } else if field.tracks.is_some() {
@@ -39,10 +44,18 @@ pub(super) fn format_of(field: &Field) -> u32 {
     }
 }
 
+fn groups(field: &Field) -> impl Iterator<Item = &TrackGroup> {
+    field.tracks.iter().flat_map(|tracks| &tracks.groups)
+}
+
+/// True where the evidence for rotations is known.
+fn has_evidence(field: &Field) -> bool {
+    groups(field).any(|group| group.rotation.is_some())
+}
+
 /// True where opacities or colours are recorded.
 fn has_appearance(field: &Field) -> bool {
-    let groups = field.tracks.iter().flat_map(|tracks| &tracks.groups);
-    groups.into_iter().any(|group| group.opacities.is_some() || group.colors.is_some())
+    groups(field).any(|group| group.opacities.is_some() || group.colors.is_some())
 }
 
 /// True where identity rows have owners, or no entries.
@@ -132,6 +145,8 @@ pub(super) struct TrackGroupJson {
     pivot: [f64; 3],
     /// Rows of the poses' tensor; those of the groups follow one another.
     pub(super) poses: usize,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    rotation: Option<RotationEvidence>,
     /// Pairs of time and whether visible.
     visibility: Vec<(f64, bool)>,
     pub(super) dense: Option<DenseJson>,
@@ -188,6 +203,7 @@ impl TrackGroupJson {
             deformed: group.deformed,
             pivot: group.pivot.to_array(),
             poses: group.poses.len(),
+            rotation: group.rotation,
             visibility: group.visibility.iter().map(|step| (step.time, step.visible)).collect(),
             dense: group.dense.as_ref().map(|dense| DenseJson {
                 times: dense.times.clone(),
@@ -211,6 +227,7 @@ impl TrackGroupJson {
             deformed: self.deformed,
             pivot: DVec3::from_array(self.pivot),
             poses: arrays.poses.into_iter().map(pose).collect(),
+            rotation: self.rotation,
             visibility: self
                 .visibility
                 .into_iter()

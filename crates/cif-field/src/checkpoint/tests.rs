@@ -9,7 +9,7 @@ use serde_json::json;
 
 use super::write::MAX_JSON_DEPTH;
 use super::*;
-use crate::{FieldError, Identities, Owner, Record, testing};
+use crate::{FieldError, Identities, Owner, Record, RotationEvidence, testing};
 
 /// Words of the message that a change must cause.
 type Change<T> = (&'static str, fn(&mut T));
@@ -293,6 +293,17 @@ fn recorded_motion_survives_and_raises_the_format() {
     let bytes = bytes_of(&moving);
     assert_eq!(format(&bytes), "2", "older software reads motion without them");
     assert_eq!(read_bytes(&bytes).unwrap(), moving);
+    let mut known = moving.clone();
+    let groups = &mut known.field.tracks.as_mut().unwrap().groups;
+    (groups[0].rotation, groups[2].rotation) =
+        (Some(RotationEvidence::Observed), Some(RotationEvidence::Assumed));
+    let bytes = bytes_of(&known);
+    assert_eq!(format(&bytes), "5", "evidence for rotations");
+    assert_eq!(read_bytes(&bytes).unwrap(), known);
+    assert_eq!(
+        known.field.gather(&[0, 1, 2]).tracks.unwrap().groups[0].rotation,
+        Some(RotationEvidence::Observed)
+    );
     let empty = Checkpoint {
         field: Field { tracks: Some(Default::default()), ..testing::field(0, 1) },
         training: None,

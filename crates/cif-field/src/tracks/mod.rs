@@ -17,6 +17,7 @@
 mod apply;
 
 use glam::{DQuat, DVec3};
+use serde::{Deserialize, Serialize};
 
 use crate::gaussians::SH_FLOATS;
 
@@ -46,6 +47,8 @@ pub struct TrackGroup {
     pub pivot: DVec3,
     /// Poses by strictly ascending time; empty where the group stays.
     pub poses: Vec<TrackPose>,
+    /// Evidence for the rotations of the poses; `None` where nobody told, as of motion that is not from images.
+    pub rotation: Option<RotationEvidence>,
     /// Changes of visibility by strictly ascending time; the first holds before its time too. Empty where the
     /// group is always visible.
     pub visibility: Vec<VisibilityStep>,
@@ -55,6 +58,25 @@ pub struct TrackGroup {
     pub opacities: Option<Samples<f32>>,
     /// Spherical harmonics over time, before the pose turns them; `None` where they stay.
     pub colors: Option<Samples<[f32; SH_FLOATS]>>,
+}
+
+/// Evidence for the rotations of an object over time.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum RotationEvidence {
+    /// The images show how the object turns.
+    Observed,
+    /// They do not, as of a plain ball; a likely rotation is assumed.
+    Assumed,
+}
+
+impl std::fmt::Display for RotationEvidence {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.pad(match self {
+            Self::Observed => "observed",
+            Self::Assumed => "assumed",
+        })
+    }
 }
 
 /// Values of a group of M Gaussians over time, linear in between and held outside.
@@ -149,6 +171,7 @@ impl TrackGroup {
             deformed: true,
             pivot,
             poses: Vec::new(),
+            rotation: None,
             visibility: Vec::new(),
             dense: None,
             opacities: None,
@@ -163,6 +186,7 @@ impl TrackGroup {
             deformed: self.deformed,
             pivot: self.pivot,
             poses: self.poses.clone(),
+            rotation: self.rotation,
             visibility: self.visibility.clone(),
             dense: self.dense.as_ref().map(|dense| dense.gather(members)),
             opacities: self.opacities.as_ref().map(|opacities| opacities.gather(members)),

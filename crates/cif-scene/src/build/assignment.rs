@@ -122,6 +122,21 @@ pub fn assign(
     owners
 }
 
+/// Gaussians of every instance, ascending, as the nodes of a graph with these options have them, as far as opacities
+/// do not change over time.
+#[must_use]
+pub fn members(field: &Field, options: &SceneOptions) -> Vec<Vec<u32>> {
+    let is_visible = |row: &u32| field.gaussians.opacity(*row as usize) >= options.min_opacity;
+    let visible: Vec<u32> = (0..field.len() as u32).filter(is_visible).collect();
+    let mut members = vec![Vec::new(); field.instances.len()];
+    for (row, owner) in visible.iter().zip(assign(field, &most_probable(field), &visible, options)) {
+        if let Some(owner) = owner {
+            members[owner].push(*row);
+        }
+    }
+    members
+}
+
 /// Labelled share above which the Gaussians of every instance make the best silhouette of it.
 fn needed_shares(field: &Field, visible: &[u32], candidates: &[Option<Identity>]) -> Vec<f64> {
     // Image and labelled share of the Gaussians of each instance.

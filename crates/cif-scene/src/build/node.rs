@@ -1,6 +1,6 @@
 //! Nodes from groups of Gaussians and their chosen motion.
 
-use cif_field::{Field, Gaussians, Identities};
+use cif_field::{Field, Gaussians, Identities, RotationEvidence};
 use cif_geometry::RigidTransform;
 use glam::DVec3;
 
@@ -248,6 +248,14 @@ pub(crate) fn weights(node: &Node, group: &MovingGroup) -> Vec<f64> {
     rows.map(|row| position(row).map_or(0.0, |position| group.weights[position])).collect()
 }
 
+/// Evidence for the rotations of the track that most of the rows follow.
+fn rotation_evidence(field: &Field, rows: &[u32]) -> Option<RotationEvidence> {
+    let tracks = field.tracks.as_ref()?;
+    let followed = |group: u32| rows.iter().filter(|row| tracks.group_of[**row as usize] == group).count();
+    let group = (0..tracks.groups.len()).find(|group| 2 * followed(*group as u32) > rows.len())?;
+    tracks.groups[group].rotation
+}
+
 fn motion_report(
     group: &MovingGroup,
     motion: &Motion,
@@ -257,6 +265,10 @@ fn motion_report(
     let (low, high) = trimmed_box(&group.rows, &group.weights, &input.reference.means);
     MotionReport {
         model: motion.model(),
+        rotation: match motion {
+            Motion::Rigid(_) => rotation_evidence(input.field, &group.rows),
+            Motion::Static | Motion::Parts(_) | Motion::Dense(_) => None,
+        },
         gaussians: group.rows.len(),
         size: DVec3::length(high - low),
         tolerance: group.tolerance,

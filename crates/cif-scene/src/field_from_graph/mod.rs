@@ -100,6 +100,14 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
     Ok(field)
 }
 
+/// Normalised time that a time code of a graph has in the field of [`field_from_graph`].
+///
+/// # Errors
+/// When the time codes of the graph do not ascend.
+pub fn time_in_field(graph: &SceneGraph, time_code: f64) -> Result<f64, SceneError> {
+    Ok(TimeMap::of_file(&graph.time_codes)?.time(time_code))
+}
+
 /// Adds the identity rows of a node.
 fn push_identities(
     identities: &mut Identities,
@@ -241,6 +249,7 @@ impl NodeRows {
         let always_visible = visibility.iter().all(|step| step.visible);
         let group = TrackGroup {
             poses: path.poses(times),
+            rotation: node.report.rotation.filter(|_| matches!(node.motion, Motion::Rigid(_))),
             visibility: if always_visible { Vec::new() } else { visibility },
             opacities,
             colors,

@@ -2,7 +2,7 @@
 
 use super::*;
 use cif_field::tracks::{NO_GROUP, Samples, TrackGroup, TrackPose};
-use cif_field::{Owner, Tracks};
+use cif_field::{Owner, RotationEvidence, Tracks};
 
 use crate::shape::convex_hull::HullMesh;
 
@@ -212,6 +212,24 @@ fn levels_of_detail_nest_and_keep_the_important() {
 }
 
 #[test]
+fn members_are_those_of_the_nodes() {
+    let mut field = field(3);
+    field.gaussians.opacity_logits[7] = -9.0;
+    let options = SceneOptions::default();
+    let members = crate::build::assignment::members(&field, &options);
+    let graph = build(&field, &options).unwrap();
+    assert_eq!((members.len(), members[0].len()), (3, 59), "one is too faint to be drawn");
+    for (node, members) in graph.nodes.iter().zip(&members) {
+        let mut rows = node.splats.rows.clone();
+        rows.sort_unstable();
+        assert_eq!(&rows, members, "{}", node.name);
+    }
+    field.identities = None;
+    let none = crate::build::assignment::members(&field, &options);
+    assert!(none.len() == 3 && none.iter().all(Vec::is_empty));
+}
+
+#[test]
 fn velocities_are_those_of_the_track() {
     let field = field(1);
     let motion = |time: f64| RigidTransform {
@@ -220,19 +238,37 @@ fn velocities_are_those_of_the_track() {
     };
     let mut source = |time: f64| moved(&field, 0..60, &motion(time));
     let options = SceneOptions { reduce_keys: false, ..SceneOptions::default() };
-    let graph = build_from(&field, &mut source, &options).unwrap();
+    let mut graph = build_from(&field, &mut source, &options).unwrap();
+    // A tetrahedron beside the origin, whose centre of mass is the mean of its corners, cut into two hulls.
+    let corners = [[0.5, 0.0, 0.0], [0.9, 0.0, 0.0], [0.5, 0.4, 0.0], [0.5, 0.0, 0.4], [0.7, 0.2, 0.0]];
+    let half = |a: u32, b: u32, c: u32| ConvexHull {
+        points: corners.to_vec(),
+        triangles: vec![[a, c, b], [a, b, 3], [b, c, 3], [c, a, 3]],
+        part: None,
+    };
+    graph.nodes[0].colliders = vec![half(0, 1, 4), half(0, 4, 2)];
+    let centre = DVec3::new(0.6, 0.1, 0.1);
     let seconds = (FRAMES - 1) as f64 / graph.time_codes.frames_per_second;
     for time_code in [0.0, 3.5, 8.0, 100.0] {
         let velocity = graph.nodes[0].initial_velocity(time_code, graph.time_codes.frames_per_second);
         let angular = DVec3::new(0.6, 0.0, 0.8) * 2.0 / seconds;
         assert!((velocity.angular - angular).length() < 1e-3 * angular.length(), "{velocity:?}");
-        // The origin of the frame turns about the world's origin besides.
+        // The centre of mass turns about the world's origin besides.
         let pose = graph.nodes[0].world_transform(time_code.clamp(0.0, 8.0));
         let at = motion(time_code.clamp(0.0, 8.0) / 8.0).translation;
-        let expected = DVec3::X * 3.0 / seconds + angular.cross(pose.translation - at);
+        let arm = pose.rotation * centre + pose.translation - at;
+        let expected = DVec3::X * 3.0 / seconds + angular.cross(arm);
         let error = (velocity.linear - expected).length();
         assert!(error < 0.1 * expected.length(), "{time_code}: {velocity:?} {expected}");
+        let of_origin = DVec3::X * 3.0 / seconds + angular.cross(pose.translation - at);
+        assert!((velocity.linear - of_origin).length() > 0.15 * expected.length(), "{time_code}");
     }
+    // Without colliders it is the origin of the local frame.
+    graph.nodes[0].colliders.clear();
+    let codes = graph.time_codes.frames_per_second;
+    let [before, after] = [0.0, 1.0].map(|code| graph.nodes[0].world_transform(code).translation);
+    let velocity = graph.nodes[0].initial_velocity(0.0, codes);
+    assert!((velocity.linear - (after - before) * codes).length() < 1e-9, "{velocity:?}");
     assert_eq!(graph.nodes[1].initial_velocity(0.0, 24.0), Velocity::default());
     assert_eq!(graph.nodes[0].initial_velocity(0.0, 0.0), Velocity::default());
 }
@@ -310,6 +346,7 @@ fn what_changes_over_time_comes_back_from_the_graph() {
             .iter()
             .map(|time| TrackPose { time: *time, translation: DVec3::X * *time, rotation: turn(*time) })
             .collect(),
+        rotation: Some(RotationEvidence::Assumed),
         opacities: Some(Samples { times: times.clone(), values: opacities }),
         colors: Some(Samples { times: times.clone(), values: colors }),
         ..TrackGroup::still("changing", DVec3::ZERO)
@@ -320,7 +357,10 @@ fn what_changes_over_time_comes_back_from_the_graph() {
     let graph = build(&field, &options).unwrap();
     let node = &graph.nodes[0];
     assert_eq!((node.model(), node.appearance.colors.len()), (MotionModel::Rigid, FRAMES));
+    let evidence: Vec<_> = graph.nodes.iter().map(|node| node.report.rotation).collect();
+    assert_eq!(evidence, [Some(RotationEvidence::Assumed), None, None], "of what follows the track alone");
     let back = field_from_graph(&graph, "graph").unwrap();
+    assert_eq!(back.tracks.as_ref().unwrap().groups[0].rotation, Some(RotationEvidence::Assumed));
     for time in &times {
         let (a, b) = (field.deformed(*time), back.deformed(*time));
         for row in 0..n {

@@ -238,8 +238,6 @@ pub fn mask_ids(field: &Field, labels: &PixelGrid<u16>) -> PixelGrid<u16> {
 fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[FrameConfusion]) -> Scores {
     let frames: Vec<&FrameScores> = frames.collect();
     let finite: Vec<f64> = frames.iter().filter_map(|f| f.psnr).collect();
-    let mean =
-        |values: &[f64]| (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64);
     Scores {
         frames: frames.len(),
         psnr: mean(&finite),
@@ -247,6 +245,11 @@ fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[Fr
         ssim: mean(&frames.iter().map(|f| f.ssim).collect::<Vec<_>>()),
         instance: instance_metrics(confusions),
     }
+}
+
+/// Mean of some values; `None` of none.
+pub(super) fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@
 //! | [`image`] | PSNR and SSIM of one picture |
 //! | [`instance`] | every instance metric, from per-frame confusion counts |
 //! | [`evaluate`](mod@evaluate) | renders the held-out frames of a capture and fills both in |
+//! | [`round_trip`] | what a scene loses on its way through a file |
 //! | [`fit`] | whether a capture is the one that a scene was trained on |
 //!
 //! A metric without anything to measure is `None` (`n/a`), never 0 or 100.
@@ -13,6 +14,7 @@ pub mod evaluate;
 pub mod fit;
 pub mod image;
 pub mod instance;
+pub mod round_trip;
 
 pub use evaluate::{
     Evaluation, EvaluationError, EvaluationOptions, FrameScores, FrameView, Scores, evaluate, mask_ids,

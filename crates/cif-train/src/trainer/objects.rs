@@ -1,7 +1,7 @@
 //! Objects that move as a whole: fitted before the fine stage, given Gaussians in a group that moves by trained
 //! poses.
 
-use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose, Tracks};
+use cif_field::tracks::{NO_GROUP, RotationEvidence, TrackGroup, TrackPose, Tracks};
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -118,7 +118,11 @@ impl Trainer {
         let tracks = field.tracks.get_or_insert_with(Tracks::default);
         tracks.group_of.resize(before, NO_GROUP);
         tracks.group_of.resize(before + rows.len(), tracks.groups.len() as u32);
-        tracks.groups.push(TrackGroup { deformed: false, poses, ..TrackGroup::still(name, place) });
+        let rotation = Some(match fitted.rotation {
+            Rotation::Observed => RotationEvidence::Observed,
+            Rotation::Assumed => RotationEvidence::Assumed,
+        });
+        tracks.groups.push(TrackGroup { deformed: false, poses, rotation, ..TrackGroup::still(name, place) });
         field.gaussians.append(&rows);
         if let Some(deformation) = &mut field.deformation {
             deformation.still.resize(before, false);

@@ -2,7 +2,7 @@
 
 use crate::support::{Scene, capture, small_config, stopped_after, train, without_record};
 use cif_dataset::Dataset;
-use cif_field::{Checkpoint, Field};
+use cif_field::{Checkpoint, Field, RotationEvidence};
 use cif_train::{Control, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
 use glam::DVec3;
 
@@ -154,6 +154,11 @@ fn check_rigid_object(use_engine: impl Fn(&mut Trainer)) {
     field.validate().unwrap();
     let tracks = field.tracks.as_ref().unwrap();
     assert_eq!((tracks.groups.len(), tracks.groups[0].poses.len()), (1, 12));
+    let evidence = match warnings.iter().any(|w| w.contains("moves as a whole") && w.contains("assumed")) {
+        true => RotationEvidence::Assumed,
+        false => RotationEvidence::Observed,
+    };
+    assert_eq!(tracks.groups[0].rotation, Some(evidence), "{warnings:?}");
     // Where the ball is, from the first time to half-time.
     let place = |time: f64| tracks.groups[0].pose(time).1;
     let followed = place(0.5) - place(0.0);

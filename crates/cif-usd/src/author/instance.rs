@@ -74,6 +74,9 @@ fn properties(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> Py
     prim.set(instance::SOURCE_FRAMES, "Int2", UNIFORM, frames)?;
     prim.set(instance::MEAN_OCCUPANCY, "Float", UNIFORM, node.mean_occupancy)?;
     prim.set(instance::MODEL, "Token", UNIFORM, node.model().to_string())?;
+    if let Some(rotation) = report.rotation {
+        prim.set(instance::ROTATION, "Token", UNIFORM, rotation.to_string())?;
+    }
     for (name, value) in [
         (instance::TOLERANCE, report.tolerance),
         (instance::SIZE, report.size),

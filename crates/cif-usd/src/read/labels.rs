@@ -1,5 +1,6 @@
 //! Names, labels, recorded identity and visibility of prims.
 
+use cif_field::RotationEvidence;
 use cif_scene::{MotionModel, VisibilitySample, naming};
 use pyo3::prelude::*;
 
@@ -19,6 +20,7 @@ pub(super) struct Recorded {
     pub(super) source_frames: Option<(usize, usize)>,
     pub(super) mean_occupancy: Option<f32>,
     pub(super) pivot: Option<glam::DVec3>,
+    pub(super) rotation: Option<RotationEvidence>,
     pub(super) report: Option<String>,
 }
 
@@ -31,17 +33,20 @@ pub(super) fn recorded<'py>(pxr: &Pxr<'py>, prim: &Bound<'py, PyAny>) -> PyResul
     let frames = value(prim, instance::SOURCE_FRAMES, &time)?
         .and_then(|value| super::values::vector::<2>(&value).ok())
         .map(|[first, last]| (first.max(0.0) as usize, last.max(0.0) as usize));
-    let model = plain::<String>(prim, instance::MODEL, &time)?;
+    let token =
+        |name: &str| plain::<String>(prim, name, &time).map(|token| token.map(serde_json::Value::String));
+    let (model, rotation) = (token(instance::MODEL)?, token(instance::ROTATION)?);
     Ok(Some(Recorded {
         background: kind == instance::KIND_BACKGROUND,
         id: int(instance::ID)?.and_then(|id| u16::try_from(id).ok()).filter(|&id| id > 0),
         index: int(instance::INDEX)?.and_then(|index| usize::try_from(index).ok()),
         label: plain(prim, instance::LABEL, &time)?,
         category: plain(prim, instance::CATEGORY, &time)?,
-        model: model.and_then(|model| serde_json::from_value(serde_json::Value::String(model)).ok()),
+        model: model.and_then(|model| serde_json::from_value(model).ok()),
         source_frames: frames,
         mean_occupancy: plain(prim, instance::MEAN_OCCUPANCY, &time)?,
         pivot: pivot.filter(|pivot| pivot.is_finite()),
+        rotation: rotation.and_then(|rotation| serde_json::from_value(rotation).ok()),
         report: plain(prim, instance::REPORT, &time)?,
     }))
 }

@@ -1,7 +1,7 @@
 //! An object from a prim and the splat prims under it.
 
 use cif_scene::assemble::{Identity, Piece, Placement, Prim, PrimName, Shape, Track};
-use cif_scene::{ConvexHull, MotionModel, PointProxy, Splats};
+use cif_scene::{ConvexHull, MotionModel, MotionReport, PointProxy, Splats};
 use glam::DVec3;
 use pyo3::prelude::*;
 
@@ -102,7 +102,11 @@ pub(super) fn read<'py>(reading: &Reading<'_, 'py>, owner: &Owner<'py>) -> Resul
         visibility: labels::visibility(reading.pxr, &owner.prim, reading.start).map_err(python)?,
         source_frames: Some(recorded.source_frames.unwrap_or(reading.source_frames)),
         mean_occupancy: recorded.mean_occupancy,
-        report: recorded.report.as_deref().and_then(|text| serde_json::from_str(text).ok()),
+        report: recorded
+            .report
+            .as_deref()
+            .and_then(|text| serde_json::from_str::<MotionReport>(text).ok())
+            .map(|report| MotionReport { rotation: recorded.rotation, ..report }),
         ..prim
     })
 }

@@ -1,11 +1,12 @@
 //! Our own export comes back as it was.
 
+use cif_field::RotationEvidence;
 use cif_scene::{CaptureFrame, LabelQuery, Motion, ObjectQuery, SceneGraph, VolumeOf};
 use glam::DVec3;
 use proptest::prelude::*;
 
 use super::scenes::Maker;
-use super::session;
+use super::{python, session};
 use crate::{ExportOptions, Payloads, ReadOptions, export, read_scene};
 
 /// Where scenes lie: at the origin, far from it, in other units, or both.
@@ -75,6 +76,35 @@ fn what_was_read_is_written_the_same() {
     let read = round_trip(&written, "a.usdc", ExportOptions::default());
     let again = round_trip(&read, "a.usda", ExportOptions::default());
     assert_same(&again, &read);
+}
+
+#[test]
+fn the_evidence_for_rotations_stands_on_the_prim() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.usda");
+    let mut scene = Maker::new(9).scene();
+    let told = [Some(RotationEvidence::Observed), Some(RotationEvidence::Assumed), None];
+    scene.nodes.iter_mut().zip(told).for_each(|(node, rotation)| node.report.rotation = rotation);
+    export(&scene, &path, ExportOptions::default()).unwrap();
+    let names: Vec<&str> = scene.nodes.iter().map(|node| node.name.as_str()).take(3).collect();
+    let program = format!(
+        "
+from pxr import Usd
+stage = Usd.Stage.Open(path)
+names = {names:?}
+seen, assumed, unknown = (stage.GetPrimAtPath('/World/' + n).GetAttribute('cif:motion:rotation') for n in names)
+assert (seen.Get(), assumed.Get()) == ('observed', 'assumed')
+assert not unknown.HasAuthoredValue()
+seen.Set('assumed')
+stage.Save()
+"
+    );
+    python(&path, &program);
+    // Of what the prim and its report say, the prim counts.
+    let read = read_scene(&path).unwrap();
+    let read: Vec<_> = read.nodes.iter().map(|node| node.report.rotation).take(3).collect();
+    assert_eq!(read, [told[1], told[1], None]);
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Random small scenes.
 
+use cif_field::RotationEvidence;
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform, spherical_harmonics};
 use cif_scene::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, CaptureFrame, ConvexHull, DenseMotion,
@@ -232,6 +233,12 @@ impl Maker {
         };
         let report = MotionReport {
             model,
+            rotation: match self.chance.random_range(0..3) {
+                _ if model != MotionModel::Rigid => None,
+                0 => None,
+                1 => Some(RotationEvidence::Observed),
+                _ => Some(RotationEvidence::Assumed),
+            },
             gaussians: count,
             size: self.chance.random(),
             tolerance: self.chance.random(),

@@ -14,6 +14,7 @@ use cif_dataset::{Dataset, Split};
 use cif_field::Field;
 use cif_geometry::PinholeCamera;
 use cif_render::RenderedImage;
+use cif_render::cpu::SimdLevel;
 use cif_render::quality::{FINAL, Quality};
 use cif_train::config::InstanceGeometry;
 use cif_train::metrics::{FrameView, trained_settings};
@@ -21,7 +22,8 @@ use cif_train::{Preset, Stop, SystemClock, TrainConfig, Trainer};
 use clap::Args;
 use serde_json::{Value, json};
 
-use super::{CaptureOptions, print_warnings, train};
+use super::trajectories::Trajectories;
+use super::{CaptureOptions, eval_motion, print_warnings, train};
 use crate::error::Error;
 use crate::pictures::{Picture, instance_picture, rgb_picture};
 use crate::settings::Layers;
@@ -38,6 +40,9 @@ settings have, as `cif train --effects all` does.
   cif bench accuracy captures/table -o report --quick
   cif bench accuracy captures/table -o report --ladders iterations,gaussians
   cif bench accuracy captures/table -o report --preset draft --set seed=3
+
+The page also tells how the objects of the base move: a picture of their paths, and where the capture
+has motion.json and tracks.npz, the scores of `cif eval` for every object.
 
 DIR holds report.html (needs no network), report.json, rungs.csv, the plots as SVG, and the rungs:
 finished ones are not measured again, and Ctrl-C keeps the one under way, so that the same command goes
@@ -170,7 +175,10 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         })
         .collect();
     let missing = measured.iter().flat_map(|(_, records)| records).filter(|record| record.is_none()).count();
-    let subject = bench.subject(command, missing);
+    let mut subject = bench.subject(command, missing);
+    if records.contains_key(BASE) || bench.base.is_some() {
+        subject.motion = bench.motion()?;
+    }
     report::write(&command.output, &bench.rungs, &subject, &measured)?;
     let page = command.output.join("report.html");
     if stopped {
@@ -452,7 +460,39 @@ impl Bench {
             threads: rayon::current_num_threads(),
             simd,
             missing,
+            motion: None,
         }
+    }
+
+    /// Motion of the objects of the base: scores where the capture knows it, and their paths in the shown frame.
+    fn motion(&mut self) -> Result<Option<report::Motion>, Error> {
+        let field = match self.base.take() {
+            Some(field) => field,
+            None => Field::load(self.base_file()).map_err(Error::plain)?,
+        };
+        let mut motion = report::Motion::default();
+        if let Some(truth) = self.dataset.motion_truth().map_err(Error::plain)?
+            && let Some(measured) = eval_motion::measure(&field, &self.dataset, &truth)?
+        {
+            motion.scores = json!(measured);
+            motion.headings = eval_motion::HEADINGS.to_vec();
+            motion.rows = measured.rows();
+        }
+        if let (Some(shown), Some((image, _))) =
+            (measure::shown_frame(&self.dataset), measure::fast(&field, &self.dataset, FINAL))
+        {
+            let frame = &self.dataset.frames[shown];
+            let lines = Trajectories::new(&field, SimdLevel::Auto).lines(&frame.camera, frame.time);
+            if !lines.is_empty() {
+                let mut picture = rgb_picture(&image.color);
+                lines.iter().for_each(|line| line.draw(&mut picture, 0));
+                let path = self.rungs.file("paths.png");
+                measure::save(&path, &picture)?;
+                motion.picture = Some(path);
+            }
+        }
+        self.base = Some(field);
+        Ok((!motion.rows.is_empty() || motion.picture.is_some()).then_some(motion))
     }
 }
 

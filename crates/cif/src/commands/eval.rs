@@ -112,9 +112,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
     };
     interrupt::watch();
     let evaluation = evaluate(&field, &dataset, &options, |view| {
-        if interrupt::requested() {
-            return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
-        }
+        interrupt::go_on()?;
         match &command.images {
             Some(folder) => save_rgb(&output::inside(folder, &view.frame.name, "png")?, &panel(&view)),
             None => Ok(()),

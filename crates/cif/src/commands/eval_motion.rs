@@ -52,24 +52,27 @@ pub(super) fn measure(
     Ok(Some(Motion { scores, seconds: start.elapsed().as_secs_f64() }))
 }
 
+/// Headings of [`Motion::rows`].
+pub(super) const HEADINGS: [&str; 13] = [
+    "id",
+    "instance",
+    "motion",
+    "exported",
+    "times",
+    "error, mm",
+    "unmoved, mm",
+    "< 10 mm",
+    "< 20 mm",
+    "< 50 mm",
+    "rotation error, deg",
+    "rotation, deg",
+    "box IoU",
+];
+
 impl Motion {
-    /// Prints a row per instance, then the means.
-    pub(super) fn print(&self) {
-        let mut table = super::table([
-            "id",
-            "instance",
-            "motion",
-            "exported",
-            "times",
-            "error, mm",
-            "unmoved, mm",
-            "< 10 mm",
-            "< 20 mm",
-            "< 50 mm",
-            "rotation error, deg",
-            "rotation, deg",
-            "box IoU",
-        ]);
+    /// A row per instance, then the means.
+    pub(super) fn rows(&self) -> Vec<Vec<String>> {
+        let mut rows = Vec::new();
         for instance in &self.scores.instances {
             let about = [
                 instance.id.to_string(),
@@ -78,14 +81,22 @@ impl Motion {
                 instance.model.map_or("none".to_owned(), |model| model.to_string()),
                 instance.times.to_string(),
             ];
-            table.add_row(about.into_iter().chain(cells(&instance.errors, number(instance.turned_deg, 1))));
+            let cells = cells(&instance.errors, number(instance.turned_deg, 1));
+            rows.push(about.into_iter().chain(cells).collect());
         }
         for (name, mean) in [("moving", &self.scores.moving), ("resting", &self.scores.resting)] {
             let Some(mean) = mean else { continue };
             let about = [String::new(), format!("{name}, mean of {}", mean.instances)];
             let about = about.into_iter().chain(std::iter::repeat_n(String::new(), 3));
-            table.add_row(about.chain(cells(&mean.errors, String::new())));
+            rows.push(about.chain(cells(&mean.errors, String::new())).collect());
         }
+        rows
+    }
+
+    /// Prints the rows.
+    pub(super) fn print(&self) {
+        let mut table = super::table(HEADINGS);
+        table.add_rows(self.rows());
         println!("{table}");
         println!("motion of followed points, as exported by default; measured in {:.1} s", self.seconds);
     }

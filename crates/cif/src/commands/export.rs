@@ -8,6 +8,7 @@ use cif_scene::{FrameRange, MotionModel, SceneFormat, SceneGraph, SceneOptions, 
 use clap::{ArgGroup, Args};
 use serde_json::json;
 
+use super::export_check::{Check, Finding};
 use super::model_options::ModelOptions;
 use super::query::code_at;
 use super::targets::{Targets, Writing};
@@ -15,6 +16,7 @@ use super::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::FORMATS;
 use crate::ground_truth::{self, MotionError};
+use crate::interrupt;
 use crate::output::{self, Outputs};
 
 /// Export a scene as USD, glTF or PLY, one prim or node per object
@@ -32,7 +34,14 @@ tolerance are left out. The table tells which motion was chosen, and what it mis
   cif export table.cif --gltf table.glb --usd table.usdc
   cif export table.cif --ply table.ply --ply-time 0.5
   cif export table.cif --ply frames --ply-sequence
-  cif export table.cif --report --ground-truth motion.json"
+  cif export table.cif --report --ground-truth motion.json
+
+--check reads every file back as `cif import` would and draws it beside the scene, from cameras that
+the scene recorded and, with --capture, from those of held-out images. PSNR of an object is over the
+pixels where the scene shows it; IoU is against where the scene shows it, or against the masks of the
+held-out images. A PLY is compared at its moment, and has no objects.
+
+  cif export table.cif --usd table.usda --check --capture captures/table"
 )]
 pub(super) struct Export {
     /// Trained scene
@@ -86,6 +95,8 @@ pub(super) struct Export {
     force: bool,
     #[command(flatten)]
     models: ModelOptions,
+    #[command(flatten)]
+    check: Check,
 }
 
 pub(super) fn run(command: &Export) -> Result<(), Error> {
@@ -97,8 +108,10 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         outputs.text(path)?;
     }
     command.targets.check(&command.writing, command.force, &mut outputs)?;
+    command.check.refuse(&command.targets, &command.writing)?;
     let truth = command.ground_truth.as_deref().map(MotionTruth::read).transpose().map_err(Error::plain)?;
     let field = scene::load(&command.scene)?;
+    let checker = command.check.open(&field, &mut outputs)?;
     let notes = command.targets.iter().filter_map(|target| target.format.about().note_on_place);
     scene::note_frame(&scene::frame(&field)?, notes);
     // The graph is as rich as the richest of the formats.
@@ -112,11 +125,18 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let codes = &graph.time_codes;
     let writing = command.writing.options(command.force, |time| code_at(&codes.times, &codes.samples, time));
     let mut rebuilt: Vec<(&dyn SceneFormat, SceneGraph)> = Vec::new();
+    let mut findings: Vec<Finding> = Vec::new();
+    if checker.is_some() {
+        interrupt::watch();
+    }
     for target in command.targets.iter() {
         let other = target.format.rebuilt(&field, &graph, &options).map_err(Error::plain)?;
         let held = other.as_ref().unwrap_or(&graph);
         let written = target.format.write(held, &target.path, &writing).map_err(Error::plain)?;
         target.tell(&written);
+        if let Some(checker) = &checker {
+            findings.push(checker.check(target, held, &writing)?);
+        }
         rebuilt.extend(other.map(|graph| (target.format, graph)));
     }
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
@@ -128,6 +148,9 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         let table = rebuilt.iter().find(|(other, _)| other.about().key == format.about().key);
         tables[format!("{}_motion", format.about().key)] =
             json!(table.map(|(_, graph)| graph.motion_table()));
+    }
+    if checker.is_some() {
+        tables["check"] = findings.iter().map(|finding| finding.json(&field)).collect();
     }
     if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
         output::write_file(path, format!("{tables:#}\n").as_bytes())?;
@@ -143,6 +166,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         if let Some(errors) = &errors {
             print_errors(errors);
         }
+        findings.iter().for_each(|finding| finding.print(&field));
     }
     Ok(())
 }

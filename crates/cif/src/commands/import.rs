@@ -1,6 +1,6 @@
 //! `cif import`: files of other tools as scenes, and edits coming home.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use cif_scene::ReadOptions;
 use clap::Args;
@@ -68,9 +68,9 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }
-    let source = name_of(&command.file);
     let field = match &base {
         Some(base) => {
+            let source = formats::name_of(&command.file);
             let (field, changes) = cif_scene::import_edits(base, &graph, &source, command.force_base)
                 .map_err(|error| import_error(&error))?;
             if command.json {
@@ -92,7 +92,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
                     "note: cif exported this file; give the scene it came from with --base to keep what was learned"
                 );
             }
-            cif_scene::field_from_graph(&graph, &source).map_err(Error::plain)?
+            formats::field_of(&graph, &command.file)?
         }
     };
     field.save(&command.output).map_err(Error::plain)?;
@@ -104,11 +104,6 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         field.timeline.times.len()
     );
     Ok(())
-}
-
-/// Name by which a scene records the file, without its folder.
-fn name_of(path: &Path) -> String {
-    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
 fn import_error(error: &cif_scene::SceneError) -> Error {

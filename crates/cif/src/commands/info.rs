@@ -6,11 +6,15 @@ use std::path::PathBuf;
 use cif_dataset::{Dataset, PointSource, Split};
 use cif_field::{Checkpoint, Field};
 use cif_geometry::Bounds;
+use cif_scene::SceneOptions;
+use cif_scene::build::assignment::members;
 use cif_train::Curve;
 use clap::Args;
 use glam::DVec3;
+use serde::Deserialize;
 use serde_json::{Value, json};
 
+use super::object_motion::ObjectMotion;
 use super::{CaptureOptions, scene};
 use crate::error::Error;
 use crate::formats;
@@ -109,23 +113,19 @@ fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
 fn scene_facts(checkpoint: &Checkpoint) -> Facts {
     let field: &Field = &checkpoint.field;
     let means = Bounds::around(field.gaussians.means.iter().map(|p| DVec3::from(p.map(f64::from))));
-    let mut owned: BTreeMap<u16, usize> = BTreeMap::new();
-    if let Some(identities) = &field.identities {
-        let probabilities = identities.probabilities();
-        for row in 0..identities.len() {
-            let best = identities.range(row).max_by(|a, b| probabilities[*a].total_cmp(&probabilities[*b]));
-            if let Some(best) = best {
-                *owned.entry(identities.labels[best]).or_default() += 1;
-            }
-        }
-    }
+    let owned = members(field, &SceneOptions::default());
     let instances: Vec<Value> = field
         .instances
         .iter()
-        .enumerate()
-        .map(|(index, instance)| {
-            let count = owned.get(&(index as u16)).copied().unwrap_or(0);
-            json!({ "id": instance.id, "label": instance.label, "category": instance.category, "gaussians": count })
+        .zip(&owned)
+        .map(|(instance, rows)| {
+            json!({
+                "id": instance.id,
+                "label": instance.label,
+                "category": instance.category,
+                "gaussians": rows.len(),
+                "motion": ObjectMotion::of(field, rows),
+            })
         })
         .collect();
     let cameras: BTreeSet<&str> = field.cameras.iter().map(|camera| camera.name.as_str()).collect();
@@ -236,6 +236,9 @@ fn named(instance: &Value) -> String {
     );
     if let Some(gaussians) = text("gaussians") {
         line += &format!("  {gaussians} Gaussians");
+    }
+    if let Some(motion) = instance.get("motion").and_then(|motion| ObjectMotion::deserialize(motion).ok()) {
+        line += &format!("  {motion}");
     }
     line
 }

@@ -9,6 +9,7 @@ mod diff;
 mod eval;
 mod eval_motion;
 mod export;
+mod export_check;
 mod import;
 mod info;
 #[cfg(feature = "wgpu")]
@@ -17,6 +18,7 @@ mod label;
 mod masks;
 mod model_options;
 mod motion_table;
+mod object_motion;
 mod painter;
 mod plan;
 mod query;
@@ -26,6 +28,7 @@ mod scene;
 mod targets;
 mod train;
 mod train_budget;
+mod trajectories;
 
 use cif_render::cpu::SimdLevel;
 use clap::builder::{EnumValueParser, TypedValueParser};

@@ -22,6 +22,7 @@ use super::painter::Painter;
 #[cfg(feature = "wgpu")]
 use super::painter::Sample;
 use super::render_files::ViewFiles;
+use super::trajectories::Trajectories;
 use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
@@ -85,6 +86,9 @@ pub(super) struct Render {
 pub(super) enum What {
     /// Colour, 8-bit RGB
     Rgb,
+    /// Colour with the paths of moving objects over it, the way to come fainter, and the axes of rigid ones (x red, y
+    /// green, z blue) where they are, 8-bit RGB
+    Tracks,
     /// Mask id of the most probable instance, 16-bit grey, 0 = belongs to none
     Instance,
     /// The same in colours, dark where no instance is, 8-bit RGB
@@ -167,6 +171,7 @@ fn after_help() -> String {
          cif render table.cif --capture captures/table -o out --exr\n  \
          cif render table.cif --capture captures/table --split val -o out --what rgb,instance,depth\n  \
          cif render table.cif --capture captures/table -o look --quality draft\n  \
+         cif render table.cif --capture captures/table -o paths --what tracks\n  \
          cif render table.cif --camera views.json --time 0.5 -o out\n\n{FORMAT_HELP}"
     )
 }
@@ -179,10 +184,10 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         what.insert(What::Rgb);
     }
     let wanted = what.iter().any(|what| what.of_instances());
-    if wanted && field.identities.is_none() {
+    if (wanted || what.contains(&What::Tracks)) && field.identities.is_none() {
         return Err(Error::failed(
             format!("{} was trained without masks, so it has no instances to show", command.scene.display()),
-            "leave instance, foreground, coverage, probability and entropy out of --what, or train with masks",
+            "leave tracks, instance, foreground, coverage, probability and entropy out of --what, or train with masks",
         ));
     }
     if command.exr && command.quality == QualityName::Draft {
@@ -217,11 +222,13 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let field = quality.thin(&field);
     let channels = Channels { depth, instances };
     let mut painter = painter(command, &field, &views, &settings, channels)?;
+    let trajectories = what.contains(&What::Tracks).then(|| Trajectories::new(&field, command.simd.into()));
     interrupt::watch();
     let settings = quality.settings(&settings);
     for (index, Shot { view, .. }) in views.iter().enumerate() {
         let time = command.time.or(view.time).unwrap_or(0.0);
-        let mut files = ViewFiles::create(&what, &field, &command.output, view)?;
+        let lines = trajectories.as_ref().map(|paths| paths.lines(&view.camera, time)).unwrap_or_default();
+        let mut files = ViewFiles::create(&what, &field, &command.output, view, lines)?;
         match &mut painter {
             Painter::Cpu(renderer) if command.exr => {
                 let place = Place { field: &field, views: &views, index, time: command.time };
@@ -230,14 +237,14 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
             Painter::Cpu(renderer) => {
                 let request = BandRequest { channels, ..BandRequest::default() };
                 renderer.render_bands(&field, &view.camera, time, &settings, &request, |band| {
-                    go_on()?;
+                    interrupt::go_on()?;
                     files.add(&band.image)
                 })?;
             }
             #[cfg(feature = "wgpu")]
             Painter::Gpu(renderer) => {
                 renderer.render_bands(&field, &view.camera, time, &settings, channels, |_, band| {
-                    go_on()?;
+                    interrupt::go_on()?;
                     files.add(&band)
                 })?;
             }
@@ -245,15 +252,6 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         files.finish()?;
     }
     eprintln!("rendered {} views into {}", views.len(), command.output.display());
-    Ok(())
-}
-
-/// # Errors
-/// After Ctrl-C.
-fn go_on() -> Result<(), Error> {
-    if interrupt::requested() {
-        return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
-    }
     Ok(())
 }
 
@@ -446,7 +444,7 @@ fn write_exr(
     let request = BandRequest { channels, ranks: cif_exr::cryptomatte::RANKS, values: moved.as_deref() };
     cif_exr::write(&path, &frame, |file| {
         renderer.render_bands(field, &view.camera, frame.time, settings, &request, |band| {
-            go_on()?;
+            interrupt::go_on()?;
             let image = &band.image;
             let motion = motion(band.blended, image);
             let (first_row, ranks) = (band.first_row, band.ranks.as_ref());

@@ -13,12 +13,16 @@ use super::render::What;
 use crate::camera_file::View;
 use crate::error::Error;
 use crate::output;
-use crate::pictures::{DepthRange, PngFile, instance_picture, rgb_picture};
+use crate::pictures::{DepthRange, PngFile, Polyline, instance_picture, rgb_picture};
 
 /// The pictures of a view. None is there before all of its rows are.
 pub(super) struct ViewFiles<'a> {
     field: &'a Field,
     files: Vec<(What, PngFile)>,
+    /// Lines over the picture of tracks.
+    lines: Vec<Polyline>,
+    /// Rows that there are already.
+    rows: u32,
     /// Depths of the view, where they are shown in colours: which those are is known behind the last row alone.
     depths: Vec<f32>,
 }
@@ -30,23 +34,30 @@ impl<'a> ViewFiles<'a> {
         field: &'a Field,
         folder: &Path,
         view: &View,
+        lines: Vec<Polyline>,
     ) -> Result<Self, Error> {
         let file = |what: &What| {
             let layer = what.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default();
             let path = output::inside(&folder.join(layer), &view.name, "png")?;
-            let is_color = matches!(what, What::Rgb | What::InstanceColor | What::DepthColor);
+            let is_color = matches!(what, What::Rgb | What::Tracks | What::InstanceColor | What::DepthColor);
             let make = if is_color { PngFile::rgb } else { PngFile::grey };
             Ok((*what, make(&path, view.camera.width, view.camera.height)?))
         };
-        Ok(Self { field, files: what.iter().map(file).collect::<Result<_, Error>>()?, depths: Vec::new() })
+        let files = what.iter().map(file).collect::<Result<_, Error>>()?;
+        Ok(Self { field, files, lines, rows: 0, depths: Vec::new() })
     }
 
     /// The next rows.
     pub(super) fn add(&mut self, rows: &RenderedImage) -> Result<(), Error> {
-        let Self { field, files, depths } = self;
+        let Self { field, files, lines, rows: first_row, depths } = self;
         for (what, file) in files {
             match what {
                 What::Rgb => file.add_rgb(&rgb_picture(&rows.color).pixels),
+                What::Tracks => {
+                    let mut picture = rgb_picture(&rows.color);
+                    lines.iter().for_each(|line| line.draw(&mut picture, *first_row));
+                    file.add_rgb(&picture.pixels)
+                }
                 What::Alpha => file.add_grey(&unit(&rows.alpha)),
                 What::Depth => file.add_grey(&scaled(depth(rows), 1000.0)),
                 What::DepthColor => {
@@ -65,6 +76,7 @@ impl<'a> ViewFiles<'a> {
                 What::Entropy => file.add_grey(&scaled(&instances(rows).entropy, 1000.0)),
             }?;
         }
+        *first_row += rows.color.height;
         Ok(())
     }
 

@@ -1,10 +1,12 @@
-//! Pictures of frames: colours for instances, depth and error, panels side by side, PNG files.
+//! Pictures of frames: colours for instances, depth and error, lines, panels side by side, PNG files.
 
 mod colors;
+mod lines;
 mod panel;
 mod png_file;
 
 pub use colors::{DepthRange, depth_picture, error_picture, instance_color, instance_picture, rgb_picture};
+pub use lines::Polyline;
 pub use panel::side_by_side;
 pub use png_file::{PngFile, save_grey, save_rgb};
 

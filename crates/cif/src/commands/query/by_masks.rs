@@ -154,20 +154,14 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         ));
     }
     let mut renderer = Renderer::new(SimdLevel::Auto);
-    let found = find(&field, &dataset, masks, options.select.into(), &mut renderer, &settings, go_on)?;
+    let found =
+        find(&field, &dataset, masks, options.select.into(), &mut renderer, &settings, interrupt::go_on)?;
     let scores = if options.eval {
         Some(evaluate(&field, &dataset, masks, &found, &mut renderer, &settings, options)?)
     } else {
         None
     };
     report(command, &found, scores.as_ref());
-    Ok(())
-}
-
-fn go_on() -> Result<(), Error> {
-    if interrupt::requested() {
-        return Err(Error::Interrupted { message: "interrupted".to_owned(), help: None });
-    }
     Ok(())
 }
 
@@ -194,7 +188,7 @@ fn evaluate(
         if files.is_empty() && !masks.loaded {
             continue;
         }
-        go_on()?;
+        interrupt::go_on()?;
         let truth = dataset.load_found_mask(index, files, masks.loaded)?;
         let rendered = render(field, &found.rows, &frame.camera, frame.time, renderer, settings);
         if let Some(folder) = &options.output {
