@@ -85,20 +85,9 @@ pub(super) fn log(rotation: DQuat) -> DVec3 {
     rotation.to_scaled_axis()
 }
 
-/// Gaussians inside the masks of all times under some poses; `None` where there are none.
+/// Gaussians inside the masks of all times under some poses, within a bound in the object's frame; `None` where there
+/// are none.
 pub(super) fn hull(
-    views: &[ObjectView],
-    poses: &BTreeMap<usize, Pose>,
-    size: f64,
-    count: usize,
-    near: f32,
-    rng: &mut Pcg64,
-) -> Option<Shape> {
-    hull_within(views, poses, (size, None), count, near, rng)
-}
-
-/// The same, of places within a bound.
-pub(super) fn hull_within(
     views: &[ObjectView],
     poses: &BTreeMap<usize, Pose>,
     (size, bound): (f64, Option<&dyn Fn(DVec3) -> bool>),

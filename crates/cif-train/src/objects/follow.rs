@@ -8,6 +8,8 @@ use rayon::prelude::*;
 
 use super::fit::{Fit, fresh_moments, hull, log};
 use super::shape::Pose;
+use crate::error::TrainError;
+use crate::stop::Stop;
 
 /// Steps of the shape at the first time, per level.
 const FIRST: usize = 120;
@@ -37,13 +39,22 @@ const UNSEEN: f64 = 0.1;
 const SEEN: f64 = 0.3;
 
 /// Finds poses of further times, nearest to `reference` first, which has one; `path` tells where the object is.
-pub(super) fn follow(fit: &mut Fit<'_>, reference: usize, path: &BTreeMap<usize, DVec3>, views: &[usize]) {
+///
+/// # Errors
+/// [`TrainError::Stopped`] when the run is to stop.
+pub(super) fn follow(
+    fit: &mut Fit<'_>,
+    reference: usize,
+    path: &BTreeMap<usize, DVec3>,
+    views: &[usize],
+    stop: &Stop,
+) -> Result<(), TrainError> {
     let levels = fit.levels();
     let mut at: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
     for view in views {
         at.entry(fit.views[*view].time_index).or_default().push(*view);
     }
-    let Some(first) = at.get(&reference).cloned() else { return };
+    let Some(first) = at.get(&reference).cloned() else { return Ok(()) };
     for level in levels {
         for step in 0..FIRST {
             fit.step(first[step % first.len()], *level, Some(1.0), 0.0);
@@ -52,6 +63,7 @@ pub(super) fn follow(fit: &mut Fit<'_>, reference: usize, path: &BTreeMap<usize,
     let mut order: Vec<usize> = at.keys().copied().filter(|t| *t != reference && path.contains_key(t)).collect();
     order.sort_by_key(|time| time.abs_diff(reference));
     for time in order {
+        stop.check()?;
         let views = &at[&time];
         let pose = found(fit, time, path, views, reference);
         fit.poses.insert(time, pose);
@@ -68,12 +80,13 @@ pub(super) fn follow(fit: &mut Fit<'_>, reference: usize, path: &BTreeMap<usize,
             fit.step(view, level, Some(SETTLE.1), SETTLE.2);
         }
     }
+    Ok(())
 }
 
 /// Makes the shape anew from all times that are known: what few views show of its far side is a guess.
 fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>) {
     let count = fit.shape.gaussians().len();
-    let Some(shape) = hull(fit.views, &fit.poses, fit.outline.size(), count, fit.near, &mut fit.rng) else { return };
+    let Some(shape) = hull(fit.views, &fit.poses, (fit.outline.size(), None), count, fit.near, &mut fit.rng) else { return };
     fit.shape = shape;
     let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
     let level = fit.trial_level();

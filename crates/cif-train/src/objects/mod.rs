@@ -10,7 +10,8 @@
 //! | `fit` | its poses and Gaussians, moved together |
 //! | `ways` | which ways of moving are tried |
 //! | `follow` | how it moves from time to time |
-//! | `start` | which way is kept, and everything in order |
+//! | `trials` | which way is kept |
+//! | `start` | everything in order |
 
 mod fit;
 mod follow;
@@ -21,13 +22,15 @@ mod shape;
 mod start;
 #[cfg(test)]
 mod tests;
+mod trials;
 mod view;
 mod ways;
 
 use cif_dataset::Dataset;
 use glam::DVec3;
 
-pub(crate) use self::start::{Fitted, Rotation, Surroundings};
+use self::start::Object;
+pub(crate) use self::start::{Fitted, Surroundings};
 use self::view::ObjectView;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
@@ -63,5 +66,7 @@ pub(crate) fn fit(
     let tolerance = ON_PLANE * dataset.extent();
     let plane = plane::support(&points, &cameras, tolerance, rng);
     let Some(outline) = outline::outline(&views, plane.as_ref()) else { return Ok(None) };
-    start::fit_object(label, &views, plane.as_ref(), &outline, surroundings)
+    let object =
+        Object { label, views: &views, plane: plane.as_ref(), outline: &outline, surroundings };
+    start::fit_object(object)
 }

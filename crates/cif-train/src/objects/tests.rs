@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
+use cif_field::tracks::{RotationEvidence, TrackGroup, TrackPose, Tracks};
 use cif_field::{Field, Gaussians};
 use cif_geometry::{PinholeCamera, RigidTransform};
 use cif_render::cpu::{Renderer, SimdLevel};
@@ -12,7 +12,7 @@ use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::RngExt;
 
 use super::plane::Plane;
-use super::start::{Fitted, Rotation, Surroundings, fit_object};
+use super::start::{Fitted, Object, Surroundings, fit_object};
 use super::view::{ObjectView, set_visible};
 use super::{outline, plane};
 use crate::frames::TrainFrame;
@@ -88,7 +88,8 @@ fn fit(views: &[ObjectView]) -> Fitted {
     let outline = outline::outline(views, Some(&FLOOR)).unwrap();
     let stop = Stop::when(|| false);
     let surroundings = Surroundings { times: TIMES, near: 0.05, seed: 0, gaussians: 150, stop: &stop };
-    fit_object(1, views, Some(&FLOOR), &outline, surroundings).unwrap().unwrap()
+    let object = Object { label: 1, views, plane: Some(&FLOOR), outline: &outline, surroundings };
+    fit_object(object).unwrap().unwrap()
 }
 
 /// Largest error of turns relative to the first pose, degrees, and mean error of displacements, metres.
@@ -137,8 +138,8 @@ fn a_textured_box_that_slides_and_turns_is_found() {
         .collect();
     let fitted = fit(&views(solid(&box_places(), patches, 0.006), &truth));
     let (turn, shift) = errors(&fitted.poses, &truth);
-    assert!(turn < 4.0 && shift < 0.006, "{turn} deg, {shift} m, {}", fitted.turns);
-    assert_eq!(fitted.rotation, Rotation::Observed);
+    assert!(turn < 4.0 && shift < 0.006, "{turn} deg, {shift} m, {}", fitted.way);
+    assert_eq!(fitted.rotation, RotationEvidence::Observed);
     assert!(fitted.error < 0.1, "{}", fitted.error);
 }
 
@@ -169,11 +170,11 @@ fn a_textured_ball_is_found_to_roll_and_a_plain_one_is_assumed_to() {
     let truth = rolling(0.057);
     let textured = fit(&views(solid(&sphere_places(0.05), patches, 0.006), &truth));
     let (turn, shift) = errors(&textured.poses, &truth);
-    assert!(turn < 25.0 && shift < 0.01, "{turn} deg, {shift} m, {}", textured.turns);
-    assert!(textured.turns.starts_with("rolls"), "{}", textured.turns);
+    assert!(turn < 25.0 && shift < 0.01, "{turn} deg, {shift} m, {}", textured.way);
+    assert!(textured.way.starts_with("rolls"), "{}", textured.way);
     let plain = fit(&views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth));
-    assert_eq!(plain.rotation, Rotation::Assumed);
-    assert!(plain.turns.starts_with("rolls"), "{}", plain.turns);
+    assert_eq!(plain.rotation, RotationEvidence::Assumed);
+    assert!(plain.way.starts_with("rolls"), "{}", plain.way);
     let (turn, shift) = errors(&plain.poses, &truth);
     // Nothing but its outline, of 30 pixels, tells how far it went: 400 degrees.
     assert!(turn < 60.0 && shift < 0.015, "{turn} deg, {shift} m");

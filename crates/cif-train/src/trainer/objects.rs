@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::Trainer;
 use crate::error::TrainError;
-use crate::objects::{self, Fitted, Rotation, Surroundings};
+use crate::objects::{self, Fitted, Surroundings};
 use crate::schedule::log_linear;
 use crate::stage::Stage;
 
@@ -73,12 +73,12 @@ impl Trainer {
         let Some(fitted) = self.fits.remove(&label) else { return false };
         let name = self.state.field.instances[usize::from(label) - 1].label.clone();
         let how = match fitted.rotation {
-            Rotation::Observed => "",
-            Rotation::Assumed => ", which the pictures do not tell: assumed",
+            RotationEvidence::Observed => "",
+            RotationEvidence::Assumed => ", which the pictures do not tell: assumed",
         };
         self.warnings.push(format!(
             "{name} moves as a whole: {}{how} (error {:.3} on pixels left out)",
-            fitted.turns, fitted.error
+            fitted.way, fitted.error
         ));
         self.join(name, &fitted);
         true
@@ -118,10 +118,7 @@ impl Trainer {
         let tracks = field.tracks.get_or_insert_with(Tracks::default);
         tracks.group_of.resize(before, NO_GROUP);
         tracks.group_of.resize(before + rows.len(), tracks.groups.len() as u32);
-        let rotation = Some(match fitted.rotation {
-            Rotation::Observed => RotationEvidence::Observed,
-            Rotation::Assumed => RotationEvidence::Assumed,
-        });
+        let rotation = Some(fitted.rotation);
         tracks.groups.push(TrackGroup { deformed: false, poses, rotation, ..TrackGroup::still(name, place) });
         field.gaussians.append(&rows);
         if let Some(deformation) = &mut field.deformation {

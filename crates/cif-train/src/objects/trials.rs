@@ -1,0 +1,298 @@
+//! Ways of moving held against each other: each is fitted to some views, and judged on others that were left out.
+
+use std::collections::BTreeMap;
+
+use cif_field::tracks::RotationEvidence;
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::fit::{Fit, Turns};
+use super::follow::follow;
+use super::outline::{self, Outline};
+use super::path::smooth;
+use super::start::{Object, Started};
+use super::view::ObjectView;
+use super::ways::{Paths, Way, is_round};
+use crate::error::TrainError;
+
+/// Gaussians of a trial.
+pub(super) const GAUSSIANS: usize = 150;
+
+/// Steps of a trial until hopeless ones are given up, and all of them.
+pub(super) const STEPS: [usize; 2] = [300, 900];
+
+/// Loss beyond the best at which a trial is hopeless.
+const HOPELESS: f64 = 1.2;
+
+/// Error of resting, relative to that of the best way of moving, up to which an object is taken to rest.
+const REST_GAIN: f64 = 1.2;
+
+/// Error of an object that was followed, relative to that of paths, below which following is preferred: of most
+/// objects, and of round ones.
+const FOLLOW_GAIN: [f64; 2] = [0.98, 0.94];
+
+/// Largest error of rolling, relative to that of sliding, at which rolling is preferred.
+const ROLL_GAIN: f64 = 0.97;
+
+/// Error by which rivals must be told apart, relative: of most objects, and of round ones, whose shading prefers no
+/// turn; and the turn from which they are rivals, degrees.
+const RIVAL: ([f64; 2], i32) = ([1.02, 1.06], 60);
+
+/// Most rivals that are tried again with all pixels, of paths and of rolls, their errors relative to the best, of
+/// rolls the second, and Gaussians and steps.
+const RIVALS: usize = 4;
+const CLOSE: f64 = 1.12;
+const FAR: f64 = 1.3;
+const FINE: (usize, usize) = (800, 1500);
+
+/// A way of moving under way.
+struct Trial<'a> {
+    way: Way,
+    fit: Fit<'a>,
+    /// Loss on the views it is fitted to, and on those left out.
+    losses: [f64; 2],
+}
+
+/// What all trials of an object share.
+struct Contest<'a> {
+    object: Object<'a>,
+    paths: Paths<'a>,
+    train: Vec<usize>,
+    left_out: Vec<usize>,
+    /// Times of which no view is fitted to, so that their poses lie between those of others.
+    between: Vec<usize>,
+}
+
+/// The best way of moving of an object that is seen well at enough times; `None` where it rests.
+pub(super) fn best_way<'a>(
+    object: Object<'a>,
+    (reliable, good): (&[usize], &[usize]),
+) -> Result<Option<Started<'a>>, TrainError> {
+    let Object { views, outline, surroundings, .. } = object;
+    let raw: BTreeMap<usize, DVec3> = good.iter().map(|time| (*time, outline.path[time])).collect();
+    let along = smooth(&raw, views, surroundings.times);
+    let reference = object.best_seen(good.iter().copied()).unwrap_or(good[0]);
+    let (train, left_out) = split(views, reliable, good);
+    let is_trained = |time: usize| train.iter().any(|view| views[*view].time_index == time);
+    let between = left_out.iter().map(|view| views[*view].time_index).filter(|time| !is_trained(*time));
+    let rays = reliable.iter().map(|view| (&views[*view], views[*view].visible.powi(2)));
+    let mut contest = Contest {
+        object,
+        between: between.collect(),
+        paths: Paths {
+            place: outline::meeting_point(rays).unwrap_or(along[&reference]),
+            along,
+            outline,
+            normal: object.plane.map(|plane| plane.normal),
+            reference,
+            followed: None,
+        },
+        train,
+        left_out,
+    };
+    let trials = match contest.simple()? {
+        Some(trials) => trials,
+        None if contest.paths.may_turn_unseen(views) => contest.spins()?,
+        None => return Ok(None),
+    };
+    let Some((way, rotation)) = decide(&trials, outline) else { return Ok(None) };
+    // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
+    let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
+    let kept = if rolls_unseen { Way::Slide(0) } else { way };
+    let Some(Trial { mut fit, losses, .. }) = trials.into_iter().find(|trial| trial.way == kept) else {
+        return Ok(None);
+    };
+    (fit.turns, fit.rolls) = match (rotation, way) {
+        (RotationEvidence::Assumed, Way::Roll(_)) => (Turns::Free, None),
+        (RotationEvidence::Assumed, _) => (Turns::Given, None),
+        (_, Way::Roll(factor)) => (Turns::Free, Some(outline.height / factor)),
+        _ => (Turns::Free, None),
+    };
+    Ok(Some(Started { fit, way, rotation, error: losses[1], reference }))
+}
+
+impl<'a> Contest<'a> {
+    /// Trials of an object that moves; `None` where resting explains it about as well as sliding does.
+    fn simple(&mut self) -> Result<Option<Vec<Trial<'a>>>, TrainError> {
+        let mut trials = self.begin(&[Way::Rest, Way::Slide(0)], GAUSSIANS);
+        self.advance(&mut trials, (0, STEPS[1]), false)?;
+        self.judge(&mut trials, false);
+        let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
+        let rests = |(rest, slide)| rest <= REST_GAIN * slide;
+        if error(Way::Rest).zip(error(Way::Slide(0))).is_some_and(rests) {
+            return Ok(None);
+        }
+        if self.between.is_empty() {
+            // Several cameras show all sides of it, and how it turns from time to time.
+            let reference = self.paths.reference;
+            if let Some(mut fit) = self.object.first(&self.paths.along, reference) {
+                follow(&mut fit, reference, &self.paths.along, &self.train, self.object.surroundings.stop)?;
+                self.paths.followed = Some(fit.poses);
+            }
+        }
+        let mut more = self.begin(&self.paths.ways(), GAUSSIANS);
+        self.advance(&mut more, (0, STEPS[0]), false)?;
+        let best = more.iter().map(|trial| trial.losses[0]).fold(f64::INFINITY, f64::min);
+        let is_kept = |way: &Way| matches!(way, Way::Followed | Way::Roll(_));
+        more.retain(|trial| trial.losses[0] <= HOPELESS * best || is_kept(&trial.way));
+        self.advance(&mut more, (STEPS[0], STEPS[1]), false)?;
+        self.judge(&mut more, false);
+        trials.extend(more);
+        let rivals = rivals(&trials);
+        // Shading prefers no turn of round things, at any resolution.
+        if is_round(self.object.outline) || rivals.len() < 2 {
+            return Ok(Some(trials));
+        }
+        self.finely(&rivals).map(Some)
+    }
+
+    /// Trials of turns in place.
+    fn spins(&self) -> Result<Vec<Trial<'a>>, TrainError> {
+        self.finely(&self.paths.spins())
+    }
+
+    /// Trials with all pixels and small Gaussians, where fine texture may tell.
+    fn finely(&self, ways: &[Way]) -> Result<Vec<Trial<'a>>, TrainError> {
+        let mut trials = self.begin(ways, FINE.0);
+        self.advance(&mut trials, (0, FINE.1), true)?;
+        self.judge(&mut trials, true);
+        Ok(trials)
+    }
+
+    fn begin(&self, ways: &[Way], gaussians: usize) -> Vec<Trial<'a>> {
+        let outline = self.object.outline;
+        let begin = |way: &Way| {
+            let mut rng = self.object.rng();
+            let mut poses = self.paths.poses(*way);
+            let shape = self.object.hull(&poses, gaussians, &mut rng)?;
+            for time in &self.between {
+                poses.remove(time);
+            }
+            let mut fit = self.object.fit(poses, shape, rng);
+            (fit.turns, fit.rolls) = match way {
+                Way::Rest => (Turns::Given, None),
+                Way::Slide(_) | Way::Spin(_) => (Turns::Upright, None),
+                Way::Roll(factor) => (Turns::Free, Some(outline.height / factor)),
+                Way::Followed => (Turns::Free, None),
+            };
+            fit.touches = !matches!(way, Way::Rest | Way::Spin(_));
+            Some(Trial { way: *way, fit, losses: [0.0; 2] })
+        };
+        ways.par_iter().filter_map(begin).collect()
+    }
+
+    /// Steps of all trials, from one count to another.
+    fn advance(&self, trials: &mut [Trial<'a>], (from, to): (usize, usize), finely: bool) -> Result<(), TrainError> {
+        let all = if finely { FINE.1 } else { STEPS[1] };
+        trials.par_iter_mut().for_each(|trial| {
+            let level = if finely { 0 } else { trial.fit.trial_level() };
+            let moves = if trial.way == Way::Rest { 0.0 } else { 1.0 };
+            trial.fit.steps(&self.train, to - from, |share| {
+                let done = from as f64 + share * (to - from) as f64;
+                let rate = if done < 0.5 * all as f64 { 1.0 } else { 0.5 };
+                (rate, moves * rate, level)
+            });
+            trial.losses[0] = trial.fit.mean_loss(&self.train, level);
+        });
+        self.object.surroundings.stop.check()
+    }
+
+    /// Losses on the views that were left out.
+    fn judge(&self, trials: &mut [Trial<'a>], finely: bool) {
+        trials.par_iter_mut().for_each(|trial| {
+            for time in &self.between {
+                if let Some(pose) = trial.fit.pose_at(*time) {
+                    trial.fit.poses.insert(*time, pose);
+                }
+            }
+            let level = if finely { 0 } else { trial.fit.trial_level() };
+            let judged = if self.left_out.is_empty() { &self.train } else { &self.left_out };
+            trial.losses[1] = trial.fit.mean_loss(judged, level);
+        });
+    }
+}
+
+/// Views to fit to, and views left out: a camera in the middle where there are several at a time, else every fourth
+/// time.
+fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) -> (Vec<usize>, Vec<usize>) {
+    if reliable.len() > good.len() {
+        let mut cameras: Vec<[i64; 3]> = reliable.iter().map(|view| views[*view].camera_key).collect();
+        cameras.sort_unstable();
+        cameras.dedup();
+        let middle = cameras[cameras.len() / 2];
+        return reliable.iter().partition(|view| views[**view].camera_key != middle);
+    }
+    let is_left_out = |time: usize| {
+        let place = good.iter().position(|other| *other == time).unwrap_or(0);
+        good.len() > 8 && place >= 2 && place + 1 < good.len() && (place - 2).is_multiple_of(4)
+    };
+    reliable.iter().partition(|view| !is_left_out(views[**view].time_index))
+}
+
+/// Ways that are near the best: paths, rolls, and what following found.
+fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
+    let mut best: Vec<(f64, Way)> = trials.iter().map(|trial| (trial.losses[1], trial.way)).collect();
+    best.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let is_near = |factor: f64, error: f64| error < factor * best[0].0;
+    let (mut paths, mut rolls, mut rivals) = (0, 0, Vec::new());
+    for (error, way) in &best {
+        // What turns about a long axis shows it by its texture alone.
+        let (count, most, factor) = match way {
+            Way::Roll(_) => (&mut rolls, RIVALS, FAR),
+            Way::Rest | Way::Followed => (&mut 0, 1, FAR),
+            _ => (&mut paths, RIVALS, CLOSE),
+        };
+        if *count < most && is_near(factor, *error) {
+            *count += 1;
+            rivals.push(*way);
+        }
+    }
+    rivals
+}
+
+/// The way of moving that is kept, and whether the pictures tell its turns; `None` where the object rests.
+fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvidence)> {
+    let (way, rotation) = decide_moving(trials, outline)?;
+    let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
+    let rests = error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= REST_GAIN * moves);
+    (!rests).then_some((way, rotation))
+}
+
+/// The best way of moving, and whether the pictures tell its turns.
+fn decide_moving(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvidence)> {
+    let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
+    let best = |wanted: &dyn Fn(&Way) -> bool| {
+        let of = trials.iter().filter(|trial| wanted(&trial.way));
+        of.min_by(|a, b| a.losses[1].total_cmp(&b.losses[1])).map(|trial| (trial.way, trial.losses[1]))
+    };
+    let (moving, moving_error) = best(&|way| *way != Way::Rest)?;
+    let roll = best(&|way| matches!(way, Way::Roll(_)));
+    let Some((turning, turning_error)) = best(&|way| way.degrees().is_some()) else {
+        return Some((moving, RotationEvidence::Observed));
+    };
+    let others = roll.map_or(turning_error, |(_, error)| error.min(turning_error));
+    if moving == Way::Followed && moving_error < FOLLOW_GAIN[usize::from(is_round)] * others {
+        return Some((moving, RotationEvidence::Observed));
+    }
+    if let Some((way, error)) = roll
+        && error <= ROLL_GAIN * turning_error
+    {
+        return Some((way, RotationEvidence::Observed));
+    }
+    let apart = |other: i32| {
+        let difference = (other - turning.degrees().unwrap_or(0)).rem_euclid(360);
+        difference.min(360 - difference) >= RIVAL.1
+    };
+    let rival = best(&|way| way.degrees().is_some_and(apart));
+    if rival.is_some_and(|(_, error)| error < RIVAL.0[usize::from(is_round)] * turning_error) {
+        let has = |wanted: &Way| trials.iter().any(|trial| trial.way == *wanted);
+        if is_round && in_contact && has(&Way::Roll(1.0)) {
+            return Some((Way::Roll(1.0), RotationEvidence::Assumed));
+        }
+        if has(&Way::Slide(0)) {
+            return Some((Way::Slide(0), RotationEvidence::Assumed));
+        }
+        return Some((turning, RotationEvidence::Assumed));
+    }
+    Some((turning, RotationEvidence::Observed))
+}
