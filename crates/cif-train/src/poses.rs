@@ -38,8 +38,8 @@ impl PoseMoments {
         Self { first: vec![[0.0; WIDTH]; poses], second: vec![[0.0; WIDTH]; poses], steps: vec![0; poses] }
     }
 
-    /// Moves the poses that views were drawn of: turns at `rate` radians, translations at as much of the `sizes` of
-    /// the groups, metres.
+    /// Moves the poses that views were drawn of: turns at `rate` radians, where they are not assumed, translations at as
+    /// much of the `sizes` of the groups, metres.
     pub(crate) fn step(
         &mut self,
         tracks: &mut Tracks,
@@ -50,6 +50,7 @@ impl PoseMoments {
     ) {
         let mut index = 0;
         for (group, size) in tracks.groups.iter_mut().zip(sizes) {
+            let turns = group.turns_are_trained();
             for pose in &mut group.poses {
                 let place = index;
                 index += 1;
@@ -68,8 +69,10 @@ impl PoseMoments {
                     *second = DECAY[1] * *second + (1.0 - DECAY[1]) * g * g;
                     taken[k] = (*first / bias[0]) / ((*second / bias[1]).sqrt() + EPSILON);
                 }
-                let turn = -rate * DVec3::from_slice(&taken[..3]);
-                pose.rotation = (pose.rotation * DQuat::from_scaled_axis(turn)).normalize();
+                if turns {
+                    let turn = -rate * DVec3::from_slice(&taken[..3]);
+                    pose.rotation = (pose.rotation * DQuat::from_scaled_axis(turn)).normalize();
+                }
                 pose.translation -= rate * size * DVec3::from_slice(&taken[3..]);
             }
         }
@@ -136,4 +139,31 @@ pub(crate) fn pose_fault(gradients: &[PoseGradient]) -> Option<Fault> {
         index,
         value: format!("{turn} {translation}"),
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_field::RotationEvidence;
+    use cif_field::tracks::{TrackGroup, TrackPose};
+
+    use super::*;
+
+    #[test]
+    fn assumed_rotations_stay_and_observed_ones_turn() {
+        let pose = TrackPose { time: 0.0, translation: DVec3::ZERO, rotation: DQuat::IDENTITY };
+        let group = |rotation| TrackGroup {
+            deformed: false,
+            poses: vec![pose],
+            rotation,
+            ..TrackGroup::still("ball", DVec3::ZERO)
+        };
+        let kinds = [Some(RotationEvidence::Assumed), Some(RotationEvidence::Observed), None];
+        let mut tracks = Tracks { groups: kinds.map(group).to_vec(), ..Tracks::default() };
+        let gradients = [PoseGradient { turn: DVec3::X, translation: DVec3::Y }; 3];
+        let mut moments = PoseMoments::zeros(Some(&tracks));
+        moments.step(&mut tracks, &[0.1; 3], &gradients, &[1; 3], 0.01);
+        let turned = tracks.groups.iter().map(|group| group.poses[0].rotation != DQuat::IDENTITY);
+        assert_eq!(turned.collect::<Vec<_>>(), [false, true, true]);
+        assert!(tracks.groups.iter().all(|group| group.poses[0].translation.y < 0.0));
+    }
 }

@@ -163,6 +163,12 @@ impl DenseTrack {
 }
 
 impl TrackGroup {
+    /// True where pictures may turn the poses: an assumed rotation is one that they do not tell.
+    #[must_use]
+    pub fn turns_are_trained(&self) -> bool {
+        self.rotation != Some(RotationEvidence::Assumed)
+    }
+
     /// A group that does nothing yet, around a pivot.
     #[must_use]
     pub fn still(name: impl Into<String>, pivot: DVec3) -> Self {

@@ -325,7 +325,8 @@ impl<'a> Fit<'a> {
     /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane; `None` at times off
     /// the plane, and where several cameras tell the distance.
     fn contact(&self, shape: &Shape, time: usize, pose: &Pose) -> Option<(PoseGradient, Vec<DVec3>)> {
-        let plane = self.plane.filter(|_| self.touches && self.one_camera && !self.outline.air.contains(&time))?;
+        let plane =
+            self.plane.filter(|_| self.touches && self.one_camera && !self.outline.air.contains(&time))?;
         let size = self.size();
         let g = shape.gaussians();
         let normal = pose.rotation.inverse() * plane.normal;
@@ -364,7 +365,10 @@ impl<'a> Fit<'a> {
             lever += *weight * (pose.rotation * mean);
             of_centres.push(c * *weight * normal);
         }
-        Some((PoseGradient { turn: c * lever.cross(plane.normal), translation: c * plane.normal }, of_centres))
+        Some((
+            PoseGradient { turn: c * lever.cross(plane.normal), translation: c * plane.normal },
+            of_centres,
+        ))
     }
 
     /// Holds a rolling object to turning as far as it goes.

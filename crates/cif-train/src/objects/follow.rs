@@ -60,7 +60,8 @@ pub(super) fn follow(
             fit.step(first[step % first.len()], *level, Some(1.0), 0.0);
         }
     }
-    let mut order: Vec<usize> = at.keys().copied().filter(|t| *t != reference && path.contains_key(t)).collect();
+    let mut order: Vec<usize> =
+        at.keys().copied().filter(|t| *t != reference && path.contains_key(t)).collect();
     order.sort_by_key(|time| time.abs_diff(reference));
     for time in order {
         stop.check()?;
@@ -86,7 +87,10 @@ pub(super) fn follow(
 /// Makes the shape anew from all times that are known: what few views show of its far side is a guess.
 fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>) {
     let count = fit.shape.gaussians().len();
-    let Some(shape) = hull(fit.views, &fit.poses, (fit.outline.size(), None), count, fit.near, &mut fit.rng) else { return };
+    let Some(shape) = hull(fit.views, &fit.poses, (fit.outline.size(), None), count, fit.near, &mut fit.rng)
+    else {
+        return;
+    };
     fit.shape = shape;
     let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
     let level = fit.trial_level();
@@ -94,13 +98,7 @@ fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>) {
 }
 
 /// Pose of a time beside those that are known, of which those on the side of `origin` tell how it moves.
-fn found(
-    fit: &Fit<'_>,
-    time: usize,
-    path: &BTreeMap<usize, DVec3>,
-    views: &[usize],
-    origin: usize,
-) -> Pose {
+fn found(fit: &Fit<'_>, time: usize, path: &BTreeMap<usize, DVec3>, views: &[usize], origin: usize) -> Pose {
     let levels = fit.levels();
     let mut known: Vec<usize> =
         fit.poses.keys().copied().filter(|t| (*t < time) == (origin < time) || *t == origin).collect();

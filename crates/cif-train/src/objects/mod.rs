@@ -26,9 +26,10 @@ mod trials;
 mod view;
 mod ways;
 
-use cif_dataset::Dataset;
+use cif_dataset::{Dataset, Split};
 use glam::DVec3;
 
+pub(crate) use self::plane::Plane;
 use self::start::Object;
 pub(crate) use self::start::{Fitted, Surroundings};
 use self::view::ObjectView;
@@ -39,7 +40,16 @@ use crate::random::{Purpose, stream};
 /// Distance from a plane within which a point is on it, of the extent of the cameras.
 const ON_PLANE: f64 = 0.005;
 
-/// Fits one object (a label: dense index + 1); `None` where its masks, or the scene, do not tell enough.
+/// The plane that objects of a capture stand on, among points of what rests; `None` where no plane has enough of them.
+pub(crate) fn support(dataset: &Dataset, points: &[[f32; 3]], seed: u64) -> Option<Plane> {
+    let points: Vec<DVec3> = points.iter().map(|p| DVec3::from_array(p.map(f64::from))).collect();
+    let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
+    let cameras: Vec<DVec3> = training.map(|frame| frame.camera.centre()).collect();
+    let rng = stream(seed, Purpose::Objects, 0);
+    plane::support(&points, &cameras, ON_PLANE * dataset.extent(), rng)
+}
+
+/// Fits one object (a label: dense index + 1); `None` where it rests, or its masks, or the scene, do not tell enough.
 ///
 /// # Errors
 /// When a frame cannot be read, or the run is to stop.
@@ -49,24 +59,15 @@ pub(crate) fn fit(
     frames: &FrameStore,
     surroundings: Surroundings<'_>,
 ) -> Result<Option<Fitted>, TrainError> {
-    let points: Vec<DVec3> =
-        dataset.points.positions.iter().map(|p| DVec3::from_array(p.map(f64::from))).collect();
     let mut views = Vec::new();
-    let mut cameras = Vec::new();
     for k in 0..frames.len() {
         surroundings.stop.check()?;
         let frame = &dataset.frames[frames.index(k)];
-        cameras.push(frame.camera.centre());
         let data = frames.get(dataset, k)?;
         views.extend(ObjectView::new(label, frame.time_index, &frame.camera, &data));
     }
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);
-    let rng = stream(surroundings.seed, Purpose::Objects, 0);
-    let tolerance = ON_PLANE * dataset.extent();
-    let plane = plane::support(&points, &cameras, tolerance, rng);
-    let Some(outline) = outline::outline(&views, plane.as_ref()) else { return Ok(None) };
-    let object =
-        Object { label, views: &views, plane: plane.as_ref(), outline: &outline, surroundings };
-    start::fit_object(object)
+    let Some(outline) = outline::outline(&views, surroundings.plane) else { return Ok(None) };
+    start::fit_object(Object { label, views: &views, outline: &outline, surroundings })
 }

@@ -13,7 +13,7 @@ const LEAST_SHARE: f64 = 0.3;
 
 /// `normal . X = offset`, the normal towards the cameras.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(super) struct Plane {
+pub(crate) struct Plane {
     pub(super) normal: DVec3,
     pub(super) offset: f64,
 }

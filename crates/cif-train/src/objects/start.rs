@@ -55,6 +55,8 @@ pub(crate) struct Fitted {
 /// Facts about the capture that fits need.
 #[derive(Clone, Copy)]
 pub(crate) struct Surroundings<'a> {
+    /// What objects stand on, where that was found.
+    pub(crate) plane: Option<&'a Plane>,
     pub(crate) times: usize,
     pub(crate) near: f32,
     pub(crate) seed: u64,
@@ -69,8 +71,6 @@ pub(super) struct Object<'a> {
     pub(super) label: u16,
     /// In the order of times.
     pub(super) views: &'a [ObjectView],
-    /// What it stands on, where that was found.
-    pub(super) plane: Option<&'a Plane>,
     pub(super) outline: &'a Outline,
     pub(super) surroundings: Surroundings<'a>,
 }
@@ -112,7 +112,8 @@ pub(super) fn fit_object(object: Object<'_>) -> Result<Option<Fitted>, TrainErro
         (0.6 * decay, 1.5 * decay, level)
     });
     stop.check()?;
-    if let (RotationEvidence::Assumed, Way::Roll(_), Some(plane)) = (rotation, way, object.plane) {
+    if let (RotationEvidence::Assumed, Way::Roll(_), Some(plane)) = (rotation, way, object.surroundings.plane)
+    {
         roll_along(&mut fit, plane, outline.height);
         if let Some(shape) = object.hull(&fit.poses, GAUSSIANS, &mut object.rng()) {
             fit.shape = shape;
@@ -150,17 +151,12 @@ impl<'a> Object<'a> {
 
     /// A fit that starts with poses and a shape.
     pub(super) fn fit(&self, poses: BTreeMap<usize, Pose>, shape: Shape, rng: Pcg64) -> Fit<'a> {
-        let Surroundings { times, near, .. } = self.surroundings;
-        Fit::new(self.views, (self.plane.copied(), self.outline), (times, near), poses, shape, rng)
+        let Surroundings { plane, times, near, .. } = self.surroundings;
+        Fit::new(self.views, (plane.copied(), self.outline), (times, near), poses, shape, rng)
     }
 
     /// Gaussians inside the masks in poses.
-    pub(super) fn hull(
-        &self,
-        poses: &BTreeMap<usize, Pose>,
-        count: usize,
-        rng: &mut Pcg64,
-    ) -> Option<Shape> {
+    pub(super) fn hull(&self, poses: &BTreeMap<usize, Pose>, count: usize, rng: &mut Pcg64) -> Option<Shape> {
         hull(self.views, poses, (self.outline.size(), None), count, self.surroundings.near, rng)
     }
 
@@ -176,13 +172,14 @@ impl<'a> Object<'a> {
     /// The object at one time of its path, from which it is followed to others.
     pub(super) fn first(&self, path: &BTreeMap<usize, DVec3>, time: usize) -> Option<Fit<'a>> {
         let poses = BTreeMap::from([(time, Pose { rotation: DQuat::IDENTITY, translation: path[&time] })]);
+        let plane = self.surroundings.plane;
         // One view does not tell how deep an object is: its outline on the plane does.
         let within = |place: DVec3| {
-            let up = self.plane.map_or(0.0, |plane| plane.normal.dot(place));
+            let up = plane.map_or(0.0, |plane| plane.normal.dot(place));
             let across = (place.length_squared() - up * up).max(0.0).sqrt();
             up.abs() < 1.1 * self.outline.height && across < 1.1 * self.outline.radius
         };
-        let bound: Option<&dyn Fn(DVec3) -> bool> = if self.plane.is_some() { Some(&within) } else { None };
+        let bound: Option<&dyn Fn(DVec3) -> bool> = if plane.is_some() { Some(&within) } else { None };
         let (size, near) = (self.outline.size(), self.surroundings.near);
         let shape = hull(self.views, &poses, (size, bound), FOLLOWED, near, &mut self.rng())?;
         Some(self.fit(poses, shape, self.rng()))

@@ -24,8 +24,9 @@ pub(super) const STEPS: [usize; 2] = [300, 900];
 /// Loss beyond the best at which a trial is hopeless.
 const HOPELESS: f64 = 1.2;
 
-/// Error of resting, relative to that of the best way of moving, up to which an object is taken to rest.
-const REST_GAIN: f64 = 1.2;
+/// Error of resting, relative to that of sliding, and to that of turning in place, up to which an object is taken to
+/// rest.
+const REST_GAIN: [f64; 2] = [1.5, 1.25];
 
 /// Error of an object that was followed, relative to that of paths, below which following is preferred: of most
 /// objects, and of round ones.
@@ -40,7 +41,7 @@ const RIVAL: ([f64; 2], i32) = ([1.02, 1.06], 60);
 
 /// Most rivals that are tried again with all pixels, of paths and of rolls, their errors relative to the best, of
 /// rolls the second, and Gaussians and steps.
-const RIVALS: usize = 4;
+const RIVALS: usize = 3;
 const CLOSE: f64 = 1.12;
 const FAR: f64 = 1.3;
 const FINE: (usize, usize) = (800, 1500);
@@ -83,7 +84,7 @@ pub(super) fn best_way<'a>(
             place: outline::meeting_point(rays).unwrap_or(along[&reference]),
             along,
             outline,
-            normal: object.plane.map(|plane| plane.normal),
+            normal: surroundings.plane.map(|plane| plane.normal),
             reference,
             followed: None,
         },
@@ -118,7 +119,7 @@ impl<'a> Contest<'a> {
         self.advance(&mut trials, (0, STEPS[1]), false)?;
         self.judge(&mut trials, false);
         let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
-        let rests = |(rest, slide)| rest <= REST_GAIN * slide;
+        let rests = |(rest, slide)| rest <= REST_GAIN[0] * slide;
         if error(Way::Rest).zip(error(Way::Slide(0))).is_some_and(rests) {
             return Ok(None);
         }
@@ -154,7 +155,11 @@ impl<'a> Contest<'a> {
     /// Trials with all pixels and small Gaussians, where fine texture may tell.
     fn finely(&self, ways: &[Way]) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = self.begin(ways, FINE.0);
-        self.advance(&mut trials, (0, FINE.1), true)?;
+        let early = FINE.1 / 3;
+        self.advance(&mut trials, (0, early), true)?;
+        let best = trials.iter().map(|trial| trial.losses[0]).fold(f64::INFINITY, f64::min);
+        trials.retain(|trial| trial.losses[0] <= HOPELESS * best || trial.way == Way::Rest);
+        self.advance(&mut trials, (early, FINE.1), true)?;
         self.judge(&mut trials, true);
         Ok(trials)
     }
@@ -182,7 +187,12 @@ impl<'a> Contest<'a> {
     }
 
     /// Steps of all trials, from one count to another.
-    fn advance(&self, trials: &mut [Trial<'a>], (from, to): (usize, usize), finely: bool) -> Result<(), TrainError> {
+    fn advance(
+        &self,
+        trials: &mut [Trial<'a>],
+        (from, to): (usize, usize),
+        finely: bool,
+    ) -> Result<(), TrainError> {
         let all = if finely { FINE.1 } else { STEPS[1] };
         trials.par_iter_mut().for_each(|trial| {
             let level = if finely { 0 } else { trial.fit.trial_level() };
@@ -254,7 +264,7 @@ fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
 fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvidence)> {
     let (way, rotation) = decide_moving(trials, outline)?;
     let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
-    let rests = error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= REST_GAIN * moves);
+    let rests = error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= REST_GAIN[1] * moves);
     (!rests).then_some((way, rotation))
 }
 

@@ -27,8 +27,8 @@ const ROUND: f64 = 0.93;
 /// Pixels of a mask from which its texture may show a turn.
 const TEXTURED: f64 = 400.0;
 
-/// Path in sizes below which an object may turn in place.
-const STAYS: f64 = 1.5;
+/// Reach of a path, in sizes, below which an object may turn in place, and does not roll.
+const STAYS: f64 = 1.2;
 
 /// A way of moving.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -87,17 +87,17 @@ pub(super) fn is_round(outline: &Outline) -> bool {
 }
 
 impl Paths<'_> {
-    /// Length of the path, metres.
-    fn length(&self) -> f64 {
-        let places: Vec<DVec3> = self.along.values().copied().collect();
-        places.windows(2).map(|pair| (pair[1] - pair[0]).length()).sum()
+    /// Largest distance of the path from its beginning, metres.
+    fn reach(&self) -> f64 {
+        let from = self.along.values().next().copied().unwrap_or_default();
+        self.along.values().map(|place| (*place - from).length()).fold(0.0, f64::max)
     }
 
     /// Ways of moving along the path worth a trial, beside sliding without a turn.
     pub(super) fn ways(&self) -> Vec<Way> {
         let mut ways = Vec::new();
         if self.normal.is_some() {
-            if self.length() < STAYS * self.outline.size() {
+            if self.reach() < STAYS * self.outline.size() {
                 ways.extend(SPINS.map(Way::Spin));
             } else {
                 ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
@@ -157,7 +157,10 @@ impl Paths<'_> {
             }
             Way::Followed => {
                 let followed = self.followed.iter().flatten();
-                return followed.filter(|(time, _)| self.along.contains_key(time)).map(|(t, p)| (*t, *p)).collect();
+                return followed
+                    .filter(|(time, _)| self.along.contains_key(time))
+                    .map(|(t, p)| (*t, *p))
+                    .collect();
             }
         };
         let stays = matches!(way, Way::Rest | Way::Spin(_));

@@ -1,7 +1,7 @@
 //! Groups that move as a whole, on a GPU beside the processor. `CIF_TEST_GPU=off|auto|require`.
 
-use cif_field::Tracks;
 use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose};
+use cif_field::{RotationEvidence, Tracks};
 use cif_render::Gradients;
 use cif_render::wgpu::{Gpu, testing};
 use glam::{DQuat, DVec3};
@@ -15,7 +15,7 @@ use crate::poses::PoseMoments;
 use crate::stage::Stage;
 
 /// A run at the start of its fine stage, in which all poses move. Two thirds of the Gaussians are in groups, one of
-/// which has poses at the first and the last time alone.
+/// which has poses at the first and the last time alone, whose turns are assumed.
 fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     let (mut trainer, folder) = trainer_with(gpu, |config| {
         (config.stages.fine, config.motion.guidance) = (3, 0.0);
@@ -36,10 +36,11 @@ fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
             .collect(),
         ..TrackGroup::still(name, pivot)
     };
-    let groups = vec![
+    let mut groups = vec![
         group("often", DVec3::new(0.1, 0.2, 0.0), &times),
         group("rarely", DVec3::new(-0.2, 0.1, 0.1), &[times[0], times[2]]),
     ];
+    groups[1].rotation = Some(RotationEvidence::Assumed);
     let group_of = (0..n).map(|row| [0, NO_GROUP, 1][row as usize % 3]).collect();
     let tracks = Tracks { group_of, groups };
     trainer.state.pose_moments = PoseMoments::zeros(Some(&tracks));

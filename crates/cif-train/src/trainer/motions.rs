@@ -1,10 +1,11 @@
 //! Motion that the deformation network gives Gaussians: measured, held against limits, and taken out of it.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use cif_field::deformation::evaluate::Deltas;
 use cif_field::deformation::{Deformation, HeadKind};
 use cif_field::{Field, Gaussians};
+use glam::DVec3;
 
 /// Times at which the network is probed.
 const PROBES: usize = 8;
@@ -60,18 +61,29 @@ impl Limits {
     }
 }
 
+/// Share by which the room around an object that moves as a whole is larger than the object: as far as its shadow
+/// reaches.
+const SHADOW: f64 = 2.0;
+
+/// Most Gaussians of an object that tell where it passes.
+const PASSING: usize = 64;
+
 /// Gaussians among others that move: of those that go through the network around them, a share moves more than the
-/// limits. Things move as wholes, and what moves little learns it late.
+/// limits, or an object with poses of its own passes. Things move as wholes, what moves little learns it late, and
+/// objects cast shadows.
 pub(super) fn restless(field: &Field, motions: &[Motion], limits: Limits) -> Vec<bool> {
     let Some(deformation) = &field.deformation else { return vec![false; motions.len()] };
-    let cell_of = |row: usize, motion: &Motion| -> [i64; 3] {
-        let moved = if deformation.is_still(row) { [0.0; 3] } else { motion.mean.position };
-        std::array::from_fn(|axis| {
-            let place = field.gaussians.means[row][axis] + moved[axis];
-            let cell = (f64::from(place) / f64::from(AROUND * field.extent)).floor();
+    let cell_at = |place: [f64; 3]| -> [i64; 3] {
+        place.map(|place| {
+            let cell = (place / f64::from(AROUND * field.extent)).floor();
             cell.clamp(-FARTHEST_CELL, FARTHEST_CELL) as i64
         })
     };
+    let cell_of = |row: usize, motion: &Motion| -> [i64; 3] {
+        let moved = if deformation.is_still(row) { [0.0; 3] } else { motion.mean.position };
+        cell_at(std::array::from_fn(|axis| f64::from(field.gaussians.means[row][axis] + moved[axis])))
+    };
+    let passed: BTreeSet<[i64; 3]> = passed(field, limits).map(|place| cell_at(place.to_array())).collect();
     // Rows that go through the network, and of these those that move, by cell.
     let mut cells: BTreeMap<[i64; 3], [u32; 2]> = BTreeMap::new();
     for (row, motion) in motions.iter().enumerate().filter(|(row, _)| !deformation.is_still(*row)) {
@@ -83,6 +95,9 @@ pub(super) fn restless(field: &Field, motions: &[Motion], limits: Limits) -> Vec
     let around = |[x, y, z]: [i64; 3]| {
         let (mut all, mut moving) = (0, 0);
         for (near_x, near_y) in (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (x + dx, y + dy))) {
+            if passed.range([near_x, near_y, z - 1]..=[near_x, near_y, z + 1]).next().is_some() {
+                return true;
+            }
             for (_, counts) in cells.range([near_x, near_y, z - 1]..=[near_x, near_y, z + 1]) {
                 (all, moving) = (all + counts[0], moving + counts[1]);
             }
@@ -94,6 +109,25 @@ pub(super) fn restless(field: &Field, motions: &[Motion], limits: Limits) -> Vec
         *known.entry(cell).or_insert_with(|| around(cell))
     };
     motions.iter().enumerate().map(of_row).collect()
+}
+
+/// Places around objects with poses of their own, wherever they go beyond the limits.
+fn passed(field: &Field, limits: Limits) -> impl Iterator<Item = DVec3> {
+    let groups =
+        field.tracks.iter().flat_map(|tracks| tracks.groups.iter().enumerate().map(move |g| (tracks, g)));
+    groups.flat_map(move |(tracks, (index, group))| {
+        let limit = f64::from(limits.displacement);
+        let goes = group.poses.iter().any(|pose| (pose.translation - group.pivot).length() > limit);
+        let rows = (0..field.len()).filter(|row| goes && tracks.group_of[*row] as usize == index);
+        let rows: Vec<usize> = rows.collect();
+        let some = rows.iter().step_by(rows.len() / PASSING + 1).map(|row| {
+            SHADOW * (DVec3::from_array(field.gaussians.means[*row].map(f64::from)) - group.pivot)
+        });
+        let offsets: Vec<DVec3> = some.collect();
+        group.poses.iter().flat_map(move |pose| {
+            offsets.clone().into_iter().map(|offset| pose.rotation * offset + pose.translation)
+        })
+    })
 }
 
 /// Takes rows out of the network, at the mean of what it did to them; returns their number. A field without a
@@ -183,7 +217,9 @@ fn length(values: &[f32; 4]) -> f32 {
 
 #[cfg(test)]
 mod tests {
+    use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose, Tracks};
     use cif_render::synthetic;
+    use glam::DQuat;
 
     use super::*;
 
@@ -317,6 +353,35 @@ mod tests {
         field.deformation.as_mut().unwrap().still.clear();
         motions.iter_mut().skip(4).for_each(|motion| motion.displacement = 0.0);
         assert_eq!(restless(&field, &motions, limits), [false; 60]);
+    }
+
+    #[test]
+    fn what_an_object_with_poses_passes_stays_awake() {
+        let mut field = field();
+        // The first ten are an object; twenty lie on its way, the others far from it.
+        for (row, place) in field.gaussians.means.iter_mut().enumerate() {
+            let side = [0.0, 0.3, 0.6, 0.6, 0.6, 0.6][row / 10];
+            *place = [side, if row < 20 { 0.0 } else { 0.5 }, 0.001 * (row % 5) as f32];
+        }
+        let pose = |time, x| TrackPose { time, translation: DVec3::X * x, rotation: DQuat::IDENTITY };
+        let group = |reach| TrackGroup {
+            deformed: false,
+            poses: vec![pose(0.0, 0.0), pose(0.5, reach), pose(1.0, 0.0)],
+            ..TrackGroup::still("ball", DVec3::ZERO)
+        };
+        let group_of: Vec<u32> = (0..60).map(|row| if row < 10 { 0 } else { NO_GROUP }).collect();
+        field.deformation.as_mut().unwrap().still = (0..60).map(|row| row < 10).collect();
+        let still =
+            Deltas { position: [0.0; 3], scale: [0.0; 3], rotation: [0.0; 4], opacity: 0.0, sh: [0.0; 48] };
+        let motions = vec![Motion { mean: still, displacement: 0.0, shape: 0.0 }; 60];
+        let limits = Limits { displacement: 0.01, shape: 1.0 };
+        for (reach, passes) in [(0.3, true), (0.005, false)] {
+            let groups = vec![group(reach)];
+            field.tracks = Some(Tracks { group_of: group_of.clone(), groups });
+            let found = restless(&field, &motions, limits);
+            assert!(found[10..20].iter().all(|awake| *awake == passes), "{reach}");
+            assert!(found[20..].iter().all(|awake| !awake), "{reach}");
+        }
     }
 
     #[test]

@@ -1,18 +1,19 @@
 //! Objects that move as a whole: fitted before the fine stage, given Gaussians in a group that moves by trained
 //! poses.
 
+use cif_dataset::PointSource;
 use cif_field::tracks::{NO_GROUP, RotationEvidence, TrackGroup, TrackPose, Tracks};
 use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Trainer;
 use crate::error::TrainError;
-use crate::objects::{self, Fitted, Surroundings};
+use crate::objects::{self, Fitted, Plane, Surroundings};
 use crate::schedule::log_linear;
 use crate::stage::Stage;
 
 /// Error on pixels that were left out beyond which an object is not taken to be rigid.
-const MOST_ERROR: f64 = 0.2;
+const MOST_ERROR: f64 = 0.15;
 
 /// Rates of poses at the start and the end of the fine stage, radians, and shares of the size of the object.
 const RATES: [f32; 2] = [0.004, 2e-4];
@@ -25,7 +26,8 @@ impl Trainer {
     pub(super) fn find_other_movers(&mut self) -> Result<(), TrainError> {
         let travelling = &self.state.guidance.travelling;
         let others: Vec<u16> = (1..travelling.len()).filter(|k| !travelling[*k]).map(|k| k as u16).collect();
-        for (label, fitted) in self.fit_objects(&others)? {
+        let plane = self.support();
+        for (label, fitted) in self.fit_objects(&others, plane.as_ref())? {
             self.state.guidance.travelling[usize::from(label)] = true;
             self.fits.insert(label, fitted);
         }
@@ -39,19 +41,32 @@ impl Trainer {
             .map(|(label, _)| label as u16)
             .filter(|label| !self.fits.contains_key(label))
             .collect();
-        let fits = self.fit_objects(&rest)?;
+        let plane = self.support();
+        let fits = self.fit_objects(&rest, plane.as_ref())?;
         self.fits.extend(fits);
         Ok(())
     }
 
+    /// What objects stand on: in the points of the capture or, where it has none, in what is reconstructed so far.
+    fn support(&self) -> Option<Plane> {
+        let (state, seed) = (&self.state, self.state.config.seed);
+        if state.dataset.points.source != PointSource::Random {
+            return objects::support(&state.dataset, &state.dataset.points.positions, seed);
+        }
+        let g = &state.field.gaussians;
+        let solid = g.means.iter().zip(&g.opacity_logits).filter(|(_, logit)| **logit > 0.0);
+        objects::support(&state.dataset, &solid.map(|(mean, _)| *mean).collect::<Vec<_>>(), seed)
+    }
+
     /// Rigid motions of objects (labels: dense index + 1), without those that rest, are not rigid, or whose masks do
     /// not tell enough.
-    fn fit_objects(&self, labels: &[u16]) -> Result<Vec<(u16, Fitted)>, TrainError> {
+    fn fit_objects(&self, labels: &[u16], plane: Option<&Plane>) -> Result<Vec<(u16, Fitted)>, TrainError> {
         if !self.state.config.motion.rigid {
             return Ok(Vec::new());
         }
         let state = &self.state;
         let surroundings = Surroundings {
+            plane,
             times: state.dataset.times.len(),
             near: state.config.near,
             seed: state.config.seed,

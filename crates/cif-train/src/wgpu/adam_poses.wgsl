@@ -1,4 +1,4 @@
-// The optimiser's step of the poses that views were drawn of, and their limits: turns by radians, translations by shares
+// The optimiser's step of the poses that views were drawn of, and their limits: turns by radians, unless they are assumed, translations by shares
 // of the size of the group, half of the largest extent of its Gaussians. Gradients become zero. A workgroup per group.
 // Rust twin: poses.rs, `PoseMoments::step` and `object_sizes`. Source: methods reference of motion, 2.1.
 
@@ -53,7 +53,7 @@ fn small_turn(turn: vec3f) -> vec4f {
     return vec4f(1.0 - h * (0.5 - h / 24.0), turn * (0.5 - h * (1.0 / 12.0 - h / 240.0)));
 }
 
-fn move_pose(at: u32, size: f32) {
+fn move_pose(at: u32, size: f32, turns: bool) {
     let gradient = gradients[at];
     var state = moments[at];
     let steps = state.first_turn.w + 1.0;
@@ -73,7 +73,9 @@ fn move_pose(at: u32, size: f32) {
     let bias_2 = 1.0 - power(POSE_DECAY_2, counted);
     let by_turn = (first_turn / bias_1) / (sqrt(second_turn / bias_2) + POSE_EPSILON);
     let by_translation = (first_translation / bias_1) / (sqrt(second_translation / bias_2) + POSE_EPSILON);
-    poses[at].rotation = normalize(product(poses[at].rotation, small_turn(-rates.rate * by_turn)));
+    if turns {
+        poses[at].rotation = normalize(product(poses[at].rotation, small_turn(-rates.rate * by_turn)));
+    }
     poses[at].offset -= vec4f(rates.rate * size * by_translation, 0.0);
 }
 
@@ -105,7 +107,7 @@ fn adam_poses(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
     let moves = rates.rate > 0.0 && atomicLoad(&faults[1]) == 0u;
     for (var at = of_group.poses.x + local; at < of_group.poses.y; at += INVOCATIONS) {
         if moves && gradients[at].turn.w > 0.0 {
-            move_pose(at, size);
+            move_pose(at, size, of_group.turns != 0u);
         }
         gradients[at].turn = vec4f(0.0);
         gradients[at].translation = vec4f(0.0);

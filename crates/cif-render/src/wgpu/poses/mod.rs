@@ -52,8 +52,8 @@ crate::shared_struct! {
         pub poses: [u32; 2],
         /// 1 when it is drawn.
         pub visible: u32,
-        /// Pads to 16 bytes.
-        pub unused: u32,
+        /// 1 when the turns of its poses train.
+        pub turns: u32,
     }
 }
 
@@ -328,7 +328,7 @@ impl GpuPoses {
                 members: *members,
                 poses: [first, end],
                 visible: u32::from(group.is_visible(time)),
-                unused: 0,
+                turns: u32::from(group.turns_are_trained()),
             };
             first = end;
             view
