@@ -163,6 +163,8 @@ fn settings_out_of_range_name_the_line_or_the_flag() {
     cif(path, "train nowhere -o a.cif --config mine.toml").fails(1, &["mine.toml:4", "stages.batch", "is 0"]);
     cif(path, "train nowhere -o a.cif --set rates.opacity=-1").fails(1, &["--set rates.opacity", "is -1"]);
     cif(path, "train nowhere -o a.cif --config mine.toml --batch 0").fails(1, &["--batch", "is 0"]);
+    cif(path, "train nowhere -o a.cif --motion-of mug=stiff").fails(1, &["--motion-of", "stiff", "rigid"]);
+    cif(path, "train nowhere -o a.cif --motion-of mug").fails(2, &["--motion-of mug", "LABEL=MOTION"]);
     cif(path, "bench step nowhere --set stages.batch=0").fails(1, &["--set stages.batch", "is 0"]);
 }
 

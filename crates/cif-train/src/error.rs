@@ -36,6 +36,16 @@ pub enum TrainError {
         /// Folder of the capture.
         root: PathBuf,
     },
+    /// The motion of an object is told that the capture does not have.
+    #[error("{}: the motion of `{label}` is told, but no instance has this label; there are: {known}", root.display())]
+    UnknownObject {
+        /// Folder of the capture.
+        root: PathBuf,
+        /// Label that was told.
+        label: String,
+        /// Labels of the capture.
+        known: String,
+    },
     /// The optimisation left the finite numbers.
     #[error(
         "{stage} stage, step {iteration}: the gradient of {tensor} is not finite; the field of the last finite step is kept. \

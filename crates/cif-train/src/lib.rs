@@ -81,7 +81,7 @@ pub mod trainer;
 pub mod wgpu;
 
 pub use clock::{Clock, Seconds, SystemClock};
-pub use config::{Ablation, Preset, TrainConfig};
+pub use config::{Ablation, ObjectMotion, Preset, TrainConfig};
 pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, TrainEvent};

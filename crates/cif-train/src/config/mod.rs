@@ -8,13 +8,14 @@ mod options;
 mod presets;
 mod validate;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use cif_field::{Heads, SortMetric, TimeEncoding};
 use serde::{Deserialize, Serialize};
 
 pub use options::{
-    Ablation, InstanceGeometry, LabelShares, Normalisation, OccupancyStart, Preset, ScaleCorrection, WeakSet,
+    Ablation, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart, Preset,
+    ScaleCorrection, WeakSet,
 };
 pub use validate::ConfigError;
 
@@ -189,9 +190,11 @@ pub struct MotionConfig {
     pub stillness: f32,
     /// Steps that teach the deformation the paths before the fine stage, default 300.
     pub rehearsal: u32,
-    /// True where travelling objects that are rigid move by a trained pose per time instead of the network; needs
-    /// `guidance`; default true.
+    /// True where objects that are rigid move by a trained pose per time instead of the network; needs `guidance`;
+    /// default true.
     pub rigid: bool,
+    /// Motion of objects, by label, that need not be found: `rigid` or `free`. Default: none is told.
+    pub of: BTreeMap<String, ObjectMotion>,
     /// Gaussians that a travelling object starts with, default 300.
     pub gaussians: u32,
     /// Training frames in which more than half of the instances, two or more, are this many times farther than

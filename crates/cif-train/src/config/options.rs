@@ -30,6 +30,16 @@ pub enum Ablation {
     NoResampling,
 }
 
+/// Motion that an object is told to have.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ObjectMotion {
+    /// It moves as a whole, by a pose per time.
+    Rigid,
+    /// It moves by the deformation network.
+    Free,
+}
+
 /// Which geometry the instance loss trains (A6; methods reference 4.5).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -1,5 +1,7 @@
 //! Values of the presets. Source of `paper`: methods reference 1.1 and 1.2.
 
+use std::collections::BTreeMap;
+
 use cif_dataset::Layout;
 use cif_field::{Heads, SortMetric, TimeEncoding};
 
@@ -197,6 +199,7 @@ impl Default for MotionConfig {
             guidance: 10.0,
             guidance_end: 0.1,
             rigid: true,
+            of: BTreeMap::new(),
             stillness: 1.0,
             rehearsal: 300,
             gaussians: 300,

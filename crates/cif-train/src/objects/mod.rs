@@ -49,7 +49,8 @@ pub(crate) fn support(dataset: &Dataset, points: &[[f32; 3]], seed: u64) -> Opti
     plane::support(&points, &cameras, ON_PLANE * dataset.extent(), rng)
 }
 
-/// Fits one object (a label: dense index + 1); `None` where it rests, or its masks, or the scene, do not tell enough.
+/// Fits one object (a label: dense index + 1); `None` where it rests, unless it is told to be rigid, or where its masks,
+/// or the scene, do not tell enough.
 ///
 /// # Errors
 /// When a frame cannot be read, or the run is to stop.
@@ -58,6 +59,7 @@ pub(crate) fn fit(
     dataset: &Dataset,
     frames: &FrameStore,
     surroundings: Surroundings<'_>,
+    is_told: bool,
 ) -> Result<Option<Fitted>, TrainError> {
     let mut views = Vec::new();
     for k in 0..frames.len() {
@@ -69,5 +71,5 @@ pub(crate) fn fit(
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);
     let Some(outline) = outline::outline(&views, surroundings.plane) else { return Ok(None) };
-    start::fit_object(Object { label, views: &views, outline: &outline, surroundings })
+    start::fit_object(Object { label, views: &views, outline: &outline, is_told, surroundings })
 }

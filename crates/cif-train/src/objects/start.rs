@@ -72,6 +72,8 @@ pub(super) struct Object<'a> {
     /// In the order of times.
     pub(super) views: &'a [ObjectView],
     pub(super) outline: &'a Outline,
+    /// True where it is told to move as a whole.
+    pub(super) is_told: bool,
     pub(super) surroundings: Surroundings<'a>,
 }
 

@@ -103,7 +103,7 @@ fn fit_on(plane: Option<&Plane>, views: &[ObjectView]) -> Option<Fitted> {
     let outline = outline::outline(views, plane).unwrap();
     let stop = Stop::default();
     let surroundings = Surroundings { plane, times: TIMES, near: 0.05, seed: 0, gaussians: 150, stop: &stop };
-    fit_object(Object { label: 1, views, outline: &outline, surroundings }).unwrap()
+    fit_object(Object { label: 1, views, outline: &outline, is_told: false, surroundings }).unwrap()
 }
 
 /// Largest error of turns relative to the first pose, degrees, and mean error of displacements, metres.

@@ -91,12 +91,21 @@ pub(super) fn best_way<'a>(
         train,
         left_out,
     };
-    let trials = match contest.simple()? {
-        Some(trials) => trials,
-        None if contest.paths.may_turn_unseen(views) => contest.spins()?,
-        None => return Ok(None),
+    let simple = contest.simple()?;
+    let trials = if object.is_told {
+        contest.along_the_path(simple)?
+    } else if contest.rests(&simple) {
+        if !contest.paths.may_turn_unseen(views) {
+            return Ok(None);
+        }
+        contest.finely(&contest.paths.spins())?
+    } else if contest.paths.shifts() {
+        contest.along_the_path(simple)?
+    } else {
+        return Ok(None);
     };
-    let Some((way, rotation)) = decide(&trials, outline) else { return Ok(None) };
+    let moves = decide(&trials, outline).filter(|(way, _)| object.is_told || !rests(&trials, *way));
+    let Some((way, rotation)) = moves else { return Ok(None) };
     // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
     let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
     let kept = if rolls_unseen { Way::Slide(0) } else { way };
@@ -113,16 +122,24 @@ pub(super) fn best_way<'a>(
 }
 
 impl<'a> Contest<'a> {
-    /// Trials of an object that moves; `None` where resting explains it about as well as sliding does.
-    fn simple(&mut self) -> Result<Option<Vec<Trial<'a>>>, TrainError> {
+    /// Trials of resting, and of moving along the path without a turn: most objects that do not travel rest.
+    fn simple(&self) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = self.begin(&[Way::Rest, Way::Slide(0)], GAUSSIANS);
         self.advance(&mut trials, (0, STEPS[1]), false)?;
         self.judge(&mut trials, false);
-        let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
+        Ok(trials)
+    }
+
+    /// True where resting explains an object about as well as moving along its path does.
+    fn rests(&self, simple: &[Trial<'_>]) -> bool {
+        let error = |way: Way| simple.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
         let rests = |(rest, slide)| rest <= REST_GAIN[0] * slide;
-        if error(Way::Rest).zip(error(Way::Slide(0))).is_some_and(rests) {
-            return Ok(None);
-        }
+        error(Way::Rest).zip(error(Way::Slide(0))).is_some_and(rests)
+    }
+
+    /// All other ways along the path, beside the simple ones.
+    fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
+        let mut trials = simple;
         if self.between.is_empty() {
             // Several cameras show all sides of it, and how it turns from time to time.
             let reference = self.paths.reference;
@@ -142,14 +159,9 @@ impl<'a> Contest<'a> {
         let rivals = rivals(&trials);
         // Shading prefers no turn of round things, at any resolution.
         if is_round(self.object.outline) || rivals.len() < 2 {
-            return Ok(Some(trials));
+            return Ok(trials);
         }
-        self.finely(&rivals).map(Some)
-    }
-
-    /// Trials of turns in place.
-    fn spins(&self) -> Result<Vec<Trial<'a>>, TrainError> {
-        self.finely(&self.paths.spins())
+        self.finely(&rivals)
     }
 
     /// Trials with all pixels and small Gaussians, where fine texture may tell.
@@ -260,16 +272,14 @@ fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
     rivals
 }
 
-/// The way of moving that is kept, and whether the pictures tell its turns; `None` where the object rests.
-fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvidence)> {
-    let (way, rotation) = decide_moving(trials, outline)?;
+/// True where resting explains an object about as well as a way of moving does.
+fn rests(trials: &[Trial<'_>], way: Way) -> bool {
     let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
-    let rests = error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= REST_GAIN[1] * moves);
-    (!rests).then_some((way, rotation))
+    error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= REST_GAIN[1] * moves)
 }
 
 /// The best way of moving, and whether the pictures tell its turns.
-fn decide_moving(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvidence)> {
+fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvidence)> {
     let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
     let best = |wanted: &dyn Fn(&Way) -> bool| {
         let of = trials.iter().filter(|trial| wanted(&trial.way));

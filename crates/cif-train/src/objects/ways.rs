@@ -27,8 +27,9 @@ const ROUND: f64 = 0.93;
 /// Pixels of a mask from which its texture may show a turn.
 const TEXTURED: f64 = 400.0;
 
-/// Reach of a path, in sizes, below which an object may turn in place, and does not roll.
-const STAYS: f64 = 1.2;
+/// Reach of a path, in sizes, from which an object moves as a whole, and from which it may roll.
+const SHIFTS: f64 = 0.6;
+const ROLLS_FROM: f64 = 1.2;
 
 /// A way of moving.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -93,19 +94,19 @@ impl Paths<'_> {
         self.along.values().map(|place| (*place - from).length()).fold(0.0, f64::max)
     }
 
+    /// True where the path goes so far that it is more than the middle of a mask whose object deforms, or opens.
+    pub(super) fn shifts(&self) -> bool {
+        self.reach() >= SHIFTS * self.outline.size()
+    }
+
     /// Ways of moving along the path worth a trial, beside sliding without a turn.
     pub(super) fn ways(&self) -> Vec<Way> {
         let mut ways = Vec::new();
         if self.normal.is_some() {
-            if self.reach() < STAYS * self.outline.size() {
-                ways.extend(SPINS.map(Way::Spin));
-            } else {
-                ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
-                if is_round(self.outline) {
-                    ways.extend(ROLLS.map(Way::Roll));
-                } else {
-                    ways.extend(OTHER_ROLLS.map(Way::Roll));
-                }
+            ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
+            if self.reach() >= ROLLS_FROM * self.outline.size() {
+                let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
+                ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
             }
         }
         if self.followed.is_some() {

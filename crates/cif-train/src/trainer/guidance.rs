@@ -36,6 +36,7 @@ impl Trainer {
 
     /// Finds out which instances travel.
     pub(super) fn find_travelling(&mut self) -> Result<(), TrainError> {
+        self.check_told()?;
         if self.state.config.motion.guidance <= 0.0 || !self.is_guided() {
             return Ok(());
         }

@@ -7,6 +7,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Trainer;
+use crate::config::ObjectMotion;
 use crate::error::TrainError;
 use crate::objects::{self, Fitted, Plane, Surroundings};
 use crate::schedule::log_linear;
@@ -47,6 +48,25 @@ impl Trainer {
         Ok(())
     }
 
+    /// Motion that an object (a label: dense index + 1) is told to have.
+    fn told(&self, label: u16) -> Option<ObjectMotion> {
+        let name = &self.state.field.instances[usize::from(label) - 1].label;
+        self.state.config.motion.of.get(name).copied()
+    }
+
+    /// Refuses motion that is told of objects that there are not.
+    pub(super) fn check_told(&self) -> Result<(), TrainError> {
+        let labels: Vec<&str> = self.state.field.instances.iter().map(|i| i.label.as_str()).collect();
+        match self.state.config.motion.of.keys().find(|label| !labels.contains(&label.as_str())) {
+            None => Ok(()),
+            Some(label) => Err(TrainError::UnknownObject {
+                root: self.state.dataset.root.clone(),
+                label: label.clone(),
+                known: labels.join(", "),
+            }),
+        }
+    }
+
     /// What objects stand on: in the points of the capture or, where it has none, in what is reconstructed so far.
     fn support(&self) -> Option<Plane> {
         let (state, seed) = (&self.state, self.state.config.seed);
@@ -73,20 +93,32 @@ impl Trainer {
             gaussians: state.config.motion.gaussians as usize,
             stop: &state.stop,
         };
-        let fits: Vec<Option<(u16, Fitted)>> = labels
-            .par_iter()
-            .map(|label| {
-                let fitted = objects::fit(*label, &state.dataset, &state.frames, surroundings)?;
-                Ok(fitted.filter(|fitted| fitted.error <= MOST_ERROR).map(|fitted| (*label, fitted)))
-            })
-            .collect::<Result<_, TrainError>>()?;
+        let wanted: Vec<(u16, Option<ObjectMotion>)> =
+            labels.iter().map(|label| (*label, self.told(*label))).collect();
+        let fit = |(label, told): &(u16, Option<ObjectMotion>)| {
+            let told = *told;
+            if told == Some(ObjectMotion::Free) {
+                return Ok(None);
+            }
+            let is_told = told == Some(ObjectMotion::Rigid);
+            let fitted = objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told)?;
+            Ok(fitted.filter(|fitted| is_told || fitted.error <= MOST_ERROR).map(|fitted| (*label, fitted)))
+        };
+        let fits: Vec<Option<(u16, Fitted)>> =
+            wanted.par_iter().map(fit).collect::<Result<_, TrainError>>()?;
         Ok(fits.into_iter().flatten().collect())
     }
 
     /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not.
     pub(super) fn add_object(&mut self, label: u16) -> bool {
-        let Some(fitted) = self.fits.remove(&label) else { return false };
         let name = self.state.field.instances[usize::from(label) - 1].label.clone();
+        let Some(fitted) = self.fits.remove(&label) else {
+            if self.told(label) == Some(ObjectMotion::Rigid) {
+                self.warnings
+                    .push(format!("{name} is told to be rigid, but its masks do not tell its poses"));
+            }
+            return false;
+        };
         let how = match fitted.rotation {
             RotationEvidence::Observed => "",
             RotationEvidence::Assumed => ", which the pictures do not tell: assumed",

@@ -3,7 +3,7 @@
 use crate::support::{Scene, capture, small_config, stopped_after, train, without_record};
 use cif_dataset::Dataset;
 use cif_field::{Checkpoint, Field, RotationEvidence};
-use cif_train::{Control, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
+use cif_train::{Control, ObjectMotion, Outcome, Stage, TrainConfig, TrainError, TrainEvent, Trainer};
 use glam::DVec3;
 
 const TRAVEL: f64 = 0.9;
@@ -178,6 +178,28 @@ fn check_rigid_object(use_engine: impl Fn(&mut Trainer)) {
     use_engine(&mut resumed);
     assert_eq!(resumed.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
     assert!(without_record(&resumed.into_field()) == without_record(&field));
+}
+
+#[test]
+fn the_motion_of_an_object_can_be_told() {
+    let folder = tempfile::tempdir().unwrap();
+    let dataset = dataset(folder.path(), 12);
+    let mut config = guided();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 20, 0);
+    let grouped = |config: &TrainConfig| {
+        let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
+        trainer.run(&mut |_, _| Control::Continue).unwrap();
+        let tracks = trainer.into_field().tracks;
+        tracks.map_or(Vec::new(), |tracks| tracks.groups.into_iter().map(|group| group.name).collect())
+    };
+    assert_eq!(grouped(&config), ["ball 9"]);
+    config.motion.of.insert("ball 9".to_owned(), ObjectMotion::Free);
+    assert!(grouped(&config).is_empty());
+    config.motion.of.insert("bal 9".to_owned(), ObjectMotion::Rigid);
+    let refused = Trainer::new(dataset.clone(), config).err().unwrap();
+    let TrainError::UnknownObject { label, known, .. } = refused else { panic!("{refused}") };
+    assert_eq!(label, "bal 9");
+    assert!(known.contains("ball 9"), "{known}");
 }
 
 #[test]

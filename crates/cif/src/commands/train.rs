@@ -94,6 +94,10 @@ pub(super) struct Train {
     /// [default: auto, and all with the preset paper]
     #[arg(long, value_name = "LIST", allow_hyphen_values = true, conflicts_with_all = ["resume", "from"])]
     effects: Option<EffectChoice>,
+    /// Motion of an object that need not be found, as in --motion-of 'red mug=rigid': rigid (a pose per time) or
+    /// free (by the deformation network); may be repeated
+    #[arg(long, value_name = "LABEL=MOTION", conflicts_with_all = ["resume", "from"])]
+    motion_of: Vec<String>,
     /// Any setting by its key in SCENE.train.toml, e.g. --set rates.opacity=0.02
     #[arg(long, value_name = "TABLE.KEY=VALUE")]
     set: Vec<String>,
@@ -445,6 +449,19 @@ fn resolve(
             .map(|value| toml::Value::String(value.get_name().to_owned()))
             .collect();
         layers.typed("--ablate", "instance.ablate", names)?;
+    }
+    if !command.motion_of.is_empty() {
+        let mut told = toml::Table::new();
+        for assignment in &command.motion_of {
+            let Some((label, motion)) = assignment.rsplit_once('=') else {
+                return Err(Error::usage(
+                    format!("--motion-of {assignment}: expected LABEL=MOTION"),
+                    "for example --motion-of 'red mug=rigid'; motions: rigid, free",
+                ));
+            };
+            told.insert(label.trim().to_owned(), motion.trim().into());
+        }
+        layers.typed("--motion-of", "motion.of", told)?;
     }
     for assignment in &command.set {
         layers.assignment(assignment)?;
