@@ -217,6 +217,8 @@ fn keys(table: &Table, prefix: &str) -> Vec<String> {
     table
         .iter()
         .flat_map(|(key, value)| match value {
+            // What users name, as objects, is not known before.
+            Value::Table(inner) if inner.is_empty() => vec![format!("{prefix}{key}")],
             Value::Table(inner) => keys(inner, &format!("{prefix}{key}.")),
             _ => vec![format!("{prefix}{key}")],
         })

@@ -24,8 +24,8 @@ pub(super) const STEPS: [usize; 2] = [300, 900];
 /// Loss beyond the best at which a trial is hopeless.
 const HOPELESS: f64 = 1.2;
 
-/// Error of resting, relative to that of sliding, and to that of turning in place, up to which an object is taken to
-/// rest.
+/// Error of resting, relative to that of sliding without a turn, and to that of the way that is kept, up to which an
+/// object is taken to rest.
 const REST_GAIN: [f64; 2] = [1.5, 1.25];
 
 /// Error of an object that was followed, relative to that of paths, below which following is preferred: of most
@@ -94,7 +94,7 @@ pub(super) fn best_way<'a>(
     let simple = contest.simple()?;
     let trials = if object.is_told {
         contest.along_the_path(simple)?
-    } else if contest.rests(&simple) {
+    } else if rests(&simple, Way::Slide(0), REST_GAIN[0]) {
         if !contest.paths.may_turn_unseen(views) {
             return Ok(None);
         }
@@ -104,7 +104,8 @@ pub(super) fn best_way<'a>(
     } else {
         return Ok(None);
     };
-    let moves = decide(&trials, outline).filter(|(way, _)| object.is_told || !rests(&trials, *way));
+    let moves =
+        decide(&trials, outline).filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
     let Some((way, rotation)) = moves else { return Ok(None) };
     // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
     let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
@@ -128,13 +129,6 @@ impl<'a> Contest<'a> {
         self.advance(&mut trials, (0, STEPS[1]), false)?;
         self.judge(&mut trials, false);
         Ok(trials)
-    }
-
-    /// True where resting explains an object about as well as moving along its path does.
-    fn rests(&self, simple: &[Trial<'_>]) -> bool {
-        let error = |way: Way| simple.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
-        let rests = |(rest, slide)| rest <= REST_GAIN[0] * slide;
-        error(Way::Rest).zip(error(Way::Slide(0))).is_some_and(rests)
     }
 
     /// All other ways along the path, beside the simple ones.
@@ -272,10 +266,10 @@ fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
     rivals
 }
 
-/// True where resting explains an object about as well as a way of moving does.
-fn rests(trials: &[Trial<'_>], way: Way) -> bool {
+/// True where the error of resting is at most `gain` times that of a way of moving.
+fn rests(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
     let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
-    error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= REST_GAIN[1] * moves)
+    error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= gain * moves)
 }
 
 /// The best way of moving, and whether the pictures tell its turns.

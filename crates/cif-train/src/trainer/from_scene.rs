@@ -91,6 +91,7 @@ impl Trainer {
         if let Some((mut tensors, steps)) = state {
             restore(&mut trainer.state.optimiser, &mut tensors, &steps)?;
             trainer.restore_guidance(&mut tensors)?;
+            trainer.restore_poses(&mut tensors)?;
         }
         trainer.warn_of_capture();
         trainer.begin(Stage::Identity);

@@ -13,8 +13,9 @@ use crate::objects::{self, Fitted, Plane, Surroundings};
 use crate::schedule::log_linear;
 use crate::stage::Stage;
 
-/// Error on pixels that were left out beyond which an object is not taken to be rigid.
-const MOST_ERROR: f64 = 0.15;
+/// Error on pixels that were left out beyond which an object is not taken to be rigid: where the capture has points,
+/// and where what it stands on is itself reconstructed.
+const MOST_ERROR: [f64; 2] = [0.2, 0.15];
 
 /// Rates of poses at the start and the end of the fine stage, radians, and shares of the size of the object.
 const RATES: [f32; 2] = [0.004, 2e-4];
@@ -93,6 +94,7 @@ impl Trainer {
             gaussians: state.config.motion.gaussians as usize,
             stop: &state.stop,
         };
+        let most = MOST_ERROR[usize::from(state.dataset.points.source == PointSource::Random)];
         let wanted: Vec<(u16, Option<ObjectMotion>)> =
             labels.iter().map(|label| (*label, self.told(*label))).collect();
         let fit = |(label, told): &(u16, Option<ObjectMotion>)| {
@@ -102,7 +104,7 @@ impl Trainer {
             }
             let is_told = told == Some(ObjectMotion::Rigid);
             let fitted = objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told)?;
-            Ok(fitted.filter(|fitted| is_told || fitted.error <= MOST_ERROR).map(|fitted| (*label, fitted)))
+            Ok(fitted.filter(|fitted| is_told || fitted.error <= most).map(|fitted| (*label, fitted)))
         };
         let fits: Vec<Option<(u16, Fitted)>> =
             wanted.par_iter().map(fit).collect::<Result<_, TrainError>>()?;

@@ -129,6 +129,15 @@ impl Trainer {
         Checkpoint { field, training: with_state.then(|| self.training_state()) }
     }
 
+    /// Takes the moments of poses out of a saved run.
+    pub(super) fn restore_poses(
+        &mut self,
+        tensors: &mut BTreeMap<String, StateTensor>,
+    ) -> Result<(), TrainError> {
+        let fits = self.state.pose_moments.restore(tensors);
+        fits.ok_or_else(|| unusable("the moments of poses do not fit"))
+    }
+
     /// Paths that objects are held to.
     pub(super) fn restore_guidance(
         &mut self,
@@ -200,8 +209,7 @@ impl Trainer {
             radius: floats(&mut tensors, "densify.radius", n)?,
         };
         trainer.restore_guidance(&mut tensors)?;
-        let moments = trainer.state.pose_moments.restore(&mut tensors);
-        moments.ok_or_else(|| unusable("the moments of poses do not fit"))?;
+        trainer.restore_poses(&mut tensors)?;
         if trainer.state.progress.stage == Stage::Coarse {
             trainer.find_travelling()?;
         }

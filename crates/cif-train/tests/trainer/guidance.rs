@@ -1,7 +1,7 @@
 //! Travelling objects, seen by one moving camera.
 
 use crate::support::{Scene, capture, small_config, stopped_after, train, without_record};
-use cif_dataset::Dataset;
+use cif_dataset::{Dataset, PointSource};
 use cif_field::{Checkpoint, Field, RotationEvidence};
 use cif_train::{Control, ObjectMotion, Outcome, Stage, TrainConfig, TrainError, TrainEvent, Trainer};
 use glam::DVec3;
@@ -14,6 +14,13 @@ fn dataset(folder: &std::path::Path, times: usize) -> Dataset {
     // Nothing is known of the ball that moves.
     dataset.points.positions.drain(300..450);
     dataset.points.colors.drain(300..450);
+    dataset
+}
+
+/// The same with points that are told to be where things rest, which rigid objects need.
+fn with_support(folder: &std::path::Path, times: usize) -> Dataset {
+    let mut dataset = dataset(folder, times);
+    dataset.points.source = PointSource::File(folder.join("points.ply"));
     dataset
 }
 
@@ -127,7 +134,7 @@ fn a_rigid_object_moves_by_poses_of_its_own_on_a_gpu() {
 /// A run on what `use_engine` sets, and one that is resumed.
 fn check_rigid_object(use_engine: impl Fn(&mut Trainer)) {
     let folder = tempfile::tempdir().unwrap();
-    let dataset = dataset(folder.path(), 12);
+    let dataset = with_support(folder.path(), 12);
     let mut config = guided();
     (config.effects.still_every, config.effects.still_told) = (100, 15);
     // Inside the fine stage.
@@ -183,7 +190,7 @@ fn check_rigid_object(use_engine: impl Fn(&mut Trainer)) {
 #[test]
 fn the_motion_of_an_object_can_be_told() {
     let folder = tempfile::tempdir().unwrap();
-    let dataset = dataset(folder.path(), 12);
+    let dataset = with_support(folder.path(), 12);
     let mut config = guided();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (20, 20, 0);
     let grouped = |config: &TrainConfig| {
@@ -205,7 +212,7 @@ fn the_motion_of_an_object_can_be_told() {
 #[test]
 fn neither_threads_nor_interruptions_change_the_result() {
     let folder = tempfile::tempdir().unwrap();
-    let dataset = dataset(folder.path(), 6);
+    let dataset = with_support(folder.path(), 6);
     let mut config = guided();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (30, 50, 30);
     config.densify.from = 10;
