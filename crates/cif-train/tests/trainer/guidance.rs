@@ -212,7 +212,17 @@ fn the_motion_of_an_object_can_be_told() {
 #[test]
 fn neither_threads_nor_interruptions_change_the_result() {
     let folder = tempfile::tempdir().unwrap();
-    let dataset = with_support(folder.path(), 6);
+    same_result(folder.path(), &dataset(folder.path(), 6), &[11, 30, 60, 95]);
+}
+
+#[test]
+fn neither_threads_nor_interruptions_change_the_result_with_poses() {
+    let folder = tempfile::tempdir().unwrap();
+    same_result(folder.path(), &with_support(folder.path(), 6), &[60, 80]);
+}
+
+/// A short run with one thread, with two, and stopped after some steps.
+fn same_result(folder: &std::path::Path, dataset: &Dataset, stops: &[u64]) {
     let mut config = guided();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (30, 50, 30);
     config.densify.from = 10;
@@ -223,9 +233,9 @@ fn neither_threads_nor_interruptions_change_the_result() {
     };
     let whole = on(1);
     assert!(without_record(&on(2)) == without_record(&whole));
-    for stop_at in [11, 30, 60, 80, 95] {
-        let trainer = stopped_after(&dataset, &config, stop_at);
-        let file = folder.path().join("stopped.cif");
+    for &stop_at in stops {
+        let trainer = stopped_after(dataset, &config, stop_at);
+        let file = folder.join("stopped.cif");
         trainer.checkpoint(true).save(&file).unwrap();
         let finish = |mut trainer: Trainer| {
             assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
