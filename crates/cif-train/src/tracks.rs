@@ -37,14 +37,6 @@ impl Observation {
     fn radius_px(&self) -> f64 {
         (self.area_px / std::f64::consts::PI).sqrt()
     }
-
-    /// Projection onto the plane across the ray through the mask's centre.
-    fn across(&self) -> DMat3 {
-        let direction = self.camera.ray(self.centroid_px).normalize();
-        let along =
-            DMat3::from_cols(direction * direction.x, direction * direction.y, direction * direction.z);
-        DMat3::IDENTITY - along
-    }
 }
 
 /// Observations of the labels in the mask of a frame, without contacts; labels of a few pixels are left out.
@@ -141,17 +133,33 @@ const TRAVEL: f64 = 0.3;
 
 /// The point nearest to all rays through the masks' centres.
 fn fixed_point(observations: &[Observation]) -> DVec3 {
+    let rays = observations.iter().map(|o| (&o.camera, o.centroid_px, 1.0));
+    nearest_to_rays(rays, PARALLEL).unwrap_or_else(|| observations[0].camera.centre())
+}
+
+/// Determinant below which rays count as parallel.
+const PARALLEL: f64 = 1e-12;
+
+/// The point nearest to rays through pixels of cameras, by weights; `None` where the determinant of the sum of the
+/// projections across them is below `least`: where they are about parallel.
+pub(crate) fn nearest_to_rays<'a>(
+    rays: impl Iterator<Item = (&'a PinholeCamera, DVec2, f64)>,
+    least: f64,
+) -> Option<DVec3> {
     let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
-    for o in observations {
-        let across = o.across();
+    for (camera, pixel, weight) in rays {
+        let across = weight * across(camera, pixel);
         normal += across;
-        right += across * o.camera.centre();
+        right += across * camera.centre();
     }
-    if normal.determinant().abs() < 1e-12 {
-        observations[0].camera.centre()
-    } else {
-        normal.inverse() * right
-    }
+    (normal.determinant().abs() >= least).then(|| normal.inverse() * right)
+}
+
+/// Projection onto the plane across the ray through a pixel.
+fn across(camera: &PinholeCamera, pixel: DVec2) -> DMat3 {
+    let direction = camera.ray(pixel).normalize();
+    DMat3::IDENTITY
+        - DMat3::from_cols(direction * direction.x, direction * direction.y, direction * direction.z)
 }
 
 /// The path of an instance; `None` with too few observations. Without any contact it is taken to be about as

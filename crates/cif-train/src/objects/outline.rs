@@ -2,10 +2,11 @@
 
 use std::collections::BTreeMap;
 
-use glam::{DMat2, DMat3, DVec2, DVec3};
+use glam::{DMat2, DVec2, DVec3};
 
 use super::plane::Plane;
 use super::view::{ObjectView, median};
+use crate::tracks::nearest_to_rays;
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
@@ -17,6 +18,9 @@ const GROUNDED: f64 = 0.9;
 /// the plane, and the fewest times in a row that do.
 const SAME_SIZE: f64 = 0.03;
 const SHORTEST_RUN: usize = 3;
+
+/// Determinant up to which rays count as parallel.
+const PARALLEL: f64 = 1e-9;
 
 /// Path and size of an object.
 #[derive(Clone, Debug)]
@@ -48,14 +52,7 @@ struct Reading {
 
 /// The point nearest to rays through the middles of masks, by weights; `None` where they are parallel.
 pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64)>) -> Option<DVec3> {
-    let (mut normal, mut right) = (DMat3::ZERO, DVec3::ZERO);
-    for (view, weight) in views {
-        let d = view.camera.ray(view.centroid).normalize();
-        let across = DMat3::IDENTITY - DMat3::from_cols(d * d.x, d * d.y, d * d.z);
-        normal += weight * across;
-        right += weight * across * view.camera.centre();
-    }
-    (normal.determinant().abs() > 1e-9).then(|| normal.inverse() * right)
+    nearest_to_rays(views.map(|(view, weight)| (&view.camera, view.centroid, weight)), PARALLEL)
 }
 
 /// Outline of the views of an object, on a plane where there is one, or seen by several cameras at a time; `None`

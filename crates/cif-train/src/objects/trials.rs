@@ -144,9 +144,7 @@ impl<'a> Contest<'a> {
         }
         let mut more = self.begin(&self.paths.ways(), GAUSSIANS);
         self.advance(&mut more, (0, STEPS[0]), false)?;
-        let best = more.iter().map(|trial| trial.losses[0]).fold(f64::INFINITY, f64::min);
-        let is_kept = |way: &Way| matches!(way, Way::Followed | Way::Roll(_));
-        more.retain(|trial| trial.losses[0] <= HOPELESS * best || is_kept(&trial.way));
+        give_up_hopeless(&mut more, |way| matches!(way, Way::Followed | Way::Roll(_)));
         self.advance(&mut more, (STEPS[0], STEPS[1]), false)?;
         self.judge(&mut more, false);
         trials.extend(more);
@@ -163,8 +161,7 @@ impl<'a> Contest<'a> {
         let mut trials = self.begin(ways, FINE.0);
         let early = FINE.1 / 3;
         self.advance(&mut trials, (0, early), true)?;
-        let best = trials.iter().map(|trial| trial.losses[0]).fold(f64::INFINITY, f64::min);
-        trials.retain(|trial| trial.losses[0] <= HOPELESS * best || trial.way == Way::Rest);
+        give_up_hopeless(&mut trials, |way| way == Way::Rest);
         self.advance(&mut trials, (early, FINE.1), true)?;
         self.judge(&mut trials, true);
         Ok(trials)
@@ -226,6 +223,12 @@ impl<'a> Contest<'a> {
             trial.losses[1] = trial.fit.mean_loss(judged, level);
         });
     }
+}
+
+/// Drops trials that are far from the best on the views that they are fitted to, but for ways that are always kept.
+fn give_up_hopeless(trials: &mut Vec<Trial<'_>>, is_kept: impl Fn(Way) -> bool) {
+    let best = trials.iter().map(|trial| trial.losses[0]).fold(f64::INFINITY, f64::min);
+    trials.retain(|trial| trial.losses[0] <= HOPELESS * best || is_kept(trial.way));
 }
 
 /// Views to fit to, and views left out: a camera in the middle where there are several at a time, else every fourth

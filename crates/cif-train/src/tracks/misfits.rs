@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use glam::{DMat3, DVec3};
 
-use super::{FEWEST, Observation};
+use super::{FEWEST, Observation, across};
 
 /// Instances that a frame must show to be judged; a single one may have moved.
 const FEWEST_INSTANCES: usize = 2;
@@ -64,7 +64,8 @@ fn miss(o: &Observation, point: DVec3) -> f64 {
 /// The point with the least sum of distances from the rays through the masks' centres, as lines: some wrong rays
 /// do not move it. `None` where the rays are parallel.
 fn middle_point(observations: &[&Observation]) -> Option<DVec3> {
-    let lines: Vec<(DVec3, DMat3)> = observations.iter().map(|o| (o.camera.centre(), o.across())).collect();
+    let lines: Vec<(DVec3, DMat3)> =
+        observations.iter().map(|o| (o.camera.centre(), across(&o.camera, o.centroid_px))).collect();
     let mut weights = vec![1.0; lines.len()];
     let mut point = DVec3::ZERO;
     for _ in 0..ROUNDS {

@@ -28,8 +28,7 @@ impl Trainer {
     pub(super) fn find_other_movers(&mut self) -> Result<(), TrainError> {
         let travelling = &self.state.guidance.travelling;
         let others: Vec<u16> = (1..travelling.len()).filter(|k| !travelling[*k]).map(|k| k as u16).collect();
-        let plane = self.support();
-        for (label, fitted) in self.fit_objects(&others, plane.as_ref())? {
+        for (label, fitted) in self.fit_objects(&others)? {
             self.state.guidance.travelling[usize::from(label)] = true;
             self.fits.insert(label, fitted);
         }
@@ -43,8 +42,7 @@ impl Trainer {
             .map(|(label, _)| label as u16)
             .filter(|label| !self.fits.contains_key(label))
             .collect();
-        let plane = self.support();
-        let fits = self.fit_objects(&rest, plane.as_ref())?;
+        let fits = self.fit_objects(&rest)?;
         self.fits.extend(fits);
         Ok(())
     }
@@ -81,13 +79,14 @@ impl Trainer {
 
     /// Rigid motions of objects (labels: dense index + 1), without those that rest, are not rigid, or whose masks do
     /// not tell enough.
-    fn fit_objects(&self, labels: &[u16], plane: Option<&Plane>) -> Result<Vec<(u16, Fitted)>, TrainError> {
+    fn fit_objects(&self, labels: &[u16]) -> Result<Vec<(u16, Fitted)>, TrainError> {
         if !self.state.config.motion.rigid {
             return Ok(Vec::new());
         }
         let state = &self.state;
+        let plane = self.support();
         let surroundings = Surroundings {
-            plane,
+            plane: plane.as_ref(),
             times: state.dataset.times.len(),
             near: state.config.near,
             seed: state.config.seed,
