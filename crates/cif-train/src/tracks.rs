@@ -156,7 +156,7 @@ pub(crate) fn nearest_to_rays<'a>(
 }
 
 /// Projection onto the plane across the ray through a pixel.
-fn across(camera: &PinholeCamera, pixel: DVec2) -> DMat3 {
+pub(crate) fn across(camera: &PinholeCamera, pixel: DVec2) -> DMat3 {
     let direction = camera.ray(pixel).normalize();
     DMat3::IDENTITY
         - DMat3::from_cols(direction * direction.x, direction * direction.y, direction * direction.z)

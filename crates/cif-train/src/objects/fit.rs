@@ -32,6 +32,9 @@ const GAP: usize = 8;
 /// Weight of the height of the lowest Gaussians above the plane.
 const CONTACT: f64 = 2.0;
 
+/// Weight of the distance along the ray from where the rays of neighbouring times cross.
+const DEPTH: f64 = 2.0;
+
 /// Weight of rolling without slip, and the slip that counts as large, radians.
 const ROLL: (f64, f64) = (0.05, 0.1);
 
@@ -226,6 +229,7 @@ impl<'a> Fit<'a> {
     ) {
         let view = &self.views[view];
         let mut gradient = shape.loss(&view.crops[level], pose, GREY, view.visible as f32, true).pose;
+        gradient.translation += self.depth(view, pose);
         if let Some((of_pose, _)) = self.contact(shape, view.time_index, pose) {
             gradient.turn += of_pose.turn;
             gradient.translation += of_pose.translation;
@@ -249,6 +253,7 @@ impl<'a> Fit<'a> {
         let weight = view.visible as f32;
         let loss = self.shape.loss(&view.crops[level], &pose, background, weight, true);
         let mut gradients = BTreeMap::from([(time, loss.pose)]);
+        gradients.entry(time).or_default().translation += self.depth(view, &pose);
         self.accelerate(time, &mut gradients);
         if let Some((of_pose, of_centres)) = self.contact(&self.shape, time, &pose) {
             let gradient = gradients.entry(time).or_default();
@@ -320,6 +325,18 @@ impl<'a> Fit<'a> {
         for (time, share) in [before, time, after].into_iter().zip(shares) {
             gradients.entry(time).or_default().turn += share * v;
         }
+    }
+
+    /// Gradient by the translation that holds it along the ray to where rays of neighbouring times cross: the size of
+    /// a mask alone says little of the distance.
+    fn depth(&self, view: &ObjectView, pose: &Pose) -> DVec3 {
+        let path = self.outline.path.get(&view.time_index);
+        let Some(place) = path.filter(|_| self.one_camera && self.outline.is_surrounded) else {
+            return DVec3::ZERO;
+        };
+        let ray = view.camera.ray(view.centroid).normalize();
+        let size = self.size();
+        2.0 * DEPTH * ray.dot(pose.translation - *place) / (size * size) * ray
     }
 
     /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane; `None` at times off
@@ -417,7 +434,15 @@ impl<'a> Fit<'a> {
         Some(match (before, after) {
             (Some(a), Some(b)) => {
                 let share = (time - a) as f64 / (b - a) as f64;
-                between(&self.poses[&a], &self.poses[&b], share)
+                let mut pose = between(&self.poses[&a], &self.poses[&b], share);
+                let path = |time: usize| self.outline.path.get(&time).copied();
+                if self.outline.is_surrounded
+                    && let (Some(from), Some(to), Some(place)) = (path(a), path(b), path(time))
+                {
+                    // Beside the path as its neighbours are.
+                    pose.translation += place - from.lerp(to, share);
+                }
+                pose
             }
             (Some(a), None) => self.onward(a, self.neighbours(a)[0], time),
             (None, Some(a)) => self.onward(a, self.neighbours(a)[1], time),

@@ -14,6 +14,11 @@ use crate::stop::Stop;
 /// Steps of the shape at the first time, per level.
 const FIRST: usize = 120;
 
+/// Times around the first that one camera shows from so many sides that they are begun together, as if the object
+/// did not turn between them, and their steps.
+const TOGETHER: usize = 6;
+const BEGIN: usize = 600;
+
 /// Steps of a pose, per level; of a second time, whose speed is not known, twice as many.
 const POSE: usize = 25;
 
@@ -55,14 +60,22 @@ pub(super) fn follow(
         at.entry(fit.views[*view].time_index).or_default().push(*view);
     }
     let Some(first) = at.get(&reference).cloned() else { return Ok(()) };
-    for level in levels {
-        for step in 0..FIRST {
-            fit.step(first[step % first.len()], *level, Some(1.0), 0.0);
-        }
-    }
     let mut order: Vec<usize> =
         at.keys().copied().filter(|t| *t != reference && path.contains_key(t)).collect();
     order.sort_by_key(|time| time.abs_diff(reference));
+    if fit.one_camera && fit.outline.is_surrounded {
+        let rotation = fit.poses[&reference].rotation;
+        for time in order.drain(..TOGETHER.min(order.len())) {
+            fit.poses.insert(time, Pose { rotation, translation: path[&time] });
+        }
+        carve(fit, &at, BEGIN, 1.0);
+    } else {
+        for level in levels {
+            for step in 0..FIRST {
+                fit.step(first[step % first.len()], *level, Some(1.0), 0.0);
+            }
+        }
+    }
     for time in order {
         stop.check()?;
         let views = &at[&time];
@@ -70,7 +83,7 @@ pub(super) fn follow(
         fit.poses.insert(time, pose);
         let mut near: Vec<usize> = fit.poses.keys().copied().collect();
         if near.len().is_power_of_two() && near.len() > 2 {
-            carve(fit, &at);
+            carve(fit, &at, CARVE, SETTLE.2);
         }
         near.sort_by_key(|other| other.abs_diff(time));
         for _ in 0..SETTLE.0 {
@@ -84,8 +97,9 @@ pub(super) fn follow(
     Ok(())
 }
 
-/// Makes the shape anew from all times that are known: what few views show of its far side is a guess.
-fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>) {
+/// Makes the shape anew from all times that are known, and fits it in so many steps, poses at a rate: what few views
+/// show of its far side is a guess.
+fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>, steps: usize, pose_rate: f64) {
     let count = fit.shape.gaussians().len();
     let Some(shape) = hull(fit.views, &fit.poses, (fit.outline.size(), None), count, fit.near, &mut fit.rng)
     else {
@@ -94,7 +108,7 @@ fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>) {
     fit.shape = shape;
     let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
     let level = fit.trial_level();
-    fit.steps(&known, CARVE, |share| (if share < 0.5 { 1.0 } else { 0.5 }, SETTLE.2, level));
+    fit.steps(&known, steps, |share| (if share < 0.5 { 1.0 } else { 0.5 }, pose_rate, level));
 }
 
 /// Pose of a time beside those that are known, of which those on the side of `origin` tell how it moves.

@@ -3,6 +3,7 @@
 //!
 //! | file | answers |
 //! |---|---|
+//! | `order` | what cannot hide an object |
 //! | `view` | what a frame shows of an object |
 //! | `plane` | which plane objects stand on |
 //! | `outline`, `path` | how large an object is, and where it goes |
@@ -15,6 +16,7 @@
 
 mod fit;
 mod follow;
+mod order;
 mod outline;
 mod path;
 mod plane;
@@ -29,6 +31,7 @@ mod ways;
 use cif_dataset::{Dataset, Split};
 use glam::DVec3;
 
+pub(crate) use self::order::Order;
 pub(crate) use self::plane::Plane;
 use self::start::Object;
 pub(crate) use self::start::{Fitted, Surroundings};
@@ -49,6 +52,13 @@ pub(crate) fn support(dataset: &Dataset, points: &[[f32; 3]], seed: u64) -> Opti
     plane::support(&points, &cameras, ON_PLANE * dataset.extent(), rng)
 }
 
+/// Mean direction upwards in the training images of a capture.
+pub(crate) fn up(dataset: &Dataset) -> DVec3 {
+    let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
+    let ups = training.map(|frame| -frame.camera.camera_from_world.rotation.row(1));
+    ups.sum::<DVec3>().try_normalize().unwrap_or(DVec3::Z)
+}
+
 /// Fits one object (a label: dense index + 1); `None` where it rests, unless it is told to be rigid, or where its masks,
 /// or the scene, do not tell enough.
 ///
@@ -61,15 +71,18 @@ pub(crate) fn fit(
     surroundings: Surroundings<'_>,
     is_told: bool,
 ) -> Result<Option<Fitted>, TrainError> {
+    let behind = surroundings.order.behind(label);
     let mut views = Vec::new();
     for k in 0..frames.len() {
         surroundings.stop.check()?;
         let frame = &dataset.frames[frames.index(k)];
         let data = frames.get(dataset, k)?;
-        views.extend(ObjectView::new(label, frame.time_index, &frame.camera, &data));
+        views.extend(ObjectView::new((label, &behind), frame.time_index, &frame.camera, &data));
     }
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);
-    let Some(outline) = outline::outline(&views, surroundings.plane) else { return Ok(None) };
+    let Some(outline) = outline::outline(&views, surroundings.plane, surroundings.times) else {
+        return Ok(None);
+    };
     start::fit_object(Object { label, views: &views, outline: &outline, is_told, surroundings })
 }

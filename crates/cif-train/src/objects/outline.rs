@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use glam::{DMat2, DVec2, DVec3};
 
+use super::path;
 use super::plane::Plane;
 use super::view::{ObjectView, median};
 use crate::tracks::nearest_to_rays;
@@ -22,6 +23,9 @@ const SHORTEST_RUN: usize = 3;
 /// Determinant up to which rays count as parallel.
 const PARALLEL: f64 = 1e-9;
 
+/// Share of the pixels of a mask that lie within its radius of its middle.
+const WITHIN: f64 = 0.98;
+
 /// Path and size of an object.
 #[derive(Clone, Debug)]
 pub(super) struct Outline {
@@ -34,6 +38,10 @@ pub(super) struct Outline {
     pub(super) path: BTreeMap<usize, DVec3>,
     /// Times at which the object is off the plane, or may be.
     pub(super) air: Vec<usize>,
+    /// Weight of the bending of the path: large where depths are guesses.
+    pub(super) stiffness: f64,
+    /// True where views of several sides, of one time or of few, tell where it is.
+    pub(super) is_surrounded: bool,
 }
 
 impl Outline {
@@ -55,17 +63,20 @@ pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64
     nearest_to_rays(views.map(|(view, weight)| (&view.camera, view.centroid, weight)), PARALLEL)
 }
 
-/// Outline of the views of an object, on a plane where there is one, or seen by several cameras at a time; `None`
-/// where neither tells where it is.
-pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>) -> Option<Outline> {
-    let met = meetings(views);
+/// Outline of the views of an object: on a plane where there is one, seen by several cameras at a time, or by one that
+/// sees it from other sides soon after; `None` where nothing tells where it is. `times` are those of the sequence.
+pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Option<Outline> {
     let mut outline = plane.and_then(|plane| on_plane(views, plane));
+    let (met, stiffness) = match meetings(views) {
+        met if met.is_empty() => (path::crossing(views, times), path::CROSSING),
+        met => (met, path::MEETING),
+    };
     if met.is_empty() {
         return outline;
     }
     let radius_of = |view: &ObjectView| {
         let depth = view.camera.project(*met.get(&view.time_index)?)?.1;
-        Some((view.area() / std::f64::consts::PI).sqrt() * depth / view.camera.focal_px.x)
+        Some(view.reach(WITHIN) * depth / view.camera.focal_px.x)
     };
     let mut radii: Vec<f64> = views.iter().filter(|view| view.is_whole()).filter_map(radius_of).collect();
     if radii.is_empty() {
@@ -78,7 +89,10 @@ pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>) -> Option<Out
         roundness: 0.0,
         path: BTreeMap::new(),
         air: Vec::new(),
+        stiffness,
+        is_surrounded: true,
     });
+    (found.stiffness, found.is_surrounded) = (stiffness, true);
     found.air.clear();
     found.path.extend(met);
     outline
@@ -153,6 +167,8 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
         roundness: medians.roundness,
         air,
         path: sums.into_iter().map(|(time, (sum, weight, _))| (time, sum / weight)).collect(),
+        stiffness: path::CUT_BY_PLANE,
+        is_surrounded: false,
     })
 }
 

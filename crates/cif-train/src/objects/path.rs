@@ -1,42 +1,107 @@
-//! Smoothing of the path of an object's centre.
+//! The path of an object's centre: smoothed, or found where the rays of one camera cross that sees it from other sides
+//! soon after.
 
 use std::collections::BTreeMap;
 
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, DVector};
 
-use super::view::ObjectView;
+use super::view::{ObjectView, median};
+use crate::tracks::across;
 
-/// Weight of squared second differences, in steps of a 60th of the sequence.
-const SMOOTHNESS: f64 = 20.0;
+/// Weights of squared second differences, in steps of a 60th of the sequence: of paths that a plane cuts from rays,
+/// of those where the rays of several cameras meet, and of those where the rays of neighbouring times cross.
+pub(super) const CUT_BY_PLANE: f64 = 20.0;
+pub(super) const MEETING: f64 = 0.3;
+pub(super) const CROSSING: f64 = 0.01;
 
 /// Weight of a time whose masks are cut by the border.
 const CUT: f64 = 0.05;
 
-/// The path that stays near `raw` where the object is well seen, and bends little; `times` of the whole sequence.
+/// Times on either side among which rays cross, and the angle from which they do, radians.
+const BESIDE: usize = 2;
+const CROSSES: f64 = 0.35;
+
+/// Rounds of reweighting of rays, by their distances from the path.
+const ROUNDS: usize = 5;
+
+/// The path that stays near `raw` where the object is well seen, and bends little, by its stiffness; `times` of the
+/// whole sequence.
 pub(super) fn smooth(
     raw: &BTreeMap<usize, DVec3>,
     views: &[ObjectView],
     times: usize,
+    stiffness: f64,
 ) -> BTreeMap<usize, DVec3> {
     let keys: Vec<usize> = raw.keys().copied().collect();
-    let n = keys.len();
-    if n < 3 {
+    if keys.len() < 3 {
         return raw.clone();
     }
-    let mut matrix = DMatrix::<f64>::zeros(n, n);
-    let mut targets = [(); 3].map(|()| DVector::<f64>::zeros(n));
-    for (k, time) in keys.iter().enumerate() {
+    let near = |time: &usize| {
         let of = || views.iter().filter(|view| view.time_index == *time);
         let seen = of().map(|view| view.visible).fold(0.0, f64::max);
         let cut = if of().any(|view| view.cut) { CUT } else { 1.0 };
         let weight = seen * seen * cut + 1e-4;
-        matrix[(k, k)] += weight;
-        for (axis, target) in targets.iter_mut().enumerate() {
-            target[k] = weight * raw[time][axis];
+        (DMat3::IDENTITY * weight, weight * raw[time])
+    };
+    even(&keys, &keys.iter().map(near).collect::<Vec<_>>(), stiffness, times).unwrap_or_else(|| raw.clone())
+}
+
+/// The path that passes near the rays of one view per time and bends little; nothing where neighbouring rays hardly
+/// cross. Rays far from it count less: what hides a part of an object moves the middle of its mask.
+pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DVec3> {
+    let views: Vec<&ObjectView> = views.iter().filter(|view| !view.cut).collect();
+    let rays: Vec<DVec3> = views.iter().map(|view| view.camera.ray(view.centroid).normalize()).collect();
+    let keys: Vec<usize> = views.iter().map(|view| view.time_index).collect();
+    let widest = |k: usize| {
+        let beside = k.saturating_sub(BESIDE)..=(k + BESIDE).min(rays.len() - 1);
+        beside.map(|other| rays[k].angle_between(rays[other])).fold(0.0, f64::max)
+    };
+    let mut angles: Vec<f64> = (0..rays.len()).map(widest).collect();
+    if keys.len() < 3 || keys.windows(2).any(|pair| pair[0] == pair[1]) || median(&mut angles) < CROSSES {
+        return BTreeMap::new();
+    }
+    let mut weights: Vec<f64> = views.iter().map(|view| view.visible.powi(2) + 1e-4).collect();
+    let mut path = BTreeMap::new();
+    for _ in 0..ROUNDS {
+        let near = |(view, weight): (&&ObjectView, &f64)| {
+            let across = *weight * across(&view.camera, view.centroid);
+            (across, across * view.camera.centre())
+        };
+        let near: Vec<(DMat3, DVec3)> = views.iter().zip(&weights).map(near).collect();
+        let Some(found) = even(&keys, &near, CROSSING, times) else { return BTreeMap::new() };
+        let distance = |view: &&ObjectView| {
+            let offset = found[&view.time_index] - view.camera.centre();
+            (across(&view.camera, view.centroid) * offset).length()
+        };
+        let distances: Vec<f64> = views.iter().map(distance).collect();
+        let large = 2.0 * median(&mut distances.clone());
+        for ((weight, view), distance) in weights.iter_mut().zip(&views).zip(&distances) {
+            *weight = (view.visible.powi(2) + 1e-4) / (1.0 + (distance / large.max(1e-12)).powi(2));
+        }
+        path = found;
+    }
+    path
+}
+
+/// The path of least bending near some places: minimises `(c - c0) . A (c - c0)`, given as `A` and `A c0` for every
+/// time, and the squared second differences; `None` where nothing determines it.
+fn even(
+    keys: &[usize],
+    near: &[(DMat3, DVec3)],
+    stiffness: f64,
+    times: usize,
+) -> Option<BTreeMap<usize, DVec3>> {
+    let n = keys.len();
+    let mut matrix = DMatrix::<f64>::zeros(3 * n, 3 * n);
+    let mut target = DVector::<f64>::zeros(3 * n);
+    for (k, (weight, place)) in near.iter().enumerate() {
+        for i in 0..3 {
+            target[3 * k + i] = place[i];
+            (0..3).for_each(|j| matrix[(3 * k + i, 3 * k + j)] += weight.col(j)[i]);
         }
     }
-    let stiffness = SMOOTHNESS * (times as f64 / 60.0).powi(4);
+    let stiffness = stiffness * (times as f64 / 60.0).powi(4);
     for k in 1..n - 1 {
         let (before, after) = ((keys[k] - keys[k - 1]) as f64, (keys[k + 1] - keys[k]) as f64);
         let scale = 2.0 / (before + after);
@@ -44,12 +109,11 @@ pub(super) fn smooth(
             [(k - 1, scale / before), (k, -scale * (1.0 / before + 1.0 / after)), (k + 1, scale / after)];
         for (i, a) in row {
             for (j, b) in row {
-                matrix[(i, j)] += stiffness * a * b;
+                (0..3).for_each(|axis| matrix[(3 * i + axis, 3 * j + axis)] += stiffness * a * b);
             }
         }
     }
-    let Some(solver) = matrix.cholesky() else { return raw.clone() };
-    let solved = targets.map(|target| solver.solve(&target));
-    let place = |k: usize| DVec3::from(std::array::from_fn(|axis| solved[axis][k]));
-    keys.iter().enumerate().map(|(k, time)| (*time, place(k))).collect()
+    let solved = matrix.cholesky()?.solve(&target);
+    let place = |k: usize| DVec3::new(solved[3 * k], solved[3 * k + 1], solved[3 * k + 2]);
+    Some(keys.iter().enumerate().map(|(k, time)| (*time, place(k))).collect())
 }

@@ -8,6 +8,9 @@ use rand_pcg::Pcg64;
 /// Draws of three points.
 const DRAWS: usize = 400;
 
+/// Points below which no plane is looked for.
+const FEWEST: usize = 100;
+
 /// Share of the points that a plane must have.
 const LEAST_SHARE: f64 = 0.3;
 
@@ -34,7 +37,7 @@ impl Plane {
 /// The plane of most points, by random draws and three rounds of least squares; `None` where no plane has enough of
 /// them.
 pub(super) fn support(points: &[DVec3], cameras: &[DVec3], tolerance: f64, mut rng: Pcg64) -> Option<Plane> {
-    if points.len() < 10 {
+    if points.len() < FEWEST {
         return None;
     }
     let near = |plane: &Plane| points.iter().filter(|point| plane.height(**point).abs() < tolerance).count();

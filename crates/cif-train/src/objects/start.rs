@@ -10,6 +10,7 @@ use rand_pcg::Pcg64;
 
 use super::fit::{Fit, Turns, between, hull};
 use super::follow::follow;
+use super::order::Order;
 use super::outline::Outline;
 use super::path::smooth;
 use super::plane::Plane;
@@ -48,6 +49,8 @@ pub(crate) struct Fitted {
     pub(crate) rotation: RotationEvidence,
     /// Error on pixels that were left out.
     pub(crate) error: f64,
+    /// True where the poses of what was left out were moved onto it before, so that errors are smaller.
+    pub(crate) is_settled: bool,
     /// Way of moving that was kept, in words.
     pub(crate) way: String,
 }
@@ -57,6 +60,9 @@ pub(crate) struct Fitted {
 pub(crate) struct Surroundings<'a> {
     /// What objects stand on, where that was found.
     pub(crate) plane: Option<&'a Plane>,
+    /// Mean direction upwards in the images.
+    pub(crate) up: DVec3,
+    pub(crate) order: &'a Order,
     pub(crate) times: usize,
     pub(crate) near: f32,
     pub(crate) seed: u64,
@@ -94,7 +100,7 @@ pub(super) struct Started<'a> {
 pub(super) fn fit_object(object: Object<'_>) -> Result<Option<Fitted>, TrainError> {
     let Object { views, outline, .. } = object;
     let stop = object.surroundings.stop;
-    let path = smooth(&outline.path, views, object.surroundings.times);
+    let path = smooth(&outline.path, views, object.surroundings.times, outline.stiffness);
     let reliable: Vec<usize> = object.views_at(&path).filter(|view| views[*view].is_reliable()).collect();
     let mut good: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
     good.dedup();
@@ -136,6 +142,7 @@ pub(super) fn fit_object(object: Object<'_>) -> Result<Option<Fitted>, TrainErro
         reference: fit.poses.get(&reference).map_or(at_rest, |p| (p.rotation, p.translation)),
         rotation,
         error,
+        is_settled: outline.is_surrounded && fit.one_camera,
         way: way.told(),
     }))
 }

@@ -11,6 +11,7 @@ use cif_render::{Channels, RenderSettings, synthetic};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use rand::RngExt;
 
+use super::order::Order;
 use super::plane::Plane;
 use super::start::{Fitted, Object, Surroundings, fit_object};
 use super::view::{ObjectView, set_visible};
@@ -82,6 +83,7 @@ fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Ve
     };
     let settings = RenderSettings { sh_degree: 0, background: [0.6, 0.6, 0.55], ..RenderSettings::default() };
     let mut renderer = Renderer::new(SimdLevel::Auto);
+    let behind: Arc<[bool]> = Arc::new([false; 2]);
     let mut views = Vec::new();
     for (k, camera) in (0..TIMES).flat_map(|k| cameras(k).into_iter().map(move |camera| (k, camera))) {
         let channels = Channels { depth: false, instances: false };
@@ -89,7 +91,7 @@ fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Ve
         let labels = image.alpha.map(|alpha| u16::from(*alpha > 0.5));
         let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
         let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0 });
-        views.extend(ObjectView::new(1, k, &camera, &frame));
+        views.extend(ObjectView::new((1, &behind), k, &camera, &frame));
     }
     set_visible(&mut views);
     views
@@ -100,9 +102,19 @@ fn fit(views: &[ObjectView]) -> Fitted {
 }
 
 fn fit_on(plane: Option<&Plane>, views: &[ObjectView]) -> Option<Fitted> {
-    let outline = outline::outline(views, plane).unwrap();
+    let outline = outline::outline(views, plane, TIMES).unwrap();
     let stop = Stop::default();
-    let surroundings = Surroundings { plane, times: TIMES, near: 0.05, seed: 0, gaussians: 150, stop: &stop };
+    let order = Order::among(&[], 2);
+    let surroundings = Surroundings {
+        plane,
+        up: DVec3::Z,
+        order: &order,
+        times: TIMES,
+        near: 0.05,
+        seed: 0,
+        gaussians: 150,
+        stop: &stop,
+    };
     fit_object(Object { label: 1, views, outline: &outline, is_told: false, surroundings }).unwrap()
 }
 
@@ -261,6 +273,35 @@ fn several_cameras_follow_an_object_that_is_lifted_and_tilted() {
     let (turn, shift) = errors(&fitted.poses, &truth);
     assert!(turn < 3.0 && shift < 0.004, "{turn} deg, {shift} m, {}", fitted.way);
     assert_eq!(fitted.rotation, RotationEvidence::Observed);
+}
+
+/// One camera that looks from another side at every time.
+fn jumping(time: usize) -> Vec<PinholeCamera> {
+    vec![camera(2.4 * time as f64)]
+}
+
+#[test]
+fn a_camera_that_jumps_follows_what_is_thrown_and_spins() {
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+        .map(|k| {
+            let share = k as f64 / (TIMES - 1) as f64;
+            let turn = DQuat::from_axis_angle(DVec3::new(0.6, 0.0, 0.8), 2.6 * share);
+            (turn, DVec3::new(-0.1 + 0.2 * share, 0.05, 0.05 + 0.4 * share * (1.0 - share)))
+        })
+        .collect();
+    // Neither its support nor its size is known.
+    let fitted = fit_on(None, &views(solid(&box_places(), patches, 0.006), &truth, jumping)).unwrap();
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(turn < 6.0 && shift < 0.008, "{turn} deg, {shift} m, {}", fitted.way);
+    assert!(fitted.error < 0.09, "{}", fitted.error);
+}
+
+#[test]
+fn one_camera_without_a_support_says_nothing_of_distances() {
+    let truth = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
+    assert!(
+        outline::outline(&views(solid(&box_places(), patches, 0.006), &truth, moving), None, TIMES).is_none()
+    );
 }
 
 #[test]

@@ -6,7 +6,7 @@ use cif_field::tracks::RotationEvidence;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::fit::{Fit, Turns};
+use super::fit::{Fit, Turns, fresh_moments};
 use super::follow::follow;
 use super::outline::{self, Outline};
 use super::path::smooth;
@@ -27,6 +27,12 @@ const HOPELESS: f64 = 1.2;
 /// Error of resting, relative to that of sliding without a turn, and to that of the way that is kept, up to which an
 /// object is taken to rest.
 const REST_GAIN: [f64; 2] = [1.5, 1.25];
+
+/// Steps of poses of times that were left out.
+const SETTLE: usize = 40;
+
+/// Error from which neither resting nor sliding explains what is seen.
+const UNEXPLAINED: f64 = 0.3;
 
 /// Error of an object that was followed, relative to that of paths, below which following is preferred: of most
 /// objects, and of round ones.
@@ -71,7 +77,7 @@ pub(super) fn best_way<'a>(
 ) -> Result<Option<Started<'a>>, TrainError> {
     let Object { views, outline, surroundings, .. } = object;
     let raw: BTreeMap<usize, DVec3> = good.iter().map(|time| (*time, outline.path[time])).collect();
-    let along = smooth(&raw, views, surroundings.times);
+    let along = smooth(&raw, views, surroundings.times, outline.stiffness);
     let reference = object.best_seen(good.iter().copied()).unwrap_or(good[0]);
     let (train, left_out) = split(views, reliable, good);
     let is_trained = |time: usize| train.iter().any(|view| views[*view].time_index == time);
@@ -84,7 +90,8 @@ pub(super) fn best_way<'a>(
             place: outline::meeting_point(rays).unwrap_or(along[&reference]),
             along,
             outline,
-            normal: surroundings.plane.map(|plane| plane.normal),
+            up: surroundings.plane.map_or(surroundings.up, |plane| plane.normal),
+            stands: surroundings.plane.is_some(),
             reference,
             followed: None,
         },
@@ -94,12 +101,12 @@ pub(super) fn best_way<'a>(
     let simple = contest.simple()?;
     let trials = if object.is_told {
         contest.along_the_path(simple)?
-    } else if rests(&simple, Way::Slide(0), REST_GAIN[0]) {
+    } else if rests(&simple, Way::Slide(0), REST_GAIN[0]) && !contest.is_unexplained(&simple) {
         if !contest.paths.may_turn_unseen(views) {
             return Ok(None);
         }
         contest.finely(&contest.paths.spins())?
-    } else if contest.paths.shifts() {
+    } else if contest.paths.shifts() || contest.is_unexplained(&simple) {
         contest.along_the_path(simple)?
     } else {
         return Ok(None);
@@ -131,12 +138,18 @@ impl<'a> Contest<'a> {
         Ok(trials)
     }
 
+    /// True where following may find what neither resting nor sliding explains.
+    fn is_unexplained(&self, simple: &[Trial<'_>]) -> bool {
+        self.object.outline.is_surrounded && simple.iter().all(|trial| trial.losses[1] > UNEXPLAINED)
+    }
+
     /// All other ways along the path, beside the simple ones.
     fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = simple;
-        if self.between.is_empty() {
-            // Several cameras show all sides of it, and how it turns from time to time.
-            let reference = self.paths.reference;
+        if self.object.outline.is_surrounded {
+            // Views of all sides show how it turns from time to time.
+            let known = self.train.iter().map(|view| self.object.views[*view].time_index);
+            let reference = self.object.best_seen(known).unwrap_or(self.paths.reference);
             if let Some(mut fit) = self.object.first(&self.paths.along, reference) {
                 follow(&mut fit, reference, &self.paths.along, &self.train, self.object.surroundings.stop)?;
                 self.paths.followed = Some(fit.poses);
@@ -210,6 +223,22 @@ impl<'a> Contest<'a> {
         self.object.surroundings.stop.check()
     }
 
+    /// Moves the poses of times that were left out onto their views, the shape as it is: from one side to the next an
+    /// object turns more than its neighbours tell, and how it looks from there is what is judged.
+    fn settle(&self, fit: &mut Fit<'_>, level: usize) {
+        let mut shape = fit.shape.copied();
+        for view in self.left_out.iter().filter(|view| self.between.contains(&fit.views[**view].time_index)) {
+            let time = fit.views[*view].time_index;
+            let Some(mut pose) = fit.poses.get(&time).copied() else { continue };
+            let mut moments = fresh_moments();
+            for step in 0..SETTLE {
+                let rate = if step < SETTLE / 2 { 1.0 } else { 0.3 };
+                fit.pose_step(&mut shape, *view, level, (&mut pose, &mut moments), rate);
+            }
+            fit.poses.insert(time, pose);
+        }
+    }
+
     /// Losses on the views that were left out.
     fn judge(&self, trials: &mut [Trial<'a>], finely: bool) {
         trials.par_iter_mut().for_each(|trial| {
@@ -219,6 +248,9 @@ impl<'a> Contest<'a> {
                 }
             }
             let level = if finely { 0 } else { trial.fit.trial_level() };
+            if self.object.outline.is_surrounded && trial.way != Way::Rest {
+                self.settle(&mut trial.fit, level);
+            }
             let judged = if self.left_out.is_empty() { &self.train } else { &self.left_out };
             trial.losses[1] = trial.fit.mean_loss(judged, level);
         });

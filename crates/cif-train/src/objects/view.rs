@@ -43,13 +43,15 @@ pub(super) struct ObjectView {
     pub(super) centroid: DVec2,
     /// True when the mask touches the border of the image.
     pub(super) cut: bool,
-    /// Share of the outline that touches other masks.
+    /// Share of the outline that touches masks which may hide it.
     pub(super) touched: f64,
     /// Visible share: area over the median area of the nearest whole masks, at most 1.
     pub(super) visible: f64,
     /// By reduction: 1, 2, 4.
     pub(super) crops: [Crop; 3],
     label: u16,
+    /// By label, true for those that cannot hide it.
+    behind: Arc<[bool]>,
     frame: Arc<TrainFrame>,
 }
 
@@ -60,16 +62,17 @@ pub(super) enum Seen {
     Object([f32; 3]),
     /// Another object, which may hide this one.
     Other,
-    /// Neither.
+    /// Nothing that is labelled, or something behind it.
     Nothing,
     /// Beyond the image, or behind the camera.
     Outside,
 }
 
 impl ObjectView {
-    /// The view of a label (dense index + 1); `None` where it shows too little of it.
+    /// The view of a label (dense index + 1), with the labels that are behind it; `None` where it shows too little of
+    /// it.
     pub(super) fn new(
-        label: u16,
+        (label, behind): (u16, &Arc<[bool]>),
         time_index: usize,
         camera: &PinholeCamera,
         frame: &Arc<TrainFrame>,
@@ -95,7 +98,7 @@ impl ObjectView {
             for (x, y) in beside.into_iter().filter(|(x, y)| *x < width && *y < height) {
                 let other = *labels.at(x, y);
                 ring += u32::from(other != label);
-                touching += u32::from(other != label && other != UNLABELLED);
+                touching += u32::from(other != label && !is_behind(behind, other));
             }
         }
         let centre = camera.centre();
@@ -108,15 +111,26 @@ impl ObjectView {
             cut: low[0] == 0 || low[1] == 0 || high[0] + 1 == width || high[1] + 1 == height,
             touched: f64::from(touching) / f64::from(ring.max(1)),
             visible: 1.0,
-            crops: [1, 2, 4].map(|factor| crop(factor, label, camera, (low, high), labels, colors)),
+            crops: [1, 2, 4].map(|factor| crop(factor, (label, behind), camera, (low, high), labels, colors)),
             pixels,
             label,
+            behind: Arc::clone(behind),
             frame: Arc::clone(frame),
         })
     }
 
     pub(super) fn area(&self) -> f64 {
         self.pixels.len() as f64
+    }
+
+    /// Distance from the middle of the mask, pixels, within which this share of it lies.
+    pub(super) fn reach(&self, share: f64) -> f64 {
+        let from = |[x, y]: &[u32; 2]| {
+            (DVec2::new(f64::from(*x) + 0.5, f64::from(*y) + 0.5) - self.centroid).length()
+        };
+        let mut distances: Vec<f64> = self.pixels.iter().map(from).collect();
+        distances.sort_by(f64::total_cmp);
+        distances[((distances.len() - 1) as f64 * share) as usize]
     }
 
     /// True where the outline is the object's own.
@@ -136,10 +150,15 @@ impl ObjectView {
             label if label == self.label => {
                 Seen::Object(self.frame.image.at(x, y).map(|c| f32::from(c) / 255.0))
             }
-            UNLABELLED => Seen::Nothing,
+            other if is_behind(&self.behind, other) => Seen::Nothing,
             _ => Seen::Other,
         }
     }
+}
+
+/// True for a label that cannot hide the object: what nobody labelled, or what lies behind it.
+fn is_behind(behind: &[bool], label: u16) -> bool {
+    label == UNLABELLED || behind[usize::from(label)]
 }
 
 /// Sets the visible shares of views, which are in the order of times: each camera that stays in place is compared
@@ -177,7 +196,7 @@ pub(super) fn median(values: &mut [f64]) -> f64 {
 
 fn crop(
     factor: u32,
-    label: u16,
+    (label, behind): (u16, &[bool]),
     camera: &PinholeCamera,
     (low, high): ([u32; 2], [u32; 2]),
     labels: &PixelGrid<u16>,
@@ -202,7 +221,7 @@ fn crop(
                         own += 1.0;
                         let color = colors.at(x, y);
                         (0..3).for_each(|k| sum[k] += f32::from(color[k]) / 255.0);
-                    } else if found != UNLABELLED {
+                    } else if !is_behind(behind, found) {
                         other += 1.0;
                     }
                 }

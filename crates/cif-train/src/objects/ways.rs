@@ -74,8 +74,10 @@ pub(super) struct Paths<'a> {
     /// Centre, had it stayed in place.
     pub(super) place: DVec3,
     pub(super) outline: &'a Outline,
-    /// Direction away from the support; `None` where there is no plane.
-    pub(super) normal: Option<DVec3>,
+    /// Direction away from the support, or upwards in the images where there is none.
+    pub(super) up: DVec3,
+    /// True where there is a support.
+    pub(super) stands: bool,
     /// Time at which all ways have the same pose.
     pub(super) reference: usize,
     /// Poses that following found, where it did.
@@ -102,12 +104,10 @@ impl Paths<'_> {
     /// Ways of moving along the path worth a trial, beside sliding without a turn.
     pub(super) fn ways(&self) -> Vec<Way> {
         let mut ways = Vec::new();
-        if self.normal.is_some() {
-            ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
-            if self.reach() >= ROLLS_FROM * self.outline.size() {
-                let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
-                ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
-            }
+        ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
+        if self.stands && self.reach() >= ROLLS_FROM * self.outline.size() {
+            let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
+            ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
         }
         if self.followed.is_some() {
             ways.push(Way::Followed);
@@ -118,7 +118,7 @@ impl Paths<'_> {
     /// True where an object may turn in place without a change of its outline, and texture would show it.
     pub(super) fn may_turn_unseen(&self, views: &[ObjectView]) -> bool {
         let mut areas: Vec<f64> = views.iter().map(ObjectView::area).collect();
-        self.normal.is_some() && is_round(self.outline) && median(&mut areas) >= TEXTURED
+        is_round(self.outline) && median(&mut areas) >= TEXTURED
     }
 
     /// Ways of turning in place, and resting.
@@ -128,14 +128,14 @@ impl Paths<'_> {
 
     /// Poses of a way at the times of the path.
     pub(super) fn poses(&self, way: Way) -> BTreeMap<usize, Pose> {
-        let normal = self.normal.unwrap_or(DVec3::ZERO);
         let times: Vec<usize> = self.along.keys().copied().collect();
         let places: Vec<DVec3> = self.along.values().copied().collect();
         let origin = times.iter().position(|time| *time == self.reference).unwrap_or(0);
         let turned = |shares: &[f64], degrees: i32| -> Vec<DQuat> {
             let whole = (shares[shares.len() - 1] - shares[0]).max(1e-9);
             let angle = f64::from(degrees).to_radians();
-            let of = |share: &f64| DQuat::from_scaled_axis(normal * angle * (share - shares[origin]) / whole);
+            let of =
+                |share: &f64| DQuat::from_scaled_axis(self.up * angle * (share - shares[origin]) / whole);
             shares.iter().map(of).collect()
         };
         let rotations = match way {
@@ -152,7 +152,7 @@ impl Paths<'_> {
                 turned(&steps, degrees)
             }
             Way::Roll(factor) => {
-                let rotations = rolled(&places, normal, self.outline.height / factor);
+                let rotations = rolled(&places, self.up, self.outline.height / factor);
                 let back = rotations[origin].inverse();
                 rotations.into_iter().map(|rotation| rotation * back).collect()
             }

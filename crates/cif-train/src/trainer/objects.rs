@@ -9,13 +9,14 @@ use rayon::prelude::*;
 use super::Trainer;
 use crate::config::ObjectMotion;
 use crate::error::TrainError;
-use crate::objects::{self, Fitted, Plane, Surroundings};
+use crate::objects::{self, Fitted, Order, Plane, Surroundings};
 use crate::schedule::log_linear;
 use crate::stage::Stage;
 
 /// Error on pixels that were left out beyond which an object is not taken to be rigid: where the capture has points,
-/// and where what it stands on is itself reconstructed.
+/// where what it stands on is itself reconstructed, and where poses were moved onto these pixels.
 const MOST_ERROR: [f64; 2] = [0.2, 0.15];
+const MOST_SETTLED: f64 = 0.095;
 
 /// Rates of poses at the start and the end of the fine stage, radians, and shares of the size of the object.
 const RATES: [f32; 2] = [0.004, 2e-4];
@@ -85,8 +86,11 @@ impl Trainer {
         }
         let state = &self.state;
         let plane = self.support();
+        let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
         let surroundings = Surroundings {
             plane: plane.as_ref(),
+            up: objects::up(&state.dataset),
+            order: &order,
             times: state.dataset.times.len(),
             near: state.config.near,
             seed: state.config.seed,
@@ -103,7 +107,8 @@ impl Trainer {
             }
             let is_told = told == Some(ObjectMotion::Rigid);
             let fitted = objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told)?;
-            Ok(fitted.filter(|fitted| is_told || fitted.error <= most).map(|fitted| (*label, fitted)))
+            let most = |fitted: &Fitted| if fitted.is_settled { MOST_SETTLED } else { most };
+            Ok(fitted.filter(|fitted| is_told || fitted.error <= most(fitted)).map(|fitted| (*label, fitted)))
         };
         let fits: Vec<Option<(u16, Fitted)>> =
             wanted.par_iter().map(fit).collect::<Result<_, TrainError>>()?;
