@@ -1,5 +1,6 @@
 //! Training frames in memory: decoded once, as bytes, up to a budget.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use cif_dataset::{Dataset, Split};
@@ -9,6 +10,7 @@ use rayon::prelude::*;
 
 use crate::error::TrainError;
 use crate::stop::Stop;
+use crate::switches::{colors, put_right, switches};
 use crate::tracks::{misfits, observe};
 
 /// A decoded frame.
@@ -27,6 +29,8 @@ pub(crate) struct FrameStore {
     frames: Vec<(usize, Option<Arc<TrainFrame>>)>,
     label_of_id: Vec<u16>,
     background: [f32; 3],
+    /// New labels of masks that show other objects, by index in the capture.
+    switched: BTreeMap<usize, BTreeMap<u16, u16>>,
 }
 
 /// Frames decoded together before the budget is looked at again.
@@ -46,7 +50,7 @@ impl FrameStore {
         }
         let training = dataset.frames.iter().enumerate().filter(|(_, f)| f.split == Split::Train);
         let frames = training.map(|(index, _)| (index, None)).collect();
-        let mut store = Self { frames, label_of_id, background };
+        let mut store = Self { frames, label_of_id, background, switched: BTreeMap::new() };
         if store.frames.is_empty() {
             return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
         }
@@ -123,10 +127,37 @@ impl FrameStore {
         Ok(left_out)
     }
 
+    /// Puts right the masks that show other objects (see [`crate::switches`]); the new labels of masks by old ones, by
+    /// index in the capture.
+    pub(crate) fn put_switches_right(
+        &mut self,
+        dataset: &Dataset,
+        stop: &Stop,
+    ) -> Result<&BTreeMap<usize, BTreeMap<u16, u16>>, TrainError> {
+        let of = |k: usize| {
+            stop.check()?;
+            Ok(colors(&*self.get(dataset, k)?))
+        };
+        let seen: Vec<_> = (0..self.len()).into_par_iter().map(of).collect::<Result<_, TrainError>>()?;
+        let found =
+            switches(&seen).into_iter().zip(&mut self.frames).filter(|(renamed, _)| !renamed.is_empty());
+        for (renamed, (index, frame)) in found {
+            if let Some(frame) = frame {
+                let labels = frame.labels.as_ref().map(|labels| put_right(labels, &renamed));
+                *frame = Arc::new(TrainFrame::new(frame.image.clone(), labels));
+            }
+            self.switched.insert(*index, renamed);
+        }
+        Ok(&self.switched)
+    }
+
     /// Renames dense labels, in frames kept and in those decoded later.
     pub(crate) fn relabel(&mut self, new_label: impl Fn(u16) -> u16) {
         let rename = |label: &u16| if *label == UNLABELLED { UNLABELLED } else { new_label(label - 1) + 1 };
         self.label_of_id.iter_mut().for_each(|label| *label = rename(label));
+        for renamed in self.switched.values_mut() {
+            *renamed = renamed.iter().map(|(from, to)| (rename(from), rename(to))).collect();
+        }
         for frame in self.frames.iter_mut().filter_map(|(_, frame)| frame.as_mut()) {
             *frame = Arc::new(TrainFrame {
                 image: frame.image.clone(),
@@ -138,14 +169,21 @@ impl FrameStore {
 
     fn load(&self, dataset: &Dataset, k: usize) -> Result<TrainFrame, TrainError> {
         let data = dataset.load_frame(self.frames[k].0, self.background)?;
-        let labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
-        let labelled =
-            labels.as_ref().map_or(0, |grid| grid.pixels.iter().filter(|l| **l != UNLABELLED).count());
-        Ok(TrainFrame { image: data.image, labels, labelled })
+        let mut labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
+        if let Some(renamed) = self.switched.get(&self.frames[k].0) {
+            labels = labels.map(|labels| put_right(&labels, renamed));
+        }
+        Ok(TrainFrame::new(data.image, labels))
     }
 }
 
 impl TrainFrame {
+    fn new(image: PixelGrid<[u8; 3]>, labels: Option<PixelGrid<u16>>) -> Self {
+        let count = |grid: &PixelGrid<u16>| grid.pixels.iter().filter(|l| **l != UNLABELLED).count();
+        let labelled = labels.as_ref().map_or(0, count);
+        Self { image, labels, labelled }
+    }
+
     fn bytes(&self) -> u64 {
         (self.image.pixels.len() * 3 + self.labels.as_ref().map_or(0, |grid| grid.pixels.len() * 2)) as u64
     }

@@ -20,6 +20,7 @@
 //! | `engine` | what computes the steps of a run: the processor, or a GPU |
 //! | `objects` | how rigid objects get poses, before the scene is trained |
 //! | [`heads`] | what the instance stage learns, and how pixels tell it |
+//! | `switches` | which masks show another object than theirs |
 //! | [`tracks`] | where objects travel, from masks alone |
 //! | [`metrics`] | how good a field is |
 //! | `wgpu` | losses and optimiser on the GPU, behind the feature of that name |
@@ -74,6 +75,7 @@ pub mod stage;
 mod state;
 mod step;
 pub mod stop;
+mod switches;
 mod times;
 pub mod tracks;
 pub mod trainer;

@@ -69,7 +69,8 @@ fn paper(layout: Layout) -> TrainConfig {
     config.instance.geometry = super::InstanceGeometry::Full;
     config.resample = ResampleConfig { from: 100, until: 2_500, every: 100, ..config.resample };
     // The published method has no such losses.
-    config.motion = MotionConfig { guidance: 0.0, stillness: 0.0, misfit: 0.0, ..config.motion };
+    config.motion =
+        MotionConfig { guidance: 0.0, stillness: 0.0, misfit: 0.0, switches: false, ..config.motion };
     match layout {
         Layout::DNerf => {
             config.model.multipliers = vec![1, 2];
@@ -204,6 +205,7 @@ impl Default for MotionConfig {
             rehearsal: 300,
             gaussians: 300,
             misfit: 20.0,
+            switches: true,
         }
     }
 }

@@ -59,8 +59,8 @@ use std::sync::Arc;
 
 use cif_dataset::Dataset;
 use cif_field::Field;
-use cif_render::Gradients;
 use cif_render::cpu::SimdLevel;
+use cif_render::{Gradients, UNLABELLED};
 
 #[cfg(feature = "wgpu")]
 pub use self::backend::Probe;
@@ -107,6 +107,27 @@ fn misfit_warning(dataset: &Dataset, left_out: &[usize]) -> Option<String> {
             "left out of training: {}{more}: they show most instances far from where all other frames see them; \
              check their cameras and masks (motion.misfit = 0 keeps such frames)",
             names.join(", ")
+        )
+    })
+}
+
+fn switch_warning(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>) -> Option<String> {
+    let name = |label: u16| dataset.instances[usize::from(label) - 1].label.as_str();
+    let (mut exchanged, mut alone): (BTreeMap<[u16; 2], usize>, BTreeMap<u16, usize>) = Default::default();
+    for (from, to) in switched.values().flatten() {
+        if *to == UNLABELLED {
+            *alone.entry(*from).or_default() += 1;
+        } else if from < to {
+            *exchanged.entry([*from, *to]).or_default() += 1;
+        }
+    }
+    let pairs = exchanged.iter().map(|([a, b], n)| format!("{} and {} exchanged in {n}", name(*a), name(*b)));
+    let singles = alone.iter().map(|(label, n)| format!("{} left out in {n}", name(*label)));
+    let found: Vec<String> = pairs.chain(singles).collect();
+    (!found.is_empty()).then(|| {
+        format!(
+            "masks show other objects by their colours, frames: {} (motion.switches = false keeps such masks)",
+            found.join(", ")
         )
     })
 }
@@ -188,6 +209,10 @@ impl Trainer {
         if has_instances && config.motion.misfit > 0.0 {
             let left_out = frames.leave_out_misfits(&dataset, f64::from(config.motion.misfit), &stop)?;
             warnings.extend(misfit_warning(&dataset, &left_out));
+        }
+        if has_instances && config.motion.switches {
+            let switched = frames.put_switches_right(&dataset, &stop)?;
+            warnings.extend(switch_warning(&dataset, switched));
         }
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
