@@ -29,7 +29,7 @@ const LIKE: f64 = 0.93;
 const MORE: f64 = 0.12;
 
 /// Largest share of the masks of an object that may be switched; beyond, nobody knows what is usual.
-const MOST: f64 = 0.3;
+const MOST: f64 = 0.4;
 
 /// Distribution of colours, summing to one.
 type Colors = Vec<f64>;
@@ -219,7 +219,8 @@ mod tests {
             found.iter().all(|renamed| !renamed.contains_key(&1) && !renamed.contains_key(&2)),
             "{found:?}"
         );
-        let often = |k: usize, label: u16| Some(if k % 2 == 0 && label < 3 { 3 - label } else { label });
+        let often =
+            |k: usize, label: u16| Some(if k.is_multiple_of(2) && label < 3 { 3 - label } else { label });
         assert!(switches(&frames(20, often)).iter().all(BTreeMap::is_empty));
         assert!(switches(&frames(4, |k, l| Some(if k == 1 { 2 } else { l }))).iter().all(BTreeMap::is_empty));
         assert!(switches(&[]).is_empty());

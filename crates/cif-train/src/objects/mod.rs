@@ -59,8 +59,17 @@ pub(crate) fn up(dataset: &Dataset) -> DVec3 {
     ups.sum::<DVec3>().try_normalize().unwrap_or(DVec3::Z)
 }
 
-/// Fits one object (a label: dense index + 1); `None` where it rests, unless it is told to be rigid, or where its masks,
-/// or the scene, do not tell enough.
+/// Finding about one object.
+pub(crate) enum Found {
+    /// Its motion as a whole.
+    Moves(Box<Fitted>),
+    /// It rests, or its masks do not tell enough.
+    Nothing,
+    /// Nothing tells how far away it is: one camera sees it, from one side, and no support is known.
+    Nowhere,
+}
+
+/// Fits one object (a label: dense index + 1); one that rests is fitted only where it is told to be rigid.
 ///
 /// # Errors
 /// When a frame cannot be read, or the run is to stop.
@@ -70,7 +79,7 @@ pub(crate) fn fit(
     frames: &FrameStore,
     surroundings: Surroundings<'_>,
     is_told: bool,
-) -> Result<Option<Fitted>, TrainError> {
+) -> Result<Found, TrainError> {
     let behind = surroundings.order.behind(label);
     let mut views = Vec::new();
     for k in 0..frames.len() {
@@ -82,7 +91,9 @@ pub(crate) fn fit(
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);
     let Some(outline) = outline::outline(&views, surroundings.plane, surroundings.times) else {
-        return Ok(None);
+        return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
     };
-    start::fit_object(Object { label, views: &views, outline: &outline, is_told, surroundings })
+    let fitted =
+        start::fit_object(Object { label, views: &views, outline: &outline, is_told, surroundings })?;
+    Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))
 }

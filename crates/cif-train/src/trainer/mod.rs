@@ -54,7 +54,7 @@ mod shape;
 mod step;
 mod still;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use cif_dataset::Dataset;
@@ -165,6 +165,8 @@ pub struct Trainer {
     last_loss: StepLoss,
     /// Objects that move as a whole, by label, until the fine stage gives them Gaussians.
     fits: BTreeMap<u16, Fitted>,
+    /// Labels of objects of which nothing tells how far away they are.
+    nowhere: BTreeSet<u16>,
     /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
 }
@@ -233,6 +235,7 @@ impl Trainer {
             saved_head: None,
             last_loss: StepLoss::default(),
             fits: BTreeMap::new(),
+            nowhere: BTreeSet::new(),
             arrived: Vec::new(),
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),

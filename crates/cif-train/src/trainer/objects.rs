@@ -9,13 +9,13 @@ use rayon::prelude::*;
 use super::Trainer;
 use crate::config::ObjectMotion;
 use crate::error::TrainError;
-use crate::objects::{self, Fitted, Order, Plane, Surroundings};
+use crate::objects::{self, Fitted, Found, Order, Plane, Surroundings};
 use crate::schedule::log_linear;
 use crate::stage::Stage;
 
 /// Error on pixels that were left out beyond which an object is not taken to be rigid: where the capture has points,
 /// where what it stands on is itself reconstructed, and where poses were moved onto these pixels.
-const MOST_ERROR: [f64; 2] = [0.2, 0.15];
+const MOST_ERROR: [f64; 2] = [0.22, 0.15];
 const MOST_SETTLED: f64 = 0.095;
 
 /// Rates of poses at the start and the end of the fine stage, radians, and shares of the size of the object.
@@ -80,7 +80,7 @@ impl Trainer {
 
     /// Rigid motions of objects (labels: dense index + 1), without those that rest, are not rigid, or whose masks do
     /// not tell enough.
-    fn fit_objects(&self, labels: &[u16]) -> Result<Vec<(u16, Fitted)>, TrainError> {
+    fn fit_objects(&mut self, labels: &[u16]) -> Result<Vec<(u16, Fitted)>, TrainError> {
         if !self.state.config.motion.rigid {
             return Ok(Vec::new());
         }
@@ -101,18 +101,30 @@ impl Trainer {
         let wanted: Vec<(u16, Option<ObjectMotion>)> =
             labels.iter().map(|label| (*label, self.told(*label))).collect();
         let fit = |(label, told): &(u16, Option<ObjectMotion>)| {
-            let told = *told;
-            if told == Some(ObjectMotion::Free) {
-                return Ok(None);
+            if *told == Some(ObjectMotion::Free) {
+                return Ok((*label, Found::Nothing));
             }
-            let is_told = told == Some(ObjectMotion::Rigid);
-            let fitted = objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told)?;
+            let is_told = *told == Some(ObjectMotion::Rigid);
+            let found = objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told)?;
             let most = |fitted: &Fitted| if fitted.is_settled { MOST_SETTLED } else { most };
-            Ok(fitted.filter(|fitted| is_told || fitted.error <= most(fitted)).map(|fitted| (*label, fitted)))
+            Ok((
+                *label,
+                match found {
+                    Found::Moves(fitted) if !is_told && fitted.error > most(&fitted) => Found::Nothing,
+                    found => found,
+                },
+            ))
         };
-        let fits: Vec<Option<(u16, Fitted)>> =
-            wanted.par_iter().map(fit).collect::<Result<_, TrainError>>()?;
-        Ok(fits.into_iter().flatten().collect())
+        let found: Vec<(u16, Found)> = wanted.par_iter().map(fit).collect::<Result<_, TrainError>>()?;
+        let mut fits = Vec::new();
+        for (label, found) in found {
+            match found {
+                Found::Moves(fitted) => fits.push((label, *fitted)),
+                Found::Nowhere => drop(self.nowhere.insert(label)),
+                Found::Nothing => {}
+            }
+        }
+        Ok(fits)
     }
 
     /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not.
@@ -122,6 +134,11 @@ impl Trainer {
             if self.told(label) == Some(ObjectMotion::Rigid) {
                 self.warnings
                     .push(format!("{name} is told to be rigid, but its masks do not tell its poses"));
+            } else if self.nowhere.contains(&label) {
+                self.warnings.push(format!(
+                    "{name}: depth uncertain: one camera sees it, and nothing that it stands on is known, so its size \
+                     and distance are guesses"
+                ));
             }
             return false;
         };

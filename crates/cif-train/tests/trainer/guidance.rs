@@ -210,6 +210,31 @@ fn the_motion_of_an_object_can_be_told() {
 }
 
 #[test]
+fn an_object_of_which_nothing_tells_the_distance_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = guided();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (2, 2, 0);
+    let told = |dataset: Dataset| {
+        let mut told = Vec::new();
+        let mut trainer = Trainer::new(dataset, config.clone()).unwrap();
+        let outcome = trainer.run(&mut |event, _| {
+            if let TrainEvent::Warning { message } = event {
+                told.push(message.clone());
+            }
+            Control::Continue
+        });
+        assert_eq!(outcome.unwrap(), Outcome::Finished);
+        told.into_iter().filter(|message| message.contains("depth uncertain")).collect::<Vec<_>>()
+    };
+    let mut dataset = dataset(folder.path(), 12);
+    // A camera that goes round would tell it.
+    let camera = dataset.frames[0].camera;
+    dataset.frames.iter_mut().for_each(|frame| frame.camera = camera);
+    let found = told(dataset);
+    assert!(found.iter().any(|message| message.starts_with("ball 9: depth uncertain")), "{found:?}");
+}
+
+#[test]
 fn neither_threads_nor_interruptions_change_the_result() {
     let folder = tempfile::tempdir().unwrap();
     same_result(folder.path(), &dataset(folder.path(), 6), &[11, 30, 60, 95]);
