@@ -14,14 +14,26 @@ use super::features::DIMENSIONS;
 /// Trees of a forest.
 const TREES: usize = 12;
 
-/// Pixels of a keyframe that stand for a class at most; unlabelled pixels are more diverse and have four times as many.
-const SAMPLES: usize = 1000;
+/// Pixels of a keyframe that stand for a class at most.
+const SAMPLES: usize = 2000;
+
+/// As many times more stand for what is unlabelled, which is more diverse.
+const UNLABELLED_FACTOR: usize = 8;
 
 /// Nodes with fewer samples are leaves.
-const LEAF: usize = 4;
+const LEAF: usize = 8;
 
 /// Random splits that a node chooses from.
 const TRIES: usize = 6;
+
+/// Samples that splits are judged by, evenly spread over those of the node.
+const JUDGES: usize = 4096;
+
+/// Trees that are asked first: where they all but agree, the others are not asked.
+const ASKED_FIRST: usize = 4;
+
+/// Share that the first trees have to give to one class to agree.
+const AGREEMENT: f32 = 0.999;
 
 /// Pixels of keyframes with their classes.
 #[derive(Clone, Default)]
@@ -42,7 +54,7 @@ impl Samples {
         }
         let mut samples = Self::default();
         for (class, pixels) in pixels.iter().enumerate() {
-            let wanted = (if class == 0 { 4 * SAMPLES } else { SAMPLES }).min(pixels.len());
+            let wanted = (if class == 0 { UNLABELLED_FACTOR * SAMPLES } else { SAMPLES }).min(pixels.len());
             for k in 0..wanted {
                 samples.points.push(features.values[pixels[k * pixels.len() / wanted]]);
                 samples.classes.push(class as u16);
@@ -61,18 +73,32 @@ impl Samples {
 /// A node of a tree.
 #[derive(Clone, Copy, Debug)]
 struct Node {
-    /// Feature that decides; `DIMENSIONS` in leaves.
-    feature: u32,
     /// Values below go to the first child, others to the second.
     threshold: f32,
-    /// Index of the first child, behind which the second lies; in leaves, index of the leaf.
-    next: u32,
+    /// Feature that decides, or `DIMENSIONS` in leaves, times [`PLACES`]; plus the index of the first child, behind
+    /// which the second lies, or in leaves the index of the leaf.
+    feature_and_next: u32,
+}
+
+/// Nodes that a tree may have.
+const PLACES: u32 = 1 << 28;
+
+impl Node {
+    fn leaf(leaf: usize) -> Self {
+        Self { threshold: 0.0, feature_and_next: DIMENSIONS as u32 * PLACES + leaf as u32 }
+    }
+
+    fn branch(feature: usize, threshold: f32, next: usize) -> Self {
+        Self { threshold, feature_and_next: feature as u32 * PLACES + next as u32 }
+    }
 }
 
 /// A tree: nodes from the root on, and per leaf the classes of its samples with their shares.
 struct Tree {
     nodes: Vec<Node>,
-    leaves: Vec<Vec<(u16, f32)>>,
+    /// Where the shares of each leaf begin; one more for the end.
+    leaves: Vec<u32>,
+    shares: Vec<(u16, f32)>,
 }
 
 /// Trees over the samples of keyframes.
@@ -90,16 +116,29 @@ impl Forest {
 
     /// Probability of every class at every pixel, `[pixels][classes]`, in units of 1 / 255.
     pub(crate) fn classify(&self, features: &Features) -> Vec<u8> {
+        /// Pixels that pass a tree together, while it is in the cache.
+        const TOGETHER: usize = 1024;
         let mut found = Vec::with_capacity(features.values.len() * self.classes);
-        let mut sums = vec![0.0_f32; self.classes];
-        for value in &features.values {
+        let mut sums = vec![0.0_f32; TOGETHER * self.classes];
+        for values in features.values.chunks(TOGETHER) {
             sums.fill(0.0);
-            for tree in &self.trees {
-                for (class, share) in tree.leaf_of(value) {
-                    sums[usize::from(*class)] += share;
+            let mut asked = [TREES; TOGETHER];
+            for (k, tree) in self.trees.iter().enumerate() {
+                let pixels = values.iter().zip(sums.chunks_exact_mut(self.classes)).zip(&mut asked);
+                for ((value, sums), asked) in pixels.filter(|(_, asked)| **asked > k) {
+                    for (class, share) in tree.leaf_of(value) {
+                        sums[usize::from(*class)] += share;
+                    }
+                    let agreed = k + 1 == ASKED_FIRST
+                        && sums.iter().any(|sum| *sum >= AGREEMENT * ASKED_FIRST as f32);
+                    if agreed {
+                        *asked = ASKED_FIRST;
+                    }
                 }
             }
-            found.extend(sums.iter().map(|sum| (sum * (255.0 / TREES as f32) + 0.5) as u8));
+            for (sums, asked) in sums.chunks_exact(self.classes).zip(asked).take(values.len()) {
+                found.extend(sums.iter().map(|sum| (sum * (255.0 / asked as f32) + 0.5) as u8));
+            }
         }
         found
     }
@@ -108,25 +147,27 @@ impl Forest {
 impl Tree {
     fn leaf_of(&self, value: &[f32; DIMENSIONS]) -> &[(u16, f32)] {
         let mut node = self.nodes[0];
-        while let Some(feature) = value.get(node.feature as usize) {
-            node = self.nodes[node.next as usize + usize::from(*feature >= node.threshold)];
+        while let Some(feature) = value.get((node.feature_and_next / PLACES) as usize) {
+            let next = (node.feature_and_next % PLACES) as usize;
+            node = self.nodes[next + usize::from(*feature >= node.threshold)];
         }
-        &self.leaves[node.next as usize]
+        let leaf = (node.feature_and_next % PLACES) as usize;
+        &self.shares[self.leaves[leaf] as usize..self.leaves[leaf + 1] as usize]
     }
 
     fn grow(samples: &Samples, classes: usize, random: &mut Pcg64) -> Self {
-        let root = Node { feature: DIMENSIONS as u32, threshold: 0.0, next: 0 };
-        let mut tree = Self { nodes: vec![root], leaves: Vec::new() };
+        let mut tree = Self { nodes: vec![Node::leaf(0)], leaves: vec![0], shares: Vec::new() };
         let mut open: Vec<(usize, Vec<u32>)> = vec![(0, (0..samples.points.len() as u32).collect())];
         while let Some((at, rows)) = open.pop() {
             let Some((feature, threshold)) = split(samples, classes, &rows, random) else {
-                tree.nodes[at].next = tree.leaves.len() as u32;
-                tree.leaves.push(shares(samples, &rows));
+                tree.nodes[at] = Node::leaf(tree.leaves.len() - 1);
+                tree.shares.extend(shares(samples, &rows));
+                tree.leaves.push(tree.shares.len() as u32);
                 continue;
             };
             let next = tree.nodes.len();
-            tree.nodes.extend([root; 2]);
-            tree.nodes[at] = Node { feature: feature as u32, threshold, next: next as u32 };
+            tree.nodes.extend([Node::leaf(0); 2]);
+            tree.nodes[at] = Node::branch(feature, threshold, next);
             let (low, high) = rows.iter().partition(|row| samples.points[**row as usize][feature] < threshold);
             open.extend([(next, low), (next + 1, high)]);
         }
@@ -148,18 +189,19 @@ fn split(samples: &Samples, classes: usize, rows: &[u32], random: &mut Pcg64) ->
     if rows.len() < LEAF || rows.iter().all(|row| class_of(row) == class_of(&rows[0])) {
         return None;
     }
+    let judges: Vec<u32> = rows.iter().step_by(rows.len().div_ceil(JUDGES)).copied().collect();
     let mut best = None;
     let mut purest = 0.0;
     let mut counts = vec![[0.0_f32; 2]; classes];
     for _ in 0..TRIES {
         let feature = random.random_range(0..DIMENSIONS);
         let place: f32 = random.random_range(0.02..0.98);
-        let values = || rows.iter().map(|row| samples.points[*row as usize][feature]);
+        let values = || judges.iter().map(|row| samples.points[*row as usize][feature]);
         let (low, high) = values().fold((f32::MAX, f32::MIN), |(low, high), v| (low.min(v), high.max(v)));
         let threshold = low + (high - low) * place;
         counts.fill([0.0; 2]);
         let mut sizes = [0.0_f32; 2];
-        for (row, value) in rows.iter().zip(values()) {
+        for (row, value) in judges.iter().zip(values()) {
             let side = usize::from(value >= threshold);
             counts[usize::from(class_of(row))][side] += 1.0;
             sizes[side] += 1.0;

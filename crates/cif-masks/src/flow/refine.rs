@@ -121,21 +121,30 @@ fn terms(first: &Level, second: &Level, field: &Flow) -> [Term; 3] {
 /// Weights of the differences to the pixel to the right and to that below; 0 at the border.
 fn smoothness(field: &Flow, right: &mut [f32], down: &mut [f32]) {
     let (width, height) = (field.u.width, field.u.height);
-    let at: Vec<f32> = (0..width * height)
-        .map(|k| {
-            let (x, y) = (k % width, k / width);
-            let next = if x + 1 < width { k + 1 } else { k };
-            let below = if y + 1 < height { k + width } else { k };
-            let squares = [&field.u.data, &field.v.data].map(|values| {
-                (values[next] - values[k]).powi(2) + (values[below] - values[k]).powi(2)
-            });
-            0.5 * SMOOTHNESS / (squares[0] + squares[1] + EPSILON).sqrt()
-        })
-        .collect();
-    for k in 0..width * height {
-        right[k] = if k % width + 1 < width { 0.5 * (at[k] + at[k + 1]) } else { 0.0 };
-        down[k] = if k / width + 1 < height { 0.5 * (at[k] + at[k + width]) } else { 0.0 };
+    let mut at = vec![EPSILON; width * height];
+    for plane in [&field.u, &field.v] {
+        for (y, at) in at.chunks_exact_mut(width).enumerate() {
+            let (row, below) = (plane.row(y as isize), plane.row(y as isize + 1));
+            for ((at, value), below) in at.iter_mut().zip(row).zip(below) {
+                *at += (below - value) * (below - value);
+            }
+            for (at, pair) in at.iter_mut().zip(row.windows(2)) {
+                *at += (pair[1] - pair[0]) * (pair[1] - pair[0]);
+            }
+        }
     }
+    at.iter_mut().for_each(|value| *value = 0.5 * SMOOTHNESS / value.sqrt());
+    for (right, at) in right.chunks_exact_mut(width).zip(at.chunks_exact(width)) {
+        for (right, pair) in right.iter_mut().zip(at.windows(2)) {
+            *right = 0.5 * (pair[0] + pair[1]);
+        }
+        right[width - 1] = 0.0;
+    }
+    let last = width * (height - 1);
+    for (down, (value, below)) in down[..last].iter_mut().zip(at.iter().zip(&at[width..])) {
+        *down = 0.5 * (value + below);
+    }
+    down[last..].fill(0.0);
 }
 
 /// One sweep of successive over-relaxation.
@@ -145,24 +154,17 @@ fn sweep(start: &Flow, systems: &[[f32; 5]], right: &[f32], down: &[f32], field:
     for y in 0..height {
         for x in 0..width {
             let k = y * width + x;
-            let (mut sum, mut pull_u, mut pull_v) = (0.0, 0.0, 0.0);
-            let mut neighbour = |at: usize, weight: f32| {
-                sum += weight;
-                pull_u += weight * u[at];
-                pull_v += weight * v[at];
+            // Beyond the border lies the pixel itself, with weight 0.
+            let (left, above) = (if x > 0 { k - 1 } else { k }, if y > 0 { k - width } else { k });
+            let (next, below) =
+                (if x + 1 < width { k + 1 } else { k }, if y + 1 < height { k + width } else { k });
+            let from_left = if x > 0 { right[k - 1] } else { 0.0 };
+            let from_above = if y > 0 { down[k - width] } else { 0.0 };
+            let sum = from_left + right[k] + from_above + down[k];
+            let pull = |values: &[f32]| {
+                from_left * values[left] + right[k] * values[next] + from_above * values[above] + down[k] * values[below]
             };
-            if x > 0 {
-                neighbour(k - 1, right[k - 1]);
-            }
-            if x + 1 < width {
-                neighbour(k + 1, right[k]);
-            }
-            if y > 0 {
-                neighbour(k - width, down[k - width]);
-            }
-            if y + 1 < height {
-                neighbour(k + width, down[k]);
-            }
+            let (pull_u, pull_v) = (pull(u), pull(v));
             let [xx, xy, yy, bx, by] = systems[k];
             let (u0, v0) = (start.u.data[k], start.v.data[k]);
             let new_u = (bx + xx * u0 - xy * (v[k] - v0) + pull_u) / (xx + sum + 1e-6);

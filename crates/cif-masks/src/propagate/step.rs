@@ -36,27 +36,25 @@ pub(super) struct Step<'a> {
 impl Step<'_> {
     /// The belief about the frame that is stepped to: the known one brought along by flow, times what pixels look like,
     /// where classes may only be near where motion brought them. Where forward and backward flow contradict each other
-    /// (occlusion, or no structure to follow), what motion brought counts little.
+    /// (occlusion, or no structure to follow), the belief becomes less reliable.
     pub(super) fn take(&self, known: &Belief) -> Belief {
         let (width, classes) = (self.width, known.classes);
         let pixels = width * self.height;
         let mut moved = vec![0.0_f32; pixels * classes];
-        let mut trust = vec![0.0_f32; pixels];
         let mut reliability = vec![0.0_f32; pixels];
         moved
             .par_chunks_mut(width * classes)
-            .zip(trust.par_chunks_mut(width))
             .zip(reliability.par_chunks_mut(width))
             .enumerate()
-            .for_each(|(y, ((moved, trust), reliability))| {
+            .for_each(|(y, (moved, reliability))| {
                 for x in 0..width {
                     let at = y * width + x;
                     let (u, v) = (self.back.u.data[at], self.back.v.data[at]);
                     let tap = Tap::new(width, self.height, x as f32 + u, y as f32 + v);
                     let du = u + tap.of(&self.forth.u.data);
                     let dv = v + tap.of(&self.forth.v.data);
-                    trust[x] = (-(du * du + dv * dv) / (2.0 * DISAGREEMENT * DISAGREEMENT)).exp();
-                    reliability[x] = trust[x] * tap.of(&known.reliability);
+                    let trust = (-(du * du + dv * dv) / (2.0 * DISAGREEMENT * DISAGREEMENT)).exp();
+                    reliability[x] = trust * tap.of(&known.reliability);
                     tap.of_rows(&known.shares, classes, &mut moved[x * classes..(x + 1) * classes]);
                 }
             });
@@ -76,7 +74,7 @@ impl Step<'_> {
                     sum += *look;
                 }
                 let scale = 1.0 / sum.max(f32::MIN_POSITIVE);
-                combine(&mut row[x * classes..(x + 1) * classes], &looks, scale, trust[at]);
+                combine(&mut row[x * classes..(x + 1) * classes], &looks, scale);
             }
         });
         Belief { classes, shares: moved, reliability }
@@ -84,12 +82,11 @@ impl Step<'_> {
 }
 
 /// The normalised geometric mean of what motion and looks say, drawn to its most probable class.
-fn combine(shares: &mut [f32], looks: &[f32], scale: f32, trust: f32) {
-    let even = (1.0 - trust) / shares.len() as f32;
+fn combine(shares: &mut [f32], looks: &[f32], scale: f32) {
     let mut sum = 0.0;
     let (mut best, mut most) = (0, 0.0);
     for (class, (share, look)) in shares.iter_mut().zip(looks).enumerate() {
-        *share = ((trust * *share + even + FLOOR) * (look * scale + FLOOR)).sqrt();
+        *share = ((*share + FLOOR) * (look * scale + FLOOR)).sqrt();
         sum += *share;
         if *share > most {
             (best, most) = (class, *share);
