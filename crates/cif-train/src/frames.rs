@@ -29,6 +29,10 @@ pub(crate) struct FrameStore {
     background: [f32; 3],
 }
 
+/// Pixels of masks with less confidence than this, in units of 1 / 255, are taken as unlabelled: their ids are wrong as
+/// often as right.
+const LEAST_CONFIDENCE: u8 = 128;
+
 /// Frames decoded together before the budget is looked at again.
 const BATCH: usize = 32;
 
@@ -138,7 +142,14 @@ impl FrameStore {
 
     fn load(&self, dataset: &Dataset, k: usize) -> Result<TrainFrame, TrainError> {
         let data = dataset.load_frame(self.frames[k].0, self.background)?;
-        let labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
+        let mut labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
+        if let (Some(labels), Some(confidence)) = (&mut labels, &data.confidence) {
+            for (label, confidence) in labels.pixels.iter_mut().zip(&confidence.pixels) {
+                if *confidence < LEAST_CONFIDENCE {
+                    *label = UNLABELLED;
+                }
+            }
+        }
         let labelled =
             labels.as_ref().map_or(0, |grid| grid.pixels.iter().filter(|l| **l != UNLABELLED).count());
         Ok(TrainFrame { image: data.image, labels, labelled })

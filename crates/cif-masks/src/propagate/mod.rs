@@ -41,7 +41,7 @@ const WINDOW_FRAMES: usize = 32;
 const NEAREST_KEYFRAMES: usize = 4;
 
 /// Confidence from which a pixel of a keyframe stands for its class.
-const SURE: f32 = 0.5;
+pub(crate) const SURE: f32 = 0.5;
 
 /// A frame whose ids are known.
 #[derive(Clone, Debug, PartialEq)]
@@ -110,13 +110,20 @@ pub fn propagate(
 }
 
 /// Ids as consecutive classes.
-struct Classes {
+pub(crate) struct Classes {
     /// Id of every class; the first is 0, unlabelled.
-    ids: Vec<u16>,
+    pub(crate) ids: Vec<u16>,
+}
+
+/// The size at which images of a size are followed.
+pub(crate) fn size_to_follow(width: usize, height: usize) -> (usize, usize) {
+    let reduction = (width.max(height) as f64 / LONGEST_SIDE as f64).max(1.0);
+    let reduced = |side: usize| ((side as f64 / reduction).round() as usize).max(1);
+    (reduced(width), reduced(height))
 }
 
 impl Classes {
-    fn new<'a>(masks: impl Iterator<Item = &'a PixelGrid<u16>>) -> Self {
+    pub(crate) fn new<'a>(masks: impl Iterator<Item = &'a PixelGrid<u16>>) -> Self {
         let mut seen = std::collections::BTreeSet::from([0]);
         for mask in masks {
             // Runs of one id are long.
@@ -125,7 +132,7 @@ impl Classes {
         Self { ids: seen.into_iter().collect() }
     }
 
-    fn class_of(&self, id: u16) -> u16 {
+    pub(crate) fn class_of(&self, id: u16) -> u16 {
         self.ids.binary_search(&id).expect("classes hold every id of the keyframes") as u16
     }
 }
@@ -144,9 +151,7 @@ struct Run<'a> {
 
 impl<'a> Run<'a> {
     fn new(clip: &'a Clip<'a>, classes: Classes, full: (usize, usize)) -> Result<Self, Error> {
-        let reduction = (full.0.max(full.1) as f64 / LONGEST_SIDE as f64).max(1.0);
-        let reduced = |side: usize| ((side as f64 / reduction).round() as usize).max(1);
-        let size = (reduced(full.0), reduced(full.1));
+        let size = size_to_follow(full.0, full.1);
         let mut run = Self { clip, classes, full, size, samples: BTreeMap::new() };
         for (frame, keyframe) in clip.keyframes {
             run.go_on()?;
