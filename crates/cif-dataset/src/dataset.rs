@@ -154,10 +154,9 @@ impl Dataset {
             PointSource::File(path) => Some(path.as_path()),
             PointSource::Random => None,
         };
-        let frames =
-            self.frames.iter().flat_map(|frame| {
-                [Some(frame.image.as_path()), frame.mask.as_deref(), frame.confidence.as_deref()]
-            });
+        let frames = self.frames.iter().flat_map(|frame| {
+            [Some(frame.image.as_path()), frame.mask.as_deref(), frame.confidence.as_deref()]
+        });
         frames.chain([points]).flatten()
     }
 

@@ -62,9 +62,8 @@ fn seen(frame: &Frame, points: &[DVec3]) -> Vec<Option<DVec2>> {
         let at = square(*pixel);
         nearest[at] = nearest[at].min(*depth);
     }
-    let visible = |(pixel, depth): (DVec2, f64)| {
-        (depth <= nearest[square(pixel)] * (1.0 + BEHIND)).then_some(pixel)
-    };
+    let visible =
+        |(pixel, depth): (DVec2, f64)| (depth <= nearest[square(pixel)] * (1.0 + BEHIND)).then_some(pixel);
     projected.into_iter().map(|found| found.and_then(visible)).collect()
 }
 

@@ -19,8 +19,8 @@ pub fn doubt(mask: &Mask) -> f64 {
 }
 
 /// The frame whose painting helps most, and the sum of doubts that it would settle. A keyframe settles all doubt at its
-/// own place and ever less towards the neighbouring keyframes, or, before the first and behind the last one, towards the
-/// end of the clip. `doubts` are those of all frames of a clip, in order. `None` where every frame is a keyframe or
+/// own place and ever less around it, none from half the gap between the neighbouring keyframes (or the ends of the clip)
+/// on. `doubts` are those of all frames of a clip, in order. `None` where every frame is a keyframe or
 /// nothing is in doubt.
 #[must_use]
 pub fn next_keyframe(doubts: &[f64], keyframes: &[usize]) -> Option<(usize, f64)> {
@@ -29,9 +29,9 @@ pub fn next_keyframe(doubts: &[f64], keyframes: &[usize]) -> Option<(usize, f64)
         let after = keyframes.iter().filter(|key| **key > frame).min();
         let low = before.map_or(0, |key| key + 1);
         let high = after.copied().unwrap_or(doubts.len());
-        let reach = |other: usize| if other < frame { frame + 1 - low } else { high - frame } as f64;
+        let reach = (high + 1 - low) as f64 / 2.0;
         (low..high)
-            .map(|other| doubts[other] * (1.0 - frame.abs_diff(other) as f64 / reach(other)))
+            .map(|other| doubts[other] * (1.0 - frame.abs_diff(other) as f64 / reach).max(0.0))
             .sum::<f64>()
     };
     let mut best: Option<(usize, f64)> = None;

@@ -129,8 +129,8 @@ impl Forest {
                     for (class, share) in tree.leaf_of(value) {
                         sums[usize::from(*class)] += share;
                     }
-                    let agreed = k + 1 == ASKED_FIRST
-                        && sums.iter().any(|sum| *sum >= AGREEMENT * ASKED_FIRST as f32);
+                    let agreed =
+                        k + 1 == ASKED_FIRST && sums.iter().any(|sum| *sum >= AGREEMENT * ASKED_FIRST as f32);
                     if agreed {
                         *asked = ASKED_FIRST;
                     }
@@ -168,7 +168,8 @@ impl Tree {
             let next = tree.nodes.len();
             tree.nodes.extend([Node::leaf(0); 2]);
             tree.nodes[at] = Node::branch(feature, threshold, next);
-            let (low, high) = rows.iter().partition(|row| samples.points[**row as usize][feature] < threshold);
+            let (low, high) =
+                rows.iter().partition(|row| samples.points[**row as usize][feature] < threshold);
             open.extend([(next, low), (next + 1, high)]);
         }
         tree

@@ -220,10 +220,8 @@ pub(super) fn search(first: &Level, second: &Plane, start: &Flow) -> Patches {
         for (column, left) in lefts.iter().enumerate().rev() {
             let (x, y) = (*left as f32, *top as f32);
             let at = row * columns + column;
-            let neighbours = [
-                (column + 1 < columns).then_some(at + 1),
-                (row + 1 < tops.len()).then_some(at + columns),
-            ];
+            let neighbours =
+                [(column + 1 < columns).then_some(at + 1), (row + 1 < tops.len()).then_some(at + columns)];
             let mut better = None;
             for neighbour in neighbours.into_iter().flatten() {
                 let candidate = moved[neighbour];

@@ -162,7 +162,10 @@ fn sweep(start: &Flow, systems: &[[f32; 5]], right: &[f32], down: &[f32], field:
             let from_above = if y > 0 { down[k - width] } else { 0.0 };
             let sum = from_left + right[k] + from_above + down[k];
             let pull = |values: &[f32]| {
-                from_left * values[left] + right[k] * values[next] + from_above * values[above] + down[k] * values[below]
+                from_left * values[left]
+                    + right[k] * values[next]
+                    + from_above * values[above]
+                    + down[k] * values[below]
             };
             let (pull_u, pull_v) = (pull(u), pull(v));
             let [xx, xy, yy, bx, by] = systems[k];

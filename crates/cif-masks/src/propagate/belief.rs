@@ -44,7 +44,8 @@ impl Stored {
     pub(crate) fn new(belief: &Belief) -> Self {
         let pixels = belief.shares.par_chunks(belief.classes).zip(&belief.reliability);
         let store = |(shares, reliability): (&[f32], &f32)| {
-            let mut kept = StoredPixel { class: [0; KEPT], share: [0; KEPT], reliability: byte(*reliability) };
+            let mut kept =
+                StoredPixel { class: [0; KEPT], share: [0; KEPT], reliability: byte(*reliability) };
             for (class, share) in shares.iter().enumerate() {
                 let share = byte(*share);
                 if let Some(place) = kept.share.iter().position(|other| share > *other) {

@@ -42,11 +42,8 @@ impl Step<'_> {
         let pixels = width * self.height;
         let mut moved = vec![0.0_f32; pixels * classes];
         let mut reliability = vec![0.0_f32; pixels];
-        moved
-            .par_chunks_mut(width * classes)
-            .zip(reliability.par_chunks_mut(width))
-            .enumerate()
-            .for_each(|(y, (moved, reliability))| {
+        moved.par_chunks_mut(width * classes).zip(reliability.par_chunks_mut(width)).enumerate().for_each(
+            |(y, (moved, reliability))| {
                 for x in 0..width {
                     let at = y * width + x;
                     let (u, v) = (self.back.u.data[at], self.back.v.data[at]);
@@ -57,7 +54,8 @@ impl Step<'_> {
                     reliability[x] = trust * tap.of(&known.reliability);
                     tap.of_rows(&known.shares, classes, &mut moved[x * classes..(x + 1) * classes]);
                 }
-            });
+            },
+        );
         let support = Support::new(&moved, width, self.height, classes);
         moved.par_chunks_mut(width * classes).enumerate().for_each(|(y, row)| {
             let mut near = vec![0.0_f32; classes];

@@ -49,8 +49,7 @@ impl Window {
                 if (clip.stop)() {
                     return Err(Error::Stopped);
                 }
-                let (there, back) =
-                    rayon::join(|| flow(&pair[0], &pair[1]), || flow(&pair[1], &pair[0]));
+                let (there, back) = rayon::join(|| flow(&pair[0], &pair[1]), || flow(&pair[1], &pair[0]));
                 Ok([there, back])
             })
             .collect::<Result<_, Error>>()?;

@@ -141,7 +141,8 @@ fn open(command: &Propagate) -> Result<Dataset, Error> {
         ..OpenOptions::default()
     };
     let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;
-    let without: Vec<_> = dataset.warnings.iter().filter(|text| !text.contains("frames have a mask")).collect();
+    let without: Vec<_> =
+        dataset.warnings.iter().filter(|text| !text.contains("frames have a mask")).collect();
     for warning in without {
         eprintln!("warning: {warning}");
     }
@@ -150,7 +151,9 @@ fn open(command: &Propagate) -> Result<Dataset, Error> {
 
 /// Refuses ids that the list of instances does not name, where there is a list.
 fn check_ids(dataset: &Dataset, keyframes: &Path) -> Result<(), Error> {
-    let Some((file, named)) = dataset.named_instances(keyframes).map_err(Error::plain)? else { return Ok(()) };
+    let Some((file, named)) = dataset.named_instances(keyframes).map_err(Error::plain)? else {
+        return Ok(());
+    };
     let unnamed: Vec<String> = dataset
         .instances
         .iter()
