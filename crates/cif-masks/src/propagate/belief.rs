@@ -14,11 +14,13 @@ pub(crate) struct Belief {
 }
 
 impl Belief {
-    /// Certainty about every pixel, as reliable as told.
-    pub(crate) fn certain(classes: usize, of_pixel: &[u16], reliability: Vec<f32>) -> Self {
-        let mut shares = vec![0.0; of_pixel.len() * classes];
-        for (pixel, class) in of_pixel.iter().enumerate() {
-            shares[pixel * classes + usize::from(*class)] = 1.0;
+    /// Belief in one class per pixel, as much as told; the rest is shared by all classes.
+    pub(crate) fn in_classes(classes: usize, of_pixel: &[u16], reliability: Vec<f32>) -> Self {
+        let mut shares = Vec::with_capacity(of_pixel.len() * classes);
+        for (class, sure) in of_pixel.iter().zip(&reliability) {
+            let start = shares.len();
+            shares.extend(std::iter::repeat_n((1.0 - sure) / classes as f32, classes));
+            shares[start + usize::from(*class)] += sure;
         }
         Self { classes, shares, reliability }
     }

@@ -10,11 +10,8 @@ use crate::plane::Tap;
 /// Keeps a way that is unreliable or far in time in play.
 const FLOOR: f32 = 0.02;
 
-/// Confidence of a class that is certain, but that no motion accounts for.
-const UNACCOUNTED: f32 = 0.5;
-
 /// Blends beliefs about a frame, each weighed by its share and by its reliability at the pixel, and takes the most
-/// probable class of every pixel of the image. Its confidence is its probability, lowered where no way was reliable.
+/// probable class of every pixel of the image. Its confidence is its probability.
 pub(super) fn mask(
     ways: &[(f32, &Belief)],
     ids: &[u16],
@@ -24,25 +21,18 @@ pub(super) fn mask(
     let classes = ids.len();
     let mut shares = vec![0.0_f32; width * height * classes];
     let mut best = vec![(0_u16, 0.0_f32); width * height];
-    let mut account = vec![0.0_f32; width * height];
-    shares.par_chunks_mut(classes).zip(&mut best).zip(&mut account).enumerate().for_each(
-        |(pixel, ((shares, best), account))| {
-            let mut sum = 0.0;
-            for (share, belief) in ways {
-                let reliability = belief.reliability[pixel];
-                let weight = (share + FLOOR) * (reliability + FLOOR);
-                sum += weight;
-                *account = account.max(reliability);
-                let theirs = &belief.shares[pixel * classes..(pixel + 1) * classes];
-                shares.iter_mut().zip(theirs).for_each(|(share, other)| *share += weight * other);
-            }
-            shares.iter_mut().for_each(|share| *share /= sum);
-            *best = most_probable(shares);
-        },
-    );
-    let confidence = |(_, share): (u16, f32), account: f32| {
-        (share * (UNACCOUNTED + (1.0 - UNACCOUNTED) * account) * 255.0 + 0.5) as u8
-    };
+    shares.par_chunks_mut(classes).zip(&mut best).enumerate().for_each(|(pixel, (shares, best))| {
+        let mut sum = 0.0;
+        for (share, belief) in ways {
+            let weight = (share + FLOOR) * (belief.reliability[pixel] + FLOOR);
+            sum += weight;
+            let theirs = &belief.shares[pixel * classes..(pixel + 1) * classes];
+            shares.iter_mut().zip(theirs).for_each(|(share, other)| *share += weight * other);
+        }
+        shares.iter_mut().for_each(|share| *share /= sum);
+        *best = most_probable(shares);
+    });
+    let with_confidence = |(class, share): (u16, f32)| (ids[usize::from(class)], (share * 255.0 + 0.5) as u8);
     let enlarged = (width, height) != full;
     let (full_width, full_height) = full;
     let step = (width as f32 / full_width as f32, height as f32 / full_height as f32);
@@ -52,14 +42,13 @@ pub(super) fn mask(
             || vec![0.0_f32; classes],
             |sum, pixel| {
                 if !enlarged {
-                    return (ids[usize::from(best[pixel].0)], confidence(best[pixel], account[pixel]));
+                    return with_confidence(best[pixel]);
                 }
                 let x = ((pixel % full_width) as f32 + 0.5) * step.0 - 0.5;
                 let y = ((pixel / full_width) as f32 + 0.5) * step.1 - 0.5;
                 let tap = Tap::new(width, height, x, y);
                 tap.of_rows(&shares, classes, sum);
-                let found = most_probable(sum);
-                (ids[usize::from(found.0)], confidence(found, tap.of(&account)))
+                with_confidence(most_probable(sum))
             },
         )
         .collect();

@@ -185,7 +185,7 @@ impl<'a> Run<'a> {
 
     fn start(&self, frame: usize) -> Belief {
         let (classes, reliability) = self.known(&self.clip.keyframes[&frame]);
-        Belief::certain(self.classes.ids.len(), &classes, reliability)
+        Belief::in_classes(self.classes.ids.len(), &classes, reliability)
     }
 
     /// A keyframe as it leaves: as it was given, at the size of the images.

@@ -43,7 +43,7 @@ of the capture, or of a first scene (--scene), which also knows how they move.
   cif train captures/table --masks table-masks -o table.cif
 
 The output folder holds a PNG of ids per frame, instances.json, confidence/FRAME.png (8-bit grey: probability that
-the id is right, 255 for certain; training takes pixels below 128 as unlabelled) and contact_sheet.jpg, every tenth
+the id is right, 255 for certain; training takes pixels below 192 as unlabelled) and contact_sheet.jpg, every tenth
 frame beside its mask. Results do not depend on the number of threads.")]
 pub(super) struct Propagate {
     /// Folder of the capture
