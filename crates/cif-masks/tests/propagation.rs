@@ -2,10 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use cif_geometry::PixelGrid;
+use cif_dataset::{Frame, Split};
+use cif_geometry::{LensDistortion, PinholeCamera, PixelGrid, RigidTransform};
 use cif_masks::flow::{Pyramid, flow};
 use cif_masks::plane::Plane;
+use cif_masks::rig::{View, carry};
 use cif_masks::{Clip, Error, Keyframe, Mask, propagate};
+use glam::{DMat3, DVec2, DVec3};
 
 const WIDTH: usize = 96;
 const HEIGHT: usize = 72;
@@ -252,4 +255,71 @@ fn large_images_are_followed_smaller_and_keep_their_size() {
         Ok(())
     })
     .unwrap();
+}
+
+/// Image and ids of a wall at z = 0 with two squares, seen from (x, 0, -2) by a camera with some lens distortion.
+fn wall(x: f64) -> (Frame, PixelGrid<[u8; 3]>, PixelGrid<u16>) {
+    let (width, height) = (120, 90);
+    let camera = PinholeCamera {
+        width,
+        height,
+        focal_px: DVec2::splat(110.0),
+        principal_px: DVec2::new(60.0, 45.0),
+        camera_from_world: RigidTransform {
+            rotation: DMat3::IDENTITY,
+            translation: DVec3::new(-x, 0.0, 2.0),
+        },
+    };
+    let lens = LensDistortion { radial: [-0.12, 0.0, 0.0, 0.0], ..LensDistortion::default() };
+    let (mut pixels, mut ids) = (Vec::new(), Vec::new());
+    for k in 0..width * height {
+        let pixel = DVec2::new(f64::from(k % width) + 0.5, f64::from(k / width) + 0.5);
+        let ideal = lens.undistort((pixel - camera.principal_px) / camera.focal_px).unwrap();
+        let place = camera.centre() + DVec3::new(ideal.x, ideal.y, 1.0) * 2.0;
+        let near = |cx: f64, cy: f64| (place.x - cx).abs().max((place.y - cy).abs()) < 0.25;
+        // Both squares look alike: only points can tell them apart.
+        let id = if near(-0.4, 0.1) { 5 } else { u16::from(near(0.4, -0.1)) * 8 };
+        let shade = 0.6 + 0.8 * texture(1.5, 40.0 * place.x as f32, 40.0 * place.y as f32);
+        let color = if id == 0 { [60.0, 90.0, 110.0] } else { [190.0, 80.0, 60.0] };
+        pixels.push(color.map(|c: f32| (c * shade).clamp(0.0, 255.0) as u8));
+        ids.push(id);
+    }
+    let frame = Frame {
+        name: format!("{x}"),
+        camera_name: format!("{x}"),
+        camera,
+        lens,
+        time: 0.0,
+        time_index: 0,
+        split: Split::Train,
+        group: None,
+        image: "image.png".into(),
+        mask: None,
+        confidence: None,
+    };
+    (frame, PixelGrid::from_pixels(width, height, pixels), PixelGrid::from_pixels(width, height, ids))
+}
+
+#[test]
+fn points_bring_ids_to_another_camera() {
+    let (left, left_image, left_ids) = wall(-0.15);
+    let (right, right_image, truth) = wall(0.15);
+    let mut points: Vec<DVec3> = (0..900)
+        .map(|k| DVec3::new(f64::from(k % 30) * 0.07 - 1.0, f64::from(k / 30) * 0.06 - 0.9, 0.0))
+        .collect();
+    // Points behind the wall would bring wrong ids if they were taken as seen.
+    points.extend(
+        (0..300).map(|k| DVec3::new(f64::from(k % 20) * 0.1 - 1.0, f64::from(k / 20) * 0.1 - 0.7, 0.8)),
+    );
+    let known = Keyframe::painted(left_ids);
+    let view = |frame, image| View { frame, image };
+    let found = carry(&[(view(&left, &left_image), &known)], &view(&right, &right_image), &points).unwrap();
+    for id in [5, 8] {
+        let score = overlap(&found.ids, &truth, id);
+        assert!(score > 0.8, "object {id}: {score}");
+    }
+    let confidence = found.confidence.unwrap();
+    assert!(confidence.pixels.iter().all(|value| (0.0..=1.0).contains(value)));
+    let behind = [DVec3::new(0.0, 0.0, -5.0)];
+    assert!(carry(&[(view(&left, &left_image), &known)], &view(&right, &right_image), &behind).is_none());
 }
