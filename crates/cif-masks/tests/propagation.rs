@@ -68,7 +68,7 @@ fn run(shapes: &[Shape], frames: usize, keys: &[usize]) -> Vec<Mask> {
         assert!(masks[k].replace(mask).is_none(), "frame {k} comes twice");
         Ok(())
     })
-    .unwrap();
+    .expect("the clip can be propagated");
     masks.into_iter().map(|mask| mask.expect("every frame has a mask")).collect()
 }
 
@@ -274,7 +274,9 @@ fn wall(x: f64) -> (Frame, PixelGrid<[u8; 3]>, PixelGrid<u16>) {
     let (mut pixels, mut ids) = (Vec::new(), Vec::new());
     for k in 0..width * height {
         let pixel = DVec2::new(f64::from(k % width) + 0.5, f64::from(k / width) + 0.5);
-        let ideal = lens.undistort((pixel - camera.principal_px) / camera.focal_px).unwrap();
+        let ideal = lens
+            .undistort((pixel - camera.principal_px) / camera.focal_px)
+            .expect("the lens covers the image");
         let place = camera.centre() + DVec3::new(ideal.x, ideal.y, 1.0) * 2.0;
         let near = |cx: f64, cy: f64| (place.x - cx).abs().max((place.y - cy).abs()) < 0.25;
         // Both squares look alike: only points can tell them apart.
