@@ -75,6 +75,7 @@ fn help_teaches_the_tool() {
         "query",
         "label",
         "info",
+        "masks propagate",
         "masks zigzag",
         "masks split",
     ];
@@ -310,6 +311,68 @@ fn masks_go_through_a_tracker_and_come_back() {
     assert!(facts.stdout.contains("instance_1"), "{}", facts.stdout);
     cif(path, "masks zigzag table -o sequence").fails(1, &["sequence"]);
     cif(path, "masks split tracked tracked -o other").fails(1, &["cif masks zigzag"]);
+}
+
+#[test]
+fn a_few_painted_frames_become_masks_of_all() {
+    let folder = folder();
+    let path = folder.path();
+    cif_test::capture::write(&path.join("table"), 8);
+    let masks = path.join("table/masks");
+    fs::create_dir(path.join("painted")).unwrap();
+    for name in ["000000.png", "000007.png"] {
+        fs::copy(masks.join(name), path.join("painted").join(name)).unwrap();
+    }
+    let run = cif(path, "masks propagate table --keyframes painted -o made").succeeds();
+    for words in [
+        "8 masks of 2 instances from 2 keyframes in made",
+        "label this frame next: 00000",
+        "next: cif train table --masks",
+    ] {
+        assert!(run.stdout.contains(words), "{words} in {}", run.stdout);
+    }
+    let mask = |file: &Path| image::open(file).unwrap().into_luma8().into_raw();
+    let (mut right, mut all) = (0, 0);
+    for frame in 0..8 {
+        let name = format!("{frame:06}.png");
+        let (made, truth) = (mask(&path.join("made").join(&name)), mask(&masks.join(&name)));
+        right += made.iter().zip(&truth).filter(|(made, truth)| made == truth).count();
+        all += truth.len();
+        let confidence = mask(&path.join("made/confidence").join(&name));
+        assert_eq!(confidence.iter().all(|value| *value == 255), [0, 7].contains(&frame), "frame {frame}");
+    }
+    assert!(right * 100 > all * 97, "{right} of {all} pixels");
+    assert!(path.join("made/contact_sheet.jpg").exists());
+    // The folder is read as masks, and nothing in it is a stranger.
+    let facts = cif(path, "info table --masks ../made").succeeds();
+    assert!(facts.stdout.contains("red ball"), "{}", facts.stdout);
+    assert!(!facts.stderr.contains("belong to no frame"), "{}", facts.stderr);
+    assert!(!facts.stdout.contains("belong to no frame"), "{}", facts.stdout);
+
+    // What is wrong is told, and nothing is left behind.
+    let paint = |folder: &str, file: &str, width: u32, height: u32, id: u8| {
+        fs::create_dir_all(path.join(folder)).unwrap();
+        let grey = image::GrayImage::from_pixel(width, height, image::Luma([id]));
+        grey.save(path.join(folder).join(file)).unwrap();
+    };
+    paint("size", "000001.png", 30, 40, 3);
+    paint("ids", "000001.png", 40, 30, 9);
+    paint("blank", "000001.png", 40, 30, 0);
+    paint("names", "first.png", 40, 30, 3);
+    fs::create_dir(path.join("none")).unwrap();
+    for (folder, words) in [
+        ("size", ["size/000001.png", "30 x 40", "40 x 30"]),
+        ("ids", ["instances.json", "does not name: 9", "add them there"]),
+        ("blank", ["blank", "no keyframe shows an object", "1 to 65535"]),
+        ("names", ["names", "no mask in it belongs to a frame", "000000.png"]),
+        ("none", ["none", "no mask in it belongs to a frame", "000000.png"]),
+        ("missing", ["missing", "no such folder of keyframes", "painted masks"]),
+    ] {
+        cif(path, &format!("masks propagate table --keyframes {folder} -o other")).fails(1, &words);
+        assert!(!path.join("other").exists(), "{folder}");
+    }
+    cif(path, "masks propagate table --keyframes painted -o made")
+        .fails(1, &["made", "something is there already"]);
 }
 
 #[cfg(unix)]

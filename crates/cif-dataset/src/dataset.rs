@@ -74,6 +74,8 @@ pub struct Frame {
     pub image: PathBuf,
     /// Mask file, where this frame has one.
     pub mask: Option<PathBuf>,
+    /// Confidence of the mask, where it has one: `confidence/<frame>.png` in the mask folder.
+    pub confidence: Option<PathBuf>,
 }
 
 /// An instance named by the capture, or found only in its masks.
@@ -141,6 +143,8 @@ pub struct FrameData {
     pub image: PixelGrid<[u8; 3]>,
     /// Instance ids, 0 = unlabelled, at the size of `image`.
     pub mask: Option<PixelGrid<u16>>,
+    /// Probability that the id of a pixel is right, in units of 1 / 255, where the mask has a confidence.
+    pub confidence: Option<PixelGrid<u8>>,
 }
 
 impl Dataset {
@@ -150,8 +154,9 @@ impl Dataset {
             PointSource::File(path) => Some(path.as_path()),
             PointSource::Random => None,
         };
-        let frames =
-            self.frames.iter().flat_map(|frame| [Some(frame.image.as_path()), frame.mask.as_deref()]);
+        let frames = self.frames.iter().flat_map(|frame| {
+            [Some(frame.image.as_path()), frame.mask.as_deref(), frame.confidence.as_deref()]
+        });
         frames.chain([points]).flatten()
     }
 

@@ -21,7 +21,11 @@ impl Dataset {
     /// # Panics
     /// When there is no frame `index`.
     pub fn load_frame(&self, index: usize, background: [f32; 3]) -> Result<FrameData, Error> {
-        Ok(FrameData { image: self.load_image(index, background)?, mask: self.load_mask(index)? })
+        Ok(FrameData {
+            image: self.load_image(index, background)?,
+            mask: self.load_mask(index)?,
+            confidence: self.load_confidence(index)?,
+        })
     }
 
     /// Loads the image of a frame; see [`Dataset::load_frame`].
@@ -33,12 +37,60 @@ impl Dataset {
     /// When there is no frame `index`.
     pub fn load_image(&self, index: usize, background: [f32; 3]) -> Result<PixelGrid<[u8; 3]>, Error> {
         let frame = &self.frames[index];
-        let stored = image::composite(&image::decode(&frame.image)?, background);
-        let reduced = image::box_resize(&stored, frame.camera.width, frame.camera.height);
+        let reduced = self.reduced_image(index, background)?;
         if frame.lens.is_identity() {
             return Ok(image::to_bytes(&reduced));
         }
         Ok(image::to_bytes(&undistort_image(&reduced, &frame.camera, &frame.lens)))
+    }
+
+    /// Loads the image of a frame as [`Dataset::load_image`] does, but with its lens distortion: as masks lie in their
+    /// files.
+    ///
+    /// # Errors
+    /// When the file is missing or truncated.
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_distorted_image(
+        &self,
+        index: usize,
+        background: [f32; 3],
+    ) -> Result<PixelGrid<[u8; 3]>, Error> {
+        Ok(image::to_bytes(&self.reduced_image(index, background)?))
+    }
+
+    fn reduced_image(&self, index: usize, background: [f32; 3]) -> Result<PixelGrid<[f32; 3]>, Error> {
+        let frame = &self.frames[index];
+        let stored = image::composite(&image::decode(&frame.image)?, background);
+        Ok(image::box_resize(&stored, frame.camera.width, frame.camera.height))
+    }
+
+    /// Loads the mask of a frame, where it has one, at the size of its image and with its lens distortion.
+    ///
+    /// # Errors
+    /// As [`Dataset::load_mask`].
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_distorted_mask(&self, index: usize) -> Result<Option<PixelGrid<u16>>, Error> {
+        self.frames[index].mask.as_deref().map(|path| self.resized_mask(index, path)).transpose()
+    }
+
+    /// Loads the confidence of the mask of a frame, where it has one, the way the mask goes.
+    ///
+    /// # Errors
+    /// When the file is missing, truncated, no grey PNG, or has another aspect than its image.
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_confidence(&self, index: usize) -> Result<Option<PixelGrid<u8>>, Error> {
+        let Some(path) = &self.frames[index].confidence else { return Ok(None) };
+        let values = self.load_mask_file(index, path)?;
+        if values.pixels.iter().any(|value| *value > 255) {
+            return Err(Error::mask(path, "a confidence is an 8-bit grey PNG, 255 for certain"));
+        }
+        Ok(Some(values.map(|value| *value as u8)))
     }
 
     /// Loads the mask of a frame, where it has one; see [`Dataset::load_frame`].
@@ -62,6 +114,27 @@ impl Dataset {
     /// When there is no frame `index`.
     pub fn load_mask_file(&self, index: usize, path: &Path) -> Result<PixelGrid<u16>, Error> {
         let frame = &self.frames[index];
+        let resized = self.resized_mask(index, path)?;
+        Ok(if frame.lens.is_identity() {
+            resized
+        } else {
+            undistort_mask(&resized, &frame.camera, &frame.lens)
+        })
+    }
+
+    /// Loads a mask file as the mask of a frame, at the size of its image and with its lens distortion.
+    ///
+    /// # Errors
+    /// As [`Dataset::load_mask_file`].
+    ///
+    /// # Panics
+    /// When there is no frame `index`.
+    pub fn load_distorted_mask_file(&self, index: usize, path: &Path) -> Result<PixelGrid<u16>, Error> {
+        self.resized_mask(index, path)
+    }
+
+    fn resized_mask(&self, index: usize, path: &Path) -> Result<PixelGrid<u16>, Error> {
+        let frame = &self.frames[index];
         let stored = mask_files::decode(path, &self.mask_objects)?;
         let (width, height) = (frame.camera.width, frame.camera.height);
         if !same_aspect((stored.width, stored.height), (width, height)) {
@@ -72,12 +145,7 @@ impl Dataset {
                 image_size: (width, height),
             });
         }
-        let resized = mask::nearest_resize(&stored, width, height);
-        Ok(if frame.lens.is_identity() {
-            resized
-        } else {
-            undistort_mask(&resized, &frame.camera, &frame.lens)
-        })
+        Ok(mask::nearest_resize(&stored, width, height))
     }
 }
 

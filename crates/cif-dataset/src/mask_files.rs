@@ -14,6 +14,9 @@ use crate::{Error, Frame, Layout};
 /// Mask folder that is taken where none is asked for.
 pub(crate) const DEFAULT_FOLDER: &str = "masks";
 
+/// Folder of confidences inside a mask folder.
+pub(crate) const CONFIDENCE_FOLDER: &str = "confidence";
+
 /// Endings of mask files, first choice first.
 const EXTENSIONS: [&str; 2] = ["png", "exr"];
 
@@ -66,6 +69,8 @@ pub(crate) type PixelCounts = BTreeMap<u16, u64>;
 pub(crate) struct MaskListing {
     /// `[frames]`.
     pub(crate) paths: Vec<Option<PathBuf>>,
+    /// Confidences of these masks, `[frames]`.
+    pub(crate) confidences: Vec<Option<PathBuf>>,
     /// Folder that holds `instances.json` for these masks, if it has one of its own.
     pub(crate) folder: Option<PathBuf>,
     /// PNG and EXR files in the folder that belong to no frame.
@@ -116,7 +121,14 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
     let numbered = paths.iter().all(Option::is_none) && number(&base, &mut paths);
     let strangers =
         count_files(&base).saturating_sub(paths.iter().flatten().filter(|p| p.starts_with(&base)).count());
-    MaskListing { paths, folder: base.is_dir().then_some(base), strangers, numbered }
+    let folder_of_confidences = base.join(CONFIDENCE_FOLDER);
+    let strangers = strangers.saturating_sub(count_files(&folder_of_confidences));
+    let confidence = |(frame, mask): (&Frame, &Option<PathBuf>)| {
+        let path = folder_of_confidences.join(format!("{}.png", frame.name));
+        mask.as_ref().map(|_| path).filter(|path| listing::is_there(path))
+    };
+    let confidences = frames.iter().zip(&paths).map(confidence).collect();
+    MaskListing { paths, confidences, folder: base.is_dir().then_some(base), strangers, numbered }
 }
 
 /// Gives numbered EXR files to the frames they count; whether there are any.

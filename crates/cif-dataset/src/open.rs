@@ -97,6 +97,17 @@ impl Dataset {
         Ok(dataset)
     }
 
+    /// The list of instances that names the ids of a mask folder (its own `instances.json`, else that of the capture),
+    /// and the ids in it; `None` without a list.
+    ///
+    /// # Errors
+    /// When the list cannot be read.
+    pub fn named_instances(&self, folder: &Path) -> Result<Option<(PathBuf, BTreeSet<u16>)>, Error> {
+        let Some(file) = instances::file_for(&self.root, Some(folder)) else { return Ok(None) };
+        let named = instances::read(&file, &mut Vec::new())?;
+        Ok(Some((file, named.into_keys().collect())))
+    }
+
     /// Mask file of every frame in another mask folder; `[frames]`, `None` where it has none.
     ///
     /// # Errors
@@ -197,8 +208,10 @@ impl Dataset {
             self.mask_paths(name)?;
         }
         if listing.paths.iter().any(Option::is_some) {
-            for (frame, path) in self.frames.iter_mut().zip(listing.paths) {
-                frame.mask = path;
+            for ((frame, path), confidence) in
+                self.frames.iter_mut().zip(listing.paths).zip(listing.confidences)
+            {
+                (frame.mask, frame.confidence) = (path, confidence);
             }
         } else if listing.folder.is_some() && listing.strangers > 0 {
             self.warnings.push(format!(
@@ -424,6 +437,7 @@ fn frames(
                 group: None,
                 image: frame.image.clone(),
                 mask: frame.mask.clone(),
+                confidence: None,
             },
             stored,
         ));

@@ -183,6 +183,57 @@ impl Progress {
     }
 }
 
+/// Progress of work on frames, whose number is known: a bar on terminals, a line every ten seconds elsewhere.
+pub struct FrameProgress {
+    bar: Option<ProgressBar>,
+    quiet: bool,
+    done: u64,
+    frames: u64,
+    start: Instant,
+    last_line: Instant,
+}
+
+impl FrameProgress {
+    /// Draws on stderr unless `quiet`.
+    #[must_use]
+    pub fn new(quiet: bool, frames: usize) -> Self {
+        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
+            let bar = ProgressBar::with_draw_target(Some(frames as u64), ProgressDrawTarget::stderr());
+            let style = ProgressStyle::with_template("[{bar:30}] {pos}/{len} frames {wide_msg}");
+            bar.set_style(style.expect("the template is valid").progress_chars("=> "));
+            bar
+        });
+        Self { bar, quiet, done: 0, frames: frames as u64, start: Instant::now(), last_line: Instant::now() }
+    }
+
+    /// One more frame is done.
+    pub fn step(&mut self) {
+        self.done += 1;
+        let rate = self.done as f64 / self.start.elapsed().as_secs_f64().max(1e-9);
+        let left = self.frames.saturating_sub(self.done) as f64 / rate;
+        let text = format!("{rate:.1} frames/s  ETA {}", duration(left));
+        match &self.bar {
+            Some(bar) => {
+                bar.set_position(self.done);
+                bar.set_message(text);
+            }
+            None if !self.quiet && self.last_line.elapsed() >= LINE_EVERY => {
+                self.last_line = Instant::now();
+                eprintln!("{}/{} frames  {text}", self.done, self.frames);
+            }
+            None => {}
+        }
+    }
+}
+
+impl Drop for FrameProgress {
+    fn drop(&mut self) {
+        if let Some(bar) = &self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
 /// `2 h 05 min`, `3 min 20 s` or `12 s`.
 #[must_use]
 pub fn duration(seconds: f64) -> String {

@@ -7,9 +7,11 @@ mod folder;
 mod found;
 mod split;
 mod view_order;
+mod writer;
 mod zigzag;
 
 pub use found::{flat_name, found_masks};
 pub use split::{KeptInstance, RemovedInstance, SplitReport, split_tracker_masks};
 pub use view_order::{ViewOrder, ordered_views};
+pub use writer::MaskWriter;
 pub use zigzag::{INDEX_FILE, ZigzagEntry, ZigzagIndex, frame_of, position_of, write_zigzag, zigzag_order};

@@ -72,6 +72,7 @@ mod tests {
             group: None,
             image: "none.png".into(),
             mask: None,
+            confidence: None,
         };
         let positions: Vec<[f32; 3]> =
             (0..5_000).map(|k| [(k % 50) as f32 * 0.01, (k / 50) as f32 * 0.01, depth]).collect();

@@ -227,6 +227,7 @@ mod tests {
             group: None,
             image: "none.png".into(),
             mask: None,
+            confidence: None,
         };
         let label =
             |(id, label): (u16, &str)| InstanceLabel { id, label: label.into(), category: label.into() };

@@ -198,6 +198,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
                 group: None,
                 image,
                 mask,
+                confidence: None,
             });
         }
     }

@@ -1,4 +1,6 @@
-//! `cif masks`: sequences for video trackers, and their answers brought back.
+//! `cif masks`: masks out of a few painted ones; sequences for video trackers, and their answers brought back.
+
+mod propagate;
 
 use std::path::{Path, PathBuf};
 
@@ -8,9 +10,14 @@ use clap::{Args, Subcommand, ValueEnum};
 use super::{CaptureOptions, print_warnings};
 use crate::error::Error;
 
-/// Prepare masks with a video tracker
+/// Make masks: out of a few painted frames, or with a video tracker
 #[derive(Debug, Args)]
 #[command(after_help = "\
+Without a tracker, paint the objects of a few frames and let the others follow:
+
+  cif masks propagate captures/table --keyframes painted -o table-masks
+  cif train captures/table --masks table-masks -o table.cif
+
 A tracker follows objects through one video. A capture with many cameras becomes one video by running
 through the first camera forwards, through the next backwards, and so on: neighbouring images then
 differ a little in time or in place, never in both.
@@ -28,6 +35,7 @@ pub(super) struct Masks {
 
 #[derive(Debug, Subcommand)]
 enum Step {
+    Propagate(propagate::Propagate),
     /// Write the images of all cameras as one sequence
     Zigzag {
         /// Folder of the capture
@@ -67,6 +75,7 @@ enum Order {
 
 pub(super) fn run(command: &Masks) -> Result<(), Error> {
     match &command.step {
+        Step::Propagate(command) => propagate::run(command),
         Step::Zigzag { capture, output, order, capture_options } => {
             zigzag(capture, output, *order, capture_options)
         }

@@ -70,7 +70,7 @@ A short tour:
 
 A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
 instance masks (PNG, value = instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/.
-`cif masks` helps to make them with a video tracker.
+`cif masks` makes them out of a few painted frames, or with a video tracker.
 Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 `cif COMMAND --help` explains one command.";
 
@@ -210,21 +210,26 @@ enum LayoutName {
     Colmap,
 }
 
+impl From<LayoutName> for cif_dataset::Layout {
+    fn from(name: LayoutName) -> Self {
+        match name {
+            LayoutName::HyperNerf => Self::HyperNerf,
+            LayoutName::Neu3d => Self::Neu3d,
+            LayoutName::DNerf => Self::DNerf,
+            LayoutName::Nerfstudio => Self::Nerfstudio,
+            LayoutName::Colmap => Self::Colmap,
+        }
+    }
+}
+
 impl CaptureOptions {
     fn options(&self) -> cif_dataset::OpenOptions {
-        use cif_dataset::Layout;
         cif_dataset::OpenOptions {
             masks: self.masks.clone(),
             without_masks: self.no_masks,
             downscale: self.downscale,
             centre_principal_point: self.center_principal_point,
-            layout: self.layout.map(|layout| match layout {
-                LayoutName::HyperNerf => Layout::HyperNerf,
-                LayoutName::Neu3d => Layout::Neu3d,
-                LayoutName::DNerf => Layout::DNerf,
-                LayoutName::Nerfstudio => Layout::Nerfstudio,
-                LayoutName::Colmap => Layout::Colmap,
-            }),
+            layout: self.layout.map(Into::into),
         }
     }
 

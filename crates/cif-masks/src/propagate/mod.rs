@@ -1,0 +1,313 @@
+//! Masks of all frames of a camera from some of them.
+//!
+//! Between two keyframes, ids are brought from both along the optical flow, step by step; each step is weighed with what
+//! the pixels look like ([`step`]), and the two are blended by distance in time and by how reliable each way was
+//! ([`fuse`]). Before the first and after the last keyframe there is one way only.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`window`] | flows and looks of some frames in a row |
+//! | [`belief`] | probabilities of classes per pixel |
+//! | [`step`] | from one frame to the next |
+//! | [`fuse`] | ids and confidence from one belief or two |
+
+pub(crate) mod belief;
+mod fuse;
+mod step;
+mod window;
+
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+
+use cif_geometry::PixelGrid;
+
+use crate::Error;
+use crate::appearance::{Features, Forest, Samples};
+use crate::picture::Picture;
+use belief::{Belief, Stored};
+use step::Step;
+use window::Window;
+
+/// Longest side at which images are followed, pixels; larger ones are reduced, and their masks enlarged at the end.
+const LONGEST_SIDE: usize = 640;
+
+/// Bytes that flows and looks of a window may take.
+const WINDOW_BYTES: usize = 1 << 28;
+
+/// Most frames of a window.
+const WINDOW_FRAMES: usize = 32;
+
+/// Keyframes whose pixels tell what classes look like: those nearest in time.
+const NEAREST_KEYFRAMES: usize = 4;
+
+/// Confidence from which a pixel of a keyframe stands for its class.
+pub(crate) const SURE: f32 = 0.5;
+
+/// A frame whose ids are known.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Keyframe {
+    /// Ids, 0 = unlabelled; of the aspect of the images.
+    pub ids: PixelGrid<u16>,
+    /// Confidence of every pixel, 0 to 1, at the size of `ids`; `None` for painted ones, which are certain.
+    pub confidence: Option<PixelGrid<f32>>,
+}
+
+impl Keyframe {
+    /// A frame that was painted.
+    #[must_use]
+    pub fn painted(ids: PixelGrid<u16>) -> Self {
+        Self { ids, confidence: None }
+    }
+}
+
+/// Frames of one camera, in order of time.
+pub struct Clip<'a> {
+    /// Number of frames.
+    pub frames: usize,
+    /// Loads the image of a frame; all have one size.
+    pub image: &'a (dyn Fn(usize) -> Result<PixelGrid<[u8; 3]>, Error> + Sync),
+    /// Frames whose ids are known.
+    pub keyframes: &'a BTreeMap<usize, Keyframe>,
+    /// True to stop with [`Error::Stopped`]; asked several times a second.
+    pub stop: &'a (dyn Fn() -> bool + Sync),
+}
+
+/// The mask of a frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Mask {
+    /// Ids, 0 = unlabelled, at the size of the image.
+    pub ids: PixelGrid<u16>,
+    /// Probability that the id is right, in units of 1 / 255; 255 everywhere in painted keyframes.
+    pub confidence: PixelGrid<u8>,
+}
+
+/// Propagates the keyframes of a clip to all frames. `done` takes each mask with its frame, in no particular order.
+///
+/// The result does not depend on the number of threads.
+///
+/// # Errors
+/// When an image cannot be read, no keyframe shows an object, the caller asks to stop, or `done` fails.
+pub fn propagate(
+    clip: &Clip<'_>,
+    done: &mut dyn FnMut(usize, Mask) -> Result<(), Error>,
+) -> Result<(), Error> {
+    let classes = Classes::new(clip.keyframes.values().map(|keyframe| &keyframe.ids));
+    if classes.ids.len() < 2 {
+        return Err(Error::NoObject);
+    }
+    let image = (clip.image)(*clip.keyframes.keys().next().ok_or(Error::NoObject)?)?;
+    let run = Run::new(clip, classes, (image.width as usize, image.height as usize))?;
+    let keys: Vec<usize> = clip.keyframes.keys().copied().collect();
+    for key in &keys {
+        done(*key, run.keyframe_mask(*key))?;
+    }
+    let (first, last) = (keys[0], keys[keys.len() - 1]);
+    run.one_way(first, (0..first).rev(), done)?;
+    for pair in keys.windows(2) {
+        run.between(pair[0], pair[1], done)?;
+    }
+    run.one_way(last, last + 1..clip.frames, done)
+}
+
+/// Ids as consecutive classes.
+pub(crate) struct Classes {
+    /// Id of every class; the first is 0, unlabelled.
+    pub(crate) ids: Vec<u16>,
+}
+
+/// The size at which images of a size are followed.
+pub(crate) fn size_to_follow(width: usize, height: usize) -> (usize, usize) {
+    let reduction = (width.max(height) as f64 / LONGEST_SIDE as f64).max(1.0);
+    let reduced = |side: usize| ((side as f64 / reduction).round() as usize).max(1);
+    (reduced(width), reduced(height))
+}
+
+impl Classes {
+    pub(crate) fn new<'a>(masks: impl Iterator<Item = &'a PixelGrid<u16>>) -> Self {
+        let mut seen = std::collections::BTreeSet::from([0]);
+        for mask in masks {
+            // Runs of one id are long.
+            seen.extend(mask.pixels.chunk_by(|a, b| a == b).map(|run| run[0]));
+        }
+        Self { ids: seen.into_iter().collect() }
+    }
+
+    pub(crate) fn class_of(&self, id: u16) -> u16 {
+        self.ids.binary_search(&id).expect("classes hold every id of the keyframes") as u16
+    }
+}
+
+/// A clip being propagated.
+struct Run<'a> {
+    clip: &'a Clip<'a>,
+    classes: Classes,
+    /// Width and height of the images.
+    full: (usize, usize),
+    /// Width and height at which they are followed.
+    size: (usize, usize),
+    /// Pixels of every keyframe that stand for their classes.
+    samples: BTreeMap<usize, Samples>,
+}
+
+impl<'a> Run<'a> {
+    fn new(clip: &'a Clip<'a>, classes: Classes, full: (usize, usize)) -> Result<Self, Error> {
+        let size = size_to_follow(full.0, full.1);
+        let mut run = Self { clip, classes, full, size, samples: BTreeMap::new() };
+        for (frame, keyframe) in clip.keyframes {
+            run.go_on()?;
+            let features = Features::new(&Picture::new(&(clip.image)(*frame)?, size.0, size.1));
+            let (classes, reliability) = run.known(keyframe);
+            let samples = Samples::new(&features, run.classes.ids.len(), |pixel| {
+                (reliability[pixel] >= SURE).then_some(classes[pixel])
+            });
+            run.samples.insert(*frame, samples);
+        }
+        Ok(run)
+    }
+
+    fn go_on(&self) -> Result<(), Error> {
+        if (self.clip.stop)() { Err(Error::Stopped) } else { Ok(()) }
+    }
+
+    /// Class and reliability of every pixel of a keyframe, at the size at which frames are followed.
+    fn known(&self, keyframe: &Keyframe) -> (Vec<u16>, Vec<f32>) {
+        let (width, height) = self.size;
+        let ids = &keyframe.ids;
+        let source = |k: usize, target: usize, source: u32| (2 * k + 1) * source as usize / (2 * target);
+        let pixels = (0..width * height).map(|k| {
+            let (x, y) = (source(k % width, width, ids.width), source(k / width, height, ids.height));
+            let at = y * ids.width as usize + x;
+            let confidence = keyframe.confidence.as_ref().map_or(1.0, |grid| grid.pixels[at]);
+            (self.classes.class_of(ids.pixels[at]), confidence)
+        });
+        pixels.unzip()
+    }
+
+    fn start(&self, frame: usize) -> Belief {
+        let (classes, reliability) = self.known(&self.clip.keyframes[&frame]);
+        Belief::in_classes(self.classes.ids.len(), &classes, reliability)
+    }
+
+    /// A keyframe as it leaves: as it was given, at the size of the images.
+    fn keyframe_mask(&self, frame: usize) -> Mask {
+        let keyframe = &self.clip.keyframes[&frame];
+        let (width, height) = self.full;
+        let source = |k: usize, target: usize, source: u32| (2 * k + 1) * source as usize / (2 * target);
+        let at = |k: usize| {
+            let x = source(k % width, width, keyframe.ids.width);
+            source(k / width, height, keyframe.ids.height) * keyframe.ids.width as usize + x
+        };
+        let confidence = |k: usize| {
+            keyframe.confidence.as_ref().map_or(255, |grid| (grid.pixels[at(k)] * 255.0 + 0.5) as u8)
+        };
+        let pixels = 0..width * height;
+        let (width, height) = (width as u32, height as u32);
+        Mask {
+            ids: PixelGrid::from_pixels(
+                width,
+                height,
+                pixels.clone().map(|k| keyframe.ids.pixels[at(k)]).collect(),
+            ),
+            confidence: PixelGrid::from_pixels(width, height, pixels.map(confidence).collect()),
+        }
+    }
+
+    /// What classes look like around a time: the nearest keyframes, of two equally near ones the earlier.
+    fn forest(&self, frames: RangeInclusive<usize>) -> Forest {
+        let distance = |key: &usize| frames.start().abs_diff(*key) + frames.end().abs_diff(*key);
+        let mut keys: Vec<usize> = self.samples.keys().copied().collect();
+        keys.sort_by_key(distance);
+        let mut samples = Samples::default();
+        for key in keys.iter().take(NEAREST_KEYFRAMES) {
+            samples.extend(&self.samples[key]);
+        }
+        Forest::new(&samples, self.classes.ids.len())
+    }
+
+    /// Frames that a window takes with its flows and looks.
+    fn window_frames(&self) -> usize {
+        // Two flows of two numbers of four bytes, and a byte per class.
+        let frame = self.size.0 * self.size.1 * (16 + self.classes.ids.len());
+        (WINDOW_BYTES / frame.max(1)).clamp(2, WINDOW_FRAMES)
+    }
+
+    fn window(&self, frames: RangeInclusive<usize>, forest: &Forest) -> Result<Window, Error> {
+        self.go_on()?;
+        Window::new(self.clip, frames, self.size, forest)
+    }
+
+    fn step(&self, window: &Window, from: usize, to: usize, known: &Belief) -> Result<Belief, Error> {
+        self.go_on()?;
+        let (forth, back) = window.flows(from, to);
+        let (width, height) = self.size;
+        Ok(Step { width, height, back, forth, looks: window.looks(to) }.take(known))
+    }
+
+    /// From a keyframe through frames that have no keyframe beyond them.
+    fn one_way(
+        &self,
+        key: usize,
+        frames: impl Iterator<Item = usize>,
+        done: &mut dyn FnMut(usize, Mask) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        let frames: Vec<usize> = frames.collect();
+        if frames.is_empty() {
+            return Ok(());
+        }
+        let forest = self.forest(key..=key);
+        let mut belief = self.start(key);
+        let mut at = key;
+        for some in frames.chunks(self.window_frames() - 1) {
+            let end = some[some.len() - 1];
+            let window = self.window(at.min(end)..=at.max(end), &forest)?;
+            for next in some {
+                belief = self.step(&window, at, *next, &belief)?;
+                at = *next;
+                done(at, fuse::mask(&[(1.0, &belief)], &self.classes.ids, self.size, self.full))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Between two keyframes: forwards first, remembering what is believed; then backwards, blending both.
+    fn between(
+        &self,
+        first: usize,
+        last: usize,
+        done: &mut dyn FnMut(usize, Mask) -> Result<(), Error>,
+    ) -> Result<(), Error> {
+        if last - first < 2 {
+            return Ok(());
+        }
+        let forest = self.forest(first..=last);
+        let length = self.window_frames() - 1;
+        let starts: Vec<usize> = (first..last).step_by(length).collect();
+        let frames = |start: usize| start..=(start + length).min(last);
+        let mut forwards = BTreeMap::new();
+        let mut belief = self.start(first);
+        let mut window = None;
+        for start in &starts {
+            let these = window.insert(self.window(frames(*start), &forest)?);
+            for at in *start..*frames(*start).end() {
+                belief = self.step(these, at, at + 1, &belief)?;
+                forwards.insert(at + 1, Stored::new(&belief));
+            }
+        }
+        let mut belief = self.start(last);
+        for start in starts.iter().rev() {
+            // The last window is still there.
+            let these = match window.take() {
+                Some(window) => window,
+                None => self.window(frames(*start), &forest)?,
+            };
+            for at in (*start..*frames(*start).end()).rev().filter(|at| *at > first) {
+                belief = self.step(&these, at + 1, at, &belief)?;
+                let forward = forwards[&at].restored();
+                let share = (last - at) as f32 / (last - first) as f32;
+                let ways = [(share, &forward), (1.0 - share, &belief)];
+                done(at, fuse::mask(&ways, &self.classes.ids, self.size, self.full))?;
+            }
+        }
+        Ok(())
+    }
+}
