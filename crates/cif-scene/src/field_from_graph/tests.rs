@@ -140,6 +140,7 @@ fn with_parts(graph: &mut SceneGraph) {
         pivot,
         track,
         extent: Bounds::EMPTY,
+        joint: None,
     };
     let parts = vec![
         part("part_00", 0..half, DVec3::new(0.0, 0.1, 0.0), Vec::new()),

@@ -43,6 +43,7 @@ mod judged;
 mod measure;
 mod motions;
 mod objects;
+mod parts;
 mod pacing;
 mod plan_step;
 mod provenance;
@@ -83,7 +84,7 @@ use crate::exposure::Exposures;
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
 use crate::heads::{Cif, Head, HeadTensors};
-use crate::objects::Fitted;
+use crate::objects::{Fitted, Jointed};
 use crate::optimiser::Optimiser;
 use crate::poses::PoseMoments;
 use crate::progress::{Progress, Stages};
@@ -144,6 +145,8 @@ pub struct Trainer {
     last_loss: StepLoss,
     /// Objects that move as a whole, by label, until the fine stage gives them Gaussians.
     fits: BTreeMap<u16, Fitted>,
+    /// Objects with a part on a joint, likewise.
+    jointed: BTreeMap<u16, Jointed>,
     /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
 }
@@ -208,6 +211,7 @@ impl Trainer {
             saved_head: None,
             last_loss: StepLoss::default(),
             fits: BTreeMap::new(),
+            jointed: BTreeMap::new(),
             arrived: Vec::new(),
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
