@@ -268,11 +268,7 @@ impl Tracks {
         }
         for (index, (group, &members)) in self.groups.iter().zip(&members).enumerate() {
             let checked = validate_group(group, members).and_then(|()| validate_joint(group, index));
-            checked.map_err(|problem| FieldError::Track {
-                index,
-                name: group.name.clone(),
-                problem,
-            })?;
+            checked.map_err(|problem| FieldError::Track { index, name: group.name.clone(), problem })?;
         }
         Ok(())
     }

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 use glam::{DQuat, DVec3};
 
 use crate::gaussians::SH_FLOATS;
-use crate::tracks::{DenseTrack, Joint, RotationEvidence, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use crate::tracks::{
+    DenseTrack, Joint, RotationEvidence, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep,
+};
 use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Timeline};
 
 /// Newest version of the layout, which this crate writes where it is needed; it reads all up to it.

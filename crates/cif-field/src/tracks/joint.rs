@@ -42,13 +42,7 @@ impl std::fmt::Display for JointKind {
 impl Joint {
     /// Turn and place of a part around `pivot`, with its base at a pose (turn, and where `base_pivot` is).
     #[must_use]
-    pub fn pose(
-        &self,
-        value: f64,
-        pivot: DVec3,
-        base_pivot: DVec3,
-        base: (DQuat, DVec3),
-    ) -> (DQuat, DVec3) {
+    pub fn pose(&self, value: f64, pivot: DVec3, base_pivot: DVec3, base: (DQuat, DVec3)) -> (DQuat, DVec3) {
         let (turn, shift) = match self.kind {
             JointKind::Revolute => (DQuat::from_axis_angle(self.axis, value), DVec3::ZERO),
             JointKind::Prismatic => (DQuat::IDENTITY, value * self.axis),
@@ -58,13 +52,7 @@ impl Joint {
 
     /// The value whose pose is nearest to a given one: radians in (-pi, pi], or a length.
     #[must_use]
-    pub fn value(
-        &self,
-        pose: (DQuat, DVec3),
-        pivot: DVec3,
-        base_pivot: DVec3,
-        base: (DQuat, DVec3),
-    ) -> f64 {
+    pub fn value(&self, pose: (DQuat, DVec3), pivot: DVec3, base_pivot: DVec3, base: (DQuat, DVec3)) -> f64 {
         let back = base.0.conjugate();
         match self.kind {
             JointKind::Revolute => {
@@ -106,8 +94,7 @@ impl Tracks {
             let pivot = of.pivot;
             let mut last: Option<DQuat> = None;
             for (pose, value) in of.poses.iter_mut().zip(values) {
-                let (mut rotation, translation) =
-                    joint.pose(value, pivot, base.pivot, base.pose(pose.time));
+                let (mut rotation, translation) = joint.pose(value, pivot, base.pivot, base.pose(pose.time));
                 if last.is_some_and(|last| last.dot(rotation) < 0.0) {
                     rotation = -rotation;
                 }

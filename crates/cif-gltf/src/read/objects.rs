@@ -196,7 +196,9 @@ impl Reader<'_> {
             };
             pieces.push(Piece { joint, ..piece(name, splats, track, stretch * movement.stretch, pivot) });
         }
-        if pieces.len() != found.parts.len() || found.parts.iter().any(|placed| position(placed) >= pieces.len()) {
+        if pieces.len() != found.parts.len()
+            || found.parts.iter().any(|placed| position(placed) >= pieces.len())
+        {
             // Joints count parts that are not where they were.
             pieces.iter_mut().for_each(|piece| piece.joint = None);
         }

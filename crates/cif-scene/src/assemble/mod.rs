@@ -22,8 +22,8 @@ pub use track::{Placement, Track, one_hemisphere};
 use crate::graph::{Motion, VisibilitySample};
 use crate::report::MotionReport;
 use crate::{
-    CameraTrack, CaptureFrame, ConvexHull, Node, NodeKind, Origin, PartJoint, PointProxy, PoseSample, SceneGraph,
-    Splats, TimeCodes, UpAxis, naming,
+    CameraTrack, CaptureFrame, ConvexHull, Node, NodeKind, Origin, PartJoint, PointProxy, PoseSample,
+    SceneGraph, Splats, TimeCodes, UpAxis, naming,
 };
 
 /// Time codes per second of files that have none.

@@ -10,13 +10,17 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use cif_field::gaussians::{INITIAL_OCCUPANCY, SH_FLOATS, saturated_logit};
-use cif_field::tracks::{DenseTrack, Joint, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use cif_field::tracks::{
+    DenseTrack, Joint, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep,
+};
 use cif_field::{Field, Gaussians, Identities, Instance, Owner, Record, RecordedCamera, Timeline};
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
-use crate::graph::{AppearanceSample, DenseMotion, Motion, Node, NodeKind, PartsMotion, PoseSample, SceneGraph, pose_at};
+use crate::graph::{
+    AppearanceSample, DenseMotion, Motion, Node, NodeKind, PartsMotion, PoseSample, SceneGraph, pose_at,
+};
 use crate::motion::time_map::TimeMap;
 use crate::{CameraTrack, SceneError};
 

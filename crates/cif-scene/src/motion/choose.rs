@@ -149,8 +149,7 @@ fn fit_parts_where_needed(
 /// The fewest parts inside the tolerance, or else the best there are.
 fn fit_parts(group: &MovingGroup, own: &[Frame], options: &SceneOptions) -> Option<FittedParts> {
     if let Some(told) = &group.told {
-        let partition =
-            Partition { labels: told.labels.clone(), count: told.parts.len() + 1, decisive: 0.0 };
+        let partition = Partition { labels: told.labels.clone(), count: told.parts.len() + 1, decisive: 0.0 };
         return Some(fit_partition(group, own, &partition));
     }
     let partitions = parts::partitions(own, &group.weights, group.tolerance, group.trim, options.max_parts);

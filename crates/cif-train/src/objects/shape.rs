@@ -1,7 +1,7 @@
 //! The Gaussians of an object in its own frame, alone: rendered on crops, compared with colours and masks, moved.
 
-use cif_field::{Field, Gaussians, Record, SortMetric, Timeline, Tracks};
 use cif_field::tracks::TrackPose;
+use cif_field::{Field, Gaussians, Record, SortMetric, Timeline, Tracks};
 use cif_geometry::{PinholeCamera, PixelGrid, RigidTransform};
 use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
 use cif_render::{BlendRequest, Blending, GeometryPath, Gradients, PoseGradient, RenderSettings};

@@ -46,6 +46,14 @@ impl Hinge {
         Pose { rotation, translation: base.rotation * (place - turn * self.point) + base.translation }
     }
 
+    /// True where another joint is about the same: of one direction, and within a distance.
+    pub(super) fn is_like(&self, other: &Self, distance: f64) -> bool {
+        let apart = other.point - self.point;
+        let across = apart - self.axis * self.axis.dot(apart);
+        let is_near = self.kind == JointKind::Prismatic || across.length() < distance;
+        self.kind == other.kind && self.axis.dot(other.axis).abs() > 0.98 && is_near
+    }
+
     /// Length that a step of the values is measured by: an angle, or the size of the object.
     pub(super) fn unit(&self, size: f64) -> f64 {
         if self.kind == JointKind::Revolute { 1.0 } else { size }

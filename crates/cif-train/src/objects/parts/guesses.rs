@@ -81,6 +81,15 @@ impl Sides {
         Self { axes: best, low: ranges.map(|[low, _]| low), high: ranges.map(|[_, high]| high) }
     }
 
+    /// The box around places with its sides turned about its last axis.
+    pub(super) fn turned(&self, angle: f64, places: &[DVec3]) -> Self {
+        let [first, second, up] = self.axes;
+        let (sine, cosine) = angle.sin_cos();
+        let axes = [cosine * first + sine * second, cosine * second - sine * first, up];
+        let ranges = axes.map(|axis| range(places, axis));
+        Self { axes, low: ranges.map(|[low, _]| low), high: ranges.map(|[_, high]| high) }
+    }
+
     fn extent(&self, axis: usize) -> f64 {
         self.high[axis] - self.low[axis]
     }
@@ -145,7 +154,8 @@ pub(super) fn guesses(sides: &Sides, stands: Option<&Plane>) -> Vec<Guess> {
             all.push(Guess { hinge, cut: cut(share), values, is_round: true });
         }
         if sign > 0.0 {
-            for (share, axis) in CUTS.iter().flat_map(|share| others.iter().map(move |axis| (*share, *axis))) {
+            for (share, axis) in CUTS.iter().flat_map(|share| others.iter().map(move |axis| (*share, *axis)))
+            {
                 let mut at = sides.middle();
                 at[face] = sides.low[face] + share * extent;
                 let hinge = revolute(sides.axes[axis], sides.point(at));

@@ -13,15 +13,18 @@
 
 mod body;
 mod guesses;
-mod search;
 #[cfg(test)]
 mod probe;
+mod search;
+#[cfg(test)]
+mod tests;
 
 use std::collections::BTreeMap;
 
 use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
+use rand::RngExt;
 use rayon::prelude::*;
 
 pub(super) use self::body::Hinge;
@@ -33,6 +36,7 @@ use super::outline::meeting_point;
 use super::shape::{Pose, Shape};
 use super::start::Object;
 use super::trials::split;
+use super::view::Seen;
 use crate::error::TrainError;
 
 /// Reliable times below which parts cannot be told apart.
@@ -42,18 +46,33 @@ const FEWEST_TIMES: usize = 8;
 const ROUGH: (usize, usize) = (300, 300);
 
 /// Times, and views of each, that guesses are searched at.
-const LOOKS: (usize, usize) = (16, 3);
+const LOOKS: (usize, usize) = (12, 3);
+
+/// Places that the box is looked for among, of these the fewest that tell it, and the share of views that may have
+/// them beside the mask.
+const CANDIDATES: usize = 8000;
+const FEWEST_INSIDE: usize = 50;
+const BESIDE: f64 = 0.03;
+
+/// Distance, of the size, within which two axes of one direction are the same joint.
+const ALIKE: f64 = 0.25;
+
+/// Turns of the box about the direction away from the support, degrees.
+const TURNS: [f64; 3] = [0.0, 30.0, 60.0];
+
+/// Reach of an object that one camera sees, of the radius of its outline.
+const ACROSS: f64 = 1.1;
 
 /// Least and largest share of the Gaussians that a part may have.
 const PART: [f64; 2] = [0.03, 0.7];
 
 /// Guesses that are fitted, with Gaussians of base and part and steps between searches.
-const FITTED: usize = 10;
-const FIT: ([usize; 2], usize) = ([300, 200], 300);
+const FITTED: usize = 12;
+const FIT: ([usize; 2], usize) = ([200, 150], 250);
 
 /// Of these, those that are fitted finely.
 const FINE: usize = 3;
-const FINELY: ([usize; 2], usize) = ([600, 300], 700);
+const FINELY: ([usize; 2], usize) = ([500, 250], 500);
 
 /// Opacity, as a logit, that the base starts with where the part is.
 const FAINT: f32 = -2.0;
@@ -90,6 +109,8 @@ struct Search<'a> {
     size: f64,
     /// Direction away from the support, in the frame of the object, where there is one.
     up: Option<DVec3>,
+    /// True with one camera per time.
+    one_camera: bool,
 }
 
 /// Looks for a part on a joint of an object that rests otherwise.
@@ -119,7 +140,15 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let (train, left_out) = split(views, &reliable, &times);
     let rotation = base.values().next().map_or(DQuat::IDENTITY, |pose| pose.rotation);
     let up = object.surroundings.plane.map(|plane| rotation.inverse() * plane.normal);
-    let search = Search { object, base, train, left_out, size: object.outline.size(), up };
+    let search = Search {
+        object,
+        base,
+        train,
+        left_out,
+        size: object.outline.size(),
+        up,
+        one_camera: reliable.len() == times.len(),
+    };
     let Some(rough) = search.rigid(ROUGH.0, ROUGH.1, search.level()) else { return Ok(None) };
     stop.check()?;
     let tried = search.tried(&rough);
@@ -161,7 +190,10 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         *loss = body.mean_loss(judged, 0);
         if std::env::var_os("CIF_PARTS").is_some() {
             let values: Vec<String> = body.values.values().step_by(5).map(|v| format!("{v:.2}")).collect();
-            eprintln!("   label {} fine {loss:.4} ({train:.4}) still {still:.4} {:?} {values:?}", object.label, body.hinge);
+            eprintln!(
+                "   label {} fine {loss:.4} ({train:.4}) still {still:.4} {:?} {values:?}",
+                object.label, body.hinge
+            );
         }
     }
     fine.sort_by(|a, b| a.2.total_cmp(&b.2));
@@ -187,6 +219,11 @@ impl<'a> Search<'a> {
     ) -> Option<Shape> {
         let near = self.object.surroundings.near;
         let reach = 1.3 * self.size;
+        // A part leaves the room of the base.
+        let bounded = bound.is_none();
+        let inside =
+            |place: DVec3| (!bounded || self.is_within(place)) && bound.is_none_or(|bound| bound(place));
+        let bound: Option<&dyn Fn(DVec3) -> bool> = Some(&inside);
         let mut shape = hull(self.object.views, poses, (reach, bound), count, near, &mut self.object.rng())?;
         shape.fade(0.0, |_| true);
         Some(shape)
@@ -229,9 +266,11 @@ impl<'a> Search<'a> {
     fn tried(&self, rough: &Body<'a>) -> Vec<(Guess, BTreeMap<usize, f64>, f64)> {
         let means = &rough.shape.gaussians().means;
         let places: Vec<DVec3> = means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))).collect();
+        let carved = self.carved();
+        let inside = if carved.len() < FEWEST_INSIDE { &places } else { &carved };
         let plane = self.object.surroundings.plane;
         let up = self.up.unwrap_or(DVec3::Z);
-        let sides = Sides::around(&places, up);
+        let sides = Sides::around(inside, up);
         let (times, level) = (self.times(LOOKS.0), self.level());
         let try_one = |guess: Guess| {
             let members: Vec<bool> = places.iter().map(|place| guess.has(*place, 0.0)).collect();
@@ -243,9 +282,59 @@ impl<'a> Search<'a> {
             let (values, loss) = search(&body, &times, (&guess.values, guess.is_round), level);
             Some((guess, values, loss))
         };
-        let mut tried: Vec<_> = guesses(&sides, plane).into_par_iter().filter_map(try_one).collect();
+        // The hull of few directions hardly tells how the box is turned.
+        let boxes = TURNS.map(|degrees| sides.turned(degrees.to_radians(), inside));
+        let all: Vec<Guess> = boxes.iter().flat_map(|sides| guesses(sides, plane)).collect();
+        let mut tried: Vec<_> = all.into_par_iter().filter_map(try_one).collect();
         tried.sort_by(|a, b| a.2.total_cmp(&b.2));
-        tried
+        // Of joints about one axis the best.
+        let mut distinct: Vec<(Guess, BTreeMap<usize, f64>, f64)> = Vec::new();
+        for (guess, values, loss) in tried {
+            if !distinct.iter().any(|(other, ..)| guess.hinge.is_like(&other.hinge, ALIKE * self.size)) {
+                distinct.push((guess, values, loss));
+            }
+        }
+        distinct
+    }
+
+    /// Places that all views which show the object well have inside its mask, above what it stands on.
+    fn carved(&self) -> Vec<DVec3> {
+        let mut rng = self.object.rng();
+        let reach = 1.6 * self.size;
+        let mut inside = Vec::new();
+        for _ in 0..CANDIDATES {
+            let place = reach * DVec3::from(std::array::from_fn(|_| 2.0 * rng.random::<f64>() - 1.0));
+            if !self.is_within(place) {
+                continue;
+            }
+            let (mut own, mut beside) = (0_u32, 0_u32);
+            for view in &self.train {
+                let view = &self.object.views[*view];
+                let Some(pose) = self.base.get(&view.time_index) else { continue };
+                match view.at(pose.rotation * place + pose.translation) {
+                    Seen::Object(_) => own += 1,
+                    Seen::Nothing => beside += 1,
+                    Seen::Other | Seen::Outside => {}
+                }
+                if f64::from(beside) > BESIDE * self.train.len() as f64 {
+                    break;
+                }
+            }
+            if own > 0 && f64::from(beside) <= BESIDE * f64::from(own + beside) {
+                inside.push(place);
+            }
+        }
+        inside
+    }
+
+    /// True for places that what the object stands on leaves room for and that, where one camera sees it at a time and
+    /// does not tell how deep it is, are not farther away from its middle than it is wide.
+    fn is_within(&self, place: DVec3) -> bool {
+        let Some((plane, up)) = self.object.surroundings.plane.zip(self.up) else { return true };
+        let Some(pose) = self.base.values().next() else { return true };
+        let across = (place - up * up.dot(place)).length();
+        let is_near = !self.one_camera || across < ACROSS * self.object.outline.radius;
+        is_near && plane.height(pose.rotation * place + pose.translation) > -0.05 * self.size
     }
 
     /// A guess with Gaussians of its own, moved with the joint, and its loss on the views it is fitted to.
@@ -265,8 +354,9 @@ impl<'a> Search<'a> {
         let inside = |place: DVec3| guess.has(place, margin);
         let mut part = self.hull(&posed, Some(&inside), of_part)?;
         part.fade(FAINT, |place| !guess.has(place, 0.0));
-        let members: Vec<bool> =
-            (0..base.gaussians().len() + part.gaussians().len()).map(|row| row >= base.gaussians().len()).collect();
+        let members: Vec<bool> = (0..base.gaussians().len() + part.gaussians().len())
+            .map(|row| row >= base.gaussians().len())
+            .collect();
         let all = self.times(usize::MAX);
         let values = all.keys().map(|time| (*time, between(&values, *time))).collect();
         let mut body = self.body(base.joined(&part), Some((hinge, members, values)));
@@ -283,8 +373,9 @@ impl<'a> Search<'a> {
         let mut shape = body.shape.copied();
         for (time, value) in found {
             let views = &all[&time];
-            let mut loss =
-                |value: f64| views.iter().map(|view| body.loss_with(&mut shape, *view, level, value)).sum::<f64>();
+            let mut loss = |value: f64| {
+                views.iter().map(|view| body.loss_with(&mut shape, *view, level, value)).sum::<f64>()
+            };
             if loss(value) < loss(body.value_at(time)) {
                 body.values.insert(time, value);
             }
@@ -321,9 +412,11 @@ impl<'a> Search<'a> {
             *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
         }
         // It opens towards positive values.
-        let most = body.values.values().map(|value| value - start).fold(0.0, |most: f64, value| {
-            if value.abs() > most.abs() { value } else { most }
-        });
+        let most = body
+            .values
+            .values()
+            .map(|value| value - start)
+            .fold(0.0, |most: f64, value| if value.abs() > most.abs() { value } else { most });
         let sign = if most < 0.0 { -1.0 } else { 1.0 };
         let values = self.base.keys().map(|time| (*time, sign * (body.value_at(*time) - start))).collect();
         let hinge = Hinge { axis: sign * hinge.axis, ..hinge };
