@@ -45,8 +45,8 @@ const FEWEST_TIMES: usize = 8;
 /// Gaussians and steps of the static body that guesses are cut from.
 const ROUGH: (usize, usize) = (300, 300);
 
-/// Times, and views of each, that guesses are searched at.
-const LOOKS: (usize, usize) = (12, 3);
+/// Times that guesses are searched at, one view each.
+const LOOKS: usize = 12;
 
 /// Places that the box is looked for among, of these the fewest that tell it, and the share of views that may have
 /// them beside the mask.
@@ -57,8 +57,8 @@ const BESIDE: f64 = 0.03;
 /// Distance, of the size, within which two axes of one direction are the same joint.
 const ALIKE: f64 = 0.25;
 
-/// Turns of the box about the direction away from the support, degrees.
-const TURNS: [f64; 3] = [0.0, 30.0, 60.0];
+/// Further turns of the box about the direction away from the support, degrees.
+const TURNS: [f64; 2] = [30.0, 60.0];
 
 /// Reach of an object that one camera sees, of the radius of its outline.
 const ACROSS: f64 = 1.1;
@@ -73,6 +73,9 @@ const FIT: ([usize; 2], usize) = ([200, 150], 250);
 /// Of these, those that are fitted finely.
 const FINE: usize = 3;
 const FINELY: ([usize; 2], usize) = ([500, 250], 500);
+
+/// Error of a slide, of that of the best joint, up to which it is preferred.
+const SIMPLE: f64 = 1.12;
 
 /// Opacity, as a logit, that the base starts with where the part is.
 const FAINT: f32 = -2.0;
@@ -152,11 +155,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let Some(rough) = search.rigid(ROUGH.0, ROUGH.1, search.level()) else { return Ok(None) };
     stop.check()?;
     let tried = search.tried(&rough);
-    let still = search::search(&rough, &search.times(LOOKS.0), (&[0.0], false), search.level()).1;
-    if std::env::var_os("CIF_PARTS").is_some() {
-        eprintln!("label {} still {still:.4} best {:?}", object.label, tried.first().map(|t| t.2 / still));
-    }
-    if tried.first().is_none_or(|(_, _, loss)| *loss > PROMISE * still) {
+    if tried.is_empty() {
         return Ok(None);
     }
     stop.check()?;
@@ -166,7 +165,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         .filter_map(|(guess, values, _)| search.fitted(guess, values, FIT, search.level()))
         .collect();
     fitted.sort_by(|a, b| a.2.total_cmp(&b.2));
-    fitted.truncate(FINE);
+    keep_kinds(&mut fitted);
     stop.check()?;
     let (rigid, mut fine) = rayon::join(
         || {
@@ -186,22 +185,30 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let judged = if search.left_out.is_empty() { &search.train } else { &search.left_out };
     let still = rigid.mean_loss(judged, 0);
     for (_, body, loss) in &mut fine {
-        let train = *loss;
         *loss = body.mean_loss(judged, 0);
-        if std::env::var_os("CIF_PARTS").is_some() {
-            let values: Vec<String> = body.values.values().step_by(5).map(|v| format!("{v:.2}")).collect();
-            eprintln!(
-                "   label {} fine {loss:.4} ({train:.4}) still {still:.4} {:?} {values:?}",
-                object.label, body.hinge
-            );
-        }
     }
     fine.sort_by(|a, b| a.2.total_cmp(&b.2));
-    let Some((_, body, error)) = fine.into_iter().next() else { return Ok(None) };
+    let Some(best) = fine.first().map(|(.., error)| *error) else { return Ok(None) };
+    // A hinge far away does what a slide does.
+    let is_simple = |(_, body, error): &(Guess, Body<'_>, f64)| {
+        *error <= SIMPLE * best && body.hinge.is_some_and(|hinge| hinge.kind == JointKind::Prismatic)
+    };
+    let taken = fine.iter().position(is_simple).unwrap_or(0);
+    let (_, body, error) = fine.swap_remove(taken);
     if error > GAIN * still {
         return Ok(None);
     }
     Ok(search.finished(body, [error, still]))
+}
+
+/// Keeps the best of the fits, which are in their order, and the best of each kind of joint among them.
+fn keep_kinds(fitted: &mut Vec<(Guess, Body<'_>, f64)>) {
+    let kind = |(guess, ..): &(Guess, Body<'_>, f64)| guess.hinge.kind;
+    let slide = fitted.iter().position(|fit| kind(fit) == JointKind::Prismatic);
+    if let Some(place) = slide.filter(|place| *place >= FINE) {
+        fitted.swap(FINE - 1, place);
+    }
+    fitted.truncate(FINE);
 }
 
 impl<'a> Search<'a> {
@@ -240,7 +247,7 @@ impl<'a> Search<'a> {
         Some(body)
     }
 
-    /// Views of each time that guesses are searched at.
+    /// Views of some times, one each, or of all times.
     fn times(&self, count: usize) -> BTreeMap<usize, Vec<usize>> {
         let mut of: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         for view in &self.train {
@@ -255,14 +262,13 @@ impl<'a> Search<'a> {
             .filter(|(k, _)| kept.contains(k))
             .map(|(_, of_time)| of_time)
             .collect();
-        for views in times.values_mut() {
-            let step = views.len().div_ceil(LOOKS.1);
-            *views = views.iter().copied().step_by(step).collect();
+        for (k, views) in times.values_mut().enumerate().filter(|_| count < all) {
+            *views = vec![views[k % views.len()]];
         }
         times
     }
 
-    /// Guesses with their values, best first.
+    /// Guesses with their values, best first; none where none promises anything.
     fn tried(&self, rough: &Body<'a>) -> Vec<(Guess, BTreeMap<usize, f64>, f64)> {
         let means = &rough.shape.gaussians().means;
         let places: Vec<DVec3> = means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))).collect();
@@ -271,7 +277,7 @@ impl<'a> Search<'a> {
         let plane = self.object.surroundings.plane;
         let up = self.up.unwrap_or(DVec3::Z);
         let sides = Sides::around(inside, up);
-        let (times, level) = (self.times(LOOKS.0), self.level());
+        let (times, level) = (self.times(LOOKS), self.level());
         let try_one = |guess: Guess| {
             let members: Vec<bool> = places.iter().map(|place| guess.has(*place, 0.0)).collect();
             let share = members.iter().filter(|member| **member).count() as f64 / members.len() as f64;
@@ -282,10 +288,20 @@ impl<'a> Search<'a> {
             let (values, loss) = search(&body, &times, (&guess.values, guess.is_round), level);
             Some((guess, values, loss))
         };
-        // The hull of few directions hardly tells how the box is turned.
-        let boxes = TURNS.map(|degrees| sides.turned(degrees.to_radians(), inside));
-        let all: Vec<Guess> = boxes.iter().flat_map(|sides| guesses(sides, plane)).collect();
-        let mut tried: Vec<_> = all.into_par_iter().filter_map(try_one).collect();
+        let try_all =
+            |sides: &Sides| -> Vec<_> { guesses(sides, plane).into_par_iter().filter_map(try_one).collect() };
+        let mut tried = try_all(&sides);
+        let (_, still) = search(rough, &times, (&[0.0], false), level);
+        let best = tried.iter().map(|(.., loss)| *loss).fold(f64::INFINITY, f64::min);
+        if best > PROMISE * still {
+            return Vec::new();
+        }
+        if self.one_camera {
+            // The hull of few directions hardly tells how the box is turned.
+            for degrees in TURNS {
+                tried.extend(try_all(&sides.turned(degrees.to_radians(), inside)));
+            }
+        }
         tried.sort_by(|a, b| a.2.total_cmp(&b.2));
         // Of joints about one axis the best.
         let mut distinct: Vec<(Guess, BTreeMap<usize, f64>, f64)> = Vec::new();
