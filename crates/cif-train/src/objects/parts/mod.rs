@@ -13,8 +13,6 @@
 
 mod body;
 mod guesses;
-#[cfg(test)]
-mod probe;
 mod search;
 #[cfg(test)]
 mod tests;
