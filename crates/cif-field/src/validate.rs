@@ -329,8 +329,7 @@ fn validate_joint(group: &TrackGroup, index: usize) -> Result<(), String> {
     if joint.base as usize >= index {
         return Err(format!("has a joint on group {}, but only an earlier one can be its base", joint.base));
     }
-    // Written so that a NaN fails too.
-    if !joint.axis.is_finite() || !((joint.axis.length() - 1.0).abs() <= MAX_NORM_ERROR) {
+    if !joint.axis.is_finite() || (joint.axis.length() - 1.0).abs() > MAX_NORM_ERROR {
         return Err("has a joint whose axis is not unit".to_owned());
     }
     Ok(())
