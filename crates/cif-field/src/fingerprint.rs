@@ -43,6 +43,10 @@ impl Field {
                 for step in &group.visibility {
                     hash.array(&[step.time, f64::from(u8::from(step.visible))]);
                 }
+                if let Some(joint) = &group.joint {
+                    hash.array(&[joint.base, joint.kind as u32]);
+                    hash.array(&joint.axis.to_array());
+                }
                 if let Some(dense) = &group.dense {
                     hash.array(&dense.times);
                     hash.array(&dense.means);

@@ -85,5 +85,5 @@ pub use parameters::Parameter;
 pub use query::{FieldAtTime, QueryResult};
 pub use record::{Drawing, Record, RecordError, Run};
 pub use timeline::{RecordedCamera, Timeline};
-pub use tracks::{RotationEvidence, TrackGroup, Tracks};
+pub use tracks::{Joint, JointKind, RotationEvidence, TrackGroup, Tracks};
 pub use validate::FieldError;

@@ -249,7 +249,7 @@ const MAX_NORM_ERROR: f64 = 1e-6;
 
 impl Tracks {
     /// Checks the groups against `gaussians` rows: every group is there, samples ascend in time, poses are
-    /// finite and unit, dense samples hold all members.
+    /// finite and unit, joints have unit axes and earlier groups as bases, dense samples hold all members.
     ///
     /// # Errors
     /// The first broken rule.
@@ -267,11 +267,8 @@ impl Tracks {
             *count += 1;
         }
         for (index, (group, &members)) in self.groups.iter().zip(&members).enumerate() {
-            validate_group(group, members).map_err(|problem| FieldError::Track {
-                index,
-                name: group.name.clone(),
-                problem,
-            })?;
+            let checked = validate_group(group, members).and_then(|()| validate_joint(group, index));
+            checked.map_err(|problem| FieldError::Track { index, name: group.name.clone(), problem })?;
         }
         Ok(())
     }
@@ -325,6 +322,17 @@ fn validate_group(group: &TrackGroup, members: usize) -> Result<(), String> {
     finite("its quaternions", dense.quaternions.as_flattened(), 4).map_err(not_finite)?;
     finite("its log-scales", dense.log_scales.as_deref().unwrap_or_default().as_flattened(), 3)
         .map_err(not_finite)
+}
+
+fn validate_joint(group: &TrackGroup, index: usize) -> Result<(), String> {
+    let Some(joint) = &group.joint else { return Ok(()) };
+    if joint.base as usize >= index {
+        return Err(format!("has a joint on group {}, but only an earlier one can be its base", joint.base));
+    }
+    if !joint.axis.is_finite() || (joint.axis.length() - 1.0).abs() > MAX_NORM_ERROR {
+        return Err("has a joint whose axis is not unit".to_owned());
+    }
+    Ok(())
 }
 
 fn validate_appearance(group: &TrackGroup, members: usize) -> Result<(), String> {

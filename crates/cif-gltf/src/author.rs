@@ -136,6 +136,8 @@ impl<'a> Author<'a> {
                                 name: part.name.clone(),
                                 part: position,
                                 pivot: part.pivot.to_array(),
+                                joint: part.joint,
+                                range: motion.joint_range(position),
                             }),
                         }),
                         ..document::Node::default()

@@ -4,7 +4,7 @@
 //! ones they are. Whatever glTF itself holds (transforms, keys, splats) is read from there, so that edits count.
 
 use cif_field::SortMetric;
-use cif_scene::{CaptureFrame, MotionReport, SceneOptions, UpAxis};
+use cif_scene::{CaptureFrame, MotionReport, PartJoint, SceneOptions, UpAxis};
 use serde::{Deserialize, Serialize};
 
 /// Version of what stands here.
@@ -87,6 +87,12 @@ pub(crate) struct Part {
     /// Position among the parts.
     pub(crate) part: usize,
     pub(crate) pivot: [f64; 3],
+    /// Joint to another part.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) joint: Option<PartJoint>,
+    /// Range of its values from the first pose on: radians, or world units.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) range: Option<[f64; 2]>,
 }
 
 /// A recorded camera.

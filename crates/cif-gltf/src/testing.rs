@@ -163,6 +163,7 @@ fn motion(numbers: &mut Numbers, index: usize, splats: &Splats, codes: &[f64]) -
                 pivot: numbers.vector(),
                 track: if moves { numbers.track(codes) } else { Vec::new() },
                 extent: Bounds::EMPTY,
+                joint: None,
             };
             let parts = vec![part("part_00", 0..half, true), part("part_01", half..splats.len(), false)];
             let track = if codes.len() > 1 { numbers.track(codes) } else { Vec::new() };

@@ -6,6 +6,7 @@ use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
+use crate::joint::PartJoint;
 use crate::motion::choose::{DENSE_BYTES, POSE_BYTES};
 use crate::motion::placement;
 use crate::report::MotionReport;
@@ -256,6 +257,8 @@ pub struct Part {
     pub track: Vec<PoseSample>,
     /// Box of the 3-sigma ellipsoids, part frame.
     pub extent: Bounds,
+    /// Ties it to another part; `None` where its poses are free.
+    pub joint: Option<PartJoint>,
 }
 
 /// A closed convex mesh.

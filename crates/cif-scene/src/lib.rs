@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`options`] | what an export may vary |
 //! | [`graph`] | what a scene is made of: nodes, motion, splats, cameras, timeline |
+//! | [`joint`] | joints between the parts of a node |
 //! | [`world`] | where a graph lies in the world of its capture |
 //! | [`naming`] | names that every format accepts |
 //! | [`build::assignment`] | which node a Gaussian belongs to |
@@ -47,6 +48,7 @@ pub mod field_from_graph;
 pub mod files;
 pub mod format;
 pub mod graph;
+pub mod joint;
 pub mod motion;
 pub mod motion_scores;
 pub mod naming;
@@ -74,6 +76,7 @@ pub use graph::{
     IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion,
     PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
+pub use joint::PartJoint;
 pub use motion::placement::PlacedSplats;
 pub use motion::velocity::Velocity;
 pub use motion_scores::{InstanceMotion, MotionErrors, MotionScores, motion_scores};

@@ -123,6 +123,11 @@ impl<'l, 'p, 'py> Prim<'l, 'p, 'py> {
         self.layer.over(&format!("{}{{{set}={variant}}}", self.path))
     }
 
+    /// Another handle to it.
+    pub(crate) fn same(&self) -> Self {
+        Self { layer: self.layer, spec: self.spec.clone(), path: self.path.clone() }
+    }
+
     /// A child that only adds opinions.
     pub(crate) fn child(&self, name: &str) -> PyResult<Prim<'l, 'p, 'py>> {
         self.layer.over(&child(&self.path, name))

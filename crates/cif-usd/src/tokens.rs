@@ -50,6 +50,12 @@ pub const SPLATS: &str = "Splats";
 pub const PROXY: &str = "Proxy";
 /// The points below their proxy.
 pub const PROXY_POINTS: &str = "Prototypes/Points";
+/// Beginning of the name of the joint of a part.
+pub const JOINT: &str = "Joint";
+/// A part that turns about an axis of another.
+pub const REVOLUTE_JOINT: &str = "PhysicsRevoluteJoint";
+/// A part that slides along an axis of another.
+pub const PRISMATIC_JOINT: &str = "PhysicsPrismaticJoint";
 /// Convex hull of a node or part; further ones are numbered.
 pub const COLLIDER: &str = "Collider";
 /// Ending of the folder of payloads: `out.usda` has `out.payloads`, `out.usdc` has `out.usdc.payloads`.

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 use glam::{DQuat, DVec3};
 
 use crate::gaussians::SH_FLOATS;
-use crate::tracks::{DenseTrack, RotationEvidence, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use crate::tracks::{
+    DenseTrack, Joint, RotationEvidence, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep,
+};
 use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Timeline};
 
 /// Newest version of the layout, which this crate writes where it is needed; it reads all up to it.
@@ -14,8 +16,12 @@ use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Time
 /// 1 is the first; 2 adds recorded motion ([`crate::Tracks`]); 3 adds Gaussians that stand still
 /// ([`crate::Deformation::still`]); 4 adds recorded opacities and colours ([`crate::TrackGroup::opacities`]), and
 /// identity rows without entries or with an owner ([`crate::Owner`]); 5 adds evidence for rotations
-/// ([`crate::TrackGroup::rotation`]). A field without these is written as 1 to 4, so that older software reads it.
-pub const FORMAT: u32 = 5;
+/// ([`crate::TrackGroup::rotation`]); 6 adds joints ([`crate::TrackGroup::joint`]). A field without these is written as
+/// 1 to 5, so that older software reads it.
+pub const FORMAT: u32 = 6;
+
+/// The layout before joints.
+const FORMAT_WITH_EVIDENCE: u32 = 5;
 
 /// The layout before evidence for rotations.
 const FORMAT_WITH_APPEARANCE: u32 = 4;
@@ -31,8 +37,10 @@ const FORMAT_WITHOUT_TRACKS: u32 = 1;
 
 /// Oldest layout that holds a field.
 pub(super) fn format_of(field: &Field) -> u32 {
-    if has_evidence(field) {
+    if groups(field).any(|group| group.joint.is_some()) {
         FORMAT
+    } else if has_evidence(field) {
+        FORMAT_WITH_EVIDENCE
     } else if has_appearance(field) || has_owners(field) {
         FORMAT_WITH_APPEARANCE
     } else if stands_still(field) {
@@ -147,6 +155,8 @@ pub(super) struct TrackGroupJson {
     pub(super) poses: usize,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     rotation: Option<RotationEvidence>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    joint: Option<Joint>,
     /// Pairs of time and whether visible.
     visibility: Vec<(f64, bool)>,
     pub(super) dense: Option<DenseJson>,
@@ -204,6 +214,7 @@ impl TrackGroupJson {
             pivot: group.pivot.to_array(),
             poses: group.poses.len(),
             rotation: group.rotation,
+            joint: group.joint,
             visibility: group.visibility.iter().map(|step| (step.time, step.visible)).collect(),
             dense: group.dense.as_ref().map(|dense| DenseJson {
                 times: dense.times.clone(),
@@ -228,6 +239,7 @@ impl TrackGroupJson {
             pivot: DVec3::from_array(self.pivot),
             poses: arrays.poses.into_iter().map(pose).collect(),
             rotation: self.rotation,
+            joint: self.joint,
             visibility: self
                 .visibility
                 .into_iter()

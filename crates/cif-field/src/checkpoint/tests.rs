@@ -2,6 +2,7 @@ use std::fs;
 use std::io::Cursor;
 use std::path::PathBuf;
 
+use glam::DVec3;
 use proptest::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
@@ -9,7 +10,7 @@ use serde_json::json;
 
 use super::write::MAX_JSON_DEPTH;
 use super::*;
-use crate::{FieldError, Identities, Owner, Record, RotationEvidence, testing};
+use crate::{FieldError, Identities, Joint, JointKind, Owner, Record, RotationEvidence, testing};
 
 /// Words of the message that a change must cause.
 type Change<T> = (&'static str, fn(&mut T));
@@ -309,6 +310,35 @@ fn recorded_motion_survives_and_raises_the_format() {
         training: None,
     };
     assert_eq!(read_bytes(&bytes_of(&empty)).unwrap(), empty);
+}
+
+#[test]
+fn joints_survive_raise_the_format_and_are_checked() {
+    let joint = Joint { base: 0, kind: JointKind::Revolute, axis: DVec3::new(0.6, 0.0, 0.8) };
+    let mut jointed = Checkpoint { field: testing::tracked_field(20, 4), training: None };
+    jointed.field.tracks.as_mut().unwrap().groups[2].joint = Some(joint);
+    let bytes = bytes_of(&jointed);
+    let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
+    assert_eq!(header.metadata().clone().unwrap()["cif.format"], "6");
+    assert_eq!(read_bytes(&bytes).unwrap(), jointed);
+    for (wrong, told) in [
+        (Joint { base: 2, ..joint }, "only an earlier one"),
+        (Joint { axis: DVec3::new(0.6, 0.0, 0.9), ..joint }, "axis is not unit"),
+        (Joint { axis: DVec3::NAN, ..joint }, "axis is not unit"),
+    ] {
+        let mut field = jointed.field.clone();
+        field.tracks.as_mut().unwrap().groups[2].joint = Some(wrong);
+        let error = field.validate().unwrap_err().to_string();
+        assert!(error.contains(told), "{error}");
+    }
+    // A base without Gaussians goes, and its joints with it; others are renumbered.
+    let tracks = jointed.field.tracks.clone().unwrap();
+    let kept = |rows: &[u32]| tracks.gather(rows).compact().unwrap().groups;
+    assert_eq!(kept(&[0, 2])[1].joint, Some(joint));
+    assert_eq!(kept(&[1, 2])[1].joint, None);
+    let mut other = tracks.clone();
+    other.groups[2].joint = Some(Joint { base: 1, ..joint });
+    assert_eq!(other.gather(&[1, 2]).compact().unwrap().groups[1].joint, Some(joint));
 }
 
 #[test]

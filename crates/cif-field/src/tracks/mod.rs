@@ -15,6 +15,7 @@
 //! the samples the nearest one holds. Times are normalised as in [`crate::Timeline`].
 
 mod apply;
+mod joint;
 
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
@@ -22,6 +23,7 @@ use serde::{Deserialize, Serialize};
 use crate::gaussians::SH_FLOATS;
 
 pub use apply::{DenseAtTime, GroupAtTime, HIDDEN_LOGIT, SamplesAtTime, TracksAtTime};
+pub use joint::{Joint, JointKind};
 
 /// Entry of [`Tracks::group_of`] for a Gaussian without a group.
 pub const NO_GROUP: u32 = u32::MAX;
@@ -49,6 +51,8 @@ pub struct TrackGroup {
     pub poses: Vec<TrackPose>,
     /// Evidence for the rotations of the poses; `None` where nobody told, as of motion that is not from images.
     pub rotation: Option<RotationEvidence>,
+    /// Ties the poses to those of another part of the same object; `None` where they are free.
+    pub joint: Option<Joint>,
     /// Changes of visibility by strictly ascending time; the first holds before its time too. Empty where the
     /// group is always visible.
     pub visibility: Vec<VisibilityStep>,
@@ -178,6 +182,7 @@ impl TrackGroup {
             pivot,
             poses: Vec::new(),
             rotation: None,
+            joint: None,
             visibility: Vec::new(),
             dense: None,
             opacities: None,
@@ -193,6 +198,7 @@ impl TrackGroup {
             pivot: self.pivot,
             poses: self.poses.clone(),
             rotation: self.rotation,
+            joint: self.joint,
             visibility: self.visibility.clone(),
             dense: self.dense.as_ref().map(|dense| dense.gather(members)),
             opacities: self.opacities.as_ref().map(|opacities| opacities.gather(members)),
@@ -317,7 +323,7 @@ impl Tracks {
         Self { group_of, groups }
     }
 
-    /// Gives rows a motion of their own: `change` makes the new group from the old one (a still one called
+    /// Gives rows a motion of their own, free of joints: `change` makes the new group from the old one (a still one called
     /// `name` around `pivot` where there was none), once per old group. Samples go with their rows.
     ///
     /// # Panics
@@ -354,12 +360,12 @@ impl Tracks {
                 moving
             };
             let new = self.groups.len() as u32;
-            self.groups.push(change(group));
+            self.groups.push(TrackGroup { joint: None, ..change(group) });
             rows.iter().for_each(|&row| self.group_of[row as usize] = new);
         }
     }
 
-    /// The same motion without groups that have no Gaussians; `None` when none is left.
+    /// The same motion without groups that have no Gaussians; `None` when none is left. A joint goes with its base.
     #[must_use]
     pub fn compact(mut self) -> Option<Self> {
         let mut used = vec![false; self.groups.len()];
@@ -379,6 +385,10 @@ impl Tracks {
         }
         let mut flags = used.iter();
         self.groups.retain(|_| *flags.next().expect("one flag per group"));
+        for group in &mut self.groups {
+            let base = group.joint.map_or(NO_GROUP, |joint| renumbered[joint.base as usize]);
+            group.joint = group.joint.filter(|_| base != NO_GROUP).map(|joint| Joint { base, ..joint });
+        }
         (!self.groups.is_empty()).then_some(self)
     }
 }

@@ -190,7 +190,17 @@ impl Reader<'_> {
             for pose in track.samples.iter_mut().chain([&mut track.rest]) {
                 pose.translation *= factor;
             }
-            pieces.push(piece(name, splats, track, stretch * movement.stretch, pivot));
+            let joint = match &placed.cif {
+                Some(Cif::Part(part)) => part.joint,
+                _ => None,
+            };
+            pieces.push(Piece { joint, ..piece(name, splats, track, stretch * movement.stretch, pivot) });
+        }
+        if pieces.len() != found.parts.len()
+            || found.parts.iter().any(|placed| position(placed) >= pieces.len())
+        {
+            // Joints count parts that are not where they were.
+            pieces.iter_mut().for_each(|piece| piece.joint = None);
         }
         Ok(pieces)
     }
@@ -257,5 +267,15 @@ fn piece(name: String, splats: Splats, track: Track, stretch: DMat3, pivot: Opti
     let change = stretch - DMat3::IDENTITY;
     let changes = change.to_cols_array().iter().any(|value| value.abs() > 1e-7);
     let placement = Placement::Rigid { track, baked: changes.then(|| DAffine3::from_mat3(stretch)) };
-    Piece { name, splats, placement, pivot, shapes: Vec::new(), opacities: Vec::new(), colors: Vec::new() }
+    let joint = None;
+    Piece {
+        name,
+        splats,
+        placement,
+        pivot,
+        joint,
+        shapes: Vec::new(),
+        opacities: Vec::new(),
+        colors: Vec::new(),
+    }
 }

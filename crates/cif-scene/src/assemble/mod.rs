@@ -22,8 +22,8 @@ pub use track::{Placement, Track, one_hemisphere};
 use crate::graph::{Motion, VisibilitySample};
 use crate::report::MotionReport;
 use crate::{
-    CameraTrack, CaptureFrame, ConvexHull, Node, NodeKind, Origin, PointProxy, PoseSample, SceneGraph,
-    Splats, TimeCodes, UpAxis, naming,
+    CameraTrack, CaptureFrame, ConvexHull, Node, NodeKind, Origin, PartJoint, PointProxy, PoseSample,
+    SceneGraph, Splats, TimeCodes, UpAxis, naming,
 };
 
 /// Time codes per second of files that have none.
@@ -164,6 +164,7 @@ impl Prim {
             splats,
             placement: Placement::still(None),
             pivot: None,
+            joint: None,
             shapes: Vec::new(),
             opacities: Vec::new(),
             colors: Vec::new(),
@@ -233,6 +234,8 @@ pub struct Piece {
     pub placement: Placement,
     /// Origin of the part's frame at the reference time, where the file records it.
     pub pivot: Option<DVec3>,
+    /// Ties it to another piece; its base counts the pieces.
+    pub joint: Option<PartJoint>,
     /// One entry per [`Prim::shape_codes`].
     pub shapes: Vec<Shape>,
     /// Opacities, one entry per [`Prim::opacity_codes`].

@@ -111,6 +111,7 @@ fn parts(pieces: Vec<Piece>) -> (Vec<Part>, Splats) {
             // What changes its shape is sampled as such, and no part.
             sampled @ Placement::Sampled(_) => (Track::still(), sampled.at(0.0)),
         };
+        let is_plain = map == DAffine3::IDENTITY;
         let splats = baked(piece.splats, map);
         let poses = track.clone().poses(false);
         parts.push(Part {
@@ -119,6 +120,8 @@ fn parts(pieces: Vec<Piece>) -> (Vec<Part>, Splats) {
             pivot: track.pivot(piece.pivot, &poses),
             extent: extent::splat_bounds(&RigidTransform::IDENTITY, &splats, 0..splats.len()),
             track: poses,
+            // What is baked into the splats is no frame that the joint knows.
+            joint: piece.joint.filter(|_| is_plain),
         });
         all.append(splats);
     }

@@ -98,6 +98,9 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
                     splats: range,
                     pivot: part.pivot - group.pivot,
                     track,
+                    joint: number
+                        .checked_sub(1)
+                        .and_then(|told| Some(group.told.as_ref()?.parts.get(told)?.joint)),
                 });
             }
             (Motion::Parts(PartsMotion { track, parts: out }), residual)

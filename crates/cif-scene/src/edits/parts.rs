@@ -17,7 +17,11 @@ pub(super) fn subset(node: &Node, positions: &[usize]) -> Node {
                 start += count;
                 Part { splats, ..part.clone() }
             });
-            let parts_left = parts_left.filter(|part| !part.splats.is_empty()).collect();
+            let mut parts_left: Vec<Part> = parts_left.filter(|part| !part.splats.is_empty()).collect();
+            if parts_left.len() < parts.parts.len() {
+                // Joints count parts that are gone.
+                parts_left.iter_mut().for_each(|part| part.joint = None);
+            }
             Motion::Parts(PartsMotion { track: parts.track.clone(), parts: parts_left })
         }
         Motion::Dense(dense) => Motion::Dense(DenseMotion {

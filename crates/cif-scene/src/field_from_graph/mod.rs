@@ -10,13 +10,17 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use cif_field::gaussians::{INITIAL_OCCUPANCY, SH_FLOATS, saturated_logit};
-use cif_field::tracks::{DenseTrack, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep};
+use cif_field::tracks::{
+    DenseTrack, Joint, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep,
+};
 use cif_field::{Field, Gaussians, Identities, Instance, Owner, Record, RecordedCamera, Timeline};
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
-use crate::graph::{AppearanceSample, DenseMotion, Motion, Node, NodeKind, PoseSample, SceneGraph, pose_at};
+use crate::graph::{
+    AppearanceSample, DenseMotion, Motion, Node, NodeKind, PartsMotion, PoseSample, SceneGraph, pose_at,
+};
 use crate::motion::time_map::TimeMap;
 use crate::{CameraTrack, SceneError};
 
@@ -198,6 +202,7 @@ impl NodeRows {
                     let name = format!("{}/{}", node.name, part.name);
                     rows.place(node, part.splats.clone(), &name, &path, times);
                 }
+                rows.join(parts, pivot, reference);
             }
             Motion::Dense(dense) => {
                 let path = Path::of(dense.track.clone(), pivot, reference);
@@ -205,10 +210,44 @@ impl NodeRows {
                 group.dense = Some(dense_track(node, dense, &path.reference, times));
             }
         }
-        rows.groups.retain(|(_, group)| {
-            group.moves() || !(group.poses.is_empty() && group.visibility.is_empty() && group.dense.is_none())
-        });
+        rows.drop_idle();
         Ok(rows)
+    }
+
+    /// Drops groups that do nothing and that no joint is on.
+    fn drop_idle(&mut self) {
+        let bases: BTreeSet<u32> =
+            self.groups.iter().filter_map(|(_, group)| Some(group.joint?.base)).collect();
+        let is_kept = |(index, (_, group)): (usize, &(std::ops::Range<usize>, TrackGroup))| {
+            let is_idle = group.poses.is_empty() && group.visibility.is_empty() && group.dense.is_none();
+            group.moves() || !is_idle || bases.contains(&(index as u32))
+        };
+        let kept: Vec<bool> = self.groups.iter().enumerate().map(is_kept).collect();
+        let place = |old: u32| kept[..old as usize].iter().filter(|kept| **kept).count() as u32;
+        for (_, group) in &mut self.groups {
+            group.joint = group.joint.map(|joint| Joint { base: place(joint.base), ..joint });
+        }
+        let mut flags = kept.iter();
+        self.groups.retain(|_| *flags.next().expect("one flag per group"));
+    }
+
+    /// Ties the groups of parts, which were placed one after the other, by the joints of the parts.
+    fn join(&mut self, parts: &PartsMotion, pivot: DVec3, reference: f64) {
+        let node = pose_at(&parts.track, pivot, reference);
+        for (index, part) in parts.parts.iter().enumerate() {
+            let Some(joint) = part.joint.filter(|joint| joint.base < index) else { continue };
+            let own = pose_at(&part.track, part.pivot, reference);
+            let rotation = (node.rotation * own.rotation).normalize();
+            let group = &mut self.groups[index].1;
+            // The pivot of a part is a point of its axis.
+            let offset = rotation * joint.anchor;
+            for pose in &mut group.poses {
+                pose.translation += pose.rotation * offset;
+            }
+            group.pivot += offset;
+            let axis = (rotation * joint.axis).normalize();
+            group.joint = Some(Joint { base: joint.base as u32, kind: joint.kind, axis });
+        }
     }
 
     /// Brings a range of rows to the world at the reference time, and adds its group.
@@ -283,7 +322,9 @@ impl NodeRows {
         let first = gaussians.len();
         gaussians.append(&self.gaussians);
         tracks.group_of.resize(gaussians.len(), NO_GROUP);
-        for (range, group) in self.groups {
+        let before = tracks.groups.len() as u32;
+        for (range, mut group) in self.groups {
+            group.joint = group.joint.map(|joint| Joint { base: before + joint.base, ..joint });
             tracks.group_of[first + range.start..first + range.end].fill(tracks.groups.len() as u32);
             tracks.groups.push(group);
         }

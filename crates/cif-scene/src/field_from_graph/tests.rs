@@ -1,3 +1,4 @@
+use cif_field::JointKind;
 use cif_geometry::RigidTransform;
 
 use super::*;
@@ -140,6 +141,7 @@ fn with_parts(graph: &mut SceneGraph) {
         pivot,
         track,
         extent: Bounds::EMPTY,
+        joint: None,
     };
     let parts = vec![
         part("part_00", 0..half, DVec3::new(0.0, 0.1, 0.0), Vec::new()),
@@ -242,5 +244,55 @@ fn broken_graphs_are_refused_by_name() {
         break_it(&mut graph);
         let message = field_from_graph(&graph, "broken.usda").unwrap_err().to_string();
         assert!(message.contains(words), "{message}");
+    }
+}
+
+#[test]
+fn joints_leave_with_their_parts_and_come_back() {
+    for kind in [JointKind::Revolute, JointKind::Prismatic] {
+        let mut field = recorded_field(4, 7);
+        let tracks = field.tracks.as_mut().unwrap();
+        let base = tracks.groups.iter().position(|group| group.poses.len() > 1).unwrap() as u32;
+        let rows: Vec<usize> =
+            (0..field.gaussians.len()).filter(|row| tracks.group_of[*row] == base).collect();
+        tracks.groups[base as usize].deformed = false;
+        let pivot = tracks.groups[base as usize].pivot + DVec3::new(0.1, 0.05, 0.0);
+        let joint = Joint { base, kind, axis: DVec3::new(0.6, 0.0, 0.8) };
+        let values: Vec<(f64, f64)> = TIMES.iter().map(|time| (*time, 0.2 + 0.9 * time)).collect();
+        let part = TrackGroup::jointed("part", pivot, joint, &values, &tracks.groups);
+        rows[rows.len() / 2..].iter().for_each(|row| tracks.group_of[*row] = tracks.groups.len() as u32);
+        tracks.groups.push(part);
+        field.validate().unwrap();
+        let graph = build(&field, &options()).unwrap();
+        let has_joint = |part: &crate::Part| part.joint.is_some();
+        let parts = graph.nodes.iter().find_map(|node| match &node.motion {
+            Motion::Parts(motion) if motion.parts.iter().any(has_joint) => Some(motion),
+            _ => None,
+        });
+        let parts = parts.unwrap();
+        assert_eq!(parts.parts.len(), 2, "{kind}");
+        let told = parts.parts[1].joint.unwrap();
+        assert_eq!((told.base, told.kind, told.anchor), (0, kind, DVec3::ZERO));
+        let [low, high] = parts.joint_range(1).unwrap();
+        let most = 0.9 * (TIMES[TIMES.len() - 1] - TIMES[0]);
+        assert!(low.abs() < 1e-4 && (high - most).abs() < 1e-2 * most, "{kind}: {low} to {high}, not {most}");
+        // The part stays on its axis at all keys.
+        let first = parts.at_first(1).unwrap();
+        for key in &parts.parts[1].track {
+            let pose = parts.on_base(1, key.time_code).unwrap();
+            let moved = pose.translation - first.translation;
+            let across = moved - told.axis * told.axis.dot(moved);
+            let off = if kind == JointKind::Revolute { moved.length() } else { across.length() };
+            let turn = (first.rotation.conjugate() * pose.rotation).xyz();
+            assert!(off < 1e-4, "{kind}: {off} from the axis");
+            assert!(turn.cross(told.axis).length() < 1e-4, "{kind}: turned by {turn}");
+        }
+        let back = field_from_graph(&graph, "memory").unwrap().tracks.unwrap();
+        let group = back.groups.iter().position(|group| group.joint.is_some()).unwrap();
+        let (joint, values) = back.joint_values(group).unwrap();
+        assert_eq!(joint.kind, kind);
+        assert!((joint.axis.length() - 1.0).abs() < 1e-9);
+        let last = values[values.len() - 1];
+        assert!((last - most).abs() < 1e-2 * most, "{kind}: {last}, not {most}");
     }
 }

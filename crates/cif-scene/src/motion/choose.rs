@@ -148,6 +148,10 @@ fn fit_parts_where_needed(
 
 /// The fewest parts inside the tolerance, or else the best there are.
 fn fit_parts(group: &MovingGroup, own: &[Frame], options: &SceneOptions) -> Option<FittedParts> {
+    if let Some(told) = &group.told {
+        let partition = Partition { labels: told.labels.clone(), count: told.parts.len() + 1, decisive: 0.0 };
+        return Some(fit_partition(group, own, &partition));
+    }
     let partitions = parts::partitions(own, &group.weights, group.tolerance, group.trim, options.max_parts);
     let promising = partitions.iter().filter(|partition| partition.decisive <= PROMISING * group.tolerance);
     let mut best: Option<FittedParts> = None;
@@ -177,7 +181,9 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
         let rows = order[start..].to_vec();
         let weights: Vec<f64> = rows.iter().map(|&k| group.weights[k as usize]).collect();
         let (low, high) = trimmed_box(&rows, &weights, &own[0].means);
-        let pivot = (low + high) / 2.0;
+        let told = part.checked_sub(1).and_then(|part| group.told.as_ref()?.parts.get(part));
+        // On the axis, which poses between keys then leave alone.
+        let pivot = told.map_or((low + high) / 2.0, |told| told.poses[0].translation);
         let part = MovingGroup::new(rows, weights, pivot, true, 0.0, group.tolerance, &own[0].means);
         parts.push((start..order.len(), part));
     }
@@ -191,6 +197,9 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
         let distances: Vec<f64> =
             parts.iter_mut().flat_map(|(_, part)| part.gather_residuals(frame)).collect();
         residual.add(&distances, &weights, group.trim, group.tolerance);
+    }
+    for ((_, part), told) in parts.iter_mut().skip(1).zip(group.told.iter().flat_map(|told| &told.parts)) {
+        part.poses.clone_from(&told.poses);
     }
     FittedParts { order, parts, residual }
 }
@@ -210,6 +219,9 @@ fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptio
     }
     if inside(group, &group.rigid_residual) || limit == MotionModel::Rigid {
         return MotionModel::Rigid;
+    }
+    if group.told.is_some() && parts.is_some() {
+        return MotionModel::Parts;
     }
     let cheaper_than_dense =
         |parts: &FittedParts| (parts.parts.len() + 1) * POSE_BYTES < group.rows.len() * DENSE_BYTES;

@@ -22,6 +22,7 @@ use glam::{DMat3, DQuat, DVec3};
 
 use crate::PoseSample;
 use crate::build::frames::Frame;
+use crate::joint::ToldParts;
 use crate::motion::keys::one_hemisphere;
 use crate::motion::procrustes::{residuals, robust_procrustes, weighted_quantile};
 use crate::report::{ResidualStatistics, TimeResidual};
@@ -61,6 +62,8 @@ pub struct MovingGroup {
     pub rigid_residual: ResidualSum,
     /// Residuals of rigid parts, where they were tried.
     pub parts_residual: Option<ResidualStatistics>,
+    /// Parts that the field ties by joints, which are taken as they are.
+    pub(crate) told: Option<ToldParts>,
     /// Seconds spent on the group.
     pub seconds: f64,
     reference: Vec<DVec3>,
@@ -253,6 +256,7 @@ impl MovingGroup {
             static_residual: ResidualSum::default(),
             rigid_residual: ResidualSum::default(),
             parts_residual: None,
+            told: None,
             seconds: 0.0,
             reference,
             fit_points,

@@ -124,6 +124,7 @@ fn colliders_enclose_their_splats_by_opacity_and_by_sight() {
         pivot: DVec3::ZERO,
         track: Vec::new(),
         extent: cif_geometry::Bounds::EMPTY,
+        joint: None,
     };
     jointed.motion =
         Motion::Parts(PartsMotion { track: Vec::new(), parts: vec![part(0..200), part(200..300)] });
@@ -203,6 +204,7 @@ fn levels_of_detail_nest_and_keep_the_important() {
         pivot: DVec3::ZERO,
         track: Vec::new(),
         extent: cif_geometry::Bounds::EMPTY,
+        joint: None,
     };
     node.motion = Motion::Parts(PartsMotion { track: Vec::new(), parts: vec![part(0..90), part(90..100)] });
     let kept = level_of_detail(&node, 0.25);

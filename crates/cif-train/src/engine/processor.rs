@@ -89,6 +89,7 @@ impl Processor {
             let Gradients { poses, pose_views, .. } = &state.gradients;
             let sizes = object_sizes(tracks, &state.field.gaussians);
             state.pose_moments.step(tracks, &sizes, poses, pose_views, plan.pose_rate);
+            tracks.hold_joints();
         }
         state.gradients.reset_poses();
         if let Some(exposures) = &mut state.progress.exposures {

@@ -13,11 +13,13 @@
 //! | `follow` | how it moves from time to time |
 //! | `trials` | which way is kept |
 //! | `start` | everything in order |
+//! | `parts` | which part of it turns on a hinge or slides |
 
 mod fit;
 mod follow;
 mod order;
 mod outline;
+mod parts;
 mod path;
 mod plane;
 mod shape;
@@ -32,6 +34,7 @@ use cif_dataset::{Dataset, Split};
 use glam::DVec3;
 
 pub(crate) use self::order::Order;
+pub(crate) use self::parts::Jointed;
 pub(crate) use self::plane::Plane;
 use self::start::Object;
 pub(crate) use self::start::{Fitted, Surroundings};
@@ -80,6 +83,41 @@ pub(crate) fn fit(
     surroundings: Surroundings<'_>,
     is_told: bool,
 ) -> Result<Found, TrainError> {
+    let views = views_of(label, dataset, frames, surroundings)?;
+    let Some(outline) = outline::outline(&views, surroundings.plane, surroundings.times) else {
+        return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
+    };
+    let fitted =
+        start::fit_object(Object { label, views: &views, outline: &outline, is_told, surroundings })?;
+    Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))
+}
+
+/// Finds the part of an object that rests (a label: dense index + 1) which turns on a hinge or slides; `None` where it
+/// has none, or the masks do not tell enough.
+///
+/// # Errors
+/// When a frame cannot be read, or the run is to stop.
+pub(crate) fn find_part(
+    label: u16,
+    dataset: &Dataset,
+    frames: &FrameStore,
+    surroundings: Surroundings<'_>,
+) -> Result<Option<Jointed>, TrainError> {
+    let views = views_of(label, dataset, frames, surroundings)?;
+    let Some(outline) = outline::outline(&views, surroundings.plane, surroundings.times) else {
+        return Ok(None);
+    };
+    let object = Object { label, views: &views, outline: &outline, is_told: false, surroundings };
+    parts::find(object)
+}
+
+/// The object in all training frames that show it, in the order of times.
+fn views_of(
+    label: u16,
+    dataset: &Dataset,
+    frames: &FrameStore,
+    surroundings: Surroundings<'_>,
+) -> Result<Vec<ObjectView>, TrainError> {
     let behind = surroundings.order.behind(label);
     let mut views = Vec::new();
     for k in 0..frames.len() {
@@ -90,10 +128,5 @@ pub(crate) fn fit(
     }
     views.sort_by_key(|view| view.time_index);
     view::set_visible(&mut views);
-    let Some(outline) = outline::outline(&views, surroundings.plane, surroundings.times) else {
-        return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
-    };
-    let fitted =
-        start::fit_object(Object { label, views: &views, outline: &outline, is_told, surroundings })?;
-    Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))
+    Ok(views)
 }

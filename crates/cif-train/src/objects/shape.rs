@@ -1,6 +1,7 @@
 //! The Gaussians of an object in its own frame, alone: rendered on crops, compared with colours and masks, moved.
 
-use cif_field::{Field, Gaussians, Record, SortMetric, Timeline};
+use cif_field::tracks::TrackPose;
+use cif_field::{Field, Gaussians, Record, SortMetric, Timeline, Tracks};
 use cif_geometry::{PinholeCamera, PixelGrid, RigidTransform};
 use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
 use cif_render::{BlendRequest, Blending, GeometryPath, Gradients, PoseGradient, RenderSettings};
@@ -128,6 +129,49 @@ impl Shape {
 
     pub(super) fn gaussians(&self) -> &Gaussians {
         &self.field.gaussians
+    }
+
+    /// The same Gaussians in groups, each with a pose in the object's frame or none.
+    pub(super) fn in_parts(mut self, tracks: Tracks) -> Self {
+        self.field.tracks = Some(tracks);
+        self.gradients = Gradients::zeros(&self.field);
+        self
+    }
+
+    /// Group of a Gaussian in [`Self::in_parts`].
+    pub(super) fn part_of(&self, row: usize) -> Option<usize> {
+        self.field.tracks.as_ref().and_then(|tracks| tracks.group(row))
+    }
+
+    /// These Gaussians, then others, not yet in parts.
+    pub(super) fn joined(mut self, other: &Self) -> Self {
+        self.field.gaussians.append(&other.field.gaussians);
+        self.field.tracks = None;
+        self.copied()
+    }
+
+    /// Lowers the opacity of Gaussians at some places to `logit`.
+    pub(super) fn fade(&mut self, logit: f32, wanted: impl Fn(DVec3) -> bool) {
+        let g = &mut self.field.gaussians;
+        for (mean, opacity) in g.means.iter().zip(&mut g.opacity_logits) {
+            if wanted(DVec3::from_array(mean.map(f64::from))) {
+                *opacity = opacity.min(logit);
+            }
+        }
+    }
+
+    /// Puts a group of [`Self::in_parts`] into a pose: its turn, and where its pivot is.
+    pub(super) fn set_part(&mut self, group: usize, pivot: DVec3, rotation: DQuat, translation: DVec3) {
+        if let Some(group) = self.field.tracks.as_mut().and_then(|tracks| tracks.groups.get_mut(group)) {
+            group.pivot = pivot;
+            group.poses = vec![TrackPose { time: 0.0, translation, rotation }];
+        }
+    }
+
+    /// Gradient of the last loss by the pose at a place among those of [`Self::in_parts`]: the turn in the frame of
+    /// the part.
+    pub(super) fn part_gradient(&self, place: usize) -> PoseGradient {
+        self.gradients.poses.get(place).copied().unwrap_or_default()
     }
 
     fn len(&self) -> usize {

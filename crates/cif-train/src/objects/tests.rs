@@ -20,19 +20,19 @@ use crate::frames::TrainFrame;
 use crate::random::{Purpose, stream};
 use crate::stop::Stop;
 
-const TIMES: usize = 30;
-const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };
+pub(super) const TIMES: usize = 30;
+pub(super) const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };
 
 /// Cameras by time.
-type Cameras = fn(usize) -> Vec<PinholeCamera>;
+pub(super) type Cameras = fn(usize) -> Vec<PinholeCamera>;
 
 /// One camera, on an arc above the floor.
-fn moving(time: usize) -> Vec<PinholeCamera> {
+pub(super) fn moving(time: usize) -> Vec<PinholeCamera> {
     vec![camera(0.5 + 0.9 * time as f64 / TIMES as f64)]
 }
 
 /// Five cameras that stay in place.
-fn rig(_: usize) -> Vec<PinholeCamera> {
+pub(super) fn rig(_: usize) -> Vec<PinholeCamera> {
     [0.0, 1.2, 2.5, 3.7, 5.0].map(camera).to_vec()
 }
 
@@ -52,7 +52,7 @@ fn camera(angle: f64) -> PinholeCamera {
 }
 
 /// Opaque Gaussians at places around the origin, in colours of these places.
-fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f32) -> Gaussians {
+pub(super) fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f32) -> Gaussians {
     let means: Vec<[f32; 3]> = places.iter().map(|p| p.to_array().map(|v| v as f32)).collect();
     let colors: Vec<[f32; 3]> = places.iter().map(|p| color(*p)).collect();
     let mut gaussians = Gaussians::from_points(&means, &colors).unwrap();
@@ -63,22 +63,33 @@ fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f32) -> Gaus
 
 /// Views of a solid on its way.
 fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Vec<ObjectView> {
-    let n = gaussians.len();
+    let group_of = vec![0; gaussians.len()];
+    views_of_groups(gaussians, group_of, &[poses.to_vec()], cameras)
+}
+
+/// Views of Gaussians in groups, each on its way.
+pub(super) fn views_of_groups(
+    gaussians: Gaussians,
+    group_of: Vec<u32>,
+    poses: &[Vec<(DQuat, DVec3)>],
+    cameras: Cameras,
+) -> Vec<ObjectView> {
     let time = |k: usize| k as f64 / (TIMES - 1) as f64;
-    let poses = poses.iter().enumerate();
-    let poses = poses.map(|(k, (rotation, translation))| TrackPose {
-        time: time(k),
-        translation: *translation,
-        rotation: *rotation,
-    });
-    let group =
-        TrackGroup { deformed: false, poses: poses.collect(), ..TrackGroup::still("solid", DVec3::ZERO) };
+    let group = |poses: &Vec<(DQuat, DVec3)>| {
+        let poses = poses.iter().enumerate().map(|(k, (rotation, translation))| TrackPose {
+            time: time(k),
+            translation: *translation,
+            rotation: *rotation,
+        });
+        TrackGroup { deformed: false, poses: poses.collect(), ..TrackGroup::still("solid", DVec3::ZERO) }
+    };
+    let groups = poses.iter().map(group).collect();
     let scene = synthetic::generate(&synthetic::SyntheticConfig::default()).field;
     let field = Field {
         gaussians,
         identities: None,
         deformation: None,
-        tracks: Some(Tracks { group_of: vec![0; n], groups: vec![group] }),
+        tracks: Some(Tracks { group_of, groups }),
         ..scene
     };
     let settings = RenderSettings { sh_degree: 0, background: [0.6, 0.6, 0.55], ..RenderSettings::default() };
@@ -102,6 +113,15 @@ fn fit(views: &[ObjectView]) -> Fitted {
 }
 
 fn fit_on(plane: Option<&Plane>, views: &[ObjectView]) -> Option<Fitted> {
+    with_object(plane, views, |object| fit_object(object).unwrap())
+}
+
+/// The object of some views, with facts about its surroundings.
+pub(super) fn with_object<T>(
+    plane: Option<&Plane>,
+    views: &[ObjectView],
+    act: impl FnOnce(Object<'_>) -> T,
+) -> T {
     let outline = outline::outline(views, plane, TIMES).unwrap();
     let stop = Stop::default();
     let order = Order::among(&[], 2);
@@ -115,7 +135,7 @@ fn fit_on(plane: Option<&Plane>, views: &[ObjectView]) -> Option<Fitted> {
         gaussians: 150,
         stop: &stop,
     };
-    fit_object(Object { label: 1, views, outline: &outline, is_told: false, surroundings }).unwrap()
+    act(Object { label: 1, views, outline: &outline, is_told: false, surroundings })
 }
 
 /// Largest error of turns relative to the first pose, degrees, and mean error of displacements, metres.
@@ -146,7 +166,7 @@ fn box_places() -> Vec<DVec3> {
 }
 
 /// Patches of colour.
-fn patches(p: DVec3) -> [f32; 3] {
+pub(super) fn patches(p: DVec3) -> [f32; 3] {
     let cell = (p * 40.0).floor();
     std::array::from_fn(|k| {
         let wave = (cell.x * (2.1 + k as f64) + cell.y * 3.7 + cell.z * (5.3 - k as f64)).sin();

@@ -265,7 +265,7 @@ fn give_up_hopeless(trials: &mut Vec<Trial<'_>>, is_kept: impl Fn(Way) -> bool) 
 
 /// Views to fit to, and views left out: a camera in the middle where there are several at a time, else every fourth
 /// time.
-fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) -> (Vec<usize>, Vec<usize>) {
+pub(super) fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) -> (Vec<usize>, Vec<usize>) {
     if reliable.len() > good.len() {
         let mut cameras: Vec<[i64; 3]> = reliable.iter().map(|view| views[*view].camera_key).collect();
         cameras.sort_unstable();

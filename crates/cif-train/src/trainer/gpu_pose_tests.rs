@@ -1,7 +1,7 @@
 //! Groups that move as a whole, on a GPU beside the processor. `CIF_TEST_GPU=off|auto|require`.
 
 use cif_field::tracks::{NO_GROUP, TrackGroup, TrackPose};
-use cif_field::{RotationEvidence, Tracks};
+use cif_field::{Joint, JointKind, RotationEvidence, Tracks};
 use cif_render::Gradients;
 use cif_render::wgpu::{Gpu, testing};
 use glam::{DQuat, DVec3};
@@ -41,7 +41,14 @@ fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
         group("rarely", DVec3::new(-0.2, 0.1, 0.1), &[times[0], times[2]]),
     ];
     groups[1].rotation = Some(RotationEvidence::Assumed);
-    let group_of = (0..n).map(|row| [0, NO_GROUP, 1][row as usize % 3]).collect();
+    // A part on a base that moves, and one on that.
+    let values = |from: f64| times.iter().map(|time| (*time, from + 0.3 * time)).collect::<Vec<_>>();
+    for (base, kind) in [(0, JointKind::Revolute), (2, JointKind::Prismatic)] {
+        let joint = Joint { base, kind, axis: DVec3::new(2.0, -1.0, 2.0) / 3.0 };
+        let part = TrackGroup::jointed("part", DVec3::new(0.2, 0.1, -0.1), joint, &values(0.1), &groups);
+        groups.push(part);
+    }
+    let group_of = (0..n).map(|row| [0, NO_GROUP, 1, 2, NO_GROUP, 3][row as usize % 6]).collect();
     let tracks = Tracks { group_of, groups };
     trainer.state.pose_moments = PoseMoments::zeros(Some(&tracks));
     trainer.state.field.tracks = Some(tracks);

@@ -44,6 +44,7 @@ mod measure;
 mod motions;
 mod objects;
 mod pacing;
+mod parts;
 mod plan_step;
 mod provenance;
 mod resume;
@@ -83,7 +84,7 @@ use crate::exposure::Exposures;
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
 use crate::heads::{Cif, Head, HeadTensors};
-use crate::objects::Fitted;
+use crate::objects::{Fitted, Jointed};
 use crate::optimiser::Optimiser;
 use crate::poses::PoseMoments;
 use crate::progress::{Progress, Stages};
@@ -167,6 +168,8 @@ pub struct Trainer {
     fits: BTreeMap<u16, Fitted>,
     /// Labels of objects of which nothing tells how far away they are.
     nowhere: BTreeSet<u16>,
+    /// Objects with a part on a joint, likewise.
+    jointed: BTreeMap<u16, Jointed>,
     /// Events of steps that were taken in, not sent yet.
     arrived: Vec<TrainEvent>,
 }
@@ -236,6 +239,7 @@ impl Trainer {
             last_loss: StepLoss::default(),
             fits: BTreeMap::new(),
             nowhere: BTreeSet::new(),
+            jointed: BTreeMap::new(),
             arrived: Vec::new(),
             state: State {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),

@@ -2,6 +2,7 @@
 //! poses.
 
 use cif_dataset::PointSource;
+use cif_field::Gaussians;
 use cif_field::tracks::{NO_GROUP, RotationEvidence, TrackGroup, TrackPose, Tracks};
 use glam::DVec3;
 use rayon::prelude::*;
@@ -33,7 +34,7 @@ impl Trainer {
             self.state.guidance.travelling[usize::from(label)] = true;
             self.fits.insert(label, fitted);
         }
-        Ok(())
+        self.find_parts(&others)
     }
 
     /// Fits the travelling objects that were not fitted yet.
@@ -43,13 +44,14 @@ impl Trainer {
             .map(|(label, _)| label as u16)
             .filter(|label| !self.fits.contains_key(label))
             .collect();
+        let rest: Vec<u16> = rest.into_iter().filter(|label| !self.jointed.contains_key(label)).collect();
         let fits = self.fit_objects(&rest)?;
         self.fits.extend(fits);
-        Ok(())
+        self.find_parts(&rest)
     }
 
     /// Motion that an object (a label: dense index + 1) is told to have.
-    fn told(&self, label: u16) -> Option<ObjectMotion> {
+    pub(super) fn told(&self, label: u16) -> Option<ObjectMotion> {
         let name = &self.state.field.instances[usize::from(label) - 1].label;
         self.state.config.motion.of.get(name).copied()
     }
@@ -68,7 +70,7 @@ impl Trainer {
     }
 
     /// What objects stand on: in the points of the capture or, where it has none, in what is reconstructed so far.
-    fn support(&self) -> Option<Plane> {
+    pub(super) fn support(&self) -> Option<Plane> {
         let (state, seed) = (&self.state, self.state.config.seed);
         if state.dataset.points.source != PointSource::Random {
             return objects::support(&state.dataset, &state.dataset.points.positions, seed);
@@ -76,6 +78,21 @@ impl Trainer {
         let g = &state.field.gaussians;
         let solid = g.means.iter().zip(&g.opacity_logits).filter(|(_, logit)| **logit > 0.0);
         objects::support(&state.dataset, &solid.map(|(mean, _)| *mean).collect::<Vec<_>>(), seed)
+    }
+
+    /// Facts that fits of objects need.
+    pub(super) fn surroundings<'a>(&'a self, plane: Option<&'a Plane>, order: &'a Order) -> Surroundings<'a> {
+        let state = &self.state;
+        Surroundings {
+            plane,
+            up: objects::up(&state.dataset),
+            order,
+            times: state.dataset.times.len(),
+            near: state.config.near,
+            seed: state.config.seed,
+            gaussians: state.config.motion.gaussians as usize,
+            stop: &state.stop,
+        }
     }
 
     /// Rigid motions of objects (labels: dense index + 1), without those that rest, are not rigid, or whose masks do
@@ -87,16 +104,7 @@ impl Trainer {
         let state = &self.state;
         let plane = self.support();
         let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
-        let surroundings = Surroundings {
-            plane: plane.as_ref(),
-            up: objects::up(&state.dataset),
-            order: &order,
-            times: state.dataset.times.len(),
-            near: state.config.near,
-            seed: state.config.seed,
-            gaussians: state.config.motion.gaussians as usize,
-            stop: &state.stop,
-        };
+        let surroundings = self.surroundings(plane.as_ref(), &order);
         let most = MOST_ERROR[usize::from(state.dataset.points.source == PointSource::Random)];
         let wanted: Vec<(u16, Option<ObjectMotion>)> =
             labels.iter().map(|label| (*label, self.told(*label))).collect();
@@ -131,6 +139,10 @@ impl Trainer {
     pub(super) fn add_object(&mut self, label: u16) -> bool {
         let name = self.state.field.instances[usize::from(label) - 1].label.clone();
         let Some(fitted) = self.fits.remove(&label) else {
+            if let Some(found) = self.jointed.remove(&label) {
+                self.add_parts(name, &found);
+                return true;
+            }
             if self.told(label) == Some(ObjectMotion::Rigid) {
                 self.warnings
                     .push(format!("{name} is told to be rigid, but its masks do not tell its poses"));
@@ -156,7 +168,6 @@ impl Trainer {
 
     /// Adds the Gaussians of an object to the field, where the best of its poses puts them, in a group of their own.
     fn join(&mut self, name: String, fitted: &Fitted) {
-        let field = &mut self.state.field;
         let (rotation, place) = fitted.reference;
         let mut rows = fitted.gaussians.clone();
         for (mean, quaternion) in rows.means.iter_mut().zip(&mut rows.quaternions) {
@@ -166,8 +177,6 @@ impl Trainer {
             let turned = rotation * glam::DQuat::from_xyzw(x, y, z, w);
             *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
         }
-        let occupancy = cif_geometry::scalar::logit(self.state.config.instance.occupancy);
-        rows.occupancy_logits.fill(occupancy);
         let times = &self.state.dataset.times;
         let back = rotation.inverse();
         let mut poses: Vec<TrackPose> = fitted
@@ -184,17 +193,28 @@ impl Trainer {
                 poses[k].rotation = -poses[k].rotation;
             }
         }
+        let rotation = Some(fitted.rotation);
+        let group = TrackGroup { deformed: false, poses, rotation, ..TrackGroup::still(name, place) };
+        self.add_group(rows, group);
+    }
+
+    /// Adds Gaussians to the field, in a group of their own that skips the network; returns its place.
+    pub(super) fn add_group(&mut self, mut rows: Gaussians, group: TrackGroup) -> u32 {
+        let occupancy = cif_geometry::scalar::logit(self.state.config.instance.occupancy);
+        rows.occupancy_logits.fill(occupancy);
+        let field = &mut self.state.field;
         let before = field.len();
         let tracks = field.tracks.get_or_insert_with(Tracks::default);
+        let place = tracks.groups.len() as u32;
         tracks.group_of.resize(before, NO_GROUP);
-        tracks.group_of.resize(before + rows.len(), tracks.groups.len() as u32);
-        let rotation = Some(fitted.rotation);
-        tracks.groups.push(TrackGroup { deformed: false, poses, rotation, ..TrackGroup::still(name, place) });
+        tracks.group_of.resize(before + rows.len(), place);
+        tracks.groups.push(group);
         field.gaussians.append(&rows);
         if let Some(deformation) = &mut field.deformation {
             deformation.still.resize(before, false);
             deformation.still.resize(before + rows.len(), true);
         }
+        place
     }
 
     /// Rate of the poses at a step of a stage; 0 where they stay.

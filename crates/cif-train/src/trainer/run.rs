@@ -311,6 +311,10 @@ impl Trainer {
         self.state.progress.sh_start = self.state.field.sh_degree;
         self.state.progress.opacities_were_reset = false;
         self.state.statistics = DensifyStatistics::zeros(self.state.field.gaussians.len());
+        if let Some(tracks) = &mut self.state.field.tracks {
+            // On a device they are held in single precision.
+            tracks.hold_joints();
+        }
         let head = Arc::clone(&self.state.head);
         if let Some(head) = heads::value_head(&head, &self.state.config) {
             match stage {

@@ -113,3 +113,49 @@ fn adam_poses(@builtin(workgroup_id) group: vec3u, @builtin(local_invocation_ind
         gradients[at].translation = vec4f(0.0);
     }
 }
+
+// A vector turned by a unit quaternion (w, x, y, z).
+fn turned(q: vec4f, v: vec3f) -> vec3f {
+    let across = 2.0 * cross(q.yzw, v);
+    return v + q.x * across + cross(q.yzw, across);
+}
+
+// Puts the pose of a part onto its joint, to the nearest value. Rust twin: cif-field, `Joint`.
+fn hold(part: GroupView, base_pivot: vec3f, base: Pose, at: u32) {
+    let axis = part.axis.xyz;
+    let back = vec4f(base.rotation.x, -base.rotation.yzw);
+    let arm = part.pivot.xyz - base_pivot;
+    let offset = base.offset.xyz - arm;
+    var pose = poses[at];
+    if part.joint.x == 1u {
+        let relative = product(back, pose.rotation);
+        let turn = normalize(vec4f(relative.x, dot(relative.yzw, axis) * axis));
+        pose.rotation = normalize(product(base.rotation, turn));
+        pose.offset = vec4f(turned(base.rotation, arm) + offset, 0.0);
+    } else {
+        let shift = dot(turned(back, pose.offset.xyz - offset) - arm, axis);
+        pose.rotation = base.rotation;
+        pose.offset = vec4f(turned(base.rotation, arm + shift * axis) + offset, 0.0);
+    }
+    poses[at] = pose;
+}
+
+// All joints, in the order of the groups, for a part may be the base of another.
+@compute @workgroup_size(1)
+fn hold_joints() {
+    for (var group = 0u; group < arrayLength(&groups); group++) {
+        let part = groups[group];
+        if part.joint.x == 0u {
+            continue;
+        }
+        let base = groups[part.joint.y];
+        let rests = base.poses.x == base.poses.y;
+        for (var at = part.poses.x; at < part.poses.y; at++) {
+            var base_pose = Pose(vec4f(1.0, 0.0, 0.0, 0.0), vec4f(0.0));
+            if !rests {
+                base_pose = poses[base.poses.x + at - part.poses.x];
+            }
+            hold(part, base.pivot.xyz, base_pose, at);
+        }
+    }
+}

@@ -378,7 +378,7 @@ pub const ADAM_POSES: Module = Module {
     text: include_str!("adam_poses.wgsl"),
     imports: &[CONSTANTS, GROUPS, QUATERNION_PRODUCTS, POSE_RATES],
     bindings: &[Uniform, Read, Read, Read, ReadWrite, ReadWrite, ReadWrite, ReadWrite],
-    entries: &["adam_poses"],
+    entries: &["adam_poses", "hold_joints"],
 };
 
 /// Optimiser of what Gaussians have.

@@ -11,6 +11,7 @@ pub(crate) struct GpuPoseOptimiser {
     moments: GpuVec<PoseState>,
     rates: Uniform<PoseRates>,
     step: Kernel,
+    hold_joints: Kernel,
 }
 
 impl GpuPoseOptimiser {
@@ -19,11 +20,12 @@ impl GpuPoseOptimiser {
     /// # Errors
     /// When the device is out of memory; when the driver rejects the kernel.
     pub(crate) fn new(gpu: &Gpu, moments: &PoseMoments) -> Result<Self, GpuError> {
-        let [step] = entries(gpu, &ADAM_POSES)?;
+        let [step, hold_joints] = entries(gpu, &ADAM_POSES)?;
         Ok(Self {
             moments: GpuVec::from_slice(gpu, "moments of the poses", &rows(moments))?,
             rates: Uniform::new(gpu, "rate of the poses", &PoseRates::default()),
             step,
+            hold_joints,
         })
     }
 
@@ -43,7 +45,8 @@ impl GpuPoseOptimiser {
         })
     }
 
-    /// Records the step of the poses that views were drawn of, at a `rate` of 0 none; gradients become zero. Nothing
+    /// Records the step of the poses that views were drawn of, at a `rate` of 0 none; gradients become zero, and parts
+    /// stay on their joints. Nothing
     /// moves while the second word of `faults` makes steps wait.
     pub(crate) fn step(
         &self,
@@ -54,21 +57,21 @@ impl GpuPoseOptimiser {
         faults: &GpuVec<u32>,
     ) {
         self.rates.write(gpu, &PoseRates { rate: rate as f32, ..PoseRates::default() });
-        let group = self.step.bind(
-            gpu,
-            &[
-                self.rates.binding(),
-                groups.views.binding(),
-                groups.members.binding(),
-                canonical.geometry.binding(),
-                groups.poses.binding(),
-                groups.gradients.binding(),
-                self.moments.binding(),
-                faults.binding(),
-            ],
-        );
+        let bindings = [
+            self.rates.binding(),
+            groups.views.binding(),
+            groups.members.binding(),
+            canonical.geometry.binding(),
+            groups.poses.binding(),
+            groups.gradients.binding(),
+            self.moments.binding(),
+            faults.binding(),
+        ];
+        let group = self.step.bind(gpu, &bindings);
+        let joints = self.hold_joints.bind(gpu, &bindings);
         commands.stage("optimiser: Gaussians", |stage| {
             stage.dispatch(&self.step, &group, [groups.groups() as u32, 1, 1]);
+            stage.dispatch(&self.hold_joints, &joints, [1, 1, 1]);
         });
     }
 }

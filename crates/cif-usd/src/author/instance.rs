@@ -41,7 +41,7 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
         inside.set_custom(tokens::PART_INDEX, "Int", i32::try_from(index).unwrap_or(i32::MAX))?;
         inside.set_custom(tokens::PART_PIVOT, "Double3", pxr.vec3d(part.pivot)?)?;
     }
-    physics::author(scene, &prim, node)?;
+    physics::author(scene, layer, &prim, node)?;
     contents(scene, &prim, layer, node)
 }
 

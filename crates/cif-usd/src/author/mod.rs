@@ -3,6 +3,7 @@
 mod camera_prims;
 mod hulls;
 mod instance;
+mod joints;
 mod levels;
 mod physics;
 mod proxies;

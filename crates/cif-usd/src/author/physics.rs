@@ -6,7 +6,7 @@ use cif_scene::{Motion, Node, PoseSample};
 use pyo3::prelude::*;
 
 use super::instance::parts;
-use super::{Scene, VARYING, transforms};
+use super::{Scene, VARYING, joints, transforms};
 use crate::layer::{Layer, Prim};
 use crate::pxr::Pxr;
 use crate::tokens::{self, variants};
@@ -30,9 +30,15 @@ pub(super) fn gravity(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>) -> PyResult<
 }
 
 /// Transforms of an instance and its parts, and the variants that simulate it where it has colliders.
-pub(super) fn author(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
+pub(super) fn author(
+    scene: &Scene<'_, '_>,
+    layer: &Layer<'_, '_>,
+    prim: &Prim<'_, '_, '_>,
+    node: &Node,
+) -> PyResult<()> {
     let pxr = scene.pxr;
     if node.colliders.is_empty() {
+        joints::author(scene, layer, prim, node)?;
         return poses(pxr, prim, node, true);
     }
     let part_tracks = parts(node).into_iter().flat_map(|motion| &motion.parts).map(|part| &part.track);
@@ -48,8 +54,9 @@ pub(super) fn author(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node
         match variant {
             variants::KINEMATIC => kinematic(scene, &inside, node)?,
             variants::DYNAMIC => dynamic(scene, &inside, node)?,
-            _ => {}
+            _ => continue,
         }
+        joints::author(scene, layer, &inside, node)?;
     }
     let moving = !matches!(node.motion, Motion::Static);
     prim.select(variants::PHYSICS, if moving { variants::KINEMATIC } else { variants::NONE })
@@ -68,17 +75,23 @@ fn poses(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, node: &Node, sampled: bool) -> 
 
 /// A body on its track; parts that have colliders of their own are bodies of their own.
 fn kinematic(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
-    let motion = parts(node).filter(|_| node.colliders.iter().all(|hull| hull.part.is_some()));
-    let Some(motion) = motion else { return body(scene, prim, true) };
-    for (index, part) in motion.parts.iter().enumerate() {
-        if node.colliders.iter().any(|hull| hull.part == Some(index)) {
-            body(scene, &prim.child(&part.name)?, true)?;
-        }
-    }
-    Ok(())
+    bodies(prim, node)?.iter().try_for_each(|prim| body(scene, prim, true))
 }
 
+/// The parts that have colliders of their own, where all colliders are theirs; else the whole.
+fn bodies<'l, 'p, 'py>(prim: &Prim<'l, 'p, 'py>, node: &Node) -> PyResult<Vec<Prim<'l, 'p, 'py>>> {
+    let motion = parts(node).filter(|_| node.colliders.iter().all(|hull| hull.part.is_some()));
+    let Some(motion) = motion else { return Ok(vec![prim.same()]) };
+    let has_collider = |index: usize| node.colliders.iter().any(|hull| hull.part == Some(index));
+    let with = motion.parts.iter().enumerate().filter(|(index, _)| has_collider(*index));
+    with.map(|(_, part)| prim.child(&part.name)).collect()
+}
+
+/// A body with the initial velocity; parts on joints are bodies of their own, which the joints hold.
 fn dynamic(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
+    if joints::has_joints(node) {
+        return bodies(prim, node)?.iter().try_for_each(|prim| body(scene, prim, false));
+    }
     body(scene, prim, false)?;
     let codes = &scene.graph.time_codes;
     let velocity = node.initial_velocity(codes.start(), codes.frames_per_second);

@@ -4,6 +4,7 @@ mod arrays;
 mod cameras;
 mod expansion;
 mod frames;
+mod joints;
 mod labels;
 mod layer_spec;
 mod nesting;

@@ -5,6 +5,7 @@ use cif_scene::{ConvexHull, MotionModel, MotionReport, PointProxy, Splats};
 use glam::DVec3;
 use pyo3::prelude::*;
 
+use super::joints::joints;
 use super::labels::{self, Recorded};
 use super::splats::SplatPrim;
 use super::stage::Reading;
@@ -86,6 +87,10 @@ pub(super) fn read<'py>(reading: &Reading<'_, 'py>, owner: &Owner<'py>) -> Resul
         .zip(placements)
         .map(|(splats, placement)| piece(reading, owner, &prim, splats, placement))
         .collect::<Result<_, _>>()?;
+    if in_parts {
+        let joints = joints(reading.pxr, owner).map_err(python)?;
+        prim.pieces.iter_mut().zip(joints).for_each(|(piece, joint)| piece.joint = joint);
+    }
     let splats = prim.pieces.iter().map(|piece| piece.splats.len()).sum();
     let original = labels::is_original(reading.pxr, &owner.prim).map_err(python)?;
     let (label, category) = labels::names(reading.pxr, &owner.prim, recorded).map_err(python)?;
@@ -181,7 +186,7 @@ fn piece<'py>(
         }
         false => (String::new(), None),
     };
-    Ok(Piece { name, splats, placement, pivot, shapes, opacities, colors })
+    Ok(Piece { name, splats, placement, pivot, joint: None, shapes, opacities, colors })
 }
 
 /// Origin of a part's frame at the reference time, where it is recorded and the part moves.

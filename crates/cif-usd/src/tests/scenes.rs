@@ -135,6 +135,7 @@ impl Maker {
                             &splats.scales[range.clone()],
                         ),
                         splats: range,
+                        joint: None,
                     }
                 });
                 let parts = parts.collect();

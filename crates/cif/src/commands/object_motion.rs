@@ -1,7 +1,10 @@
 //! Motion of the objects of a scene, as it was trained or imported.
 
+use std::f64::consts::PI;
+
 use cif_field::tracks::TrackGroup;
-use cif_field::{Field, RotationEvidence};
+use cif_field::{Field, JointKind, RotationEvidence};
+use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 /// Motion of an object.
@@ -20,16 +23,35 @@ pub(super) enum ObjectMotion {
         /// `None` where nobody told.
         rotation: Option<RotationEvidence>,
     },
+    /// A base, and parts that joints tie to it.
+    Parts { joints: Vec<JointMotion> },
     /// Each of its Gaussians follows recorded samples.
     Dense { samples: usize },
     /// The deformation moves so many of its Gaussians.
     Free { moving: usize },
 }
 
+/// A part on a joint.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(super) struct JointMotion {
+    joint: JointKind,
+    /// Unit direction, world.
+    axis: [f64; 3],
+    /// A point of the axis, units of the capture.
+    through: [f64; 3],
+    /// Least and largest value: degrees, or units of the capture.
+    range: [f64; 2],
+    gaussians: usize,
+}
+
 impl ObjectMotion {
     /// Motion of the Gaussians `rows` of a field: that of the recorded motion which most of them follow, else that of
     /// the deformation.
     pub(super) fn of(field: &Field, rows: &[u32]) -> Self {
+        let joints = joints(field, rows);
+        if !joints.is_empty() {
+            return Self::Parts { joints };
+        }
         if let Some(group) = followed(field, rows) {
             if let Some(dense) = group.dense.as_ref().filter(|dense| dense.times.len() > 1) {
                 return Self::Dense { samples: dense.times.len() };
@@ -58,6 +80,16 @@ impl std::fmt::Display for ObjectMotion {
                 write!(f, "rigid, {poses} poses, moves {moves:.3}, turns {turns_deg:.1} deg")?;
                 rotation.map_or(Ok(()), |rotation| write!(f, ", rotation {rotation}"))
             }
+            Self::Parts { joints } => {
+                write!(f, "{} parts", joints.len() + 1)?;
+                for JointMotion { joint, axis: [x, y, z], range: [low, high], .. } in joints {
+                    let unit = if *joint == JointKind::Revolute { " deg" } else { "" };
+                    let digits = if *joint == JointKind::Revolute { 1 } else { 3 };
+                    write!(f, ", {joint} joint along ({x:.2}, {y:.2}, {z:.2})")?;
+                    write!(f, " from {low:.digits$} to {high:.digits$}{unit}")?;
+                }
+                Ok(())
+            }
             Self::Dense { samples } => write!(f, "dense, {samples} samples"),
             Self::Free { moving } => write!(f, "free, {moving} Gaussians move"),
         }
@@ -67,6 +99,24 @@ impl std::fmt::Display for ObjectMotion {
 fn group_of(field: &Field, row: u32) -> Option<&TrackGroup> {
     let tracks = field.tracks.as_ref()?;
     tracks.groups.get(*tracks.group_of.get(row as usize)? as usize)
+}
+
+/// Parts on joints among the rows of an object.
+fn joints(field: &Field, rows: &[u32]) -> Vec<JointMotion> {
+    let Some(tracks) = &field.tracks else { return Vec::new() };
+    let frame = &field.record.frame;
+    let of_group = |group: usize| {
+        let (joint, values) = tracks.joint_values(group)?;
+        let gaussians = rows.iter().filter(|row| tracks.group(**row as usize) == Some(group)).count();
+        let unit = if joint.kind == JointKind::Revolute { 180.0 / PI } else { 1.0 / frame.scale };
+        let range = values.iter().fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| {
+            [low.min(unit * value), high.max(unit * value)]
+        });
+        let place = tracks.groups[group].pivot / frame.scale + DVec3::from_array(frame.offset);
+        let (axis, through) = (joint.axis.to_array(), place.to_array());
+        (gaussians > 0).then_some(JointMotion { joint: joint.kind, axis, through, range, gaussians })
+    };
+    (0..tracks.groups.len()).filter_map(of_group).collect()
 }
 
 /// The group that more than half of the rows belong to.

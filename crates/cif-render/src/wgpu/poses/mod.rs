@@ -12,7 +12,7 @@
 
 use bytemuck::Zeroable;
 use cif_field::Tracks;
-use cif_field::tracks::{HIDDEN_LOGIT, NO_GROUP, TrackGroup};
+use cif_field::tracks::{HIDDEN_LOGIT, JointKind, NO_GROUP, TrackGroup};
 use glam::DQuat;
 
 use super::deform::GpuDeformation;
@@ -54,6 +54,10 @@ crate::shared_struct! {
         pub visible: u32,
         /// 1 when the turns of its poses train.
         pub turns: u32,
+        /// Axis of its joint; one more float.
+        pub axis: [f32; 4],
+        /// Kind of its joint (0 none, 1 revolute, 2 prismatic) and the group that it moves on; two more numbers.
+        pub joint: [u32; 4],
     }
 }
 
@@ -312,6 +316,21 @@ impl GpuPoses {
         PosedInput { geometry: &posed.geometry, turns: Some(&self.turns), ..moved }
     }
 
+    /// Kind and base of a joint that the device holds poses to: one whose base rests, or has poses at the same times.
+    fn joint(&self, group: &TrackGroup) -> [u32; 4] {
+        let Some(joint) = group.joint else { return [0; 4] };
+        let base = &self.groups[joint.base as usize];
+        let times = |group: &TrackGroup| group.poses.iter().map(|pose| pose.time).collect::<Vec<_>>();
+        if !base.poses.is_empty() && times(base) != times(group) {
+            return [0; 4];
+        }
+        let kind = match joint.kind {
+            JointKind::Revolute => 1,
+            JointKind::Prismatic => 2,
+        };
+        [kind, joint.base, 0, 0]
+    }
+
     fn views_at(&self, time: f64) -> Vec<GroupView> {
         let mut first = 0;
         let of_group = |(group, members): (&TrackGroup, &[u32; 2])| {
@@ -329,6 +348,8 @@ impl GpuPoses {
                 poses: [first, end],
                 visible: u32::from(group.is_visible(time)),
                 turns: u32::from(group.turns_are_trained()),
+                axis: group.joint.map_or([0.0; 4], |joint| joint.axis.as_vec3().extend(0.0).to_array()),
+                joint: self.joint(group),
             };
             first = end;
             view

@@ -1,0 +1,168 @@
+//! Joints that an object may have, by the box around it: flaps at its edges, drawers, halves and slabs that turn.
+
+use cif_field::tracks::JointKind;
+use glam::DVec3;
+
+use super::super::plane::Plane;
+use super::body::Hinge;
+
+/// Thickness of flaps, drawers and slabs that turn, of the box.
+const FLAPS: [f64; 3] = [0.15, 0.35, 0.55];
+const DRAWERS: [f64; 3] = [0.15, 0.4, 0.75];
+const PLATES: [f64; 2] = [0.15, 0.4];
+const WHEELS: [f64; 3] = [0.15, 0.4, 0.7];
+
+/// Places at which halves are cut apart, of the box.
+const CUTS: [f64; 3] = [0.3, 0.5, 0.7];
+
+/// Turns of the sides of the box that are tried, degrees apart.
+const SIDES: i32 = 3;
+
+/// Share of the Gaussians beyond each side of the box.
+const BEYOND: f64 = 0.02;
+
+/// A box around an object, in its frame.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Sides {
+    /// Unit directions; the last one away from the support, where there is one.
+    pub(super) axes: [DVec3; 3],
+    pub(super) low: [f64; 3],
+    pub(super) high: [f64; 3],
+}
+
+/// A joint to be tried.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) struct Guess {
+    pub(super) hinge: Hinge,
+    /// The part is what is beyond this plane: its normal, and its offset.
+    pub(super) cut: (DVec3, f64),
+    /// Values that are tried at each time, ascending and equally far apart.
+    pub(super) values: Vec<f64>,
+    /// True where the last value is followed by the first.
+    pub(super) is_round: bool,
+}
+
+impl Guess {
+    /// True where a place belongs to the part, widened by a margin.
+    pub(super) fn has(&self, place: DVec3, margin: f64) -> bool {
+        self.cut.0.dot(place) >= self.cut.1 - margin
+    }
+}
+
+fn range(places: &[DVec3], axis: DVec3) -> [f64; 2] {
+    let mut along: Vec<f64> = places.iter().map(|place| axis.dot(*place)).collect();
+    along.sort_by(f64::total_cmp);
+    let last = along.len() - 1;
+    let at = |share: f64| along[(last as f64 * share).round() as usize];
+    [at(BEYOND), at(1.0 - BEYOND)]
+}
+
+impl Sides {
+    /// The upright box of least area around places; `up` in the object's frame.
+    pub(super) fn around(places: &[DVec3], up: DVec3) -> Self {
+        let across = up.any_orthonormal_vector();
+        let turned = |degrees: i32| {
+            let (sine, cosine) = f64::from(degrees).to_radians().sin_cos();
+            let first = cosine * across + sine * up.cross(across);
+            [first, up.cross(first), up]
+        };
+        let area = |axes: &[DVec3; 3]| {
+            let [a, b] = [0, 1].map(|k| range(places, axes[k])).map(|[low, high]| high - low);
+            a * b
+        };
+        let mut best = turned(0);
+        for degrees in (0..90).step_by(SIDES as usize) {
+            let axes = turned(degrees);
+            if area(&axes) < area(&best) {
+                best = axes;
+            }
+        }
+        let ranges = best.map(|axis| range(places, axis));
+        Self { axes: best, low: ranges.map(|[low, _]| low), high: ranges.map(|[_, high]| high) }
+    }
+
+    /// The box around places with its sides turned about its last axis.
+    pub(super) fn turned(&self, angle: f64, places: &[DVec3]) -> Self {
+        let [first, second, up] = self.axes;
+        let (sine, cosine) = angle.sin_cos();
+        let axes = [cosine * first + sine * second, cosine * second - sine * first, up];
+        let ranges = axes.map(|axis| range(places, axis));
+        Self { axes, low: ranges.map(|[low, _]| low), high: ranges.map(|[_, high]| high) }
+    }
+
+    fn extent(&self, axis: usize) -> f64 {
+        self.high[axis] - self.low[axis]
+    }
+
+    /// The point at these coordinates along the axes.
+    fn point(&self, at: [f64; 3]) -> DVec3 {
+        (0..3).map(|axis| at[axis] * self.axes[axis]).sum()
+    }
+
+    fn middle(&self) -> [f64; 3] {
+        [0, 1, 2].map(|axis| 0.5 * (self.low[axis] + self.high[axis]))
+    }
+}
+
+/// Equally spaced values.
+fn spaced(from: f64, to: f64, count: usize) -> Vec<f64> {
+    (0..count).map(|k| from + (to - from) * k as f64 / (count - 1) as f64).collect()
+}
+
+fn degrees(from: f64, to: f64, count: usize) -> Vec<f64> {
+    spaced(from.to_radians(), to.to_radians(), count)
+}
+
+/// Joints worth a trial; nothing opens towards what the object stands on.
+pub(super) fn guesses(sides: &Sides, stands: Option<&Plane>) -> Vec<Guess> {
+    let mut all = Vec::new();
+    let revolute = |axis, point| Hinge { kind: JointKind::Revolute, axis, point };
+    let slide = |axis, point| Hinge { kind: JointKind::Prismatic, axis, point };
+    for (face, sign) in (0..3).flat_map(|face| [(face, 1.0), (face, -1.0)]) {
+        if face == 2 && sign < 0.0 && stands.is_some() {
+            continue;
+        }
+        let normal = sign * sides.axes[face];
+        let outer = if sign > 0.0 { sides.high[face] } else { -sides.low[face] };
+        let extent = sides.extent(face);
+        let cut = |share: f64| (normal, outer - share * extent);
+        let others: Vec<usize> = (0..3).filter(|axis| *axis != face).collect();
+        for share in FLAPS {
+            for (side, towards) in others.iter().flat_map(|axis| [(*axis, 1.0), (*axis, -1.0)]) {
+                let mut at = sides.middle();
+                at[face] = sign * cut(share).1;
+                at[side] = if towards > 0.0 { sides.high[side] } else { sides.low[side] };
+                let hinge = revolute(normal.cross(towards * sides.axes[side]), sides.point(at));
+                let values = degrees(-30.0, 150.0, 13);
+                all.push(Guess { hinge, cut: cut(share), values, is_round: false });
+            }
+        }
+        for share in DRAWERS {
+            let hinge = slide(normal, sides.point(sides.middle()));
+            let values = spaced(-0.2 * extent, extent, 13);
+            all.push(Guess { hinge, cut: cut(share), values, is_round: false });
+        }
+        for (share, side) in PLATES.iter().flat_map(|share| others.iter().map(move |side| (*share, *side))) {
+            let reach = sides.extent(side);
+            let hinge = slide(sides.axes[side], sides.point(sides.middle()));
+            let values = spaced(-0.9 * reach, 0.9 * reach, 13);
+            all.push(Guess { hinge, cut: cut(share), values, is_round: false });
+        }
+        for share in WHEELS {
+            let hinge = revolute(normal, sides.point(sides.middle()));
+            let values = degrees(-180.0, 150.0, 12);
+            all.push(Guess { hinge, cut: cut(share), values, is_round: true });
+        }
+        if sign > 0.0 {
+            for (share, axis) in CUTS.iter().flat_map(|share| others.iter().map(move |axis| (*share, *axis)))
+            {
+                let mut at = sides.middle();
+                at[face] = sides.low[face] + share * extent;
+                let hinge = revolute(sides.axes[axis], sides.point(at));
+                let values = degrees(-120.0, 120.0, 13);
+                all.push(Guess { hinge, cut: (normal, at[face]), values, is_round: false });
+            }
+        }
+    }
+    all
+}

@@ -1,0 +1,99 @@
+//! Solids with a part on a joint, rendered and found again.
+
+use std::f64::consts::PI;
+
+use cif_field::tracks::JointKind;
+use glam::{DQuat, DVec3};
+use rand::RngExt;
+
+use super::super::parts;
+use super::super::tests::{Cameras, FLOOR, TIMES, moving, patches, rig, solid, views_of_groups, with_object};
+use super::super::view::ObjectView;
+use super::Jointed;
+use crate::random::{Purpose, stream};
+
+fn find(views: &[ObjectView]) -> Option<Jointed> {
+    with_object(Some(&FLOOR), views, |object| parts::find(object).unwrap())
+}
+
+/// Places on the faces of a box.
+fn faces(low: DVec3, high: DVec3, count: usize, seed: u64) -> Vec<DVec3> {
+    let mut rng = stream(0, Purpose::Objects, seed);
+    (0..count)
+        .map(|k| {
+            let mut p = low + (high - low) * DVec3::from(std::array::from_fn(|_| rng.random::<f64>()));
+            p[k % 3] = if (k / 3) % 2 == 0 { low[k % 3] } else { high[k % 3] };
+            p
+        })
+        .collect()
+}
+
+/// Share of the way at a time: it rests, goes, and rests.
+fn share(time: usize) -> f64 {
+    let share = ((time as f64 / (TIMES - 1) as f64 - 0.2) / 0.6).clamp(0.0, 1.0);
+    share * share * (3.0 - 2.0 * share)
+}
+
+/// Views of a base and of a part in poses over time.
+fn seen(
+    base: &[DVec3],
+    part: &[DVec3],
+    pose: impl Fn(f64) -> (DQuat, DVec3),
+    cameras: Cameras,
+) -> Vec<ObjectView> {
+    let mut all = solid(base, patches, 0.006);
+    all.append(&solid(part, |p| patches(p + DVec3::splat(0.31)), 0.006));
+    let group_of = (0..all.len()).map(|row| u32::from(row >= base.len())).collect();
+    let still = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
+    let poses = (0..TIMES).map(|time| pose(share(time))).collect();
+    views_of_groups(all, group_of, &[still, poses], cameras)
+}
+
+/// Largest error of the values, from the first on.
+fn value_error(found: &Jointed, truth: impl Fn(f64) -> f64) -> f64 {
+    found.values.iter().map(|(time, value)| (value - truth(share(*time))).abs()).fold(0.0, f64::max)
+}
+
+#[test]
+fn the_lid_of_a_box_turns_on_its_hinge() {
+    let base = faces(DVec3::new(-0.07, -0.05, 0.0), DVec3::new(0.07, 0.05, 0.06), 1200, 20);
+    let lid = faces(DVec3::new(-0.07, -0.05, 0.065), DVec3::new(0.07, 0.05, 0.08), 700, 21);
+    let hinge = DVec3::new(0.0, 0.05, 0.065);
+    // It opens away from the cameras.
+    let pose = |share: f64| {
+        let turn = DQuat::from_rotation_x(1.6 * share);
+        (turn, hinge - turn * hinge)
+    };
+    let pose = |share: f64| pose(-share);
+    let found = find(&seen(&base, &lid, pose, rig)).unwrap();
+    assert_eq!(found.hinge.kind, JointKind::Revolute);
+    let angle = found.hinge.axis.dot(DVec3::X).abs().min(1.0).acos() * 180.0 / PI;
+    let off = found.hinge.point - hinge;
+    let error = value_error(&found, |share| 1.6 * share).to_degrees();
+    eprintln!("{} axis off {angle:.2} deg, {off:.4}, values {error:.2} deg", found.told());
+    assert!(angle < 3.0 && error < 5.0, "axis {angle} deg, values {error} deg");
+    assert!((off - off.x * DVec3::X).length() < 0.01, "{off}");
+    assert!(found.errors[0] < 0.75 * found.errors[1]);
+}
+
+#[test]
+fn a_drawer_slides() {
+    let base = faces(DVec3::new(-0.07, -0.04, 0.0), DVec3::new(0.07, 0.06, 0.08), 1200, 22);
+    let drawer = faces(DVec3::new(-0.06, -0.055, 0.01), DVec3::new(0.06, 0.03, 0.07), 900, 23);
+    let pose = |share: f64| (DQuat::IDENTITY, DVec3::new(0.0, -0.07 * share, 0.0));
+    let found = find(&seen(&base, &drawer, pose, rig)).unwrap();
+    assert_eq!(found.hinge.kind, JointKind::Prismatic);
+    let angle = found.hinge.axis.dot(DVec3::NEG_Y).min(1.0).acos() * 180.0 / PI;
+    let error = value_error(&found, |share| 0.07 * share);
+    eprintln!("{} axis off {angle:.2} deg, values {error:.4} m", found.told());
+    assert!(angle < 3.0 && error < 0.006, "axis {angle} deg, values {error} m");
+}
+
+#[test]
+fn a_box_that_rests_has_no_part() {
+    let places = faces(DVec3::new(-0.07, -0.05, 0.0), DVec3::new(0.07, 0.05, 0.08), 1500, 24);
+    let (base, rest) = places.split_at(1000);
+    for cameras in [moving as Cameras, rig] {
+        assert!(find(&seen(base, rest, |_| (DQuat::IDENTITY, DVec3::ZERO), cameras)).is_none());
+    }
+}

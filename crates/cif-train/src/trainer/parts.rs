@@ -1,0 +1,53 @@
+//! Objects with a part on a joint: found where an object rests but for a part, given Gaussians in two groups, of which
+//! that of the part moves on the joint.
+
+use cif_field::tracks::{Joint, TrackGroup};
+use rayon::prelude::*;
+
+use super::Trainer;
+use crate::error::TrainError;
+use crate::objects::{self, Jointed, Order};
+
+impl Trainer {
+    /// Looks for parts of objects (labels: dense index + 1) that do not move as a whole, and of which nothing is told.
+    pub(super) fn find_parts(&mut self, labels: &[u16]) -> Result<(), TrainError> {
+        if !self.state.config.motion.rigid {
+            return Ok(());
+        }
+        let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();
+        let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
+        let plane = self.support();
+        let state = &self.state;
+        let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
+        let surroundings = self.surroundings(plane.as_ref(), &order);
+        let find = |label: &u16| {
+            let found = objects::find_part(*label, &state.dataset, &state.frames, surroundings)?;
+            Ok(found.map(|found| (*label, found)))
+        };
+        let found: Vec<Option<(u16, Jointed)>> =
+            wanted.par_iter().map(find).collect::<Result<_, TrainError>>()?;
+        for (label, found) in found.into_iter().flatten() {
+            self.state.guidance.travelling[usize::from(label)] = true;
+            self.jointed.insert(label, found);
+        }
+        Ok(())
+    }
+
+    /// Gives an object with a part groups for both.
+    pub(super) fn add_parts(&mut self, name: String, found: &Jointed) {
+        let [with, without] = found.errors;
+        self.warnings.push(format!(
+            "{name} rests, but {} (error {with:.3} on pixels left out, {without:.3} without)",
+            found.told()
+        ));
+        let base = TrackGroup { deformed: false, ..TrackGroup::still(name.clone(), found.hinge.point) };
+        let base = self.add_group(found.base.clone(), base);
+        let times = &self.state.dataset.times;
+        let values: Vec<(f64, f64)> =
+            found.values.iter().map(|(time, value)| (times[*time], *value)).collect();
+        let joint = Joint { base, kind: found.hinge.kind, axis: found.hinge.axis };
+        let groups = self.state.field.tracks.as_ref().map_or(&[][..], |tracks| &tracks.groups);
+        let part = TrackGroup::jointed(name, found.hinge.point, joint, &values, groups);
+        self.add_group(found.part.clone(), part);
+    }
+}

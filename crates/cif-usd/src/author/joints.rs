@@ -1,0 +1,54 @@
+//! Joints between the bodies of parts.
+
+use cif_field::JointKind;
+use cif_scene::{Node, PartJoint};
+use glam::{DQuat, DVec3};
+use pyo3::prelude::*;
+
+use super::instance::parts;
+use super::{Scene, UNIFORM, VARYING};
+use crate::layer::{Layer, Prim, child};
+use crate::tokens;
+
+/// True where parts of a node are tied by joints.
+pub(super) fn has_joints(node: &Node) -> bool {
+    parts(node).is_some_and(|motion| motion.parts.iter().any(|part| part.joint.is_some()))
+}
+
+/// Defines the joints of a node in `place`: the prim itself, or one of its variants. Their limits are the range that
+/// was recorded, from the first pose on.
+pub(super) fn author(
+    scene: &Scene<'_, '_>,
+    layer: &Layer<'_, '_>,
+    place: &Prim<'_, '_, '_>,
+    node: &Node,
+) -> PyResult<()> {
+    let Some(motion) = parts(node) else { return Ok(()) };
+    let pxr = scene.pxr;
+    let body = |name: &str| child(&child(tokens::WORLD, &node.name), name);
+    for (index, part) in motion.parts.iter().enumerate() {
+        let Some(PartJoint { base, kind, axis, anchor }) = part.joint else { continue };
+        let (Some(first), Some(base)) = (motion.at_first(index), motion.parts.get(base)) else { continue };
+        let (prim_type, scale) = match kind {
+            JointKind::Revolute => (tokens::REVOLUTE_JOINT, 180.0 / std::f64::consts::PI),
+            JointKind::Prismatic => (tokens::PRISMATIC_JOINT, 1.0),
+        };
+        let name = format!("{}_{}", tokens::JOINT, part.name);
+        let prim = layer.define(&child(place.path(), &name), prim_type)?;
+        prim.relate("physics:body0", &body(&base.name))?;
+        prim.relate("physics:body1", &body(&part.name))?;
+        let turn = DQuat::from_rotation_arc(DVec3::X, axis);
+        let point = |v: DVec3| pxr.gf.call_method1("Vec3f", (v.x, v.y, v.z));
+        let at_base = first.rotation * anchor + first.translation;
+        prim.set("physics:localPos0", "Point3f", VARYING, point(at_base)?)?;
+        prim.set("physics:localRot0", "Quatf", VARYING, pxr.quatf((first.rotation * turn).normalize())?)?;
+        prim.set("physics:localPos1", "Point3f", VARYING, point(anchor)?)?;
+        prim.set("physics:localRot1", "Quatf", VARYING, pxr.quatf(turn)?)?;
+        prim.set("physics:axis", "Token", UNIFORM, "X")?;
+        if let Some([low, high]) = motion.joint_range(index) {
+            prim.set("physics:lowerLimit", "Float", VARYING, scale * low)?;
+            prim.set("physics:upperLimit", "Float", VARYING, scale * high)?;
+        }
+    }
+    Ok(())
+}
