@@ -1,7 +1,9 @@
 //! Our own export comes back as it was.
 
-use cif_field::RotationEvidence;
-use cif_scene::{CaptureFrame, LabelQuery, Motion, ObjectQuery, SceneGraph, VolumeOf};
+use cif_field::{JointKind, RotationEvidence};
+use cif_scene::{
+    CaptureFrame, LabelQuery, Motion, MotionModel, NodeKind, ObjectQuery, PartJoint, SceneGraph, VolumeOf,
+};
 use glam::DVec3;
 use proptest::prelude::*;
 
@@ -225,4 +227,45 @@ fn a_stage_that_is_placed_nowhere_is_refused() {
     std::fs::write(&path, text.replace(scale, "double captureScale = -1")).unwrap();
     let told = read_scene(&path).unwrap_err().to_string();
     assert!(told.contains("/World") && told.contains("captureScale"), "{told}");
+}
+
+#[test]
+fn joints_of_parts_leave_between_their_bodies_and_come_back() {
+    let _session = session();
+    for (kind, prim_type) in
+        [(JointKind::Revolute, "PhysicsRevoluteJoint"), (JointKind::Prismatic, "PhysicsPrismaticJoint")]
+    {
+        let mut made = Maker::new(5);
+        let node = NodeKind::Instance { id: 3, index: 0 };
+        let mut written = Maker::new(5).scene();
+        let mut node = made.node(node, MotionModel::Parts);
+        let joint =
+            PartJoint { base: 0, kind, axis: DVec3::new(0.6, 0.0, 0.8), anchor: DVec3::new(0.1, 0.2, 0.3) };
+        let Motion::Parts(motion) = &mut node.motion else { panic!("parts") };
+        motion.parts[1].joint = Some(joint);
+        written.nodes = vec![node];
+        for colliders in [written.nodes[0].colliders.clone(), Vec::new()] {
+            written.nodes[0].colliders = colliders;
+            let folder = tempfile::tempdir().unwrap();
+            let path = folder.path().join("a.usda");
+            export(&written, &path, ExportOptions::default()).unwrap();
+            let text = std::fs::read_to_string(&path).unwrap();
+            let name = &written.nodes[0].name;
+            for wanted in [
+                prim_type.to_owned(),
+                format!("rel physics:body0 = </World/{name}/part_00>"),
+                format!("rel physics:body1 = </World/{name}/part_01>"),
+                "physics:lowerLimit".to_owned(),
+            ] {
+                assert!(text.contains(&wanted), "{wanted} in {text}");
+            }
+            let read = read_scene(&path).unwrap();
+            let Motion::Parts(motion) = &read.nodes[0].motion else { panic!("{:?}", read.nodes[0].motion) };
+            let found = motion.parts[1].joint.unwrap();
+            assert_eq!((found.base, found.kind), (joint.base, joint.kind));
+            assert!(found.axis.distance(joint.axis) < 1e-6, "{}", found.axis);
+            assert!(found.anchor.distance(joint.anchor) < 1e-6, "{}", found.anchor);
+            assert!(motion.parts[0].joint.is_none());
+        }
+    }
 }
