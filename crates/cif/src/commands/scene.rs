@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use cif_field::Field;
+use cif_field::{Checkpoint, Field};
 use cif_render::RenderSettings;
 use cif_scene::CaptureFrame;
+use cif_train::heads::Decoder;
 
 use crate::error::Error;
 
@@ -20,6 +21,19 @@ pub(super) fn load(path: &Path) -> Result<Field, Error> {
         ));
     }
     Field::load(path).map_err(Error::plain)
+}
+
+/// Loads a `.cif` file with the head that tells labels of its pixels, where its identity rows do not.
+///
+/// # Errors
+/// As [`load`], and when the head does not fit the scene.
+pub(super) fn load_with_head(path: &Path) -> Result<(Field, Option<Decoder>), Error> {
+    let field = load(path)?;
+    let Some(head) = Checkpoint::load(path).map_err(Error::plain)?.head else { return Ok((field, None)) };
+    let decoder = Decoder::of_scene(&field, &head);
+    decoder
+        .map(|decoder| (field, Some(decoder)))
+        .map_err(|error| Error::plain(format!("{}: {error}", path.display())))
 }
 
 /// The settings that a scene is to be rendered with: those of its training.
