@@ -173,7 +173,8 @@ impl StepLoss {
     /// Of the views of a step; `lambda_instance` weighs the instance loss.
     pub(crate) fn new(plan: &StepPlan, views: &[ViewReport], lambda_instance: f32) -> Self {
         let sum = |of: fn(&ViewReport) -> f64| views.iter().map(of).sum::<f64>();
-        let is_labelled = plan.stage == Stage::Instance && plan.labelled > 0;
+        let trains_labels = plan.trains_head || plan.settings.instances.is_some();
+        let is_labelled = plan.stage == Stage::Instance && trains_labels && plan.labelled > 0;
         let of_labelled = |sum: f64| is_labelled.then(|| sum / plan.labelled as f64);
         let of_views = |sum: f64| sum * f64::from(plan.view_weight());
         let color = of_views(sum(|view| view.color_loss));

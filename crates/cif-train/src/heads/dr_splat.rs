@@ -90,8 +90,9 @@ impl ValueHead for DrSplat {
         let channels = self.channels(field);
         let mut values = vec![0.0; field.len() * channels];
         for (row, label) in values.chunks_exact_mut(channels).zip(tensors.values(&LABELS)) {
-            if let Some(label) = (*label as usize).checked_sub(1) {
-                row[label] = 1.0;
+            // A file may say anything.
+            if let Some(value) = (*label as usize).checked_sub(1).and_then(|label| row.get_mut(label)) {
+                *value = 1.0;
             }
         }
         values

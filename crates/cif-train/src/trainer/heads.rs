@@ -74,7 +74,7 @@ impl Trainer {
             return Ok(());
         }
         self.fetch()?;
-        let before = self.state.keep();
+        let (before, told) = (self.state.keep(), events.len());
         let mut random = stream(self.state.config.seed, Purpose::HeadRearrangements, u64::from(iteration));
         for part in 0..parts {
             let change =
@@ -83,6 +83,7 @@ impl Trainer {
                     Ok(None) => continue,
                     Err(error) => {
                         self.state.put_back(before);
+                        events.truncate(told);
                         self.engine.changed(Changed::Everything);
                         return Err(error);
                     }

@@ -38,6 +38,8 @@ mod gpu_tests;
 #[cfg(test)]
 mod guard_tests;
 mod guidance;
+#[cfg(test)]
+mod head_tests;
 mod heads;
 mod identity;
 mod initialize;

@@ -169,3 +169,43 @@ fn runs_of_heads_go_on_where_they_were_stopped() {
         assert_eq!(resumed.head, whole.head);
     }
 }
+
+/// Losses of the steps that train the head of a run, and the field in the end.
+#[cfg(feature = "wgpu")]
+fn losses(mut trainer: Trainer) -> (Vec<f64>, Field) {
+    let mut losses = Vec::new();
+    let outcome = trainer.run(&mut |event, _| {
+        if let TrainEvent::Step { stage: Stage::Instance, instance_loss: Some(loss), .. } = event {
+            losses.push(*loss);
+        }
+        Control::Continue
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Finished);
+    (losses, trainer.into_field())
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn heads_learn_the_same_on_a_gpu() {
+    let Some(gpu) = cif_render::wgpu::testing::gpu() else { return };
+    for name in [HeadName::GaussianGrouping, HeadName::Sa4d, HeadName::Vlgs, HeadName::Trace3d] {
+        let started = || {
+            let (_, dataset, reconstruction) = &*RECONSTRUCTION;
+            let mut config = TrainConfig { head: named(name), ..config() };
+            (config.stages.instance, config.report.step_every) = (12, 1);
+            Trainer::from_scene(dataset.clone(), config, reconstruction.clone(), "base.cif").unwrap()
+        };
+        let (on_processor, field) = losses(started());
+        let mut trainer = started();
+        trainer.use_gpu(&gpu).unwrap();
+        let (on_gpu, of_gpu) = losses(trainer);
+        assert!(on_processor.len() >= 8 && on_processor.len() == on_gpu.len(), "{}", name.name());
+        for (a, b) in on_processor.iter().zip(&on_gpu) {
+            assert!((a / b - 1.0).abs() < 0.03, "{}: {on_processor:?} and {on_gpu:?}", name.name());
+        }
+        assert!(field.len().abs_diff(of_gpu.len()) <= field.len() / 50, "{}", name.name());
+        let occupancies = field.gaussians.occupancy_logits.iter().zip(&of_gpu.gaussians.occupancy_logits);
+        let apart = occupancies.map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+        assert!(name != HeadName::Vlgs || apart < 0.05, "opacities of its own differ by {apart}");
+    }
+}

@@ -25,7 +25,8 @@ use crate::{interrupt, output};
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Every capture is reconstructed once per seed; every head then trains on that reconstruction, sees the same masks and is
-scored on the held-out frames as `cif eval` scores its scene.
+scored on the held-out frames as `cif eval` scores its scene. All train what their settings have, as `cif train
+--effects all` does.
 
   cif bench compare captures/table -o compare --preset draft
   cif bench compare captures/table captures/kitchen -o compare --heads cif,sa4d --seeds 1 --ablations
