@@ -44,7 +44,7 @@ fn scenes_of_every_head_can_be_scored_drawn_searched_and_exported() {
         assert!(scores["macc_pix"].is_number() && scores["psnr"].is_number(), "{head}: {scores:#}");
         cif(path, &format!("render {head}.cif --capture table -o {head} --what instance")).succeeds();
         cif(path, &format!("query {head}.cif --label * --json")).succeeds();
-        cif(path, &format!("export {head}.cif -o {head}.glb")).succeeds();
+        cif(path, &format!("export {head}.cif --gltf {head}.glb")).succeeds();
     }
     let told = cif(path, "eval base.cif table --json base.json").succeeds().stdout;
     assert!(!told.contains("decodes every pixel"), "{told}");

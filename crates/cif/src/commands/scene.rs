@@ -14,13 +14,18 @@ use crate::error::Error;
 /// # Errors
 /// When it is missing, truncated or not a scene.
 pub(super) fn load(path: &Path) -> Result<Field, Error> {
+    refuse_folder(path)?;
+    Field::load(path).map_err(Error::plain)
+}
+
+fn refuse_folder(path: &Path) -> Result<(), Error> {
     if path.is_dir() {
         return Err(Error::failed(
             format!("{} is a folder; a trained scene (.cif) is expected here", path.display()),
             "train one first: cif train CAPTURE -o scene.cif",
         ));
     }
-    Field::load(path).map_err(Error::plain)
+    Ok(())
 }
 
 /// Loads a `.cif` file with the head that tells labels of its pixels, where its identity rows do not.
@@ -28,8 +33,9 @@ pub(super) fn load(path: &Path) -> Result<Field, Error> {
 /// # Errors
 /// As [`load`], and when the head does not fit the scene.
 pub(super) fn load_with_head(path: &Path) -> Result<(Field, Option<Decoder>), Error> {
-    let field = load(path)?;
-    let Some(head) = Checkpoint::load(path).map_err(Error::plain)?.head else { return Ok((field, None)) };
+    refuse_folder(path)?;
+    let Checkpoint { field, head, .. } = Checkpoint::load(path).map_err(Error::plain)?;
+    let Some(head) = head else { return Ok((field, None)) };
     let decoder = Decoder::of_scene(&field, &head);
     decoder
         .map(|decoder| (field, Some(decoder)))
