@@ -1,6 +1,6 @@
 //! Ideal pinhole cameras. Lenses and skew are removed when a capture is read (see [`crate::lens`]).
 
-use glam::{DVec2, DVec3};
+use glam::{DMat3, DQuat, DVec2, DVec3};
 use serde::{Deserialize, Serialize};
 
 use crate::RigidTransform;
@@ -61,6 +61,24 @@ impl PinholeCamera {
         self.camera_from_world.inverse().translation
     }
 
+    /// The camera on the way to another one: the shortest turn, a straight line of centres and intermediate
+    /// intrinsics, `ratio` being 0 here and 1 there. Image sizes are those of this one.
+    #[must_use]
+    pub fn toward(&self, other: &Self, ratio: f64) -> Self {
+        let poses = [self, other].map(|camera| camera.camera_from_world.inverse());
+        let [from, to] = poses.map(|pose| DQuat::from_mat3(&pose.rotation));
+        let world_from_camera = RigidTransform {
+            rotation: DMat3::from_quat(from.slerp(to, ratio)),
+            translation: poses[0].translation.lerp(poses[1].translation, ratio),
+        };
+        Self {
+            focal_px: self.focal_px.lerp(other.focal_px, ratio),
+            principal_px: self.principal_px.lerp(other.principal_px, ratio),
+            camera_from_world: world_from_camera.inverse(),
+            ..*self
+        }
+    }
+
     /// Viewing direction (camera +z) in the world, unit.
     #[must_use]
     pub fn forward(&self) -> DVec3 {
@@ -108,8 +126,6 @@ impl PinholeCamera {
 
 #[cfg(test)]
 mod tests {
-    use glam::DMat3;
-
     use super::*;
 
     fn camera() -> PinholeCamera {
@@ -123,6 +139,27 @@ mod tests {
                 translation: DVec3::new(0.1, 0.2, 2.0),
             },
         }
+    }
+
+    #[test]
+    fn cameras_in_between_see_what_both_look_at() {
+        let point = DVec3::new(0.1, -0.2, 0.3);
+        let around = |angle: f64| {
+            let rotation = DMat3::from_rotation_y(angle);
+            let camera_from_world =
+                RigidTransform { rotation, translation: DVec3::Z * 2.0 - rotation * point };
+            PinholeCamera { camera_from_world, ..camera() }
+        };
+        let (from, to) = (around(-0.2), around(0.4));
+        let between = from.toward(&to, 0.5);
+        let (pixel, depth) = between.project(point).unwrap();
+        assert!((pixel - camera().principal_px).length() < 1e-9 && depth < 2.0 && depth > 1.8);
+        assert!((between.centre() - (from.centre() + to.centre()) / 2.0).length() < 1e-12);
+        let same = from.toward(&to, 0.0);
+        assert!(
+            (same.centre() - from.centre()).length() < 1e-12
+                && (same.forward() - from.forward()).length() < 1e-9
+        );
     }
 
     #[test]

@@ -105,13 +105,24 @@ pub fn add_gaussians(
     }
     let is_large = |row: u32| largest_scale(gaussians, row as usize) > config.split_scale * extent;
     let (splits, clones): (Vec<u32>, Vec<u32>) = chosen.into_iter().partition(|row| is_large(*row));
+    Some(with_copies(gaussians, &clones, &splits, rng))
+}
+
+/// Duplicates some Gaussians, and replaces others by two smaller ones drawn from them.
+pub(crate) fn with_copies(
+    gaussians: &Gaussians,
+    clones: &[u32],
+    splits: &[u32],
+    rng: &mut impl Rng,
+) -> Rearrangement {
+    let n = gaussians.len();
     let mut is_split = vec![false; n];
-    for row in &splits {
+    for row in splits {
         is_split[*row as usize] = true;
     }
     let mut parents: Vec<u32> = (0..n as u32).filter(|row| !is_split[*row as usize]).collect();
     let mut origins: Vec<Option<u32>> = parents.iter().copied().map(Some).collect();
-    parents.extend(&clones);
+    parents.extend(clones);
     let first_child = parents.len();
     parents.extend(splits.iter().flat_map(|row| [*row, *row]));
     origins.resize(parents.len(), None);
@@ -124,13 +135,19 @@ pub fn add_gaussians(
             set.log_scales[row][axis] -= SPLIT_SHRINK.ln();
         }
     }
-    Some(Rearrangement {
-        gaussians: set,
-        origins,
-        parents,
-        cloned: clones.len(),
-        split: splits.len(),
-        pruned: 0,
+    Rearrangement { gaussians: set, origins, parents, cloned: clones.len(), split: splits.len(), pruned: 0 }
+}
+
+/// Removes all but some Gaussians; `None` where all stay.
+pub(crate) fn keep(gaussians: &Gaussians, kept: Vec<u32>) -> Option<Rearrangement> {
+    let n = gaussians.len();
+    (kept.len() < n).then(|| Rearrangement {
+        gaussians: gaussians.gather(&kept),
+        pruned: n - kept.len(),
+        origins: kept.iter().copied().map(Some).collect(),
+        parents: kept,
+        cloned: 0,
+        split: 0,
     })
 }
 
@@ -154,15 +171,7 @@ pub fn prune(
                 && (statistics.radius[row] > config.prune_radius_px
                     || largest_scale(gaussians, row) > config.prune_scale * extent))
     };
-    let kept: Vec<u32> = (0..n as u32).filter(|row| !goes(*row as usize)).collect();
-    (kept.len() < n).then(|| Rearrangement {
-        gaussians: gaussians.gather(&kept),
-        pruned: n - kept.len(),
-        origins: kept.iter().copied().map(Some).collect(),
-        parents: kept,
-        cloned: 0,
-        split: 0,
-    })
+    keep(gaussians, (0..n as u32).filter(|row| !goes(*row as usize)).collect())
 }
 
 /// Caps every opacity; the caller zeroes the opacity moments (methods reference 7, row 24).

@@ -117,6 +117,20 @@ pub enum TrainError {
         /// The problem.
         reason: String,
     },
+    /// The head saved with a scene cannot be used.
+    #[error("the head of the scene is not usable: {reason}; train it again")]
+    BadHead {
+        /// The problem.
+        reason: String,
+    },
+    /// No training frame is of the camera that a head is to be trained on.
+    #[error("head.camera = {camera}: no training frame is of that camera; training cameras: {cameras}")]
+    NoSuchCamera {
+        /// Camera asked for.
+        camera: String,
+        /// Cameras of the training frames.
+        cameras: String,
+    },
     /// A scene to begin with has no motion, and the capture has.
     #[error(
         "{scene} has no deformation, but {} has {times} times; begin with a scene that was trained on them",
@@ -171,6 +185,7 @@ impl TrainError {
             | Self::RecordedMotion { .. }
             | Self::NoState
             | Self::BadState { .. }
+            | Self::BadHead { .. }
             | Self::OtherCapture { .. } => Self::Scene { path: path.to_owned(), problem: Box::new(self) },
             other => other,
         }

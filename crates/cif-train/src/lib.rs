@@ -83,12 +83,12 @@ pub mod trainer;
 pub mod wgpu;
 
 pub use clock::{Clock, Seconds, SystemClock};
-pub use config::{Ablation, ObjectMotion, Preset, TrainConfig};
+pub use config::{Ablation, HeadName, ObjectMotion, Preset, TrainConfig};
 pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, TrainEvent};
 pub use guard::{Fault, Hint};
-pub use heads::{Head, HeadLoss, HeadTensors, Pass, ValueHead};
+pub use heads::{Head, HeadLoss, HeadTensors, HeadView, Pass, ValueHead};
 pub use plan::{EffectChoice, EffectPlan};
 pub use stage::Stage;
 pub use stop::{Start, Stop};

@@ -58,6 +58,11 @@ impl StepRates {
         Self(by_parameter.collect())
     }
 
+    /// One rate for some parameters; the others keep still.
+    pub(crate) fn uniform(rates: impl IntoIterator<Item = (Parameter, f32)>) -> Self {
+        Self(rates.into_iter().map(|(parameter, rate)| (parameter, RowRates::Uniform(rate))).collect())
+    }
+
     /// The same for some parameters; the others keep still.
     pub(crate) fn only(mut self, wanted: &[Parameter]) -> Self {
         self.0.retain(|(parameter, _)| wanted.contains(parameter));

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use serde::{Deserialize, Serialize};
 
 use crate::clock::Seconds;
-use crate::config::TrainConfig;
+use crate::config::{HeadName, TrainConfig};
 use crate::curve::{Curve, Targets};
 use crate::exposure::Exposures;
 use crate::guard::Rollbacks;
@@ -214,6 +214,8 @@ impl Stages {
             Stage::Coarse if self.is_dynamic => config.stages.coarse,
             Stage::Fine if self.is_dynamic => config.fine_iterations(),
             Stage::Fine => config.stages.coarse.saturating_add(config.fine_iterations()),
+            // Labels are counted before its first step.
+            Stage::Instance if config.head.name == HeadName::DrSplat => 0,
             Stage::Instance if self.has_instances => config.stages.instance,
             _ => 0,
         }

@@ -21,6 +21,22 @@ pub(crate) enum Purpose {
     Still = 7,
     /// Fits of objects.
     Objects = 8,
+    /// Codes of heads.
+    Codes = 9,
+    /// Weights of the classifiers of heads.
+    Classifier = 10,
+    /// Their biases.
+    ClassifierBiases = 11,
+    /// Gaussians and pixels that losses of heads sample.
+    HeadSamples = 12,
+    /// Weights of the networks of heads.
+    HeadNetwork = 13,
+    /// Steps of heads.
+    HeadSteps = 14,
+    /// Changes of the set of Gaussians by heads.
+    HeadRearrangements = 15,
+    /// Cameras between views.
+    HeadCameras = 16,
 }
 
 /// The stream of a purpose; `counter` tells its uses apart.

@@ -3,15 +3,18 @@
 
 use std::sync::Arc;
 
-use cif_render::RenderSettings;
+use cif_geometry::PinholeCamera;
+use cif_render::{BlendedImage, RenderSettings};
 
 use crate::adam::PlaneWeights;
 use crate::config::TrainConfig;
 use crate::frames::TrainFrame;
 use crate::guard::Fault;
-use crate::heads::{Head, ValueHead, value_head};
+use crate::heads::{Head, HeadLoss, HeadStep, HeadTensors, HeadView, ValueHead, value_head};
 use crate::optimiser::StepRates;
+use crate::random::{Purpose, derive};
 use crate::stage::Stage;
+use crate::state::State;
 
 /// A view of a step.
 #[derive(Clone)]
@@ -21,6 +24,36 @@ pub(crate) struct StepView {
     pub frame: Arc<TrainFrame>,
     /// True when the pixels that effects are judged by train nothing.
     pub leaves_judged: bool,
+}
+
+/// A camera whose blended values train a head, and the masks that they are held to with the weight of each.
+#[derive(Clone)]
+pub(crate) struct HeadTarget {
+    pub camera: PinholeCamera,
+    pub time: f64,
+    pub masks: Vec<(Arc<TrainFrame>, f32)>,
+}
+
+impl HeadTarget {
+    /// Loss of a head on what it blends to, and its gradient times `weight`.
+    pub(crate) fn loss(
+        &self,
+        head: &dyn ValueHead,
+        tensors: &mut HeadTensors,
+        (blended, seed): (&BlendedImage, u64),
+        weight: f32,
+        v_blended: &mut [f32],
+    ) -> HeadLoss {
+        let mut sum = HeadLoss::default();
+        for (frame, share) in &self.masks {
+            let Some(labels) = &frame.labels else { continue };
+            let view = HeadView { blended, labels, seed };
+            let HeadLoss { loss, unsupported } = head.loss(tensors, &view, weight * share, v_blended);
+            sum.loss += f64::from(*share) * loss;
+            sum.unsupported += unsupported;
+        }
+        sum
+    }
 }
 
 /// A step.
@@ -34,8 +67,9 @@ pub(crate) struct StepPlan {
     pub labelled: usize,
     /// Settings of views with labels; those without have no instances.
     pub settings: RenderSettings,
-    /// True when a head that blends values of its own is trained.
+    /// True when a head that blends values of its own is trained, and what it is trained on.
     pub trains_head: bool,
+    pub head_targets: Vec<HeadTarget>,
     /// False when only the instance loss is differentiated.
     pub trains_colors: bool,
     /// Weights of the pulls to paths, and to where Gaussians are.
@@ -78,9 +112,22 @@ impl StepPlan {
         value_head(head, config).filter(|_| self.trains_head)
     }
 
-    /// Weight of a labelled pixel in the loss of a head that sums over them.
-    pub(crate) fn head_weight(&self, config: &TrainConfig) -> f32 {
-        config.loss.lambda_instance / self.labelled.max(1) as f32
+    /// Names the random choices of a head on a target of the step.
+    pub(crate) fn head_seed(&self, config: &TrainConfig, target: usize) -> u64 {
+        derive(config.seed, Purpose::HeadSteps, u64::from(self.iteration) << 16 | target as u64)
+    }
+
+    /// Adds the gradients of the regulariser of a head.
+    pub(crate) fn regularise(&self, head: &dyn ValueHead, state: &mut State) {
+        let time = self.head_targets.first().map_or(0.0, |target| target.time);
+        let step = HeadStep {
+            field: &state.field,
+            time,
+            step: self.iteration,
+            steps: state.config.stages.instance,
+            seed: self.head_seed(&state.config, self.head_targets.len()),
+        };
+        head.regularise(&mut state.head_tensors, &step);
     }
 
     /// Share of the labelled pixels of the step that a view has (A4).
@@ -94,7 +141,7 @@ impl StepPlan {
 pub(crate) struct StepLoss {
     /// Mean over the views.
     pub color: f64,
-    /// Mean over the labelled pixels of all views.
+    /// Mean over the labelled pixels of all views, or as a head says.
     pub instance: Option<f64>,
     /// Share of them that no covering Gaussian supports.
     pub unsupported: Option<f64>,
@@ -103,31 +150,43 @@ pub(crate) struct StepLoss {
 }
 
 /// Measurements of a view of a step.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ViewReport {
-    /// Of the picture.
-    pub psnr: f64,
+    /// Of the picture, where one was rendered.
+    pub psnr: Option<f64>,
     /// Mean over the pixels of the view.
     pub color_loss: f64,
-    /// Summed over its labelled pixels.
+    /// Summed over its labelled pixels; that of the view where a head says what it is.
     pub instance_loss: f64,
     /// Labelled pixels that no covering Gaussian supports.
     pub unsupported: f64,
+}
+
+impl ViewReport {
+    /// Of a view that trained a head alone.
+    pub(crate) fn of_head(loss: HeadLoss) -> Self {
+        Self { instance_loss: loss.loss, unsupported: loss.unsupported, ..Self::default() }
+    }
 }
 
 impl StepLoss {
     /// Of the views of a step; `lambda_instance` weighs the instance loss.
     pub(crate) fn new(plan: &StepPlan, views: &[ViewReport], lambda_instance: f32) -> Self {
         let sum = |of: fn(&ViewReport) -> f64| views.iter().map(of).sum::<f64>();
-        let is_labelled = plan.stage == Stage::Instance && plan.labelled > 0;
+        let trains_labels = plan.trains_head || plan.settings.instances.is_some();
+        let is_labelled = plan.stage == Stage::Instance && trains_labels && plan.labelled > 0;
         let of_labelled = |sum: f64| is_labelled.then(|| sum / plan.labelled as f64);
-        let color = sum(|view| view.color_loss) * f64::from(plan.view_weight());
-        let instance = of_labelled(sum(|view| view.instance_loss));
+        let of_views = |sum: f64| sum * f64::from(plan.view_weight());
+        let color = of_views(sum(|view| view.color_loss));
+        let (instance, weight) = match plan.trains_head {
+            true => (Some(of_views(sum(|view| view.instance_loss))), 1.0),
+            false => (of_labelled(sum(|view| view.instance_loss)), f64::from(lambda_instance)),
+        };
         Self {
             color,
             instance,
             unsupported: of_labelled(sum(|view| view.unsupported)),
-            total: color + f64::from(lambda_instance) * instance.unwrap_or(0.0),
+            total: color + weight * instance.unwrap_or(0.0),
         }
     }
 }

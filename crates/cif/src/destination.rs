@@ -248,7 +248,7 @@ mod tests {
     fn checkpoint(iterations: u32) -> Checkpoint {
         let mut field = generate(&SyntheticConfig::default()).field;
         field.record.notes.insert("iterations".to_owned(), serde_json::json!(iterations));
-        Checkpoint { field, training: None }
+        Checkpoint { field, training: None, head: None }
     }
 
     fn listing(folder: &Path) -> Vec<String> {

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use cif_dataset::{Dataset, Split};
-use cif_field::{Checkpoint, Field};
+use cif_field::Field;
 use cif_geometry::PixelGrid;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::quality::Quality;
@@ -11,15 +11,14 @@ use cif_render::{Channels, RenderSettings, RenderedImage, reference};
 use cif_scene::{ExportOptions, SceneFormat, SceneOptions, Tolerance};
 use cif_train::metrics::image::psnr;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, FrameView, Scores, evaluate, trained_settings};
-use cif_train::{
-    Clock, Control, Outcome, Seconds, Start, Stop, SystemClock, TrainConfig, TrainError, Trainer,
-};
+use cif_train::{Clock, Seconds, Start, Stop, SystemClock, TrainConfig, Trainer};
 use half::f16;
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 
 use super::record::{Folder, Record};
 use crate::error::{Error, write_file};
+use crate::training::Run;
 
 /// An error that evaluation can pass on.
 struct Failure(Error);
@@ -56,42 +55,14 @@ pub fn train(
     stop: &Stop,
     tell: &mut dyn FnMut(u64, u64),
 ) -> Result<Option<(Field, Record)>, Error> {
-    let partial = folder.file(&format!("{}.partial.cif", training.id));
-    let begun = match partial.is_file() {
-        true => Checkpoint::load(&partial).ok(),
-        false => None,
+    let run = Run {
+        partial: &folder.file(&format!("{}.partial.cif", training.id)),
+        dataset: &training.dataset,
+        config: &training.config,
+        until: None,
     };
-    let start = || Start { dataset: training.dataset.clone(), stop: stop.clone() };
-    let resumed = begun.and_then(|checkpoint| Trainer::resume(start(), checkpoint).ok());
-    let mut trainer = match resumed {
-        // Settings may have changed since.
-        Some(trainer) if *trainer.config() == training.config => trainer,
-        _ => match Trainer::new(start(), training.config) {
-            Err(TrainError::Stopped) => return Ok(None),
-            begun => begun.map_err(Error::plain)?,
-        },
-    };
-    let whole = trainer.steps_done() + trainer.steps_left();
-    let before = trainer.steps_done();
-    // Steps of earlier stages, and those that this stage had and has.
-    let (mut done, mut stage) = (0, (0, 0));
-    let outcome = trainer.run(&mut |event, _| {
-        if let cif_train::TrainEvent::StageStarted { iteration, .. } = event {
-            (done, stage) = (done + stage.1 - stage.0, (*iteration, *iteration));
-        }
-        if let cif_train::TrainEvent::Step { iteration, .. } = event {
-            stage.1 = *iteration;
-            tell(before + u64::from(done + stage.1 - stage.0), whole);
-        }
-        Control::Continue
-    });
-    if outcome.map_err(Error::plain)? == Outcome::Interrupted {
-        trainer.checkpoint(true).save(&partial).map_err(Error::plain)?;
-        return Ok(None);
-    }
-    if partial.is_file() {
-        std::fs::remove_file(&partial).map_err(Error::io("remove", &partial))?;
-    }
+    let begin = |start: Start| Trainer::new(start, training.config.clone());
+    let Some(trainer) = run.train(&begin, stop, tell)? else { return Ok(None) };
     let curve = trainer.curve().clone();
     let field = trainer.into_field();
     let run = field.record.run.clone().unwrap_or_default();

@@ -6,14 +6,12 @@
 //! | `measure` | how a rung is measured |
 //! | `record` | what is kept of a rung, so that a report can be interrupted |
 //! | `pareto` | which rungs nothing else beats, and what the next dB costs |
-//! | `plots` | pictures of it |
 //! | `time_limit` | what still fits into a quick report |
 //! | `report` | the page, the table and the JSON |
 
 pub mod ladders;
 pub mod measure;
 mod pareto;
-mod plots;
 pub mod record;
 pub mod report;
 pub mod time_limit;

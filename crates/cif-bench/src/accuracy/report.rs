@@ -3,15 +3,14 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
 use serde_json::{Value, json};
 
 use super::ladders::{BASE, Ladder, Work};
 use super::pareto::{Climb, amount, front, sentence};
-use super::plots::{Plot, Series, svg};
 use super::record::{Folder, Record};
 use crate::error::{Error, write_file};
+use crate::page::{STYLE, escape, picture};
+use crate::plots::{Plot, Series, svg};
 
 /// Subject of a report: capture, command and processor.
 #[derive(Clone, Debug)]
@@ -317,12 +316,6 @@ fn plots(measured: &Measured, rows: &[Row<'_>]) -> Vec<(String, String, String)>
     found
 }
 
-const STYLE: &str = include_str!("report.css");
-
-fn escape(text: &str) -> String {
-    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
-}
-
 fn page(
     rungs: &Folder,
     subject: &Subject,
@@ -570,19 +563,11 @@ fn pictures(page: &mut String, rungs: &Folder, rows: &[&Row<'_>]) -> Result<(), 
     Ok(())
 }
 
-fn picture(page: &mut String, path: &Path, caption: &str) -> Result<(), Error> {
-    let bytes = std::fs::read(path).map_err(Error::io("read", path))?;
-    let caption = escape(caption);
-    let _ = writeln!(
-        page,
-        "<figure><img alt=\"{caption}\" src=\"data:image/png;base64,{}\"><figcaption>{caption}</figcaption></figure>",
-        STANDARD.encode(bytes)
-    );
-    Ok(())
-}
-
 #[cfg(test)]
 mod tests {
+    use base64::Engine;
+    use base64::engine::general_purpose::STANDARD;
+
     use super::super::ladders::{Base, ladders};
     use super::*;
 

@@ -16,9 +16,12 @@ use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Time
 /// 1 is the first; 2 adds recorded motion ([`crate::Tracks`]); 3 adds Gaussians that stand still
 /// ([`crate::Deformation::still`]); 4 adds recorded opacities and colours ([`crate::TrackGroup::opacities`]), and
 /// identity rows without entries or with an owner ([`crate::Owner`]); 5 adds evidence for rotations
-/// ([`crate::TrackGroup::rotation`]); 6 adds joints ([`crate::TrackGroup::joint`]). A field without these is written as
-/// 1 to 5, so that older software reads it.
-pub const FORMAT: u32 = 6;
+/// ([`crate::TrackGroup::rotation`]); 6 adds joints ([`crate::TrackGroup::joint`]); 7 adds heads
+/// ([`super::Checkpoint::head`]). A scene without these is written as 1 to 6, so that older software reads it.
+pub const FORMAT: u32 = 7;
+
+/// The layout before heads.
+const FORMAT_WITH_JOINTS: u32 = 6;
 
 /// The layout before joints.
 const FORMAT_WITH_EVIDENCE: u32 = 5;
@@ -35,10 +38,12 @@ const FORMAT_WITH_TRACKS: u32 = 2;
 /// The layout before there were tracks.
 const FORMAT_WITHOUT_TRACKS: u32 = 1;
 
-/// Oldest layout that holds a field.
-pub(super) fn format_of(field: &Field) -> u32 {
-    if groups(field).any(|group| group.joint.is_some()) {
+/// Oldest layout that holds a field, and what a head learnt where `has_head`.
+pub(super) fn format_of(field: &Field, has_head: bool) -> u32 {
+    if has_head {
         FORMAT
+    } else if groups(field).any(|group| group.joint.is_some()) {
+        FORMAT_WITH_JOINTS
     } else if has_evidence(field) {
         FORMAT_WITH_EVIDENCE
     } else if has_appearance(field) || has_owners(field) {
@@ -97,6 +102,7 @@ pub(super) const FORMAT_KEY: &str = "cif.format";
 pub(super) const VERSION_KEY: &str = "cif.version";
 pub(super) const FIELD_KEY: &str = "cif.field";
 pub(super) const TRAINING_KEY: &str = "cif.training";
+pub(super) const HEAD_KEY: &str = "cif.head";
 
 pub(super) const STILL: &str = "deformation.still";
 pub(super) const TRACK_GROUPS: &str = "tracks.group_of";
@@ -111,6 +117,7 @@ pub(super) const LABELS: &str = "identities.labels";
 pub(super) const LOG_ESTIMATES: &str = "identities.log_estimates";
 pub(super) const OWNERS: &str = "identities.owners";
 pub(super) const TRAINING_PREFIX: &str = "training.";
+pub(super) const HEAD_PREFIX: &str = "head.";
 
 /// The part of a field that is not a tensor.
 #[derive(Serialize, Deserialize)]

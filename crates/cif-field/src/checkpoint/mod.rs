@@ -8,6 +8,7 @@
 //! | `cif.version` | version of the cif that wrote the file |
 //! | `cif.field` | JSON of everything in a [`Field`] that is not a tensor |
 //! | `cif.training` | JSON of the [`TrainingState`]; absent in a scene without one |
+//! | `cif.head` | JSON of [`Checkpoint::head`], likewise |
 //!
 //! and the tensors are, little-endian, with N Gaussians and E identity entries:
 //!
@@ -29,7 +30,7 @@
 //! | `identities.labels` | U16 | `[E]` |
 //! | `identities.log_estimates`, `identities.log_calibrations` | F32 | `[E]` |
 //! | `identities.owners` | I32 | `[N]`: an instance, -1 for none, -2 where the identity row decides; absent where all do |
-//! | `training.<name>` | F32, F64, U32 or U64 | `[length]` |
+//! | `training.<name>`, `head.<name>` | F32, F64, U32 or U64 | `[length]` |
 //!
 //! Floats survive bit by bit, in tensors and in JSON; equal fields give equal bytes. A file is written beside
 //! its destination and renamed, so a failed save leaves what was there. A reader trusts nothing: it allocates
@@ -56,9 +57,12 @@ pub struct Checkpoint {
     pub field: Field,
     /// State of the run; `None` in a finished scene.
     pub training: Option<TrainingState>,
+    /// What a finished scene needs to tell labels of pixels by something else than its identity rows: the head that
+    /// it was trained with, by name, and what that learnt. `None` where its rows tell them.
+    pub head: Option<TrainingState>,
 }
 
-/// State beside the field from which a run goes on exactly as if it had not been interrupted.
+/// State beside the field: that from which a run goes on exactly as if it had not been interrupted, or that of a head.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TrainingState {
     /// Counters, settings, random generators.
@@ -80,13 +84,24 @@ pub enum StateTensor {
     U64(Vec<u64>),
 }
 
+/// What is written beside a field.
+#[derive(Clone, Copy, Default)]
+struct States<'a> {
+    training: Option<&'a TrainingState>,
+    head: Option<&'a TrainingState>,
+}
+
 impl Checkpoint {
     /// Writes the file, replacing an older one only once the new one is complete on disk.
     ///
     /// # Errors
     /// When the field is not valid (see [`Field::validate`]) or the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
-        write::save(path.as_ref(), &self.field, self.training.as_ref())
+        write::save(path.as_ref(), &self.field, self.states())
+    }
+
+    fn states(&self) -> States<'_> {
+        States { training: self.training.as_ref(), head: self.head.as_ref() }
     }
 
     /// Reads a file.
@@ -111,7 +126,7 @@ impl Checkpoint {
     /// # Errors
     /// As [`Checkpoint::save`].
     pub fn write(&self, sink: &mut dyn Write, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
-        write::write(sink, path.as_ref(), &self.field, self.training.as_ref())
+        write::write(sink, path.as_ref(), &self.field, self.states())
     }
 
     /// Reads the bytes of a `.cif` file from any source; `path` is only named in errors.
@@ -129,7 +144,7 @@ impl Field {
     /// # Errors
     /// As [`Checkpoint::save`].
     pub fn save(&self, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
-        write::save(path.as_ref(), self, None)
+        write::save(path.as_ref(), self, States::default())
     }
 
     /// [`Checkpoint::save`] without taking the field.
@@ -141,7 +156,7 @@ impl Field {
         training: &TrainingState,
         path: impl AsRef<Path>,
     ) -> Result<(), CheckpointError> {
-        write::save(path.as_ref(), self, Some(training))
+        write::save(path.as_ref(), self, States { training: Some(training), head: None })
     }
 
     /// Reads the scene of a `.cif` file and leaves a training state in it unread.

@@ -9,9 +9,9 @@ use safetensors::Dtype;
 use safetensors::tensor::{Metadata, TensorInfo};
 
 use super::format::{
-    FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, LABELS, LOG_ESTIMATES, MAX_HEADER, OWNERS, POSE_FLOATS,
-    ROW_OFFSETS, STILL, SamplesJson, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS,
-    TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays,
+    FIELD_KEY, FORMAT, FORMAT_KEY, FieldJson, HEAD_KEY, HEAD_PREFIX, LABELS, LOG_ESTIMATES, MAX_HEADER,
+    OWNERS, POSE_FLOATS, ROW_OFFSETS, STILL, SamplesJson, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES,
+    TRACK_MEANS, TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays,
     TrackGroupJson, VERSION_KEY,
 };
 use super::{Checkpoint, CheckpointError, StateTensor, TrainingState};
@@ -20,8 +20,8 @@ use crate::gaussians::SH_FLOATS;
 use crate::parameters::{LOG_CALIBRATIONS, MEANS, MLP, PLANES};
 use crate::{Deformation, Field, Gaussians, Identities, Owner, Parameter, Record, Tracks};
 
-pub(super) fn load(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
-    let checkpoint = load_unchecked(path, with_training)?;
+pub(super) fn load(path: &Path, with_states: bool) -> Result<Checkpoint, CheckpointError> {
+    let checkpoint = load_unchecked(path, with_states)?;
     validated(checkpoint, path)
 }
 
@@ -35,24 +35,24 @@ fn validated(checkpoint: Checkpoint, path: &Path) -> Result<Checkpoint, Checkpoi
 }
 
 /// As [`load`], with whatever values the file holds; shapes and sizes are right.
-pub(super) fn load_unchecked(path: &Path, with_training: bool) -> Result<Checkpoint, CheckpointError> {
+pub(super) fn load_unchecked(path: &Path, with_states: bool) -> Result<Checkpoint, CheckpointError> {
     let failed = |source: io::Error| CheckpointError::Read { path: path.to_owned(), source };
     let file = cif_input::open(path).map_err(failed)?;
-    read_unchecked(&mut BufReader::new(file), path, with_training)
+    read_unchecked(&mut BufReader::new(file), path, with_states)
 }
 
 pub(super) fn read<S: Read + Seek>(
     source: &mut S,
     path: &Path,
-    with_training: bool,
+    with_states: bool,
 ) -> Result<Checkpoint, CheckpointError> {
-    validated(read_unchecked(source, path, with_training)?, path)
+    validated(read_unchecked(source, path, with_states)?, path)
 }
 
 fn read_unchecked<S: Read + Seek>(
     source: &mut S,
     path: &Path,
-    with_training: bool,
+    with_states: bool,
 ) -> Result<Checkpoint, CheckpointError> {
     let mut reader = Reader::open(source, path)?;
     let metadata = reader.header.metadata().clone().unwrap_or_default();
@@ -64,18 +64,21 @@ fn read_unchecked<S: Read + Seek>(
 
     let field = read_field(&mut reader, json)?;
     let training = match metadata.get(TRAINING_KEY) {
-        Some(json) if with_training => Some(read_training(&mut reader, json)?),
+        Some(json) if with_states => Some(read_state(&mut reader, json, (TRAINING_KEY, TRAINING_PREFIX))?),
         _ => None,
     };
-    let unknown = reader
-        .header
-        .offset_keys()
-        .into_iter()
-        .find(|name| !reader.known.contains(name) && !name.starts_with(TRAINING_PREFIX));
+    let head = match metadata.get(HEAD_KEY) {
+        Some(json) if with_states => Some(read_state(&mut reader, json, (HEAD_KEY, HEAD_PREFIX))?),
+        _ => None,
+    };
+    let unknown = reader.header.offset_keys().into_iter().find(|name| {
+        let is_state = name.starts_with(TRAINING_PREFIX) || name.starts_with(HEAD_PREFIX);
+        !reader.known.contains(name) && !is_state
+    });
     if let Some(name) = unknown {
         return Err(reader.tensor_error(&name, "is not part of a scene"));
     }
-    Ok(Checkpoint { field, training })
+    Ok(Checkpoint { field, training, head })
 }
 
 fn read_field<S: Read + Seek>(reader: &mut Reader<'_, S>, json: FieldJson) -> Result<Field, CheckpointError> {
@@ -250,15 +253,15 @@ fn read_tracks<S: Read + Seek>(
     Ok(Tracks { group_of, groups })
 }
 
-fn read_training<S: Read + Seek>(
+fn read_state<S: Read + Seek>(
     reader: &mut Reader<'_, S>,
     json: &str,
+    (key, prefix): (&str, &str),
 ) -> Result<TrainingState, CheckpointError> {
-    let json =
-        serde_json::from_str(json).map_err(|error| reader.damaged(format!("`{TRAINING_KEY}`: {error}")))?;
+    let json = serde_json::from_str(json).map_err(|error| reader.damaged(format!("`{key}`: {error}")))?;
     let mut tensors = BTreeMap::new();
     for name in reader.header.offset_keys() {
-        let Some(short) = name.strip_prefix(TRAINING_PREFIX) else { continue };
+        let Some(short) = name.strip_prefix(prefix) else { continue };
         let Some(info) = reader.header.info(&name).cloned() else { continue };
         let [length] = info.shape[..] else {
             return Err(reader.shape_error(&name, &info.shape, "[length]"));

@@ -41,7 +41,7 @@ fn read_bytes(bytes: &[u8]) -> Result<Checkpoint, CheckpointError> {
 }
 
 fn example(n: usize) -> Checkpoint {
-    Checkpoint { field: testing::field(n, 4), training: Some(training()) }
+    Checkpoint { field: testing::field(n, 4), training: Some(training()), head: None }
 }
 
 /// A file with another header; the tensors' bytes stay.
@@ -108,7 +108,7 @@ fn fields_without_the_optional_parts_survive() {
             cameras: Vec::new(),
             ..testing::field(n, 1)
         };
-        let checkpoint = Checkpoint { field, training: None };
+        let checkpoint = Checkpoint { field, training: None, head: None };
         assert_eq!(read_bytes(&bytes_of(&checkpoint)).unwrap(), checkpoint);
         let full = example(n);
         assert_eq!(bytes_of(&read_bytes(&bytes_of(&full)).unwrap()), bytes_of(&full));
@@ -165,7 +165,7 @@ proptest! {
                 (format!("{text}2"), StateTensor::F64(doubles)),
             ].into(),
         };
-        let saved = Checkpoint { field, training: Some(training) };
+        let saved = Checkpoint { field, training: Some(training), head: None };
         let bytes = bytes_of(&saved);
         let loaded = read_bytes(&bytes).unwrap();
         prop_assert_eq!(&loaded.field, &saved.field);
@@ -281,7 +281,7 @@ fn recorded_motion_survives_and_raises_the_format() {
     };
     let plain = example(20);
     assert_eq!(format(&bytes_of(&plain)), "1", "older software reads fields without tracks");
-    let tracked = Checkpoint { field: testing::tracked_field(20, 4), training: None };
+    let tracked = Checkpoint { field: testing::tracked_field(20, 4), training: None, head: None };
     let bytes = bytes_of(&tracked);
     assert_eq!(format(&bytes), "4", "opacities and colours change over time");
     let loaded = read_bytes(&bytes).unwrap();
@@ -308,6 +308,7 @@ fn recorded_motion_survives_and_raises_the_format() {
     let empty = Checkpoint {
         field: Field { tracks: Some(Default::default()), ..testing::field(0, 1) },
         training: None,
+        head: None,
     };
     assert_eq!(read_bytes(&bytes_of(&empty)).unwrap(), empty);
 }
@@ -315,7 +316,7 @@ fn recorded_motion_survives_and_raises_the_format() {
 #[test]
 fn joints_survive_raise_the_format_and_are_checked() {
     let joint = Joint { base: 0, kind: JointKind::Revolute, axis: DVec3::new(0.6, 0.0, 0.8) };
-    let mut jointed = Checkpoint { field: testing::tracked_field(20, 4), training: None };
+    let mut jointed = Checkpoint { field: testing::tracked_field(20, 4), training: None, head: None };
     jointed.field.tracks.as_mut().unwrap().groups[2].joint = Some(joint);
     let bytes = bytes_of(&jointed);
     let (_, header) = safetensors::SafeTensors::read_metadata(&bytes).unwrap();
@@ -348,7 +349,7 @@ fn what_stands_still_survives_and_raises_the_format() {
         header.metadata().clone().unwrap()["cif.format"].clone()
     };
     for (field, expected) in [(testing::field(20, 4), "3"), (testing::tracked_field(20, 4), "4")] {
-        let mut partly = Checkpoint { field, training: None };
+        let mut partly = Checkpoint { field, training: None, head: None };
         let other = partly.field.fingerprint();
         partly.field.deformation.as_mut().unwrap().still = (0..20).map(|row| row % 3 == 1).collect();
         assert_ne!(partly.field.fingerprint(), other);
@@ -364,14 +365,14 @@ fn what_stands_still_survives_and_raises_the_format() {
     }
     let mut field = testing::field(20, 4);
     field.deformation.as_mut().unwrap().still = vec![false; 20];
-    assert_eq!(format(&bytes_of(&Checkpoint { field: field.clone(), training: None })), "1");
+    assert_eq!(format(&bytes_of(&Checkpoint { field: field.clone(), training: None, head: None })), "1");
     field.deformation.as_mut().unwrap().still = vec![true; 21];
     let error = field.validate().unwrap_err().to_string();
     assert!(error.contains("deformation.still"), "{error}");
 
     let mut field = testing::field(20, 4);
     field.deformation.as_mut().unwrap().still = vec![true; 20];
-    let mut bytes = bytes_of(&Checkpoint { field, training: None });
+    let mut bytes = bytes_of(&Checkpoint { field, training: None, head: None });
     // Bytes are the narrowest tensor, so that they come last.
     *bytes.last_mut().unwrap() = 7;
     let refused = message(read_bytes(&bytes));
@@ -380,7 +381,7 @@ fn what_stands_still_survives_and_raises_the_format() {
 
 #[test]
 fn tracks_that_do_not_fit_their_tensors_are_refused() {
-    let bytes = bytes_of(&Checkpoint { field: testing::tracked_field(20, 4), training: None });
+    let bytes = bytes_of(&Checkpoint { field: testing::tracked_field(20, 4), training: None, head: None });
     let change = |change: &dyn Fn(&mut serde_json::Value)| {
         message(read_bytes(&with_field(&bytes, |field| change(&mut field["tracks"]))))
     };
@@ -508,7 +509,7 @@ fn broken_identity_rows_are_named() {
 
 #[test]
 fn owners_survive_and_raise_the_format() {
-    let mut checkpoint = Checkpoint { field: testing::field(4, 2), training: None };
+    let mut checkpoint = Checkpoint { field: testing::field(4, 2), training: None, head: None };
     let mut rows = Identities::empty();
     rows.push(Owner::Estimated, &[(0, 0.5), (2, 0.25)]);
     rows.push_certain(Some(3));
@@ -536,7 +537,7 @@ fn owners_of_older_layouts_are_understood() {
         log_calibrations: vec![0.0; 3],
         owners: Vec::new(),
     });
-    let loaded = read_bytes(&bytes_of(&Checkpoint { field, training: None })).unwrap();
+    let loaded = read_bytes(&bytes_of(&Checkpoint { field, training: None, head: None })).unwrap();
     let rows = loaded.field.identities.unwrap();
     assert_eq!(rows.owners, [Owner::Instance(3), Owner::Background, Owner::Estimated]);
     assert_eq!((rows.labels, rows.row_offsets), (vec![3, 1], vec![0, 1, 1, 2]));
@@ -638,4 +639,26 @@ fn a_link_stays_a_link() {
     testing::field(4, 1).save(&link).unwrap();
     assert!(link.is_symlink());
     assert_eq!(Field::load(&target).unwrap().len(), 4);
+}
+
+#[test]
+fn heads_survive_and_raise_the_format() {
+    let head = TrainingState {
+        json: json!({ "name": "sa4d" }),
+        tensors: BTreeMap::from([("weights".to_owned(), StateTensor::F32(vec![0.25, -1.5]))]),
+    };
+    let field = testing::field(4, 2);
+    let format_of = |bytes: &[u8]| {
+        let (_, header) = safetensors::SafeTensors::read_metadata(bytes).unwrap();
+        header.metadata().clone().unwrap()["cif.format"].clone()
+    };
+    let plain = bytes_of(&Checkpoint { field: field.clone(), training: None, head: None });
+    assert_ne!(format_of(&plain), FORMAT.to_string(), "older software reads scenes without heads");
+    let finished = Checkpoint { field, training: None, head: Some(head) };
+    let bytes = bytes_of(&finished);
+    assert_eq!(format_of(&bytes), FORMAT.to_string());
+    assert_eq!(read_bytes(&bytes).unwrap(), finished);
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), &bytes).unwrap();
+    assert_eq!(Field::load(file.path()).unwrap(), finished.field, "the scene is read without it");
 }

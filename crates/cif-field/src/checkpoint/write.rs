@@ -10,12 +10,12 @@ use safetensors::tensor::TensorInfo;
 use serde::Serialize;
 
 use super::format::{
-    FIELD_KEY, FORMAT_KEY, FieldJson, LABELS, LOG_ESTIMATES, MAX_HEADER, OWNERS, POSE_FLOATS, ROW_OFFSETS,
-    STILL, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS, TRACK_OPACITIES, TRACK_POSES,
-    TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays, VERSION_KEY, format_of, owner_codes,
-    still_rows,
+    FIELD_KEY, FORMAT_KEY, FieldJson, HEAD_KEY, HEAD_PREFIX, LABELS, LOG_ESTIMATES, MAX_HEADER, OWNERS,
+    POSE_FLOATS, ROW_OFFSETS, STILL, TRACK_COLORS, TRACK_GROUPS, TRACK_LOG_SCALES, TRACK_MEANS,
+    TRACK_OPACITIES, TRACK_POSES, TRACK_QUATERNIONS, TRAINING_KEY, TRAINING_PREFIX, TrackArrays, VERSION_KEY,
+    format_of, owner_codes, still_rows,
 };
-use super::{CheckpointError, StateTensor, TrainingState};
+use super::{CheckpointError, StateTensor, States};
 use crate::Field;
 use crate::gaussians::SH_FLOATS;
 
@@ -40,12 +40,8 @@ struct Header<'a> {
 }
 
 /// Writes a file beside `path` and renames it.
-pub(super) fn save(
-    path: &Path,
-    field: &Field,
-    training: Option<&TrainingState>,
-) -> Result<(), CheckpointError> {
-    replace_file(path, |file| write(file, path, field, training))
+pub(super) fn save(path: &Path, field: &Field, states: States<'_>) -> Result<(), CheckpointError> {
+    replace_file(path, |file| write(file, path, field, states))
 }
 
 /// Runs `write` on a temporary file in the folder of `path`, and gives it that name once it is on disk.
@@ -68,20 +64,21 @@ pub(super) fn write(
     sink: &mut dyn Write,
     path: &Path,
     field: &Field,
-    training: Option<&TrainingState>,
+    States { training, head }: States<'_>,
 ) -> Result<(), CheckpointError> {
     field.validate().map_err(|source| CheckpointError::Unsaveable { path: path.to_owned(), source })?;
     let unsaveable =
         |problem: String| CheckpointError::Write { path: path.to_owned(), problem, source: None };
     let json = |value: serde_json::Result<String>| value.map_err(|error| unsaveable(error.to_string()));
     let own = FieldJson::of(field);
-    let free_form = [Some(&own.provenance), training.map(|training| &training.json)];
+    let free_form =
+        [Some(&own.provenance), training.map(|training| &training.json), head.map(|head| &head.json)];
     if free_form.into_iter().flatten().any(|value| deeper_than(value, MAX_JSON_DEPTH)) {
         return Err(unsaveable("its record or training state is nested too deeply".to_owned()));
     }
 
     let mut metadata = BTreeMap::from([
-        (FORMAT_KEY, format_of(field).to_string()),
+        (FORMAT_KEY, format_of(field, head.is_some()).to_string()),
         (VERSION_KEY, env!("CARGO_PKG_VERSION").to_owned()),
         (FIELD_KEY, json(serde_json::to_string(&own))?),
     ]);
@@ -105,9 +102,11 @@ pub(super) fn write(
             bytes: rows,
         });
     }
-    if let Some(training) = training {
-        metadata.insert(TRAINING_KEY, json(serde_json::to_string(&training.json))?);
-        tensors.extend(training.tensors.iter().map(|(name, tensor)| state_tensor(name, tensor)));
+    for (state, key, prefix) in [(training, TRAINING_KEY, TRAINING_PREFIX), (head, HEAD_KEY, HEAD_PREFIX)] {
+        if let Some(state) = state {
+            metadata.insert(key, json(serde_json::to_string(&state.json))?);
+            tensors.extend(state.tensors.iter().map(|(name, tensor)| state_tensor(prefix, name, tensor)));
+        }
     }
     // Widest elements first, so that every tensor is aligned in the file; names break ties.
     tensors.sort_by(|a, b| b.dtype.bitsize().cmp(&a.dtype.bitsize()).then_with(|| a.name.cmp(&b.name)));
@@ -189,12 +188,12 @@ fn field_tensors<'a>(field: &'a Field, track_arrays: Option<&'a TrackArrays>) ->
     tensors
 }
 
-fn state_tensor<'a>(name: &str, tensor: &'a StateTensor) -> Tensor<'a> {
+fn state_tensor<'a>(prefix: &str, name: &str, tensor: &'a StateTensor) -> Tensor<'a> {
     let (dtype, length, bytes): (Dtype, usize, &[u8]) = match tensor {
         StateTensor::F32(values) => (Dtype::F32, values.len(), bytemuck::cast_slice(values)),
         StateTensor::F64(values) => (Dtype::F64, values.len(), bytemuck::cast_slice(values)),
         StateTensor::U32(values) => (Dtype::U32, values.len(), bytemuck::cast_slice(values)),
         StateTensor::U64(values) => (Dtype::U64, values.len(), bytemuck::cast_slice(values)),
     };
-    Tensor { name: format!("{TRAINING_PREFIX}{name}"), dtype, shape: vec![length], bytes }
+    Tensor { name: format!("{prefix}{name}"), dtype, shape: vec![length], bytes }
 }

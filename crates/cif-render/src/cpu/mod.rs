@@ -11,6 +11,8 @@
 //! | `dense` | instance images |
 //! | `blend`, `blend_backward` | other values per Gaussian, and back |
 //! | `identity`, `counts` | label mass for identity estimation |
+//! | `contributors` | label mass by the contributors of every pixel |
+//! | `products` | matrix products for networks elsewhere |
 //! | `renderer` | the stages in order, in both directions |
 //!
 //! Results do not depend on the number of threads: every sum over pixels, tiles or Gaussians runs in an
@@ -21,6 +23,7 @@ mod bin;
 mod blend;
 mod blend_backward;
 mod channels;
+mod contributors;
 mod counts;
 mod deform;
 mod dense;
@@ -30,6 +33,7 @@ mod labels;
 mod level;
 mod matrix;
 mod pixels;
+mod products;
 mod project;
 mod rasterize;
 mod rasterize_backward;
@@ -38,8 +42,10 @@ mod tile;
 mod timing;
 mod vector;
 
+pub use contributors::{ContributorMass, ContributorRule};
 pub use counts::IdentityCounts;
 pub use level::SimdLevel;
+pub use products::{Products, Side};
 pub use renderer::{
     BandRequest, BlendWeightGradients, ForwardPass, NotFinite, RenderedBand, Renderer, ViewStatistics,
 };

@@ -5,7 +5,10 @@
 //! band, see `agreement.rs`, carry no gradient and are not compared.
 
 use cif_field::parameters::{Parameter, TABLE};
-use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
+use cif_geometry::PixelGrid;
+use cif_render::cpu::{
+    BlendWeightGradients, ContributorMass, ContributorRule, IdentityCounts, Renderer, SimdLevel,
+};
 use cif_render::reference::Parameters;
 use cif_render::reference::blend::{blend, blend_backward};
 use cif_render::reference::{Forward, Scene, splats_backward};
@@ -639,5 +642,80 @@ mod gpu {
         let settings = RenderSettings { instances: None, ..settings() };
         let outcome = run(&mut device, &expected, &settings, &[Some(GeometryPath::Full)]).unwrap();
         assert!(outcome.v_values.is_empty() && outcome.blended == vec![0.0; 5 * 71 * 53]);
+    }
+}
+
+/// One-hot labels of a picture, and what a gradient of `share` by the channel of each pixel's label adds up to per
+/// Gaussian: its blending weights on the label.
+fn weights_on_labels(
+    renderer: &mut Renderer,
+    scene: &SyntheticScene,
+    labels: &PixelGrid<u16>,
+    share: impl Fn(usize) -> f32,
+) -> Vec<f32> {
+    let channels = scene.field.instances.len();
+    let values = vec![0.0; scene.field.len() * channels];
+    let mut v_blended = vec![0.0; labels.pixels.len() * channels];
+    for (pixel, label) in labels.pixels.iter().enumerate().filter(|(_, label)| **label != 0) {
+        v_blended[pixel * channels + usize::from(*label) - 1] = share(pixel);
+    }
+    let mut sums = vec![0.0; values.len()];
+    let request = BlendRequest { values: &values[..], channels, blending: Blending::Color };
+    renderer.prepare(&scene.field, &scene.camera, 0.3, &RenderSettings::default());
+    renderer.blend_backward(&request, &v_blended, &mut sums, None);
+    sums
+}
+
+#[test]
+fn contributors_of_pixels_have_the_weights_that_blending_gives_them() {
+    let scene = generate(&SyntheticConfig { gaussians: 200, ..SyntheticConfig::default() });
+    let (n, k) = (scene.field.len(), scene.field.instances.len());
+    let settings = RenderSettings::default();
+    let labels = PixelGrid::from_pixels(
+        scene.camera.width,
+        scene.camera.height,
+        (0..scene.camera.width * scene.camera.height)
+            .map(|pixel| (pixel / 5 % (k as u32 + 1)) as u16)
+            .collect(),
+    );
+    for level in SimdLevel::available() {
+        let mut renderer = Renderer::new(level);
+        let count = |renderer: &mut Renderer, rule: ContributorRule| {
+            let mut counts = IdentityCounts::zeros(n, k);
+            let of = (&labels, &rule);
+            renderer.count_contributors(&scene.field, &scene.camera, 0.3, &settings, of, &mut counts);
+            counts
+        };
+        let agree = |counts: &IdentityCounts, sums: &[f32]| {
+            for row in 0..n {
+                for label in 0..k {
+                    let (a, b) = (counts.label_mass(row, label as u16), f64::from(sums[row * k + label]));
+                    assert!((a - b).abs() < 1e-4 * b.max(1.0), "{level:?} {row} {label}: {a} and {b}");
+                }
+            }
+        };
+        // With all contributors: the counts of identities before they are divided by the coverage.
+        let all = count(&mut renderer, ContributorRule::ALL);
+        agree(&all, &weights_on_labels(&mut renderer, &scene, &labels, |_| 1.0));
+        let rendered =
+            renderer.render(&scene.field, &scene.camera, 0.3, &settings, cif_render::Channels::default());
+        let mut identities = IdentityCounts::zeros(n, k);
+        renderer.count_identities(&scene.field, &scene.camera, 0.3, &settings, &labels, &mut identities);
+        let share = |pixel: usize| match rendered.alpha.pixels[pixel] {
+            alpha if alpha >= cif_render::constants::MIN_COVERAGE => 1.0 / alpha,
+            _ => 0.0,
+        };
+        agree(&identities, &weights_on_labels(&mut renderer, &scene, &labels, share));
+
+        let total = |counts: &IdentityCounts| (0..n).map(|row| counts.total_mass(row)).sum::<f64>();
+        let first = ContributorRule { first: 1, ..ContributorRule::ALL };
+        let strongest = ContributorRule { strongest: 1, ..ContributorRule::ALL };
+        let (nearest, best) = (count(&mut renderer, first), count(&mut renderer, strongest));
+        assert!(total(&nearest) < total(&best) && total(&best) < total(&all));
+        // One contributor of every covered pixel.
+        let ones = ContributorRule { mass: ContributorMass::One, ..strongest };
+        let labelled = labels.pixels.iter().filter(|label| **label != 0).count() as f64;
+        let found = total(&count(&mut renderer, ones));
+        assert!(found <= labelled && found > 0.5 * labelled, "{found} of {labelled}");
     }
 }

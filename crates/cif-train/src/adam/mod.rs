@@ -111,10 +111,27 @@ impl Moments {
         rates: RowRates,
         visible: Option<&[f32]>,
     ) -> Result<(), NotFinite> {
+        self.step_with(parameters, gradients, (rates, EPSILON), visible)
+    }
+
+    /// As [`Self::step`], with an epsilon of its own.
+    ///
+    /// # Errors
+    /// When a gradient is not finite.
+    ///
+    /// # Panics
+    /// When the lengths differ from the group's.
+    pub fn step_with(
+        &mut self,
+        parameters: &mut [f32],
+        gradients: &mut [f32],
+        (rates, epsilon): (RowRates, f32),
+        visible: Option<&[f32]>,
+    ) -> Result<(), NotFinite> {
         assert_eq!(parameters.len(), self.first.len(), "parameters and moments differ in length");
         assert_eq!(gradients.len(), self.first.len(), "gradients and moments differ in length");
         self.steps += 1;
-        let bias = BiasCorrection::after(self.steps);
+        let bias = (BiasCorrection::after(self.steps), epsilon);
         let width = self.width.max(1);
         let chunk_rows = (CHUNK / width).max(1);
         parameters
@@ -240,17 +257,24 @@ fn all_finite(values: &[f32]) -> bool {
 
 /// The step of one float. Below the smallest normal second moment the ratio would be noise: no step (row 25).
 #[inline(always)]
-fn move_by(p: &mut f32, g: f32, m: &mut f32, v: &mut f32, rate: f32, second: f32) {
+fn move_by(p: &mut f32, g: f32, m: &mut f32, v: &mut f32, rate: f32, (second, epsilon): (f32, f32)) {
     *m = BETA_1 * *m + (1.0 - BETA_1) * g;
     *v = BETA_2 * *v + (1.0 - BETA_2) * g * g;
-    let step = rate * *m / (v.sqrt() * second + EPSILON);
+    let step = rate * *m / (v.sqrt() * second + epsilon);
     *p -= if *v >= f32::MIN_POSITIVE { step } else { 0.0 };
 }
 
-fn update(p: &mut [f32], g: &[f32], m: &mut [f32], v: &mut [f32], rate: f32, bias: BiasCorrection) {
+fn update(
+    p: &mut [f32],
+    g: &[f32],
+    m: &mut [f32],
+    v: &mut [f32],
+    rate: f32,
+    (bias, epsilon): (BiasCorrection, f32),
+) {
     let rate = rate * bias.first;
     for (((p, g), m), v) in p.iter_mut().zip(g).zip(m.iter_mut()).zip(v.iter_mut()) {
-        move_by(p, *g, m, v, rate, bias.second);
+        move_by(p, *g, m, v, rate, (bias.second, epsilon));
     }
 }
 
@@ -260,10 +284,10 @@ fn update_with_rates(
     m: &mut [f32],
     v: &mut [f32],
     rates: &[f32],
-    bias: BiasCorrection,
+    (bias, epsilon): (BiasCorrection, f32),
 ) {
     for ((((p, g), m), v), rate) in p.iter_mut().zip(g).zip(m.iter_mut()).zip(v.iter_mut()).zip(rates) {
-        move_by(p, *g, m, v, rate * bias.first, bias.second);
+        move_by(p, *g, m, v, rate * bias.first, (bias.second, epsilon));
     }
 }
 

@@ -4,7 +4,7 @@
 use cif_field::deformation::{DeformationConfig, PlaneLayout, is_time_plane};
 use rayon::prelude::*;
 
-use super::{BiasCorrection, Moments, NotFinite, all_finite, update};
+use super::{BiasCorrection, EPSILON, Moments, NotFinite, all_finite, update};
 
 /// Weights of the plane regularisers.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -177,7 +177,7 @@ fn sweep(band: Band<'_>, rate: f32, bias: BiasCorrection) -> Result<(), NotFinit
             &mut band.first[range.clone()],
             &mut band.second[range.clone()],
             rate,
-            bias,
+            (bias, EPSILON),
         );
         gradient.fill(0.0);
     }

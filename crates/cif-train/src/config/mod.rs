@@ -14,7 +14,7 @@ use cif_field::{Heads, SortMetric, TimeEncoding};
 use serde::{Deserialize, Serialize};
 
 pub use options::{
-    Ablation, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart, Preset,
+    Ablation, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart, Preset,
     ScaleCorrection, WeakSet,
 };
 pub use validate::ConfigError;
@@ -59,6 +59,8 @@ pub struct TrainConfig {
     pub identity: IdentityConfig,
     /// Instance stage.
     pub instance: InstanceConfig,
+    /// Head that the instance stage trains.
+    pub head: HeadConfig,
     /// Instance-guided resampling.
     pub resample: ResampleConfig,
     /// Effects that a run may leave out where the capture does not call for them.
@@ -282,6 +284,20 @@ pub struct InstanceConfig {
     pub color_loss: bool,
     /// Parts of the method switched off, default none.
     pub ablate: BTreeSet<Ablation>,
+}
+
+/// Head that the instance stage trains: the paper's, or that of a system it is compared with (methods reference 8).
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct HeadConfig {
+    /// Its name: `cif` (default), `dr-splat`, `gaussian-grouping`, `sa4d`, `vlgs` or `trace3d`.
+    pub name: HeadName,
+    /// With `dr-splat`: contributors of a pixel that count, of the first 100. Default 0, as many as in its published
+    /// command: 45.
+    pub contributors: u32,
+    /// With `sa4d`: the only camera whose frames train, as its released code has it on Neu3D (`cam16`). Default: none,
+    /// all cameras train.
+    pub camera: String,
 }
 
 /// Instance-guided resampling (methods reference 6). Steps count from the start of the instance stage.

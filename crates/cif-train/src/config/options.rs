@@ -30,6 +30,59 @@ pub enum Ablation {
     NoResampling,
 }
 
+/// A system whose head the instance stage trains (methods reference 8).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum HeadName {
+    /// The paper's: occupancies and calibrated distributions over instances.
+    #[default]
+    Cif,
+    /// Labels counted over the strongest contributors of every pixel; nothing is trained.
+    DrSplat,
+    /// A code per Gaussian and a classifier.
+    GaussianGrouping,
+    /// A network from place and time to codes, and a classifier.
+    Sa4d,
+    /// Language channels fused with colour by attention, with an opacity of their own. A re-implementation: there is
+    /// no public code.
+    Vlgs,
+    /// Gaussians of several labels split or deleted, then codes learnt by contrast.
+    Trace3d,
+}
+
+impl HeadName {
+    /// Every head, in the order of tables.
+    pub const ALL: [Self; 6] =
+        [Self::Cif, Self::GaussianGrouping, Self::Sa4d, Self::Vlgs, Self::DrSplat, Self::Trace3d];
+
+    /// As in settings, file names and tables.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Cif => "cif",
+            Self::DrSplat => "dr-splat",
+            Self::GaussianGrouping => "gaussian-grouping",
+            Self::Sa4d => "sa4d",
+            Self::Vlgs => "vlgs",
+            Self::Trace3d => "trace3d",
+        }
+    }
+
+    /// Steps of the instance stage in its own publication or released configuration.
+    #[must_use]
+    pub fn published_steps(self) -> u32 {
+        match self {
+            Self::Cif => 3_000,
+            Self::DrSplat => 0,
+            Self::GaussianGrouping => 30_000,
+            Self::Sa4d => 5_000,
+            Self::Vlgs => 15_000,
+            // Splitting and deleting, then lifting.
+            Self::Trace3d => 9_000 + 20_000,
+        }
+    }
+}
+
 /// Motion that an object is told to have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]

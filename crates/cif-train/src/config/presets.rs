@@ -6,8 +6,8 @@ use cif_dataset::Layout;
 use cif_field::{Heads, SortMetric, TimeEncoding};
 
 use super::{
-    AdamConfig, DensifyConfig, EffectsConfig, IdentityConfig, InstanceConfig, LossConfig, ModelConfig,
-    MotionConfig, Preset, RatesConfig, ReportConfig, ResampleConfig, StagesConfig, TrainConfig,
+    AdamConfig, DensifyConfig, EffectsConfig, HeadConfig, IdentityConfig, InstanceConfig, LossConfig,
+    ModelConfig, MotionConfig, Preset, RatesConfig, ReportConfig, ResampleConfig, StagesConfig, TrainConfig,
 };
 
 impl TrainConfig {
@@ -130,6 +130,7 @@ impl Default for TrainConfig {
             densify: DensifyConfig::default(),
             identity: IdentityConfig::default(),
             instance: InstanceConfig::default(),
+            head: HeadConfig::default(),
             resample: ResampleConfig::default(),
             effects: EffectsConfig::default(),
             report: ReportConfig::default(),

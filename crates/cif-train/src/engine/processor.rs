@@ -6,14 +6,14 @@ use std::time::Instant;
 
 use cif_field::Field;
 use cif_geometry::{PixelGrid, quaternion};
-use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
-use cif_render::{BlendRequest, Channels, Gradients, RenderSettings, RenderedImage};
+use cif_render::cpu::{BlendWeightGradients, IdentityCounts, Renderer, SimdLevel};
+use cif_render::{BlendRequest, Channels, GeometryPath, Gradients, RenderSettings, RenderedImage};
 
 use super::{Changed, Engine, Views};
 use crate::densify::Rearrangement;
 use crate::error::TrainError;
 use crate::guard::{Fault, exposure_fault, gradient_fault, loss_fault, value_fault};
-use crate::heads::{self, HeadLoss, HeadTensors, ValueHead};
+use crate::heads;
 use crate::losses::held_out::leave_out_held_out;
 use crate::losses::{SsimScratch, color_loss};
 use crate::poses::{object_sizes, pose_fault};
@@ -53,17 +53,16 @@ impl Processor {
         reports: &mut Vec<ViewReport>,
     ) -> Result<Option<Fault>, TrainError> {
         let mut fault = None;
-        for view in &plan.views {
-            if fault.is_some() {
-                break;
-            }
-            fault = self.view(state, plan, view, reports);
+        for position in 0..plan.head_targets.len() {
+            fault = fault.or_else(|| self.head_view(state, plan, position, reports));
+        }
+        for view in plan.views.iter().filter(|_| !plan.trains_head) {
+            fault = fault.or_else(|| self.view(state, plan, view, reports));
         }
         state.times.add_render(&self.renderer.times());
         let head = Arc::clone(&state.head);
         if let Some(head) = plan.head(&head, &state.config) {
-            let seed = state.config.seed ^ u64::from(plan.iteration);
-            head.regularise(&mut state.head_tensors, &state.field, seed);
+            plan.regularise(head, state);
             fault = fault.or_else(|| state.head_tensors.fault());
         }
         fault = fault
@@ -123,7 +122,7 @@ impl Processor {
         let with_instances = plan.trains_instances(view);
         let labels = data.labels.as_ref().filter(|_| with_instances);
         let with_instances = labels.is_some();
-        let instances = plan.settings.instances.filter(|_| with_instances || plan.trains_head);
+        let instances = plan.settings.instances.filter(|_| with_instances);
         let settings = RenderSettings { instances, ..plan.settings };
         let pass = self.renderer.forward(&state.field, &frame.camera, time, &settings, labels);
         let mut since = Instant::now();
@@ -143,11 +142,10 @@ impl Processor {
         );
         lap(&mut state.times.losses, &mut since);
         let labelled = if with_instances { data.labelled as f64 } else { 0.0 };
-        let mut instance_loss = pass.instance_loss;
-        let mut report = ViewReport {
-            psnr: color.psnr(),
+        let report = ViewReport {
+            psnr: Some(color.psnr()),
             color_loss: color.loss,
-            instance_loss: labelled * instance_loss,
+            instance_loss: labelled * pass.instance_loss,
             unsupported: pass.unsupported_pixels as f64,
         };
         if !plan.trains_colors {
@@ -163,15 +161,8 @@ impl Processor {
             let gradient = exposure.pull_back(&pass.color, &mut self.v_color);
             all.add(&frame.camera_name, &gradient);
         }
-        let head = Arc::clone(&state.head);
-        if let (Some(head), Some(labels)) = (plan.head(&head, &state.config), &data.labels) {
-            let weight = plan.head_weight(&state.config);
-            let HeadLoss { sum, unsupported } =
-                self.blend_head(head, (&mut state.head_tensors, &state.field), time, labels, weight);
-            (report.instance_loss, report.unsupported, instance_loss) = (sum, unsupported, sum);
-        }
         reports.push(report);
-        if let Some(fault) = self.fault_of_view(color.loss, instance_loss) {
+        if let Some(fault) = self.fault_of_view(color.loss, pass.instance_loss) {
             return Some(fault);
         }
         let share = if with_instances { plan.label_share(view) } else { 0.0 };
@@ -195,25 +186,39 @@ impl Processor {
         fault
     }
 
-    /// Blends the values of a head over the view that was rendered last, and adds the gradients of its tensors.
-    fn blend_head(
+    /// A view of a step that trains a head, forward and backward; the field stays as it is, but for opacities of the
+    /// head's own.
+    fn head_view(
         &mut self,
-        head: &dyn ValueHead,
-        (tensors, field): (&mut HeadTensors, &Field),
-        time: f64,
-        labels: &PixelGrid<u16>,
-        weight: f32,
-    ) -> HeadLoss {
-        let values = head.values(tensors, field, time);
+        state: &mut State,
+        plan: &StepPlan,
+        position: usize,
+        reports: &mut Vec<ViewReport>,
+    ) -> Option<Fault> {
+        let target = &plan.head_targets[position];
+        let head = Arc::clone(&state.head);
+        let head = plan.head(&head, &state.config)?;
+        let State { head_tensors: tensors, field, gradients, .. } = state;
+        self.renderer.prepare(field, &target.camera, target.time, &plan.settings);
+        let values = head.values(tensors, field, target.time);
         let (channels, blending) = (head.channels(field), head.blending());
         let request = BlendRequest { values: &values[..], channels, blending };
         let blended = self.renderer.blend(&request);
         let mut v_blended = vec![0.0; blended.values.len()];
-        let loss = head.loss(tensors, &blended, labels, weight, &mut v_blended);
+        let of_target = (&blended, plan.head_seed(&state.config, position));
+        let loss = target.loss(head, tensors, of_target, plan.view_weight(), &mut v_blended);
         let mut v_values = vec![0.0; values.len()];
-        self.renderer.blend_backward(&request, &v_blended, &mut v_values, None);
-        head.values_backward(tensors, field, time, &v_values);
-        loss
+        let weights = head.own_opacity().map(|_| BlendWeightGradients {
+            field,
+            blended: &blended,
+            geometry: GeometryPath::Off,
+            gradients,
+        });
+        self.renderer.blend_backward(&request, &v_blended, &mut v_values, weights);
+        head.values_backward(tensors, field, target.time, &v_values);
+        reports.push(ViewReport::of_head(loss));
+        let fault = self.renderer.take_not_finite().map(Fault::from);
+        fault.or_else(|| loss_fault("instance loss", loss.loss))
     }
 
     /// A value that the renderer met, then a loss that is not finite.
@@ -319,11 +324,9 @@ impl Engine for Processor {
             let mut rendered =
                 self.renderer.render(field, &frame.camera, frame.time, views.settings, channels);
             if let Some(head) = by_values {
-                // A picture without instances leaves no weights of theirs behind.
-                self.renderer.prepare(field, &frame.camera, frame.time, views.settings);
-                let values = head.values(&state.head_tensors, field, frame.time);
-                let (channels, blending) = (head.channels(field), head.blending());
-                let blended = self.renderer.blend(&BlendRequest { values: &values[..], channels, blending });
+                let of = (head, &state.head_tensors);
+                let view = (&frame.camera, frame.time);
+                let blended = heads::blended(&mut self.renderer, of, field, view, views.settings);
                 let image = heads::instance_image(head, &state.head_tensors, &blended, &rendered.alpha);
                 rendered.instances = Some(image);
             }

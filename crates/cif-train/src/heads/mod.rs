@@ -1,25 +1,68 @@
 //! Heads: what the instance stage learns about instances, and how pixels tell it back.
 //!
-//! The head of the paper is [`Cif`]. A head of another system declares tensors of its own ([`Parameter`]s, beside the
-//! table of the field), the C values that they give every Gaussian, a loss on these values blended over a view, and
-//! how a blended pixel decodes to a label. Its tensors follow the Gaussians when these are cloned, split, pruned or
-//! relocated, are saved with the run, and are stepped by the same optimiser, whichever engine blends.
+//! | file | holds |
+//! |---|---|
+//! | `cif` | the head of the paper |
+//! | `dr_splat`, `gaussian_grouping`, `sa4d`, `vlgs`, `trace3d` | those of the systems that it is compared with |
+//! | `classifier` | codes told apart by a linear classifier, and neighbours that agree: what several of these share |
+//! | `tensors` | what heads learn, with gradients and moments |
+//! | `views` | the training views as heads may look at them between steps |
+//! | `decoder` | the head of a finished scene |
+//!
+//! A head of another system declares tensors of its own ([`Parameter`]s, beside the table of the field), the C values
+//! that they give every Gaussian, a loss on these values blended over a view, and how a blended pixel decodes to a
+//! label. Its tensors follow the Gaussians when these are cloned, split, pruned or relocated, are saved with the run and
+//! with the scene, and are stepped by the same optimiser, whichever engine blends. Gaussians and deformation stay as they
+//! were reconstructed, but for steps that a head asks for ([`Phase::Field`]).
 //!
 //! Source: methods reference 8.
 
 mod cif;
+mod classifier;
+mod decoder;
+mod dr_splat;
+mod gaussian_grouping;
+mod sa4d;
 mod tensors;
+mod trace3d;
+mod views;
+mod vlgs;
 
 use std::sync::Arc;
 
 use cif_field::parameters::Parameter;
 use cif_field::{Field, Identities};
-use cif_geometry::PixelGrid;
-use cif_render::{BlendedImage, Blending, InstanceImage, InstanceSettings};
+use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_render::cpu::Renderer;
+use cif_render::{BlendRequest, BlendedImage, Blending, InstanceImage, InstanceSettings, RenderSettings};
+use rand_pcg::Pcg64;
 
 pub use self::cif::Cif;
+pub use self::decoder::Decoder;
+pub use self::dr_splat::DrSplat;
+pub use self::gaussian_grouping::GaussianGrouping;
+pub use self::sa4d::Sa4d;
 pub use self::tensors::HeadTensors;
-use crate::config::TrainConfig;
+pub use self::trace3d::Trace3d;
+pub use self::views::TrainingViews;
+pub use self::vlgs::Vlgs;
+use crate::adam::EPSILON;
+use crate::config::{HeadConfig, HeadName, TrainConfig};
+use crate::densify::Rearrangement;
+use crate::error::TrainError;
+
+/// The head that settings name.
+#[must_use]
+pub fn configured(config: &HeadConfig) -> Arc<dyn Head> {
+    match config.name {
+        HeadName::Cif => Arc::new(Cif),
+        HeadName::DrSplat => Arc::new(DrSplat::new(config.contributors)),
+        HeadName::GaussianGrouping => Arc::new(GaussianGrouping),
+        HeadName::Sa4d => Arc::new(Sa4d::new(&config.camera)),
+        HeadName::Vlgs => Arc::new(Vlgs),
+        HeadName::Trace3d => Arc::new(Trace3d),
+    }
+}
 
 /// Way from the Gaussians to the labels of pixels.
 pub enum Pass<'a> {
@@ -39,16 +82,70 @@ pub trait Head: Send + Sync {
     fn pass(&self, config: &TrainConfig) -> Pass<'_>;
 }
 
-/// Loss of a head on a view, summed over the labelled pixels.
+/// Loss of a head on a view.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct HeadLoss {
-    /// The loss.
-    pub sum: f64,
+    /// The loss, as the head normalises it.
+    pub loss: f64,
     /// Labelled pixels that nothing of the head covers.
     pub unsupported: f64,
 }
 
-/// A head that blends values of its own. Gradients reach its tensors; the Gaussians are what they are.
+/// A view of a step, blended.
+#[derive(Clone, Copy, Debug)]
+pub struct HeadView<'a> {
+    /// The values of the head.
+    pub blended: &'a BlendedImage,
+    /// Dense indices + 1, 0 where there is none.
+    pub labels: &'a PixelGrid<u16>,
+    /// Names the random choices of the head in this view and step.
+    pub seed: u64,
+}
+
+/// A step of the stage.
+#[derive(Clone, Copy)]
+pub struct HeadStep<'a> {
+    /// The scene.
+    pub field: &'a Field,
+    /// Normalised time of its first view.
+    pub time: f64,
+    /// Step of the stage, from 1.
+    pub step: u32,
+    /// Steps of the stage.
+    pub steps: u32,
+    /// Names the random choices of the head in this step.
+    pub seed: u64,
+}
+
+/// Trained part in a step.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Phase {
+    /// The head; the field stays as it is.
+    #[default]
+    Head,
+    /// The field, by colours alone, as in the stage before; the head stays as it is.
+    Field,
+}
+
+/// Opacities of its own that a head with [`Blending::Own`] learns: they are the occupancies of the field.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct OwnOpacity {
+    /// At the start of the stage, in (0, 1).
+    pub start: f32,
+    /// Learning rate of their logits.
+    pub rate: f32,
+}
+
+/// Cameras between two training views of one time, supervised with the labels of both.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CameraBlending {
+    /// Weight of their loss beside that of a view, times the similarity (SSIM) of the two images.
+    pub weight: f32,
+    /// Limits of the place of such a camera on the way from the first view to the second, in [0, 1].
+    pub ratio: [f32; 2],
+}
+
+/// A head that blends values of its own. Gradients reach its tensors, and its own opacities where it has such.
 pub trait ValueHead: Send + Sync {
     /// Tensors: with a row per Gaussian, or of a fixed size.
     fn parameters(&self) -> Vec<Parameter>;
@@ -56,8 +153,33 @@ pub trait ValueHead: Send + Sync {
     /// Values of one of them at the start of the instance stage, whole rows.
     fn start(&self, parameter: &Parameter, field: &Field, seed: u64) -> Vec<f32>;
 
-    /// Learning rate of one of them at a step (from 1) of the `steps` of the stage.
+    /// Learning rate of one of them at a step (from 1) of the `steps` of the stage; 0 for what no step learns.
     fn rate(&self, parameter: &Parameter, step: u32, steps: u32) -> f32;
+
+    /// Number that Adam adds to the root of the second moment of one of them.
+    fn epsilon(&self, _parameter: &Parameter) -> f32 {
+        EPSILON
+    }
+
+    /// Opacities of its own that it learns.
+    fn own_opacity(&self) -> Option<OwnOpacity> {
+        None
+    }
+
+    /// Cameras between views that it trains on too.
+    fn camera_blending(&self) -> Option<CameraBlending> {
+        None
+    }
+
+    /// True when frames of a camera train it.
+    fn trains_on(&self, _camera: &str) -> bool {
+        true
+    }
+
+    /// Trained part in a step (from 1) of the `steps` of the stage.
+    fn phase(&self, _step: u32, _steps: u32) -> Phase {
+        Phase::Head
+    }
 
     /// Number of values C per Gaussian.
     fn channels(&self, field: &Field) -> usize;
@@ -71,20 +193,18 @@ pub trait ValueHead: Send + Sync {
     /// Adds the gradients of its tensors by those of the values, `[N, C]`.
     fn values_backward(&self, tensors: &mut HeadTensors, field: &Field, time: f64, v_values: &[f32]);
 
-    /// Loss of a view. `v_blended`, `[height, width, C]` and zero, becomes its gradient times `weight` by the blended
-    /// values; gradients by tensors that the loss itself uses are added. Labels are dense indices + 1, 0 where there
-    /// is none.
+    /// Loss of a view. Its gradient times `weight` by the blended values is added to `v_blended`, `[height, width, C]`;
+    /// gradients by tensors that the loss itself uses are added too.
     fn loss(
         &self,
         tensors: &mut HeadTensors,
-        blended: &BlendedImage,
-        labels: &PixelGrid<u16>,
+        view: &HeadView<'_>,
         weight: f32,
         v_blended: &mut [f32],
     ) -> HeadLoss;
 
     /// A regulariser of a step, whose gradients are added; its value.
-    fn regularise(&self, _tensors: &mut HeadTensors, _field: &Field, _seed: u64) -> f64 {
+    fn regularise(&self, _tensors: &mut HeadTensors, _step: &HeadStep<'_>) -> f64 {
         0.0
     }
 
@@ -93,6 +213,41 @@ pub trait ValueHead: Send + Sync {
 
     /// Label of every Gaussian (dense index + 1, 0 for none), for export.
     fn label_of_rows(&self, tensors: &HeadTensors, field: &Field) -> Vec<u16>;
+
+    /// Prepares the first step.
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or the run is to stop.
+    fn begin(&self, _tensors: &mut HeadTensors, _views: &mut TrainingViews<'_>) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    /// Concludes the last step; what it sets is set anew when it is called again.
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or the run is to stop.
+    fn finish(&self, _tensors: &mut HeadTensors, _views: &mut TrainingViews<'_>) -> Result<(), TrainError> {
+        Ok(())
+    }
+
+    /// Changes of the set of Gaussians that fall behind a step (from 1) of the `steps` of the stage, one after another.
+    fn rearrangements(&self, _step: u32, _steps: u32) -> u32 {
+        0
+    }
+
+    /// One of them; `None` where nothing changes.
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or the run is to stop.
+    fn rearrange(
+        &self,
+        _part: u32,
+        _step: (u32, u32),
+        _views: &mut TrainingViews<'_>,
+        _random: &mut Pcg64,
+    ) -> Result<Option<Rearrangement>, TrainError> {
+        Ok(None)
+    }
 }
 
 /// A head that blends values of its own.
@@ -101,6 +256,21 @@ pub(crate) fn value_head<'a>(head: &'a Arc<dyn Head>, config: &TrainConfig) -> O
         Pass::Identities(_) => None,
         Pass::Values(head) => Some(head),
     }
+}
+
+/// The values of a head blended over a view by `renderer`, which `settings` without instances are for.
+pub(crate) fn blended(
+    renderer: &mut Renderer,
+    (head, tensors): (&dyn ValueHead, &HeadTensors),
+    field: &Field,
+    (camera, time): (&PinholeCamera, f64),
+    settings: &RenderSettings,
+) -> BlendedImage {
+    let instances = (head.blending() == Blending::Own).then(InstanceSettings::default);
+    renderer.prepare(field, camera, time, &RenderSettings { instances, ..*settings });
+    let values = head.values(tensors, field, time);
+    let (channels, blending) = (head.channels(field), head.blending());
+    renderer.blend(&BlendRequest { values: &values[..], channels, blending })
 }
 
 /// Instance outputs of blended values.
@@ -132,3 +302,12 @@ pub(crate) fn identities(labels: &[u16]) -> Identities {
     }
     identities
 }
+
+/// The place of the largest value, the first of equals.
+pub(crate) fn largest(values: impl IntoIterator<Item = f32>) -> Option<(usize, f32)> {
+    let numbered = values.into_iter().enumerate();
+    numbered.reduce(|best, next| if next.1 > best.1 { next } else { best })
+}
+
+#[cfg(test)]
+pub(crate) mod testing;

@@ -66,6 +66,15 @@ impl HeadTensors {
         (&tensor.values, &mut tensor.gradients)
     }
 
+    /// Its values, to be set where they are not learnt by steps.
+    ///
+    /// # Panics
+    /// When it is none of the head's.
+    pub fn values_mut(&mut self, parameter: &Parameter) -> &mut [f32] {
+        let mut tensors = self.0.iter_mut();
+        &mut tensors.find(|tensor| tensor.parameter == *parameter).expect("a parameter of the head").values
+    }
+
     fn rows_of_gaussians(&mut self) -> impl Iterator<Item = &mut HeadTensor> {
         self.0.iter_mut().filter(|tensor| tensor.parameter.rows == Rows::Gaussians)
     }
@@ -110,10 +119,35 @@ impl HeadTensors {
     /// Moves every tensor at a step (from 1) of the `steps` of the stage; gradients become zero.
     pub(crate) fn step(&mut self, head: &dyn ValueHead, step: u32, steps: u32) {
         for HeadTensor { parameter, values, gradients, moments } in &mut self.0 {
-            let rates = RowRates::Uniform(head.rate(parameter, step, steps));
-            let finite = moments.step(values, gradients, rates, None);
+            let rate = head.rate(parameter, step, steps);
+            if rate == 0.0 {
+                gradients.fill(0.0);
+                continue;
+            }
+            let rates = (RowRates::Uniform(rate), head.epsilon(parameter));
+            let finite = moments.step_with(values, gradients, rates, None);
             debug_assert!(finite.is_ok(), "gradients were looked at");
         }
+    }
+
+    /// Values alone, by name: what a finished scene keeps of a head.
+    pub(crate) fn learnt(&self) -> BTreeMap<String, StateTensor> {
+        let value =
+            |tensor: &HeadTensor| (tensor.parameter.file_name(), StateTensor::F32(tensor.values.clone()));
+        self.0.iter().map(value).collect()
+    }
+
+    /// Takes the values of [`Self::learnt`]; `None` when they do not fit.
+    pub(crate) fn take_learnt(&mut self, learnt: &BTreeMap<String, StateTensor>) -> Option<()> {
+        for tensor in &mut self.0 {
+            match learnt.get(&tensor.parameter.file_name())? {
+                StateTensor::F32(values) if values.len() == tensor.values.len() => {
+                    tensor.values.clone_from(values);
+                }
+                _ => return None,
+            }
+        }
+        Some(())
     }
 
     /// Arrays of a saved run, by name.

@@ -13,13 +13,14 @@ use serde::Serialize;
 
 use crate::config::TrainConfig;
 use crate::exposure::trained_exposures;
+use crate::heads::Decoder;
 
 use super::image::{psnr, ssim, unit_color};
 use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
 
 /// Frames to score, and settings by which they are rendered.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct EvaluationOptions {
+#[derive(Clone, Copy)]
+pub struct EvaluationOptions<'a> {
     /// Frames to score.
     pub split: Split,
     /// Render settings; usually [`trained_settings`].
@@ -28,13 +29,16 @@ pub struct EvaluationOptions {
     pub simd: SimdLevel,
     /// Also render depth, for pictures.
     pub depth: bool,
+    /// Head that tells the labels of pixels; `None` where the identity rows do.
+    pub decoder: Option<&'a Decoder>,
 }
 
-impl EvaluationOptions {
+impl EvaluationOptions<'_> {
     /// The held-out frames, rendered as the field says.
     #[must_use]
     pub fn held_out(field: &Field) -> Self {
-        Self { split: Split::Val, settings: trained_settings(field), simd: SimdLevel::Auto, depth: false }
+        let settings = trained_settings(field);
+        Self { split: Split::Val, settings, simd: SimdLevel::Auto, depth: false, decoder: None }
     }
 }
 
@@ -130,13 +134,14 @@ pub struct Evaluation {
 pub fn evaluate<E: From<EvaluationError>>(
     field: &Field,
     dataset: &Dataset,
-    options: &EvaluationOptions,
+    options: &EvaluationOptions<'_>,
     mut observe: impl FnMut(FrameView<'_>) -> Result<(), E>,
 ) -> Result<Evaluation, E> {
     let mut renderer = Renderer::new(options.simd);
     let exposures = trained_exposures(field);
     let mut exposed_frames = 0;
-    let channels = Channels { depth: options.depth, instances: options.settings.instances.is_some() };
+    let by_rows = options.settings.instances.is_some() && options.decoder.is_none();
+    let channels = Channels { depth: options.depth, instances: by_rows };
     let mut frames: Vec<FrameScores> = Vec::new();
     let mut confusions: Vec<Option<FrameConfusion>> = Vec::new();
     for (index, frame) in dataset.frames.iter().enumerate().filter(|(_, f)| f.split == options.split) {
@@ -144,6 +149,11 @@ pub fn evaluate<E: From<EvaluationError>>(
             dataset.load_frame(index, options.settings.background).map_err(EvaluationError::Dataset)?;
         let start = Instant::now();
         let mut rendered = renderer.render(field, &frame.camera, frame.time, &options.settings, channels);
+        if let Some(decoder) = options.decoder {
+            let view = (&frame.camera, frame.time);
+            let decoded = decoder.instances(&mut renderer, field, view, &options.settings, &rendered);
+            rendered.instances = Some(decoded);
+        }
         let render_ms = start.elapsed().as_secs_f64() * 1e3;
         if let Some(exposure) = exposures.get(&frame.camera_name) {
             exposure.apply(&mut rendered.color);

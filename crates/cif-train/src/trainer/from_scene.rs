@@ -46,7 +46,7 @@ impl Trainer {
         // Settings of a scene without instances say that there shall be none; here they are all there is to train.
         config.effects.instances = true;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
-        let Checkpoint { mut field, training } = scene;
+        let Checkpoint { mut field, training, .. } = scene;
         check_capture(&field, &dataset)?;
         let mut progress = Progress::at(Stage::Identity);
         let mut state = None;

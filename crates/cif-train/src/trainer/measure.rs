@@ -79,6 +79,7 @@ impl Trainer {
                 trainer.state.label_pixels = trainer.count_label_pixels()?;
             }
         }
+        trainer.prepare_head(stage)?;
         trainer.begin(stage);
         Ok(trainer)
     }

@@ -9,6 +9,7 @@
 //! | `still` | which Gaussians skip the deformation network |
 //! | `changes` | where cameras that stay in place see the capture change |
 //! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
+//! | `heads` | what heads of other systems see and change between steps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `objects` | which objects move as a whole, and how they join the field |
 //! | `identity` | how identity rows come about |
@@ -37,6 +38,9 @@ mod gpu_tests;
 #[cfg(test)]
 mod guard_tests;
 mod guidance;
+#[cfg(test)]
+mod head_tests;
+mod heads;
 mod identity;
 mod initialize;
 mod judged;
@@ -83,7 +87,7 @@ use crate::events::TrainEvent;
 use crate::exposure::Exposures;
 use crate::frames::FrameStore;
 use crate::guidance::Guidance;
-use crate::heads::{Cif, Head, HeadTensors};
+use crate::heads::{Head, HeadTensors, configured};
 use crate::objects::{Fitted, Jointed};
 use crate::optimiser::Optimiser;
 use crate::poses::PoseMoments;
@@ -245,7 +249,7 @@ impl Trainer {
                 progress: progress.unwrap_or_else(|| Progress::at(Stage::Coarse)),
                 optimiser: Optimiser::new(&field),
                 pose_moments: PoseMoments::zeros(field.tracks.as_ref()),
-                head: Arc::new(Cif),
+                head: configured(&config.head),
                 head_tensors: HeadTensors::default(),
                 statistics: DensifyStatistics::zeros(n),
                 guidance: Guidance::default(),
@@ -354,7 +358,7 @@ impl Trainer {
         self.state.progress.effects = Some(plan);
     }
 
-    /// Trains another head in the instance stage than the one of the paper. A run that was saved in or behind that
+    /// Trains another head in the instance stage than the one that the settings name. A run that was saved in or behind that
     /// stage goes on with the head that it was saved with.
     ///
     /// # Errors

@@ -1,30 +1,48 @@
 //! The plan of a step of the run.
 
+use std::sync::Arc;
+
+use cif_field::parameters::OCCUPANCY_LOGITS;
 use cif_geometry::scalar::logit;
 use cif_render::RenderSettings;
+use rand::RngExt;
 use rand::seq::SliceRandom;
+use rand_pcg::Pcg64;
 
 use super::{InstancePass, Trainer};
 use crate::adam::PlaneWeights;
 use crate::config::{Ablation, TrainConfig};
 use crate::error::TrainError;
 use crate::exposure::RATES;
+use crate::heads::{CameraBlending, Phase, ValueHead};
+use crate::metrics::image::{ssim, unit_color};
 use crate::optimiser::StepRates;
 use crate::random::{Purpose, stream};
 use crate::schedule::{log_linear, schedule_steps};
 use crate::stage::Stage;
-use crate::step::{StepPlan, StepView};
+use crate::state::State;
+use crate::step::{HeadTarget, StepPlan, StepView};
 
 /// Steps between renormalisations of the raw quaternions, which keep their effective rate (row 18).
 const RENORMALISE_EVERY: u64 = 1_000;
 
 impl Trainer {
+    /// Training views of a stage, those of a head's own cameras where it trains on some alone.
+    fn views_of(&self, stage: Stage) -> Vec<u32> {
+        let State { frames, dataset, .. } = &self.state;
+        let head = self.state.value_head().filter(|_| stage == Stage::Instance);
+        let camera = |view: &u32| &dataset.frames[frames.index(*view as usize)].camera_name;
+        let all = 0..frames.len() as u32;
+        all.filter(|view| head.is_none_or(|head| head.trains_on(camera(view)))).collect()
+    }
+
     /// Training view `position` of a stage: every epoch visits all views, in its own order.
     fn view_at(&mut self, stage: Stage, position: u64) -> usize {
-        let count = self.state.frames.len() as u64;
+        let views = self.views_of(stage);
+        let count = views.len() as u64;
         let key = (stage, position / count);
         if self.order.as_ref().is_none_or(|(at, _)| *at != key) {
-            let mut order: Vec<u32> = (0..count as u32).collect();
+            let mut order = views;
             let counter = (stage as u64) << 48 | key.1;
             order.shuffle(&mut stream(self.state.config.seed, Purpose::Views, counter));
             self.order = Some((key, order));
@@ -46,6 +64,13 @@ impl Trainer {
         }
         let in_instance_stage = stage == Stage::Instance;
         let with_instances = in_instance_stage && self.instance_pass == InstancePass::On;
+        let of_head = self.state.value_head().filter(|_| in_instance_stage);
+        let phase = of_head.map(|head| head.phase(iteration, self.state.config.stages.instance));
+        if let (Some(head), Some(Phase::Head), true) = (of_head, phase, with_instances) {
+            let targets = self.head_targets(head, iteration, &views)?;
+            return Ok(self.plan_head_step(head, iteration, views, targets));
+        }
+        let with_instances = with_instances && of_head.is_none();
         let (config, instance) = (&self.state.config, &self.state.config.instance);
         Ok(StepPlan {
             stage,
@@ -56,8 +81,9 @@ impl Trainer {
                 instances: self.state.instance_settings().filter(|_| with_instances),
                 ..self.state.color_settings()
             },
-            trains_head: with_instances && self.state.value_head().is_some(),
-            trains_colors: !in_instance_stage || instance.color_loss,
+            trains_head: false,
+            head_targets: Vec::new(),
+            trains_colors: !in_instance_stage || of_head.is_some() || instance.color_loss,
             pulls: self.guidance_weight(stage, iteration),
             rates: StepRates::at(config, stage, iteration, &self.state.field),
             pose_rate: self.pose_rate(stage, iteration),
@@ -71,11 +97,104 @@ impl Trainer {
             visible_rows_only: config.adam.visible_rows_only,
             counts_statistics: matches!(stage, Stage::Coarse | Stage::Fine)
                 && iteration < config.densify.until,
-            occupancy_limits: (in_instance_stage && !config.ablates(Ablation::ConstantOccupancy))
+            occupancy_limits: (with_instances && !config.ablates(Ablation::ConstantOccupancy))
                 .then(|| instance.occupancy_limits.map(logit)),
-            calibration_limit: in_instance_stage.then_some(instance.calibration_limit),
+            calibration_limit: with_instances.then_some(instance.calibration_limit),
             renormalises: (self.state.progress.total_steps + 1).is_multiple_of(RENORMALISE_EVERY),
         })
+    }
+}
+
+impl Trainer {
+    /// The plan of a step that trains a head on the field as it is, but for opacities of its own.
+    fn plan_head_step(
+        &self,
+        head: &dyn ValueHead,
+        iteration: u32,
+        views: Vec<StepView>,
+        head_targets: Vec<HeadTarget>,
+    ) -> StepPlan {
+        let own = head.own_opacity().map(|own| (OCCUPANCY_LOGITS, own.rate));
+        StepPlan {
+            stage: Stage::Instance,
+            iteration,
+            labelled: views.iter().map(|view| view.frame.labelled).sum(),
+            views,
+            settings: RenderSettings {
+                instances: self.state.instance_settings(),
+                ..self.state.color_settings()
+            },
+            trains_head: true,
+            head_targets,
+            trains_colors: false,
+            pulls: [0.0; 2],
+            rates: StepRates::uniform(own),
+            pose_rate: 0.0,
+            exposure_rate: None,
+            weights: plane_weights(&self.state.config),
+            visible_rows_only: false,
+            counts_statistics: false,
+            occupancy_limits: None,
+            calibration_limit: None,
+            renormalises: false,
+        }
+    }
+}
+
+impl Trainer {
+    /// What a head is trained on in a step: views with masks, and cameras between them where it asks for such.
+    fn head_targets(
+        &self,
+        head: &dyn ValueHead,
+        iteration: u32,
+        views: &[StepView],
+    ) -> Result<Vec<HeadTarget>, TrainError> {
+        let frames = &self.state.dataset.frames;
+        let masked = || views.iter().filter(|view| view.frame.labels.is_some());
+        let mut targets: Vec<HeadTarget> = masked()
+            .map(|view| HeadTarget {
+                camera: frames[view.index].camera,
+                time: frames[view.index].time,
+                masks: vec![(Arc::clone(&view.frame), 1.0)],
+            })
+            .collect();
+        let Some(blending) = head.camera_blending() else { return Ok(targets) };
+        let mut random = stream(self.state.config.seed, Purpose::HeadCameras, u64::from(iteration));
+        for view in masked() {
+            targets.extend(self.between(view, &blending, &mut random)?);
+        }
+        Ok(targets)
+    }
+
+    /// A camera between a view and another training view of its time, held to the masks of both; none where there is no
+    /// such view.
+    fn between(
+        &self,
+        view: &StepView,
+        blending: &CameraBlending,
+        random: &mut Pcg64,
+    ) -> Result<Option<HeadTarget>, TrainError> {
+        let State { frames: store, dataset, .. } = &self.state;
+        let here = &dataset.frames[view.index];
+        let size = [here.camera.width, here.camera.height];
+        let is_partner = |k: &usize| {
+            let other = &dataset.frames[store.index(*k)];
+            other.time_index == here.time_index
+                && other.camera_name != here.camera_name
+                && other.mask.is_some()
+                && [other.camera.width, other.camera.height] == size
+        };
+        let partners: Vec<usize> = (0..store.len()).filter(is_partner).collect();
+        let [low, high] = blending.ratio;
+        let (chosen, ratio) = (random.random::<u64>(), random.random_range(low..high));
+        let Some(chosen) = chosen.checked_rem(partners.len() as u64) else { return Ok(None) };
+        let partner = partners[chosen as usize];
+        let other = store.get(dataset, partner)?;
+        let images = [&view.frame.image, &other.image].map(unit_color);
+        let weight = blending.weight * ssim(&images[0], &images[1]).max(0.0) as f32;
+        let camera = here.camera.toward(&dataset.frames[store.index(partner)].camera, f64::from(ratio));
+        let masks = vec![(Arc::clone(&view.frame), weight * (1.0 - ratio)), (other, weight * ratio)];
+        Ok(Some(HeadTarget { camera, time: here.time, masks }))
     }
 }
 

@@ -31,7 +31,7 @@ impl Trainer {
             drawing: Drawing {
                 near: Some(config.near),
                 antialiased: Some(config.antialiased),
-                opacity_is_occupancy: config.ablates(Ablation::OpacityOccupancy),
+                opacity_is_occupancy: config.ablates(Ablation::OpacityOccupancy) || self.labels_by_opacity(),
                 exposures: exposures.map(|(camera, exposure)| (camera.to_owned(), exposure)).collect(),
             },
             frame: dataset.frame,

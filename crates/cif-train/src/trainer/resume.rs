@@ -126,7 +126,8 @@ impl Trainer {
     pub fn checkpoint(&self, with_state: bool) -> Checkpoint {
         let mut field = self.state.field.clone();
         field.record = self.provenance();
-        Checkpoint { field, training: with_state.then(|| self.training_state()) }
+        let head = if with_state { None } else { self.saved_decoder() };
+        Checkpoint { field, training: with_state.then(|| self.training_state()), head }
     }
 
     /// Takes the moments of poses out of a saved run.
@@ -224,6 +225,9 @@ impl Trainer {
         if state.head != Cif.name() {
             tensors.retain(|name, _| name.starts_with("head."));
             trainer.saved_head = Some(SavedHead { name: state.head, tensors });
+            if trainer.saved_head.as_ref().is_some_and(|saved| saved.name == trainer.state.head.name()) {
+                trainer.restore_head()?;
+            }
         }
         Ok(trainer)
     }

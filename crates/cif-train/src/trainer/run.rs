@@ -11,7 +11,7 @@ use crate::densify::DensifyStatistics;
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, TrainEvent};
-use crate::heads::{self, HeadTensors};
+use crate::heads;
 use crate::optimiser::Optimiser;
 use crate::progress::{AfterStep, Progress};
 use crate::schedule::falls_on;
@@ -109,6 +109,7 @@ impl Trainer {
                     return fetched.map(|()| Outcome::Interrupted);
                 }
                 fetched?;
+                self.finish_head(stage)?;
             }
             let next = self.stages.after(&self.state.config, stage);
             let ends =
@@ -288,6 +289,7 @@ impl Trainer {
                 return Err(error);
             }
         }
+        self.prepare_head(stage)?;
         self.begin(stage);
         Ok(())
     }
@@ -316,19 +318,13 @@ impl Trainer {
             tracks.hold_joints();
         }
         let head = Arc::clone(&self.state.head);
-        if let Some(head) = heads::value_head(&head, &self.state.config) {
-            match stage {
-                Stage::Instance => {
-                    self.state.head_tensors =
-                        HeadTensors::start(head, &self.state.field, self.state.config.seed);
-                }
-                Stage::Done if self.state.field.identities.is_some() => {
-                    let labels = head.label_of_rows(&self.state.head_tensors, &self.state.field);
-                    self.state.field.identities = Some(heads::identities(&labels));
-                    self.state.optimiser.start_identities(&self.state.field);
-                }
-                _ => {}
-            }
+        if let Some(head) = heads::value_head(&head, &self.state.config)
+            && stage == Stage::Done
+            && self.state.field.identities.is_some()
+        {
+            let labels = head.label_of_rows(&self.state.head_tensors, &self.state.field);
+            self.state.field.identities = Some(heads::identities(&labels));
+            self.state.optimiser.start_identities(&self.state.field);
         }
         self.engine.changed(Changed::Everything);
     }

@@ -49,6 +49,10 @@ impl Trainer {
             self.take_in(report)?;
         } else {
             let plan = self.plan_step(stage, iteration)?;
+            if plan.trains_head {
+                // What a head learns from is on the host.
+                self.fetch()?;
+            }
             self.engine.step(&mut self.state, plan)?;
             self.state.progress.count_step();
             self.receive(false)?;
@@ -108,7 +112,7 @@ impl Trainer {
         let Some(fault) = fault else {
             self.last_loss = StepLoss::new(&plan, &views, self.state.config.loss.lambda_instance);
             let progress = &mut self.state.progress;
-            views.iter().for_each(|view| progress.add_psnr(view.psnr));
+            views.iter().filter_map(|view| view.psnr).for_each(|psnr| progress.add_psnr(psnr));
             progress.rollbacks.in_a_row = 0;
             return Ok(());
         };
@@ -152,6 +156,7 @@ impl Trainer {
             self.fetch()?;
         }
         if self.state.progress.after_step == Some(AfterStep::Changes) {
+            self.rearrange_by_head(stage, iteration, events)?;
             if due.changes_gaussians() {
                 self.change_gaussians(stage, iteration, &due, events)?;
             }
@@ -255,7 +260,7 @@ impl Trainer {
     }
 
     /// Replaces the set of Gaussians, and everything that has a row per Gaussian.
-    fn rearrange(&mut self, change: Rearrangement) {
+    pub(super) fn rearrange(&mut self, change: Rearrangement) {
         self.engine.rearrange(&mut self.state, &change);
         self.state.statistics.gather(&change.origins);
         self.state.head_tensors.gather(&change.parents, &change.origins);

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use crate::support::{Scene, capture, small_config};
 use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
 use cif_field::{Checkpoint, Field};
-use cif_geometry::PixelGrid;
-use cif_render::{BlendedImage, Blending};
+use cif_render::Blending;
 use cif_train::{
-    Control, Head, HeadLoss, HeadTensors, Outcome, Pass, TrainConfig, TrainEvent, Trainer, ValueHead,
+    Control, Head, HeadLoss, HeadTensors, HeadView, Outcome, Pass, TrainConfig, TrainEvent, Trainer,
+    ValueHead,
 };
 
 /// Instances of the capture, and the rest.
@@ -83,24 +83,24 @@ impl ValueHead for Scored {
     fn loss(
         &self,
         tensors: &mut HeadTensors,
-        blended: &BlendedImage,
-        labels: &PixelGrid<u16>,
+        HeadView { blended, labels, .. }: &HeadView<'_>,
         weight: f32,
         v_blended: &mut [f32],
     ) -> HeadLoss {
         let (bias, v_bias) = tensors.values_and_gradients(&BIAS);
         let mut sum = 0.0;
+        let share = weight / labels.pixels.len() as f32;
         let pixels = blended.pixels().zip(&labels.pixels).zip(v_blended.chunks_exact_mut(CLASSES));
         for ((scores, label), v) in pixels {
             let mut probabilities = softmax(scores, bias);
             sum -= f64::from(probabilities[usize::from(*label)].max(1e-30).ln());
             probabilities[usize::from(*label)] -= 1.0;
             for class in 0..CLASSES {
-                v[class] = weight * probabilities[class];
+                v[class] = share * probabilities[class];
                 v_bias[class] += v[class];
             }
         }
-        HeadLoss { sum, unsupported: 0.0 }
+        HeadLoss { loss: sum / labels.pixels.len() as f64, unsupported: 0.0 }
     }
 
     fn decode(&self, tensors: &HeadTensors, blended: &[f32]) -> (u16, f32) {

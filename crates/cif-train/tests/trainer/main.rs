@@ -12,6 +12,7 @@
 #![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod acceptance;
+mod compared_heads;
 mod curve;
 mod effects;
 mod from_scene;

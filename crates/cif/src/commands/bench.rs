@@ -1,5 +1,5 @@
 //! `cif bench`: what a training step costs, and where; what accuracy costs, of scenes and of exported motion; how
-//! hard captures fare.
+//! hard captures fare; how the method compares.
 
 use std::path::PathBuf;
 use std::time::Duration;
@@ -22,7 +22,7 @@ use crate::error::Error;
 use crate::output::{self, Outputs};
 use crate::settings::Layers;
 
-/// Measure what a training step, an export or accuracy costs, and how hard captures fare
+/// Measure what a training step, an export or accuracy costs, how hard captures fare and how the method compares
 #[derive(Debug, Args)]
 #[command(subcommand_required = true, arg_required_else_help = true)]
 pub(super) struct Bench {
@@ -36,6 +36,7 @@ enum What {
     Export(super::bench_export::BenchExport),
     Hardness(super::bench_hardness::BenchHardness),
     Accuracy(super::bench_accuracy::BenchAccuracy),
+    Compare(super::bench_compare::BenchCompare),
 }
 
 /// Tell where the time of a training step goes
@@ -121,6 +122,7 @@ pub(super) fn run(command: &Bench) -> Result<(), Error> {
         What::Export(command) => super::bench_export::run(command),
         What::Hardness(command) => super::bench_hardness::run(command),
         What::Accuracy(command) => super::bench_accuracy::run(command),
+        What::Compare(command) => super::bench_compare::run(command),
     }
 }
 

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use cif_dataset::Split;
 use cif_field::Field;
+use cif_train::heads::Decoder;
 use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, Scores, evaluate};
 use clap::{Args, ValueEnum};
 use serde_json::{Value, json};
@@ -22,7 +23,8 @@ use crate::{interrupt, output};
 #[command(after_help = "\
 PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). Instance scores are
 percent over labelled pixels: mAcc-pix per frame, mAcc-inst per instance, mIoU per pair of instance
-and frame. The JSON also has the other definitions in use, and values per frame and per instance.
+and frame. A scene of another head (`cif train --head`) is scored by what that head decodes per pixel
+(JSON: labels_by). The JSON also has the other definitions in use, and values per frame and per instance.
 n/a (JSON null) means that there is nothing to measure.
 
 Motion is measured where the capture has motion.json and tracks.npz, on what `cif export` would
@@ -86,7 +88,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
     if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
         outputs.text(path)?;
     }
-    let field = scene::load(&command.scene)?;
+    let (field, decoder) = scene::load_with_head(&command.scene)?;
     let mut capture = command.capture_options.clone();
     capture.downscale = capture.downscale.or(scene::trained_downscale(&field));
     let dataset = capture.open(&command.capture)?;
@@ -109,6 +111,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
         settings: scene::render_settings(&field),
         simd: command.simd.into(),
         depth: command.images.is_some(),
+        decoder: decoder.as_ref(),
     };
     interrupt::watch();
     let evaluation = evaluate(&field, &dataset, &options, |view| {
@@ -122,11 +125,15 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
         Some(truth) => eval_motion::measure(&field, &dataset, truth)?,
         None => None,
     };
-    let report = to_json(&evaluation, motion.as_ref(), &field);
+    let labels_by = decoder.as_ref().map(Decoder::name);
+    let report = to_json(&evaluation, motion.as_ref(), &field, labels_by);
     if to_stdout {
         println!("{report:#}");
     } else {
         print_table(&evaluation, &field);
+        if let Some(head) = labels_by {
+            println!("labels as the head {head} decodes every pixel");
+        }
         if let Some(motion) = &motion {
             motion.print();
         }
@@ -157,7 +164,12 @@ fn panel(view: &FrameView<'_>) -> Picture {
     side_by_side(&pictures)
 }
 
-fn to_json(evaluation: &Evaluation, motion: Option<&Motion>, field: &Field) -> Value {
+fn to_json(
+    evaluation: &Evaluation,
+    motion: Option<&Motion>,
+    field: &Field,
+    head: Option<&'static str>,
+) -> Value {
     let mut report = scores_json(&evaluation.overall, field);
     let groups: serde_json::Map<String, Value> =
         evaluation.groups.iter().map(|(name, scores)| (name.clone(), scores_json(scores, field))).collect();
@@ -165,6 +177,7 @@ fn to_json(evaluation: &Evaluation, motion: Option<&Motion>, field: &Field) -> V
     report["groups"] = Value::Object(groups);
     report["per_frame"] = json!(evaluation.frames);
     report["motion"] = json!(motion);
+    report["labels_by"] = json!(head.unwrap_or("identity rows"));
     report["gaussians"] = json!(evaluation.gaussians);
     report["frames_with_exposure"] = json!(evaluation.exposed_frames);
     report["render_ms_per_frame"] = json!(evaluation.render_ms_per_frame);

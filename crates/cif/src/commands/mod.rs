@@ -2,6 +2,7 @@
 
 mod bench;
 mod bench_accuracy;
+mod bench_compare;
 mod bench_export;
 mod bench_hardness;
 mod check;

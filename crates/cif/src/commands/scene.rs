@@ -2,9 +2,10 @@
 
 use std::path::Path;
 
-use cif_field::Field;
+use cif_field::{Checkpoint, Field};
 use cif_render::RenderSettings;
 use cif_scene::CaptureFrame;
+use cif_train::heads::Decoder;
 
 use crate::error::Error;
 
@@ -13,13 +14,32 @@ use crate::error::Error;
 /// # Errors
 /// When it is missing, truncated or not a scene.
 pub(super) fn load(path: &Path) -> Result<Field, Error> {
+    refuse_folder(path)?;
+    Field::load(path).map_err(Error::plain)
+}
+
+fn refuse_folder(path: &Path) -> Result<(), Error> {
     if path.is_dir() {
         return Err(Error::failed(
             format!("{} is a folder; a trained scene (.cif) is expected here", path.display()),
             "train one first: cif train CAPTURE -o scene.cif",
         ));
     }
-    Field::load(path).map_err(Error::plain)
+    Ok(())
+}
+
+/// Loads a `.cif` file with the head that tells labels of its pixels, where its identity rows do not.
+///
+/// # Errors
+/// As [`load`], and when the head does not fit the scene.
+pub(super) fn load_with_head(path: &Path) -> Result<(Field, Option<Decoder>), Error> {
+    refuse_folder(path)?;
+    let Checkpoint { field, head, .. } = Checkpoint::load(path).map_err(Error::plain)?;
+    let Some(head) = head else { return Ok((field, None)) };
+    let decoder = Decoder::of_scene(&field, &head);
+    decoder
+        .map(|decoder| (field, Some(decoder)))
+        .map_err(|error| Error::plain(format!("{}: {error}", path.display())))
 }
 
 /// The settings that a scene is to be rendered with: those of its training.

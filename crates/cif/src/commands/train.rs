@@ -6,8 +6,8 @@ use cif_dataset::{Dataset, Layout};
 use cif_field::Checkpoint;
 use cif_train::plan::Basis;
 use cif_train::{
-    Control, EffectChoice, EffectPlan, Outcome, Preset, Start, Stop, TrainConfig, TrainError, TrainEvent,
-    Trainer,
+    Control, EffectChoice, EffectPlan, HeadName, Outcome, Preset, Start, Stop, TrainConfig, TrainError,
+    TrainEvent, Trainer,
 };
 use clap::{Args, ValueEnum};
 
@@ -41,6 +41,11 @@ are those of the scene it comes from):
   cif train captures/table -o table.cif --no-masks
   cif train captures/table -o exact.cif --from table.cif
   cif train captures/table -o fixed.cif --from table.cif --ablate no-resampling
+
+The head of a system that the method is compared with, on the same reconstruction (`cif bench compare`
+runs all of them; each is described in crates/cif-train/src/heads):
+
+  cif train captures/table -o codes.cif --from table.cif --head gaussian-grouping
 
 As good as it gets in a minute and a half, or only as long as it has to:
 
@@ -153,6 +158,9 @@ struct Settings {
     /// Fraction of Gaussians relocated per resampling event
     #[arg(long, value_name = "FRACTION")]
     resampling_rate: Option<f64>,
+    /// Head that the instance stage trains: the paper's, or that of a system it is compared with
+    #[arg(long, value_name = "NAME")]
+    head: Option<HeadArgument>,
     /// Switch a part of the method off; may be repeated
     #[arg(long, value_name = "PART")]
     ablate: Vec<AblationName>,
@@ -169,6 +177,30 @@ struct Settings {
     /// neither [default: 300]
     #[arg(long, value_name = "SECONDS")]
     checkpoint_seconds: Option<u32>,
+}
+
+/// Heads by name.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(super) enum HeadArgument {
+    Cif,
+    DrSplat,
+    GaussianGrouping,
+    Sa4d,
+    Vlgs,
+    Trace3d,
+}
+
+impl HeadArgument {
+    pub(super) fn head(self) -> HeadName {
+        match self {
+            Self::Cif => HeadName::Cif,
+            Self::DrSplat => HeadName::DrSplat,
+            Self::GaussianGrouping => HeadName::GaussianGrouping,
+            Self::Sa4d => HeadName::Sa4d,
+            Self::Vlgs => HeadName::Vlgs,
+            Self::Trace3d => HeadName::Trace3d,
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, ValueEnum)]
@@ -437,6 +469,9 @@ fn resolve(
         if let Some(value) = value {
             layers.typed(flag, key, value)?;
         }
+    }
+    if let Some(head) = settings.head {
+        layers.typed("--head", "head.name", head.head().name())?;
     }
     if settings.antialiased {
         layers.typed("--antialiased", "antialiased", true)?;

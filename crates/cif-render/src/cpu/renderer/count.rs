@@ -6,6 +6,7 @@ use fearless_simd::dispatch;
 use rayon::prelude::*;
 
 use super::super::bin::TileRegion;
+use super::super::contributors::{ContributorRule, contributors_of_tile};
 use super::super::counts::{IdentityCounts, add_to};
 use super::super::identity::label_mass_tile;
 use super::super::labels::TileLabels;
@@ -47,8 +48,49 @@ impl Renderer {
                 (labels.map(|labels| labels.labels).unwrap_or_default(), mass)
             })
             .collect();
+        self.add_tiles(&tiles, counts);
+    }
+
+    /// Adds the mass that contributors of the labelled pixels of a view have by a rule to `counts`; of unlabelled
+    /// pixels nothing counts. Source: methods reference 8.4 and 8.5.
+    ///
+    /// # Panics
+    /// As [`Self::count_identities`].
+    pub fn count_contributors(
+        &mut self,
+        field: &Field,
+        camera: &PinholeCamera,
+        time: f64,
+        settings: &RenderSettings,
+        (labels, rule): (&PixelGrid<u16>, &ContributorRule),
+        counts: &mut IdentityCounts,
+    ) {
+        assert_eq!((labels.width, labels.height), (camera.width, camera.height), "label map size");
+        assert_eq!(counts.gaussians(), field.gaussians.len(), "counts of other Gaussians");
+        self.prepare(field, camera, time, &RenderSettings { instances: None, ..*settings });
+        let (tape, level) = (&self.tape, self.level);
+        let lists = &tape.lists;
+        let tiles: Vec<(Vec<u16>, Vec<f32>)> = (0..lists.tiles())
+            .into_par_iter()
+            .map(|tile| {
+                let place = self.place(tile);
+                let Some(labels) = TileLabels::new(labels, &place) else { return Default::default() };
+                let entries = lists.tile(tile);
+                let columns = labels.labels.len() + 1;
+                let mut mass = vec![0.0; entries.len() * columns];
+                dispatch!(level, simd => contributors_of_tile(
+                    simd, &tape.splats, entries, &place, &labels, rule, &mut mass));
+                (labels.labels, mass)
+            })
+            .collect();
+        self.add_tiles(&tiles, counts);
+    }
+
+    /// Adds the mass of the pairs of every tile, `[entries, labels + 1]` with the total last, to `counts`.
+    fn add_tiles(&self, tiles: &[(Vec<u16>, Vec<f32>)], counts: &mut IdentityCounts) {
+        let lists = &self.tape.lists;
         let tile_of_pair = lists.tile_of_pair();
-        let rank_of = self.ranks(field.gaussians.len());
+        let rank_of = self.ranks(counts.gaussians());
         let instances = counts.instances();
         let (rows, total_mass) = counts.parts_mut();
         // Each Gaussian adds up its own tiles, in their order.
@@ -63,6 +105,9 @@ impl Renderer {
                     for &pair in lists.pairs_of(*rank as usize) {
                         let tile = tile_of_pair[pair as usize] as usize;
                         let (labels, mass) = &tiles[tile];
+                        if mass.is_empty() {
+                            continue;
+                        }
                         let columns = labels.len() + 1;
                         let local = pair as usize - lists.tile_offsets[tile] as usize;
                         let mass = &mass[local * columns..(local + 1) * columns];

@@ -155,11 +155,7 @@ impl GpuEngine {
                     state.times.tile_pairs += u64::from(view.counts.pairs);
                 }
                 self.make_room(recording.gaussians)?;
-                let mut views: Vec<ViewReport> = results.iter().map(ViewResult::report).collect();
-                for (view, loss) in views.iter_mut().zip(recording.head.iter().flat_map(|head| &head.losses))
-                {
-                    (view.instance_loss, view.unsupported) = (loss.sum, loss.unsupported);
-                }
+                let views: Vec<ViewReport> = results.iter().map(ViewResult::report).collect();
                 return Ok(Some(StepReport { plan: recording.plan, views, fault: None }));
             }
             // It and those behind it moved nothing.
@@ -176,9 +172,6 @@ impl GpuEngine {
                 continue;
             }
             uncount(state, recording.moving);
-            if let Some(head) = &recording.head {
-                state.head_tensors = head.before.clone();
-            }
             for later in &mut self.again {
                 later.uncount(recording.moving);
             }
@@ -199,7 +192,7 @@ impl GpuEngine {
 impl ViewResult {
     fn report(&self) -> ViewReport {
         ViewReport {
-            psnr: self.loss.color.psnr(),
+            psnr: Some(self.loss.color.psnr()),
             color_loss: self.loss.color.loss,
             instance_loss: if self.about.labelled > 0 { self.loss.instance_sum } else { 0.0 },
             unsupported: self.loss.unsupported,

@@ -86,8 +86,8 @@ pub(crate) struct GpuEngine {
     faults: GpuVec<u32>,
     readback: Readback,
     flights: Flights,
-    /// A step that the head refused, until it is received.
-    refused: Option<StepReport>,
+    /// A step that trained a head, until it is received.
+    of_head: Option<StepReport>,
     /// Steps behind one that must not be taken, to be recorded again.
     again: Vec<Recording>,
     /// Most pairs and label slots that a view wanted so far, and of how many Gaussians.
@@ -186,7 +186,7 @@ impl GpuEngine {
             faults: GpuVec::zeros(gpu, "faults", faults::WORDS)?,
             readback: Readback::new(VIEW_WORDS),
             flights: Flights::default(),
-            refused: None,
+            of_head: None,
             again: Vec::new(),
             wanted: [SMALLEST_ROOM; 2],
             wanted_of: 0,
@@ -224,14 +224,11 @@ impl Engine for GpuEngine {
             self.fetched = Some(counters(state));
         }
         self.send(state)?;
-        let head = match self.head_pass(state, &plan)? {
-            Err(fault) => {
-                self.refused = Some(StepReport { plan, views: Vec::new(), fault: Some(fault) });
-                return Ok(());
-            }
-            Ok(head) => head,
-        };
-        let recording = Recording { head, ..step::count(state, plan) };
+        if plan.trains_head {
+            self.of_head = Some(self.head_step(state, plan)?);
+            return Ok(());
+        }
+        let recording = step::count(state, plan);
         self.record(state, recording)?;
         self.ahead = true;
         self.since_fetch += 1;
@@ -239,11 +236,10 @@ impl Engine for GpuEngine {
     }
 
     fn receive(&mut self, state: &mut State, all: bool) -> Result<Option<StepReport>, TrainError> {
-        if let Some(refused) = self.refused.take() {
-            return Ok(Some(refused));
+        if let Some(of_head) = self.of_head.take() {
+            return Ok(Some(of_head));
         }
-        let waits = self.waits || state.value_head().is_some();
-        self.receive_step(state, all || waits)
+        self.receive_step(state, all || self.waits)
     }
 
     fn give_up(&mut self, state: &mut State) -> u32 {

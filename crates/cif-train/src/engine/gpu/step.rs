@@ -2,7 +2,6 @@
 
 use super::GpuEngine;
 use super::flight::Flight;
-use super::head::HeadPass;
 use super::resident::{Resident, Stale};
 use crate::error::TrainError;
 use crate::guard::MAX_RATE;
@@ -22,8 +21,6 @@ pub(super) struct Recording {
     pub(super) exposures: GroupStep,
     /// Parameters that move, as bits of the fault word.
     pub(super) moving: u32,
-    /// The head of the step, where it blends values of its own.
-    pub(super) head: Option<HeadPass>,
     /// Parameters that cannot move, likewise, as known before the step is recorded.
     pub(super) known: u32,
 }
@@ -60,7 +57,7 @@ pub(super) fn count(state: &mut State, plan: StepPlan) -> Recording {
         moving |= fault::EXPOSURES;
         exposures = GroupStep::uniform(rate, all.steps);
     }
-    Recording { plan, gaussians: state.field.gaussians.len(), groups, exposures, moving, known, head: None }
+    Recording { plan, gaussians: state.field.gaussians.len(), groups, exposures, moving, known }
 }
 
 /// Takes back a step of some parameters.

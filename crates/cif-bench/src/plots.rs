@@ -20,7 +20,7 @@ const INK: RGBColor = RGBColor(40, 44, 52);
 const GRID: RGBColor = RGBColor(228, 230, 234);
 
 /// Points of one colour.
-pub(super) struct Series {
+pub(crate) struct Series {
     /// In the legend.
     pub name: String,
     /// Places, with what they are called where that helps.
@@ -30,7 +30,7 @@ pub(super) struct Series {
 }
 
 /// A plot.
-pub(super) struct Plot<'a> {
+pub(crate) struct Plot<'a> {
     /// Axis captions with units.
     pub axes: [&'a str; 2],
     /// Horizontal axis in powers of ten.
@@ -145,7 +145,7 @@ impl Area {
 }
 
 /// Draws a plot; none when nothing can be shown.
-pub(super) fn svg(plot: &Plot<'_>) -> Option<String> {
+pub(crate) fn svg(plot: &Plot<'_>) -> Option<String> {
     let place = |x: f64| if plot.log { x.max(1e-9).log10() } else { x };
     let shown = || {
         plot.series

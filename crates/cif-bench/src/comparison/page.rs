@@ -1,0 +1,315 @@
+//! The page of a comparison, and its tables as files.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use cif_geometry::PixelGrid;
+use image::ImageReader;
+
+use super::crops::Crop;
+use super::record::{Record, Runs};
+use super::tables::{MEASURES, Subject, cells};
+use super::title;
+use crate::accuracy::measure::save;
+use crate::error::{Error, write_file};
+use crate::page::{STYLE, escape, picture};
+use crate::plots::{Plot, Series, svg};
+
+/// Subject of a page.
+#[derive(Clone, Debug)]
+pub struct Comparison {
+    /// A few lines on it.
+    pub description: String,
+    /// Command that made it.
+    pub command: String,
+    /// Threads used.
+    pub threads: usize,
+    /// Vector instructions used.
+    pub simd: String,
+    /// Runs that are not done yet.
+    pub missing: usize,
+    /// Heads in the order of tables.
+    pub heads: Vec<String>,
+    /// True when ablations were asked for.
+    pub ablations: bool,
+    /// The only camera that SA4D trained on; empty for all.
+    pub camera: String,
+    /// Colour of pixels without a label in pictures of labels.
+    pub empty: [u8; 3],
+}
+
+/// Numbers of the ablations, in the order of tables; the last is the whole method.
+const ABLATIONS: [&str; 5] = ["i", "ii", "iii", "iv", "v"];
+
+/// Writes the page `compare.html` and the tables `panoptic` and, where there are any, `ablation`, each as `.md`,
+/// `.csv`, `.json` and `.tex`.
+///
+/// # Errors
+/// When a file cannot be written or a picture not be read.
+pub fn write(folder: &Path, runs: &Runs, comparison: &Comparison, records: &[Record]) -> Result<(), Error> {
+    let is_ablation = |record: &&Record| ABLATIONS.contains(&record.row.head.as_str());
+    let rows = |of_ablation: bool| {
+        let of = records.iter().filter(|record| is_ablation(record) == of_ablation);
+        of.map(|record| record.row.clone()).collect::<Vec<_>>()
+    };
+    let (panoptic, mut ablation) = (rows(false), rows(true));
+    // The whole method is the row of its head.
+    let whole = panoptic.iter().filter(|row| row.head == "cif").cloned();
+    ablation.extend(whole.map(|row| super::record::Row { head: "v".to_owned(), ..row }));
+    let ablations = ABLATIONS.map(str::to_owned);
+    let of_heads =
+        Subject { rows: &panoptic, names: &comparison.heads, camera: &comparison.camera, ablation: false };
+    let of_parts = Subject { rows: &ablation, names: &ablations, camera: "", ablation: true };
+    let mut subjects = vec![("panoptic", &of_heads)];
+    if comparison.ablations {
+        subjects.push(("ablation", &of_parts));
+    }
+    for (name, subject) in &subjects {
+        let forms = [
+            ("md", subject.markdown()),
+            ("csv", subject.csv()),
+            ("json", subject.json()),
+            ("tex", subject.latex()),
+        ];
+        for (extension, text) in forms {
+            write_file(&folder.join(format!("{name}.{extension}")), text.as_bytes())?;
+        }
+    }
+    let page = page(runs, comparison, &subjects, records)?;
+    write_file(&folder.join("compare.html"), page.as_bytes())
+}
+
+fn page(
+    runs: &Runs,
+    comparison: &Comparison,
+    subjects: &[(&str, &Subject<'_>)],
+    records: &[Record],
+) -> Result<String, Error> {
+    let mut page = String::new();
+    let threads = match comparison.threads {
+        1 => "one thread".to_owned(),
+        threads => format!("{threads} threads"),
+    };
+    let _ = write!(
+        page,
+        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"viewport\" \
+         content=\"width=device-width, initial-scale=1\">\n<title>Comparison</title>\n<style>\n{STYLE}</style>\n\
+         </head>\n<body>\n<header>\n<h1>The method beside others, on one reconstruction</h1>\n<p>{}</p>\n\
+         <p class=\"how\">Measured on {threads} with {}. Made by <code>{}</code>.</p>\n",
+        escape(&comparison.description),
+        escape(&comparison.simd),
+        escape(&comparison.command),
+    );
+    if comparison.missing > 0 {
+        let _ = writeln!(
+            page,
+            "<p class=\"missing\">{} runs are not done yet; the same command goes on with them.</p>",
+            comparison.missing
+        );
+    }
+    page += "</header>\n<main>\n";
+    for (name, subject) in subjects {
+        let heading = if subject.ablation { "Without parts of the method" } else { "Panoptic segmentation" };
+        let _ = writeln!(page, "<section id=\"{name}\">\n<h2>{heading}</h2>");
+        for table in subject.tables() {
+            let _ = write!(
+                page,
+                "<h3>{}</h3>\n<div class=\"wide\"><table>\n<thead><tr><th></th>",
+                escape(&table.caption)
+            );
+            for measure in &MEASURES {
+                let _ = write!(page, "<th>{}</th>", measure.name);
+            }
+            let _ = write!(page, "<th>{}</th></tr></thead>\n<tbody>\n", escape(&subject.published_heading()));
+            for line in &table.lines {
+                let _ = write!(page, "<tr><td>{}</td>", escape(&line.title));
+                for (text, best) in cells(line) {
+                    let text = escape(&text);
+                    let _ = match best {
+                        true => write!(page, "<td><strong>{text}</strong></td>"),
+                        false => write!(page, "<td>{text}</td>"),
+                    };
+                }
+                let _ = writeln!(page, "<td>{}</td></tr>", escape(&line.published));
+            }
+            page += "</tbody></table></div>\n";
+        }
+        for note in subject.notes() {
+            let _ = writeln!(page, "<p class=\"how\">{}</p>", escape(&note));
+        }
+        if let Some(plot) = costs(subject) {
+            let caption = "Accuracy against what it costs in time; a dot per capture and seed.";
+            let _ = writeln!(page, "<figure>{plot}<figcaption>{caption}</figcaption></figure>");
+        }
+        page += "</section>\n";
+    }
+    pictures(&mut page, runs, comparison, records)?;
+    page += "</main>\n<footer>Accuracies and IoU are percent over labelled pixels of the held-out frames: mAcc-pix per \
+             frame, mAcc-inst per instance, mIoU per pair of instance and frame. Every row but Trace3D has the Gaussians of \
+             the same reconstruction, the same masks and the same frames.</footer>\n</body>\n</html>\n";
+    Ok(page)
+}
+
+/// mIoU against processor time.
+fn costs(subject: &Subject<'_>) -> Option<String> {
+    let of = |name: &String| Series {
+        name: title(name, subject.camera),
+        points: subject
+            .rows
+            .iter()
+            .filter(|row| row.head == *name)
+            .filter_map(|row| Some((row.seconds.max(1e-2), row.miou?, String::new())))
+            .collect(),
+        line: false,
+    };
+    let series: Vec<Series> =
+        subject.names.iter().map(of).filter(|series| !series.points.is_empty()).collect();
+    svg(&Plot {
+        axes: ["processor time on top of the reconstruction, s", "mIoU of held-out frames, %"],
+        log: true,
+        series,
+        front: Vec::new(),
+        size: (900, 420),
+    })
+}
+
+/// A picture of the folder of runs.
+fn read(path: &Path) -> Result<PixelGrid<[u8; 3]>, Error> {
+    let failed = |error: &dyn std::fmt::Display| Error::plain(format!("{}: {error}", path.display()));
+    let reader = ImageReader::open(path).map_err(Error::io("read", path))?;
+    let image = reader.decode().map_err(|error| failed(&error))?.into_rgb8();
+    let pixels = image.pixels().map(|pixel| pixel.0).collect();
+    Ok(PixelGrid::from_pixels(image.width(), image.height(), pixels))
+}
+
+/// Per capture, the captured frame, its true labels and those of every run of the first seed; below them the part of it
+/// in which they differ most.
+fn pictures(
+    page: &mut String,
+    runs: &Runs,
+    comparison: &Comparison,
+    records: &[Record],
+) -> Result<(), Error> {
+    let mut captures: Vec<(&str, u64)> = Vec::new();
+    for row in records.iter().map(|record| &record.row) {
+        if captures.iter().all(|(capture, _)| *capture != row.capture) {
+            captures.push((&row.capture, row.seed));
+        }
+    }
+    page.push_str("<section id=\"pictures\">\n<h2>One held-out frame</h2>\n");
+    for (capture, seed) in captures {
+        let of_capture: Vec<&Record> = records
+            .iter()
+            .filter(|record| record.row.capture == capture && record.row.seed == seed)
+            .collect();
+        let named = |record: &Record, suffix: &str| {
+            record.pictures.iter().find(|name| name.ends_with(suffix)).map(|name| runs.file(name))
+        };
+        let first = of_capture
+            .iter()
+            .find_map(|record| Some((named(record, ".truth.png")?, named(record, ".mask.png")?)));
+        let Some((truth, mask)) = first else { continue };
+        let mut shown = vec![("captured".to_owned(), truth), ("true labels".to_owned(), mask)];
+        for record in &of_capture {
+            if let Some(path) = named(record, ".instances.png") {
+                shown.push((title(&record.row.head, &comparison.camera), path));
+            }
+        }
+        let loaded: Vec<PixelGrid<[u8; 3]>> =
+            shown.iter().map(|(_, path)| read(path)).collect::<Result<_, _>>()?;
+        let _ = writeln!(page, "<h3>{}</h3>\n<div class=\"pictures\">", escape(capture));
+        for (name, path) in &shown {
+            picture(page, path, name)?;
+        }
+        page.push_str("</div>\n");
+        let of_runs: Vec<&PixelGrid<[u8; 3]>> = loaded[2..].iter().collect();
+        if let Some(crop) = Crop::of_differences(&loaded[1], &of_runs, comparison.empty) {
+            page.push_str("<p class=\"how\">Where they differ most:</p>\n<div class=\"pictures\">\n");
+            for (k, ((name, _), whole)) in shown.iter().zip(&loaded).enumerate() {
+                let path = runs.file(&format!("{capture}.crop{k}.png"));
+                save(&path, &crop.of(whole))?;
+                picture(page, &path, name)?;
+            }
+            page.push_str("</div>\n");
+        }
+    }
+    page.push_str("</section>\n");
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::record::Row;
+    use super::*;
+
+    #[test]
+    fn the_page_and_the_tables_are_whole_without_a_network() {
+        let folder = tempfile::tempdir().unwrap();
+        let runs = Runs::inside(folder.path()).unwrap();
+        let record = |head: &str, color: u8| {
+            let mut pictures = Vec::new();
+            for (suffix, value) in [(".truth", 9), (".mask", 1), (".instances", color)] {
+                let name = format!("{head}{suffix}.png");
+                save(&runs.file(&name), &PixelGrid::from_pixels(6, 6, vec![[value; 3]; 36])).unwrap();
+                pictures.push(name);
+            }
+            let row = Row {
+                capture: "table <1>".into(),
+                head: head.into(),
+                macc_pix: Some(91.25),
+                miou: Some(70.0 + f64::from(color)),
+                psnr: Some(30.0),
+                seconds: 3.0,
+                ..Row::default()
+            };
+            Record { row, pictures, ..Record::default() }
+        };
+        let records = [record("cif", 1), record("vlgs", 2), record("i", 3)];
+        let comparison = Comparison {
+            description: "one capture".into(),
+            command: "cif bench compare table".into(),
+            threads: 2,
+            simd: "Avx2".into(),
+            missing: 1,
+            heads: ["cif", "vlgs"].map(str::to_owned).to_vec(),
+            ablations: true,
+            camera: String::new(),
+            empty: [0; 3],
+        };
+        write(folder.path(), &runs, &comparison, &records).unwrap();
+        let text = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
+        let page = text("compare.html");
+        for part in [
+            "table &lt;1&gt;",
+            "1 runs are not done yet",
+            "VLGS (re-implementation)",
+            "(i) constant occupancy",
+            "(v) full",
+            "Where they differ most",
+            "<strong>72.00</strong>",
+        ] {
+            assert!(page.contains(part), "{part}");
+        }
+        let loaded = page.replace("http://www.w3.org/2000/svg", "");
+        for outside in ["http:", "https:", "<script", "@import", "<link"] {
+            assert!(!loaded.contains(outside), "{outside}");
+        }
+        let rows = |name: &str| serde_json::from_str::<Vec<Row>>(&text(name)).unwrap();
+        let heads = |rows: &[Row]| rows.iter().map(|row| row.head.clone()).collect::<Vec<_>>();
+        assert_eq!(heads(&rows("panoptic.json")), ["cif", "vlgs"]);
+        assert_eq!(
+            heads(&rows("ablation.json")),
+            ["i", "v"],
+            "the whole method is its row of the other table"
+        );
+        for name in ["panoptic", "ablation"] {
+            for extension in ["md", "csv", "tex"] {
+                assert!(!text(&format!("{name}.{extension}")).is_empty());
+            }
+        }
+        let alone = Comparison { ablations: false, missing: 0, ..comparison };
+        let other = tempfile::tempdir().unwrap();
+        write(other.path(), &runs, &alone, &records[..2]).unwrap();
+        assert!(!other.path().join("ablation.md").exists());
+    }
+}

@@ -1,0 +1,252 @@
+//! A linear classifier of blended codes, and the term by which Gaussians agree with their nearest neighbours. Source:
+//! methods reference 8.1 (Ye et al., Gaussian Grouping, ECCV 2024, and its released code).
+
+use cif_field::Field;
+use cif_field::neighbours::NearestNeighbours;
+use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
+use rand::seq::index::sample;
+use rand::{Rng, RngExt};
+use rayon::prelude::*;
+
+use super::{HeadLoss, HeadStep, HeadTensors, HeadView, largest};
+use crate::random::{Purpose, stream};
+
+/// Pixels that one task classifies.
+const CHUNK: usize = 2_048;
+
+/// Gaussians sampled for the neighbour term.
+const SAMPLES: usize = 1_000;
+
+/// Nearest neighbours of each, itself among them.
+const NEIGHBOURS: usize = 5;
+
+/// Weight of the neighbour term.
+const NEIGHBOUR_WEIGHT: f64 = 2.0;
+
+/// Added to probabilities before their logarithm.
+const TINY: f64 = 1e-10;
+
+/// A linear map with biases from codes to classes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Classifier {
+    /// `[classes, width of a code]`.
+    pub(super) weights: Parameter,
+    /// `[classes]`.
+    pub(super) biases: Parameter,
+    /// True when pixels without a label are of a class of their own, the first; otherwise they do not count.
+    pub(super) unlabelled_is_class: bool,
+    /// True when the loss is divided by the logarithm of the number of classes.
+    pub(super) divides: bool,
+}
+
+/// Weights of a classifier of codes of `shape`.
+pub(super) const fn weights(part: &'static str, shape: &'static [usize]) -> Parameter {
+    Parameter {
+        name: "classifier_weights",
+        part,
+        rate: "classifier_weights",
+        rows: Rows::Fixed,
+        shape,
+        activation: Activation::Identity,
+        on_copy: OnCopy::Same,
+    }
+}
+
+/// Biases of a classifier.
+pub(super) const fn biases(part: &'static str) -> Parameter {
+    Parameter { name: "classifier_biases", rate: "classifier_biases", ..weights(part, &[]) }
+}
+
+/// Uniform numbers below a magnitude.
+pub(super) fn uniform(count: usize, magnitude: f32, random: &mut impl Rng) -> Vec<f32> {
+    (0..count).map(|_| random.random_range(-magnitude..magnitude)).collect()
+}
+
+/// Softmax of logits, in place.
+fn softmax(logits: &mut [f32]) {
+    let most = logits.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let mut sum = 0.0;
+    for logit in logits.iter_mut() {
+        *logit = (*logit - most).exp();
+        sum += *logit;
+    }
+    logits.iter_mut().for_each(|logit| *logit /= sum);
+}
+
+/// Gradients by weights and biases.
+struct Sums {
+    weights: Vec<f32>,
+    biases: Vec<f32>,
+}
+
+impl Sums {
+    fn zeros(classes: usize, width: usize) -> Self {
+        Self { weights: vec![0.0; classes * width], biases: vec![0.0; classes] }
+    }
+
+    /// Adds the gradient by logits of a code, and adds that by the code to `v_code`.
+    fn add(&mut self, v_logits: &[f32], code: &[f32], weights: &[f32], v_code: &mut [f32]) {
+        let rows = self.weights.chunks_exact_mut(code.len()).zip(weights.chunks_exact(code.len()));
+        for (((v_weights, weights), v_bias), v) in rows.zip(&mut self.biases).zip(v_logits) {
+            *v_bias += v;
+            for k in 0..code.len() {
+                v_weights[k] += v * code[k];
+                v_code[k] += v * weights[k];
+            }
+        }
+    }
+}
+
+impl Classifier {
+    /// Width of a code.
+    fn width(&self) -> usize {
+        self.weights.width()
+    }
+
+    /// Number of classes.
+    fn classes(&self, field: &Field) -> usize {
+        field.instances.len() + usize::from(self.unlabelled_is_class)
+    }
+
+    /// Weights or biases at the start: uniform below `1 / sqrt(width)`, as linear layers start in the released code.
+    pub(super) fn start(&self, parameter: &Parameter, field: &Field, seed: u64) -> Vec<f32> {
+        let (count, purpose) = if *parameter == self.biases {
+            (self.classes(field), Purpose::ClassifierBiases)
+        } else {
+            (self.classes(field) * self.width(), Purpose::Classifier)
+        };
+        uniform(count, 1.0 / (self.width() as f32).sqrt(), &mut stream(seed, purpose, 0))
+    }
+
+    fn logits(&self, tensors: &HeadTensors, code: &[f32], logits: &mut [f32]) {
+        let rows = tensors.values(&self.weights).chunks_exact(self.width());
+        for ((logit, weights), bias) in logits.iter_mut().zip(rows).zip(tensors.values(&self.biases)) {
+            *logit = bias + weights.iter().zip(code).map(|(a, b)| a * b).sum::<f32>();
+        }
+    }
+
+    /// Class of a label (dense index + 1, 0 for none).
+    fn class_of(&self, label: u16) -> Option<usize> {
+        if self.unlabelled_is_class { Some(usize::from(label)) } else { usize::from(label).checked_sub(1) }
+    }
+
+    /// Label of a code and its probability.
+    pub(super) fn decode(&self, tensors: &HeadTensors, code: &[f32]) -> (u16, f32) {
+        let mut scores = vec![0.0; tensors.values(&self.biases).len()];
+        self.logits(tensors, code, &mut scores);
+        softmax(&mut scores);
+        let (class, probability) = largest(scores).unwrap_or_default();
+        (class as u16 + u16::from(!self.unlabelled_is_class), probability)
+    }
+
+    /// Mean cross-entropy of the pixels of a view, and its gradient times `weight`. See
+    /// [`super::ValueHead::loss`].
+    pub(super) fn loss(
+        &self,
+        tensors: &mut HeadTensors,
+        view: &HeadView<'_>,
+        weight: f32,
+        v_blended: &mut [f32],
+    ) -> HeadLoss {
+        let (classes, width) = (tensors.values(&self.biases).len(), self.width());
+        let labels = &view.labels.pixels;
+        let pixels = labels.iter().filter(|label| self.class_of(**label).is_some()).count();
+        if pixels == 0 || classes < 2 {
+            return HeadLoss::default();
+        }
+        let divisor = if self.divides { (classes as f64).ln() } else { 1.0 };
+        let share = (f64::from(weight) / (pixels as f64 * divisor)) as f32;
+        let of_chunks: Vec<(f64, Sums)> = view
+            .blended
+            .values
+            .par_chunks(CHUNK * width)
+            .zip(labels.par_chunks(CHUNK))
+            .zip(v_blended.par_chunks_mut(CHUNK * width))
+            .map(|((codes, labels), v_codes)| {
+                let (mut loss, mut sums) = (0.0, Sums::zeros(classes, width));
+                let mut scores = vec![0.0; classes];
+                let of_pixels = codes.chunks_exact(width).zip(labels).zip(v_codes.chunks_exact_mut(width));
+                for ((code, label), v_code) in of_pixels {
+                    let Some(class) = self.class_of(*label) else { continue };
+                    self.logits(tensors, code, &mut scores);
+                    softmax(&mut scores);
+                    loss -= f64::from(scores[class].max(f32::MIN_POSITIVE)).ln();
+                    scores[class] -= 1.0;
+                    scores.iter_mut().for_each(|score| *score *= share);
+                    sums.add(&scores, code, tensors.values(&self.weights), v_code);
+                }
+                (loss, sums)
+            })
+            .collect();
+        let loss: f64 = of_chunks.iter().map(|(loss, _)| loss).sum();
+        of_chunks.iter().for_each(|(_, sums)| self.add(tensors, sums));
+        HeadLoss { loss: loss / (pixels as f64 * divisor), unsupported: 0.0 }
+    }
+
+    fn add(&self, tensors: &mut HeadTensors, sums: &Sums) {
+        for (parameter, sums) in [(&self.weights, &sums.weights), (&self.biases, &sums.biases)] {
+            let (_, gradients) = tensors.values_and_gradients(parameter);
+            gradients.iter_mut().zip(sums).for_each(|(total, v)| *total += v);
+        }
+    }
+
+    /// The neighbour term: divergence of the classes of 1 000 random Gaussians from those of their nearest neighbours at
+    /// the time of the step, a mean over pairs, divided by the number of classes, times 2. Its value, and the
+    /// gradient by the codes of some rows, `[rows, width]`, which `codes_of` gives; positions get none.
+    pub(super) fn neighbour_term(
+        &self,
+        tensors: &mut HeadTensors,
+        step: &HeadStep<'_>,
+        codes_of: impl FnOnce(&HeadTensors, &[u32]) -> Vec<f32>,
+    ) -> (f64, Vec<u32>, Vec<f32>) {
+        let positions = step.field.deformed(step.time).means;
+        let (n, classes, width) = (positions.len(), self.classes(step.field), self.width());
+        let index = NearestNeighbours::new(&positions);
+        let mut random = stream(step.seed, Purpose::HeadSamples, 0);
+        let samples: Vec<usize> = sample(&mut random, n, SAMPLES.min(n)).into_vec();
+        let pairs: Vec<(u32, u32)> = samples
+            .par_iter()
+            .flat_map_iter(|row| {
+                let near = index.nearest(positions[*row].map(f64::from), NEIGHBOURS);
+                near.into_iter().map(move |found| (*row as u32, found.row))
+            })
+            .collect();
+        let mut rows: Vec<u32> = pairs.iter().flat_map(|(a, b)| [*a, *b]).collect();
+        rows.sort_unstable();
+        rows.dedup();
+        let codes = codes_of(tensors, &rows);
+        let mut probabilities = vec![0.0_f32; rows.len() * classes];
+        for (scores, code) in probabilities.chunks_exact_mut(classes).zip(codes.chunks_exact(width)) {
+            self.logits(tensors, code, scores);
+            softmax(scores);
+        }
+        let share = NEIGHBOUR_WEIGHT / (classes as f64 * pairs.len().max(1) as f64);
+        let mut v_probabilities = vec![0.0_f64; probabilities.len()];
+        let mut divergence = 0.0;
+        let place = |row: &u32| rows.binary_search(row).map_or(0, |at| at * classes);
+        for (a, b) in &pairs {
+            let (a, b) = (place(a), place(b));
+            for k in 0..classes {
+                let (p, q) = (f64::from(probabilities[a + k]), f64::from(probabilities[b + k]));
+                let difference = (p + TINY).ln() - (q + TINY).ln();
+                divergence += p * difference;
+                v_probabilities[a + k] += share * (difference + p / (p + TINY));
+                v_probabilities[b + k] -= share * p / (q + TINY);
+            }
+        }
+        let (mut sums, mut v_codes) = (Sums::zeros(classes, width), vec![0.0; codes.len()]);
+        let mut v_logits = vec![0.0; classes];
+        for (row, v_code) in v_codes.chunks_exact_mut(width).enumerate() {
+            let range = row * classes..(row + 1) * classes;
+            let (p, v) = (&probabilities[range.clone()], &v_probabilities[range]);
+            let mean: f64 = p.iter().zip(v).map(|(p, v)| f64::from(*p) * v).sum();
+            for k in 0..classes {
+                v_logits[k] = (f64::from(p[k]) * (v[k] - mean)) as f32;
+            }
+            let code = &codes[row * width..(row + 1) * width];
+            sums.add(&v_logits, code, tensors.values(&self.weights), v_code);
+        }
+        self.add(tensors, &sums);
+        (share * divergence, rows, v_codes)
+    }
+}

@@ -1,0 +1,82 @@
+//! The head of a finished scene, which tells labels of pixels where its identity rows would tell others.
+
+use std::sync::Arc;
+
+use cif_field::Field;
+use cif_field::checkpoint::TrainingState;
+use cif_geometry::PinholeCamera;
+use cif_render::cpu::Renderer;
+use cif_render::{InstanceImage, RenderSettings, RenderedImage};
+use serde::{Deserialize, Serialize};
+
+use super::{Head, HeadTensors, ValueHead, blended, configured, instance_image, value_head};
+use crate::config::{HeadConfig, TrainConfig};
+use crate::error::TrainError;
+
+/// The JSON of a head in a file.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Saved {
+    head: HeadConfig,
+}
+
+/// A trained head beside its scene.
+#[derive(Clone)]
+pub struct Decoder {
+    head: Arc<dyn Head>,
+    tensors: HeadTensors,
+    config: TrainConfig,
+}
+
+impl Decoder {
+    /// What a finished scene keeps of a head.
+    pub(crate) fn save(config: &HeadConfig, tensors: &HeadTensors) -> TrainingState {
+        let json = serde_json::to_value(Saved { head: config.clone() }).expect("names and numbers");
+        TrainingState { json, tensors: tensors.learnt() }
+    }
+
+    /// The head that was saved with a scene.
+    ///
+    /// # Errors
+    /// When it is not known, or does not fit the scene.
+    pub fn of_scene(field: &Field, saved: &TrainingState) -> Result<Self, TrainError> {
+        let unusable = |reason: String| TrainError::BadHead { reason };
+        let Saved { head: of } =
+            serde_json::from_value(saved.json.clone()).map_err(|error| unusable(error.to_string()))?;
+        let head = configured(&of);
+        let name = head.name();
+        let config = TrainConfig { head: of, ..TrainConfig::default() };
+        let values = value_head(&head, &config)
+            .ok_or_else(|| unusable(format!("{name} tells labels by identity rows")))?;
+        let mut tensors = HeadTensors::start(values, field, 0);
+        if field.instances.is_empty() || tensors.take_learnt(&saved.tensors).is_none() {
+            return Err(unusable(format!("what {name} learnt does not fit the Gaussians of the scene")));
+        }
+        Ok(Self { head, tensors, config })
+    }
+
+    /// Name of the head.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        self.head.name()
+    }
+
+    fn values(&self) -> &dyn ValueHead {
+        value_head(&self.head, &self.config).expect("a head with values of its own")
+    }
+
+    /// Instance outputs of a view that `renderer` has just rendered as `rendered`.
+    #[must_use]
+    pub fn instances(
+        &self,
+        renderer: &mut Renderer,
+        field: &Field,
+        view: (&PinholeCamera, f64),
+        settings: &RenderSettings,
+        rendered: &RenderedImage,
+    ) -> InstanceImage {
+        let head = self.values();
+        let blended = blended(renderer, (head, &self.tensors), field, view, settings);
+        instance_image(head, &self.tensors, &blended, &rendered.alpha)
+    }
+}

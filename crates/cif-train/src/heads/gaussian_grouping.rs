@@ -1,0 +1,146 @@
+//! Gaussian Grouping: an identity code per Gaussian, blended like colour and classified per pixel.
+//!
+//! Source: Ye et al., Gaussian Grouping: Segment and Edit Anything in 3D Scenes, ECCV 2024, and its released code; methods
+//! reference 8.1. Codes are constant in time. The loss is the mean cross-entropy over all pixels, unlabelled ones being
+//! of a class like any other, divided by the logarithm of the number of classes; every fifth step also has the
+//! neighbour term of [`super::classifier`].
+//!
+//! Deviations: the classes are the instances of the capture and one for unlabelled pixels, instead of 256; Gaussians stay
+//! as they were reconstructed, where the published method trains them with their codes for 30 000 steps; neighbours are
+//! those at the time of the step's first view. Where published training draws from at most 200 000 Gaussians, all are
+//! drawn from.
+//!
+//! Constants: codes of 16 from (U(0, 1) - 0.5) / 0.2821 (the first spherical harmonic) at a rate of 2.5e-3 (epsilon of Adam 1e-15); classifier at
+//! 5e-4 (1e-8); 1 000 samples, 5 neighbours, weight 2.
+
+use cif_field::Field;
+use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
+use cif_geometry::spherical_harmonics::BAND_0;
+use cif_render::Blending;
+use rand::RngExt;
+
+use super::classifier::{Classifier, biases, weights};
+use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadView, Pass, ValueHead};
+use crate::adam::EPSILON;
+use crate::config::TrainConfig;
+use crate::random::{Purpose, stream};
+
+/// Width of a code.
+const CODE: usize = 16;
+
+/// Steps between neighbour terms.
+const NEIGHBOURS_EVERY: u32 = 5;
+
+/// Rates and epsilons.
+const CODE_RATE: f32 = 2.5e-3;
+const CLASSIFIER_RATE: f32 = 5e-4;
+const CLASSIFIER_EPSILON: f32 = 1e-8;
+
+const PART: &str = "gaussian_grouping";
+
+/// Codes of every Gaussian.
+const CODES: Parameter = Parameter {
+    name: "codes",
+    part: PART,
+    rate: "codes",
+    rows: Rows::Gaussians,
+    shape: &[CODE],
+    activation: Activation::Identity,
+    on_copy: OnCopy::Same,
+};
+
+const CLASSIFIER: Classifier = Classifier {
+    weights: weights(PART, &[CODE]),
+    biases: biases(PART),
+    unlabelled_is_class: true,
+    divides: true,
+};
+
+/// A code per Gaussian and a classifier.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct GaussianGrouping;
+
+impl Head for GaussianGrouping {
+    fn name(&self) -> &'static str {
+        "gaussian-grouping"
+    }
+
+    fn pass(&self, _config: &TrainConfig) -> Pass<'_> {
+        Pass::Values(self)
+    }
+}
+
+impl ValueHead for GaussianGrouping {
+    fn parameters(&self) -> Vec<Parameter> {
+        vec![CODES, CLASSIFIER.weights, CLASSIFIER.biases]
+    }
+
+    fn start(&self, parameter: &Parameter, field: &Field, seed: u64) -> Vec<f32> {
+        if *parameter != CODES {
+            return CLASSIFIER.start(parameter, field, seed);
+        }
+        let mut random = stream(seed, Purpose::Codes, 0);
+        (0..field.len() * CODE).map(|_| (random.random::<f32>() - 0.5) / BAND_0 as f32).collect()
+    }
+
+    fn rate(&self, parameter: &Parameter, _step: u32, _steps: u32) -> f32 {
+        if *parameter == CODES { CODE_RATE } else { CLASSIFIER_RATE }
+    }
+
+    fn epsilon(&self, parameter: &Parameter) -> f32 {
+        if *parameter == CODES { EPSILON } else { CLASSIFIER_EPSILON }
+    }
+
+    fn channels(&self, _field: &Field) -> usize {
+        CODE
+    }
+
+    fn blending(&self) -> Blending {
+        Blending::Color
+    }
+
+    fn values(&self, tensors: &HeadTensors, _field: &Field, _time: f64) -> Vec<f32> {
+        tensors.values(&CODES).to_vec()
+    }
+
+    fn values_backward(&self, tensors: &mut HeadTensors, _field: &Field, _time: f64, v_values: &[f32]) {
+        let (_, gradients) = tensors.values_and_gradients(&CODES);
+        gradients.iter_mut().zip(v_values).for_each(|(sum, v)| *sum += v);
+    }
+
+    fn loss(
+        &self,
+        tensors: &mut HeadTensors,
+        view: &HeadView<'_>,
+        weight: f32,
+        v_blended: &mut [f32],
+    ) -> HeadLoss {
+        CLASSIFIER.loss(tensors, view, weight, v_blended)
+    }
+
+    fn regularise(&self, tensors: &mut HeadTensors, step: &HeadStep<'_>) -> f64 {
+        if !step.step.is_multiple_of(NEIGHBOURS_EVERY) {
+            return 0.0;
+        }
+        let row = |row: &u32| *row as usize * CODE..(*row as usize + 1) * CODE;
+        let (value, rows, v_codes) = CLASSIFIER.neighbour_term(tensors, step, |tensors, rows| {
+            rows.iter().flat_map(|at| &tensors.values(&CODES)[row(at)]).copied().collect()
+        });
+        let (_, gradients) = tensors.values_and_gradients(&CODES);
+        for (at, v_code) in rows.iter().zip(v_codes.chunks_exact(CODE)) {
+            gradients[row(at)].iter_mut().zip(v_code).for_each(|(sum, v)| *sum += v);
+        }
+        value
+    }
+
+    fn decode(&self, tensors: &HeadTensors, blended: &[f32]) -> (u16, f32) {
+        CLASSIFIER.decode(tensors, blended)
+    }
+
+    fn label_of_rows(&self, tensors: &HeadTensors, _field: &Field) -> Vec<u16> {
+        tensors.values(&CODES).chunks_exact(CODE).map(|code| CLASSIFIER.decode(tensors, code).0).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests;

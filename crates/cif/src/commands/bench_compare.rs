@@ -1,0 +1,416 @@
+//! `cif bench compare`: the tables of the paper on captures of one's own.
+
+use std::io::{IsTerminal, Write};
+use std::path::{Path, PathBuf};
+
+use cif_bench::comparison::page::{self, Comparison};
+use cif_bench::comparison::record::{Record, Runs};
+use cif_bench::comparison::run::{Subject, settings};
+use cif_bench::comparison::{ABLATIONS, Contender};
+use cif_dataset::{Dataset, Layout, Split};
+use cif_geometry::PixelGrid;
+use cif_train::metrics::FrameView;
+use cif_train::{HeadName, Stop, TrainConfig, Trainer};
+use clap::Args;
+use serde_json::json;
+
+use super::train::{self, HeadArgument};
+use super::{CaptureOptions, print_warnings};
+use crate::error::Error;
+use crate::pictures::{Picture, instance_picture, rgb_picture};
+use crate::settings::Layers;
+use crate::{interrupt, output};
+
+/// Compare the method with other systems and without its parts, on one reconstruction per capture and seed
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Every capture is reconstructed once per seed; every head then trains on that reconstruction, sees the same masks and is
+scored on the held-out frames as `cif eval` scores its scene. All train what their settings have, as `cif train
+--effects all` does.
+
+  cif bench compare captures/table -o compare --preset draft
+  cif bench compare captures/table captures/kitchen -o compare --heads cif,sa4d --seeds 1 --ablations
+
+DIR holds compare.html (needs no network), panoptic and ablation each as .md, .csv, .json and .tex, and the runs with
+their scenes: finished ones are not done again, and Ctrl-C keeps the one under way, so that the same command goes on
+where it stopped.
+
+--iterations published trains every head as long as its own publication does: Gaussian Grouping 30 000 steps, SA4D 5 000,
+VLGS 15 000, Trace3D 29 000, CIF 3 000; Dr. Splat trains nothing. VLGS is a re-implementation, because there is no
+public code; the page says so beside its numbers. Published numbers stand in a column of their own: they were taken
+against other masks.")]
+pub(super) struct BenchCompare {
+    /// Folders of the captures
+    #[arg(required = true)]
+    captures: Vec<PathBuf>,
+    /// Folder to write into
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Heads to compare, comma separated [default: all]
+    #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
+    heads: Vec<HeadArgument>,
+    /// Number of seeds, from that of the settings on
+    #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=100))]
+    seeds: u32,
+    /// Named settings: draft, standard or paper [default: standard]
+    #[arg(long, value_name = "NAME")]
+    preset: Option<String>,
+    /// Steps of the instance stage of every head: a number, or `published` for those of its publication
+    #[arg(long, value_name = "N|published", default_value = "3000", value_parser = iterations)]
+    iterations: Iterations,
+    /// Compare the method without its parts too
+    #[arg(long)]
+    ablations: bool,
+    /// Any setting by its key in SCENE.train.toml, e.g. --set head.camera=cam16
+    #[arg(long, value_name = "TABLE.KEY=VALUE")]
+    set: Vec<String>,
+    /// Write into a folder that holds other files already
+    #[arg(long)]
+    force: bool,
+    #[command(flatten)]
+    capture_options: CaptureOptions,
+}
+
+/// Steps of the instance stage.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Iterations {
+    Published,
+    Steps(u32),
+}
+
+fn iterations(text: &str) -> Result<Iterations, String> {
+    match text {
+        "published" => Ok(Iterations::Published),
+        number => match number.parse() {
+            Ok(steps) if (1..=1_000_000).contains(&steps) => Ok(Iterations::Steps(steps)),
+            _ => Err("expected a number of steps from 1 to 1000000, or `published`".to_owned()),
+        },
+    }
+}
+
+impl Iterations {
+    fn of(self, head: HeadName) -> u32 {
+        match self {
+            Self::Published => head.published_steps(),
+            Self::Steps(steps) => steps,
+        }
+    }
+}
+
+/// A capture to compare on.
+struct Capture {
+    name: String,
+    dataset: Dataset,
+    config: TrainConfig,
+}
+
+pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
+    let goes_on = command.output.join("runs").is_dir();
+    output::check_folder(&command.output, command.force || goes_on)?;
+    let captures = command
+        .captures
+        .iter()
+        .map(|path| open(command, path.as_path()))
+        .collect::<Result<Vec<_>, Error>>()?;
+    for (k, capture) in captures.iter().enumerate() {
+        if captures[..k].iter().any(|other| other.name == capture.name) {
+            return Err(Error::failed(
+                format!("two captures are called {}", capture.name),
+                "rename one of the folders: tables name captures by them",
+            ));
+        }
+    }
+    let runs = Runs::inside(&command.output)?;
+    let contenders = contenders(command);
+    let mut bench = Bench {
+        iterations: command.iterations,
+        runs,
+        records: Vec::new(),
+        missing: 0,
+        is_terminal: std::io::stderr().is_terminal(),
+    };
+    interrupt::watch();
+    let mut stopped = false;
+    for capture in &captures {
+        for seed in 0..u64::from(command.seeds) {
+            let mut config = capture.config.clone();
+            config.seed += seed;
+            let subject = Subject { capture: &capture.name, dataset: &capture.dataset, config: &config };
+            if stopped {
+                bench.missing += contenders.len();
+            } else {
+                stopped = !bench.compare(&subject, &contenders)?;
+            }
+        }
+    }
+    let comparison = describe(command, &captures, &contenders, bench.missing);
+    page::write(&command.output, &bench.runs, &comparison, &bench.records)?;
+    let page = command.output.join("compare.html");
+    if stopped {
+        return Err(Error::Interrupted {
+            message: format!("interrupted; {} holds what is compared so far", page.display()),
+            help: Some("the same command goes on".to_owned()),
+        });
+    }
+    let text = std::fs::read_to_string(command.output.join("panoptic.md"))
+        .map_err(Error::io("read", &command.output))?;
+    println!("{text}");
+    eprintln!("wrote {}", page.display());
+    Ok(())
+}
+
+/// Runs of every capture and seed, in the order of tables.
+fn contenders(command: &BenchCompare) -> Vec<Contender> {
+    let wanted = |head: &HeadName| {
+        command.heads.is_empty() || command.heads.iter().any(|argument| argument.head() == *head)
+    };
+    let mut contenders: Vec<Contender> =
+        HeadName::ALL.into_iter().filter(wanted).map(Contender::Head).collect();
+    if command.ablations {
+        let whole = Contender::Head(HeadName::Cif);
+        if !contenders.contains(&whole) {
+            contenders.insert(0, whole);
+        }
+        contenders.extend(ABLATIONS.map(|(ablation, _)| Contender::Without(ablation)));
+    }
+    contenders
+}
+
+/// Opens a capture, with the settings of its reconstruction.
+fn open(command: &BenchCompare, path: &Path) -> Result<Capture, Error> {
+    let check = |layout| base_config(command, layout).map(drop);
+    let layout = command.capture_options.layout_after(path, check)?;
+    let mut options = command.capture_options.clone();
+    options.downscale = options.downscale.or(base_config(command, layout)?.downscale);
+    let dataset = options.open(path)?;
+    print_warnings(&dataset);
+    let refused = |problem: &str, help: &str| {
+        Err(Error::failed(format!("{}: {problem}", path.display()), help.to_owned()))
+    };
+    if !dataset.frames.iter().any(|frame| frame.split == Split::Val) {
+        return refused(
+            "no frame is held out, so nothing can be scored",
+            "hold frames out in the split lists of the capture",
+        );
+    }
+    let is_masked = |split| dataset.frames.iter().any(|frame| frame.split == split && frame.mask.is_some());
+    if !is_masked(Split::Train) || !is_masked(Split::Val) {
+        return refused(
+            "heads are compared by masks, and its training or held-out frames have none",
+            "give a capture with masks, or their folder with --masks",
+        );
+    }
+    let mut config = base_config(command, dataset.layout)?;
+    config.downscale = options.downscale;
+    let name = dataset.root.file_name().map_or_else(|| "capture".into(), |name| name.to_string_lossy());
+    Ok(Capture { name: name.into_owned(), config, dataset })
+}
+
+/// Settings of the reconstruction: those of the run of the method itself.
+fn base_config(command: &BenchCompare, layout: Layout) -> Result<TrainConfig, Error> {
+    let preset = command.preset.as_deref().map(|name| train::preset(name, "--preset")).transpose()?;
+    let mut config = TrainConfig::preset(preset.unwrap_or_default(), layout);
+    let steps = command.iterations.of(HeadName::Cif);
+    // Relocations end as far before the end of the stage as in the preset.
+    let stage = u64::from(config.stages.instance.max(1));
+    config.resample.until = (u64::from(config.resample.until) * u64::from(steps) / stage) as u32;
+    config.stages.instance = steps;
+    let mut layers = Layers::new(config);
+    for assignment in &command.set {
+        layers.assignment(assignment)?;
+    }
+    let mut config = layers.validated()?;
+    config.head.name = HeadName::Cif;
+    config.instance.ablate.clear();
+    Ok(config)
+}
+
+struct Bench {
+    iterations: Iterations,
+    runs: Runs,
+    records: Vec<Record>,
+    missing: usize,
+    is_terminal: bool,
+}
+
+impl Bench {
+    /// Runs everything on a capture with a seed; false when interrupted, the runs left being counted.
+    fn compare(&mut self, subject: &Subject<'_>, contenders: &[Contender]) -> Result<bool, Error> {
+        let stop = Stop::when(interrupt::requested);
+        let heading = format!("{}, seed {}", subject.capture, subject.config.seed);
+        let mut base = None;
+        for (k, contender) in contenders.iter().enumerate() {
+            let left = contenders.len() - k;
+            let mut config = match contender {
+                // What the settings say of the steps of the method holds.
+                Contender::Head(HeadName::Cif) | Contender::Without(_) => {
+                    settings(subject.config, HeadName::Cif, subject.config.stages.instance)
+                }
+                Contender::Head(head) => settings(subject.config, *head, self.iterations.of(*head)),
+            };
+            if let Contender::Without(ablation) = contender {
+                config.instance.ablate.insert(*ablation);
+            }
+            let id = format!("{}.seed{}.{}", subject.capture, config.seed, contender.name());
+            let fingerprint = json!({
+                "version": env!("CARGO_PKG_VERSION"),
+                "capture": subject.dataset.root,
+                "masks": subject.dataset.frames.iter().filter_map(|frame| frame.mask.as_ref()).next(),
+                "base": subject.config,
+                "settings": config,
+            });
+            if let Some(record) = self.runs.find(&id, &fingerprint) {
+                self.show(&format!("{heading}: {}: kept, {}", contender.name(), told(&record)), true);
+                self.records.push(record);
+                continue;
+            }
+            let show = |what: &str, done: u64, whole: u64| {
+                let percent = 100 * done / whole.max(1);
+                self.show(&format!("{heading}: {what}: {percent} %"), false);
+            };
+            if base.is_none() {
+                let tell = &mut |done, whole| show("reconstruction", done, whole);
+                let reconstructed = subject.reconstruct(&self.runs, &stop, tell)?;
+                let Some(reconstructed) = reconstructed else {
+                    self.missing += left;
+                    return Ok(false);
+                };
+                base = Some(reconstructed);
+            }
+            let Some(base) = &base else { return Ok(false) };
+            let tell: &mut dyn FnMut(u64, u64) = &mut |done, whole| show(contender.name(), done, whole);
+            let trained = subject.train(&self.runs, (&id, &config), base, &stop, (tell, &draw))?;
+            let Some(mut record) = trained else {
+                self.missing += left;
+                return Ok(false);
+            };
+            record.fingerprint = fingerprint;
+            record.row.head = contender.name().to_owned();
+            self.runs.keep(&id, &record)?;
+            self.show(&format!("{heading}: {}: {}", contender.name(), told(&record)), true);
+            self.records.push(record);
+        }
+        Ok(true)
+    }
+
+    fn show(&self, text: &str, ends: bool) {
+        // Overwritten on terminals; elsewhere only what is finished.
+        if self.is_terminal {
+            eprint!("\r\x1b[K{text}{}", if ends { "\n" } else { "" });
+            let _ = std::io::stderr().flush();
+        } else if ends {
+            eprintln!("{text}");
+        }
+    }
+}
+
+/// Colour of pixels without a label in pictures of labels.
+fn empty() -> [u8; 3] {
+    labels(&PixelGrid::filled(1, 1, 0)).pixels[0]
+}
+
+/// Labels in full colour.
+fn labels(ids: &PixelGrid<u16>) -> Picture {
+    instance_picture(ids, &PixelGrid::filled(ids.width, ids.height, 1.0))
+}
+
+/// Pictures of a view for the page.
+fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
+    let mut pictures = vec![("", rgb_picture(&view.rendered.color)), (".truth", view.truth.image.clone())];
+    pictures.extend(view.truth.mask.as_ref().map(|mask| (".mask", labels(mask))));
+    pictures.extend(view.predicted.map(|ids| (".instances", labels(ids))));
+    pictures
+}
+
+/// A record in a line.
+fn told(record: &Record) -> String {
+    let row = &record.row;
+    let number = |value: Option<f64>, digits: usize| super::eval::number(value, digits);
+    format!(
+        "mAcc-pix {} %, mIoU {} %, {} dB, {} Gaussians, {:.1} s",
+        number(row.macc_pix, 2),
+        number(row.miou, 2),
+        number(row.psnr, 2),
+        row.gaussians,
+        row.seconds
+    )
+}
+
+fn describe(
+    command: &BenchCompare,
+    captures: &[Capture],
+    contenders: &[Contender],
+    missing: usize,
+) -> Comparison {
+    let of_captures: Vec<String> = captures
+        .iter()
+        .map(|capture| {
+            let count = |split| capture.dataset.frames.iter().filter(|frame| frame.split == split).count();
+            format!(
+                "{}: {} training frames, {} held out, {} instances, {} steps of reconstruction",
+                capture.name,
+                count(Split::Train),
+                count(Split::Val),
+                capture.dataset.instances.len(),
+                capture.config.stages.coarse + capture.config.fine_iterations()
+            )
+        })
+        .collect();
+    let steps = match command.iterations {
+        Iterations::Published => "as many steps as its publication has".to_owned(),
+        Iterations::Steps(steps) => format!("{steps} steps"),
+    };
+    let seeds = match command.seeds {
+        1 => "one seed".to_owned(),
+        seeds => format!("{seeds} seeds"),
+    };
+    let folder = |path: &PathBuf| {
+        path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
+    };
+    let mut line = format!(
+        "cif bench compare {} -o {} --seeds {}",
+        command.captures.iter().map(folder).collect::<Vec<_>>().join(" "),
+        folder(&command.output),
+        command.seeds
+    );
+    line += &match command.iterations {
+        Iterations::Published => " --iterations published".to_owned(),
+        Iterations::Steps(steps) => format!(" --iterations {steps}"),
+    };
+    if let Some(preset) = &command.preset {
+        line += &format!(" --preset {preset}");
+    }
+    if command.ablations {
+        line += " --ablations";
+    }
+    for assignment in &command.set {
+        line += &format!(" --set {assignment}");
+    }
+    let heads = contenders.iter().filter_map(|contender| match contender {
+        Contender::Head(head) => Some(head.name().to_owned()),
+        Contender::Without(_) => None,
+    });
+    Comparison {
+        description: format!("{}. Every head trains {steps}; {seeds}.", of_captures.join("; ")),
+        command: line,
+        threads: rayon::current_num_threads(),
+        simd: Trainer::vector_instructions(),
+        missing,
+        heads: heads.collect(),
+        ablations: command.ablations,
+        camera: captures.first().map(|capture| capture.config.head.camera.clone()).unwrap_or_default(),
+        empty: empty(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn steps_are_a_number_or_published() {
+        assert_eq!(iterations("3000"), Ok(Iterations::Steps(3_000)));
+        assert_eq!(iterations("published").unwrap().of(HeadName::Sa4d), 5_000);
+        assert!(iterations("0").is_err() && iterations("many").is_err());
+    }
+}

@@ -1,0 +1,112 @@
+//! Heads of other systems by the command, and the comparison of all. How good any is on so few steps is not tested.
+
+use std::fs;
+use std::path::Path;
+
+use cif_test::capture;
+use cif_test::command::{Run, run};
+use serde_json::Value;
+
+const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
+
+/// A small model and short stages.
+const SMALL: &str = "--set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4 \
+                     --set stages.coarse=10 --set stages.fine=60 --set densify.max_gaussians=600";
+
+fn cif(folder: &Path, line: &str) -> Run {
+    run(CIF, folder, line.split_whitespace())
+}
+
+fn with_capture() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    capture::write(&folder.path().join("table"), 8);
+    folder
+}
+
+fn json(path: &Path) -> Value {
+    let text = fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error} in {text}"))
+}
+
+#[test]
+fn scenes_of_every_head_can_be_scored_drawn_searched_and_exported() {
+    let folder = with_capture();
+    let path = folder.path();
+    cif(path, &format!("train table -o base.cif --iterations-instance 10 {SMALL}")).succeeds();
+    for head in ["dr-splat", "gaussian-grouping", "sa4d", "vlgs", "trace3d"] {
+        let line =
+            format!("train table -o {head}.cif --from base.cif --head {head} --iterations-instance 25");
+        cif(path, &line).succeeds();
+        let told = cif(path, &format!("eval {head}.cif table --json {head}.json")).succeeds().stdout;
+        assert!(told.contains(&format!("labels as the head {head} decodes every pixel")), "{told}");
+        let scores = json(&path.join(format!("{head}.json")));
+        assert_eq!(scores["labels_by"], head);
+        assert!(scores["macc_pix"].is_number() && scores["psnr"].is_number(), "{head}: {scores:#}");
+        cif(path, &format!("render {head}.cif --capture table -o {head} --what instance")).succeeds();
+        cif(path, &format!("query {head}.cif --label * --json")).succeeds();
+        cif(path, &format!("export {head}.cif --gltf {head}.glb")).succeeds();
+    }
+    let told = cif(path, "eval base.cif table --json base.json").succeeds().stdout;
+    assert!(!told.contains("decodes every pixel"), "{told}");
+    assert_eq!(json(&path.join("base.json"))["labels_by"], "identity rows");
+    cif(path, "train table -o x.cif --from base.cif --head lerf").fails(2, &["--head", "gaussian-grouping"]);
+    cif(path, "train table -o x.cif --from base.cif --head sa4d --set head.camera=cam16")
+        .fails(1, &["head.camera = cam16", "training cameras"]);
+}
+
+#[test]
+fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
+    let folder = with_capture();
+    let path = folder.path();
+    let line = format!(
+        "bench compare table -o out --heads cif,dr-splat,vlgs --seeds 1 --iterations 8 --ablations {SMALL}"
+    );
+    let told = cif(path, &line).succeeds();
+    assert!(told.stdout.contains("VLGS (re-implementation)"), "{}", told.stdout);
+    let rows = json(&path.join("out/panoptic.json"));
+    let rows = rows.as_array().unwrap();
+    let named: Vec<(&str, u64)> =
+        rows.iter().map(|row| (row["head"].as_str().unwrap(), row["seed"].as_u64().unwrap())).collect();
+    assert_eq!(named, [("cif", 0), ("vlgs", 0), ("dr-splat", 0)]);
+    for row in rows {
+        let (head, seed) = (row["head"].as_str().unwrap(), &row["seed"]);
+        cif(path, &format!("eval out/runs/table.seed{seed}.{head}.cif table --json {head}{seed}.json"))
+            .succeeds();
+        let scores = json(&path.join(format!("{head}{seed}.json")));
+        for key in ["macc_pix", "macc_inst", "miou", "psnr", "ssim", "gaussians"] {
+            assert_eq!(row[key], scores[key], "{head} {key}");
+        }
+        assert!(row["seconds"].as_f64() >= Some(0.0) && row["capture"] == "table");
+    }
+    // Heads leave the reconstruction as it is.
+    assert_eq!(rows[1]["psnr"], rows[2]["psnr"]);
+    let parts = json(&path.join("out/ablation.json"));
+    let parts: Vec<&str> =
+        parts.as_array().unwrap().iter().map(|row| row["head"].as_str().unwrap()).collect();
+    assert_eq!(parts, ["i", "ii", "iii", "iv", "v"]);
+    for file in ["compare.html", "panoptic.md", "panoptic.csv", "panoptic.tex", "ablation.md", "ablation.tex"]
+    {
+        assert!(path.join("out").join(file).is_file(), "{file}");
+    }
+    let page = fs::read_to_string(path.join("out/compare.html")).unwrap();
+    for part in
+        ["Where they differ most", "data:image/png", "taken against other masks", "(ii) opacity as occupancy"]
+    {
+        assert!(page.contains(part), "{part}");
+    }
+    let base = fs::read(path.join("out/runs/table.seed0.base.cif")).unwrap();
+
+    // Everything is kept but what is gone, which needs the reconstruction again.
+    fs::remove_file(path.join("out/runs/table.seed0.vlgs.json")).unwrap();
+    let told = cif(path, &line).succeeds().stderr;
+    assert_eq!(told.matches(": kept, ").count(), 6, "{told}");
+    assert_eq!(fs::read(path.join("out/runs/table.seed0.base.cif")).unwrap(), base);
+    assert_eq!(json(&path.join("out/panoptic.json"))[1]["miou"], rows[1]["miou"], "the same run again");
+    let told = cif(path, &line.replace("--iterations 8", "--iterations 9")).succeeds().stderr;
+    assert_eq!(told.matches(": kept, ").count(), 0, "{told}");
+
+    cif(path, "bench compare table -o table").fails(1, &["not empty"]);
+    cif(path, "bench compare table table -o other").fails(1, &["two captures are called table"]);
+    cif(path, "bench compare table -o other --iterations some").fails(2, &["published"]);
+    cif(path, "bench compare table -o other --no-masks").fails(1, &["masks"]);
+}
