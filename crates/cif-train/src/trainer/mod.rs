@@ -35,7 +35,7 @@ mod gpu_pose_tests;
 #[cfg(feature = "wgpu")]
 mod gpu_tests;
 #[cfg(test)]
-mod guard_tests;
+pub(crate) mod guard_tests;
 mod guidance;
 mod identity;
 mod initialize;

@@ -4,10 +4,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::MaskWriter;
-use cif_dataset::{Dataset, OpenOptions, PointSource};
+use cif_dataset::{Dataset, OpenOptions, PointSource, Split};
 use cif_geometry::PixelGrid;
 use cif_masks::rig::{self, View};
-use cif_masks::suggest::{doubt, next_keyframe};
+use cif_masks::suggest::{Camera, Propagated, doubt, next_frame};
 use cif_masks::{Clip, Keyframe, Mask};
 use clap::Args;
 use glam::DVec3;
@@ -360,16 +360,14 @@ impl Work<'_> {
                 dataset.frames[unmasked[0]].name
             );
         }
-        let best = cameras
-            .values()
-            .filter_map(|frames| {
-                let known: Vec<usize> =
-                    (0..frames.len()).filter(|k| painted.contains_key(&frames[*k])).collect();
-                let doubts: Vec<f64> = frames.iter().map(|frame| doubts[*frame]).collect();
-                next_keyframe(&doubts, &known).map(|(k, gain)| (frames[k], gain))
-            })
-            .max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
-        if let Some((frame, _)) = best {
+        let propagated = |frame: &usize| Propagated {
+            frame: *frame,
+            doubt: doubts[*frame],
+            painted: painted.contains_key(frame),
+            trained: dataset.frames[*frame].split == Split::Train,
+        };
+        let camera = |frames: &Vec<usize>| Camera { frames: frames.iter().map(propagated).collect() };
+        if let Some(frame) = next_frame(&cameras.values().map(camera).collect::<Vec<_>>()) {
             println!(
                 "label this frame next: {} ({:.0} % of its objects in doubt)",
                 dataset.frames[frame].name,
