@@ -379,7 +379,8 @@ fn a_few_painted_frames_become_masks_of_all() {
 /// A scene of points that stand still and hide what is behind them.
 fn scene_of(dataset: &cif_dataset::Dataset, cameras: Vec<RecordedCamera>) -> Field {
     let points = &dataset.points.positions;
-    let mut gaussians = Gaussians::from_points(points, &vec![[0.5; 3]; points.len()]).unwrap();
+    let mut gaussians =
+        Gaussians::from_points(points, &vec![[0.5; 3]; points.len()]).expect("as many colours as points");
     gaussians.opacity_logits.fill(2.0);
     Field {
         gaussians,

@@ -1,4 +1,5 @@
 //! Confidences of masks, and folders of masks that are written with them.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod support;
 
