@@ -6,6 +6,7 @@ use std::path::Path;
 #[path = "../../crates/cif-dataset/tests/support/mod.rs"]
 mod captures;
 
+use cif_field::{Field, Gaussians, RecordedCamera, SortMetric, Timeline};
 use cif_test::capture;
 use cif_test::command::{Run, run};
 
@@ -373,6 +374,83 @@ fn a_few_painted_frames_become_masks_of_all() {
     }
     cif(path, "masks propagate table --keyframes painted -o made")
         .fails(1, &["made", "something is there already"]);
+}
+
+/// A scene of points that stand still and hide what is behind them.
+fn scene_of(dataset: &cif_dataset::Dataset, cameras: Vec<RecordedCamera>) -> Field {
+    let points = &dataset.points.positions;
+    let mut gaussians =
+        Gaussians::from_points(points, &vec![[0.5; 3]; points.len()]).expect("as many colours as points");
+    gaussians.opacity_logits.fill(2.0);
+    Field {
+        gaussians,
+        deformation: None,
+        tracks: None,
+        identities: None,
+        instances: Vec::new(),
+        timeline: Timeline { times: dataset.times.clone(), frames_per_second: 24.0 },
+        cameras,
+        sh_degree: 1,
+        background: [1.0; 3],
+        sort_metric: SortMetric::Z,
+        extent: 1.0,
+        record: Default::default(),
+    }
+}
+
+#[test]
+fn a_scene_brings_masks_to_a_camera_without_keyframes() {
+    let folder = folder();
+    let path = folder.path();
+    cif_test::capture::write(&path.join("table"), 8);
+    // The last frame is that of a second camera, at the moment of the fourth.
+    captures::edit_json(&path.join("table/metadata.json"), |frames| {
+        frames["000007"] =
+            serde_json::json!({ "warp_id": 3, "appearance_id": 3, "camera_id": 1, "time_id": 3 });
+    });
+    let dataset = cif_dataset::Dataset::open(path.join("table"), &Default::default()).unwrap();
+    let mut cameras: Vec<RecordedCamera> = Vec::new();
+    for frame in &dataset.frames {
+        let (name, time_index) = (frame.camera_name.clone(), frame.time_index);
+        cameras.push(RecordedCamera { name, time_index, trained: true, camera: frame.camera });
+    }
+    scene_of(&dataset, cameras.clone()).save(path.join("scene.cif")).unwrap();
+    cameras.iter_mut().for_each(|recorded| recorded.camera.camera_from_world.translation.x += 0.5);
+    scene_of(&dataset, cameras).save(path.join("other.cif")).unwrap();
+    fs::remove_file(path.join("table/points.npy")).unwrap();
+    let masks = path.join("table/masks");
+    let paint = |folder: &str, names: &[&str]| {
+        fs::create_dir(path.join(folder)).unwrap();
+        for name in names {
+            fs::copy(masks.join(name), path.join(folder).join(name)).unwrap();
+        }
+    };
+    paint("painted", &["000000.png", "000003.png", "000006.png"]);
+    paint("all", &["000000.png", "000007.png"]);
+
+    let propagate = "masks propagate table --keyframes painted -o made";
+    cif(path, propagate).fails(1, &["has no keyframe", "--scene"]);
+    let other = ["other.cif", "another capture", "table", "cif train CAPTURE"];
+    cif(path, &format!("{propagate} --scene other.cif")).fails(1, &other);
+    cif(path, &format!("{propagate} --scene nowhere.cif")).fails(1, &["nowhere.cif"]);
+    assert!(!path.join("made").exists());
+
+    let run = cif(path, &format!("{propagate} --scene scene.cif")).succeeds();
+    assert!(run.stdout.contains("8 masks of 2 instances from 3 keyframes"), "{}", run.stdout);
+    // Held-out frames, 000002 and 000006 among them, are not what to paint next.
+    assert!(!run.stdout.contains("label this frame next: 000002"), "{}", run.stdout);
+    assert!(!run.stderr.contains("nothing is taken"), "{}", run.stderr);
+    let mask = |file: &Path| image::open(file).unwrap().into_luma8().into_raw();
+    let (made, truth) = (mask(&path.join("made/000007.png")), mask(&masks.join("000007.png")));
+    // The ball that stands: the other one is elsewhere in that image.
+    let is = |id: &u8| u16::from(*id) == capture::STANDING;
+    let both = made.iter().zip(&truth).filter(|(made, truth)| is(made) && is(truth)).count();
+    let either = made.iter().zip(&truth).filter(|(made, truth)| is(made) || is(truth)).count();
+    assert!(either > 20 && both * 10 > either * 6, "{both} of {either} pixels");
+
+    let unused = "masks propagate table --keyframes all -o again --scene scene.cif";
+    let run = cif(path, unused).succeeds();
+    assert!(run.stderr.contains("nothing is taken from scene.cif"), "{}", run.stderr);
 }
 
 #[cfg(unix)]

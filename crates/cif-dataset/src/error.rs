@@ -166,6 +166,18 @@ pub enum Error {
         /// The problem and what is expected.
         problem: String,
     },
+    /// A confidence of a mask cannot be decoded, or does not belong to its image.
+    #[error(
+        "{}: cannot be used as the confidence of a mask: {problem}; write it again as an 8-bit grey PNG of the size \
+         of the mask, 255 for certain, or remove it",
+        path.display()
+    )]
+    Confidence {
+        /// The confidence.
+        path: PathBuf,
+        /// The problem.
+        problem: String,
+    },
     /// A mask and its image differ in shape.
     #[error(
         "{}: the mask has {} x {} pixels, its image {} has {} x {}: another aspect; export the mask at the \

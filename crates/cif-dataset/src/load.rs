@@ -4,9 +4,9 @@ use std::path::Path;
 
 use cif_geometry::{PinholeCamera, PixelGrid};
 
-use crate::files::{image, mask};
+use crate::files::{confidence, image, mask};
 use crate::lens_removal::{undistort_image, undistort_mask};
-use crate::{Dataset, Error, FrameData, mask_files};
+use crate::{Dataset, Error, Frame, FrameData, mask_files};
 
 impl Dataset {
     /// Loads image and mask of a frame.
@@ -80,16 +80,16 @@ impl Dataset {
     /// Loads the confidence of the mask of a frame, where it has one, the way the mask goes.
     ///
     /// # Errors
-    /// When the file is missing, truncated, no grey PNG, or has another aspect than its image.
+    /// When the file is missing, truncated, no 8-bit grey PNG, or has another aspect than its image.
     ///
     /// # Panics
     /// When there is no frame `index`.
     pub fn load_confidence(&self, index: usize) -> Result<Option<PixelGrid<u8>>, Error> {
-        let Some(path) = &self.frames[index].confidence else { return Ok(None) };
-        let values = self.load_mask_file(index, path)?;
-        if values.pixels.iter().any(|value| *value > 255) {
-            return Err(Error::mask(path, "a confidence is an 8-bit grey PNG, 255 for certain"));
-        }
+        let frame = &self.frames[index];
+        let Some(path) = &frame.confidence else { return Ok(None) };
+        let (width, height) = (frame.camera.width, frame.camera.height);
+        let stored = confidence::decode(path, (width, height))?;
+        let values = without_lens(mask::nearest_resize(&stored, width, height), frame);
         Ok(Some(values.map(|value| *value as u8)))
     }
 
@@ -113,13 +113,7 @@ impl Dataset {
     /// # Panics
     /// When there is no frame `index`.
     pub fn load_mask_file(&self, index: usize, path: &Path) -> Result<PixelGrid<u16>, Error> {
-        let frame = &self.frames[index];
-        let resized = self.resized_mask(index, path)?;
-        Ok(if frame.lens.is_identity() {
-            resized
-        } else {
-            undistort_mask(&resized, &frame.camera, &frame.lens)
-        })
+        Ok(without_lens(self.resized_mask(index, path)?, &self.frames[index]))
     }
 
     /// Loads a mask file as the mask of a frame, at the size of its image and with its lens distortion.
@@ -147,6 +141,11 @@ impl Dataset {
         }
         Ok(mask::nearest_resize(&stored, width, height))
     }
+}
+
+/// Values of the pixels of a frame without its lens distortion.
+fn without_lens(values: PixelGrid<u16>, frame: &Frame) -> PixelGrid<u16> {
+    if frame.lens.is_identity() { values } else { undistort_mask(&values, &frame.camera, &frame.lens) }
 }
 
 /// True when two sizes have one aspect, up to the rounding of either to whole pixels.

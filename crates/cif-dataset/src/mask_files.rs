@@ -7,7 +7,7 @@ use cif_geometry::PixelGrid;
 use rayon::prelude::*;
 
 use crate::cryptomatte::{self, ObjectIds};
-use crate::files::{listing, mask};
+use crate::files::{confidence, listing, mask};
 use crate::load::same_aspect;
 use crate::{Error, Frame, Layout};
 
@@ -199,15 +199,19 @@ pub(crate) struct ResizedMasks {
     pub(crate) image_size: (u32, u32),
 }
 
-/// Checks the headers of all masks against the sizes of the images as stored.
+/// Checks the headers of all masks and confidences against the sizes of the images as stored.
 ///
 /// # Errors
-/// When a mask is no PNG, a colour image, or has another aspect than its image.
+/// When a mask is no PNG, a colour image, or has another aspect than its image; when a confidence is no 8-bit grey PNG or
+/// has another aspect.
 pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Result<MaskHeaders, Error> {
     let headers: Vec<Option<Result<mask::MaskHeader, Error>>> =
         frames.par_iter().map(|frame| frame.mask.as_deref().map(probe)).collect();
     let mut result = MaskHeaders { largest_id: 0, resized: None };
     for ((frame, header), stored) in frames.iter().zip(headers).zip(stored_sizes) {
+        if let Some(path) = &frame.confidence {
+            confidence::check(path, *stored)?;
+        }
         let (Some(header), Some(path)) = (header, &frame.mask) else { continue };
         let header = header?;
         let size = (header.width, header.height);

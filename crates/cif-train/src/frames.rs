@@ -199,3 +199,39 @@ impl TrainFrame {
         (self.image.pixels.len() * 3 + self.labels.as_ref().map_or(0, |grid| grid.pixels.len() * 2)) as u64
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::trainer::guard_tests::support::{HEIGHT, Scene, WIDTH, capture};
+
+    #[test]
+    fn unsure_pixels_are_unlabelled_and_the_others_keep_their_labels() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut dataset = capture(folder.path(), Scene { times: 1, views: 2, ..Scene::default() });
+        let open =
+            |dataset: &Dataset| FrameStore::open(dataset, [1.0; 3], u64::MAX, &Stop::default()).unwrap();
+        let certain = open(&dataset);
+        // Rows alternate between just too little and just enough.
+        let path = folder.path().join("confidence.png");
+        let row = |y: u32| if y.is_multiple_of(2) { LEAST_CONFIDENCE - 1 } else { LEAST_CONFIDENCE };
+        let grey = image::GrayImage::from_fn(WIDTH, HEIGHT, |_, y| image::Luma([row(y)]));
+        grey.save(&path).unwrap();
+        dataset.frames[certain.index(0)].confidence = Some(path);
+        let unsure = open(&dataset);
+        let labels = |store: &FrameStore, k| store.get(&dataset, k).unwrap().labels.clone().unwrap();
+        let (before, after) = (labels(&certain, 0), labels(&unsure, 0));
+        for (k, (before, after)) in before.pixels.iter().zip(&after.pixels).enumerate() {
+            let sure = (k / WIDTH as usize) % 2 == 1;
+            assert_eq!(*after, if sure { *before } else { UNLABELLED }, "pixel {k}");
+        }
+        let labelled = |labels: &PixelGrid<u16>| labels.pixels.iter().filter(|l| **l != UNLABELLED).count();
+        assert!(labelled(&before) > labelled(&after) && labelled(&after) > 0);
+        assert_eq!(unsure.get(&dataset, 0).unwrap().labelled, labelled(&after));
+        // Frames without a confidence are as before, and so are frames that memory has no room for.
+        assert_eq!(labels(&unsure, 1), labels(&certain, 1));
+        let none_kept = FrameStore::open(&dataset, [1.0; 3], 0, &Stop::default()).unwrap();
+        assert_eq!(none_kept.not_kept(), none_kept.len());
+        assert_eq!(labels(&none_kept, 0), after);
+    }
+}

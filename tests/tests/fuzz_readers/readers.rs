@@ -49,6 +49,7 @@ pub(crate) fn all() -> Vec<Reader> {
         capture("hypernerf-camera", "camera/000001.json", Form::Json, hypernerf),
         capture("capture-image", "rgb/1x/000001.png", Form::Binary, hypernerf),
         capture("capture-mask", "masks/000000.png", Form::Binary, hypernerf),
+        capture("capture-confidence", "masks/confidence/000001.png", Form::Binary, confidence),
         capture("capture-instances", "instances.json", Form::Json, hypernerf),
         capture("capture-splits", "splits.json", Form::Json, hypernerf),
         capture("capture-points-npy", "points.npy", Form::Binary, hypernerf),
@@ -212,6 +213,15 @@ fn adopt(made: &Path, folder: &Path) {
 fn hypernerf(folder: &Path) {
     adopt(captures::hypernerf(3).path(), folder);
     fs::write(folder.join("splits.json"), r#"{ "interp": ["000001"], "novel": [] }"#).unwrap();
+}
+
+/// A capture one of whose masks has a confidence.
+fn confidence(folder: &Path) {
+    hypernerf(folder);
+    fs::create_dir(folder.join("masks/confidence")).unwrap();
+    image::GrayImage::from_fn(captures::WIDTH, captures::HEIGHT, |x, y| image::Luma([(x * y) as u8]))
+        .save(folder.join("masks/confidence/000001.png"))
+        .unwrap();
 }
 
 fn neu3d(folder: &Path) {

@@ -22,7 +22,11 @@ pub(crate) struct MaskHeader {
     pub(crate) largest_id: u16,
 }
 
-fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
+/// Opens a PNG file whose pixels are to arrive as they are stored.
+///
+/// # Errors
+/// When the file is missing, no PNG, or its header claims more than it can hold.
+pub(super) fn open_png(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
     let file = cif_input::open(path).map_err(Error::read(path))?;
     let size = file.metadata().map_err(Error::read(path))?.len();
     let mut decoder = Decoder::new_with_limits(BufReader::new(file), Limits { bytes: 1 << 31 });
@@ -32,23 +36,6 @@ fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
         .read_info()
         .map_err(|error| Error::mask(path, format!("not a readable PNG file ({error}); export it again")))?;
     let info = reader.info();
-    match info.color_type {
-        ColorType::Grayscale | ColorType::Indexed => {}
-        ColorType::Rgb | ColorType::Rgba | ColorType::GrayscaleAlpha => {
-            return Err(Error::mask(
-                path,
-                format!(
-                    "it is a {} image; a mask is an 8- or 16-bit grey or palette PNG whose pixel values are \
-                     instance ids, 0 for unlabelled",
-                    match info.color_type {
-                        ColorType::GrayscaleAlpha => "grey and alpha",
-                        ColorType::Rgba => "RGBA",
-                        _ => "RGB",
-                    }
-                ),
-            ));
-        }
-    }
     if u64::from(info.width) * u64::from(info.height) > MAX_PIXELS {
         return Err(Error::mask(path, format!("{} x {} pixels are too many", info.width, info.height)));
     }
@@ -59,6 +46,28 @@ fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
             info.width, info.height
         );
         return Err(Error::mask(path, problem));
+    }
+    Ok(reader)
+}
+
+fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
+    let reader = open_png(path)?;
+    match reader.info().color_type {
+        ColorType::Grayscale | ColorType::Indexed => {}
+        ColorType::Rgb | ColorType::Rgba | ColorType::GrayscaleAlpha => {
+            return Err(Error::mask(
+                path,
+                format!(
+                    "it is a {} image; a mask is an 8- or 16-bit grey or palette PNG whose pixel values are \
+                     instance ids, 0 for unlabelled",
+                    match reader.info().color_type {
+                        ColorType::GrayscaleAlpha => "grey and alpha",
+                        ColorType::Rgba => "RGBA",
+                        _ => "RGB",
+                    }
+                ),
+            ));
+        }
     }
     Ok(reader)
 }

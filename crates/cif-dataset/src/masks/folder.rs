@@ -19,16 +19,7 @@ impl NewFolder {
     /// # Errors
     /// When `place` holds something already, or its parent cannot be written.
     pub(super) fn create(place: &Path) -> Result<Self, Error> {
-        let occupied = match std::fs::read_dir(place) {
-            Ok(mut entries) => entries.next().is_some(),
-            Err(_) => place.exists(),
-        };
-        if occupied {
-            return Err(Error::invalid(
-                place,
-                "something is there already; give a new folder, or empty this one",
-            ));
-        }
+        check_free(place)?;
         let parent = folder_of(place);
         std::fs::create_dir_all(&parent).map_err(Error::write(&parent))?;
         let scratch = Scratch::inside(&parent).map_err(Error::write(&parent))?;
@@ -44,9 +35,25 @@ impl NewFolder {
     /// Moves the folder to its place.
     ///
     /// # Errors
-    /// When it cannot be moved.
+    /// When something came to `place` in the meantime, or the folder cannot be moved.
     pub(super) fn finish(self) -> Result<(), Error> {
         let Self { scratch, partial, place } = self;
+        check_free(&place)?;
         scratch.replace(&[(partial, place.clone())], None).map_err(Error::write(&place))
     }
+}
+
+/// Refuses a place that holds something already.
+fn check_free(place: &Path) -> Result<(), Error> {
+    let occupied = match std::fs::read_dir(place) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(_) => place.exists(),
+    };
+    if occupied {
+        return Err(Error::invalid(
+            place,
+            "something is there already; give a new folder, or empty this one",
+        ));
+    }
+    Ok(())
 }

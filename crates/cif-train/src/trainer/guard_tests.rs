@@ -1,7 +1,7 @@
 //! Steps that go wrong, on a real capture.
 
 #[path = "../../tests/support/mod.rs"]
-pub(super) mod support;
+pub(crate) mod support;
 
 use cif_field::Field;
 use cif_field::parameters::OPACITY_LOGITS;

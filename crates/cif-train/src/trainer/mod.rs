@@ -36,7 +36,7 @@ mod gpu_pose_tests;
 #[cfg(feature = "wgpu")]
 mod gpu_tests;
 #[cfg(test)]
-mod guard_tests;
+pub(crate) mod guard_tests;
 mod guidance;
 #[cfg(test)]
 mod head_tests;

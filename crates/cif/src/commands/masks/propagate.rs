@@ -1,18 +1,20 @@
 //! `cif masks propagate`: masks of all frames from a few painted ones.
 
+mod points;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::MaskWriter;
-use cif_dataset::{Dataset, OpenOptions, PointSource};
+use cif_dataset::{Dataset, OpenOptions, Split};
 use cif_geometry::PixelGrid;
 use cif_masks::rig::{self, View};
-use cif_masks::suggest::{doubt, next_keyframe};
+use cif_masks::suggest::{Camera, Propagated, doubt, next_frame};
 use cif_masks::{Clip, Keyframe, Mask};
 use clap::Args;
-use glam::DVec3;
 
-use crate::commands::{LayoutName, command_line, scene};
+use self::points::Points;
+use crate::commands::{LayoutName, command_line};
 use crate::error::Error;
 use crate::interrupt;
 use crate::pictures::{ContactSheet, save_jpeg};
@@ -23,9 +25,6 @@ const SHEET: &str = "contact_sheet.jpg";
 
 /// Every so many frames one is on the picture.
 const SHEET_EVERY: usize = 10;
-
-/// Opacity from which a Gaussian of a scene is a point that carries ids.
-const SOLID: f32 = 0.5;
 
 /// Background behind images with alpha.
 const BACKGROUND: [f32; 3] = [1.0; 3];
@@ -96,7 +95,7 @@ pub(super) fn run(command: &Propagate) -> Result<(), Error> {
         ));
     }
     let cameras = cameras(&dataset);
-    let points = Points::new(command, &dataset, &cameras, &painted)?;
+    let points = Points::new(command.scene.as_deref(), &dataset, &cameras, &painted)?;
     let writer = MaskWriter::create(&command.output).map_err(Error::plain)?;
     interrupt::watch();
     let mut work = Work {
@@ -182,62 +181,6 @@ fn cameras(dataset: &Dataset) -> BTreeMap<&str, Vec<usize>> {
 fn keyframes_of(frames: &[usize], painted: &BTreeMap<usize, Keyframe>) -> BTreeMap<usize, Keyframe> {
     let known = frames.iter().enumerate().filter_map(|(k, frame)| Some((k, painted.get(frame)?.clone())));
     known.collect()
-}
-
-/// Points of the world that bring ids from camera to camera.
-enum Points {
-    /// Every camera has a keyframe, or there are none.
-    None,
-    /// Points that stand still.
-    Still(Vec<DVec3>),
-    /// Gaussians of a scene, which move.
-    Scene(Box<cif_field::Field>),
-}
-
-impl Points {
-    fn new(
-        command: &Propagate,
-        dataset: &Dataset,
-        cameras: &BTreeMap<&str, Vec<usize>>,
-        painted: &BTreeMap<usize, Keyframe>,
-    ) -> Result<Self, Error> {
-        let without: Vec<&str> = cameras
-            .iter()
-            .filter(|(_, frames)| frames.iter().all(|frame| !painted.contains_key(frame)))
-            .map(|(name, _)| *name)
-            .collect();
-        if let Some(path) = &command.scene {
-            return Ok(Self::Scene(Box::new(scene::load(path)?)));
-        }
-        if without.is_empty() {
-            return Ok(Self::None);
-        }
-        if dataset.points.source == PointSource::Random {
-            return Err(Error::failed(
-                format!(
-                    "{} {} no keyframe, and the capture has no points that could bring ids from other cameras",
-                    without.join(", "),
-                    if without.len() == 1 { "has" } else { "have" }
-                ),
-                "paint a frame of each camera, or train a scene without masks and give it with --scene",
-            ));
-        }
-        let point = |point: &[f32; 3]| DVec3::from_array(point.map(f64::from));
-        Ok(Self::Still(dataset.points.positions.iter().map(point).collect()))
-    }
-
-    /// World positions at a normalised time, metres.
-    fn at(&self, time: f64) -> Vec<DVec3> {
-        match self {
-            Self::None => Vec::new(),
-            Self::Still(points) => points.clone(),
-            Self::Scene(field) => {
-                let gaussians = field.deformed(time);
-                let solid = (0..gaussians.means.len()).filter(|row| gaussians.opacity(*row) >= SOLID);
-                solid.map(|row| DVec3::from_array(gaussians.means[row].map(f64::from))).collect()
-            }
-        }
-    }
 }
 
 /// Masks being made.
@@ -360,16 +303,14 @@ impl Work<'_> {
                 dataset.frames[unmasked[0]].name
             );
         }
-        let best = cameras
-            .values()
-            .filter_map(|frames| {
-                let known: Vec<usize> =
-                    (0..frames.len()).filter(|k| painted.contains_key(&frames[*k])).collect();
-                let doubts: Vec<f64> = frames.iter().map(|frame| doubts[*frame]).collect();
-                next_keyframe(&doubts, &known).map(|(k, gain)| (frames[k], gain))
-            })
-            .max_by(|a, b| a.1.total_cmp(&b.1).then(b.0.cmp(&a.0)));
-        if let Some((frame, _)) = best {
+        let propagated = |frame: &usize| Propagated {
+            frame: *frame,
+            doubt: doubts[*frame],
+            painted: painted.contains_key(frame),
+            trained: dataset.frames[*frame].split == Split::Train,
+        };
+        let camera = |frames: &Vec<usize>| Camera { frames: frames.iter().map(propagated).collect() };
+        if let Some(frame) = next_frame(&cameras.values().map(camera).collect::<Vec<_>>()) {
             println!(
                 "label this frame next: {} ({:.0} % of its objects in doubt)",
                 dataset.frames[frame].name,
