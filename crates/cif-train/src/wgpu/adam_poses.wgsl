@@ -1,5 +1,6 @@
-// The optimiser's step of the poses that views were drawn of, and their limits: turns by radians, unless they are assumed, translations by shares
-// of the size of the group, half of the largest extent of its Gaussians. Gradients become zero. A workgroup per group.
+// The optimiser's step of the poses that views were drawn of, and their limits: turns by radians, unless they are
+// assumed, translations by shares of the size of the group, half of the largest extent of its Gaussians. Gradients
+// become zero. A workgroup per group.
 // Rust twin: poses.rs, `PoseMoments::step` and `object_sizes`. Source: methods reference of motion, 2.1.
 
 #import constants
@@ -140,9 +141,12 @@ fn hold(part: GroupView, base_pivot: vec3f, base: Pose, at: u32) {
     poses[at] = pose;
 }
 
-// All joints, in the order of the groups, for a part may be the base of another.
+// All joints, in the order of the groups, for a part may be the base of another; none while steps wait.
 @compute @workgroup_size(1)
 fn hold_joints() {
+    if atomicLoad(&faults[1]) != 0u {
+        return;
+    }
     for (var group = 0u; group < arrayLength(&groups); group++) {
         let part = groups[group];
         if part.joint.x == 0u {

@@ -46,7 +46,10 @@ fn seen(
     let group_of = (0..all.len()).map(|row| u32::from(row >= base.len())).collect();
     let still = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
     let poses = (0..TIMES).map(|time| pose(share(time))).collect();
-    views_of_groups(all, group_of, &[still, poses], cameras)
+    let mut views = views_of_groups(all, group_of, &[still, poses], cameras);
+    // Half of the times tell enough.
+    views.retain(|view| view.time_index.is_multiple_of(2));
+    views
 }
 
 /// Largest error of the values, from the first on.
@@ -70,7 +73,6 @@ fn the_lid_of_a_box_turns_on_its_hinge() {
     let angle = found.hinge.axis.dot(DVec3::X).abs().min(1.0).acos() * 180.0 / PI;
     let off = found.hinge.point - hinge;
     let error = value_error(&found, |share| 1.6 * share).to_degrees();
-    eprintln!("{} axis off {angle:.2} deg, {off:.4}, values {error:.2} deg", found.told());
     assert!(angle < 3.0 && error < 5.0, "axis {angle} deg, values {error} deg");
     assert!((off - off.x * DVec3::X).length() < 0.01, "{off}");
     assert!(found.errors[0] < 0.75 * found.errors[1]);
@@ -85,7 +87,6 @@ fn a_drawer_slides() {
     assert_eq!(found.hinge.kind, JointKind::Prismatic);
     let angle = found.hinge.axis.dot(DVec3::NEG_Y).min(1.0).acos() * 180.0 / PI;
     let error = value_error(&found, |share| 0.07 * share);
-    eprintln!("{} axis off {angle:.2} deg, values {error:.4} m", found.told());
     assert!(angle < 3.0 && error < 0.006, "axis {angle} deg, values {error} m");
 }
 
