@@ -1,4 +1,4 @@
-//! What pages of measurements share: they need no network and no other file.
+//! The frame of pages of measurements: they need no network and no other file.
 
 use std::fmt::Write;
 use std::path::Path;

@@ -107,7 +107,7 @@ pub struct Table {
     pub lines: Vec<Line>,
 }
 
-/// What the tables of a comparison are about.
+/// Subject of the tables of a comparison.
 pub struct Subject<'a> {
     /// Rows of all runs.
     pub rows: &'a [Row],
@@ -315,7 +315,7 @@ impl Subject<'_> {
         format!("{:#}\n", json!(self.rows))
     }
 
-    /// What readers of the tables must know.
+    /// Notes for readers of the tables.
     #[must_use]
     pub fn notes(&self) -> Vec<String> {
         let mut notes = vec![

@@ -57,7 +57,7 @@ pub struct Checkpoint {
     pub field: Field,
     /// State of the run; `None` in a finished scene.
     pub training: Option<TrainingState>,
-    /// What a finished scene needs to tell labels of pixels by something else than its identity rows: the head that
+    /// Tensors by which a finished scene tells labels of pixels other than by its identity rows: the head that
     /// it was trained with, by name, and what that learnt. `None` where its rows tell them.
     pub head: Option<TrainingState>,
 }
@@ -84,7 +84,7 @@ pub enum StateTensor {
     U64(Vec<u64>),
 }
 
-/// What is written beside a field.
+/// Contents that are written beside a field.
 #[derive(Clone, Copy, Default)]
 struct States<'a> {
     training: Option<&'a TrainingState>,

@@ -1,4 +1,4 @@
-//! What pixels look like: features of colour and texture, and which class the pixels of keyframes give to them.
+//! Appearance of pixels: features of colour and texture, and which class the pixels of keyframes give to them.
 //!
 //! | module | answers |
 //! |---|---|

@@ -85,7 +85,7 @@ impl Padded {
     }
 }
 
-/// What a patch of the first image brings to every alignment: brightness without its mean, gradients without theirs,
+/// Facts that a patch of the first image brings to every alignment: brightness without its mean, gradients without theirs,
 /// and the inverse of the matrix of Gauss-Newton.
 struct Template {
     brightness: [[f32; SIDE]; SIDE],

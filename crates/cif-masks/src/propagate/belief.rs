@@ -1,4 +1,4 @@
-//! What is believed of the pixels of a frame.
+//! Belief of the pixels of a frame: their classes and how sure they are.
 
 use rayon::prelude::*;
 

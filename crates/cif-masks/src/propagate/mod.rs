@@ -212,7 +212,7 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// What classes look like around a time: the nearest keyframes, of two equally near ones the earlier.
+    /// Appearance of the classes around a time: the nearest keyframes, of two equally near ones the earlier.
     fn forest(&self, frames: RangeInclusive<usize>) -> Forest {
         let distance = |key: &usize| frames.start().abs_diff(*key) + frames.end().abs_diff(*key);
         let mut keys: Vec<usize> = self.samples.keys().copied().collect();

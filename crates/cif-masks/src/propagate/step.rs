@@ -19,7 +19,7 @@ const HARDENING: f32 = 0.5;
 /// Distance, in pixels of the halved grid, over which a class may appear beside where motion brought it.
 const SUPPORT: usize = 2;
 
-/// What a step needs besides the belief.
+/// Inputs of a step besides the belief.
 pub(super) struct Step<'a> {
     /// Columns of the frames.
     pub(super) width: usize,
@@ -29,7 +29,7 @@ pub(super) struct Step<'a> {
     pub(super) back: &'a Flow,
     /// Flow from the known frame to the one that is stepped to.
     pub(super) forth: &'a Flow,
-    /// What the pixels of the frame that is stepped to look like, `[pixels][classes]`, 1 / 255.
+    /// Appearance of the pixels of the frame that is stepped to, `[pixels][classes]`, 1 / 255.
     pub(super) looks: &'a [u8],
 }
 

@@ -10,7 +10,7 @@ use crate::appearance::{Features, Forest};
 use crate::flow::{Flow, Pyramid, flow};
 use crate::picture::Picture;
 
-/// What propagation needs to know of some frames in a row.
+/// Facts about some frames in a row that propagation needs.
 pub(super) struct Window {
     first: usize,
     /// Between each frame and the next: flow to the next, flow back.
@@ -62,7 +62,7 @@ impl Window {
         if from < to { (to_later, to_earlier) } else { (to_earlier, to_later) }
     }
 
-    /// What the pixels of a frame look like.
+    /// Appearance of the pixels of a frame.
     pub(super) fn looks(&self, frame: usize) -> &[u8] {
         &self.looks[frame - self.first]
     }

@@ -30,6 +30,8 @@ fn draft() -> TrainConfig {
     config.densify =
         DensifyConfig { from: 150, until: 1_200, every: 75, max_gaussians: 6_000, ..config.densify };
     config.resample = ResampleConfig { from: 50, until: 400, every: 50, ..config.resample };
+    // They take as long as all steps together.
+    config.motion.parts = false;
     config
 }
 
@@ -69,8 +71,14 @@ fn paper(layout: Layout) -> TrainConfig {
     config.instance.geometry = super::InstanceGeometry::Full;
     config.resample = ResampleConfig { from: 100, until: 2_500, every: 100, ..config.resample };
     // The published method has no such losses.
-    config.motion =
-        MotionConfig { guidance: 0.0, stillness: 0.0, misfit: 0.0, switches: false, ..config.motion };
+    config.motion = MotionConfig {
+        guidance: 0.0,
+        stillness: 0.0,
+        misfit: 0.0,
+        switches: false,
+        parts: false,
+        ..config.motion
+    };
     match layout {
         Layout::DNerf => {
             config.model.multipliers = vec![1, 2];
@@ -201,6 +209,7 @@ impl Default for MotionConfig {
             guidance: 10.0,
             guidance_end: 0.1,
             rigid: true,
+            parts: true,
             of: BTreeMap::new(),
             stillness: 1.0,
             rehearsal: 300,

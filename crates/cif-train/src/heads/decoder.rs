@@ -29,7 +29,7 @@ pub struct Decoder {
 }
 
 impl Decoder {
-    /// What a finished scene keeps of a head.
+    /// Tensors that a finished scene keeps of a head.
     pub(crate) fn save(config: &HeadConfig, tensors: &HeadTensors) -> TrainingState {
         let json = serde_json::to_value(Saved { head: config.clone() }).expect("names and numbers");
         TrainingState { json, tensors: tensors.learnt() }

@@ -58,7 +58,7 @@ pub(crate) struct Fitted {
 /// Facts about the capture that fits need.
 #[derive(Clone, Copy)]
 pub(crate) struct Surroundings<'a> {
-    /// What objects stand on, where that was found.
+    /// The plane that objects stand on, where it was found.
     pub(crate) plane: Option<&'a Plane>,
     /// Mean direction upwards in the images.
     pub(crate) up: DVec3,

@@ -60,7 +60,7 @@ struct Trial<'a> {
     losses: [f64; 2],
 }
 
-/// What all trials of an object share.
+/// Facts that all trials of an object share.
 struct Contest<'a> {
     object: Object<'a>,
     paths: Paths<'a>,

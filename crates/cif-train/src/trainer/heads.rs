@@ -106,7 +106,7 @@ impl Trainer {
         Ok(())
     }
 
-    /// What a finished scene keeps of a head.
+    /// Tensors that a finished scene keeps of a head.
     pub(super) fn saved_decoder(&self) -> Option<TrainingState> {
         let is_configured = self.state.head.name() == self.state.config.head.name.name();
         let has_values = matches!(self.state.head.pass(&self.state.config), Pass::Values(_));

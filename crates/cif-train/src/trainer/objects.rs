@@ -69,7 +69,7 @@ impl Trainer {
         }
     }
 
-    /// What objects stand on: in the points of the capture or, where it has none, in what is reconstructed so far.
+    /// The plane that objects stand on: in the points of the capture or, where it has none, in what is reconstructed so far.
     pub(super) fn support(&self) -> Option<Plane> {
         let (state, seed) = (&self.state, self.state.config.seed);
         if state.dataset.points.source != PointSource::Random {

@@ -11,7 +11,8 @@ use crate::objects::{self, Jointed, Order};
 impl Trainer {
     /// Looks for parts of objects (labels: dense index + 1) that do not move as a whole, and of which nothing is told.
     pub(super) fn find_parts(&mut self, labels: &[u16]) -> Result<(), TrainError> {
-        if !self.state.config.motion.rigid {
+        let motion = &self.state.config.motion;
+        if !motion.rigid || !motion.parts {
             return Ok(());
         }
         let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();

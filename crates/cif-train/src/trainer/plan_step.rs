@@ -142,7 +142,7 @@ impl Trainer {
 }
 
 impl Trainer {
-    /// What a head is trained on in a step: views with masks, and cameras between them where it asks for such.
+    /// Targets of a head in a step: views with masks, and cameras between them where it asks for such.
     fn head_targets(
         &self,
         head: &dyn ValueHead,

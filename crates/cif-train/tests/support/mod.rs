@@ -265,6 +265,7 @@ pub(crate) fn small_config() -> TrainConfig {
     config.resample.every = 20;
     config.resample.until = 100;
     config.resample.rate = 0.05;
+    config.motion.parts = false;
     config
 }
 
