@@ -42,12 +42,11 @@ impl Trainer {
         let travelling = self.state.guidance.travelling.iter().enumerate().filter(|(_, travels)| **travels);
         let rest: Vec<u16> = travelling
             .map(|(label, _)| label as u16)
-            .filter(|label| !self.fits.contains_key(label))
+            .filter(|label| !self.fits.contains_key(label) && !self.jointed.contains_key(label))
             .collect();
-        let rest: Vec<u16> = rest.into_iter().filter(|label| !self.jointed.contains_key(label)).collect();
         let fits = self.fit_objects(&rest)?;
         self.fits.extend(fits);
-        self.find_parts(&rest)
+        Ok(())
     }
 
     /// Motion that an object (a label: dense index + 1) is told to have.

@@ -9,7 +9,8 @@ use crate::error::TrainError;
 use crate::objects::{self, Jointed, Order};
 
 impl Trainer {
-    /// Looks for parts of objects (labels: dense index + 1) that do not move as a whole, and of which nothing is told.
+    /// Looks for parts of objects (labels: dense index + 1) that do not travel, nor move as a whole, and of which nothing
+    /// is told: among all that moves, a joint far away does what travelling does.
     pub(super) fn find_parts(&mut self, labels: &[u16]) -> Result<(), TrainError> {
         let motion = &self.state.config.motion;
         if !motion.rigid || !motion.parts {

@@ -84,6 +84,9 @@ const SEEN: f32 = -3.0;
 /// Error on pixels left out, of that of the static body, up to which a joint is taken.
 const GAIN: f64 = 0.75;
 
+/// Error on pixels left out beyond which nothing is explained.
+const MOST_ERROR: f64 = 0.1;
+
 /// Loss of the best guess, of that of the static body, from which nothing is looked for.
 const PROMISE: f64 = 0.99;
 
@@ -193,7 +196,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     };
     let taken = fine.iter().position(is_simple).unwrap_or(0);
     let (_, body, error) = fine.swap_remove(taken);
-    if error > GAIN * still {
+    if error > MOST_ERROR || error > GAIN * still {
         return Ok(None);
     }
     Ok(search.finished(body, [error, still]))
