@@ -68,7 +68,8 @@ pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64
 pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Option<Outline> {
     let mut outline = plane.and_then(|plane| on_plane(views, plane));
     let (met, stiffness) = match meetings(views) {
-        met if met.is_empty() => (path::crossing(views, times), path::CROSSING),
+        // A plane tells depths better than few rays.
+        met if met.is_empty() && outline.is_none() => (path::crossing(views, times), path::CROSSING),
         met => (met, path::MEETING),
     };
     if met.is_empty() {
