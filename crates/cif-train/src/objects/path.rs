@@ -20,7 +20,7 @@ const CUT: f64 = 0.05;
 
 /// Times on either side among which rays cross, and the angle from which they do, radians.
 const BESIDE: usize = 2;
-const CROSSES: f64 = 0.35;
+const CROSSES: f64 = 0.7;
 
 /// Rounds of reweighting of rays, by their distances from the path.
 const ROUNDS: usize = 5;
