@@ -7,6 +7,7 @@
 //! | [`export`] | what accuracy of exported motion costs in bytes and seconds |
 //! | [`hard_captures`] | captures changed in ways that must not matter or must not break a run |
 //! | [`hardness`] | how runs on them end |
+//! | [`records`] | what is measured already, when a bench goes on |
 //! | `device` | stages of a step on a GPU beside the least that they could take, behind the feature `wgpu` |
 
 pub mod accuracy;
@@ -19,6 +20,7 @@ pub mod hard_captures;
 pub mod hardness;
 mod page;
 mod plots;
+pub mod records;
 mod training;
 
 pub use error::Error;

@@ -16,8 +16,9 @@ use half::f16;
 use image::codecs::png::PngEncoder;
 use image::{ExtendedColorType, ImageEncoder};
 
-use super::record::{Folder, Record};
+use super::record::Record;
 use crate::error::{Error, write_file};
+use crate::records::Records;
 use crate::training::Run;
 
 /// An error that evaluation can pass on.
@@ -50,7 +51,7 @@ pub type Draw<'a> = &'a dyn Fn(&FrameView<'_>) -> Vec<(&'static str, Picture)>;
 /// # Errors
 /// When a setting cannot work, or training fails.
 pub fn train(
-    folder: &Folder,
+    folder: &Records<Record>,
     training: Training<'_>,
     stop: &Stop,
     tell: &mut dyn FnMut(u64, u64),
@@ -87,7 +88,7 @@ pub fn score(
     settings: &RenderSettings,
     dataset: &Dataset,
     id: &str,
-    folder: &Folder,
+    folder: &Records<Record>,
     draw: Draw<'_>,
     record: &mut Record,
 ) -> Result<(), Error> {

@@ -7,10 +7,11 @@ use serde_json::{Value, json};
 
 use super::ladders::{BASE, Ladder, Work};
 use super::pareto::{Climb, amount, front, sentence};
-use super::record::{Folder, Record};
+use super::record::Record;
 use crate::error::{Error, write_file};
 use crate::page::{STYLE, escape, picture};
 use crate::plots::{Plot, Series, svg};
+use crate::records::Records;
 
 /// Subject of a report: capture, command and processor.
 #[derive(Clone, Debug)]
@@ -137,7 +138,12 @@ fn mark_fronts(rows: &mut [Row<'_>]) {
 ///
 /// # Errors
 /// When a file cannot be written or a picture not be read.
-pub fn write(folder: &Path, rungs: &Folder, subject: &Subject, measured: &Measured) -> Result<(), Error> {
+pub fn write(
+    folder: &Path,
+    rungs: &Records<Record>,
+    subject: &Subject,
+    measured: &Measured,
+) -> Result<(), Error> {
     let rows = rows(measured);
     let plots = plots(measured, &rows);
     for (name, _, text) in &plots {
@@ -317,7 +323,7 @@ fn plots(measured: &Measured, rows: &[Row<'_>]) -> Vec<(String, String, String)>
 }
 
 fn page(
-    rungs: &Folder,
+    rungs: &Records<Record>,
     subject: &Subject,
     measured: &Measured,
     rows: &[Row<'_>],
@@ -544,7 +550,7 @@ fn table(page: &mut String, kind: Kind, rows: &[&Row<'_>]) {
 }
 
 /// The same frame of every rung that has pictures, the captured one first.
-fn pictures(page: &mut String, rungs: &Folder, rows: &[&Row<'_>]) -> Result<(), Error> {
+fn pictures(page: &mut String, rungs: &Records<Record>, rows: &[&Row<'_>]) -> Result<(), Error> {
     if rows.iter().all(|row| row.record.pictures.is_empty()) {
         return Ok(());
     }
@@ -609,7 +615,7 @@ mod tests {
     #[test]
     fn a_report_is_whole_without_a_network() {
         let folder = tempfile::tempdir().unwrap();
-        let rungs = Folder::inside(folder.path()).unwrap();
+        let rungs = Records::inside(folder.path()).unwrap();
         let subject = Subject {
             capture: "table <1>".into(),
             description: "80 frames".into(),
@@ -655,7 +661,7 @@ mod tests {
         assert_eq!(table.lines().count(), present + 1);
         assert!(folder.path().join("overview-psnr.svg").is_file());
         let still = Subject { motion: None, ..subject };
-        write(folder.path(), &Folder::inside(folder.path()).unwrap(), &still, &measured).unwrap();
+        write(folder.path(), &Records::<Record>::inside(folder.path()).unwrap(), &still, &measured).unwrap();
         let page = std::fs::read_to_string(folder.path().join("report.html")).unwrap();
         assert!(!page.contains("#motion"));
     }

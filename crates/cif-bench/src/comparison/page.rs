@@ -7,13 +7,14 @@ use cif_geometry::PixelGrid;
 use image::ImageReader;
 
 use super::crops::Crop;
-use super::record::{Record, Runs};
+use super::record::Record;
 use super::tables::{MEASURES, Subject, cells};
 use super::title;
 use crate::accuracy::measure::save;
 use crate::error::{Error, write_file};
 use crate::page::{STYLE, escape, picture};
 use crate::plots::{Plot, Series, svg};
+use crate::records::Records;
 
 /// Subject of a page.
 #[derive(Clone, Debug)]
@@ -46,7 +47,12 @@ const ABLATIONS: [&str; 5] = ["i", "ii", "iii", "iv", "v"];
 ///
 /// # Errors
 /// When a file cannot be written or a picture not be read.
-pub fn write(folder: &Path, runs: &Runs, comparison: &Comparison, records: &[Record]) -> Result<(), Error> {
+pub fn write(
+    folder: &Path,
+    runs: &Records<Record>,
+    comparison: &Comparison,
+    records: &[Record],
+) -> Result<(), Error> {
     let is_ablation = |record: &&Record| ABLATIONS.contains(&record.row.head.as_str());
     let rows = |of_ablation: bool| {
         let of = records.iter().filter(|record| is_ablation(record) == of_ablation);
@@ -80,7 +86,7 @@ pub fn write(folder: &Path, runs: &Runs, comparison: &Comparison, records: &[Rec
 }
 
 fn page(
-    runs: &Runs,
+    runs: &Records<Record>,
     comparison: &Comparison,
     subjects: &[(&str, &Subject<'_>)],
     records: &[Record],
@@ -186,7 +192,7 @@ fn read(path: &Path) -> Result<PixelGrid<[u8; 3]>, Error> {
 /// in which they differ most.
 fn pictures(
     page: &mut String,
-    runs: &Runs,
+    runs: &Records<Record>,
     comparison: &Comparison,
     records: &[Record],
 ) -> Result<(), Error> {
@@ -245,7 +251,7 @@ mod tests {
     #[test]
     fn the_page_and_the_tables_are_whole_without_a_network() {
         let folder = tempfile::tempdir().unwrap();
-        let runs = Runs::inside(folder.path()).unwrap();
+        let runs = Records::inside(folder.path()).unwrap();
         let record = |head: &str, color: u8| {
             let mut pictures = Vec::new();
             for (suffix, value) in [(".truth", 9), (".mask", 1), (".instances", color)] {

@@ -6,9 +6,10 @@ use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::{HeadName, Stage, Start, Stop, TrainConfig, Trainer};
 use serde_json::json;
 
-use super::record::{Record, Row, Runs};
+use super::record::{Record, Row};
 use crate::accuracy::measure::{Draw, save, shown_frame};
 use crate::error::Error;
+use crate::records::Records;
 use crate::training::Run;
 
 /// An error that evaluation can pass on.
@@ -58,7 +59,7 @@ impl Subject<'_> {
     /// When a setting cannot work, or training fails.
     pub fn reconstruct(
         &self,
-        runs: &Runs,
+        runs: &Records<Record>,
         stop: &Stop,
         tell: &mut dyn FnMut(u64, u64),
     ) -> Result<Option<Checkpoint>, Error> {
@@ -95,7 +96,7 @@ impl Subject<'_> {
     /// When a setting cannot work, training fails, or a file cannot be read or written.
     pub fn train(
         &self,
-        runs: &Runs,
+        runs: &Records<Record>,
         (id, config): (&str, &TrainConfig),
         reconstruction: &Checkpoint,
         stop: &Stop,

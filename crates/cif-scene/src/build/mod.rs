@@ -17,7 +17,7 @@ use crate::build::frames::{Frame, Frames};
 use crate::build::node::{Naming, NodeInput};
 use crate::build::source::FieldMotion;
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
-use crate::joint::ToldParts;
+use crate::joint::{ToldParts, jointed_groups};
 use crate::motion::{MovingGroup, trimmed_box, vector};
 use crate::motion::{choose, loose};
 use crate::shape::{colliders, proxy};
@@ -68,8 +68,11 @@ pub fn build_from(
     let owners = assignment::assign(field, &identities, &visible, options);
     let grouped = rows_of_nodes(field, &visible, &owners, &mut frames_of, options);
     let (group_owners, mut groups) = moving_groups(grouped, &reference, &opacities.peak, options);
-    for (_, group) in group_owners.iter().zip(&mut groups).filter(|(owner, _)| owner.is_some()) {
-        group.told = ToldParts::of(field, &group.rows, &time_codes.times);
+    let jointed = jointed_groups(field, groups.iter().map(|group| &group.rows[..]));
+    for ((_, group), jointed) in
+        group_owners.iter().zip(&mut groups).zip(&jointed).filter(|((owner, _), _)| owner.is_some())
+    {
+        group.told = ToldParts::of(field, &group.rows, jointed, &time_codes.times);
     }
     let chosen = choose::choose(&mut groups, &mut frames_of, &time_codes.samples, options);
 

@@ -3,11 +3,12 @@
 
 use cif_field::Field;
 use cif_field::neighbours::NearestNeighbours;
-use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
+use cif_field::parameters::Parameter;
 use rand::seq::index::sample;
 use rand::{Rng, RngExt};
 use rayon::prelude::*;
 
+use super::tensors::shared;
 use super::{HeadLoss, HeadStep, HeadTensors, HeadView, largest};
 use crate::random::{Purpose, stream};
 
@@ -41,20 +42,12 @@ pub(super) struct Classifier {
 
 /// Weights of a classifier of codes of `shape`.
 pub(super) const fn weights(part: &'static str, shape: &'static [usize]) -> Parameter {
-    Parameter {
-        name: "classifier_weights",
-        part,
-        rate: "classifier_weights",
-        rows: Rows::Fixed,
-        shape,
-        activation: Activation::Identity,
-        on_copy: OnCopy::Same,
-    }
+    shared(part, "classifier_weights", shape)
 }
 
 /// Biases of a classifier.
 pub(super) const fn biases(part: &'static str) -> Parameter {
-    Parameter { name: "classifier_biases", rate: "classifier_biases", ..weights(part, &[]) }
+    shared(part, "classifier_biases", &[])
 }
 
 /// Uniform numbers below a magnitude.
@@ -184,14 +177,12 @@ impl Classifier {
     }
 
     fn add(&self, tensors: &mut HeadTensors, sums: &Sums) {
-        for (parameter, sums) in [(&self.weights, &sums.weights), (&self.biases, &sums.biases)] {
-            let (_, gradients) = tensors.values_and_gradients(parameter);
-            gradients.iter_mut().zip(sums).for_each(|(total, v)| *total += v);
-        }
+        tensors.add_gradients(&self.weights, &sums.weights);
+        tensors.add_gradients(&self.biases, &sums.biases);
     }
 
-    /// The neighbour term: divergence of the classes of 1 000 random Gaussians from those of their nearest neighbours at
-    /// the time of the step, a mean over pairs, divided by the number of classes, times 2. Its value, and the
+    /// The neighbour term: divergence of the classes of 1 000 random Gaussians from those of their nearest neighbours
+    /// at the time of the step, a mean over pairs, divided by the number of classes, times 2. Its value, and the
     /// gradient by the codes of some rows, `[rows, width]`, which `codes_of` gives; positions get none.
     pub(super) fn neighbour_term(
         &self,

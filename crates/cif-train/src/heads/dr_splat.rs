@@ -1,13 +1,13 @@
 //! Dr. Splat: labels of pixels registered directly on the Gaussians that show them, without training.
 //!
 //! Source: Kim et al., Dr. Splat: Directly Referring 3D Gaussian Splatting via Direct Language Embedding Registration,
-//! CVPR 2025, and its released code; methods reference 8.4. Of every labelled training pixel, the k contributors with the
-//! largest weights `T alpha` among the first 100 add these weights to a table of Gaussians and masks. A Gaussian has the
-//! label of its largest sum; pixels blend one-hot labels by colour opacity.
+//! CVPR 2025, and its released code; methods reference 8.4. Of every labelled training pixel, the k contributors with
+//! the largest weights `T alpha` among the first 100 add these weights to a table of Gaussians and masks. A Gaussian
+//! has the label of its largest sum; pixels blend one-hot labels by colour opacity.
 //!
 //! Deviations: a mask is its one-hot label instead of an embedding of its picture, so that nothing is quantised and
-//! nothing is queried; views at all times count, with Gaussians where they are then. The rule of the published code for
-//! Gaussians of little weight has no effect there, and is left out.
+//! nothing is queried; views at all times count, with Gaussians where they are then. The rule of the published code
+//! for Gaussians of little weight has no effect there, and is left out.
 //!
 //! Constants: k = 45, as in the published command (1 is the default of the code), of 100 contributors looked at.
 

@@ -1,25 +1,26 @@
 //! Gaussian Grouping: an identity code per Gaussian, blended like colour and classified per pixel.
 //!
-//! Source: Ye et al., Gaussian Grouping: Segment and Edit Anything in 3D Scenes, ECCV 2024, and its released code; methods
-//! reference 8.1. Codes are constant in time. The loss is the mean cross-entropy over all pixels, unlabelled ones being
-//! of a class like any other, divided by the logarithm of the number of classes; every fifth step also has the
-//! neighbour term of [`super::classifier`].
+//! Source: Ye et al., Gaussian Grouping: Segment and Edit Anything in 3D Scenes, ECCV 2024, and its released code;
+//! methods reference 8.1. Codes are constant in time. The loss is the mean cross-entropy over all pixels, unlabelled
+//! ones being of a class like any other, divided by the logarithm of the number of classes; every fifth step also has
+//! the neighbour term of [`super::classifier`].
 //!
-//! Deviations: the classes are the instances of the capture and one for unlabelled pixels, instead of 256; Gaussians stay
-//! as they were reconstructed, where the published method trains them with their codes for 30 000 steps; neighbours are
-//! those at the time of the step's first view. Where published training draws from at most 200 000 Gaussians, all are
-//! drawn from.
+//! Deviations: the classes are the instances of the capture and one for unlabelled pixels, instead of 256; Gaussians
+//! stay as they were reconstructed, where the published method trains them with their codes for 30 000 steps;
+//! neighbours are those at the time of the step's first view. Where published training draws from at most 200 000
+//! Gaussians, all are drawn from.
 //!
-//! Constants: codes of 16 from (U(0, 1) - 0.5) / 0.2821 (the first spherical harmonic) at a rate of 2.5e-3 (epsilon of Adam 1e-15); classifier at
-//! 5e-4 (1e-8); 1 000 samples, 5 neighbours, weight 2.
+//! Constants: codes of 16 from (U(0, 1) - 0.5) / 0.2821 (the first spherical harmonic) at a rate of 2.5e-3 (epsilon of
+//! Adam 1e-15); classifier at 5e-4 (1e-8); 1 000 samples, 5 neighbours, weight 2.
 
 use cif_field::Field;
-use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
+use cif_field::parameters::Parameter;
 use cif_geometry::spherical_harmonics::BAND_0;
 use cif_render::Blending;
 use rand::RngExt;
 
 use super::classifier::{Classifier, biases, weights};
+use super::tensors::per_gaussian;
 use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadView, Pass, ValueHead};
 use crate::adam::EPSILON;
 use crate::config::TrainConfig;
@@ -39,15 +40,7 @@ const CLASSIFIER_EPSILON: f32 = 1e-8;
 const PART: &str = "gaussian_grouping";
 
 /// Codes of every Gaussian.
-const CODES: Parameter = Parameter {
-    name: "codes",
-    part: PART,
-    rate: "codes",
-    rows: Rows::Gaussians,
-    shape: &[CODE],
-    activation: Activation::Identity,
-    on_copy: OnCopy::Same,
-};
+const CODES: Parameter = per_gaussian(PART, "codes", &[CODE]);
 
 const CLASSIFIER: Classifier = Classifier {
     weights: weights(PART, &[CODE]),
@@ -104,8 +97,7 @@ impl ValueHead for GaussianGrouping {
     }
 
     fn values_backward(&self, tensors: &mut HeadTensors, _field: &Field, _time: f64, v_values: &[f32]) {
-        let (_, gradients) = tensors.values_and_gradients(&CODES);
-        gradients.iter_mut().zip(v_values).for_each(|(sum, v)| *sum += v);
+        tensors.add_gradients(&CODES, v_values);
     }
 
     fn loss(
@@ -135,10 +127,6 @@ impl ValueHead for GaussianGrouping {
 
     fn decode(&self, tensors: &HeadTensors, blended: &[f32]) -> (u16, f32) {
         CLASSIFIER.decode(tensors, blended)
-    }
-
-    fn label_of_rows(&self, tensors: &HeadTensors, _field: &Field) -> Vec<u16> {
-        tensors.values(&CODES).chunks_exact(CODE).map(|code| CLASSIFIER.decode(tensors, code).0).collect()
     }
 }
 

@@ -11,9 +11,9 @@
 //!
 //! A head of another system declares tensors of its own ([`Parameter`]s, beside the table of the field), the C values
 //! that they give every Gaussian, a loss on these values blended over a view, and how a blended pixel decodes to a
-//! label. Its tensors follow the Gaussians when these are cloned, split, pruned or relocated, are saved with the run and
-//! with the scene, and are stepped by the same optimiser, whichever engine blends. Gaussians and deformation stay as they
-//! were reconstructed, but for steps that a head asks for ([`Phase::Field`]).
+//! label. Its tensors follow the Gaussians when these are cloned, split, pruned or relocated, are saved with the run
+//! and with the scene, and are stepped by the same optimiser, whichever engine blends. Gaussians and deformation stay
+//! as they were reconstructed, but for steps that a head asks for ([`Phase::Field`]).
 //!
 //! Source: methods reference 8.
 
@@ -193,8 +193,8 @@ pub trait ValueHead: Send + Sync {
     /// Adds the gradients of its tensors by those of the values, `[N, C]`.
     fn values_backward(&self, tensors: &mut HeadTensors, field: &Field, time: f64, v_values: &[f32]);
 
-    /// Loss of a view. Its gradient times `weight` by the blended values is added to `v_blended`, `[height, width, C]`;
-    /// gradients by tensors that the loss itself uses are added too.
+    /// Loss of a view. Its gradient times `weight` by the blended values is added to `v_blended`, `[height, width,
+    /// C]`; gradients by tensors that the loss itself uses are added too.
     fn loss(
         &self,
         tensors: &mut HeadTensors,
@@ -211,8 +211,12 @@ pub trait ValueHead: Send + Sync {
     /// Label of a pixel (dense index + 1, 0 for none) and its probability, by its blended values.
     fn decode(&self, tensors: &HeadTensors, blended: &[f32]) -> (u16, f32);
 
-    /// Label of every Gaussian (dense index + 1, 0 for none), for export.
-    fn label_of_rows(&self, tensors: &HeadTensors, field: &Field) -> Vec<u16>;
+    /// Label of every Gaussian (dense index + 1, 0 for none), for export: that of a pixel that shows it alone, at the
+    /// first time.
+    fn label_of_rows(&self, tensors: &HeadTensors, field: &Field) -> Vec<u16> {
+        let values = self.values(tensors, field, 0.0);
+        values.chunks_exact(self.channels(field)).map(|values| self.decode(tensors, values).0).collect()
+    }
 
     /// Prepares the first step.
     ///
@@ -230,7 +234,8 @@ pub trait ValueHead: Send + Sync {
         Ok(())
     }
 
-    /// Changes of the set of Gaussians that fall behind a step (from 1) of the `steps` of the stage, one after another.
+    /// Changes of the set of Gaussians that fall behind a step (from 1) of the `steps` of the stage, one after
+    /// another.
     fn rearrangements(&self, _step: u32, _steps: u32) -> u32 {
         0
     }

@@ -4,11 +4,33 @@ use std::collections::BTreeMap;
 
 use cif_field::Field;
 use cif_field::checkpoint::StateTensor;
-use cif_field::parameters::{OnCopy, Parameter, Rows};
+use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
 
 use super::ValueHead;
 use crate::adam::{Moments, RowRates};
 use crate::guard::{Fault, MAX_GRADIENT, fault};
+
+/// Numbers of a head for every Gaussian, of any value, which clones inherit.
+pub(super) const fn per_gaussian(
+    part: &'static str,
+    name: &'static str,
+    shape: &'static [usize],
+) -> Parameter {
+    Parameter {
+        name,
+        part,
+        rate: name,
+        rows: Rows::Gaussians,
+        shape,
+        activation: Activation::Identity,
+        on_copy: OnCopy::Same,
+    }
+}
+
+/// Numbers of a head that belong to no Gaussian, in rows of `shape`.
+pub(super) const fn shared(part: &'static str, name: &'static str, shape: &'static [usize]) -> Parameter {
+    Parameter { rows: Rows::Fixed, ..per_gaussian(part, name, shape) }
+}
 
 /// A tensor of a head.
 #[derive(Clone, Debug, PartialEq)]
@@ -64,6 +86,15 @@ impl HeadTensors {
         let mut tensors = self.0.iter_mut();
         let tensor = tensors.find(|tensor| tensor.parameter == *parameter).expect("a parameter of the head");
         (&tensor.values, &mut tensor.gradients)
+    }
+
+    /// Adds to its gradients.
+    ///
+    /// # Panics
+    /// When it is none of the head's.
+    pub fn add_gradients(&mut self, parameter: &Parameter, v_values: &[f32]) {
+        let (_, gradients) = self.values_and_gradients(parameter);
+        gradients.iter_mut().zip(v_values).for_each(|(sum, v)| *sum += v);
     }
 
     /// Its values, to be set where they are not learnt by steps.

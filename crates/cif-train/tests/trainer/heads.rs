@@ -108,10 +108,6 @@ impl ValueHead for Scored {
         let best = (0..CLASSES).max_by(|a, b| probabilities[*a].total_cmp(&probabilities[*b])).unwrap();
         (best as u16, probabilities[best])
     }
-
-    fn label_of_rows(&self, tensors: &HeadTensors, _field: &Field) -> Vec<u16> {
-        tensors.values(&SCORES).chunks_exact(CLASSES).map(|scores| self.decode(tensors, scores).0).collect()
-    }
 }
 
 fn config() -> TrainConfig {

@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 
 use cif_bench::accuracy::ladders::{BASE, Base, NAMES, QUICK_BASE};
 use cif_bench::accuracy::measure::{self, Training};
-use cif_bench::accuracy::record::{Folder, Record};
+use cif_bench::accuracy::record::Record;
 use cif_bench::accuracy::report::{self, Measured, Subject};
 use cif_bench::accuracy::time_limit::{QUICK_SECONDS, TimeLimit};
 use cif_bench::accuracy::{Rung, Work, ladders};
+use cif_bench::records::Records;
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
 use cif_geometry::PinholeCamera;
@@ -123,7 +124,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
             "it has a single time or no masks; leave --ladders away for those that fit",
         ));
     }
-    let rungs = Folder::inside(&command.output)?;
+    let rungs = Records::inside(&command.output)?;
     measure::save_truth(&dataset, config.background, &rungs.file("truth.png"))?;
     let mut bench = Bench {
         capture: options,
@@ -236,7 +237,7 @@ struct Bench {
     /// Capture that everything is scored on.
     dataset: Dataset,
     config: TrainConfig,
-    rungs: Folder,
+    rungs: Records<Record>,
     /// The scene of the base, once it is needed.
     base: Option<Field>,
     /// The shown frame in 64 bits, once it is needed.

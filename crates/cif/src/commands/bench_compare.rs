@@ -4,9 +4,10 @@ use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
 use cif_bench::comparison::page::{self, Comparison};
-use cif_bench::comparison::record::{Record, Runs};
+use cif_bench::comparison::record::Record;
 use cif_bench::comparison::run::{Subject, settings};
 use cif_bench::comparison::{ABLATIONS, Contender};
+use cif_bench::records::Records;
 use cif_dataset::{Dataset, Layout, Split};
 use cif_geometry::PixelGrid;
 use cif_train::metrics::FrameView;
@@ -120,7 +121,7 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
             ));
         }
     }
-    let runs = Runs::inside(&command.output)?;
+    let runs = Records::inside(&command.output)?;
     let contenders = contenders(command);
     let mut bench = Bench {
         iterations: command.iterations,
@@ -227,7 +228,7 @@ fn base_config(command: &BenchCompare, layout: Layout) -> Result<TrainConfig, Er
 
 struct Bench {
     iterations: Iterations,
-    runs: Runs,
+    runs: Records<Record>,
     records: Vec<Record>,
     missing: usize,
     is_terminal: bool,

@@ -1,13 +1,14 @@
 //! SA4D: identity codes from a network of place and time, blended like colour and classified per pixel.
 //!
 //! Source: Ji et al., Segment Any 4D Gaussians, 2024, and its released code; methods reference 8.2. Place and time are
-//! encoded by sines and cosines, and a network of four layers maps them to a code. The loss is that of Gaussian Grouping,
-//! with the neighbour term at every step. The reconstruction is frozen, as published.
+//! encoded by sines and cosines, and a network of four layers maps them to a code. The loss is that of Gaussian
+//! Grouping, with the neighbour term at every step. The reconstruction is frozen, as published.
 //!
-//! Deviations: the classes are the instances of the capture and one for unlabelled pixels, instead of 256; all Gaussians
-//! are drawn from for the neighbour term, where the published training draws from at most 300 000. All cameras train,
-//! where the released code trains on one on Neu3D (`cam16`): `head.camera` names one. What its paper does after training,
-//! for editing, is left out. Rows of the scene have the label that most of 16 times, evenly spread, give them (ours).
+//! Deviations: the classes are the instances of the capture and one for unlabelled pixels, instead of 256; all
+//! Gaussians are drawn from for the neighbour term, where the published training draws from at most 300 000. All
+//! cameras train, where the released code trains on one on Neu3D (`cam16`): `head.camera` names one. What its paper
+//! does after training, for editing, is left out. Rows of the scene have the label that most of 16 times, evenly
+//! spread, give them (ours).
 //!
 //! Constants: 10 frequencies for the canonical place in world units and 4 for the time; layers 72-256-256-256-16 with
 //! Xavier-uniform weights of gain 1 and biases below 1 / sqrt(inputs); rates 5e-4; published steps 5 000; epsilon of
@@ -16,11 +17,12 @@
 mod network;
 
 use cif_field::Field;
-use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
+use cif_field::parameters::Parameter;
 use cif_render::Blending;
 
 use self::network::{CODE, Network};
 use super::classifier::{Classifier, biases, weights};
+use super::tensors::shared;
 use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadView, Pass, ValueHead, largest};
 use crate::config::TrainConfig;
 
@@ -33,15 +35,7 @@ const TIMES_OF_ROWS: usize = 16;
 const PART: &str = "sa4d";
 
 /// Weights and biases of the network, layer by layer.
-const NETWORK: Parameter = Parameter {
-    name: "network",
-    part: PART,
-    rate: "network",
-    rows: Rows::Fixed,
-    shape: &[],
-    activation: Activation::Identity,
-    on_copy: OnCopy::Same,
-};
+const NETWORK: Parameter = shared(PART, "network", &[]);
 
 const CLASSIFIER: Classifier = Classifier {
     weights: weights(PART, &[CODE]),

@@ -2,26 +2,26 @@
 //!
 //! Source: Shen et al., Trace3D: Consistent Segmentation Lifting via Gaussian Instance Tracing, ICCV 2025, and its
 //! released code; methods reference 8.5. First the field is trained by colours for a while. In cycles, Gaussians whose
-//! pixels in a view are of several labels, in many views, are split in two, and all that then still are so are deleted;
-//! Gaussians that no view shows go at the first and the last of these steps. Then the field is frozen, and a code per
-//! Gaussian is learnt: codes blended over pixels of one label shall be alike, those of others not. Pixels have the label
-//! whose mean code over the training views is nearest.
+//! pixels in a view are of several labels, in many views, are split in two, and all that then still are so are
+//! deleted; Gaussians that no view shows go at the first and the last of these steps. Then the field is frozen, and a
+//! code per Gaussian is learnt: codes blended over pixels of one label shall be alike, those of others not. Pixels
+//! have the label whose mean code over the training views is nearest.
 //!
 //! The number of Gaussians changes. The cull by opacity of the published code never acts there, and is left out.
 //!
 //! Deviations: masks are consistent over views, so that patches need no merging; views at all times are traced, with
-//! Gaussians where they are then; colours train as in the stages before, without the normals of 2D Gaussians; shorter runs
-//! shorten all parts alike. A probability of a pixel is the softmax of negative squared distances (ours).
+//! Gaussians where they are then; colours train as in the stages before, without the normals of 2D Gaussians; shorter
+//! runs shorten all parts alike. A probability of a pixel is the softmax of negative squared distances (ours).
 //!
 //! Constants: published 9 000 steps of colour with 4 cycles of 1 200 steps from step 10 on, and 20 000 of codes; a
-//! Gaussian counts in a view with more than 25 pixels there, is ambiguous below a share of 0.8, and goes when that is so in
-//! more than 0.4 of its views; children have 1 / 1.6 of the scale; codes of 16 from N(0, 1) at a rate of 5e-3; 4 096
-//! pixels; temperatures 100 within a label and 1 between labels.
+//! Gaussian counts in a view with more than 25 pixels there, is ambiguous below a share of 0.8, and goes when that is
+//! so in more than 0.4 of its views; children have 1 / 1.6 of the scale; codes of 16 from N(0, 1) at a rate of 5e-3; 4
+//! 096 pixels; temperatures 100 within a label and 1 between labels.
 
 mod contrast;
 
 use cif_field::Field;
-use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
+use cif_field::parameters::Parameter;
 use cif_render::Blending;
 use cif_render::cpu::{ContributorMass, ContributorRule};
 use rand::seq::index::sample;
@@ -29,6 +29,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64;
 
 use self::contrast::contrast;
+use super::tensors::{per_gaussian, shared};
 use super::{Head, HeadLoss, HeadTensors, HeadView, Pass, Phase, TrainingViews, ValueHead};
 use crate::config::{HeadName, TrainConfig};
 use crate::densify::{Rearrangement, keep, with_copies};
@@ -64,21 +65,13 @@ const AMBIGUOUS_SHARE: f64 = 0.4;
 const PART: &str = "trace3d";
 
 /// Codes of every Gaussian.
-const CODES: Parameter = Parameter {
-    name: "codes",
-    part: PART,
-    rate: "codes",
-    rows: Rows::Gaussians,
-    shape: &[CODE],
-    activation: Activation::Identity,
-    on_copy: OnCopy::Same,
-};
+const CODES: Parameter = per_gaussian(PART, "codes", &[CODE]);
 
 /// Mean codes of the labels.
-const CENTROIDS: Parameter = Parameter { name: "centroids", rate: "centroids", rows: Rows::Fixed, ..CODES };
+const CENTROIDS: Parameter = shared(PART, "centroids", &[CODE]);
 
 /// 1 for labels that have a mean code.
-const KNOWN: Parameter = Parameter { name: "known", rate: "known", shape: &[], ..CENTROIDS };
+const KNOWN: Parameter = shared(PART, "known", &[]);
 
 /// A change of the set of Gaussians.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -133,8 +126,8 @@ fn ambiguous(views: &mut TrainingViews<'_>) -> Result<Vec<bool>, TrainError> {
     Ok(ambiguous.into_iter().zip(counted).map(exceeds).collect())
 }
 
-/// Calls `each` with the row of every Gaussian in every view, its pixels per label, unlabelled ones as a label of their
-/// own, and their number.
+/// Calls `each` with the row of every Gaussian in every view, its pixels per label, unlabelled ones as a label of
+/// their own, and their number.
 fn trace(views: &mut TrainingViews<'_>, each: &mut Traced<'_>) -> Result<(), TrainError> {
     let rule = ContributorRule { mass: ContributorMass::One, ..ContributorRule::ALL };
     views.each_count(&rule, &mut |counts| {
@@ -188,8 +181,7 @@ impl ValueHead for Trace3d {
     }
 
     fn values_backward(&self, tensors: &mut HeadTensors, _field: &Field, _time: f64, v_values: &[f32]) {
-        let (_, gradients) = tensors.values_and_gradients(&CODES);
-        gradients.iter_mut().zip(v_values).for_each(|(sum, v)| *sum += v);
+        tensors.add_gradients(&CODES, v_values);
     }
 
     fn loss(
@@ -233,10 +225,6 @@ impl ValueHead for Trace3d {
             return (0, 0.0);
         };
         (label, 1.0 / distances.iter().map(|(_, squared)| (least - squared).exp()).sum::<f32>())
-    }
-
-    fn label_of_rows(&self, tensors: &HeadTensors, _field: &Field) -> Vec<u16> {
-        tensors.values(&CODES).chunks_exact(CODE).map(|code| self.decode(tensors, code).0).collect()
     }
 
     fn finish(&self, tensors: &mut HeadTensors, views: &mut TrainingViews<'_>) -> Result<(), TrainError> {

@@ -1,8 +1,8 @@
 //! Self-attention over the channels of a Gaussian, with a residual: `u = x + attention(x)`.
 //!
-//! A token per channel, `e_m = x_m a + E_m`, is turned into query, key and value; the mean of the values that the query
-//! of a language channel attends to becomes one number by `w` and `b`. Parameters lie one after another: a, E, query, key
-//! and value matrices (`[in, out]`), w, b.
+//! A token per channel, `e_m = x_m a + E_m`, is turned into query, key and value; the mean of the values that the
+//! query of a language channel attends to becomes one number by `w` and `b`. Parameters lie one after another: a, E,
+//! query, key and value matrices (`[in, out]`), w, b.
 
 use rayon::prelude::*;
 

@@ -1,30 +1,31 @@
 //! VLGS: language channels fused with colour by attention, blended by an opacity of their own.
 //!
-//! A re-implementation: there is no public code. Source: Peng et al., 3D Vision-Language Gaussian Splatting, ICLR 2025;
-//! methods reference 8.3. Every Gaussian has three colour and three language channels; self-attention over the six mixes
-//! them, with a residual; language is blended with a learnable opacity of its own (the semantic indicator) that has its
-//! own transmittance, and classified per pixel. Between two views of the same time, a camera at a random place in
-//! between is supervised with the labels of both, weighted by how alike their images are.
+//! A re-implementation: there is no public code. Source: Peng et al., 3D Vision-Language Gaussian Splatting, ICLR
+//! 2025; methods reference 8.3. Every Gaussian has three colour and three language channels; self-attention over the
+//! six mixes them, with a residual; language is blended with a learnable opacity of its own (the semantic indicator)
+//! that has its own transmittance, and classified per pixel. Between two views of the same time, a camera at a random
+//! place in between is supervised with the labels of both, weighted by how alike their images are.
 //!
-//! Deviations: instances of the capture instead of language embeddings; the reconstruction is frozen, so that attention
-//! changes language alone; labels of unlabelled pixels do not count; blended cameras need two training views of one time
-//! and size, and are left out elsewhere, because what moved in between has no common target.
+//! Deviations: instances of the capture instead of language embeddings; the reconstruction is frozen, so that
+//! attention changes language alone; labels of unlabelled pixels do not count; blended cameras need two training views
+//! of one time and size, and are left out elsewhere, because what moved in between has no common target.
 //!
-//! Constants of the paper: 3 + 3 channels; weight 1.2 of blended cameras. Ours, because it does not give them: tokens of
-//! 8 (a shared linear map of the channel and an embedding per channel), one head; language channels from N(0, 1) / 10 at a
-//! rate of 2.5e-3; attention 1e-3, classifier 5e-3; opacities start at 0.1 with a rate of 0.01; ratios of blended cameras
-//! from U(0.3, 0.7).
+//! Constants of the paper: 3 + 3 channels; weight 1.2 of blended cameras. Ours, because it does not give them: tokens
+//! of 8 (a shared linear map of the channel and an embedding per channel), one head; language channels from N(0, 1) /
+//! 10 at a rate of 2.5e-3; attention 1e-3, classifier 5e-3; opacities start at 0.1 with a rate of 0.01; ratios of
+//! blended cameras from U(0.3, 0.7).
 
 mod attention;
 
 use cif_field::Field;
-use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
+use cif_field::parameters::Parameter;
 use cif_geometry::spherical_harmonics::BAND_0;
 use cif_render::Blending;
 use rand_distr::{Distribution, StandardNormal};
 
 use self::attention::{LANGUAGE, TOKENS};
 use super::classifier::{Classifier, biases, weights};
+use super::tensors::{per_gaussian, shared};
 use super::{CameraBlending, Head, HeadLoss, HeadTensors, HeadView, OwnOpacity, Pass, ValueHead};
 use crate::config::TrainConfig;
 use crate::random::{Purpose, stream};
@@ -40,19 +41,10 @@ const CLASSIFIER_RATE: f32 = 5e-3;
 const PART: &str = "vlgs";
 
 /// Language channels of every Gaussian.
-const CODES: Parameter = Parameter {
-    name: "codes",
-    part: PART,
-    rate: "codes",
-    rows: Rows::Gaussians,
-    shape: &[LANGUAGE],
-    activation: Activation::Identity,
-    on_copy: OnCopy::Same,
-};
+const CODES: Parameter = per_gaussian(PART, "codes", &[LANGUAGE]);
 
 /// Parameters of the attention, see [`attention`].
-const ATTENTION: Parameter =
-    Parameter { name: "attention", rate: "attention", rows: Rows::Fixed, shape: &[], ..CODES };
+const ATTENTION: Parameter = shared(PART, "attention", &[]);
 
 const CLASSIFIER: Classifier = Classifier {
     weights: weights(PART, &[LANGUAGE]),
@@ -134,10 +126,8 @@ impl ValueHead for Vlgs {
         let codes = tensors.values(&CODES);
         let of = |row: usize| channels(field, codes, row);
         let (v_codes, v_attention) = attention::backward(tensors.values(&ATTENTION), of, v_values);
-        for (parameter, sums) in [(&CODES, v_codes), (&ATTENTION, v_attention)] {
-            let (_, gradients) = tensors.values_and_gradients(parameter);
-            gradients.iter_mut().zip(sums).for_each(|(total, v)| *total += v);
-        }
+        tensors.add_gradients(&CODES, &v_codes);
+        tensors.add_gradients(&ATTENTION, &v_attention);
     }
 
     fn loss(
@@ -152,11 +142,6 @@ impl ValueHead for Vlgs {
 
     fn decode(&self, tensors: &HeadTensors, blended: &[f32]) -> (u16, f32) {
         CLASSIFIER.decode(tensors, blended)
-    }
-
-    fn label_of_rows(&self, tensors: &HeadTensors, field: &Field) -> Vec<u16> {
-        let values = self.values(tensors, field, 0.0);
-        values.chunks_exact(LANGUAGE).map(|code| CLASSIFIER.decode(tensors, code).0).collect()
     }
 }
 
