@@ -202,9 +202,8 @@ fn effects_earn_their_place_on_the_same_steps_as_on_the_processor() {
     let Some(gpu) = testing::gpu() else { return };
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 3, views: 4, ..Scene::default() });
-    let judged = |gpu: Option<&Gpu>, seed: u64| {
-        let config = TrainConfig { seed, ..judging_config() };
-        let mut trainer = Trainer::new(dataset.clone(), config).unwrap();
+    let judged = |gpu: Option<&Gpu>| {
+        let mut trainer = Trainer::new(dataset.clone(), judging_config()).unwrap();
         if let Some(gpu) = gpu {
             trainer.use_gpu(gpu).unwrap();
         }
@@ -224,28 +223,22 @@ fn effects_earn_their_place_on_the_same_steps_as_on_the_processor() {
         assert_eq!(outcome.unwrap(), Outcome::Finished);
         (trainer, judgements)
     };
-    // One run of so small a capture varies by a point of mIoU from seed to seed; means of three vary less.
-    let mut means = [[0.0; 2]; 2];
-    for seed in [3, 4, 5] {
-        let ((cpu, expected), (on_gpu, found)) = (judged(None, seed), judged(Some(&gpu), seed));
-        assert_eq!(found, expected);
-        for what in ["still", "view-dependent colour of degree 1", "motion of scales"] {
-            assert!(found.iter().any(|(_, _, name, _)| name == what), "{what}: {found:?}");
-        }
-        for (trainer, mean) in [&cpu, &on_gpu].into_iter().zip(&mut means) {
-            let field = trainer.field();
-            let deformation = field.deformation.as_ref().unwrap();
-            assert!(!deformation.config.heads.scale && !deformation.config.heads.rotation);
-            assert_eq!(field.sh_degree, 0);
-            let still = deformation.still.iter().filter(|still| **still).count();
-            assert!(still > field.len() / 4, "{still} of {}", field.len());
-            let (psnr, miou) = scores(trainer);
-            eprintln!("{still} of {} stand still, {psnr:.2} dB, mIoU {miou:.1} %", field.len());
-            *mean = [mean[0] + psnr / 3.0, mean[1] + miou / 3.0];
-        }
+    let ((cpu, expected), (on_gpu, found)) = (judged(None), judged(Some(&gpu)));
+    assert_eq!(found, expected);
+    for what in ["still", "view-dependent colour of degree 1", "motion of scales"] {
+        assert!(found.iter().any(|(_, _, name, _)| name == what), "{what}: {found:?}");
     }
-    let [expected, found] = means;
-    assert!(found[0] > expected[0] - 0.2 && found[1] > expected[1] - 1.0, "{found:?} {expected:?}");
+    let [expected, found] = [&cpu, &on_gpu].map(|trainer| {
+        let field = trainer.field();
+        let deformation = field.deformation.as_ref().unwrap();
+        assert!(!deformation.config.heads.scale && !deformation.config.heads.rotation);
+        assert_eq!(field.sh_degree, 0);
+        let still = deformation.still.iter().filter(|still| **still).count();
+        assert!(still > field.len() / 4, "{still} of {}", field.len());
+        scores(trainer)
+    });
+    // One run of so small a capture varies by a point of mIoU from seed to seed.
+    assert!(found.0 > expected.0 - 0.4 && found.1 > expected.1 - 2.0, "{found:?} {expected:?}");
 }
 
 #[test]
@@ -295,7 +288,8 @@ fn a_run_goes_on_on_either_backend() {
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (10, 18, 12);
     (config.densify.from, config.densify.every) = (5, 5);
     (config.resample.from, config.resample.every) = (4, 4);
-    for (first, second) in [(Some(&gpu), None), (None, Some(&gpu)), (Some(&gpu), Some(&gpu))] {
+    // Stopped and resumed on the GPU alone it ends the same, which another test demands.
+    for (first, second) in [(Some(&gpu), None), (None, Some(&gpu))] {
         for stop_at in [7_u64, 19, 35] {
             let trainer = run(&dataset, &config, first, stop_at);
             assert_eq!(trainer.steps_done(), stop_at);

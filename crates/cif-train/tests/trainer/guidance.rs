@@ -121,24 +121,25 @@ fn masks_tell_early_what_stands_still() {
 
 #[test]
 fn a_rigid_object_moves_by_poses_of_its_own() {
-    check_rigid_object(|_| {});
+    check_rigid_object([100, 300, 60], |_| {});
 }
 
 #[cfg(feature = "wgpu")]
 #[test]
 fn a_rigid_object_moves_by_poses_of_its_own_on_a_gpu() {
     let Some(gpu) = cif_render::wgpu::testing::gpu() else { return };
-    check_rigid_object(|trainer| trainer.use_gpu(&gpu).unwrap());
+    check_rigid_object([60, 160, 20], |trainer| trainer.use_gpu(&gpu).unwrap());
 }
 
-/// A run on what `use_engine` sets, and one that is resumed.
-fn check_rigid_object(use_engine: impl Fn(&mut Trainer)) {
+/// A run with so many steps on what `use_engine` sets, and one that is resumed.
+fn check_rigid_object([coarse, fine, instance]: [u32; 3], use_engine: impl Fn(&mut Trainer)) {
     let folder = tempfile::tempdir().unwrap();
     let dataset = with_support(folder.path(), 12);
     let mut config = guided();
+    (config.stages.coarse, config.stages.fine, config.stages.instance) = (coarse, fine, instance);
     (config.effects.still_every, config.effects.still_told) = (100, 15);
     // Inside the fine stage.
-    config.report.checkpoint_every = 230;
+    config.report.checkpoint_every = coarse + fine / 2;
     let mut warnings = Vec::new();
     let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
     use_engine(&mut trainer);
