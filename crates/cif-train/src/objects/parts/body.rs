@@ -113,6 +113,12 @@ impl<'a> Body<'a> {
         rows.map(|row| self.shape.part_of(row) == Some(1)).collect()
     }
 
+    /// Difference of the largest and the least value of the joint.
+    pub(super) fn reach(&self) -> f64 {
+        let (low, high) = range(&self.values);
+        high - low
+    }
+
     /// Value of the joint at a time, between those that are known.
     pub(super) fn value_at(&self, time: usize) -> f64 {
         between(&self.values, time)
@@ -219,6 +225,11 @@ impl<'a> Body<'a> {
         self.values.insert(time, at);
         self.hinge = Some(Hinge { axis: axis.normalize(), point, ..hinge });
     }
+}
+
+/// Least and largest value; infinities where there are none.
+pub(super) fn range(values: &BTreeMap<usize, f64>) -> (f64, f64) {
+    values.values().fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)))
 }
 
 /// Value at a time between those of others, or that of the nearest.

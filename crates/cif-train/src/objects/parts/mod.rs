@@ -26,7 +26,7 @@ use rand::RngExt;
 use rayon::prelude::*;
 
 pub(super) use self::body::Hinge;
-use self::body::{Body, between};
+use self::body::{Body, between, range};
 use self::guesses::{Guess, Sides, guesses};
 use self::search::search;
 use super::fit::hull;
@@ -68,7 +68,8 @@ const PART: [f64; 2] = [0.03, 0.7];
 const FITTED: usize = 12;
 const FIT: ([usize; 2], usize) = ([200, 150], 250);
 
-/// Of these, those that are fitted finely.
+/// Of these, those whose values are searched for again, and those that are fitted finely.
+const AGAIN: usize = 8;
 const FINE: usize = 3;
 const FINELY: ([usize; 2], usize) = ([500, 250], 500);
 
@@ -87,8 +88,9 @@ const GAIN: f64 = 0.75;
 /// Error on pixels left out beyond which nothing is explained.
 const MOST_ERROR: f64 = 0.1;
 
-/// Loss of the best guess, of that of the static body, from which nothing is looked for.
+/// Loss of the best guess, and of the best fit, of that of the static body, from which nothing is looked for.
 const PROMISE: f64 = 0.99;
+const PROMISE_OF_FIT: f64 = 0.85;
 
 /// An object that rests and a part of it that moves, in the world.
 #[derive(Clone, Debug)]
@@ -160,23 +162,32 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         return Ok(None);
     }
     stop.check()?;
-    let mut fitted: Vec<(Guess, Body<'_>, f64)> = tried
+    let level = search.level();
+    let mut begun: Vec<Fit<'_>> = tried
         .into_par_iter()
         .take(FITTED)
-        .filter_map(|(guess, values, _)| search.fitted(guess, values, FIT, search.level()))
+        .filter_map(|(guess, values, _)| search.begun(guess, &values, FIT, level))
         .collect();
-    fitted.sort_by(|a, b| a.2.total_cmp(&b.2));
-    keep_kinds(&mut fitted);
+    keep_kinds(&mut begun, AGAIN);
     stop.check()?;
+    let mut fitted: Vec<Fit<'_>> =
+        begun.into_par_iter().map(|begun| search.finely_valued(begun, FIT.1, level)).collect();
+    keep_kinds(&mut fitted, FINE);
+    stop.check()?;
+    let promises = |fit: &Fit<'_>| fit.loss < PROMISE_OF_FIT * rough.mean_loss(&search.train, level);
+    if !fitted.first().is_some_and(promises) {
+        return Ok(None);
+    }
     let (rigid, mut fine) = rayon::join(
         || {
             let ([base, part], steps) = FINELY;
             search.rigid(base + part, 2 * steps, 0)
         },
         || {
-            let finely = |(guess, body, _): (Guess, Body<'_>, f64)| {
+            let finely = |Fit { guess, body, .. }: Fit<'_>| {
                 let refined = Guess { hinge: body.hinge.unwrap_or(guess.hinge), ..guess };
-                search.fitted(refined, body.values, FINELY, 0)
+                let begun = search.begun(refined, &body.values, FINELY, 0)?;
+                Some(search.finely_valued(begun, FINELY.1, 0))
             };
             fitted.into_par_iter().filter_map(finely).collect::<Vec<_>>()
         },
@@ -185,31 +196,39 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let Some(rigid) = rigid else { return Ok(None) };
     let judged = if search.left_out.is_empty() { &search.train } else { &search.left_out };
     let still = rigid.mean_loss(judged, 0);
-    for (_, body, loss) in &mut fine {
-        *loss = body.mean_loss(judged, 0);
+    for fit in &mut fine {
+        fit.loss = fit.body.mean_loss(judged, 0);
     }
-    fine.sort_by(|a, b| a.2.total_cmp(&b.2));
-    let Some(best) = fine.first().map(|(.., error)| *error) else { return Ok(None) };
-    // A hinge far away does what a slide does.
-    let is_simple = |(_, body, error): &(Guess, Body<'_>, f64)| {
-        *error <= SIMPLE * best && body.hinge.is_some_and(|hinge| hinge.kind == JointKind::Prismatic)
+    fine.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+    let Some(best) = fine.first().map(|fit| fit.loss) else { return Ok(None) };
+    // A hinge far away does what a slide does; nothing slides out of what holds it.
+    let is_simple = |fit: &Fit<'_>| {
+        let slides = fit.body.hinge.is_some_and(|hinge| hinge.kind == JointKind::Prismatic);
+        fit.loss <= SIMPLE * best && slides && fit.body.reach() <= search.size
     };
     let taken = fine.iter().position(is_simple).unwrap_or(0);
-    let (_, body, error) = fine.swap_remove(taken);
+    let Fit { body, loss: error, .. } = fine.swap_remove(taken);
     if error > MOST_ERROR || error > GAIN * still {
         return Ok(None);
     }
     Ok(search.finished(body, [error, still]))
 }
 
-/// Keeps the best of the fits, which are in their order, and the best of each kind of joint among them.
-fn keep_kinds(fitted: &mut Vec<(Guess, Body<'_>, f64)>) {
-    let kind = |(guess, ..): &(Guess, Body<'_>, f64)| guess.hinge.kind;
-    let slide = fitted.iter().position(|fit| kind(fit) == JointKind::Prismatic);
-    if let Some(place) = slide.filter(|place| *place >= FINE) {
-        fitted.swap(FINE - 1, place);
+/// A guess under way, with the loss on the views that it is fitted to.
+struct Fit<'a> {
+    guess: Guess,
+    body: Body<'a>,
+    loss: f64,
+}
+
+/// Keeps the best of the fits, in their order, and the best slide among them.
+fn keep_kinds(fits: &mut Vec<Fit<'_>>, count: usize) {
+    fits.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+    let slide = fits.iter().position(|fit| fit.guess.hinge.kind == JointKind::Prismatic);
+    if let Some(place) = slide.filter(|place| *place >= count) {
+        fits.swap(count - 1, place);
     }
-    fitted.truncate(FINE);
+    fits.truncate(count);
 }
 
 impl<'a> Search<'a> {
@@ -354,16 +373,16 @@ impl<'a> Search<'a> {
         is_near && plane.height(pose.rotation * place + pose.translation) > -0.05 * self.size
     }
 
-    /// A guess with Gaussians of its own, moved with the joint, and its loss on the views it is fitted to.
-    fn fitted(
+    /// A guess with Gaussians of its own, moved with the joint.
+    fn begun(
         &self,
         guess: Guess,
-        values: BTreeMap<usize, f64>,
+        values: &BTreeMap<usize, f64>,
         ([of_base, of_part], steps): ([usize; 2], usize),
         level: usize,
-    ) -> Option<(Guess, Body<'a>, f64)> {
+    ) -> Option<Fit<'a>> {
         let hinge = guess.hinge;
-        let posed = self.base.iter().map(|(time, pose)| (*time, hinge.posed(pose, between(&values, *time))));
+        let posed = self.base.iter().map(|(time, pose)| (*time, hinge.posed(pose, between(values, *time))));
         let posed: BTreeMap<usize, Pose> = posed.collect();
         let mut base = self.hull(self.base, None, of_base)?;
         base.fade(FAINT, |place| guess.has(place, 0.0));
@@ -374,12 +393,20 @@ impl<'a> Search<'a> {
         let members: Vec<bool> = (0..base.gaussians().len() + part.gaussians().len())
             .map(|row| row >= base.gaussians().len())
             .collect();
-        let all = self.times(usize::MAX);
-        let values = all.keys().map(|time| (*time, between(&values, *time))).collect();
+        let times = self.times(usize::MAX);
+        let values = times.keys().map(|time| (*time, between(values, *time))).collect();
         let mut body = self.body(base.joined(&part), Some((hinge, members, values)));
         body.steps(&self.train, steps, level, |share| if share < 0.2 { (1.0, 0.0) } else { (1.0, 1.0) });
+        let loss = body.mean_loss(&self.train, level);
+        Some(Fit { guess, body, loss })
+    }
+
+    /// A fit whose values were searched for again at all times, and moved on from there.
+    fn finely_valued(&self, fit: Fit<'a>, steps: usize, level: usize) -> Fit<'a> {
+        let Fit { guess, mut body, .. } = fit;
+        let all = self.times(usize::MAX);
         let (low, high) = body.values.values().fold((0.0_f64, 0.0_f64), |(l, h), v| (l.min(*v), h.max(*v)));
-        let widened = 0.25 * (high - low) + 0.05 * hinge.unit(self.size);
+        let widened = 0.25 * (high - low) + 0.05 * guess.hinge.unit(self.size);
         let count = 25;
         let finer: Vec<f64> = (0..count)
             .map(|k| low - widened + (high - low + 2.0 * widened) * f64::from(k) / f64::from(count - 1))
@@ -402,7 +429,7 @@ impl<'a> Search<'a> {
             (rate, rate)
         });
         let loss = body.mean_loss(&self.train, level);
-        Some((guess, body, loss))
+        Fit { guess, body, loss }
     }
 
     /// The body that is kept, fitted to all views that show it well: at the value 0 as it is seen first.
@@ -453,10 +480,7 @@ impl Jointed {
 
     /// The joint in words, with the range of its values.
     pub(crate) fn told(&self) -> String {
-        let (low, high) = self
-            .values
-            .values()
-            .fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), v| (low.min(*v), high.max(*v)));
+        let (low, high) = range(&self.values);
         match self.hinge.kind {
             JointKind::Revolute => {
                 format!("a part turns on a hinge, {:.0} to {:.0} deg", low.to_degrees(), high.to_degrees())
