@@ -16,6 +16,7 @@
 //! 3. Gaussians inside an object are hardly ever seen, so that they keep their first occupancy. One below the
 //!    threshold that lies in the box of its instance's Gaussians, and whose nearest neighbours are mostly of
 //!    that instance, is *enclosed* and goes back to it; else it would stay behind when the object moves.
+//! 4. Where most of the image of an instance moves by poses of its own, that is all of it ([`super::posed`]).
 //!
 //! Rows that have an owner ([`cif_field::Owner`]: they came from a file that names its objects) belong to it,
 //! whatever their occupancy.
@@ -29,6 +30,7 @@ use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
 
+use super::posed;
 use crate::SceneOptions;
 
 /// Neighbours that vote on an enclosed Gaussian.
@@ -119,6 +121,7 @@ pub fn assign(
     }
     let open = |position: usize| candidate(position).filter(|_| owner_of(position) == Owner::Estimated);
     enclose(field, visible, &open, &mut owners);
+    posed::settle(field, visible, &|position| owner_of(position) == Owner::Estimated, &mut owners);
     owners
 }
 

@@ -4,6 +4,7 @@ pub mod assignment;
 pub mod camera_tracks;
 pub mod frames;
 pub(crate) mod node;
+mod posed;
 pub mod source;
 
 use cif_field::{Field, Gaussians};

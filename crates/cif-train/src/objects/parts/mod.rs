@@ -73,6 +73,10 @@ const AGAIN: usize = 8;
 const FINE: usize = 3;
 const FINELY: ([usize; 2], usize) = ([500, 250], 500);
 
+/// Places of a hinge that are tried about that of a fit: steps to each side of it, and a step, of the size.
+const PLACES: i32 = 3;
+const PLACE: f64 = 0.13;
+
 /// Error of a slide, of that of the best joint, up to which it is preferred.
 const SIMPLE: f64 = 1.12;
 
@@ -185,8 +189,8 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         },
         || {
             let finely = |Fit { guess, body, .. }: Fit<'_>| {
-                let refined = Guess { hinge: body.hinge.unwrap_or(guess.hinge), ..guess };
-                let begun = search.begun(refined, &body.values, FINELY, 0)?;
+                let (hinge, values) = search.placed(&guess, body, level);
+                let begun = search.begun(Guess { hinge, ..guess }, &values, FINELY, 0)?;
                 Some(search.finely_valued(begun, FINELY.1, 0))
             };
             fitted.into_par_iter().filter_map(finely).collect::<Vec<_>>()
@@ -399,6 +403,29 @@ impl<'a> Search<'a> {
         body.steps(&self.train, steps, level, |share| if share < 0.2 { (1.0, 0.0) } else { (1.0, 1.0) });
         let loss = body.mean_loss(&self.train, level);
         Some(Fit { guess, body, loss })
+    }
+
+    /// The joint of a body and its values, a hinge where it explains most: it was guessed at a side of the hull, which
+    /// is too wide where few directions see the object, and angles follow the place.
+    fn placed(&self, guess: &Guess, mut body: Body<'a>, level: usize) -> (Hinge, BTreeMap<usize, f64>) {
+        let hinge = body.hinge.unwrap_or(guess.hinge);
+        if guess.is_round || hinge.kind == JointKind::Prismatic {
+            return (hinge, body.values);
+        }
+        let times = self.times(LOOKS);
+        let (first, second) = hinge.axis.any_orthonormal_pair();
+        let mut best = (hinge, BTreeMap::new(), f64::INFINITY);
+        for (i, j) in (-PLACES..=PLACES).flat_map(|i| (-PLACES..=PLACES).map(move |j| (i, j))) {
+            let aside = PLACE * self.size * (f64::from(i) * first + f64::from(j) * second);
+            let moved = Hinge { point: hinge.point + aside, ..hinge };
+            body.hinge = Some(moved);
+            let (values, loss) = search(&body, &times, (&guess.values, false), level);
+            if loss < best.2 {
+                best = (moved, values, loss);
+            }
+        }
+        let (placed, values, _) = best;
+        if placed == hinge { (hinge, body.values) } else { (placed, values) }
     }
 
     /// A fit whose values were searched for again at all times, and moved on from there.
