@@ -174,27 +174,67 @@ impl Trainer {
         trial: Option<&Field>,
         settings: &RenderSettings,
     ) -> Result<f64, TrainError> {
+        Ok(self.judged_errors(trial, settings)?.all.mean())
+    }
+
+    /// The same of all pixels, and of those of each label.
+    pub(super) fn judged_errors(
+        &mut self,
+        trial: Option<&Field>,
+        settings: &RenderSettings,
+    ) -> Result<JudgedErrors, TrainError> {
         let views: Vec<usize> = judged_views(self.state.frames.len()).collect();
         let frames: Vec<usize> = views.iter().map(|view| self.state.frames.index(*view)).collect();
         let mut truth = Vec::with_capacity(views.len());
         for view in views {
             truth.push(self.state.frames.get(&self.state.dataset, view)?);
         }
-        let (mut squares, mut values) = (0.0, 0_u64);
+        let labels = self.state.field.instances.len() + 1;
+        let mut errors =
+            JudgedErrors { all: SquaredError::default(), of_labels: vec![SquaredError::default(); labels] };
         let channels = Channels { depth: false, instances: false };
         let mut truth = truth.iter();
         self.draw(trial, Views { frames: &frames, settings, channels }, &mut |rendered| {
             let Some(data) = truth.next() else { return };
             for pixel in held_out(data.image.width, data.image.height) {
+                let label = data.labels.as_ref().map_or(0, |labels| labels.pixels[pixel]);
                 for channel in 0..3 {
                     let target = f64::from(data.image.pixels[pixel][channel]) / 255.0;
-                    squares += (f64::from(rendered.color.pixels[pixel][channel]) - target).powi(2);
+                    let difference = f64::from(rendered.color.pixels[pixel][channel]) - target;
+                    errors.all.add(difference);
+                    errors.of_labels[usize::from(label)].add(difference);
                 }
-                values += 3;
             }
         })?;
-        Ok(squares / values.max(1) as f64)
+        Ok(errors)
     }
+}
+
+/// A mean of squares under way.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct SquaredError {
+    sum: f64,
+    values: u64,
+}
+
+impl SquaredError {
+    pub(super) fn add(&mut self, difference: f64) {
+        self.sum += difference.powi(2);
+        self.values += 1;
+    }
+
+    /// 0 without values.
+    pub(super) fn mean(&self) -> f64 {
+        self.sum / self.values.max(1) as f64
+    }
+}
+
+/// Squared colour errors of held-out pixels.
+#[derive(Clone, Debug)]
+pub(super) struct JudgedErrors {
+    pub(super) all: SquaredError,
+    /// By label: dense index + 1, or 0.
+    pub(super) of_labels: Vec<SquaredError>,
 }
 
 /// A field without an output of its deformation.

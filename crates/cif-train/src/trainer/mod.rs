@@ -51,6 +51,7 @@ mod pacing;
 mod parts;
 mod plan_step;
 mod provenance;
+mod resting;
 mod resume;
 mod run;
 mod saving;

@@ -114,11 +114,12 @@ impl Trainer {
             }
             self.state.field = trial;
         }
+        let rested = if stage == Stage::Instance { self.rest_instances(&motions)? } else { 0 };
         self.engine.changed(Changed::Gaussians);
         let still =
             self.state.field.deformation.as_ref().map_or(0, |d| d.still.iter().filter(|s| **s).count());
         let gaussians = self.state.field.len();
-        let settled = settled.unwrap_or(0);
+        let settled = settled.unwrap_or(0) + rested;
         events.push(TrainEvent::Settled { stage, iteration, still, settled, released, gaussians });
         Ok(())
     }

@@ -46,6 +46,9 @@ const ROUGH: (usize, usize) = (300, 300);
 /// Times that guesses are searched at, one view each.
 const LOOKS: usize = 12;
 
+/// Most views of a time that values are searched on.
+const VIEWS: usize = 2;
+
 /// Places that the box is looked for among, of these the fewest that tell it, and the share of views that may have
 /// them beside the mask.
 const CANDIDATES: usize = 8000;
@@ -271,7 +274,7 @@ impl<'a> Search<'a> {
         Some(body)
     }
 
-    /// Views of some times, one each, or of all times.
+    /// Views of some times, one each, or of all times, a few each.
     fn times(&self, count: usize) -> BTreeMap<usize, Vec<usize>> {
         let mut of: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
         for view in &self.train {
@@ -286,8 +289,9 @@ impl<'a> Search<'a> {
             .filter(|(k, _)| kept.contains(k))
             .map(|(_, of_time)| of_time)
             .collect();
-        for (k, views) in times.values_mut().enumerate().filter(|_| count < all) {
-            *views = vec![views[k % views.len()]];
+        for (k, views) in times.values_mut().enumerate() {
+            let wanted = if count < all { 1 } else { VIEWS.min(views.len()) };
+            *views = (0..wanted).map(|view| views[(k + view * views.len() / wanted) % views.len()]).collect();
         }
         times
     }

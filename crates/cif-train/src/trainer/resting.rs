@@ -1,0 +1,156 @@
+//! Instances that rest: the network moves their Gaussians only to draw light and shadow, or what shines through them.
+//! They are taken out of it as a whole where the held-out pixels hardly miss it, so that they leave as one thing that
+//! stands still.
+
+use super::Trainer;
+use super::judged::{JudgedErrors, gain};
+use super::motions::{Motion, put_to_rest};
+use crate::config::ObjectMotion;
+use crate::error::TrainError;
+
+/// Loss on held-out pixels, dB, up to which instances are taken to rest: each on its own pixels, and together on all.
+const OWN_LOSS: f64 = 1.0;
+const LOSS: f64 = 0.05;
+
+/// Share of its image on labelled pixels from which a Gaussian may leave with its instance.
+const LABELLED_SHARE: f32 = 0.2;
+
+impl Trainer {
+    /// Puts the instances to rest that neither travel nor have poses, and whose pixels allow it; returns the number of
+    /// Gaussians. It does nothing before identities are estimated.
+    pub(super) fn rest_instances(&mut self, motions: &[Motion]) -> Result<usize, TrainError> {
+        let instance_of = self.rows_of_instances();
+        let mut resting = self.may_rest(&instance_of);
+        if !resting.contains(&true) {
+            return Ok(0);
+        }
+        let settings = self.state.color_settings();
+        let before = self.judged_errors(None, &settings)?;
+        while resting.contains(&true) {
+            let mut trial = self.state.field.clone();
+            let rests = |row: usize| {
+                instance_of[row].is_some_and(|instance| resting[instance]) && !self.is_mover(row)
+            };
+            let count = put_to_rest(&mut trial, motions, rests);
+            let after = self.judged_errors(Some(&trial), &settings)?;
+            let missed = missed(&before, &after, &resting);
+            if missed.is_empty() {
+                self.state.field = trial;
+                return Ok(count);
+            }
+            missed.into_iter().for_each(|instance| resting[instance] = false);
+        }
+        Ok(0)
+    }
+
+    /// The instance of every row that most of its image shows as such.
+    fn rows_of_instances(&self) -> Vec<Option<usize>> {
+        let field = &self.state.field;
+        let Some((identities, of)) = field.identities.as_ref().zip(field.instance_of_gaussians()) else {
+            return vec![None; field.len()];
+        };
+        let shares = identities.labelled_shares();
+        of.into_iter()
+            .zip(shares)
+            .map(|(of, share)| of.filter(|_| share >= LABELLED_SHARE).map(usize::from))
+            .collect()
+    }
+
+    /// True for Gaussians that were made for a travelling object, or that have poses.
+    fn is_mover(&self, row: usize) -> bool {
+        let is_posed = self.state.field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some());
+        is_posed || self.state.guidance.travels(row)
+    }
+
+    /// Instances of which something goes through the network that is no mover, and that are not told to be free.
+    fn may_rest(&self, instance_of: &[Option<usize>]) -> Vec<bool> {
+        let field = &self.state.field;
+        let mut may_rest = vec![false; field.instances.len()];
+        let Some(deformation) = &field.deformation else { return may_rest };
+        for (row, instance) in instance_of.iter().enumerate() {
+            if let Some(instance) = *instance
+                && self.told(instance as u16 + 1) != Some(ObjectMotion::Free)
+            {
+                may_rest[instance] |= !deformation.is_still(row) && !self.is_mover(row);
+            }
+        }
+        may_rest
+    }
+}
+
+/// Instances that must not rest: those whose own pixels miss the network or, where all pixels together do, the one that
+/// misses it most.
+fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool]) -> Vec<usize> {
+    let loss =
+        |instance: usize| gain(after.of_labels[instance + 1].mean(), before.of_labels[instance + 1].mean());
+    let tried = || (0..resting.len()).filter(|instance| resting[*instance]);
+    let missed: Vec<usize> = tried().filter(|instance| loss(*instance) > OWN_LOSS).collect();
+    if !missed.is_empty() || gain(after.all.mean(), before.all.mean()) <= LOSS {
+        return missed;
+    }
+    tried().max_by(|a, b| loss(*a).total_cmp(&loss(*b))).into_iter().collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::guard_tests::support::{Scene, capture, small_config, stopped_after};
+    use super::super::judged::SquaredError;
+    use super::super::motions::{probe, probe_times};
+    use super::*;
+
+    #[test]
+    fn instances_rest_where_their_pixels_allow_it() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene::default());
+        let mut config = small_config();
+        (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 200, 10);
+        (config.motion.rigid, config.effects.still_every) = (false, 0);
+        // What rests is held, so that the network has nothing to gain there.
+        (config.motion.guidance, config.motion.stillness, config.motion.rehearsal) = (10.0, 1.0, 50);
+        let mut trainer = stopped_after(&dataset, &config, 261);
+        let rows: Vec<u32> = (0..trainer.state.field.len() as u32).collect();
+        let motions = probe(
+            trainer.state.field.deformation.as_ref().unwrap(),
+            &trainer.state.field.gaussians,
+            &rows,
+            &probe_times(&trainer.state.dataset.times),
+        );
+        let instance_of = trainer.rows_of_instances();
+        assert!(trainer.may_rest(&instance_of)[0]);
+        let settings = trainer.state.color_settings();
+        let before = trainer.judged_error(None, &settings).unwrap();
+        assert!(trainer.rest_instances(&motions).unwrap() > 10);
+        for (row, instance) in instance_of.iter().enumerate() {
+            let is_still = trainer.state.field.deformation.as_ref().unwrap().is_still(row);
+            let rests = *instance == Some(0) && !trainer.is_mover(row);
+            assert!(is_still || !rests, "{row} of a ball that rests");
+            assert!(!is_still || !trainer.is_mover(row), "{row} of the ball that moves");
+        }
+        assert!(!trainer.may_rest(&instance_of)[0]);
+        assert!(gain(trainer.judged_error(None, &settings).unwrap(), before) <= LOSS);
+        trainer.state.config.motion.of =
+            ["ball 4", "ball 7", "ball 9"].map(|name| (name.to_owned(), ObjectMotion::Free)).into();
+        assert_eq!(trainer.may_rest(&instance_of), [false; 3]);
+    }
+
+    #[test]
+    fn what_misses_the_network_does_not_rest() {
+        let errors = |of: [f64; 4]| {
+            let mut errors = JudgedErrors { all: SquaredError::default(), of_labels: Vec::new() };
+            for difference in of {
+                let mut of_label = SquaredError::default();
+                of_label.add(difference);
+                errors.all.add(difference);
+                errors.of_labels.push(of_label);
+            }
+            errors
+        };
+        let before = errors([0.1; 4]);
+        let missed = |after: [f64; 4], resting: [bool; 3]| missed(&before, &errors(after), &resting);
+        assert!(missed([0.1, 0.1005, 0.1, 0.1], [true; 3]).is_empty());
+        assert_eq!(missed([0.1, 0.1, 0.2, 0.1], [true; 3]), [1]);
+        assert_eq!(missed([0.1, 0.11, 0.105, 0.1], [true; 3]), [0], "all pixels together miss it");
+        assert_eq!(missed([0.2, 0.1, 0.1, 0.1], [true; 3]).len(), 1, "so they do for what has no label");
+        assert!(missed([0.1, 0.1, 0.2, 0.1], [true, false, true]) != [1], "it was not tried");
+    }
+}
