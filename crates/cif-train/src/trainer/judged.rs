@@ -223,6 +223,10 @@ impl SquaredError {
         self.values += 1;
     }
 
+    pub(super) fn sum(&self) -> f64 {
+        self.sum
+    }
+
     /// 0 without values.
     pub(super) fn mean(&self) -> f64 {
         self.sum / self.values.max(1) as f64

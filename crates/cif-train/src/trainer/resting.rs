@@ -79,7 +79,7 @@ impl Trainer {
 }
 
 /// Instances that must not rest: those whose own pixels miss the network or, where all pixels together do, the one that
-/// misses it most.
+/// costs most.
 fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool]) -> Vec<usize> {
     let loss =
         |instance: usize| gain(after.of_labels[instance + 1].mean(), before.of_labels[instance + 1].mean());
@@ -88,7 +88,8 @@ fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool]) -> Vec<
     if !missed.is_empty() || gain(after.all.mean(), before.all.mean()) <= LOSS {
         return missed;
     }
-    tried().max_by(|a, b| loss(*a).total_cmp(&loss(*b))).into_iter().collect()
+    let cost = |instance: usize| after.of_labels[instance + 1].sum() - before.of_labels[instance + 1].sum();
+    tried().max_by(|a, b| cost(*a).total_cmp(&cost(*b))).into_iter().collect()
 }
 
 #[cfg(test)]
