@@ -140,16 +140,19 @@ pub fn members(field: &Field, options: &SceneOptions) -> Vec<Vec<u32>> {
     members
 }
 
+/// Image of a Gaussian seen from its broad side: opacity times area, world units.
+pub(super) fn image(field: &Field, row: usize) -> f64 {
+    let [x, y, z] = field.gaussians.log_scales[row].map(f64::from);
+    f64::from(field.gaussians.opacity(row)) * (x + y).max(y + z).max(x + z).exp()
+}
+
 /// Labelled share above which the Gaussians of every instance make the best silhouette of it.
 fn needed_shares(field: &Field, visible: &[u32], candidates: &[Option<Identity>]) -> Vec<f64> {
     // Image and labelled share of the Gaussians of each instance.
     let mut members: Vec<Vec<(f64, f64)>> = vec![Vec::new(); field.instances.len()];
     for (&row, identity) in visible.iter().zip(candidates) {
         let Some(identity) = identity else { continue };
-        let [x, y, z] = field.gaussians.log_scales[row as usize].map(f64::from);
-        let area = (x + y).max(y + z).max(x + z).exp();
-        let image = f64::from(field.gaussians.opacity(row as usize)) * area;
-        members[identity.index].push((image, f64::from(identity.labelled_share)));
+        members[identity.index].push((image(field, row as usize), f64::from(identity.labelled_share)));
     }
     members
         .iter()

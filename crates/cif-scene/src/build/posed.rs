@@ -4,6 +4,8 @@ use std::collections::BTreeMap;
 
 use cif_field::Field;
 
+use super::assignment::image;
+
 /// Share of the image of an instance that its posed Gaussians make at least, where they are taken to be all of it.
 const MOST_OF_IT: f64 = 0.5;
 
@@ -21,11 +23,7 @@ pub(super) fn settle(
         let group = tracks.group(visible[position] as usize)?;
         (!tracks.groups[group].deformed).then_some(group)
     };
-    let image = |position: usize| {
-        let row = visible[position] as usize;
-        let [x, y, z] = field.gaussians.log_scales[row].map(f64::from);
-        f64::from(field.gaussians.opacity(row)) * (x + y).max(y + z).max(x + z).exp()
-    };
+    let image = |position: usize| image(field, visible[position] as usize);
     let mut shares: BTreeMap<(usize, usize), f64> = BTreeMap::new();
     let mut images = vec![0.0; field.instances.len()];
     for (position, owner) in owners.iter().enumerate() {

@@ -6,7 +6,7 @@
 //! | `run` | how it goes through its stages, and where it may be stopped |
 //! | `plan_step` | what decides a step |
 //! | `step` | how a step is done, and what falls behind it |
-//! | `still` | which Gaussians skip the deformation network |
+//! | `still`, `resting` | which Gaussians skip the deformation network, one by one and as whole instances |
 //! | `changes` | where cameras that stay in place see the capture change |
 //! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `heads` | what heads of other systems see and change between steps |

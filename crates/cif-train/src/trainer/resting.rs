@@ -1,6 +1,6 @@
 //! Instances that rest: the network moves their Gaussians only to draw light and shadow, or what shines through them.
 //! They are taken out of it as a whole where the held-out pixels hardly miss it, so that they leave as one thing that
-//! stands still.
+//! stands still; likewise what stays behind of an object that has poses.
 
 use super::Trainer;
 use super::judged::{JudgedErrors, gain};
@@ -16,8 +16,8 @@ const LOSS: f64 = 0.05;
 const LABELLED_SHARE: f32 = 0.2;
 
 impl Trainer {
-    /// Puts the instances to rest that neither travel nor have poses, and whose pixels allow it; returns the number of
-    /// Gaussians. It does nothing before identities are estimated.
+    /// Puts to rest what the network moves of every instance whose pixels allow it; returns the number of Gaussians. It
+    /// does nothing before identities are estimated.
     pub(super) fn rest_instances(&mut self, motions: &[Motion]) -> Result<usize, TrainError> {
         let instance_of = self.rows_of_instances();
         let mut resting = self.may_rest(&instance_of);
@@ -43,7 +43,7 @@ impl Trainer {
         Ok(0)
     }
 
-    /// The instance of every row that most of its image shows as such.
+    /// The instance of every row that may leave with it.
     fn rows_of_instances(&self) -> Vec<Option<usize>> {
         let field = &self.state.field;
         let Some((identities, of)) = field.identities.as_ref().zip(field.instance_of_gaussians()) else {
