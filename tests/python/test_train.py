@@ -140,7 +140,8 @@ def test_the_command_leaves_signals_to_the_program(tmp_path: Path) -> None:
     settings = ["--set=model.spatial_resolution=[8,8,8]"]
     # --stop-after counts the steps that are told of.
     told = {**ENDLESS, "report.step_every": 1}
-    settings += [f"--set={key}={json.dumps(value)}" for key, value in told.items() if not isinstance(value, dict)]
+    plain = {key: value for key, value in told.items() if not isinstance(value, dict)}
+    settings += [f"--set={key}={json.dumps(value)}" for key, value in plain.items()]
     with pytest.raises(KeyboardInterrupt), ctrl_c(path):
         cif.run(["train", CAPTURE, "-o", path, "--quiet", *settings])
     assert cif.run(["train", CAPTURE, "-o", path, "--quiet", "--resume", "--stop-after", "1"]) == 0
