@@ -21,7 +21,7 @@ SMALL = {
     "stages": {"coarse": 6, "fine": 6, "instance": 6},
     "model": {"max_initial_points": 300, "spatial_resolution": [8, 8, 8], "channels": 4, "width": 16},
     "motion.rehearsal": 3,
-    "motion.parts": False,
+    "motion.rigid": False,
     "report.step_every": 1,
     "report.curve_frames": 1,
 }
