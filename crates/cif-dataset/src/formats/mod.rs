@@ -41,6 +41,8 @@ pub(crate) struct Draft {
     /// Half edge of the box for random points around the origin, for layouts that have a customary one.
     pub(crate) random_box: Option<f64>,
     pub(crate) frames_per_second: Option<f64>,
+    /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
+    pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
 }
 
