@@ -381,7 +381,10 @@ fn neu3d_images_that_are_stored_reduced_are_not_reduced_again() {
         let options = OpenOptions { downscale, ..OpenOptions::default() };
         let dataset = Dataset::open(folder.path(), &options).unwrap();
         let image = dataset.load_image(0, [0.0; 3]).unwrap();
-        assert_eq!((image.width, image.height), (dataset.frames[0].camera.width, dataset.frames[0].camera.height));
+        assert_eq!(
+            (image.width, image.height),
+            (dataset.frames[0].camera.width, dataset.frames[0].camera.height)
+        );
         (image.width, dataset.frames[0].camera.focal_px.x)
     };
     // As captured, and as 4DGaussians' preprocessing leaves them: the same images either way.
@@ -405,10 +408,10 @@ fn cameras_can_be_left_out() {
     assert_eq!(names, ["cam00/0000", "cam00/0001", "cam02/0000", "cam02/0001"]);
     assert_eq!(kept.frames[2].camera.focal_px, whole.frames[4].camera.focal_px);
     let turned = |dataset: &Dataset, frame: usize| dataset.frames[frame].camera.camera_from_world.rotation;
-    assert!((turned(&kept, 0).transpose() * turned(&kept, 2)).abs_diff_eq(
-        turned(&whole, 0).transpose() * turned(&whole, 4),
-        1e-12
-    ));
+    assert!(
+        (turned(&kept, 0).transpose() * turned(&kept, 2))
+            .abs_diff_eq(turned(&whole, 0).transpose() * turned(&whole, 4), 1e-12)
+    );
     // Its files may be gone: the row of its pose stays its own.
     std::fs::remove_dir_all(folder.path().join("cam01")).unwrap();
     assert!(Dataset::open(folder.path(), &OpenOptions::default()).is_err());
@@ -438,7 +441,8 @@ fn videos_give_their_first_frames_reduced_while_they_are_decoded() {
         std::fs::remove_dir_all(folder.path().join(name)).unwrap();
     }
     let open = |video_frames, downscale| {
-        Dataset::open(folder.path(), &OpenOptions { video_frames, downscale, ..OpenOptions::default() }).unwrap()
+        Dataset::open(folder.path(), &OpenOptions { video_frames, downscale, ..OpenOptions::default() })
+            .unwrap()
     };
     let all = open(None, None);
     assert_eq!((all.frames.len(), all.frames[0].camera.width), (20, 2 * WIDTH));
@@ -450,7 +454,9 @@ fn videos_give_their_first_frames_reduced_while_they_are_decoded() {
     let stored = image::image_dimensions(&few.frames[0].image).unwrap();
     assert_eq!(stored, (WIDTH, HEIGHT));
     let whole = open(None, Some(1)).load_image(0, [0.0; 3]).unwrap();
-    let mean = |pixels: &[[u8; 3]]| pixels.iter().flatten().map(|v| f64::from(*v)).sum::<f64>() / pixels.len() as f64;
+    let mean = |pixels: &[[u8; 3]]| {
+        pixels.iter().flatten().map(|v| f64::from(*v)).sum::<f64>() / pixels.len() as f64
+    };
     assert!((mean(&image.pixels) - mean(&whole.pixels)).abs() < 6.0);
 }
 
@@ -461,7 +467,11 @@ fn training_frames_without_an_image_are_left_out() {
     std::fs::remove_file(folder.path().join("rgb/1x/000005.png")).unwrap();
     let dataset = Dataset::open(folder.path(), &OpenOptions::default()).unwrap();
     assert_eq!(dataset.frames.len(), 5);
-    assert!(warns(&dataset, &["dataset.json", "1 training frames have no image", "000005"]), "{:?}", dataset.warnings);
+    assert!(
+        warns(&dataset, &["dataset.json", "1 training frames have no image", "000005"]),
+        "{:?}",
+        dataset.warnings
+    );
     assert_eq!(dataset.frames[4].time, whole.frames[4].time, "times stay those of the whole list");
     for k in [0, 2, 3] {
         std::fs::remove_file(folder.path().join(format!("rgb/1x/{k:06}.png"))).unwrap();

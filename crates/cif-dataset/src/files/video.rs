@@ -173,7 +173,8 @@ mod tests {
         assert_eq!(first.len(), 2);
         assert!(first[0].ends_with(".cif_frames/cam00-300-9x5/0000.png"));
         // The second call needs no program.
-        let second = frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, wanted).unwrap();
+        let second =
+            frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, wanted).unwrap();
         assert_eq!(first, second);
         // Other frames are others.
         let fewer = Extraction { most: 1, ..wanted };

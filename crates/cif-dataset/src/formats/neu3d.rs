@@ -149,10 +149,11 @@ fn images(source: &Source<'_>, name: &str, captured: Option<DVec2>) -> Result<Ve
     let movie = root.join(format!("{name}.mp4"));
     if images.is_empty() && listing::is_there(&movie) {
         let reduction = options.downscale.filter(|reduction| *reduction > 1);
-        let size = reduction.zip(captured.filter(|size| size.min_element() >= 1.0)).map(|(reduction, size)| {
-            let (width, height) = reduced_size(size.x as u32, size.y as u32, reduction);
-            [width, height]
-        });
+        let size =
+            reduction.zip(captured.filter(|size| size.min_element() >= 1.0)).map(|(reduction, size)| {
+                let (width, height) = reduced_size(size.x as u32, size.y as u32, reduction);
+                [width, height]
+            });
         let most = options.video_frames.unwrap_or(DEFAULT_VIDEO_FRAMES);
         images = video::frames(root, &movie, &folder.join("images"), Extraction { most, size })?;
     }

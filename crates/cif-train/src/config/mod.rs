@@ -14,8 +14,8 @@ use cif_field::{Heads, SortMetric, TimeEncoding};
 use serde::{Deserialize, Serialize};
 
 pub use options::{
-    Ablation, Excess, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart, Preset,
-    ScaleCorrection, WeakSet,
+    Ablation, Excess, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart,
+    Preset, ScaleCorrection, WeakSet,
 };
 pub use validate::ConfigError;
 
@@ -39,7 +39,8 @@ pub struct TrainConfig {
     pub antialiased: bool,
     /// Depth order, `z` or `distance`, default `z`.
     pub sort_metric: SortMetric,
-    /// Memory for decoded training frames, MiB, default 1024; frames beyond it are decoded when needed.
+    /// Memory for decoded training frames, MiB, default 1024; frames beyond it are decoded ahead of the
+    /// steps that need them, at most 8 at a time, which takes memory of its own.
     pub frame_memory_mib: u32,
     /// Length of the stages.
     pub stages: StagesConfig,

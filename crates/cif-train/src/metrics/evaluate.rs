@@ -41,7 +41,14 @@ impl EvaluationOptions<'_> {
     #[must_use]
     pub fn held_out(field: &Field) -> Self {
         let settings = trained_settings(field);
-        Self { split: Split::Val, settings, simd: SimdLevel::Auto, depth: false, covisible: false, decoder: None }
+        Self {
+            split: Split::Val,
+            settings,
+            simd: SimdLevel::Auto,
+            depth: false,
+            covisible: false,
+            decoder: None,
+        }
     }
 }
 

@@ -112,7 +112,8 @@ pub fn choose(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) 
         })
         .collect();
     let budget = (f64::from(context.config.rate) * n as f64).round() as usize;
-    let most: Vec<usize> = members.iter().map(|members| most_weak(members.len(), n, context.config)).collect();
+    let most: Vec<usize> =
+        members.iter().map(|members| most_weak(members.len(), n, context.config)).collect();
     let shares = match context.config.excess {
         Excess::Drop => {
             shares(budget, &weights).into_iter().zip(&most).map(|(share, most)| share.min(*most)).collect()

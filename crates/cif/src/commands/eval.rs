@@ -236,7 +236,8 @@ fn label(field: &Field, id: u16) -> String {
 }
 
 fn print_table(evaluation: &Evaluation, field: &Field) {
-    let mut table = super::table(["", "frames", "PSNR", "co-visible", "seen", "SSIM", "mAcc-pix", "mAcc-inst", "mIoU"]);
+    let mut table =
+        super::table(["", "frames", "PSNR", "co-visible", "seen", "SSIM", "mAcc-pix", "mAcc-inst", "mIoU"]);
     let overall = std::iter::once(("all", &evaluation.overall));
     for (name, scores) in
         overall.chain(evaluation.groups.iter().map(|(name, scores)| (name.as_str(), scores)))

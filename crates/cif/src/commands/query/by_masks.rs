@@ -203,7 +203,8 @@ fn evaluate(
         }
         interrupt::go_on()?;
         let truth = dataset.load_found_mask(index, files, masks.loaded)?;
-        let rendered = render(field, &found.rows, options.foreground, &frame.camera, frame.time, renderer, settings);
+        let rendered =
+            render(field, &found.rows, options.foreground, &frame.camera, frame.time, renderer, settings);
         if let Some(folder) = &options.output {
             let picture: PixelGrid<u16> = rendered.map(|inside| if *inside { u16::MAX } else { 0 });
             save_grey(&output::inside(folder, &frame.name, "png")?, &picture)?;
