@@ -40,7 +40,7 @@ impl Dataset {
         }
         let layout = layout::recognise(root, options.layout, &mut warnings)?;
         let mut draft = formats::read(layout, &Source { root, options })?;
-        leave_out_cameras(root, &mut draft, &options.without_cameras)?;
+        draft.leave_out(root, &options.without_cameras)?;
         warnings.extend(draft.warnings.iter().cloned());
         let (frames, has_alpha, stored_sizes) = frames(root, &draft, options, &mut warnings)?;
 
@@ -358,21 +358,6 @@ impl Dataset {
         let colors = points::sample_colors(self, &positions)?;
         Ok(PointCloud { positions, colors, source: PointSource::Random })
     }
-}
-
-/// Takes the frames of cameras out that are not wanted.
-fn leave_out_cameras(root: &Path, draft: &mut Draft, unwanted: &[String]) -> Result<(), Error> {
-    for name in unwanted {
-        let known: BTreeSet<&str> = draft.frames.iter().map(|frame| frame.camera_name.as_str()).collect();
-        if !known.contains(name.as_str()) && !draft.left_out.contains(name) {
-            return Err(Error::invalid(
-                root,
-                format!("it has no camera {name} to leave out; its cameras: {}", some_of(known.into_iter())),
-            ));
-        }
-    }
-    draft.frames.retain(|frame| !unwanted.contains(&frame.camera_name));
-    Ok(())
 }
 
 /// Frames with checked cameras in order of camera, time and name; whether any image has alpha; the sizes of the
