@@ -25,6 +25,17 @@ pub const STANDING: u16 = 7;
 /// Radius of both balls, metres.
 const RADIUS: f64 = 0.22;
 
+/// A folder with the capture in `table/`.
+///
+/// # Panics
+/// When it cannot be written.
+#[must_use]
+pub fn in_folder(frames: usize) -> tempfile::TempDir {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    write(&folder.path().join("table"), frames);
+    folder
+}
+
 /// Centre of a ball at a normalised time, world, metres; z is up and the floor is z = 0.
 #[must_use]
 pub fn centre(id: u16, time: f64) -> DVec3 {

@@ -57,3 +57,26 @@ pub fn run<S: AsRef<OsStr>>(program: &str, folder: &Path, arguments: impl IntoIt
     command.args(arguments).current_dir(folder).env("NO_COLOR", "1");
     Run::from(&command.output().expect("the program starts"))
 }
+
+/// Settings of a small model, for runs whose quality does not matter.
+pub const SMALL_MODEL: &str =
+    "--set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4";
+
+/// Runs `program` in `folder` with the words of a line, split at blanks.
+///
+/// # Panics
+/// As [`run`].
+#[must_use]
+pub fn run_line(program: &str, folder: &Path, line: &str) -> Run {
+    run(program, folder, line.split_whitespace())
+}
+
+/// What the command wrote as JSON.
+///
+/// # Panics
+/// When it is none.
+#[must_use]
+#[track_caller]
+pub fn json(text: &str) -> serde_json::Value {
+    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error} in {text}"))
+}

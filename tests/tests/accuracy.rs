@@ -5,31 +5,16 @@ use std::fs;
 use std::path::Path;
 
 use cif_test::capture;
-use cif_test::command::{Run, run};
+use cif_test::command::{Run, SMALL_MODEL as SMALL, json, run_line};
 use serde_json::Value;
 
-const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
-
-/// A small model and short stages.
-const SMALL: &str = "--set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4";
-
 fn cif(folder: &Path, line: &str) -> Run {
-    run(CIF, folder, line.split_whitespace())
-}
-
-fn with_capture() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    capture::write(&folder.path().join("table"), 8);
-    folder
-}
-
-fn json(text: &str) -> Value {
-    serde_json::from_str(text).unwrap_or_else(|error| panic!("{error} in {text}"))
+    run_line(env!("CARGO_BIN_EXE_cif-under-test"), folder, line)
 }
 
 #[test]
 fn a_run_tells_its_curve_and_a_draft_its_error() {
-    let folder = with_capture();
+    let folder = capture::in_folder(8);
     let path = folder.path();
     let steps = "--iterations-coarse 10 --iterations-fine 120 --iterations-instance 30 --set stages.batch=1";
     cif(path, &format!("train table -o table.cif --log run.jsonl {steps} {SMALL}")).succeeds();
@@ -65,7 +50,7 @@ fn image_size(path: &Path) -> (u32, u32) {
 
 #[test]
 fn a_budget_says_what_it_buys_and_writes_the_settings_that_came_of_it() {
-    let folder = with_capture();
+    let folder = capture::in_folder(8);
     let path = folder.path();
     let told = cif(path, &format!("train table -o table.cif --budget 2s {SMALL}")).succeeds().stderr;
     assert!(told.contains("budget 2 s: the settings of standard would take about"), "{told}");
@@ -89,7 +74,7 @@ fn a_budget_says_what_it_buys_and_writes_the_settings_that_came_of_it() {
 
 #[test]
 fn a_target_stops_a_run() {
-    let folder = with_capture();
+    let folder = capture::in_folder(8);
     let path = folder.path();
     let line = format!("train table -o table.cif --target-psnr 8 --target-miou 5 {SMALL}");
     let told = cif(path, &line).succeeds().stderr;
@@ -102,7 +87,7 @@ fn a_target_stops_a_run() {
 
 #[test]
 fn a_report_holds_its_ladders_and_goes_on_where_it_stopped() {
-    let folder = with_capture();
+    let folder = capture::in_folder(8);
     let path = folder.path();
     capture::write_motion(&path.join("table"), 8);
     let short = "--set stages.coarse=5 --set stages.fine=20 --set stages.instance=10";

@@ -139,6 +139,28 @@ fn presets_follow_the_layout_of_the_capture() {
 }
 
 #[test]
+fn settings_of_published_scenes_are_taken() {
+    let settings = Path::new(env!("CARGO_MANIFEST_DIR")).join("../examples/settings");
+    let (neu3d, hypernerf) = (captures::neu3d(2, 2), captures::hypernerf(4));
+    for (file, folder, expected) in [
+        ("hypernerf-chickchicken.toml", &hypernerf, ["time_resolution=80", "batch=2", "rate=0.01"]),
+        ("neu3d-batch-2.toml", &neu3d, ["time_resolution=150", "batch=2", "rate=0.05"]),
+    ] {
+        let (path, file) = (folder.path().display(), settings.join(file));
+        let steps = "--set stages.coarse=1 --set stages.fine=1 --set stages.instance=0";
+        let line = format!("train {path} -o {path}/a.cif --config {} {steps}", file.display());
+        cif(folder.path().parent().unwrap(), &line).succeeds();
+        let settings = fs::read_to_string(folder.path().join("a.train.toml")).unwrap();
+        for key in expected {
+            let (name, value) = key.split_once('=').unwrap();
+            assert!(settings.contains(&format!("{name} = {value}")), "{key}: {settings}");
+        }
+    }
+    let files = listing(&settings).len();
+    assert_eq!(files, 2, "every file has a row here and in examples/README.md");
+}
+
+#[test]
 fn settings_that_cannot_be_are_refused_before_anything_is_read() {
     let folder = folder();
     let path = folder.path();

@@ -4,42 +4,32 @@ use std::fs;
 use std::path::Path;
 
 use cif_test::capture;
-use cif_test::command::{Run, run};
+use cif_test::command::{Run, SMALL_MODEL, json, run_line};
 use serde_json::Value;
 
-const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
-
-/// A small model and short stages.
-const SMALL: &str = "--set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4 \
-                     --set stages.coarse=10 --set stages.fine=60 --set densify.max_gaussians=600";
+/// Short stages before those of the heads.
+const SHORT: &str = "--set stages.coarse=10 --set stages.fine=60 --set densify.max_gaussians=600";
 
 fn cif(folder: &Path, line: &str) -> Run {
-    run(CIF, folder, line.split_whitespace())
+    run_line(env!("CARGO_BIN_EXE_cif-under-test"), folder, line)
 }
 
-fn with_capture() -> tempfile::TempDir {
-    let folder = tempfile::tempdir().expect("a temporary folder");
-    capture::write(&folder.path().join("table"), 8);
-    folder
-}
-
-fn json(path: &Path) -> Value {
-    let text = fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
-    serde_json::from_str(&text).unwrap_or_else(|error| panic!("{error} in {text}"))
+fn json_file(path: &Path) -> Value {
+    json(&fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
 }
 
 #[test]
 fn scenes_of_every_head_can_be_scored_drawn_searched_and_exported() {
-    let folder = with_capture();
+    let folder = capture::in_folder(8);
     let path = folder.path();
-    cif(path, &format!("train table -o base.cif --iterations-instance 10 {SMALL}")).succeeds();
+    cif(path, &format!("train table -o base.cif --iterations-instance 10 {SMALL_MODEL} {SHORT}")).succeeds();
     for head in ["dr-splat", "gaussian-grouping", "sa4d", "vlgs", "trace3d"] {
         let line =
             format!("train table -o {head}.cif --from base.cif --head {head} --iterations-instance 25");
         cif(path, &line).succeeds();
         let told = cif(path, &format!("eval {head}.cif table --json {head}.json")).succeeds().stdout;
         assert!(told.contains(&format!("labels as the head {head} decodes every pixel")), "{told}");
-        let scores = json(&path.join(format!("{head}.json")));
+        let scores = json_file(&path.join(format!("{head}.json")));
         assert_eq!(scores["labels_by"], head);
         assert!(scores["macc_pix"].is_number() && scores["psnr"].is_number(), "{head}: {scores:#}");
         cif(path, &format!("render {head}.cif --capture table -o {head} --what instance")).succeeds();
@@ -48,7 +38,7 @@ fn scenes_of_every_head_can_be_scored_drawn_searched_and_exported() {
     }
     let told = cif(path, "eval base.cif table --json base.json").succeeds().stdout;
     assert!(!told.contains("decodes every pixel"), "{told}");
-    assert_eq!(json(&path.join("base.json"))["labels_by"], "identity rows");
+    assert_eq!(json_file(&path.join("base.json"))["labels_by"], "identity rows");
     cif(path, "train table -o x.cif --from base.cif --head lerf").fails(2, &["--head", "gaussian-grouping"]);
     cif(path, "train table -o x.cif --from base.cif --head sa4d --set head.camera=cam16")
         .fails(1, &["head.camera = cam16", "training cameras"]);
@@ -56,14 +46,14 @@ fn scenes_of_every_head_can_be_scored_drawn_searched_and_exported() {
 
 #[test]
 fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
-    let folder = with_capture();
+    let folder = capture::in_folder(8);
     let path = folder.path();
     let line = format!(
-        "bench compare table -o out --heads cif,dr-splat,vlgs --seeds 1 --iterations 8 --ablations {SMALL}"
+        "bench compare table -o out --heads cif,dr-splat,vlgs --seeds 1 --iterations 8 --ablations {SMALL_MODEL} {SHORT}"
     );
     let told = cif(path, &line).succeeds();
     assert!(told.stdout.contains("VLGS (re-implementation)"), "{}", told.stdout);
-    let rows = json(&path.join("out/panoptic.json"));
+    let rows = json_file(&path.join("out/panoptic.json"));
     let rows = rows.as_array().unwrap();
     let named: Vec<(&str, u64)> =
         rows.iter().map(|row| (row["head"].as_str().unwrap(), row["seed"].as_u64().unwrap())).collect();
@@ -72,7 +62,7 @@ fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
         let (head, seed) = (row["head"].as_str().unwrap(), &row["seed"]);
         cif(path, &format!("eval out/runs/table.seed{seed}.{head}.cif table --json {head}{seed}.json"))
             .succeeds();
-        let scores = json(&path.join(format!("{head}{seed}.json")));
+        let scores = json_file(&path.join(format!("{head}{seed}.json")));
         for key in ["macc_pix", "macc_inst", "miou", "psnr", "ssim", "gaussians"] {
             assert_eq!(row[key], scores[key], "{head} {key}");
         }
@@ -80,7 +70,7 @@ fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
     }
     // Heads leave the reconstruction as it is.
     assert_eq!(rows[1]["psnr"], rows[2]["psnr"]);
-    let parts = json(&path.join("out/ablation.json"));
+    let parts = json_file(&path.join("out/ablation.json"));
     let parts: Vec<&str> =
         parts.as_array().unwrap().iter().map(|row| row["head"].as_str().unwrap()).collect();
     assert_eq!(parts, ["i", "ii", "iii", "iv", "v"]);
@@ -101,7 +91,7 @@ fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
     let told = cif(path, &line).succeeds().stderr;
     assert_eq!(told.matches(": kept, ").count(), 6, "{told}");
     assert_eq!(fs::read(path.join("out/runs/table.seed0.base.cif")).unwrap(), base);
-    assert_eq!(json(&path.join("out/panoptic.json"))[1]["miou"], rows[1]["miou"], "the same run again");
+    assert_eq!(json_file(&path.join("out/panoptic.json"))[1]["miou"], rows[1]["miou"], "the same run again");
     let told = cif(path, &line.replace("--iterations 8", "--iterations 9")).succeeds().stderr;
     assert_eq!(told.matches(": kept, ").count(), 0, "{told}");
 
@@ -109,4 +99,73 @@ fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
     cif(path, "bench compare table table -o other").fails(1, &["two captures are called table"]);
     cif(path, "bench compare table -o other --iterations some").fails(2, &["published"]);
     cif(path, "bench compare table -o other --no-masks").fails(1, &["masks"]);
+}
+
+#[test]
+fn a_comparison_out_of_time_tells_what_is_missing_and_goes_on() {
+    let folder = capture::in_folder(8);
+    let path = folder.path();
+    let line = |heads: &str, more: &str| {
+        format!(
+            "bench compare table -o out --heads {heads} --seeds 2 --iterations 4 {SMALL_MODEL} {SHORT} {more}"
+        )
+    };
+    // Nothing begins, not even the reconstruction.
+    let told = cif(path, &line("cif", "--budget 0s")).succeeds();
+    assert!(told.stderr.contains("goes on with the 2 runs"), "{}", told.stderr);
+    assert!(
+        told.stdout.contains("Not done yet, and not in the means: table with CIF (seed 0, 1)"),
+        "{}",
+        told.stdout
+    );
+    assert_eq!(fs::read_dir(path.join("out/runs")).unwrap().count(), 0);
+    assert!(!cif(path, &line("cif", "--budget 1h")).succeeds().stdout.contains("Not done yet"));
+    // What is there is kept and told; what is not is named.
+    let told = cif(path, &line("cif,dr-splat", "--budget 0s")).succeeds();
+    assert_eq!(told.stderr.matches(": kept, ").count(), 2, "{}", told.stderr);
+    assert!(told.stdout.contains("table with Dr. Splat (seed 0, 1)"), "{}", told.stdout);
+    for file in ["panoptic.tex", "compare.html"] {
+        let text = fs::read_to_string(path.join("out").join(file)).unwrap();
+        assert!(text.contains("Dr. Splat (seed 0, 1)"), "{file}");
+    }
+    let told = cif(path, &line("cif,dr-splat", "")).succeeds();
+    assert_eq!(told.stderr.matches(": kept, ").count(), 2, "{}", told.stderr);
+    assert!(!told.stdout.contains("Not done yet"), "{}", told.stdout);
+    cif(path, &line("cif", "--budget soon")).fails(2, &["--budget"]);
+}
+
+#[test]
+fn a_comparison_has_a_video_of_its_runs() {
+    let folder = capture::in_folder(8);
+    let path = folder.path();
+    let line = format!(
+        "bench compare table -o out --heads cif,vlgs --seeds 1 --iterations 4 --video {SMALL_MODEL} {SHORT}"
+    );
+    let encoders = std::process::Command::new("ffmpeg").arg("-encoders").output();
+    if !encoders.is_ok_and(|told| String::from_utf8_lossy(&told.stdout).contains("libx264")) {
+        cif(path, &line).fails(1, &["--video", "ffmpeg"]);
+        eprintln!("skipped: no ffmpeg with libx264");
+        return;
+    }
+    cif(path, &line).succeeds();
+    let page = fs::read_to_string(path.join("out/compare.html")).unwrap();
+    assert!(page.contains("From left to right: colours, CIF, VLGS (re-implementation)."));
+    assert!(page.contains("data:video/mp4;base64,"));
+    let probed = std::process::Command::new("ffprobe")
+        .args([
+            "-v",
+            "error",
+            "-count_frames",
+            "-show_entries",
+            "stream=width,height,nb_read_frames",
+            "-of",
+            "csv=p=0",
+        ])
+        .arg(path.join("out/table.mp4"))
+        .output()
+        .unwrap();
+    let told = String::from_utf8_lossy(&probed.stdout).trim().to_owned();
+    let numbers: Vec<u32> = told.split(',').map(|number| number.parse().unwrap()).collect();
+    assert!(numbers[0] >= 3 * capture::WIDTH && numbers[1] >= capture::HEIGHT, "{told}: three parts");
+    assert!(numbers[2] >= 61, "{told}: between two held-out frames there are sixty pictures");
 }

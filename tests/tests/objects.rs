@@ -129,6 +129,17 @@ fn a_scene_shows_and_tells_its_objects() {
     assert!(found["eval"]["macc"].as_f64().unwrap() > 90.0, "{found:#}");
     let shown = image::open(path.join("shown/000002.png")).unwrap().into_luma16();
     assert!(shown.pixels().any(|pixel| pixel.0[0] == u16::MAX));
+    let inside = |gate: &str| {
+        let line = format!(
+            "query scene.cif --masks answers --capture table --eval -o gate{gate} --foreground {gate} --json"
+        );
+        cif(path, &line).succeeds();
+        let shown = image::open(path.join(format!("gate{gate}/000002.png"))).unwrap().into_luma16();
+        shown.pixels().filter(|pixel| pixel.0[0] == u16::MAX).count()
+    };
+    let default = shown.pixels().filter(|pixel| pixel.0[0] == u16::MAX).count();
+    assert_eq!(inside("0.5"), default);
+    assert!(inside("0") > default && default > inside("0.95"), "the gate keeps faint occupancy out");
     for select in ["gaussian", "both"] {
         let line = format!("query scene.cif --masks answers --capture table --select {select} --eval --json");
         let found = json(&cif(path, &line).succeeds().stdout);
@@ -190,6 +201,7 @@ fn questions_that_cannot_be_asked_end_with_2() {
     cif(path, "query a.cif --point 1,2,3 --label x").fails(2, &["without other conditions"]);
     cif(path, "query a.txt").fails(2, &[".cif, .usda"]);
     cif(path, "query a.cif --masks m").fails(2, &["--capture"]);
+    cif(path, "query a.cif --masks m --capture c --eval --foreground 2").fails(2, &["0 to 1"]);
     cif(path, "query a.cif --prompt x --capture c").fails(2, &["--detector"]);
     cif(path, "query a.usda --masks m --capture c").fails(2, &["trained scene"]);
     cif(path, "render a.cif --capture c -o out --exr-color display").fails(2, &["--exr"]);

@@ -60,6 +60,7 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     let scores = json(&cif(path, "eval scene.cif table --json - --images pictures").succeeds().stdout);
     let number = |key: &str| scores[key].as_f64().unwrap_or_else(|| panic!("{key} in {scores:#}"));
     assert!(number("psnr") > 18.0, "{scores:#}");
+    assert!(number("psnr_covisible") > 18.0 && (50.0..=100.0).contains(&number("covisible")), "{scores:#}");
     assert!(number("ssim") > 0.5, "{scores:#}");
     assert!(number("miou") > 60.0, "{scores:#}");
     assert!(number("macc_pix") > 75.0 && number("macc_inst") > 75.0, "{scores:#}");

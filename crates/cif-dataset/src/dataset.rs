@@ -48,7 +48,14 @@ pub struct OpenOptions {
     pub centre_principal_point: bool,
     /// Forces a layout where two fit.
     pub layout: Option<Layout>,
+    /// Cameras whose frames are left out, by [`Frame::camera_name`].
+    pub without_cameras: Vec<String>,
+    /// Most frames taken of a video, from its start on; [`DEFAULT_VIDEO_FRAMES`] where `None`.
+    pub video_frames: Option<u32>,
 }
+
+/// Frames taken of a video unless said otherwise: as many as the published scores of Neu3D are of.
+pub const DEFAULT_VIDEO_FRAMES: u32 = 300;
 
 /// One image of a capture: where it is, and the ideal pinhole camera it has once loaded.
 #[derive(Clone, Debug, PartialEq)]

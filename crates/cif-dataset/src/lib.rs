@@ -48,7 +48,8 @@ mod summary;
 /// Where a dataset lies in the coordinates of its capture.
 pub use cif_geometry::CaptureFrame;
 pub use dataset::{
-    Dataset, Frame, FrameData, InstanceLabel, Layout, OpenOptions, PointCloud, PointSource, Split,
+    DEFAULT_VIDEO_FRAMES, Dataset, Frame, FrameData, InstanceLabel, Layout, OpenOptions, PointCloud,
+    PointSource, Split,
 };
 pub use error::Error;
 pub use motion_truth::{MotionTruth, TrueMotion};

@@ -39,7 +39,8 @@ impl Dataset {
             return Err(Error::invalid(root, "images cannot be reduced by 0; give 1, 2, 4, ..."));
         }
         let layout = layout::recognise(root, options.layout, &mut warnings)?;
-        let draft = formats::read(layout, &Source { root, options })?;
+        let mut draft = formats::read(layout, &Source { root, options })?;
+        draft.leave_out(root, &options.without_cameras)?;
         warnings.extend(draft.warnings.iter().cloned());
         let (frames, has_alpha, stored_sizes) = frames(root, &draft, options, &mut warnings)?;
 

@@ -1,7 +1,13 @@
-//! Training frames in memory: decoded once, as bytes, up to a budget.
+//! Training frames in memory: decoded once, as bytes, up to a budget; others are decoded ahead of the steps that need
+//! them.
+
+mod ahead;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+
+use ahead::Ahead;
+pub(crate) use ahead::MOST as MOST_AHEAD;
 
 use cif_dataset::{Dataset, Split};
 use cif_geometry::PixelGrid;
@@ -27,6 +33,14 @@ pub(crate) struct TrainFrame {
 pub(crate) struct FrameStore {
     /// Index in the capture, and the frame where it fits into memory.
     frames: Vec<(usize, Option<Arc<TrainFrame>>)>,
+    decoding: Arc<Decoding>,
+    /// Frames that are being decoded for coming steps, where some do not fit into memory.
+    ahead: Option<Ahead>,
+}
+
+/// What makes of the files of a frame what is trained on.
+#[derive(Clone)]
+struct Decoding {
     label_of_id: Vec<u16>,
     background: [f32; 3],
     /// New labels of masks that show other objects, by index in the capture.
@@ -54,7 +68,8 @@ impl FrameStore {
         }
         let training = dataset.frames.iter().enumerate().filter(|(_, f)| f.split == Split::Train);
         let frames = training.map(|(index, _)| (index, None)).collect();
-        let mut store = Self { frames, label_of_id, background, switched: BTreeMap::new() };
+        let decoding = Arc::new(Decoding { label_of_id, background, switched: BTreeMap::new() });
+        let mut store = Self { frames, decoding, ahead: None };
         if store.frames.is_empty() {
             return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
         }
@@ -74,7 +89,18 @@ impl FrameStore {
                 }
             }
         }
+        if store.not_kept() > 0 {
+            store.ahead = Some(Ahead::of(dataset));
+        }
         Ok(store)
+    }
+
+    /// Begins to decode training frames that are needed soon, in the order given, on other threads. Frames that are in
+    /// memory, or begun already, are passed over; those begun before that are not among them are given up.
+    pub(crate) fn expect(&self, coming: impl IntoIterator<Item = usize>) {
+        let Some(ahead) = &self.ahead else { return };
+        let missing = coming.into_iter().filter(|k| self.frames[*k].1.is_none()).map(|k| self.frames[k].0);
+        ahead.expect(missing, &self.decoding);
     }
 
     /// Number of training frames.
@@ -96,7 +122,10 @@ impl FrameStore {
     pub(crate) fn get(&self, dataset: &Dataset, k: usize) -> Result<Arc<TrainFrame>, TrainError> {
         match &self.frames[k].1 {
             Some(frame) => Ok(Arc::clone(frame)),
-            None => Ok(Arc::new(self.load(dataset, k)?)),
+            None => match self.ahead.as_ref().and_then(|ahead| ahead.take(self.frames[k].0)) {
+                Some(frame) => Ok(Arc::new(frame?)),
+                None => Ok(Arc::new(self.load(dataset, k)?)),
+            },
         }
     }
 
@@ -150,18 +179,21 @@ impl FrameStore {
                 let labels = frame.labels.as_ref().map(|labels| put_right(labels, &renamed));
                 *frame = Arc::new(TrainFrame::new(frame.image.clone(), labels));
             }
-            self.switched.insert(*index, renamed);
+            Arc::make_mut(&mut self.decoding).switched.insert(*index, renamed);
         }
-        Ok(&self.switched)
+        self.ahead.iter().for_each(Ahead::give_up);
+        Ok(&self.decoding.switched)
     }
 
     /// Renames dense labels, in frames kept and in those decoded later.
     pub(crate) fn relabel(&mut self, new_label: impl Fn(u16) -> u16) {
         let rename = |label: &u16| if *label == UNLABELLED { UNLABELLED } else { new_label(label - 1) + 1 };
-        self.label_of_id.iter_mut().for_each(|label| *label = rename(label));
-        for renamed in self.switched.values_mut() {
+        let decoding = Arc::make_mut(&mut self.decoding);
+        decoding.label_of_id.iter_mut().for_each(|label| *label = rename(label));
+        for renamed in decoding.switched.values_mut() {
             *renamed = renamed.iter().map(|(from, to)| (rename(from), rename(to))).collect();
         }
+        self.ahead.iter().for_each(Ahead::give_up);
         for frame in self.frames.iter_mut().filter_map(|(_, frame)| frame.as_mut()) {
             *frame = Arc::new(TrainFrame {
                 image: frame.image.clone(),
@@ -172,9 +204,16 @@ impl FrameStore {
     }
 
     fn load(&self, dataset: &Dataset, k: usize) -> Result<TrainFrame, TrainError> {
-        let data = dataset.load_frame(self.frames[k].0, self.background)?;
+        Ok(self.decoding.load(dataset, self.frames[k].0)?)
+    }
+}
+
+impl Decoding {
+    /// Frame `index` of a capture.
+    fn load(&self, dataset: &Dataset, index: usize) -> Result<TrainFrame, cif_dataset::Error> {
+        let data = dataset.load_frame(index, self.background)?;
         let mut labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
-        if let Some(renamed) = self.switched.get(&self.frames[k].0) {
+        if let Some(renamed) = self.switched.get(&index) {
             labels = labels.map(|labels| put_right(&labels, renamed));
         }
         if let (Some(labels), Some(confidence)) = (&mut labels, &data.confidence) {
@@ -233,5 +272,60 @@ mod tests {
         let none_kept = FrameStore::open(&dataset, [1.0; 3], 0, &Stop::default()).unwrap();
         assert_eq!(none_kept.not_kept(), none_kept.len());
         assert_eq!(labels(&none_kept, 0), after);
+    }
+
+    #[test]
+    fn frames_read_ahead_are_those_read_when_they_are_needed() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 2, views: 3, ..Scene::default() });
+        let open = |budget| FrameStore::open(&dataset, [1.0; 3], budget, &Stop::default()).unwrap();
+        let (kept, mut read) = (open(u64::MAX), open(0));
+        let same = |a: &FrameStore, b: &FrameStore, k: usize| {
+            let (a, b) = (a.get(&dataset, k).unwrap(), b.get(&dataset, k).unwrap());
+            a.image == b.image && a.labels == b.labels && a.labelled == b.labelled
+        };
+        let begun = |store: &FrameStore| store.ahead.as_ref().map(Ahead::begun);
+        assert_eq!(begun(&kept), None);
+        read.expect(0..read.len());
+        assert_eq!(begun(&read), Some((0..read.len()).map(|k| read.index(k)).collect()));
+        assert!((0..read.len()).all(|k| same(&kept, &read, k)));
+        assert_eq!(begun(&read), Some(vec![]), "frames that were taken are not kept");
+        // Others are expected than came before; frames that nobody expected are read all the same.
+        read.expect([0, 1]);
+        read.expect([1, 2]);
+        assert_eq!(begun(&read), Some(vec![read.index(1), read.index(2)]));
+        assert!((0..read.len()).rev().all(|k| same(&kept, &read, k)));
+        // New labels hold for frames that were begun with the old ones.
+        read.expect([0]);
+        let mut renamed = kept;
+        for store in [&mut renamed, &mut read] {
+            store.relabel(|label| 1 - label.min(1));
+        }
+        assert!(same(&renamed, &read, 0));
+    }
+
+    #[test]
+    fn no_more_frames_are_read_ahead_than_there_is_room_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 8, views: 3, ..Scene::default() });
+        let store = FrameStore::open(&dataset, [1.0; 3], 0, &Stop::default()).unwrap();
+        assert!(store.len() > ahead::MOST);
+        for _ in 0..3 {
+            store.expect(0..store.len());
+            assert_eq!(store.ahead.as_ref().unwrap().begun().len(), ahead::MOST);
+        }
+    }
+
+    #[test]
+    fn a_damaged_frame_read_ahead_is_named_when_it_is_needed() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
+        let store = FrameStore::open(&dataset, [1.0; 3], 0, &Stop::default()).unwrap();
+        let image = &dataset.frames[store.index(1)].image;
+        std::fs::write(image, b"no image").unwrap();
+        store.expect([0, 1]);
+        assert!(store.get(&dataset, 0).is_ok());
+        let Err(error) = store.get(&dataset, 1) else { panic!("a damaged image was read") };
+        assert!(error.to_string().contains(&*image.file_name().unwrap().to_string_lossy()), "{error}");
     }
 }

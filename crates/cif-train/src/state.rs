@@ -11,7 +11,8 @@ use cif_render::{Blending, Gradients, InstanceSettings, RenderSettings, Rendered
 
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
-use crate::frames::FrameStore;
+use crate::error::TrainError;
+use crate::frames::{FrameStore, TrainFrame};
 use crate::guidance::{Guidance, Pulls};
 use crate::heads::{self, Head, HeadTensors, Pass, ValueHead};
 use crate::optimiser::Optimiser;
@@ -114,6 +115,13 @@ impl State {
     /// Training views that identities are estimated from.
     pub(crate) fn views_of_identities(&self) -> impl Iterator<Item = usize> + use<> {
         (0..self.frames.len()).step_by(self.config.identity.stride as usize)
+    }
+
+    /// The frame of a view of [`Self::views_of_identities`]; those behind it are read ahead.
+    pub(crate) fn frame_of_identities(&self, view: usize) -> Result<Arc<TrainFrame>, TrainError> {
+        let frame = self.frames.get(&self.dataset, view)?;
+        self.frames.expect(self.views_of_identities().filter(|later| *later > view));
+        Ok(frame)
     }
 
     /// Pulls to paths and places at a time; `None` where nothing pulls.

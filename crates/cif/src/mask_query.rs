@@ -9,8 +9,8 @@
 //!   1/5;
 //! - score of a Gaussian: `a_i / d_i`, its part of colour inside the masks;
 //! - rendered mask: `F > A / 2` with `F = sum over the chosen Gaussians of W_i` and the instance coverage A, where
-//!   the pixel belongs to any instance at all (foreground at least 1/2; without it, faint stray occupancy on the
-//!   background would count).
+//!   the foreground f is at least a gate. The paper has no such gate (0); [`GATE`] keeps faint stray occupancy on the
+//!   background out.
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;
@@ -28,6 +28,9 @@ const CHOSEN: f64 = 0.5;
 const BEST: f64 = 0.2;
 /// Share of a Gaussian's colour that has to lie inside the masks.
 const INSIDE: f64 = 0.5;
+/// Foreground from which on a pixel may belong to what was found, unless the user says otherwise: as in the instance
+/// maps of `cif eval` pictures, a pixel that is mostly background is nobody's.
+pub const GATE: f32 = 0.5;
 /// Instances per pixel that vote: exact for scenes of no more, and the rest of a pixel is nothing otherwise.
 const VOTERS: usize = 32;
 
@@ -207,7 +210,8 @@ fn rows(
         .collect()
 }
 
-/// Renders what was found in a view: true where most of what the instance pass shows is of the rows.
+/// Renders what was found in a view: true where most of what the instance pass shows is of the rows, and the foreground
+/// is at least `gate` (see [`GATE`]; 0 for none).
 ///
 /// # Panics
 /// When the field has no identities.
@@ -215,6 +219,7 @@ fn rows(
 pub fn render(
     field: &Field,
     rows: &[u32],
+    gate: f32,
     camera: &cif_geometry::PinholeCamera,
     time: f64,
     renderer: &mut Renderer,
@@ -230,7 +235,7 @@ pub fn render(
     let pixels = (0..share.values.len())
         .map(|pixel| {
             share.values[pixel] > 0.5 * layers.coverage.pixels[pixel]
-                && layers.foreground.pixels[pixel] >= 0.5
+                && layers.foreground.pixels[pixel] >= gate
         })
         .collect();
     PixelGrid::from_pixels(camera.width, camera.height, pixels)

@@ -9,7 +9,7 @@ use super::ladders::{BASE, Ladder, Work};
 use super::pareto::{Climb, amount, front, sentence};
 use super::record::Record;
 use crate::error::{Error, write_file};
-use crate::page::{STYLE, escape, picture};
+use crate::page::{self, Header, escape, picture};
 use crate::plots::{Plot, Series, svg};
 use crate::records::Records;
 
@@ -329,26 +329,18 @@ fn page(
     rows: &[Row<'_>],
     plots: &[(String, String, String)],
 ) -> Result<String, Error> {
-    let mut page = String::new();
-    let title = format!("What accuracy costs: {}", escape(&subject.capture));
-    let _ = write!(
-        page,
-        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"viewport\" \
-         content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n<style>\n{STYLE}</style>\n\
-         </head>\n<body>\n<header>\n<h1>{title}</h1>\n<p>{}</p>\n<p class=\"how\">Measured on {} with {}. Made \
-         by <code>{}</code>.</p>\n",
-        escape(&subject.description),
-        if subject.threads == 1 { "one thread".to_owned() } else { format!("{} threads", subject.threads) },
-        escape(&subject.simd),
-        escape(&subject.command),
-    );
-    if subject.missing > 0 {
-        let _ = writeln!(
-            page,
-            "<p class=\"missing\">{} rungs are not measured yet; the same command goes on with them.</p>",
-            subject.missing
-        );
-    }
+    let title = format!("What accuracy costs: {}", subject.capture);
+    let mut page = page::open(&Header {
+        title: &title,
+        heading: &title,
+        description: &subject.description,
+        threads: subject.threads,
+        simd: &subject.simd,
+        command: &subject.command,
+        missing: (subject.missing > 0).then(|| {
+            format!("{} rungs are not measured yet; the same command goes on with them.", subject.missing)
+        }),
+    });
     page += "<nav>";
     for (ladder, records) in measured.iter().filter(|(_, records)| records.iter().any(Option::is_some)) {
         debug_assert_eq!(ladder.rungs.len(), records.len());
@@ -392,9 +384,12 @@ fn page(
     if let Some(motion) = &subject.motion {
         motion_section(&mut page, motion)?;
     }
-    page += "</main>\n<footer>PSNR and SSIM are means over the held-out frames; mIoU is over pairs of instance and \
-             frame. Processor time counts all threads together and no measuring. Filled dots mark the fronts: no other \
-             trained rung is both cheaper and better.</footer>\n</body>\n</html>\n";
+    page::close(
+        &mut page,
+        "PSNR and SSIM are means over the held-out frames; mIoU is over pairs of instance and frame. Processor time counts \
+         all threads together and no measuring. Filled dots mark the fronts: no other trained rung is both cheaper and \
+         better.",
+    );
     Ok(page)
 }
 
@@ -404,21 +399,11 @@ fn motion_section(page: &mut String, motion: &Motion) -> Result<(), Error> {
     if !motion.rows.is_empty() {
         page.push_str(
             "<p>Of the base as it is exported by default, against the followed surface points of the capture: mean \
-             distance from the true points, the same had nothing moved, and shares of points within a distance.</p>\n\
-             <div class=\"wide\"><table>\n<thead><tr>",
+             distance from the true points, the same had nothing moved, and shares of points within a distance.</p>\n",
         );
-        for heading in &motion.headings {
-            let _ = write!(page, "<th>{}</th>", escape(heading));
-        }
-        page.push_str("</tr></thead>\n<tbody>\n");
-        for row in &motion.rows {
-            page.push_str("<tr>");
-            for cell in row {
-                let _ = write!(page, "<td>{}</td>", escape(cell));
-            }
-            page.push_str("</tr>\n");
-        }
-        page.push_str("</tbody></table></div>\n");
+        let headings: Vec<String> = motion.headings.iter().map(|heading| escape(heading)).collect();
+        let rows = motion.rows.iter().map(|row| ("", row.iter().map(|cell| escape(cell)).collect()));
+        page::table(page, headings.iter().map(String::as_str), rows);
     }
     if let Some(path) = &motion.picture {
         page.push_str("<div class=\"pictures\">\n");
@@ -461,7 +446,7 @@ fn figures(page: &mut String, plots: &[(String, String, String)], prefix: &str) 
     for (name, caption, text) in plots.iter().filter(|(name, ..)| name.starts_with(prefix)) {
         let whole = name == prefix || prefix.ends_with('-');
         if whole {
-            let _ = writeln!(page, "<figure>{text}<figcaption>{}</figcaption></figure>", escape(caption));
+            page::figure(page, text, caption);
         }
     }
 }
@@ -534,19 +519,10 @@ fn table(page: &mut String, kind: Kind, rows: &[&Row<'_>]) {
                 .push(("largest residual, world units", Box::new(move |row| number(row.record.residual, 5))));
         }
     }
-    page.push_str("<div class=\"wide\"><table>\n<thead><tr>");
-    for (name, _) in &columns {
-        let _ = write!(page, "<th>{name}</th>");
-    }
-    page.push_str("</tr></thead>\n<tbody>\n");
-    for row in rows {
-        page.push_str(if row.id == BASE { "<tr class=\"base\">" } else { "<tr>" });
-        for (_, cell) in &columns {
-            let _ = write!(page, "<td>{}</td>", cell(row));
-        }
-        page.push_str("</tr>\n");
-    }
-    page.push_str("</tbody></table></div>\n");
+    let tag = |row: &&&Row<'_>| if row.id == BASE { " class=\"base\"" } else { "" };
+    let cells = |row: &&Row<'_>| columns.iter().map(|(_, cell)| cell(row)).collect();
+    let headings = columns.iter().map(|(name, _)| *name);
+    page::table(page, headings, rows.iter().map(|row| (tag(&row), cells(row))));
 }
 
 /// The same frame of every rung that has pictures, the captured one first.

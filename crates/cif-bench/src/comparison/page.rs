@@ -1,18 +1,18 @@
 //! The page of a comparison, and its tables as files.
 
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use cif_geometry::PixelGrid;
 use image::ImageReader;
 
 use super::crops::Crop;
 use super::record::Record;
-use super::tables::{MEASURES, Subject, cells};
+use super::tables::{MEASURES, Missing, Subject, cells};
 use super::title;
 use crate::accuracy::measure::save;
 use crate::error::{Error, write_file};
-use crate::page::{STYLE, escape, picture};
+use crate::page::{self, Header, close, escape, open, picture, video};
 use crate::plots::{Plot, Series, svg};
 use crate::records::Records;
 
@@ -28,7 +28,9 @@ pub struct Comparison {
     /// Vector instructions used.
     pub simd: String,
     /// Runs that are not done yet.
-    pub missing: usize,
+    pub missing: Vec<Missing>,
+    /// Videos, by capture.
+    pub videos: Vec<Video>,
     /// Heads in the order of tables.
     pub heads: Vec<String>,
     /// True when ablations were asked for.
@@ -37,6 +39,17 @@ pub struct Comparison {
     pub camera: String,
     /// Colour of pixels without a label in pictures of labels.
     pub empty: [u8; 3],
+}
+
+/// A video of the runs of a capture.
+#[derive(Clone, Debug)]
+pub struct Video {
+    /// Name of the capture.
+    pub capture: String,
+    /// MP4 file.
+    pub file: PathBuf,
+    /// Its parts, from left to right.
+    pub parts: Vec<String>,
 }
 
 /// Numbers of the ablations, in the order of tables; the last is the whole method.
@@ -63,9 +76,15 @@ pub fn write(
     let whole = panoptic.iter().filter(|row| row.head == "cif").cloned();
     ablation.extend(whole.map(|row| super::record::Row { head: "v".to_owned(), ..row }));
     let ablations = ABLATIONS.map(str::to_owned);
-    let of_heads =
-        Subject { rows: &panoptic, names: &comparison.heads, camera: &comparison.camera, ablation: false };
-    let of_parts = Subject { rows: &ablation, names: &ablations, camera: "", ablation: true };
+    let missing = &comparison.missing;
+    let of_heads = Subject {
+        rows: &panoptic,
+        names: &comparison.heads,
+        camera: &comparison.camera,
+        ablation: false,
+        missing,
+    };
+    let of_parts = Subject { rows: &ablation, names: &ablations, camera: "", ablation: true, missing };
     let mut subjects = vec![("panoptic", &of_heads)];
     if comparison.ablations {
         subjects.push(("ablation", &of_parts));
@@ -91,68 +110,61 @@ fn page(
     subjects: &[(&str, &Subject<'_>)],
     records: &[Record],
 ) -> Result<String, Error> {
-    let mut page = String::new();
-    let threads = match comparison.threads {
-        1 => "one thread".to_owned(),
-        threads => format!("{threads} threads"),
-    };
-    let _ = write!(
-        page,
-        "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta name=\"viewport\" \
-         content=\"width=device-width, initial-scale=1\">\n<title>Comparison</title>\n<style>\n{STYLE}</style>\n\
-         </head>\n<body>\n<header>\n<h1>The method beside others, on one reconstruction</h1>\n<p>{}</p>\n\
-         <p class=\"how\">Measured on {threads} with {}. Made by <code>{}</code>.</p>\n",
-        escape(&comparison.description),
-        escape(&comparison.simd),
-        escape(&comparison.command),
-    );
-    if comparison.missing > 0 {
-        let _ = writeln!(
-            page,
-            "<p class=\"missing\">{} runs are not done yet; the same command goes on with them.</p>",
-            comparison.missing
-        );
-    }
+    let mut page = open(&Header {
+        title: "Comparison",
+        heading: "The method beside others, on one reconstruction",
+        description: &comparison.description,
+        threads: comparison.threads,
+        simd: &comparison.simd,
+        command: &comparison.command,
+        missing: (!comparison.missing.is_empty()).then(|| {
+            format!("{} runs are not done yet; the same command goes on with them.", comparison.missing.len())
+        }),
+    });
     page += "</header>\n<main>\n";
     for (name, subject) in subjects {
         let heading = if subject.ablation { "Without parts of the method" } else { "Panoptic segmentation" };
         let _ = writeln!(page, "<section id=\"{name}\">\n<h2>{heading}</h2>");
         for table in subject.tables() {
-            let _ = write!(
-                page,
-                "<h3>{}</h3>\n<div class=\"wide\"><table>\n<thead><tr><th></th>",
-                escape(&table.caption)
-            );
-            for measure in &MEASURES {
-                let _ = write!(page, "<th>{}</th>", measure.name);
-            }
-            let _ = write!(page, "<th>{}</th></tr></thead>\n<tbody>\n", escape(&subject.published_heading()));
-            for line in &table.lines {
-                let _ = write!(page, "<tr><td>{}</td>", escape(&line.title));
-                for (text, best) in cells(line) {
-                    let text = escape(&text);
-                    let _ = match best {
-                        true => write!(page, "<td><strong>{text}</strong></td>"),
-                        false => write!(page, "<td>{text}</td>"),
-                    };
-                }
-                let _ = writeln!(page, "<td>{}</td></tr>", escape(&line.published));
-            }
-            page += "</tbody></table></div>\n";
+            let _ = writeln!(page, "<h3>{}</h3>", escape(&table.caption));
+            let published = escape(&subject.published_heading());
+            let measures = MEASURES.iter().map(|measure| measure.name);
+            let headings = std::iter::once("").chain(measures).chain([published.as_str()]);
+            let rows = table.lines.iter().map(|line| {
+                let cell = |(text, best): (String, bool)| match best {
+                    true => format!("<strong>{}</strong>", escape(&text)),
+                    false => escape(&text),
+                };
+                let measured = cells(line).into_iter().map(cell);
+                let row = std::iter::once(escape(&line.title)).chain(measured);
+                ("", row.chain([escape(&line.published)]).collect())
+            });
+            page::table(&mut page, headings, rows);
         }
         for note in subject.notes() {
             let _ = writeln!(page, "<p class=\"how\">{}</p>", escape(&note));
         }
         if let Some(plot) = costs(subject) {
             let caption = "Accuracy against what it costs in time; a dot per capture and seed.";
-            let _ = writeln!(page, "<figure>{plot}<figcaption>{caption}</figcaption></figure>");
+            page::figure(&mut page, &plot, caption);
         }
         page += "</section>\n";
     }
     pictures(&mut page, runs, comparison, records)?;
-    page += "</main>\n<footer>Accuracies and IoU are percent over labelled pixels of the held-out frames: mAcc-pix per \
-             frame, mAcc-inst per instance, mIoU per pair of instance and frame. Every row but Trace3D has the Gaussians of \
-             the same reconstruction, the same masks and the same frames.</footer>\n</body>\n</html>\n";
+    if !comparison.videos.is_empty() {
+        page += "<section id=\"videos\">\n<h2>Along the held-out frames</h2>\n";
+        for shown in &comparison.videos {
+            let _ = writeln!(page, "<h3>{}</h3>", escape(&shown.capture));
+            video(&mut page, &shown.file, &format!("From left to right: {}.", shown.parts.join(", ")))?;
+        }
+        page += "</section>\n";
+    }
+    close(
+        &mut page,
+        "Accuracies and IoU are percent over labelled pixels of the held-out frames: mAcc-pix per frame, mAcc-inst per \
+         instance, mIoU per pair of instance and frame. Every row but Trace3D has the Gaussians of the same reconstruction, \
+         the same masks and the same frames.",
+    );
     Ok(page)
 }
 
@@ -276,22 +288,31 @@ mod tests {
             command: "cif bench compare table".into(),
             threads: 2,
             simd: "Avx2".into(),
-            missing: 1,
+            videos: vec![Video {
+                capture: "table <1>".into(),
+                file: runs.file("table.mp4"),
+                parts: vec!["colours".into(), "CIF".into()],
+            }],
+            missing: vec![Missing { capture: "table <1>".into(), head: "vlgs".into(), seed: 1 }],
             heads: ["cif", "vlgs"].map(str::to_owned).to_vec(),
             ablations: true,
             camera: String::new(),
             empty: [0; 3],
         };
+        std::fs::write(runs.file("table.mp4"), b"video").unwrap();
         write(folder.path(), &runs, &comparison, &records).unwrap();
         let text = |name: &str| std::fs::read_to_string(folder.path().join(name)).unwrap();
         let page = text("compare.html");
         for part in [
             "table &lt;1&gt;",
             "1 runs are not done yet",
+            "table &lt;1&gt; with VLGS (re-implementation) (seed 1)",
             "VLGS (re-implementation)",
             "(i) constant occupancy",
             "(v) full",
             "Where they differ most",
+            "src=\"data:video/mp4;base64,dmlkZW8=\"",
+            "From left to right: colours, CIF.",
             "<strong>72.00</strong>",
         ] {
             assert!(page.contains(part), "{part}");
@@ -313,7 +334,7 @@ mod tests {
                 assert!(!text(&format!("{name}.{extension}")).is_empty());
             }
         }
-        let alone = Comparison { ablations: false, missing: 0, ..comparison };
+        let alone = Comparison { ablations: false, missing: Vec::new(), ..comparison };
         let other = tempfile::tempdir().unwrap();
         write(other.path(), &runs, &alone, &records[..2]).unwrap();
         assert!(!other.path().join("ablation.md").exists());

@@ -13,20 +13,50 @@ use crate::Error;
 /// Folder inside a capture that holds extracted frames.
 const CACHE: &str = ".cif_frames";
 
-/// The frames of a video as PNG files in order (`0000.png`, ...), extracted unless an earlier call did so.
+/// Frames that are wanted of a video.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Extraction {
+    /// Most frames, from the start on.
+    pub(crate) most: u32,
+    /// Width and height that larger frames are reduced to by area averages, pixels; `None` leaves them as they are.
+    pub(crate) size: Option<[u32; 2]>,
+}
+
+impl Extraction {
+    /// Folder of such frames of a video.
+    fn folder(self, video: &str) -> String {
+        match self.size {
+            Some([width, height]) => format!("{video}-{}-{width}x{height}", self.most),
+            None => format!("{video}-{}", self.most),
+        }
+    }
+}
+
+/// Frames of a video as PNG files in order (`0000.png`, ...), extracted unless an earlier call did so.
 ///
-/// They lie in `.cif_frames/<stem>` inside `root`, or in the system's temporary folder where `root` cannot be
-/// written. `images` is where a person would put extracted frames (for the message).
+/// They lie in `.cif_frames/<stem>-<most>[-<width>x<height>]` inside `root`, or in the system's temporary folder where
+/// `root` cannot be written. `images` is where a person would put extracted frames (for the message).
 ///
 /// # Errors
 /// When ffmpeg is missing or fails.
-pub(crate) fn frames(root: &Path, video: &Path, images: &Path) -> Result<Vec<PathBuf>, Error> {
-    frames_with(OsStr::new("ffmpeg"), root, video, images)
+pub(crate) fn frames(
+    root: &Path,
+    video: &Path,
+    images: &Path,
+    wanted: Extraction,
+) -> Result<Vec<PathBuf>, Error> {
+    frames_with(OsStr::new("ffmpeg"), root, video, images, wanted)
 }
 
-fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Result<Vec<PathBuf>, Error> {
+fn frames_with(
+    ffmpeg: &OsStr,
+    root: &Path,
+    video: &Path,
+    images: &Path,
+    wanted: Extraction,
+) -> Result<Vec<PathBuf>, Error> {
     cif_input::check(video).map_err(Error::read(video))?;
-    let name = listing::stem(video);
+    let name = wanted.folder(&listing::stem(video));
     let caches =
         [root.join(CACHE), std::env::temp_dir().join(format!("cif_frames_{:016x}", fingerprint(root)))];
     let changed = |path: &Path| std::fs::metadata(path).and_then(|data| data.modified()).ok();
@@ -46,6 +76,10 @@ fn frames_with(ffmpeg: &OsStr, root: &Path, video: &Path, images: &Path) -> Resu
     let output = Command::new(ffmpeg)
         .args(["-nostdin", "-v", "error", "-i"])
         .arg(video)
+        .args(["-frames:v", &wanted.most.to_string()])
+        .args(wanted.size.iter().flat_map(|[width, height]| {
+            ["-vf".to_owned(), format!("scale='min(iw,{width})':'min(ih,{height})':flags=area")]
+        }))
         .args(["-start_number", "0"])
         .arg(partial.join("%04d.png"))
         .output();
@@ -108,6 +142,7 @@ mod tests {
             root.path(),
             &video,
             &root.path().join("cam00/images"),
+            Extraction { most: 300, size: None },
         )
         .unwrap_err()
         .to_string();
@@ -133,11 +168,16 @@ mod tests {
         .unwrap();
         std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
         let images = root.path().join("cam00/images");
-        let first = frames_with(program.as_os_str(), root.path(), &video, &images).unwrap();
+        let wanted = Extraction { most: 300, size: Some([9, 5]) };
+        let first = frames_with(program.as_os_str(), root.path(), &video, &images, wanted).unwrap();
         assert_eq!(first.len(), 2);
-        assert!(first[0].ends_with(".cif_frames/cam00/0000.png"));
+        assert!(first[0].ends_with(".cif_frames/cam00-300-9x5/0000.png"));
         // The second call needs no program.
-        let second = frames_with(OsStr::new("no-such-program"), root.path(), &video, &images).unwrap();
+        let second =
+            frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, wanted).unwrap();
         assert_eq!(first, second);
+        // Other frames are others.
+        let fewer = Extraction { most: 1, ..wanted };
+        assert!(frames_with(OsStr::new("no-such-program"), root.path(), &video, &images, fewer).is_err());
     }
 }

@@ -68,6 +68,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let splits = splits(&list, &list_path, &mut warnings)?;
     let mut frames = Vec::with_capacity(splits.len());
     let mut last_warp = 0;
+    let mut without_image = Vec::new();
     for (id, split) in &splits {
         let entry = metadata.get(id).ok_or_else(|| {
             Error::invalid(
@@ -84,6 +85,11 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         let image = match (image, listing::is_there(&camera_path)) {
             (Some(image), true) => image,
             (Some(image), false) => return Err(Error::ImageWithoutCamera { image, camera: camera_path }),
+            // Published lists name frames that were taken out of the folder of images again.
+            (None, _) if *split == Split::Train => {
+                without_image.push(id.as_str());
+                continue;
+            }
             (None, _) => {
                 return Err(Error::CameraWithoutImage {
                     frame: id.clone(),
@@ -105,7 +111,16 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     for frame in &mut frames {
         frame.time /= last_warp.max(1) as f64;
     }
-    let unlisted = listing::images(&images)?.len().saturating_sub(list.ids.len());
+    if !without_image.is_empty() {
+        warnings.push(format!(
+            "{}: {} training frames have no image in {} and are left out: {}",
+            list_path.display(),
+            without_image.len(),
+            images.display(),
+            some_of(without_image.iter().copied())
+        ));
+    }
+    let unlisted = listing::images(&images)?.len().saturating_sub(list.ids.len() - without_image.len());
     if unlisted > 0 {
         warnings.push(format!(
             "{}: {unlisted} images are not listed in dataset.json and are not used",

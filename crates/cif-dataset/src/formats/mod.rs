@@ -15,6 +15,7 @@ mod transforms;
 
 pub(crate) use colmap::sparse_folder as colmap_sparse_folder;
 
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use cif_geometry::{LensDistortion, RigidTransform};
@@ -41,7 +42,28 @@ pub(crate) struct Draft {
     /// Half edge of the box for random points around the origin, for layouts that have a customary one.
     pub(crate) random_box: Option<f64>,
     pub(crate) frames_per_second: Option<f64>,
+    /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
+    pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
+}
+
+impl Draft {
+    /// Takes the frames of cameras out that are not wanted.
+    ///
+    /// # Errors
+    /// When there is no such camera.
+    pub(crate) fn leave_out(&mut self, root: &Path, unwanted: &[String]) -> Result<(), Error> {
+        let known: BTreeSet<&str> = self.frames.iter().map(|frame| frame.camera_name.as_str()).collect();
+        let missing = |name: &&String| !known.contains(name.as_str()) && !self.left_out.contains(*name);
+        if let Some(name) = unwanted.iter().find(missing) {
+            return Err(Error::invalid(
+                root,
+                format!("it has no camera {name} to leave out; its cameras: {}", some_of(known.into_iter())),
+            ));
+        }
+        self.frames.retain(|frame| !unwanted.contains(&frame.camera_name));
+        Ok(())
+    }
 }
 
 /// One frame as its files tell it.

@@ -7,13 +7,17 @@ use cif_geometry::LensDistortion;
 use glam::{DMat3, DVec2, DVec3};
 
 use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, customary_points, some_of, world_to_camera};
-use crate::files::{listing, npy, video};
+use crate::dataset::DEFAULT_VIDEO_FRAMES;
+use crate::files::video::{self, Extraction};
+use crate::files::{image, listing, npy};
+use crate::load::reduced_size;
 use crate::{Error, Split};
 
 /// One camera of the rig with its images in order.
 struct View {
     name: String,
     images: Vec<PathBuf>,
+    camera: DraftCamera,
 }
 
 pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
@@ -30,19 +34,21 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
             ),
         ));
     }
-    let views = views(root)?;
-    if views.len() != poses.rows {
-        return Err(Error::invalid(
-            &poses_path,
-            format!(
-                "it has {} cameras, but the capture has images of {} ({}): a camera without images or images \
-                 without a camera; rows belong to the camera folders in name order",
-                poses.rows,
-                views.len(),
-                some_of(views.iter().map(|view| view.name.as_str()))
-            ),
-        ));
+    let (names, left_out) = cameras(root, &poses_path, poses.rows, &source.options.without_cameras)?;
+    let row = |row: usize| &poses.values[row * poses.columns..][..15];
+    let mut views = Vec::new();
+    for (at, name) in names.into_iter().enumerate() {
+        if left_out.contains(&name) {
+            continue;
+        }
+        let camera = camera(&poses_path, row(at));
+        let images = images(source, &name, camera.size)?;
+        views.push(View { name, images, camera });
     }
+    let Some(first) = views.first() else {
+        return Err(Error::invalid(root, "every camera is left out; keep one to train on"));
+    };
+    let stored_reduction = stored_reduction(first)?;
 
     // Frames of different cameras belong together by name; a step that some camera lacks still counts.
     let steps: BTreeSet<String> =
@@ -57,7 +63,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     if held_out != "cam00" {
         warnings.push(format!("{}: there is no cam00; {held_out} is held out instead", root.display()));
     }
-    for (row, view) in views.iter().enumerate() {
+    for view in &views {
         if view.images.len() < steps.len() {
             warnings.push(format!(
                 "{}: {} of {} frames are missing",
@@ -66,7 +72,6 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
                 steps.len()
             ));
         }
-        let camera = camera(&poses_path, &poses.values[row * poses.columns..][..15]);
         for image in &view.images {
             let stem = listing::stem(image);
             let step = steps
@@ -79,11 +84,12 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
                 split: if view.name == held_out && views.len() > 1 { Split::Val } else { Split::Train },
                 image: image.clone(),
                 mask: None,
-                camera: camera.clone(),
+                camera: view.camera.clone(),
             });
         }
     }
-    Ok(Draft { frames, stored_reduction: 1, points: customary_points(root)?, warnings, ..Draft::default() })
+    let points = customary_points(root)?;
+    Ok(Draft { frames, stored_reduction, points, left_out, warnings, ..Draft::default() })
 }
 
 /// True when a name is that of a camera: `cam` and digits.
@@ -91,38 +97,21 @@ fn is_camera(name: &str) -> bool {
     name.strip_prefix("cam").is_some_and(|rest| !rest.is_empty() && rest.chars().all(|c| c.is_ascii_digit()))
 }
 
-/// Cameras in name order: images where there are any, else the video.
-fn views(root: &Path) -> Result<Vec<View>, Error> {
-    let names: BTreeSet<String> = listing::entries(root)?
+/// Names of the cameras in the order of the rows of poses, and those of them that are left out. A camera that is left
+/// out keeps its row, whether its files are there or not.
+fn cameras(
+    root: &Path,
+    poses_path: &Path,
+    rows: usize,
+    unwanted: &[String],
+) -> Result<(Vec<String>, Vec<String>), Error> {
+    let there: BTreeSet<String> = listing::entries(root)?
         .iter()
         .filter(|path| path.is_dir() || listing::has_extension(path, &["mp4"]))
         .map(|path| listing::stem(path))
         .filter(|name| is_camera(name))
         .collect();
-    let mut views = Vec::new();
-    for name in names {
-        let folder = root.join(&name);
-        let mut images = listing::images(&folder.join("images"))?;
-        if images.is_empty() {
-            images = listing::images(&folder)?;
-        }
-        let movie = root.join(format!("{name}.mp4"));
-        if images.is_empty() && listing::is_there(&movie) {
-            images = video::frames(root, &movie, &folder.join("images"))?;
-        }
-        if images.is_empty() {
-            return Err(Error::MissingFile {
-                path: folder.join("images"),
-                fix: format!("give the images of this camera there, or {name}.mp4 beside it"),
-            });
-        }
-        if let Some(pair) = images.windows(2).find(|pair| listing::stem(&pair[0]) == listing::stem(&pair[1]))
-        {
-            return Err(Error::DuplicateFrame { path: folder, frame: listing::stem(&pair[0]) });
-        }
-        views.push(View { name, images });
-    }
-    if views.is_empty() {
+    if there.is_empty() {
         return Err(Error::MissingFile {
             path: root.join("cam00"),
             fix: "poses_bounds.npy needs camXX/images or camXX.mp4 beside it; for a static capture of one image \
@@ -130,7 +119,68 @@ fn views(root: &Path) -> Result<Vec<View>, Error> {
                 .to_owned(),
         });
     }
-    Ok(views)
+    let unwanted = unwanted.iter().filter(|name| is_camera(name)).cloned();
+    let all: BTreeSet<String> = there.iter().cloned().chain(unwanted.clone()).collect();
+    let names = if all.len() == rows { all } else { there };
+    if names.len() != rows {
+        return Err(Error::invalid(
+            poses_path,
+            format!(
+                "it has {rows} cameras, but the capture has images of {} ({}): a camera without images or images \
+                 without a camera; rows belong to the camera folders in name order",
+                names.len(),
+                some_of(names.iter().map(String::as_str))
+            ),
+        ));
+    }
+    let left_out = unwanted.filter(|name| names.contains(name)).collect();
+    Ok((names.into_iter().collect(), left_out))
+}
+
+/// Images of a camera in order where there are any, else the frames of its video, reduced while they are decoded.
+/// `captured` is the size that its pose is of, pixels.
+fn images(source: &Source<'_>, name: &str, captured: Option<DVec2>) -> Result<Vec<PathBuf>, Error> {
+    let (root, options) = (source.root, source.options);
+    let folder = root.join(name);
+    let mut images = listing::images(&folder.join("images"))?;
+    if images.is_empty() {
+        images = listing::images(&folder)?;
+    }
+    let movie = root.join(format!("{name}.mp4"));
+    if images.is_empty() && listing::is_there(&movie) {
+        let reduction = options.downscale.filter(|reduction| *reduction > 1);
+        let size =
+            reduction.zip(captured.filter(|size| size.min_element() >= 1.0)).map(|(reduction, size)| {
+                let (width, height) = reduced_size(size.x as u32, size.y as u32, reduction);
+                [width, height]
+            });
+        let most = options.video_frames.unwrap_or(DEFAULT_VIDEO_FRAMES);
+        images = video::frames(root, &movie, &folder.join("images"), Extraction { most, size })?;
+    }
+    if images.is_empty() {
+        return Err(Error::MissingFile {
+            path: folder.join("images"),
+            fix: format!("give the images of this camera there, or {name}.mp4 beside it"),
+        });
+    }
+    if let Some(pair) = images.windows(2).find(|pair| listing::stem(&pair[0]) == listing::stem(&pair[1])) {
+        return Err(Error::DuplicateFrame { path: folder, frame: listing::stem(&pair[0]) });
+    }
+    Ok(images)
+}
+
+/// Reduction of the images relative to the size that poses are of, as preprocessing by others leaves them; 1 where it
+/// is no whole number, or differs between width and height by more than rounding.
+fn stored_reduction(view: &View) -> Result<u32, Error> {
+    let Some(captured) = view.camera.size else { return Ok(1) };
+    let header = image::probe(&view.images[0])?;
+    let factor = (captured.x / f64::from(header.width)).round();
+    if !(1.0..=64.0).contains(&factor) {
+        return Ok(1);
+    }
+    let rounded = |captured: f64, stored: u32| (captured / factor - f64::from(stored)).abs() <= 1.0;
+    let fits = rounded(captured.x, header.width) && rounded(captured.y, header.height);
+    Ok(if fits { factor as u32 } else { 1 })
 }
 
 /// A 3 x 5 pose, row by row: columns down, right, back, position, (H, W, f).

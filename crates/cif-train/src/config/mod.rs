@@ -14,8 +14,8 @@ use cif_field::{Heads, SortMetric, TimeEncoding};
 use serde::{Deserialize, Serialize};
 
 pub use options::{
-    Ablation, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart, Preset,
-    ScaleCorrection, WeakSet,
+    Ablation, Excess, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart,
+    Preset, ScaleCorrection, WeakSet,
 };
 pub use validate::ConfigError;
 
@@ -39,7 +39,8 @@ pub struct TrainConfig {
     pub antialiased: bool,
     /// Depth order, `z` or `distance`, default `z`.
     pub sort_metric: SortMetric,
-    /// Memory for decoded training frames, MiB, default 1024; frames beyond it are decoded when needed.
+    /// Memory for decoded training frames, MiB, default 1024; frames beyond it are decoded ahead of the
+    /// steps that need them, at most 8 at a time, which takes memory of its own.
     pub frame_memory_mib: u32,
     /// Length of the stages.
     pub stages: StagesConfig,
@@ -319,6 +320,12 @@ pub struct ResampleConfig {
     pub gamma_floor: f32,
     /// Candidates of weak draws, `members` (default) or `literal` (A10).
     pub weak_set: WeakSet,
+    /// Largest share of the candidates of an instance that one event relocates, (0, 1], default 0.5. The paper states
+    /// no limit: with 1 (as in `paper`) only one member of the instance is sure to stay, so that there is something to
+    /// copy.
+    pub weak_share: f32,
+    /// Relocations beyond that share, `drop` (default) or `share` (to the other instances, as in `paper`).
+    pub excess: Excess,
     /// Scale correction, `off` (default) or `mcmc` (A13).
     pub scale_correction: ScaleCorrection,
     /// Shares of the instances, `equal` (default), `gamma` or `pixels` (A8).

@@ -158,6 +158,18 @@ pub enum WeakSet {
     Literal,
 }
 
+/// Relocations that an instance has too few weak candidates for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Excess {
+    /// They are left out: the event relocates fewer Gaussians than its rate says.
+    #[default]
+    Drop,
+    /// They go to the instances that have candidates left, in proportion to the shares of these: the paper states the
+    /// rate as one of all Gaussians.
+    Share,
+}
+
 /// Correction of scales on relocation (A13; methods reference 6.4).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

@@ -69,7 +69,14 @@ fn paper(layout: Layout) -> TrainConfig {
         ..config.densify
     };
     config.instance.geometry = super::InstanceGeometry::Full;
-    config.resample = ResampleConfig { from: 100, until: 2_500, every: 100, ..config.resample };
+    config.resample = ResampleConfig {
+        from: 100,
+        until: 2_500,
+        every: 100,
+        weak_share: 1.0,
+        excess: super::Excess::Share,
+        ..config.resample
+    };
     // The published method has no such losses.
     config.motion = MotionConfig {
         guidance: 0.0,
@@ -112,6 +119,7 @@ fn paper(layout: Layout) -> TrainConfig {
             config.loss.lambda_instance = 0.005;
             config.densify.until = 10_000;
             config.densify.opacity_reset_every = 60_000;
+            config.resample.rate = 0.05;
         }
         Layout::Nerfstudio | Layout::Colmap => {}
     }
@@ -278,6 +286,8 @@ impl Default for ResampleConfig {
             rate: 0.01,
             gamma_floor: 1e-3,
             weak_set: super::WeakSet::Members,
+            weak_share: 0.5,
+            excess: super::Excess::Drop,
             scale_correction: super::ScaleCorrection::Off,
             label_shares: super::LabelShares::Equal,
             offset: 0.5,

@@ -26,7 +26,11 @@ fn the_paper_preset_follows_the_dataset_type() {
     assert_eq!(hyper.densify.prune_min_n, 200_000);
     let neu = TrainConfig::preset(Preset::Paper, Layout::Neu3d);
     assert!(neu.model.heads.opacity && neu.model.heads.sh);
-    assert_eq!(neu.loss.lambda_instance, 0.005);
+    assert_eq!((neu.loss.lambda_instance, neu.resample.rate), (0.005, 0.05));
+    assert_eq!(hyper.resample.rate, 0.01);
+    assert_eq!((hyper.resample.weak_share, hyper.resample.excess), (1.0, Excess::Share));
+    let reductions = LAYOUTS.map(|layout| TrainConfig::preset(Preset::Paper, layout).downscale);
+    assert_eq!(reductions, [Some(2), Some(2), None, None, None]);
     let dnerf = TrainConfig::preset(Preset::Paper, Layout::DNerf);
     assert_eq!(dnerf.rates.mlp, [1.6e-4, 1.6e-6]);
     assert_eq!(dnerf.densify.prune_every, 8_000);
@@ -48,7 +52,7 @@ fn absent_keys_take_defaults_and_unknown_keys_are_refused() {
 #[test]
 fn impossible_settings_are_refused_by_key() {
     type Change = fn(&mut TrainConfig);
-    let changes: [(&str, Change); 11] = [
+    let changes: [(&str, Change); 13] = [
         ("stages.batch", |c| c.stages.batch = 0),
         ("stages.batch", |c| c.stages.batch = u32::MAX),
         ("near", |c| c.near = f32::NAN),
@@ -58,6 +62,8 @@ fn impossible_settings_are_refused_by_key() {
         ("rates.means", |c| c.rates.means = [1e-4, 0.0]),
         ("rates.opacity", |c| c.rates.opacity = f32::INFINITY),
         ("resample.gamma_floor", |c| c.resample.gamma_floor = 0.0),
+        ("resample.weak_share", |c| c.resample.weak_share = 0.0),
+        ("resample.weak_share", |c| c.resample.weak_share = 1.01),
         ("instance.occupancy_limits", |c| c.instance.occupancy_limits = [0.5, 0.1]),
         ("instance.ablate", |c| {
             c.instance.ablate.extend([Ablation::ConstantOccupancy, Ablation::OpacityOccupancy]);

@@ -164,6 +164,12 @@ impl TrainConfig {
             resample.gamma_floor,
             "expected a number in (0, 1]",
         )?;
+        check(
+            resample.weak_share > 0.0 && resample.weak_share <= 1.0,
+            "resample.weak_share",
+            resample.weak_share,
+            "expected a number in (0, 1]",
+        )?;
         at_least("report.step_every", self.report.step_every, 1, "expected at least 1")?;
         at_least("report.evaluate_frames", self.report.evaluate_frames, 1, "expected at least 1")
     }

@@ -341,7 +341,7 @@ impl Engine for Processor {
         let mut frames = 0;
         for view in state.views_of_identities() {
             state.stop.check()?;
-            let data = state.frames.get(&state.dataset, view)?;
+            let data = state.frame_of_identities(view)?;
             let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
             let frame = &state.dataset.frames[state.frames.index(view)];
             let (camera, time) = (&frame.camera, frame.time);

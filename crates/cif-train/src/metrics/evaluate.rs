@@ -15,7 +15,8 @@ use crate::config::TrainConfig;
 use crate::exposure::trained_exposures;
 use crate::heads::Decoder;
 
-use super::image::{psnr, ssim, unit_color};
+use super::covisible::TrainingViews;
+use super::image::{masked_psnr, psnr, ssim, unit_color};
 use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
 
 /// Frames to score, and settings by which they are rendered.
@@ -29,6 +30,8 @@ pub struct EvaluationOptions<'a> {
     pub simd: SimdLevel,
     /// Also render depth, for pictures.
     pub depth: bool,
+    /// Also score over the pixels that training views show, see [`super::covisible`]; renders them first.
+    pub covisible: bool,
     /// Head that tells the labels of pixels; `None` where the identity rows do.
     pub decoder: Option<&'a Decoder>,
 }
@@ -38,7 +41,14 @@ impl EvaluationOptions<'_> {
     #[must_use]
     pub fn held_out(field: &Field) -> Self {
         let settings = trained_settings(field);
-        Self { split: Split::Val, settings, simd: SimdLevel::Auto, depth: false, decoder: None }
+        Self {
+            split: Split::Val,
+            settings,
+            simd: SimdLevel::Auto,
+            depth: false,
+            covisible: false,
+            decoder: None,
+        }
     }
 }
 
@@ -85,6 +95,10 @@ pub struct FrameScores {
     pub time: f64,
     /// dB; `None` when the pictures agree exactly.
     pub psnr: Option<f64>,
+    /// The same over co-visible pixels; `None` when they agree exactly, there are none, or nobody asked.
+    pub psnr_covisible: Option<f64>,
+    /// Percent of the pixels that are co-visible; `None` when nobody asked.
+    pub covisible: Option<f64>,
     /// Structural similarity.
     pub ssim: f64,
     /// Percent of labelled pixels predicted right; `None` without labelled pixels or identities.
@@ -100,6 +114,10 @@ pub struct Scores {
     pub frames: usize,
     /// Mean over images with a finite value, dB.
     pub psnr: Option<f64>,
+    /// The same over co-visible pixels.
+    pub psnr_covisible: Option<f64>,
+    /// Mean percent of the pixels that are co-visible.
+    pub covisible: Option<f64>,
     /// Images left out of the mean because they agree exactly.
     pub psnr_infinite: usize,
     /// Mean over images.
@@ -141,7 +159,9 @@ pub fn evaluate<E: From<EvaluationError>>(
     let exposures = trained_exposures(field);
     let mut exposed_frames = 0;
     let by_rows = options.settings.instances.is_some() && options.decoder.is_none();
-    let channels = Channels { depth: options.depth, instances: by_rows };
+    let channels = Channels { depth: options.depth || options.covisible, instances: by_rows };
+    let training_views =
+        options.covisible.then(|| TrainingViews::of(field, dataset, &options.settings, &mut renderer));
     let mut frames: Vec<FrameScores> = Vec::new();
     let mut confusions: Vec<Option<FrameConfusion>> = Vec::new();
     for (index, frame) in dataset.frames.iter().enumerate().filter(|(_, f)| f.split == options.split) {
@@ -167,11 +187,22 @@ pub fn evaluate<E: From<EvaluationError>>(
             _ => None,
         };
         let target = unit_color(&truth.image);
+        let shown = training_views.as_ref().map(|views| views.show(&frame.camera, &rendered));
+        if !options.depth {
+            rendered.depth = None;
+        }
+        let covisible = shown.as_ref().map(|shown| {
+            let count = shown.pixels.iter().filter(|shown| **shown).count();
+            100.0 * count as f64 / shown.pixels.len() as f64
+        });
+        let psnr_covisible = shown.and_then(|shown| masked_psnr(&rendered.color, &target, &shown));
         let scores = FrameScores {
             name: frame.name.clone(),
             group: frame.group.clone(),
             time: frame.time,
             psnr: Some(psnr(&rendered.color, &target)).filter(|value| *value != f64::INFINITY),
+            psnr_covisible: psnr_covisible.filter(|value| *value != f64::INFINITY),
+            covisible,
             ssim: ssim(&rendered.color, &target),
             macc_pix: confusion.as_ref().and_then(FrameConfusion::pixel_accuracy).map(|v| v * 100.0),
             render_ms,
@@ -251,6 +282,8 @@ fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[Fr
     Scores {
         frames: frames.len(),
         psnr: mean(&finite),
+        psnr_covisible: mean(&frames.iter().filter_map(|f| f.psnr_covisible).collect::<Vec<_>>()),
+        covisible: mean(&frames.iter().filter_map(|f| f.covisible).collect::<Vec<_>>()),
         psnr_infinite: frames.len() - finite.len(),
         ssim: mean(&frames.iter().map(|f| f.ssim).collect::<Vec<_>>()),
         instance: instance_metrics(confusions),
@@ -267,7 +300,17 @@ mod tests {
     use super::*;
 
     fn frame(psnr: Option<f64>, ssim: f64) -> FrameScores {
-        FrameScores { name: "f".into(), group: None, time: 0.0, psnr, ssim, macc_pix: None, render_ms: 1.0 }
+        FrameScores {
+            name: "f".into(),
+            group: None,
+            time: 0.0,
+            psnr,
+            psnr_covisible: psnr.map(|value| value + 1.0),
+            covisible: Some(50.0),
+            ssim,
+            macc_pix: None,
+            render_ms: 1.0,
+        }
     }
 
     #[test]
@@ -275,6 +318,7 @@ mod tests {
         let frames = [frame(Some(20.0), 0.5), frame(None, 1.0), frame(Some(30.0), 0.9)];
         let scores = scores_of(frames.iter(), &[]);
         assert_eq!((scores.psnr, scores.psnr_infinite, scores.frames), (Some(25.0), 1, 3));
+        assert_eq!((scores.psnr_covisible, scores.covisible), (Some(26.0), Some(50.0)));
         assert!((scores.ssim.unwrap() - 0.8).abs() < 1e-12);
         assert_eq!(scores.instance, InstanceMetrics::default());
     }

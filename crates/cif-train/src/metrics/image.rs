@@ -38,6 +38,27 @@ pub fn psnr(rendered: &PixelGrid<[f32; 3]>, truth: &PixelGrid<[f32; 3]>) -> f64 
     -10.0 * (squares / (truth.pixels.len() * 3) as f64).log10()
 }
 
+/// [`psnr`] over the pixels that `counts` marks; `None` where it marks none.
+///
+/// # Panics
+/// When the sizes differ.
+#[must_use]
+pub fn masked_psnr(
+    rendered: &PixelGrid<[f32; 3]>,
+    truth: &PixelGrid<[f32; 3]>,
+    counts: &PixelGrid<bool>,
+) -> Option<f64> {
+    assert_same_size(rendered, truth);
+    assert_eq!((counts.width, counts.height), (truth.width, truth.height), "a mask of another size");
+    let chosen = |image: &PixelGrid<[f32; 3]>| {
+        let pixels: Vec<[f32; 3]> =
+            image.pixels.iter().zip(&counts.pixels).filter(|(_, counts)| **counts).map(|(p, _)| *p).collect();
+        PixelGrid::from_pixels(pixels.len() as u32, 1, pixels)
+    };
+    let (rendered, truth) = (chosen(rendered), chosen(truth));
+    (!truth.pixels.is_empty()).then(|| psnr(&rendered, &truth))
+}
+
 /// Structural similarity: 11 x 11 Gaussian window of standard deviation 1.5, zero padding of 5 pixels,
 /// C1 = 1e-4, C2 = 9e-4, range 1, the render clamped to [0, 1]; mean over pixels and channels.
 ///
@@ -147,6 +168,17 @@ mod tests {
     fn psnr_of_a_constant_error() {
         // MSE 0.01 is 20 dB.
         assert!((psnr(&flat(5, 3, 0.6), &flat(5, 3, 0.5)) - 20.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_masked_psnr_is_that_of_the_pixels_that_count() {
+        let (mut rendered, truth) = (flat(4, 1, 0.6), flat(4, 1, 0.5));
+        rendered.pixels[1] = [1.0; 3];
+        let counts = |marks: [bool; 4]| PixelGrid::from_pixels(4, 1, marks.to_vec());
+        let value = |marks| masked_psnr(&rendered, &truth, &counts(marks));
+        assert!((value([true, false, true, true]).unwrap() - 20.0).abs() < 1e-5);
+        assert_eq!(value([true; 4]), Some(psnr(&rendered, &truth)));
+        assert_eq!(value([false; 4]), None);
     }
 
     #[test]

@@ -3,6 +3,7 @@
 //! | module | answers |
 //! |---|---|
 //! | [`image`] | PSNR and SSIM of one picture |
+//! | [`covisible`] | which pixels of a held-out view training views show too |
 //! | [`instance`] | every instance metric, from per-frame confusion counts |
 //! | [`evaluate`](mod@evaluate) | renders the held-out frames of a capture and fills both in |
 //! | [`round_trip`] | what a scene loses on its way through a file |
@@ -10,6 +11,7 @@
 //!
 //! A metric without anything to measure is `None` (`n/a`), never 0 or 100.
 
+pub mod covisible;
 pub mod evaluate;
 pub mod fit;
 pub mod image;

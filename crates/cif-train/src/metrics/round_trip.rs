@@ -124,6 +124,7 @@ pub fn held_out_loss<E: From<EvaluationError>>(
         settings: trained_settings(field),
         simd,
         depth: false,
+        covisible: false,
         decoder: None,
     };
     let mut errors = [ObjectErrors::default(), ObjectErrors::default()];

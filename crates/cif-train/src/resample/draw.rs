@@ -68,6 +68,26 @@ pub fn shares(budget: usize, weights: &[f64]) -> Vec<usize> {
     shares
 }
 
+/// Shares as [`shares`] gives them, but none above its limit: what is beyond goes to the others in proportion to their
+/// weights, as long as there is room.
+#[must_use]
+pub fn limited_shares(budget: usize, weights: &[f64], limits: &[usize]) -> Vec<usize> {
+    let mut given = vec![0; weights.len()];
+    let mut open = weights.to_vec();
+    let mut left = budget;
+    while left > 0 && open.iter().any(|weight| *weight > 0.0) {
+        for (k, more) in shares(left, &open).into_iter().enumerate() {
+            let taken = more.min(limits[k] - given[k]);
+            given[k] += taken;
+            left -= taken;
+            if given[k] == limits[k] {
+                open[k] = 0.0;
+            }
+        }
+    }
+    given
+}
+
 #[cfg(test)]
 mod tests {
     use rand::SeedableRng;
@@ -155,5 +175,14 @@ mod tests {
         assert_eq!(shares(2, &[1.0, 1.0, 1.0]), [1, 1, 0]);
         assert_eq!(shares(7, &[0.0, 0.0]), [0, 0]);
         assert_eq!(shares(100, &[70.0, 29.6, 0.4]), [70, 30, 0]);
+    }
+
+    #[test]
+    fn shares_beyond_a_limit_go_to_the_others() {
+        assert_eq!(limited_shares(10, &[1.0, 1.0, 1.0], &[9, 9, 9]), shares(10, &[1.0, 1.0, 1.0]));
+        assert_eq!(limited_shares(12, &[1.0, 1.0, 2.0], &[1, 9, 9]), [1, 4, 7]);
+        assert_eq!(limited_shares(12, &[1.0, 0.0, 1.0], &[2, 9, 3]), [2, 0, 3]);
+        assert_eq!(limited_shares(7, &[0.0, 0.0], &[5, 5]), [0, 0]);
+        assert_eq!(limited_shares(3, &[1.0, 1.0], &[0, 9]), [0, 3]);
     }
 }

@@ -10,9 +10,9 @@ use rand::Rng;
 use rand_distr::{Distribution, StandardNormal};
 
 pub use conserve::{conserved_logit, footprint_integral, scale_correction};
-pub use draw::{draw_with_replacement, draw_without_replacement, shares};
+pub use draw::{draw_with_replacement, draw_without_replacement, limited_shares, shares};
 
-use crate::config::{LabelShares, ResampleConfig, ScaleCorrection, WeakSet};
+use crate::config::{Excess, LabelShares, ResampleConfig, ScaleCorrection, WeakSet};
 use crate::densify::in_world;
 use crate::estimate::most_probable;
 
@@ -83,7 +83,8 @@ fn gammas(field: &Field, identities: &Identities, context: &ResampleContext<'_>)
 /// Draws the pairs of one event: weak ones without replacement with weight 1 / gamma, then a source for each
 /// with weight gamma, among Gaussians that support the instance and are not weak in this event.
 ///
-/// Shares that an instance cannot use (too few members, no source) are left out.
+/// Shares that an instance cannot use (too few candidates, see [`ResampleConfig::weak_share`]) are left out or go to the
+/// others, see [`ResampleConfig::excess`]; those of an instance without a source are left out.
 #[must_use]
 pub fn choose(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) -> Relocations {
     let Some(identities) = &field.identities else { return Relocations::default() };
@@ -111,7 +112,14 @@ pub fn choose(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) 
         })
         .collect();
     let budget = (f64::from(context.config.rate) * n as f64).round() as usize;
-    let shares = shares(budget, &weights);
+    let most: Vec<usize> =
+        members.iter().map(|members| most_weak(members.len(), n, context.config)).collect();
+    let shares = match context.config.excess {
+        Excess::Drop => {
+            shares(budget, &weights).into_iter().zip(&most).map(|(share, most)| share.min(*most)).collect()
+        }
+        Excess::Share => limited_shares(budget, &weights, &most),
+    };
 
     let mut is_weak = vec![false; n];
     let mut weak: Vec<Vec<u32>> = vec![Vec::new(); k];
@@ -128,12 +136,8 @@ pub fn choose(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) 
                 1.0 / gamma_of(identities, &gamma, *row as usize, label as u16).unwrap_or(floor)
             })
             .collect();
-        // Half of the members stay, so that there is something to copy.
-        let most = members[label].len() / 2;
-        weak[label] = draw_without_replacement(&weights, shares[label].min(most), rng)
-            .into_iter()
-            .map(|k| free[k])
-            .collect();
+        weak[label] =
+            draw_without_replacement(&weights, shares[label], rng).into_iter().map(|k| free[k]).collect();
         for row in &weak[label] {
             is_weak[*row as usize] = true;
         }
@@ -156,6 +160,16 @@ pub fn choose(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) 
             .extend(weak.iter().zip(drawn).map(|(weak, k)| Pair { weak: *weak, source: candidates[k] }));
     }
     plan
+}
+
+/// Most Gaussians that one event relocates for an instance of so many members. Of the members one stays in any case,
+/// so that there is something to copy.
+fn most_weak(members: usize, all: usize, config: &ResampleConfig) -> usize {
+    let share = |candidates: usize| (f64::from(config.weak_share) * candidates as f64) as usize;
+    match config.weak_set {
+        WeakSet::Members => share(members).min(members.saturating_sub(1)),
+        WeakSet::Literal => share(all),
+    }
 }
 
 /// Clamped gamma of a Gaussian and an instance; `None` outside its support.

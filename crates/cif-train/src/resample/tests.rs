@@ -64,6 +64,33 @@ fn a_plan_shares_pairs_equally_inside_instances() {
     assert_eq!(weak.iter().filter(|row| *row % 2 == 0).count(), 5);
 }
 
+/// Instance 0 has the first `members` rows, instance 1 all others.
+fn divided(members: usize) -> Field {
+    let mut scene = field();
+    let rows = scene.identities.as_mut().unwrap();
+    for row in 0..40 {
+        let own = usize::from(row >= members);
+        rows.log_estimates[2 * row + own] = 0.9_f32.ln();
+        rows.log_estimates[2 * row + 1 - own] = 0.1_f32.ln();
+    }
+    scene
+}
+
+#[test]
+fn draws_beyond_the_weak_share_are_dropped_or_shared_and_one_member_stays() {
+    let weak_of = |weak_share: f32, excess: Excess, weak_set: WeakSet| {
+        let config = ResampleConfig { rate: 0.5, weak_share, excess, weak_set, ..ResampleConfig::default() };
+        let plan = choose(&divided(6), &context(&config, &[false; 40]), &mut Pcg64::seed_from_u64(1));
+        let of_first = plan.pairs.iter().filter(|pair| pair.weak < 6).count();
+        (of_first, plan.pairs.len())
+    };
+    assert_eq!(weak_of(0.5, Excess::Drop, WeakSet::Members), (3, 13));
+    assert_eq!(weak_of(0.5, Excess::Share, WeakSet::Members), (3, 20));
+    assert_eq!(weak_of(1.0, Excess::Drop, WeakSet::Members), (5, 15));
+    assert_eq!(weak_of(1.0, Excess::Share, WeakSet::Members), (5, 20));
+    assert_eq!(weak_of(1.0, Excess::Drop, WeakSet::Literal).1, 20, "all Gaussians are candidates");
+}
+
 #[test]
 fn flagged_rows_are_never_sources() {
     let config = ResampleConfig { rate: 0.25, ..ResampleConfig::default() };

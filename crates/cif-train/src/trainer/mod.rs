@@ -298,7 +298,7 @@ impl Trainer {
         if not_kept > 0 {
             self.warnings.push(format!(
                 "{not_kept} of {} training frames do not fit into frame_memory_mib = {} and are decoded \
-                 whenever they are needed",
+                 again for every step that needs them",
                 self.state.frames.len(),
                 self.state.config.frame_memory_mib
             ));

@@ -14,6 +14,7 @@ use crate::adam::PlaneWeights;
 use crate::config::{Ablation, TrainConfig};
 use crate::error::TrainError;
 use crate::exposure::RATES;
+use crate::frames::MOST_AHEAD;
 use crate::heads::{CameraBlending, Phase, ValueHead};
 use crate::metrics::image::{ssim, unit_color};
 use crate::optimiser::StepRates;
@@ -51,6 +52,16 @@ impl Trainer {
         order[(position % count) as usize] as usize
     }
 
+    /// Has the views from a position of a stage on decoded while the present step is computed, where memory has no room
+    /// for all.
+    fn expect_views(&mut self, stage: Stage, position: u64) {
+        if self.state.frames.not_kept() > 0 {
+            let coming: Vec<usize> =
+                (position..).take(MOST_AHEAD).map(|position| self.view_at(stage, position)).collect();
+            self.state.frames.expect(coming);
+        }
+    }
+
     /// The plan of a step of a stage, from 1.
     pub(super) fn plan_step(&mut self, stage: Stage, iteration: u32) -> Result<StepPlan, TrainError> {
         let batch = self.state.config.stages.batch;
@@ -62,6 +73,7 @@ impl Trainer {
             let leaves_judged = self.leaves_out_judged(stage, iteration, index);
             views.push(StepView { index, frame, leaves_judged });
         }
+        self.expect_views(stage, u64::from(iteration) * u64::from(batch));
         let in_instance_stage = stage == Stage::Instance;
         let with_instances = in_instance_stage && self.instance_pass == InstancePass::On;
         let of_head = self.state.value_head().filter(|_| in_instance_stage);

@@ -7,6 +7,7 @@
 //! | `acceptance` | identities and their resampling keep what they promise |
 //! | `from_scene` | instances on the reconstruction of another run |
 //! | `heads` | a head declared by a test, on every engine |
+//! | `memory` | frames that do not fit into memory, read ahead |
 //! | `curve`, `pacing`, `measure` | error curves, budgets of time, measured steps |
 //! | `gpu` | runs on a GPU beside the same runs on the processor (`CIF_TEST_GPU=off|auto|require`) |
 #![allow(clippy::unwrap_used)] // Helpers of tests.
@@ -21,6 +22,7 @@ mod gpu;
 mod guidance;
 mod heads;
 mod measure;
+mod memory;
 mod pacing;
 #[path = "../support/mod.rs"]
 mod support;

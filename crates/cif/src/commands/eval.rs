@@ -21,7 +21,10 @@ use crate::{interrupt, output};
 /// Score a scene on the held-out frames of a capture
 #[derive(Debug, Args)]
 #[command(after_help = "\
-PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). Instance scores are
+PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). The co-visible PSNR is that of
+the pixels, seen so many percent of all, whose place training views show too: their point, at the depth that
+the scene renders, lies inside a tenth of the training views (at least 5; 64 are asked where there are more)
+and at most 5 % behind what the scene renders there. It leaves out what no training image shows. Instance scores are
 percent over labelled pixels: mAcc-pix per frame, mAcc-inst per instance, mIoU per pair of instance
 and frame. A scene of another head (`cif train --head`) is scored by what that head decodes per pixel
 (JSON: labels_by). The JSON also has the other definitions in use, and values per frame and per instance.
@@ -111,6 +114,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
         settings: scene::render_settings(&field),
         simd: command.simd.into(),
         depth: command.images.is_some(),
+        covisible: matches!(command.split, SplitName::Val),
         decoder: decoder.as_ref(),
     };
     interrupt::watch();
@@ -205,6 +209,8 @@ fn scores_json(scores: &Scores, field: &Field) -> Value {
     json!({
         "frames": scores.frames,
         "psnr": scores.psnr,
+        "psnr_covisible": scores.psnr_covisible,
+        "covisible": scores.covisible,
         "ssim": scores.ssim,
         "macc_pix": instance.macc_pix,
         "macc_inst": instance.macc_inst,
@@ -230,7 +236,8 @@ fn label(field: &Field, id: u16) -> String {
 }
 
 fn print_table(evaluation: &Evaluation, field: &Field) {
-    let mut table = super::table(["", "frames", "PSNR", "SSIM", "mAcc-pix", "mAcc-inst", "mIoU"]);
+    let mut table =
+        super::table(["", "frames", "PSNR", "co-visible", "seen", "SSIM", "mAcc-pix", "mAcc-inst", "mIoU"]);
     let overall = std::iter::once(("all", &evaluation.overall));
     for (name, scores) in
         overall.chain(evaluation.groups.iter().map(|(name, scores)| (name.as_str(), scores)))
@@ -239,6 +246,8 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
             name.to_owned(),
             scores.frames.to_string(),
             number(scores.psnr, 2),
+            number(scores.psnr_covisible, 2),
+            scores.covisible.map_or("n/a".to_owned(), |percent| format!("{percent:.0} %")),
             number(scores.ssim, 4),
             number(scores.instance.macc_pix, 2),
             number(scores.instance.macc_inst, 2),

@@ -200,6 +200,20 @@ struct CaptureOptions {
     /// Read the folder as this layout where two fit
     #[arg(long, value_name = "LAYOUT")]
     layout: Option<LayoutName>,
+    #[command(flatten)]
+    frames: FrameOptions,
+}
+
+/// Frames of a capture that are read.
+#[derive(Clone, Debug, Default, Args)]
+struct FrameOptions {
+    /// Leave the frames of a camera out, as in --without-camera cam13 where its video is not synchronised; may be
+    /// repeated
+    #[arg(long, value_name = "CAMERA")]
+    without_camera: Vec<String>,
+    /// Frames taken of each video of the capture, at most [default: 300]
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    video_frames: Option<u32>,
 }
 
 #[derive(Clone, Copy, Debug, ValueEnum)]
@@ -231,6 +245,8 @@ impl CaptureOptions {
             downscale: self.downscale,
             centre_principal_point: self.center_principal_point,
             layout: self.layout.map(Into::into),
+            without_cameras: self.frames.without_camera.clone(),
+            video_frames: self.frames.video_frames,
         }
     }
 

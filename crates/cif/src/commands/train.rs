@@ -365,6 +365,12 @@ fn resume_command(command: &Train) -> String {
     if command.simd != Simd::Auto {
         option("--simd", command.simd.name().to_owned());
     }
+    for camera in &capture.frames.without_camera {
+        option("--without-camera", camera.clone());
+    }
+    if let Some(frames) = capture.frames.video_frames {
+        option("--video-frames", frames.to_string());
+    }
     #[cfg(feature = "wgpu")]
     if command.backend != super::backend::Backend::Cpu {
         option("--backend", command.backend.name().to_owned());

@@ -27,7 +27,7 @@ impl GpuEngine {
         let mut counts = GpuIdentityCounts::zeros(gpu, n, instances)?;
         let mut frames = 0;
         for view in state.views_of_identities() {
-            let data = state.frames.get(&state.dataset, view)?;
+            let data = state.frame_of_identities(view)?;
             let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
             let mut present: Vec<u16> = labels.pixels.clone();
             present.sort_unstable();

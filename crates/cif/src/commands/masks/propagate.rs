@@ -14,7 +14,7 @@ use cif_masks::{Clip, Keyframe, Mask};
 use clap::Args;
 
 use self::points::Points;
-use crate::commands::{LayoutName, command_line};
+use crate::commands::{FrameOptions, LayoutName, command_line};
 use crate::error::Error;
 use crate::interrupt;
 use crate::pictures::{ContactSheet, save_jpeg};
@@ -62,6 +62,8 @@ pub(super) struct Propagate {
     /// Read the folder as this layout where two fit
     #[arg(long, value_name = "LAYOUT")]
     layout: Option<LayoutName>,
+    #[command(flatten)]
+    frames: FrameOptions,
     /// Show no progress
     #[arg(short, long)]
     quiet: bool,
@@ -137,6 +139,8 @@ fn open(command: &Propagate) -> Result<Dataset, Error> {
         masks: Some(std::path::absolute(folder).map_err(Error::io("find", folder))?),
         downscale: command.downscale,
         layout: command.layout.map(Into::into),
+        without_cameras: command.frames.without_camera.clone(),
+        video_frames: command.frames.video_frames,
         ..OpenOptions::default()
     };
     let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;

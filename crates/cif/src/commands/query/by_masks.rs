@@ -12,11 +12,11 @@ use clap::{Args, ValueEnum};
 use serde_json::json;
 
 use super::Query;
-use crate::commands::{CaptureOptions, LayoutName, print_misfits, print_warnings, scene};
+use crate::commands::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, scene};
 use crate::detector::{Detected, detect};
 use crate::error::Error;
 use crate::formats;
-use crate::mask_query::{Agreement, Found, FoundMasks, Selection, agreement, find, render};
+use crate::mask_query::{Agreement, Found, FoundMasks, GATE, Selection, agreement, find, render};
 use crate::pictures::save_grey;
 use crate::{interrupt, output};
 
@@ -51,6 +51,10 @@ pub(super) struct ByMasks {
     /// Gaussians that make up the result
     #[arg(long, value_name = "SET", default_value = "instance")]
     select: Select,
+    /// Least foreground of a pixel of the rendered masks, 0 to 1: below it a pixel is background. The paper has no
+    /// such gate (0)
+    #[arg(long, value_name = "SHARE", default_value_t = GATE, value_parser = share, requires = "eval")]
+    foreground: f32,
     /// Render the result from held-out frames and compare it with the masks there
     #[arg(long, requires = "capture")]
     eval: bool,
@@ -63,6 +67,8 @@ pub(super) struct ByMasks {
     /// Read the capture as this layout where two fit
     #[arg(long, value_name = "LAYOUT")]
     layout: Option<LayoutName>,
+    #[command(flatten)]
+    frames: FrameOptions,
 }
 
 /// Which Gaussians make up the result.
@@ -93,6 +99,12 @@ impl ByMasks {
     }
 }
 
+/// A number in [0, 1].
+fn share(text: &str) -> Result<f32, String> {
+    let share: f32 = text.parse().map_err(|_| "expected a number".to_owned())?;
+    if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("expected 0 to 1".to_owned()) }
+}
+
 pub(super) fn run(command: &Query) -> Result<(), Error> {
     let options = &command.by_masks;
     let Some(capture) = &options.capture else {
@@ -120,6 +132,7 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         downscale: options.downscale.or(scene::trained_downscale(&field)),
         center_principal_point: false,
         layout: options.layout,
+        frames: options.frames.clone(),
     }
     .open(capture)?;
     print_warnings(&dataset);
@@ -190,7 +203,8 @@ fn evaluate(
         }
         interrupt::go_on()?;
         let truth = dataset.load_found_mask(index, files, masks.loaded)?;
-        let rendered = render(field, &found.rows, &frame.camera, frame.time, renderer, settings);
+        let rendered =
+            render(field, &found.rows, options.foreground, &frame.camera, frame.time, renderer, settings);
         if let Some(folder) = &options.output {
             let picture: PixelGrid<u16> = rendered.map(|inside| if *inside { u16::MAX } else { 0 });
             save_grey(&output::inside(folder, &frame.name, "png")?, &picture)?;

@@ -1,24 +1,25 @@
 //! `cif bench compare`: the tables of the paper on captures of one's own.
 
-use std::io::{IsTerminal, Write};
-use std::path::{Path, PathBuf};
+mod describe;
+mod runs;
+mod video;
 
-use cif_bench::comparison::page::{self, Comparison};
-use cif_bench::comparison::record::Record;
-use cif_bench::comparison::run::{Subject, settings};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use cif_bench::comparison::page;
+use cif_bench::comparison::run::Subject;
 use cif_bench::comparison::{ABLATIONS, Contender};
 use cif_bench::records::Records;
 use cif_dataset::{Dataset, Layout, Split};
-use cif_geometry::PixelGrid;
-use cif_train::metrics::FrameView;
-use cif_train::{HeadName, Stop, TrainConfig, Trainer};
+use cif_train::{HeadName, TrainConfig};
 use clap::Args;
-use serde_json::json;
 
+use self::describe::describe;
+use self::runs::{Bench, Ended};
 use super::train::{self, HeadArgument};
 use super::{CaptureOptions, print_warnings};
 use crate::error::Error;
-use crate::pictures::{Picture, instance_picture, rgb_picture};
 use crate::settings::Layers;
 use crate::{interrupt, output};
 
@@ -34,7 +35,8 @@ scored on the held-out frames as `cif eval` scores its scene. All train what the
 
 DIR holds compare.html (needs no network), panoptic and ablation each as .md, .csv, .json and .tex, and the runs with
 their scenes: finished ones are not done again, and Ctrl-C keeps the one under way, so that the same command goes on
-where it stopped.
+where it stopped. --budget 2h begins no new run after that long. With --video, the camera goes through the held-out
+frames of one camera in the order of their times, and straight from one to the next.
 
 --iterations published trains every head as long as its own publication does: Gaussian Grouping 30 000 steps, SA4D 5 000,
 VLGS 15 000, Trace3D 29 000, CIF 3 000; Dr. Splat trains nothing. VLGS is a re-implementation, because there is no
@@ -62,6 +64,14 @@ pub(super) struct BenchCompare {
     /// Compare the method without its parts too
     #[arg(long)]
     ablations: bool,
+    /// Begin no new run after so long: 90s, 5m, "1h 30m". Runs under way are finished, the tables say what is missing,
+    /// and the same command goes on
+    #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
+    budget: Option<Duration>,
+    /// Write a video per capture, shown in the page: colours, then the labels of every run of the first seed, side by
+    /// side, along the held-out frames. Needs ffmpeg with libx264
+    #[arg(long)]
+    video: bool,
     /// Any setting by its key in SCENE.train.toml, e.g. --set head.camera=cam16
     #[arg(long, value_name = "TABLE.KEY=VALUE")]
     set: Vec<String>,
@@ -123,31 +133,28 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
     }
     let runs = Records::inside(&command.output)?;
     let contenders = contenders(command);
-    let mut bench = Bench {
-        iterations: command.iterations,
-        runs,
-        records: Vec::new(),
-        missing: 0,
-        is_terminal: std::io::stderr().is_terminal(),
-    };
+    if command.video {
+        video::check()?;
+    }
     interrupt::watch();
-    let mut stopped = false;
+    let mut bench = Bench::new(runs, command.iterations, command.budget);
     for capture in &captures {
         for seed in 0..u64::from(command.seeds) {
             let mut config = capture.config.clone();
             config.seed += seed;
             let subject = Subject { capture: &capture.name, dataset: &capture.dataset, config: &config };
-            if stopped {
-                bench.missing += contenders.len();
-            } else {
-                stopped = !bench.compare(&subject, &contenders)?;
-            }
+            bench.compare(&subject, &contenders)?;
         }
     }
-    let comparison = describe(command, &captures, &contenders, bench.missing);
+    let videos = match command.video && bench.ended != Some(Ended::Interrupted) {
+        true => video::write_all(&command.output, &bench, &captures)?,
+        false => Vec::new(),
+    };
+    let comparison = describe(command, &captures, &contenders, &bench, videos);
     page::write(&command.output, &bench.runs, &comparison, &bench.records)?;
     let page = command.output.join("compare.html");
-    if stopped {
+    let left = bench.missing.len();
+    if bench.ended == Some(Ended::Interrupted) {
         return Err(Error::Interrupted {
             message: format!("interrupted; {} holds what is compared so far", page.display()),
             help: Some("the same command goes on".to_owned()),
@@ -157,6 +164,11 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
         .map_err(Error::io("read", &command.output))?;
     println!("{text}");
     eprintln!("wrote {}", page.display());
+    if bench.ended == Some(Ended::OutOfTime) {
+        eprintln!(
+            "the budget is used up; the same command goes on with the {left} runs that are not done yet"
+        );
+    }
     Ok(())
 }
 
@@ -224,184 +236,6 @@ fn base_config(command: &BenchCompare, layout: Layout) -> Result<TrainConfig, Er
     config.head.name = HeadName::Cif;
     config.instance.ablate.clear();
     Ok(config)
-}
-
-struct Bench {
-    iterations: Iterations,
-    runs: Records<Record>,
-    records: Vec<Record>,
-    missing: usize,
-    is_terminal: bool,
-}
-
-impl Bench {
-    /// Runs everything on a capture with a seed; false when interrupted, the runs left being counted.
-    fn compare(&mut self, subject: &Subject<'_>, contenders: &[Contender]) -> Result<bool, Error> {
-        let stop = Stop::when(interrupt::requested);
-        let heading = format!("{}, seed {}", subject.capture, subject.config.seed);
-        let mut base = None;
-        for (k, contender) in contenders.iter().enumerate() {
-            let left = contenders.len() - k;
-            let mut config = match contender {
-                // What the settings say of the steps of the method holds.
-                Contender::Head(HeadName::Cif) | Contender::Without(_) => {
-                    settings(subject.config, HeadName::Cif, subject.config.stages.instance)
-                }
-                Contender::Head(head) => settings(subject.config, *head, self.iterations.of(*head)),
-            };
-            if let Contender::Without(ablation) = contender {
-                config.instance.ablate.insert(*ablation);
-            }
-            let id = format!("{}.seed{}.{}", subject.capture, config.seed, contender.name());
-            let fingerprint = json!({
-                "version": env!("CARGO_PKG_VERSION"),
-                "capture": subject.dataset.root,
-                "masks": subject.dataset.frames.iter().filter_map(|frame| frame.mask.as_ref()).next(),
-                "base": subject.config,
-                "settings": config,
-            });
-            if let Some(record) = self.runs.find(&id, &fingerprint) {
-                self.show(&format!("{heading}: {}: kept, {}", contender.name(), told(&record)), true);
-                self.records.push(record);
-                continue;
-            }
-            let show = |what: &str, done: u64, whole: u64| {
-                let percent = 100 * done / whole.max(1);
-                self.show(&format!("{heading}: {what}: {percent} %"), false);
-            };
-            if base.is_none() {
-                let tell = &mut |done, whole| show("reconstruction", done, whole);
-                let reconstructed = subject.reconstruct(&self.runs, &stop, tell)?;
-                let Some(reconstructed) = reconstructed else {
-                    self.missing += left;
-                    return Ok(false);
-                };
-                base = Some(reconstructed);
-            }
-            let Some(base) = &base else { return Ok(false) };
-            let tell: &mut dyn FnMut(u64, u64) = &mut |done, whole| show(contender.name(), done, whole);
-            let trained = subject.train(&self.runs, (&id, &config), base, &stop, (tell, &draw))?;
-            let Some(mut record) = trained else {
-                self.missing += left;
-                return Ok(false);
-            };
-            record.fingerprint = fingerprint;
-            record.row.head = contender.name().to_owned();
-            self.runs.keep(&id, &record)?;
-            self.show(&format!("{heading}: {}: {}", contender.name(), told(&record)), true);
-            self.records.push(record);
-        }
-        Ok(true)
-    }
-
-    fn show(&self, text: &str, ends: bool) {
-        // Overwritten on terminals; elsewhere only what is finished.
-        if self.is_terminal {
-            eprint!("\r\x1b[K{text}{}", if ends { "\n" } else { "" });
-            let _ = std::io::stderr().flush();
-        } else if ends {
-            eprintln!("{text}");
-        }
-    }
-}
-
-/// Colour of pixels without a label in pictures of labels.
-fn empty() -> [u8; 3] {
-    labels(&PixelGrid::filled(1, 1, 0)).pixels[0]
-}
-
-/// Labels in full colour.
-fn labels(ids: &PixelGrid<u16>) -> Picture {
-    instance_picture(ids, &PixelGrid::filled(ids.width, ids.height, 1.0))
-}
-
-/// Pictures of a view for the page.
-fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
-    let mut pictures = vec![("", rgb_picture(&view.rendered.color)), (".truth", view.truth.image.clone())];
-    pictures.extend(view.truth.mask.as_ref().map(|mask| (".mask", labels(mask))));
-    pictures.extend(view.predicted.map(|ids| (".instances", labels(ids))));
-    pictures
-}
-
-/// A record in a line.
-fn told(record: &Record) -> String {
-    let row = &record.row;
-    let number = |value: Option<f64>, digits: usize| super::eval::number(value, digits);
-    format!(
-        "mAcc-pix {} %, mIoU {} %, {} dB, {} Gaussians, {:.1} s",
-        number(row.macc_pix, 2),
-        number(row.miou, 2),
-        number(row.psnr, 2),
-        row.gaussians,
-        row.seconds
-    )
-}
-
-fn describe(
-    command: &BenchCompare,
-    captures: &[Capture],
-    contenders: &[Contender],
-    missing: usize,
-) -> Comparison {
-    let of_captures: Vec<String> = captures
-        .iter()
-        .map(|capture| {
-            let count = |split| capture.dataset.frames.iter().filter(|frame| frame.split == split).count();
-            format!(
-                "{}: {} training frames, {} held out, {} instances, {} steps of reconstruction",
-                capture.name,
-                count(Split::Train),
-                count(Split::Val),
-                capture.dataset.instances.len(),
-                capture.config.stages.coarse + capture.config.fine_iterations()
-            )
-        })
-        .collect();
-    let steps = match command.iterations {
-        Iterations::Published => "as many steps as its publication has".to_owned(),
-        Iterations::Steps(steps) => format!("{steps} steps"),
-    };
-    let seeds = match command.seeds {
-        1 => "one seed".to_owned(),
-        seeds => format!("{seeds} seeds"),
-    };
-    let folder = |path: &PathBuf| {
-        path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned())
-    };
-    let mut line = format!(
-        "cif bench compare {} -o {} --seeds {}",
-        command.captures.iter().map(folder).collect::<Vec<_>>().join(" "),
-        folder(&command.output),
-        command.seeds
-    );
-    line += &match command.iterations {
-        Iterations::Published => " --iterations published".to_owned(),
-        Iterations::Steps(steps) => format!(" --iterations {steps}"),
-    };
-    if let Some(preset) = &command.preset {
-        line += &format!(" --preset {preset}");
-    }
-    if command.ablations {
-        line += " --ablations";
-    }
-    for assignment in &command.set {
-        line += &format!(" --set {assignment}");
-    }
-    let heads = contenders.iter().filter_map(|contender| match contender {
-        Contender::Head(head) => Some(head.name().to_owned()),
-        Contender::Without(_) => None,
-    });
-    Comparison {
-        description: format!("{}. Every head trains {steps}; {seeds}.", of_captures.join("; ")),
-        command: line,
-        threads: rayon::current_num_threads(),
-        simd: Trainer::vector_instructions(),
-        missing,
-        heads: heads.collect(),
-        ablations: command.ablations,
-        camera: captures.first().map(|capture| capture.config.head.camera.clone()).unwrap_or_default(),
-        empty: empty(),
-    }
 }
 
 #[cfg(test)]

@@ -1,0 +1,182 @@
+//! The runs of a comparison, one after the other: what is kept is not done again.
+
+use std::io::{IsTerminal, Write};
+use std::time::{Duration, Instant};
+
+use cif_bench::comparison::Contender;
+use cif_bench::comparison::record::Record;
+use cif_bench::comparison::run::{Subject, settings};
+use cif_bench::comparison::tables::Missing;
+use cif_bench::records::Records;
+use cif_geometry::PixelGrid;
+use cif_train::metrics::FrameView;
+use cif_train::{HeadName, Stop, TrainConfig};
+use serde_json::json;
+
+use super::Iterations;
+use crate::commands::eval::number;
+use crate::error::Error;
+use crate::interrupt;
+use crate::pictures::{Picture, instance_picture, rgb_picture};
+
+/// Why no new run begins.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Ended {
+    Interrupted,
+    OutOfTime,
+}
+
+/// A comparison under way.
+pub(super) struct Bench {
+    iterations: Iterations,
+    pub(super) runs: Records<Record>,
+    /// Runs that are done, in the order of tables.
+    pub(super) records: Vec<Record>,
+    /// Runs that are not.
+    pub(super) missing: Vec<Missing>,
+    pub(super) ended: Option<Ended>,
+    /// Time after which no run begins; `None` without a budget.
+    deadline: Option<Instant>,
+    is_terminal: bool,
+}
+
+impl Bench {
+    pub(super) fn new(runs: Records<Record>, iterations: Iterations, budget: Option<Duration>) -> Self {
+        Self {
+            iterations,
+            runs,
+            records: Vec::new(),
+            missing: Vec::new(),
+            ended: None,
+            deadline: budget.and_then(|budget| Instant::now().checked_add(budget)),
+            is_terminal: std::io::stderr().is_terminal(),
+        }
+    }
+
+    /// Runs everything on a capture with a seed. Once the comparison has ended, what is kept is taken and the rest
+    /// noted as missing.
+    pub(super) fn compare(&mut self, subject: &Subject<'_>, contenders: &[Contender]) -> Result<(), Error> {
+        let stop = Stop::when(interrupt::requested);
+        let heading = format!("{}, seed {}", subject.capture, subject.config.seed);
+        let mut base = None;
+        for contender in contenders {
+            let config = self.settings(subject, *contender);
+            let id = id(subject.capture, config.seed, contender.name());
+            let fingerprint = json!({
+                "version": env!("CARGO_PKG_VERSION"),
+                "capture": subject.dataset.root,
+                "masks": subject.dataset.frames.iter().filter_map(|frame| frame.mask.as_ref()).next(),
+                "base": subject.config,
+                "settings": config,
+            });
+            if let Some(record) = self.runs.find(&id, &fingerprint) {
+                self.show(&format!("{heading}: {}: kept, {}", contender.name(), told(&record)), true);
+                self.records.push(record);
+                continue;
+            }
+            if base.is_none() && self.begins() {
+                let tell = &mut |done, whole| self.show_share(&heading, "reconstruction", done, whole);
+                base = subject.reconstruct(&self.runs, &stop, tell)?;
+                self.ended = base.is_none().then_some(Ended::Interrupted);
+            }
+            let trained = match base.as_ref().filter(|_| self.begins()) {
+                Some(base) => {
+                    let tell: &mut dyn FnMut(u64, u64) =
+                        &mut |done, whole| self.show_share(&heading, contender.name(), done, whole);
+                    let trained = subject.train(&self.runs, (&id, &config), base, &stop, (tell, &draw))?;
+                    if trained.is_none() {
+                        self.ended = Some(Ended::Interrupted);
+                    }
+                    trained
+                }
+                None => None,
+            };
+            let Some(mut record) = trained else {
+                self.missing.push(Missing {
+                    capture: subject.capture.to_owned(),
+                    head: contender.name().to_owned(),
+                    seed: config.seed,
+                });
+                continue;
+            };
+            record.fingerprint = fingerprint;
+            record.row.head = contender.name().to_owned();
+            self.runs.keep(&id, &record)?;
+            self.show(&format!("{heading}: {}: {}", contender.name(), told(&record)), true);
+            self.records.push(record);
+        }
+        Ok(())
+    }
+
+    /// Settings of a run; those of the steps of the method hold for the method.
+    fn settings(&self, subject: &Subject<'_>, contender: Contender) -> TrainConfig {
+        let steps = match contender {
+            Contender::Head(HeadName::Cif) | Contender::Without(_) => subject.config.stages.instance,
+            Contender::Head(head) => self.iterations.of(head),
+        };
+        let mut config = settings(subject.config, contender.head(), steps);
+        if let Contender::Without(ablation) = contender {
+            config.instance.ablate.insert(ablation);
+        }
+        config
+    }
+
+    /// True while new runs begin.
+    fn begins(&mut self) -> bool {
+        if self.ended.is_none() && self.deadline.is_some_and(|deadline| Instant::now() >= deadline) {
+            self.ended = Some(Ended::OutOfTime);
+        }
+        self.ended.is_none()
+    }
+
+    /// Tells how far a run is.
+    fn show_share(&self, heading: &str, what: &str, done: u64, whole: u64) {
+        self.show(&format!("{heading}: {what}: {} %", 100 * done / whole.max(1)), false);
+    }
+
+    pub(super) fn show(&self, text: &str, ends: bool) {
+        // Overwritten on terminals; elsewhere only what is finished.
+        if self.is_terminal {
+            eprint!("\r\x1b[K{text}{}", if ends { "\n" } else { "" });
+            let _ = std::io::stderr().flush();
+        } else if ends {
+            eprintln!("{text}");
+        }
+    }
+}
+
+/// Name of a run: that of its scene and of its record, without extension.
+pub(super) fn id(capture: &str, seed: u64, contender: &str) -> String {
+    format!("{capture}.seed{seed}.{contender}")
+}
+
+/// Colour of pixels without a label in pictures of labels.
+pub(super) fn empty() -> [u8; 3] {
+    labels(&PixelGrid::filled(1, 1, 0)).pixels[0]
+}
+
+/// Labels in full colour.
+pub(super) fn labels(ids: &PixelGrid<u16>) -> Picture {
+    instance_picture(ids, &PixelGrid::filled(ids.width, ids.height, 1.0))
+}
+
+/// Pictures of a view for the page.
+fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
+    let mut pictures = vec![("", rgb_picture(&view.rendered.color)), (".truth", view.truth.image.clone())];
+    pictures.extend(view.truth.mask.as_ref().map(|mask| (".mask", labels(mask))));
+    pictures.extend(view.predicted.map(|ids| (".instances", labels(ids))));
+    pictures
+}
+
+/// A record in a line.
+fn told(record: &Record) -> String {
+    let row = &record.row;
+    format!(
+        "mAcc-pix {} %, mIoU {} %, {} dB, {} Gaussians, {:.1} s",
+        number(row.macc_pix, 2),
+        number(row.miou, 2),
+        number(row.psnr, 2),
+        row.gaussians,
+        row.seconds
+    )
+}
