@@ -70,7 +70,7 @@ pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u
 }
 
 /// Name of an instance that nobody named.
-fn default_label(id: u16) -> String {
+pub(crate) fn default_label(id: u16) -> String {
     format!("instance_{id}")
 }
 
