@@ -100,7 +100,7 @@ impl Objects {
                 return Err(format!("the name {label:?} holds a NUL character; leave it out"));
             }
             ids.push(id);
-            instances.insert(id, InstanceLabel { id, label, category });
+            instances.insert(id, InstanceLabel { id, label, category, taxonomies: BTreeMap::new() });
         }
         Ok((ids, instances.into_values().collect()))
     }
