@@ -2,7 +2,8 @@ use super::{brush, polygon, runs};
 
 #[test]
 fn the_text_of_coco_gives_its_runs() {
-    // Columns 0011, 1100, 0001: runs 2, 4, 5, 1, the last as its difference to the second, -3.
+    // Columns 0011, 1100, 0001, as pycocotools 2.0 writes them: runs 2, 4, 5, 1, the last as its difference to the
+    // second, -3.
     assert_eq!(runs::from_text("245M").unwrap(), [2, 4, 5, 1]);
     assert!(runs::from_text("000N").unwrap_err().contains("negative"));
     // 100 = 4 + 3 * 32: `T3`; the fourth run is a difference to the second.
