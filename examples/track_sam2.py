@@ -6,12 +6,13 @@ In an environment of its own, because torch is large:
     python examples/track_sam2.py captures/table/rgb/1x painted -o table-masks --model sam2-hiera-small
     cif train captures/table --masks table-masks -o table.cif
 
-The model is a folder on this machine, as `Sam2VideoModel.save_pretrained` and the same of its processor write it;
-nothing is downloaded. Keyframes are PNG files of ids, 0 for unlabelled, named as the images that they show, as `cif masks propagate` takes them. Every object is prompted with its painted
-mask in every keyframe that shows it, and followed from the first keyframe to the last image, and back to the first
-one. A pixel has the object whose mask is surest there; keyframes stay as they were painted. Images of several
-cameras are tracked camera by camera, or as one sequence that `cif masks zigzag` writes and `cif masks split` takes
-apart.
+The model is a folder on this machine, as `Sam2VideoModel.save_pretrained` and the same of its processor
+write it; nothing is downloaded. Keyframes are PNG files of ids, 0 for unlabelled, named as the images that
+they show, as `cif masks propagate` takes them. Every object is prompted with its painted mask in every
+keyframe that shows it, and followed from the first keyframe to the last image, and back to the first one. A
+pixel has the object whose mask is surest there; keyframes stay as they were painted. Images of several
+cameras are tracked camera by camera, or as one sequence that `cif masks zigzag` writes and `cif masks split`
+takes apart.
 """
 
 from __future__ import annotations
@@ -91,9 +92,8 @@ def read_keyframes(folder: Path, images: list[Path]) -> dict[int, np.ndarray]:
         ids = np.array(picture).astype(np.uint16)
         with Image.open(images[places[path.stem]]) as image:
             if ids.shape != (image.height, image.width):
-                raise ValueError(
-                    f"{path}: {ids.shape[1]} x {ids.shape[0]} pixels, not {image.width} x {image.height} as its image"
-                )
+                found, expected = f"{ids.shape[1]} x {ids.shape[0]}", f"{image.width} x {image.height}"
+                raise ValueError(f"{path}: {found} pixels, its image has {expected}")
         keyframes[places[path.stem]] = ids
     if not any(ids.any() for ids in keyframes.values()):
         raise ValueError(f"{folder}: no keyframe shows an object; paint each with an id from 1 to 65535")
