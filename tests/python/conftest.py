@@ -13,7 +13,7 @@ FRAMES = 6
 TIMES = [k / (FRAMES - 1) for k in range(FRAMES)]
 PER_OBJECT = 80
 LABELS = [
-    {"id": 1, "label": "red mug", "category": "mug"},
+    {"id": 1, "label": "red mug", "category": "mug", "taxonomies": {"wikidata_qcode": "Q81727"}},
     {"id": 2, "label": "toy car", "category": "car"},
     {"id": 7, "label": "green napkin", "category": "napkin"},
 ]

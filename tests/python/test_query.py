@@ -70,7 +70,9 @@ def test_find_returns_prims(stage_path: Path) -> None:
     assert cif.usd.find(stage, "car", taxonomy="instance") == []
     assert "Splats" in names(cif.usd.find(stage, "mug", inherited=True))
     labels = cif.usd.labels(stage.GetPrimAtPath("/World/red_mug_001"))
-    assert labels == {"class": ["mug", "red mug"], "instance": ["red_mug_001"]}
+    expected = {"class": ["mug", "red mug"], "instance": ["red_mug_001"], "wikidata_qcode": ["Q81727"]}
+    assert labels == expected
+    assert names(cif.usd.find(stage, "Q81727", taxonomy="wikidata_qcode")) == ["red_mug_001"]
     with pytest.raises(cif.CifError, match=r"no\.usda: no such file"):
         cif.usd.find("no.usda", "x")
 

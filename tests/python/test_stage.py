@@ -71,7 +71,10 @@ def test_one_prim_per_object(stage: Usd.Stage) -> None:
     assert mug.GetDisplayName() == "red mug"
     assert mug.GetAttribute("userProperties:label").Get() == "red mug"
     assert Usd.ModelAPI(mug).GetKind() == "component"
-    assert "CifInstanceAPI" in mug.GetMetadata("apiSchemas").GetAddedOrExplicitItems()
+    applied = mug.GetMetadata("apiSchemas").GetAddedOrExplicitItems()
+    assert "CifInstanceAPI" in applied
+    assert "SemanticsLabelsAPI:wikidata_qcode" in applied
+    assert list(mug.GetAttribute("semantics:labels:wikidata_qcode").Get()) == ["Q81727"]
     assert mug.GetAttribute("cif:motion:model").Get() == "static"
     assert (mug.GetAttribute("cif:id").Get(), mug.GetAttribute("cif:kind").Get()) == (1, "instance")
     assert mug.GetVariantSets().GetVariantSet("lod").GetVariantSelection() == "full"

@@ -90,7 +90,7 @@ pub fn write(folder: &Path, frames: usize) {
         folder,
         "instances.json",
         &json!([
-            { "id": ROLLING, "label": "red ball", "category": "ball" },
+            { "id": ROLLING, "label": "red ball", "category": "ball", "taxonomies": { "wikidata_qcode": "Q18545" } },
             { "id": STANDING, "label": "blue ball", "category": "ball" },
         ]),
     );

@@ -76,6 +76,7 @@ fn help_teaches_the_tool() {
         "query",
         "label",
         "info",
+        "masks import",
         "masks propagate",
         "masks zigzag",
         "masks split",
@@ -304,6 +305,31 @@ fn damaged_captures_are_refused_with_the_file() {
     train(&["000001.png"]);
     fs::remove_file(&image).unwrap();
     train(&["000001"]);
+}
+
+#[test]
+fn colours_of_a_tracker_are_imported_and_read() {
+    let folder = with_capture();
+    let path = folder.path();
+    let tracked = path.join("tracked");
+    fs::create_dir(&tracked).unwrap();
+    for (index, name) in ["000000", "000001"].iter().enumerate() {
+        let image = image::open(path.join(format!("table/rgb/1x/{name}.png"))).unwrap();
+        let color = |x: u32, _| image::Rgb(if x < 5 { [250, 20, 30 + 100 * index as u8] } else { [0; 3] });
+        image::RgbImage::from_fn(image.width(), image.height(), color)
+            .save(tracked.join(format!("{name}.png")))
+            .unwrap();
+    }
+    let run = cif(path, "masks import tracked -o imported --capture table").succeeds();
+    for words in ["read as a tracker", "2 objects in 2 masks", "instance_2", "cif train table --masks"] {
+        assert!(run.stdout.contains(words), "{words}: {}", run.stdout);
+    }
+    let facts = cif(path, "info table --masks ../imported").succeeds();
+    assert!(facts.stdout.contains("instance_2"), "{}", facts.stdout);
+    cif(path, "masks import tracked -o imported --capture table").fails(1, &["imported", "new folder"]);
+    cif(path, "masks import tracked -o other --capture table --from coco").fails(1, &["tracked"]);
+    cif(path, "masks import nowhere -o other --capture table").fails(1, &["nowhere", "no such file"]);
+    assert!(!path.join("other").exists());
 }
 
 #[test]

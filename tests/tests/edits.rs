@@ -48,7 +48,12 @@ fn learned() -> Field {
     field.instances = ["red mug", "cereal box", "spoon"]
         .iter()
         .enumerate()
-        .map(|(k, label)| Instance { id: k as u16 + 1, label: (*label).into(), category: "thing".into() })
+        .map(|(k, label)| Instance {
+            id: k as u16 + 1,
+            label: (*label).into(),
+            category: "thing".into(),
+            taxonomies: Default::default(),
+        })
         .collect();
     field.cameras =
         vec![RecordedCamera { name: "left".into(), time_index: 0, trained: true, camera: scene.camera }];

@@ -113,6 +113,22 @@ fn a_scene_shows_and_tells_its_objects() {
     assert!(elsewhere.contains("nothing is there"), "{elsewhere}");
     cif(path, "query scene.cif --label ball --taxonomy instance").fails(1, &["ball", "red_ball_003"]);
 
+    // By a name in the vocabulary of others, also in an exported file and in what comes back of it.
+    cif(path, "export scene.cif --gltf named.glb").succeeds();
+    cif(path, "import named.glb -o back.cif").succeeds();
+    for file in ["scene.cif", "named.glb", "back.cif"] {
+        let line = format!("query {file} --taxonomy wikidata_qcode=Q18545 --json");
+        let found = json(&cif(path, &line).succeeds().stdout);
+        let labels: Vec<_> = found.as_array().unwrap().iter().map(|one| one["label"].clone()).collect();
+        assert_eq!(labels, ["red ball"], "{file}");
+    }
+    cif(path, "query scene.cif --taxonomy coco=ball").fails(1, &["ball"]);
+    cif(path, "query scene.cif --taxonomy wikidata_qcode=Q18545 --label ball").fails(2, &["--label"]);
+    for file in ["table", "scene.cif"] {
+        let told = cif(path, &format!("info {file}")).succeeds().stdout;
+        assert!(told.contains("wikidata_qcode Q18545"), "{told}");
+    }
+
     // By masks of a detector.
     detections(&table, &path.join("answers"), STANDING);
     let found = json(

@@ -362,7 +362,12 @@ fn balls(follows: bool) -> Field {
     gaussians.log_scales.fill([0.002_f32.ln(); 3]);
     gaussians.opacity_logits.fill(3.0);
     gaussians.occupancy_logits.fill(3.0);
-    let instance = |id| Instance { id, label: format!("ball {id}"), category: "ball".to_owned() };
+    let instance = |id| Instance {
+        id,
+        label: format!("ball {id}"),
+        category: "ball".to_owned(),
+        taxonomies: Default::default(),
+    };
     Field {
         gaussians,
         deformation: None,

@@ -274,7 +274,12 @@ fn one_pixel(_: usize, mask: &mut PixelGrid<u16>, labels: &mut Vec<InstanceLabel
         Some(label) => label.id,
         None => {
             let free = (1..=u16::MAX).find(|id| labels.iter().all(|label| label.id != *id)).unwrap_or(1);
-            labels.push(InstanceLabel { id: free, label: LABEL.into(), category: LABEL.into() });
+            labels.push(InstanceLabel {
+                id: free,
+                label: LABEL.into(),
+                category: LABEL.into(),
+                taxonomies: Default::default(),
+            });
             labels.sort_by_key(|label| label.id);
             free
         }

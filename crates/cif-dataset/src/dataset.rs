@@ -1,5 +1,6 @@
 //! The common form into which captures of every layout are read.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
@@ -94,6 +95,10 @@ pub struct InstanceLabel {
     pub label: String,
     /// Class, where given; else equal to `label`.
     pub category: String,
+    /// Names of its class in vocabularies of others by taxonomy, e.g. `wikidata_qcode` and `Q81727`; see
+    /// [`cif_output::check_taxonomy`].
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub taxonomies: BTreeMap<String, String>,
 }
 
 /// Where the initial points come from.

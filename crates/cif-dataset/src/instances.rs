@@ -22,6 +22,8 @@ struct Entry {
     label: Option<String>,
     #[serde(default)]
     category: Option<String>,
+    #[serde(default)]
+    taxonomies: BTreeMap<String, String>,
 }
 
 /// Labels named by a file, ascending id.
@@ -34,7 +36,8 @@ pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u
     let file: InstancesFile = serde_json::from_value(value).map_err(|_| {
         Error::invalid(
             path,
-            "a list of {\"id\": 1, \"label\": \"red mug\", \"category\": \"mug\"} is expected, or {\"instances\": [...]}",
+            "a list of {\"id\": 1, \"label\": \"red mug\", \"category\": \"mug\"} is expected, or {\"instances\": [...]}; \
+             taxonomies are texts by name: {\"wikidata_qcode\": \"Q81727\"}",
         )
     })?;
     let (InstancesFile::List(entries) | InstancesFile::Object { instances: entries }) = file;
@@ -62,7 +65,21 @@ pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u
                 format!("the label or category of id {id} holds a NUL character; leave it out"),
             ));
         }
-        if labels.insert(id, InstanceLabel { id, label, category }).is_some() {
+        for (taxonomy, name) in &entry.taxonomies {
+            cif_output::check_taxonomy(taxonomy).map_err(|problem| {
+                Error::invalid(path, format!("the taxonomy {taxonomy:?} of id {id} {problem}"))
+            })?;
+            if name.trim().is_empty() || name.contains('\0') {
+                return Err(Error::invalid(
+                    path,
+                    format!(
+                        "the taxonomy {taxonomy:?} of id {id} has no name, or one with a NUL character; name it"
+                    ),
+                ));
+            }
+        }
+        let taxonomies = entry.taxonomies;
+        if labels.insert(id, InstanceLabel { id, label, category, taxonomies }).is_some() {
             return Err(Error::invalid(path, format!("id {id} is listed twice; keep one entry")));
         }
     }
@@ -70,7 +87,7 @@ pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u
 }
 
 /// Name of an instance that nobody named.
-fn default_label(id: u16) -> String {
+pub(crate) fn default_label(id: u16) -> String {
     format!("instance_{id}")
 }
 
@@ -125,6 +142,7 @@ pub(crate) fn complete(
                 id: *id,
                 label: default_label(*id),
                 category: default_label(*id),
+                taxonomies: BTreeMap::new(),
             })
         })
         .collect()

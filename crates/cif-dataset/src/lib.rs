@@ -9,7 +9,8 @@
 //! | COLMAP | `sparse/0` | every eighth image |
 //!
 //! Masks are PNG files of instance ids, 0 for unlabelled, or EXR files with a [`cryptomatte`]; labels come from
-//! `instances.json`, which may also lie in the mask folder, or from the Cryptomatte. A mask folder may hold
+//! `instances.json`, which may also lie in the mask folder and may name `taxonomies` per instance, or from the
+//! Cryptomatte. [`masks::Import`] makes such a folder of what other tools write. A mask folder may hold
 //! `confidence/<frame>.png`: 8-bit grey, the probability that the id of a pixel is right in units of 1 / 255. Named groups of held-out frames
 //! come from `splits.json`, known motion from `motion.json` and `tracks.npz` (see [`motion_truth`]). All cameras are
 //! ideal pinholes in this project's axes once a frame is loaded; times are normalised to [0, 1].

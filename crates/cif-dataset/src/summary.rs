@@ -93,6 +93,9 @@ pub struct InstanceSummary {
     pub label: String,
     /// Class.
     pub category: String,
+    /// Names of its class in vocabularies of others, by taxonomy.
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub taxonomies: BTreeMap<String, String>,
     /// Masks that show it.
     pub frames: usize,
     /// Masks of training frames that show it.
@@ -181,6 +184,7 @@ impl Dataset {
                 id: instance.id,
                 label: instance.label.clone(),
                 category: instance.category.clone(),
+                taxonomies: instance.taxonomies.clone(),
                 frames: 0,
                 train_frames: 0,
                 pixels: 0,

@@ -138,6 +138,22 @@ fn instance_lists_are_checked() {
     holds(&failure(&folder), &["instances.json", "id 1 is listed twice"]);
     write_json(&path, &json!({"things": 3}));
     holds(&failure(&folder), &["instances.json", "list of"]);
+    for (taxonomies, words) in [
+        (json!({"wikidata-qcode": "Q81727"}), ["wikidata-qcode", "letters, digits and _"]),
+        (json!({"class": "mug"}), ["class", "is taken"]),
+        (json!({"coco": " "}), ["coco", "has no name"]),
+        (json!({"coco": 47}), ["taxonomies are texts", "wikidata_qcode"]),
+    ] {
+        write_json(&path, &json!([{"id": 1, "label": "a", "taxonomies": taxonomies}]));
+        holds(&failure(&folder), &["instances.json", words[0], words[1]]);
+    }
+    write_json(
+        &path,
+        &json!([{"id": 1, "taxonomies": {"wikidata_qcode": "Q81727", "coco": "cup"}}, {"id": 2}]),
+    );
+    let named = &open(&folder).instances;
+    assert_eq!(named[0].taxonomies.values().map(String::as_str).collect::<Vec<_>>(), ["cup", "Q81727"]);
+    assert!(named[1].taxonomies.is_empty());
     write_json(
         &path,
         &json!({"instances": [{"id": 0, "label": "void"}, {"id": 1}, {"id": 9, "label": "lost"}]}),

@@ -107,7 +107,12 @@ fn written_masks_come_back_with_large_ids_and_confidences() {
     // A name that leads out of the folder is refused, and nothing is there before the end.
     assert!(writer.add("../000001", &ids(1), None).is_err());
     assert!(!out.exists());
-    let label = |id: u16| InstanceLabel { id, label: format!("thing {id}"), category: "thing".to_owned() };
+    let label = |id: u16| InstanceLabel {
+        id,
+        label: format!("thing {id}"),
+        category: "thing".to_owned(),
+        taxonomies: Default::default(),
+    };
     writer.finish(&[label(255), label(300), label(65_535)]).unwrap();
     assert!(!folder.path().join("000001.png").exists());
 

@@ -76,6 +76,10 @@ impl Field {
             hash.array(&[instance.id]);
             hash.bytes(instance.label.as_bytes());
             hash.bytes(instance.category.as_bytes());
+            for (taxonomy, name) in &instance.taxonomies {
+                hash.bytes(taxonomy.as_bytes());
+                hash.bytes(name.as_bytes());
+            }
         }
         hash.array(&self.timeline.times);
         hash.array(&[self.timeline.frames_per_second]);

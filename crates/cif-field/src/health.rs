@@ -427,7 +427,10 @@ fn replace_bad(values: &mut [f32], by: f32) -> usize {
 
 /// Takes NUL characters out of the names of instances and cameras.
 fn mend_names(field: &mut Field) -> usize {
-    let of_instances = field.instances.iter_mut().flat_map(|one| [&mut one.label, &mut one.category]);
+    let of_instances = field
+        .instances
+        .iter_mut()
+        .flat_map(|one| [&mut one.label, &mut one.category].into_iter().chain(one.taxonomies.values_mut()));
     let names = of_instances.chain(field.cameras.iter_mut().map(|record| &mut record.name));
     let mut mended = 0;
     for name in names.filter(|name| name.contains('\0')) {

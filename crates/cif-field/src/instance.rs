@@ -1,5 +1,7 @@
 //! The instance table.
 
+use std::collections::BTreeMap;
+
 use serde::{Deserialize, Serialize};
 
 /// One instance. Its dense index is its position in [`crate::Field::instances`].
@@ -12,4 +14,8 @@ pub struct Instance {
     pub label: String,
     /// Class, e.g. `mug`.
     pub category: String,
+    /// Names of its class in vocabularies of others by taxonomy, e.g. `wikidata_qcode` and `Q81727`; see
+    /// [`cif_output::check_taxonomy`].
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub taxonomies: BTreeMap<String, String>,
 }

@@ -36,7 +36,7 @@
 //!         log_calibrations: vec![0.0],
 //!         owners: Vec::new(),
 //!     }),
-//!     instances: vec![Instance { id: 7, label: "red mug".into(), category: "mug".into() }],
+//!     instances: vec![Instance { id: 7, label: "red mug".into(), category: "mug".into(), taxonomies: Default::default() }],
 //!     timeline: Timeline { times: vec![0.0], frames_per_second: 24.0 },
 //!     cameras: Vec::new(),
 //!     sh_degree: 0,

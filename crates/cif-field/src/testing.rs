@@ -56,6 +56,7 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
             id: 7 * index + 300,
             label: format!("thing \"{index}\" ü\n"),
             category: "thing".to_owned(),
+            taxonomies: Default::default(),
         })
         .collect();
     let camera = PinholeCamera {

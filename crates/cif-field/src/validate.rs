@@ -400,6 +400,14 @@ fn validate_instances(instances: &[Instance]) -> Result<(), FieldError> {
         if [&instance.label, &instance.category].iter().any(|text| text.contains('\0')) {
             return broken(index, format!("has a label or class with {NUL}"));
         }
+        for (taxonomy, name) in &instance.taxonomies {
+            if let Err(problem) = cif_output::check_taxonomy(taxonomy) {
+                return broken(index, format!("has a taxonomy {taxonomy:?}, which {problem}"));
+            }
+            if name.is_empty() || name.contains('\0') {
+                return broken(index, format!("has no name in the taxonomy {taxonomy}, or one with {NUL}"));
+            }
+        }
     }
     Ok(())
 }

@@ -480,6 +480,7 @@ fn object_extras(node: &Node) -> Cif {
         name: node.name.clone(),
         label: node.label.clone(),
         category: node.category.clone(),
+        taxonomies: node.taxonomies.clone(),
         pivot: node.pivot.to_array(),
         motion: node.report.clone(),
         source_frames: node.source_frames,

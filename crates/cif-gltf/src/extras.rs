@@ -3,6 +3,8 @@
 //! The root node says how the file was made, a node per instance says what it is, parts and cameras say which
 //! ones they are. Whatever glTF itself holds (transforms, keys, splats) is read from there, so that edits count.
 
+use std::collections::BTreeMap;
+
 use cif_field::SortMetric;
 use cif_scene::{CaptureFrame, MotionReport, PartJoint, SceneOptions, UpAxis};
 use serde::{Deserialize, Serialize};
@@ -71,6 +73,9 @@ pub(crate) struct Object {
     pub(crate) name: String,
     pub(crate) label: String,
     pub(crate) category: String,
+    /// Names of its class in vocabularies of others, by taxonomy.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub(crate) taxonomies: BTreeMap<String, String>,
     /// World units; glTF itself holds single precision only.
     pub(crate) pivot: [f64; 3],
     /// Motion model, residuals, samples.

@@ -214,6 +214,7 @@ fn node(
         name: name.into(),
         label: format!("{name} \u{676f}"),
         category: "thing".into(),
+        taxonomies: [("coco".to_owned(), "cup".to_owned())].into(),
         pivot: if kind == NodeKind::Background { DVec3::ZERO } else { numbers.vector() },
         extent: extent::ellipsoid_bounds(&identity, &splats.means, &splats.orientations, &splats.scales),
         motion,

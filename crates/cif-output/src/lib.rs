@@ -15,6 +15,6 @@ mod name;
 mod place;
 mod unfinished;
 
-pub use name::{check_name, inside};
+pub use name::{check_name, check_taxonomy, inside};
 pub use place::{Place, folder_of, place, target};
 pub use unfinished::{NewFile, Scratch, abandon, finish_all, probe, write};

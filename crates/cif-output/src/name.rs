@@ -42,9 +42,38 @@ pub fn inside(folder: &Path, name: &str, extension: &str) -> io::Result<PathBuf>
     Ok(folder.join(format!("{name}.{extension}")))
 }
 
+/// Checks the name of a taxonomy of labels: it becomes part of names of properties in USD, and must not be one of those
+/// that scenes write for every object.
+///
+/// # Errors
+/// The problem and its remedy, as the predicate of a sentence.
+pub fn check_taxonomy(name: &str) -> Result<(), &'static str> {
+    let mut letters = name.chars();
+    let first = letters.next().is_some_and(|letter| letter.is_ascii_alphabetic() || letter == '_');
+    if !first || !letters.all(|letter| letter.is_ascii_alphanumeric() || letter == '_') {
+        return Err(
+            "is no name in USD; use letters, digits and _, not beginning with a digit: wikidata_qcode",
+        );
+    }
+    if matches!(name, "class" | "instance") {
+        return Err("is taken: class holds category and label, instance the unique name; use another one");
+    }
+    Ok(())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn taxonomies_are_identifiers_that_are_free() {
+        for name in ["wikidata_qcode", "coco", "_a1", "ADE20K"] {
+            assert_eq!(check_taxonomy(name), Ok(()), "{name}");
+        }
+        for name in ["", "1a", "wikidata-qcode", "a:b", "a b", "ü", "class", "instance"] {
+            assert!(check_taxonomy(name).is_err(), "{name:?}");
+        }
+    }
 
     #[test]
     fn names_stay_in_their_folder() {

@@ -1,5 +1,7 @@
 //! Trained scenes: arrays, rendering, queries.
 
+use std::collections::BTreeMap;
+
 use std::path::PathBuf;
 
 use cif_field::{Gaussians, Identities, Instance, RecordedCamera, SortMetric, Timeline};
@@ -85,7 +87,12 @@ fn instance_table(entries: &Bound<'_, PyList>) -> PyResult<Vec<Instance>> {
             let text = |key: &str| entry.get_item(key)?.extract::<String>();
             let label = text("label")?;
             let category = if entry.contains("category")? { text("category")? } else { label.clone() };
-            Ok(Instance { id: entry.get_item("id")?.extract()?, label, category })
+            let taxonomies = if entry.contains("taxonomies")? {
+                entry.get_item("taxonomies")?.extract()?
+            } else {
+                BTreeMap::new()
+            };
+            Ok(Instance { id: entry.get_item("id")?.extract()?, label, category, taxonomies })
         })
         .collect()
 }

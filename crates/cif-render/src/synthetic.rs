@@ -80,6 +80,7 @@ pub fn generate(config: &SyntheticConfig) -> SyntheticScene {
                 id: k as u16 + 1,
                 label: format!("object {k}"),
                 category: "object".to_owned(),
+                taxonomies: Default::default(),
             })
             .collect(),
         timeline: Timeline { times: vec![0.0, 0.5, 1.0], frames_per_second: 24.0 },

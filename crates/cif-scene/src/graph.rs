@@ -1,5 +1,7 @@
 //! The scene graph: nodes, their splats and motion, and cameras.
 
+use std::collections::BTreeMap;
+
 use cif_dataset::CaptureFrame;
 use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
@@ -105,6 +107,8 @@ pub struct Node {
     pub label: String,
     /// Class, e.g. `mug`.
     pub category: String,
+    /// Names of its class in vocabularies of others, by taxonomy.
+    pub taxonomies: BTreeMap<String, String>,
     /// Origin of the local frame at the reference time, world.
     pub pivot: DVec3,
     /// Motion of the node.

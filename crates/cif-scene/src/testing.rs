@@ -66,7 +66,12 @@ pub(crate) fn recorded_field(objects: usize, seed: u64) -> Field {
         tracks: tracks.compact(),
         identities: Some(identities),
         instances: (0..objects as u16)
-            .map(|k| Instance { id: 3 * k + 2, label: format!("thing {k}"), category: "thing".into() })
+            .map(|k| Instance {
+                id: 3 * k + 2,
+                label: format!("thing {k}"),
+                category: "thing".into(),
+                taxonomies: Default::default(),
+            })
             .collect(),
         timeline: Timeline { times: TIMES.to_vec(), frames_per_second: 30.0 },
         cameras: cameras(),

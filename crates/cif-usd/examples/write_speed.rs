@@ -80,6 +80,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
         name: "cloud_001".to_owned(),
         label: "cloud".to_owned(),
         category: "cloud".to_owned(),
+        taxonomies: Default::default(),
         pivot: glam::DVec3::ZERO,
         motion,
         splats,

@@ -15,8 +15,8 @@
 //!
 //! Layout of a stage: `/World` (assembly) holds one `Xform` (component) per instance and one for the background,
 //! the scope `Cameras` and, where there are colliders, `PhysicsScene`. An instance has `translate` and `orient`,
-//! `SemanticsLabelsAPI` in the taxonomies `class` (category and human label) and `instance` (unique name),
-//! `CifInstanceAPI` (`schemas/cif`), and the children `Splats` (`ParticleField3DGaussianSplat`), `Proxy` (`Points`
+//! `SemanticsLabelsAPI` in the taxonomies `class` (category and human label) and `instance` (unique name) and in those
+//! of [`cif_scene::Node::taxonomies`], `CifInstanceAPI` (`schemas/cif`), and the children `Splats` (`ParticleField3DGaussianSplat`), `Proxy` (`Points`
 //! drawn by a `PointInstancer`, purpose proxy) and `Collider` (`Mesh`, purpose guide). Where it moves in parts, every
 //! part is an `Xform` under it with such children of its own. The variant set `lod` chooses how many splats are
 //! loaded, `physics` how simulators treat the instance. Arrays stand in the root layer or, by payload, in one layer

@@ -146,6 +146,7 @@ mod tests {
             name: "box_004".into(),
             label: "box".into(),
             category: "box".into(),
+            taxonomies: Default::default(),
             pivot: DVec3::ZERO,
             motion: Motion::Rigid(track),
             splats: Splats::default(),

@@ -4,6 +4,7 @@
 
 #[path = "../../../crates/cif-dataset/tests/support/mod.rs"]
 mod captures;
+mod mask_files;
 mod mutate;
 mod readers;
 

@@ -23,6 +23,7 @@ use glam::{DQuat, DVec2, DVec3};
 use serde_json::json;
 
 use crate::captures;
+use crate::mask_files;
 use crate::mutate::Form;
 
 /// A reader and the file that is damaged for it.
@@ -89,6 +90,36 @@ pub(crate) fn all() -> Vec<Reader> {
             form: Form::Binary,
             write: |folder| capture::write_motion(folder, 3),
             read: known_motion,
+        },
+        Reader {
+            name: "masks-coco",
+            file: "coco.json",
+            form: Form::Json,
+            write: |folder| {
+                hypernerf(folder);
+                fs::write(folder.join("coco.json"), mask_files::coco()).unwrap();
+            },
+            read: |folder| mask_files::import(folder, "coco.json"),
+        },
+        Reader {
+            name: "masks-label-studio",
+            file: "tasks.json",
+            form: Form::Json,
+            write: |folder| {
+                hypernerf(folder);
+                fs::write(folder.join("tasks.json"), mask_files::label_studio()).unwrap();
+            },
+            read: |folder| mask_files::import(folder, "tasks.json"),
+        },
+        Reader {
+            name: "masks-cvat",
+            file: "annotations.xml",
+            form: Form::Binary,
+            write: |folder| {
+                hypernerf(folder);
+                fs::write(folder.join("annotations.xml"), mask_files::cvat()).unwrap();
+            },
+            read: |folder| mask_files::import(folder, "annotations.xml"),
         },
         Reader {
             name: "settings",
@@ -317,7 +348,12 @@ fn field() -> Field {
         camera_from_world: RigidTransform { translation: DVec3::Z, ..RigidTransform::IDENTITY },
     };
     let record = |time_index| RecordedCamera { name: "left".to_owned(), time_index, trained: true, camera };
-    let instance = |id, label: &str| Instance { id, label: label.to_owned(), category: "thing".to_owned() };
+    let instance = |id, label: &str| Instance {
+        id,
+        label: label.to_owned(),
+        category: "thing".to_owned(),
+        taxonomies: Default::default(),
+    };
     Field {
         gaussians,
         deformation: Some(Deformation::new(config, bounds, 1.0, 1, false).unwrap()),

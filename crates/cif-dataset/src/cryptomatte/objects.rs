@@ -51,7 +51,15 @@ pub(crate) fn assign(
         for (name, object) in manifests.iter().filter(|(name, _)| name.as_str() != BACKGROUND) {
             let id = u16::try_from(named.len() + 1)
                 .map_err(|_| Error::invalid(place, "the Cryptomatte names more than 65535 objects"))?;
-            named.insert(id, InstanceLabel { id, label: name.clone(), category: base(name).to_owned() });
+            named.insert(
+                id,
+                InstanceLabel {
+                    id,
+                    label: name.clone(),
+                    category: base(name).to_owned(),
+                    taxonomies: BTreeMap::new(),
+                },
+            );
             ids.insert(*object, id);
         }
         return Ok(ids);
@@ -66,7 +74,12 @@ pub(crate) fn assign(
                 if labels_absent && id != 0 {
                     let label = base(name).to_owned();
                     let category = label.clone();
-                    named.entry(id).or_insert(InstanceLabel { id, label, category });
+                    named.entry(id).or_insert(InstanceLabel {
+                        id,
+                        label,
+                        category,
+                        taxonomies: BTreeMap::new(),
+                    });
                 }
             }
             None if name == BACKGROUND => {}

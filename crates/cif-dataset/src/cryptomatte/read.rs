@@ -4,17 +4,11 @@ use std::collections::BTreeMap;
 use std::path::{Component, Path};
 
 use cif_geometry::PixelGrid;
-use exr::meta::MetaData;
 use exr::prelude::{AttributeValue, FlatSamples, ReadChannels, ReadLayers, Text, read as read_exr};
 
 use super::{CONVERSION, Cryptomatte, HASH, object_id};
 use crate::Error;
-
-/// Larger images than this are refused before anything is allocated.
-const MAX_PIXELS: u64 = 1 << 28;
-
-/// No lossless compression packs more than this into a byte; a header that claims more is not believed.
-const MAX_RATIO: u64 = 4096;
+use crate::files::exr_header;
 
 /// Cryptomatte metadata in the header of a file.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -34,34 +28,7 @@ pub struct Header {
 /// # Errors
 /// When the file is missing, damaged, no EXR, or has no Cryptomatte with a manifest.
 pub fn read_header(path: &Path) -> Result<Header, Error> {
-    let file_size = cif_input::check(path).map_err(Error::read(path))?;
-    let meta = MetaData::read_from_file(path, false)
-        .map_err(|error| Error::mask(path, format!("not a readable EXR file ({error}); export it again")))?;
-    let Some(first) = meta.headers.first() else {
-        return Err(Error::mask(path, "the EXR file has no part; export it again"));
-    };
-    let size = first.shared_attributes.display_window.size;
-    let too_large = || {
-        Error::mask(
-            path,
-            format!(
-                "its header claims {} x {} pixels, more than the {file_size} bytes of the file can hold",
-                size.x(),
-                size.y()
-            ),
-        )
-    };
-    let (mut bytes, mut widest) = (0_u64, size.x() as u64 * size.y() as u64);
-    for header in &meta.headers {
-        let pixels = header.layer_size.x() as u64 * header.layer_size.y() as u64;
-        widest = widest.max(pixels);
-        let sample: u64 =
-            header.channels.list.iter().map(|channel| channel.sample_type.bytes_per_sample() as u64).sum();
-        bytes = bytes.saturating_add(pixels.saturating_mul(sample));
-    }
-    if widest > MAX_PIXELS || bytes > file_size.saturating_mul(MAX_RATIO) {
-        return Err(too_large());
-    }
+    let (meta, (width, height)) = exr_header::read(path)?;
     // Multi-part files keep the metadata in one part, which need not be that of the layer.
     let mut texts: BTreeMap<String, String> = BTreeMap::new();
     for header in &meta.headers {
@@ -100,7 +67,7 @@ pub fn read_header(path: &Path) -> Result<Header, Error> {
         }
     };
     let objects = parse_manifest(path, &manifest, text("hash").is_none_or(|hash| hash == HASH))?;
-    Ok(Header { layer, width: size.x() as u32, height: size.y() as u32, objects })
+    Ok(Header { layer, width, height, objects })
 }
 
 /// The layer of objects, as (key, name).

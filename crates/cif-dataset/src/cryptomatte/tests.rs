@@ -197,7 +197,17 @@ fn manifests_beside_the_file_are_read() {
 fn labels(entries: &[(u16, &str)]) -> BTreeMap<u16, InstanceLabel> {
     entries
         .iter()
-        .map(|(id, label)| (*id, InstanceLabel { id: *id, label: (*label).into(), category: "thing".into() }))
+        .map(|(id, label)| {
+            (
+                *id,
+                InstanceLabel {
+                    id: *id,
+                    label: (*label).into(),
+                    category: "thing".into(),
+                    taxonomies: Default::default(),
+                },
+            )
+        })
         .collect()
 }
 

@@ -5,6 +5,7 @@ use std::io::BufReader;
 use std::path::Path;
 
 use cif_geometry::PixelGrid;
+use image::DynamicImage;
 use png::{BitDepth, ColorType, Decoder, Limits, Transformations};
 
 use super::MAX_DEFLATE_RATIO;
@@ -12,6 +13,12 @@ use crate::Error;
 
 /// Larger masks than this are refused before anything is allocated.
 const MAX_PIXELS: u64 = 1 << 28;
+
+/// Half of white in 16 bits.
+const HALF: u16 = 1 << 15;
+
+/// The value 1 of 8 bits in 16.
+const ONE: u16 = 257;
 
 /// Size of a mask and the largest id that it can hold, from its header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,7 +66,7 @@ fn open(path: &Path) -> Result<png::Reader<BufReader<File>>, Error> {
                 path,
                 format!(
                     "it is a {} image; a mask is an 8- or 16-bit grey or palette PNG whose pixel values are \
-                     instance ids, 0 for unlabelled",
+                     instance ids, 0 for unlabelled; colours of a tracker become ids with `cif masks import`",
                     match reader.info().color_type {
                         ColorType::GrayscaleAlpha => "grey and alpha",
                         ColorType::Rgba => "RGBA",
@@ -140,6 +147,69 @@ pub(crate) fn decode_binary(path: &Path) -> Result<PixelGrid<u16>, Error> {
     let picture = reader.decode().map_err(damaged)?.into_rgb16();
     let pixels = picture.pixels().map(|pixel| u16::from(pixel.0 != [0; 3])).collect();
     Ok(PixelGrid::from_pixels(picture.width(), picture.height(), pixels))
+}
+
+/// Kind of the pixels of a PNG file.
+///
+/// # Errors
+/// When the file is missing or no PNG.
+pub(crate) fn color_type(path: &Path) -> Result<ColorType, Error> {
+    Ok(open_png(path)?.info().color_type)
+}
+
+/// Decodes a PNG file of any kind, 8 bits per channel.
+fn decode_picture(path: &Path) -> Result<DynamicImage, Error> {
+    drop(open_png(path)?);
+    let damaged = |error: image::ImageError| {
+        Error::mask(path, format!("it cannot be decoded ({error}); export it again"))
+    };
+    let file = cif_input::open(path).map_err(Error::read(path))?;
+    image::ImageReader::with_format(BufReader::new(file), image::ImageFormat::Png).decode().map_err(damaged)
+}
+
+/// Decodes a picture whose colours stand for objects: 8 bits of red, green and blue; transparent pixels are black.
+///
+/// # Errors
+/// When the file is missing, truncated, no PNG, has more than 8 bits per channel or partly transparent pixels.
+pub(crate) fn decode_colors(path: &Path) -> Result<PixelGrid<[u8; 3]>, Error> {
+    if open_png(path)?.info().bit_depth == BitDepth::Sixteen {
+        return Err(Error::mask(path, "16 bits per colour channel; export colours with 8 bits"));
+    }
+    let picture = decode_picture(path)?.into_rgba8();
+    let pixels = picture
+        .pixels()
+        .map(|pixel| match pixel.0 {
+            [r, g, b, 255] => Ok([r, g, b]),
+            [_, _, _, 0] => Ok([0; 3]),
+            _ => Err(Error::mask(
+                path,
+                "partly transparent pixels: edges are blended; export it without antialiasing",
+            )),
+        })
+        .collect::<Result<_, _>>()?;
+    Ok(PixelGrid::from_pixels(picture.width(), picture.height(), pixels))
+}
+
+/// Decodes a mask of one object: true from a half of white on, or of opacity where that varies. In a palette every index
+/// but 0 is the object; so is every value but 0 where 8 bits go no higher than 1.
+///
+/// # Errors
+/// When the file is missing, truncated or no PNG.
+pub(crate) fn decode_matte(path: &Path) -> Result<PixelGrid<bool>, Error> {
+    if color_type(path)? == ColorType::Indexed {
+        return Ok(decode(path)?.map(|index| *index != 0));
+    }
+    let picture = decode_picture(path)?.into_rgba16();
+    let (width, height) = picture.dimensions();
+    let opaque: Vec<bool> = picture.pixels().map(|pixel| pixel.0[3] >= HALF).collect();
+    if opaque.contains(&true) && opaque.contains(&false) {
+        return Ok(PixelGrid::from_pixels(width, height, opaque));
+    }
+    let brightest = |pixel: &image::Rgba<u16>| pixel.0[..3].iter().copied().max().unwrap_or(0);
+    let values: Vec<u16> = picture.pixels().map(brightest).collect();
+    let most = values.iter().copied().max().unwrap_or(0);
+    let least = if most <= ONE { 1 } else { HALF };
+    Ok(PixelGrid::from_pixels(width, height, values.into_iter().map(|value| value >= least).collect()))
 }
 
 /// Nearest-neighbour resize: never invents an id (methods reference 7, row 39).

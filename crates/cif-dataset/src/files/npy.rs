@@ -51,6 +51,30 @@ pub(crate) fn read_matrix(path: &Path) -> Result<Matrix, Error> {
     }
 }
 
+/// Reads an array of integers: a `.npy` file, or a `.npz` archive that holds one array.
+///
+/// # Errors
+/// When the file is damaged, of other elements, or an archive of several arrays.
+pub(crate) fn read_integers(path: &Path) -> Result<Array, Error> {
+    if !super::listing::has_extension(path, &["npz"]) {
+        let bytes = cif_input::read(path).map_err(Error::read(path))?;
+        return parse(&bytes, Elements::Integers).map_err(|problem| Error::invalid(path, problem));
+    }
+    let mut archive = Archive::open(path)?;
+    let names: Vec<String> = archive
+        .zip
+        .file_names()
+        .map(|name| name.map_or_else(|_| "?".to_owned(), |name| name.into_owned()))
+        .collect();
+    match names.as_slice() {
+        [name] => archive.array(name.strip_suffix(".npy").unwrap_or(name), Elements::Integers),
+        _ => Err(Error::invalid(
+            path,
+            format!("{} arrays where one of ids is expected: {}", names.len(), names.join(", ")),
+        )),
+    }
+}
+
 /// An opened `.npz` archive.
 pub(crate) struct Archive<'a> {
     path: &'a Path,

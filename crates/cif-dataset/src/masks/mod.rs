@@ -1,16 +1,19 @@
-//! Masks from a video tracker: one sequence out of all views, and its ids back per view; and what a detector found.
+//! Masks from a video tracker: one sequence out of all views, and its ids back per view; what a detector found; masks of
+//! other tools.
 //!
 //! Source: methods reference 10.1. The masks of every view, the held-out ones included, come from one tracker
 //! pass: scores on them measure agreement with a consistent tracker, not with human truth.
 
 mod folder;
 mod found;
+mod import;
 mod split;
 mod view_order;
 mod writer;
 mod zigzag;
 
 pub use found::{flat_name, found_masks};
+pub use import::{Drawn, Import, SourceKind};
 pub use split::{KeptInstance, RemovedInstance, SplitReport, split_tracker_masks};
 pub use view_order::{ViewOrder, ordered_views};
 pub use writer::MaskWriter;

@@ -17,8 +17,12 @@ use crate::{DeformationConfig, Field, Instance, RecordedCamera, SortMetric, Time
 /// ([`crate::Deformation::still`]); 4 adds recorded opacities and colours ([`crate::TrackGroup::opacities`]), and
 /// identity rows without entries or with an owner ([`crate::Owner`]); 5 adds evidence for rotations
 /// ([`crate::TrackGroup::rotation`]); 6 adds joints ([`crate::TrackGroup::joint`]); 7 adds heads
-/// ([`super::Checkpoint::head`]). A scene without these is written as 1 to 6, so that older software reads it.
-pub const FORMAT: u32 = 7;
+/// ([`super::Checkpoint::head`]); 8 adds taxonomies ([`Instance::taxonomies`]). A scene without these is written as 1 to
+/// 7, so that older software reads it.
+pub const FORMAT: u32 = 8;
+
+/// The layout before taxonomies.
+const FORMAT_WITH_HEADS: u32 = 7;
 
 /// The layout before heads.
 const FORMAT_WITH_JOINTS: u32 = 6;
@@ -40,8 +44,10 @@ const FORMAT_WITHOUT_TRACKS: u32 = 1;
 
 /// Oldest layout that holds a field, and what a head learnt where `has_head`.
 pub(super) fn format_of(field: &Field, has_head: bool) -> u32 {
-    if has_head {
+    if field.instances.iter().any(|instance| !instance.taxonomies.is_empty()) {
         FORMAT
+    } else if has_head {
+        FORMAT_WITH_HEADS
     } else if groups(field).any(|group| group.joint.is_some()) {
         FORMAT_WITH_JOINTS
     } else if has_evidence(field) {

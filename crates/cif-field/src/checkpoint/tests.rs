@@ -642,7 +642,7 @@ fn a_link_stays_a_link() {
 }
 
 #[test]
-fn heads_survive_and_raise_the_format() {
+fn heads_and_taxonomies_survive_and_raise_the_format() {
     let head = TrainingState {
         json: json!({ "name": "sa4d" }),
         tensors: BTreeMap::from([("weights".to_owned(), StateTensor::F32(vec![0.25, -1.5]))]),
@@ -653,11 +653,19 @@ fn heads_survive_and_raise_the_format() {
         header.metadata().clone().unwrap()["cif.format"].clone()
     };
     let plain = bytes_of(&Checkpoint { field: field.clone(), training: None, head: None });
-    assert_ne!(format_of(&plain), FORMAT.to_string(), "older software reads scenes without heads");
+    assert!(format_of(&plain).parse::<u32>().unwrap() < 7, "older software reads scenes without heads");
     let finished = Checkpoint { field, training: None, head: Some(head) };
     let bytes = bytes_of(&finished);
-    assert_eq!(format_of(&bytes), FORMAT.to_string());
+    assert_eq!(format_of(&bytes), "7");
     assert_eq!(read_bytes(&bytes).unwrap(), finished);
+    let mut named = finished.clone();
+    named.field.instances[1].taxonomies = [("coco".to_owned(), "cup".to_owned())].into();
+    let with_taxonomies = bytes_of(&named);
+    assert_eq!(format_of(&with_taxonomies), FORMAT.to_string());
+    assert_eq!(read_bytes(&with_taxonomies).unwrap(), named);
+    assert_ne!(named.field.fingerprint(), finished.field.fingerprint());
+    named.field.instances[1].taxonomies = [("a-b".to_owned(), "cup".to_owned())].into();
+    assert!(named.field.validate().unwrap_err().to_string().contains("\"a-b\", which is no name in USD"));
     let file = tempfile::NamedTempFile::new().unwrap();
     std::fs::write(file.path(), &bytes).unwrap();
     assert_eq!(Field::load(file.path()).unwrap(), finished.field, "the scene is read without it");

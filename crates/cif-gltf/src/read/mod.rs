@@ -81,7 +81,19 @@ pub fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
     let mut prims: Vec<Prim> = prims.into_iter().flatten().collect();
     prims.sort_by_key(|prim| prim.identity == Identity::Background);
     let cameras = cameras::read(&mut reader, &hierarchy.placed);
-    let objects = prims.iter().flat_map(|prim| [&prim.label, &prim.category]);
+    for (taxonomy, label) in prims.iter().flat_map(|prim| &prim.taxonomies) {
+        if let Err(problem) = cif_output::check_taxonomy(taxonomy) {
+            return Err(source.invalid(format!("the taxonomy {taxonomy:?}"), problem));
+        }
+        if label.is_empty() {
+            return Err(
+                source.invalid(format!("the taxonomy {taxonomy:?}"), "it names nothing; leave it out")
+            );
+        }
+    }
+    let objects = prims
+        .iter()
+        .flat_map(|prim| [&prim.label, &prim.category].into_iter().chain(prim.taxonomies.values()));
     if let Some(name) =
         objects.chain(cameras.iter().map(|track| &track.label)).find(|name| name.contains('\0'))
     {

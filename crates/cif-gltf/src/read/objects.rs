@@ -240,6 +240,7 @@ fn ours(prim: Prim, object: &Object) -> Prim {
     Prim {
         label: object.label.clone(),
         category: object.category.clone(),
+        taxonomies: object.taxonomies.clone(),
         pivot: Some(DVec3::from_array(object.pivot)),
         keeps_pose: object.motion.model == MotionModel::Rigid,
         report: Some(object.motion.clone()),

@@ -35,6 +35,9 @@ const ASKED_FIRST: usize = 4;
 /// Share that the first trees have to give to one class to agree.
 const AGREEMENT: f32 = 0.999;
 
+/// Pixels that walk through a tree together.
+const LANES: usize = 8;
+
 /// Pixels of keyframes with their classes.
 #[derive(Clone, Default)]
 pub(crate) struct Samples {
@@ -123,17 +126,27 @@ impl Forest {
         for values in features.values.chunks(TOGETHER) {
             sums.fill(0.0);
             let mut asked = [TREES; TOGETHER];
+            // Pixels that the next tree is asked about.
+            let mut open: Vec<usize> = (0..values.len()).collect();
             for (k, tree) in self.trees.iter().enumerate() {
-                let pixels = values.iter().zip(sums.chunks_exact_mut(self.classes)).zip(&mut asked);
-                for ((value, sums), asked) in pixels.filter(|(_, asked)| **asked > k) {
-                    for (class, share) in tree.leaf_of(value) {
-                        sums[usize::from(*class)] += share;
+                for pixels in open.chunks(LANES) {
+                    let leaves = tree.leaves_of(values, pixels);
+                    for (pixel, leaf) in pixels.iter().zip(leaves) {
+                        let sums = &mut sums[pixel * self.classes..(pixel + 1) * self.classes];
+                        for (class, share) in tree.shares_of(leaf) {
+                            sums[usize::from(*class)] += share;
+                        }
                     }
-                    let agreed =
-                        k + 1 == ASKED_FIRST && sums.iter().any(|sum| *sum >= AGREEMENT * ASKED_FIRST as f32);
-                    if agreed {
-                        *asked = ASKED_FIRST;
-                    }
+                }
+                if k + 1 == ASKED_FIRST {
+                    open.retain(|pixel| {
+                        let sums = &sums[pixel * self.classes..(pixel + 1) * self.classes];
+                        let agreed = sums.iter().any(|sum| *sum >= AGREEMENT * ASKED_FIRST as f32);
+                        if agreed {
+                            asked[*pixel] = ASKED_FIRST;
+                        }
+                        !agreed
+                    });
                 }
             }
             for (sums, asked) in sums.chunks_exact(self.classes).zip(asked).take(values.len()) {
@@ -145,13 +158,29 @@ impl Forest {
 }
 
 impl Tree {
-    fn leaf_of(&self, value: &[f32; DIMENSIONS]) -> &[(u16, f32)] {
-        let mut node = self.nodes[0];
-        while let Some(feature) = value.get((node.feature_and_next / PLACES) as usize) {
-            let next = (node.feature_and_next % PLACES) as usize;
-            node = self.nodes[next + usize::from(*feature >= node.threshold)];
+    /// Leaves that pixels fall into, at most [`LANES`]: walks wait for memory at every node, so that several go on
+    /// together. Lanes beyond the pixels repeat the first.
+    fn leaves_of(&self, values: &[[f32; DIMENSIONS]], pixels: &[usize]) -> [usize; LANES] {
+        let values: [&[f32; DIMENSIONS]; LANES] =
+            std::array::from_fn(|lane| &values[pixels.get(lane).copied().unwrap_or(pixels[0])]);
+        let mut nodes = [self.nodes[0]; LANES];
+        loop {
+            let mut walking = false;
+            for (node, value) in nodes.iter_mut().zip(values) {
+                if let Some(feature) = value.get((node.feature_and_next / PLACES) as usize) {
+                    let next = (node.feature_and_next % PLACES) as usize;
+                    *node = self.nodes[next + usize::from(*feature >= node.threshold)];
+                    walking = true;
+                }
+            }
+            if !walking {
+                return nodes.map(|node| (node.feature_and_next % PLACES) as usize);
+            }
         }
-        let leaf = (node.feature_and_next % PLACES) as usize;
+    }
+
+    /// Classes of the samples of a leaf with their shares.
+    fn shares_of(&self, leaf: usize) -> &[(u16, f32)] {
         &self.shares[self.leaves[leaf] as usize..self.leaves[leaf + 1] as usize]
     }
 

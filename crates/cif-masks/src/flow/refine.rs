@@ -68,22 +68,43 @@ pub(super) fn refine(first: &Level, second: &Level, field: &mut Flow) {
     let (width, height) = (field.u.width, field.u.height);
     let [brightness, gradient_x, gradient_y] = terms(first, second, field);
     let start = field.clone();
-    let mut systems = vec![[0.0_f32; 5]; width * height];
-    let (mut right, mut down) = (vec![0.0_f32; width * height], vec![0.0_f32; width * height]);
+    let mut equations = vec![Equation::default(); width * height];
+    let mut weights = Smoothness::new(width, height);
     for _ in 0..ROUNDS {
-        for (k, system) in systems.iter_mut().enumerate() {
-            let step = [field.u.data[k] - start.u.data[k], field.v.data[k] - start.v.data[k]];
-            *system = [0.0; 5];
-            brightness.add(k, 0.5 * BRIGHTNESS / (brightness.square(k, step) + EPSILON).sqrt(), system);
+        weights.update(field);
+        for (k, equation) in equations.iter_mut().enumerate() {
+            let from = [start.u.data[k], start.v.data[k]];
+            let step = [field.u.data[k] - from[0], field.v.data[k] - from[1]];
+            let mut system = [0.0; 5];
+            brightness.add(k, 0.5 * BRIGHTNESS / (brightness.square(k, step) + EPSILON).sqrt(), &mut system);
             let squares = gradient_x.square(k, step) + gradient_y.square(k, step);
             let weight = 0.5 * GRADIENT / (squares + EPSILON).sqrt();
-            gradient_x.add(k, weight, system);
-            gradient_y.add(k, weight, system);
+            gradient_x.add(k, weight, &mut system);
+            gradient_y.add(k, weight, &mut system);
+            *equation = Equation::new(system, from, weights.sum(k));
         }
-        smoothness(field, &mut right, &mut down);
         for _ in 0..SWEEPS {
-            sweep(&start, &systems, &right, &down, field);
+            sweep(&equations, &weights, field);
         }
+    }
+}
+
+/// The two linear equations of a pixel, without what its neighbours pull.
+#[derive(Clone, Copy, Default)]
+struct Equation {
+    /// Right sides of the equations of u and of v.
+    rest: [f32; 2],
+    /// Factor of the other component in either equation.
+    cross: f32,
+    /// Relaxation by the factors of the components.
+    rate: [f32; 2],
+}
+
+impl Equation {
+    /// `system` is for steps from the displacement `from`: xx, xy, yy, and the right sides.
+    fn new([xx, xy, yy, bx, by]: [f32; 5], [u, v]: [f32; 2], smoothness: f32) -> Self {
+        let rate = |own: f32| RELAXATION / (own + smoothness + 1e-6);
+        Self { rest: [bx + xx * u + xy * v, by + yy * v + xy * u], cross: xy, rate: [rate(xx), rate(yy)] }
     }
 }
 
@@ -118,62 +139,87 @@ fn terms(first: &Level, second: &Level, field: &Flow) -> [Term; 3] {
     ]
 }
 
-/// Weights of the differences to the pixel to the right and to that below; 0 at the border.
-fn smoothness(field: &Flow, right: &mut [f32], down: &mut [f32]) {
-    let (width, height) = (field.u.width, field.u.height);
-    let mut at = vec![EPSILON; width * height];
-    for plane in [&field.u, &field.v] {
-        for (y, at) in at.chunks_exact_mut(width).enumerate() {
-            let (row, below) = (plane.row(y as isize), plane.row(y as isize + 1));
-            for ((at, value), below) in at.iter_mut().zip(row).zip(below) {
-                *at += (below - value) * (below - value);
-            }
-            for (at, pair) in at.iter_mut().zip(row.windows(2)) {
-                *at += (pair[1] - pair[0]) * (pair[1] - pair[0]);
-            }
-        }
-    }
-    at.iter_mut().for_each(|value| *value = 0.5 * SMOOTHNESS / value.sqrt());
-    for (right, at) in right.chunks_exact_mut(width).zip(at.chunks_exact(width)) {
-        for (right, pair) in right.iter_mut().zip(at.windows(2)) {
-            *right = 0.5 * (pair[0] + pair[1]);
-        }
-        right[width - 1] = 0.0;
-    }
-    let last = width * (height - 1);
-    for (down, (value, below)) in down[..last].iter_mut().zip(at.iter().zip(&at[width..])) {
-        *down = 0.5 * (value + below);
-    }
-    down[last..].fill(0.0);
+/// Weights of the differences between neighbouring pixels.
+struct Smoothness {
+    width: usize,
+    /// Weight between a pixel and the one before it in its row, 0 where there is none; one more at the end.
+    across: Vec<f32>,
+    /// Weight between a pixel and the one above, 0 where there is none; one row more at the end.
+    down: Vec<f32>,
+    /// Weight of every pixel.
+    at: Vec<f32>,
 }
 
-/// One sweep of successive over-relaxation.
-fn sweep(start: &Flow, systems: &[[f32; 5]], right: &[f32], down: &[f32], field: &mut Flow) {
+impl Smoothness {
+    fn new(width: usize, height: usize) -> Self {
+        let pixels = width * height;
+        Self { width, across: vec![0.0; pixels + 1], down: vec![0.0; pixels + width], at: vec![0.0; pixels] }
+    }
+
+    /// The weights for a field.
+    fn update(&mut self, field: &Flow) {
+        let width = self.width;
+        self.at.fill(EPSILON);
+        for plane in [&field.u, &field.v] {
+            for (y, at) in self.at.chunks_exact_mut(width).enumerate() {
+                let (row, below) = (plane.row(y as isize), plane.row(y as isize + 1));
+                for ((at, value), below) in at.iter_mut().zip(row).zip(below) {
+                    *at += (below - value) * (below - value);
+                }
+                for (at, pair) in at.iter_mut().zip(row.windows(2)) {
+                    *at += (pair[1] - pair[0]) * (pair[1] - pair[0]);
+                }
+            }
+        }
+        self.at.iter_mut().for_each(|value| *value = 0.5 * SMOOTHNESS / value.sqrt());
+        for (across, at) in self.across.chunks_exact_mut(width).zip(self.at.chunks_exact(width)) {
+            for (across, pair) in across[1..].iter_mut().zip(at.windows(2)) {
+                *across = 0.5 * (pair[0] + pair[1]);
+            }
+        }
+        let inner = self.at.len();
+        for (down, (value, below)) in
+            self.down[width..inner].iter_mut().zip(self.at.iter().zip(&self.at[width..]))
+        {
+            *down = 0.5 * (value + below);
+        }
+    }
+
+    /// Sum of the weights between a pixel and its neighbours.
+    fn sum(&self, k: usize) -> f32 {
+        self.across[k] + self.across[k + 1] + self.down[k] + self.down[k + self.width]
+    }
+}
+
+/// One sweep of successive over-relaxation: first the pixels of one colour of a chessboard, then those of the other,
+/// whose neighbours are all of the first. None of a colour waits for another.
+fn sweep(equations: &[Equation], weights: &Smoothness, field: &mut Flow) {
     let (width, height) = (field.u.width, field.u.height);
     let (u, v) = (&mut field.u.data, &mut field.v.data);
-    for y in 0..height {
-        for x in 0..width {
-            let k = y * width + x;
-            // Beyond the border lies the pixel itself, with weight 0.
-            let (left, above) = (if x > 0 { k - 1 } else { k }, if y > 0 { k - width } else { k });
-            let (next, below) =
-                (if x + 1 < width { k + 1 } else { k }, if y + 1 < height { k + width } else { k });
-            let from_left = if x > 0 { right[k - 1] } else { 0.0 };
-            let from_above = if y > 0 { down[k - width] } else { 0.0 };
-            let sum = from_left + right[k] + from_above + down[k];
-            let pull = |values: &[f32]| {
-                from_left * values[left]
-                    + right[k] * values[next]
-                    + from_above * values[above]
-                    + down[k] * values[below]
-            };
-            let (pull_u, pull_v) = (pull(u), pull(v));
-            let [xx, xy, yy, bx, by] = systems[k];
-            let (u0, v0) = (start.u.data[k], start.v.data[k]);
-            let new_u = (bx + xx * u0 - xy * (v[k] - v0) + pull_u) / (xx + sum + 1e-6);
-            u[k] += RELAXATION * (new_u - u[k]);
-            let new_v = (by + yy * v0 - xy * (u[k] - u0) + pull_v) / (yy + sum + 1e-6);
-            v[k] += RELAXATION * (new_v - v[k]);
+    let last = equations.len() - 1;
+    for color in 0..2 {
+        for y in 0..height {
+            for x in ((y + color) % 2..width).step_by(2) {
+                let k = y * width + x;
+                // Beyond the border any pixel stands in, with weight 0.
+                let (left, next) = (k.saturating_sub(1), (k + 1).min(last));
+                let (above, below) = (k.saturating_sub(width), (k + width).min(last));
+                let (from_left, from_next) = (weights.across[k], weights.across[k + 1]);
+                let (from_above, from_below) = (weights.down[k], weights.down[k + width]);
+                let pull = |values: &[f32]| {
+                    from_left * values[left]
+                        + from_next * values[next]
+                        + from_above * values[above]
+                        + from_below * values[below]
+                };
+                let equation = &equations[k];
+                let (own_u, own_v) = (u[k], v[k]);
+                let right_u = equation.rest[0] - equation.cross * own_v + pull(u);
+                let new_u = (1.0 - RELAXATION) * own_u + equation.rate[0] * right_u;
+                let right_v = equation.rest[1] - equation.cross * new_u + pull(v);
+                u[k] = new_u;
+                v[k] = (1.0 - RELAXATION) * own_v + equation.rate[1] * right_v;
+            }
         }
     }
 }

@@ -123,6 +123,8 @@ pub struct Prim {
     pub label: String,
     /// Class.
     pub category: String,
+    /// Names of its class in vocabularies of others, by taxonomy.
+    pub taxonomies: BTreeMap<String, String>,
     /// Path of the object's frame in that of the scene.
     pub track: Track,
     /// True when a pose without samples is a track of one sample even if it is not turned.
@@ -174,6 +176,7 @@ impl Prim {
             identity: Identity::New,
             name: PrimName::OfLabel,
             category: label.clone(),
+            taxonomies: BTreeMap::new(),
             label,
             track: Track::still(),
             keeps_pose: false,

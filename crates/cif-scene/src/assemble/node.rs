@@ -37,6 +37,7 @@ pub(super) fn node(mut prim: Prim, kind: NodeKind, name: String) -> Node {
         name,
         label: prim.label,
         category: prim.category,
+        taxonomies: prim.taxonomies,
         pivot,
         extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, at_first),
         mean_occupancy: prim.mean_occupancy.unwrap_or_else(|| splats.mean_occupancy()),

@@ -1,5 +1,7 @@
 //! Nodes from groups of Gaussians and their chosen motion.
 
+use std::collections::BTreeMap;
+
 use cif_field::{Field, Gaussians, Identities, RotationEvidence};
 use cif_geometry::RigidTransform;
 use glam::DVec3;
@@ -24,6 +26,7 @@ pub(crate) struct Naming {
     name: String,
     label: String,
     category: String,
+    taxonomies: BTreeMap<String, String>,
 }
 
 impl Naming {
@@ -43,6 +46,7 @@ impl Naming {
                     name,
                     label: instance.label.clone(),
                     category: instance.category.clone(),
+                    taxonomies: instance.taxonomies.clone(),
                 }
             }
             None => Self {
@@ -53,6 +57,7 @@ impl Naming {
                     false => naming::BACKGROUND.to_owned(),
                 },
                 category: naming::BACKGROUND.to_owned(),
+                taxonomies: BTreeMap::new(),
             },
         }
     }
@@ -125,6 +130,7 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
         name: naming.name,
         label: naming.label,
         category: naming.category,
+        taxonomies: naming.taxonomies,
         pivot: group.pivot,
         extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, at_pivot),
         motion,

@@ -83,6 +83,8 @@ pub struct ObjectChange {
     pub relabelled: Option<FromTo>,
     /// Category, if it differs.
     pub recategorised: Option<FromTo>,
+    /// Names in taxonomies, if they differ: `coco=cup, wikidata_qcode=Q81727`.
+    pub taxonomies: Option<FromTo>,
     /// Move, if there is one.
     pub moved: Option<Moved>,
     /// True when it is seen at other times.
@@ -99,6 +101,7 @@ impl ObjectChange {
             || self.renamed.is_some()
             || self.relabelled.is_some()
             || self.recategorised.is_some()
+            || self.taxonomies.is_some()
             || self.moved.is_some()
             || self.visibility
             || self.splats.is_some()
@@ -114,8 +117,12 @@ impl ObjectChange {
             ChangeKind::Removed => words.push("removed".to_owned()),
             ChangeKind::Changed => {}
         }
-        let changes =
-            [("renamed", &self.renamed), ("relabelled", &self.relabelled), ("category", &self.recategorised)];
+        let changes = [
+            ("renamed", &self.renamed),
+            ("relabelled", &self.relabelled),
+            ("category", &self.recategorised),
+            ("taxonomies", &self.taxonomies),
+        ];
         for (what, change) in changes {
             if let Some(FromTo { from, to }) = change {
                 words.push(format!("{what} {from:?} -> {to:?}"));
@@ -202,6 +209,7 @@ pub(crate) fn compare(before: &SceneGraph, after: &SceneGraph, pair: &Pair) -> O
         renamed: None,
         relabelled: None,
         recategorised: None,
+        taxonomies: None,
         moved: None,
         visibility: false,
         splats: None,
@@ -210,6 +218,10 @@ pub(crate) fn compare(before: &SceneGraph, after: &SceneGraph, pair: &Pair) -> O
     change.renamed = FromTo::of(&first.name, &second.name);
     change.relabelled = FromTo::of(&first.label, &second.label);
     change.recategorised = FromTo::of(&first.category, &second.category);
+    let taxonomies = |node: &Node| {
+        node.taxonomies.iter().map(|(name, label)| format!("{name}={label}")).collect::<Vec<_>>().join(", ")
+    };
+    change.taxonomies = FromTo::of(&taxonomies(first), &taxonomies(second));
     let codes = key_codes(&[before, after], &[first, second]);
     change.moved = moved(first, second, &codes);
     change.visibility = visibility_differs(first, second, &codes);

@@ -406,6 +406,9 @@ fn rename(instance: &mut Instance, id: u16, first: &Node, second: &Node) {
     if second.category != first.category {
         instance.category.clone_from(&second.category);
     }
+    if second.taxonomies != first.taxonomies {
+        instance.taxonomies.clone_from(&second.taxonomies);
+    }
 }
 
 fn visibility(node: &Node, times: &TimeMap) -> Vec<VisibilityStep> {

@@ -165,7 +165,8 @@ impl InstanceTable {
         let index = self.entries.len() as u16;
         let label = if node.label.is_empty() { node.name.clone() } else { node.label.clone() };
         let category = if node.category.is_empty() { label.clone() } else { node.category.clone() };
-        self.entries.push(Instance { id, label, category });
+        let taxonomies = node.taxonomies.clone();
+        self.entries.push(Instance { id, label, category, taxonomies });
         Ok(index)
     }
 }

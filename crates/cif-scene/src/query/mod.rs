@@ -89,8 +89,8 @@ pub fn query(graph: &SceneGraph, query: &LabelQuery, place: &str) -> Result<Vec<
     let mut known = Vec::new();
     let mut found = Vec::new();
     for node in &graph.nodes {
-        let names = [&node.label, &node.category, &node.name];
-        if names.iter().any(|name| matcher.matches(name)) {
+        let names = || [&node.label, &node.category, &node.name].into_iter().chain(node.taxonomies.values());
+        if names().any(|name| matcher.matches(name)) {
             let rows = world::world_matrix(&graph.frame, &node.world_transform(time_code));
             let (low, high) = corners(&world::world_bounds(&graph.frame, node.bounds(time_code)));
             found.push(LabelMatch {
@@ -103,7 +103,7 @@ pub fn query(graph: &SceneGraph, query: &LabelQuery, place: &str) -> Result<Vec<
                 high,
             });
         }
-        known.extend(names.map(Clone::clone));
+        known.extend(names().cloned());
     }
     if found.is_empty() { Err(query.unknown(place, known)) } else { Ok(found) }
 }

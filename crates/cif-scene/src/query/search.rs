@@ -29,7 +29,7 @@ pub struct ObjectQuery {
     /// Label, class or unique name; see [`crate::LabelPattern`].
     pub label: Option<String>,
     /// Only labels of this taxonomy count; [`TAXONOMY_CLASS`] holds classes and human labels,
-    /// [`TAXONOMY_INSTANCE`] unique names.
+    /// [`TAXONOMY_INSTANCE`] unique names, others the names in vocabularies of others.
     pub taxonomy: Option<String>,
     /// When.
     pub when: When,
@@ -186,6 +186,7 @@ pub fn search(
             (TAXONOMY_INSTANCE, &node.name),
         ]
         .into_iter()
+        .chain(node.taxonomies.iter().map(|(taxonomy, name)| (taxonomy.as_str(), name)))
         .filter_map(|(taxonomy, name)| wanted.counts(taxonomy).then_some(name))
         .collect();
         let carries = names.iter().any(|name| matcher.as_ref().is_none_or(|pattern| pattern.matches(name)));

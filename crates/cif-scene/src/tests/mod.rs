@@ -50,7 +50,12 @@ fn field(objects: usize) -> Field {
         tracks: None,
         identities: Some(identities),
         instances: (0..objects)
-            .map(|k| Instance { id: k as u16 + 1, label: "red mug".into(), category: "mug".into() })
+            .map(|k| Instance {
+                id: k as u16 + 1,
+                label: "red mug".into(),
+                category: "mug".into(),
+                taxonomies: Default::default(),
+            })
             .collect(),
         timeline: Timeline {
             times: (0..FRAMES).map(|k| k as f64 / (FRAMES - 1) as f64).collect(),
@@ -298,7 +303,12 @@ fn damaged_fields_are_refused() {
 #[test]
 fn instances_without_gaussians_are_named() {
     let mut field = field(1);
-    field.instances.push(Instance { id: 9, label: "ghost".into(), category: "ghost".into() });
+    field.instances.push(Instance {
+        id: 9,
+        label: "ghost".into(),
+        category: "ghost".into(),
+        taxonomies: Default::default(),
+    });
     let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
     assert_eq!(graph.omitted, ["ghost"]);
     assert_eq!(graph.nodes.len(), 2);

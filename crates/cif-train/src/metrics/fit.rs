@@ -229,8 +229,12 @@ mod tests {
             mask: None,
             confidence: None,
         };
-        let label =
-            |(id, label): (u16, &str)| InstanceLabel { id, label: label.into(), category: label.into() };
+        let label = |(id, label): (u16, &str)| InstanceLabel {
+            id,
+            label: label.into(),
+            category: label.into(),
+            taxonomies: Default::default(),
+        };
         Dataset {
             root: "table".into(),
             layout: Layout::HyperNerf,
@@ -272,6 +276,7 @@ mod tests {
             id: label.id,
             label: label.label.clone(),
             category: label.category.clone(),
+            taxonomies: label.taxonomies.clone(),
         };
         field.instances = dataset.instances.iter().map(instance).collect();
         field.record.capture = Some("table".to_owned());
@@ -326,7 +331,12 @@ mod tests {
         for frame in &mut other.frames {
             frame.camera = camera(0.1 * frame.time_index as f64, 0.5);
         }
-        other.instances = vec![InstanceLabel { id: 2, label: "dog".into(), category: "dog".into() }];
+        other.instances = vec![InstanceLabel {
+            id: 2,
+            label: "dog".into(),
+            category: "dog".into(),
+            taxonomies: Default::default(),
+        }];
         let found = told(&other);
         assert_eq!(found.len(), 2, "{found:?}");
         assert_eq!((found[0].0, found[1].0), (Severity::Warning, Severity::Warning));

@@ -241,7 +241,12 @@ mod tests {
         }
         field.identities = Some(identities);
         field.instances = [(3, "left"), (8, "right")]
-            .map(|(id, label)| Instance { id, label: label.into(), category: label.into() })
+            .map(|(id, label)| Instance {
+                id,
+                label: label.into(),
+                category: label.into(),
+                taxonomies: Default::default(),
+            })
             .into();
         scene
     }

@@ -9,7 +9,12 @@ use super::*;
 /// 40 Gaussians, even rows of instance 0, odd rows of instance 1; occupancy grows with the row.
 fn field() -> Field {
     let n = 40;
-    let instance = |id: u16| Instance { id, label: format!("thing {id}"), category: "thing".into() };
+    let instance = |id: u16| Instance {
+        id,
+        label: format!("thing {id}"),
+        category: "thing".into(),
+        taxonomies: Default::default(),
+    };
     Field {
         gaussians: Gaussians {
             means: (0..n).map(|k| [k as f32, 0.0, 0.0]).collect(),

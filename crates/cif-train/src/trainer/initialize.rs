@@ -77,6 +77,7 @@ pub(super) fn instances(dataset: &Dataset) -> Vec<Instance> {
         id: label.id,
         label: label.label.clone(),
         category: label.category.clone(),
+        taxonomies: label.taxonomies.clone(),
     };
     dataset.instances.iter().map(instance).collect()
 }

@@ -115,7 +115,7 @@ impl Trainer {
         let new_label = |label: u16| spread(usize::from(label), count);
         let padding = free.take(count - present).map(|id| {
             let label = format!("padding_{id}");
-            Instance { id, category: label.clone(), label }
+            Instance { id, category: label.clone(), label, taxonomies: Default::default() }
         });
         let old: Vec<Instance> = self.state.field.instances.drain(..).chain(padding).collect();
         let mut table: Vec<(u16, Instance)> =

@@ -202,7 +202,12 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
             });
         }
     }
-    let label = |id| InstanceLabel { id, label: format!("ball {id}"), category: "ball".into() };
+    let label = |id| InstanceLabel {
+        id,
+        label: format!("ball {id}"),
+        category: "ball".into(),
+        taxonomies: Default::default(),
+    };
     let (mut positions, mut colors) = (Vec::new(), Vec::new());
     for (centre, radius, color, _) in balls(0.0, scene.rolls) {
         for k in 0..POINTS {

@@ -83,7 +83,12 @@ fn with_probe(field: &Field) -> Field {
     probed.log_calibrations = vec![0.0; probed.labels.len()];
     let mut field = field.clone();
     field.identities = Some(probed);
-    field.instances.push(Instance { id: 60_000, label: "probe".into(), category: "probe".into() });
+    field.instances.push(Instance {
+        id: 60_000,
+        label: "probe".into(),
+        category: "probe".into(),
+        taxonomies: Default::default(),
+    });
     field
 }
 
@@ -185,7 +190,12 @@ fn one_in_view(others: usize) -> (Field, PinholeCamera) {
             log_calibrations: vec![0.0; n],
             owners: Vec::new(),
         }),
-        instances: vec![Instance { id: 1, label: "one".into(), category: "one".into() }],
+        instances: vec![Instance {
+            id: 1,
+            label: "one".into(),
+            category: "one".into(),
+            taxonomies: Default::default(),
+        }],
         timeline: Timeline { times: vec![0.0], frames_per_second: 24.0 },
         cameras: vec![],
         sh_degree: 0,

@@ -141,7 +141,12 @@ fn the_longest_table_of_instances_trains() {
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (2, 2, 2);
     // Counts of 65 535 instances x 2 700 Gaussians would take 1.4 GB if they were dense.
     let mut crowded = dataset.clone();
-    let label = |id| InstanceLabel { id, label: format!("{id}"), category: "thing".into() };
+    let label = |id| InstanceLabel {
+        id,
+        label: format!("{id}"),
+        category: "thing".into(),
+        taxonomies: Default::default(),
+    };
     crowded.instances = (1..=u16::MAX).map(label).collect();
     let points = crowded.points.clone();
     for shift in 1..6 {

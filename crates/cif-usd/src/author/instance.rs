@@ -14,19 +14,18 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
     prim.info("kind", tokens::KIND_COMPONENT)?;
     prim.info("displayName", &node.label)?;
     let taxonomy = |name: &str| format!("{}:{name}", tokens::LABELS_API);
-    prim.apply(&[
-        &taxonomy(tokens::TAXONOMY_CLASS),
-        &taxonomy(tokens::TAXONOMY_INSTANCE),
-        tokens::INSTANCE_API,
-    ])?;
+    let mut schemas = vec![taxonomy(tokens::TAXONOMY_CLASS), taxonomy(tokens::TAXONOMY_INSTANCE)];
+    schemas.extend(node.taxonomies.keys().map(|name| taxonomy(name)));
+    schemas.push(tokens::INSTANCE_API.to_owned());
+    prim.apply(&schemas.iter().map(String::as_str).collect::<Vec<_>>())?;
     // Both words find the object: the class ("mug") and what a person calls it ("red mug").
     let mut class = vec![node.category.as_str()];
     if node.label != node.category {
         class.push(&node.label);
     }
-    for (taxonomy, labels) in
-        [(tokens::TAXONOMY_CLASS, class), (tokens::TAXONOMY_INSTANCE, vec![node.name.as_str()])]
-    {
+    let ours = [(tokens::TAXONOMY_CLASS, class), (tokens::TAXONOMY_INSTANCE, vec![node.name.as_str()])];
+    let others = node.taxonomies.iter().map(|(taxonomy, label)| (taxonomy.as_str(), vec![label.as_str()]));
+    for (taxonomy, labels) in ours.into_iter().chain(others) {
         let labels = pxr.vt.call_method1("TokenArray", (labels,))?;
         prim.set(&format!("{}:{taxonomy}", tokens::LABELS), "TokenArray", VARYING, labels)?;
     }

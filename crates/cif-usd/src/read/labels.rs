@@ -1,5 +1,7 @@
 //! Names, labels, recorded identity and visibility of prims.
 
+use std::collections::BTreeMap;
+
 use cif_field::RotationEvidence;
 use cif_scene::{MotionModel, VisibilitySample, naming};
 use pyo3::prelude::*;
@@ -75,6 +77,21 @@ pub(super) fn taxonomies(prim: &Bound<'_, PyAny>) -> PyResult<Vec<String>> {
     }
     taxonomies.sort();
     Ok(taxonomies)
+}
+
+/// First label of a prim in every taxonomy but ours.
+pub(super) fn others<'py>(pxr: &Pxr<'py>, prim: &Bound<'py, PyAny>) -> PyResult<BTreeMap<String, String>> {
+    let mut found = BTreeMap::new();
+    for taxonomy in taxonomies(prim)? {
+        // Names with colons would be namespaces, which labels do not have.
+        if cif_output::check_taxonomy(&taxonomy).is_ok()
+            && let Some(label) =
+                in_taxonomy(pxr, prim, &taxonomy)?.into_iter().find(|label| !label.is_empty())
+        {
+            found.insert(taxonomy, label);
+        }
+    }
+    Ok(found)
 }
 
 /// Human label and class of a prim.

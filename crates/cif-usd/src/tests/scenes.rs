@@ -257,6 +257,10 @@ impl Maker {
             name,
             label,
             category,
+            taxonomies: match kind {
+                NodeKind::Instance { .. } => [("wikidata_qcode".to_owned(), "Q81727".to_owned())].into(),
+                NodeKind::Background => Default::default(),
+            },
             pivot,
             motion,
             extent: splat_bounds(&splats),

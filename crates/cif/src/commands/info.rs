@@ -123,6 +123,7 @@ fn scene_facts(checkpoint: &Checkpoint) -> Facts {
                 "id": instance.id,
                 "label": instance.label,
                 "category": instance.category,
+                "taxonomies": instance.taxonomies,
                 "gaussians": rows.len(),
                 "motion": ObjectMotion::of(field, rows),
             })
@@ -234,6 +235,11 @@ fn named(instance: &Value) -> String {
         text("label").unwrap_or_default(),
         text("category").unwrap_or_default()
     );
+    if let Some(Value::Object(taxonomies)) = instance.get("taxonomies") {
+        for (taxonomy, name) in taxonomies {
+            line += &format!("  {taxonomy} {}", one_line(name));
+        }
+    }
     if let Some(gaussians) = text("gaussians") {
         line += &format!("  {gaussians} Gaussians");
     }

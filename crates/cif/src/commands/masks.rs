@@ -1,5 +1,6 @@
-//! `cif masks`: masks out of a few painted ones; sequences for video trackers, and their answers brought back.
+//! `cif masks`: masks of other tools; masks out of a few painted ones; sequences for video trackers, and their answers brought back.
 
+mod import;
 mod propagate;
 
 use std::path::{Path, PathBuf};
@@ -10,9 +11,13 @@ use clap::{Args, Subcommand, ValueEnum};
 use super::{CaptureOptions, print_warnings};
 use crate::error::Error;
 
-/// Make masks: out of a few painted frames, or with a video tracker
+/// Make masks: out of those of other tools, out of a few painted frames, or with a video tracker
 #[derive(Debug, Args)]
 #[command(after_help = "\
+Masks of trackers, annotation tools and compositors become the folder that training reads:
+
+  cif masks import deva-output -o table-masks --capture captures/table
+
 Without a tracker, paint the objects of a few frames and let the others follow:
 
   cif masks propagate captures/table --keyframes painted -o table-masks
@@ -35,6 +40,7 @@ pub(super) struct Masks {
 
 #[derive(Debug, Subcommand)]
 enum Step {
+    Import(import::Import),
     Propagate(propagate::Propagate),
     /// Write the images of all cameras as one sequence
     Zigzag {
@@ -75,6 +81,7 @@ enum Order {
 
 pub(super) fn run(command: &Masks) -> Result<(), Error> {
     match &command.step {
+        Step::Import(command) => import::run(command),
         Step::Propagate(command) => propagate::run(command),
         Step::Zigzag { capture, output, order, capture_options } => {
             zigzag(capture, output, *order, capture_options)

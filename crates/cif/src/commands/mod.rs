@@ -71,7 +71,7 @@ A short tour:
 
 A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
 instance masks (PNG, value = instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/.
-`cif masks` makes them out of a few painted frames, or with a video tracker.
+`cif masks` makes them out of those of other tools, a few painted frames, or with a video tracker.
 Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 `cif COMMAND --help` explains one command.";
 

@@ -28,6 +28,7 @@ Time in a stage or glTF file is its time code, which counts captured frames; in 
 
   cif query table.usda --label 'red mug' --time 36
   cif query table.usda --taxonomy class --label mug --interval 0:20
+  cif query table.cif --taxonomy wikidata_qcode=Q81727
   cif query table.glb --box -0.2,-0.2,0,0.2,0.2,0.3
   cif query table.cif --label '*box' --json
   cif query table.cif --point 0.1,0.2,0.05 --time 0.5
@@ -46,8 +47,9 @@ pub(super) struct Query {
     /// Label to look for
     #[arg(long, value_name = "PATTERN")]
     label: Option<String>,
-    /// Labels that count: class (classes and human labels), instance (unique names), or another taxonomy of a stage
-    #[arg(long, value_name = "NAME")]
+    /// Labels that count: class (classes and human labels), instance (unique names), or another taxonomy of the
+    /// instances; NAME=PATTERN also gives the label to look for
+    #[arg(long, value_name = "NAME[=PATTERN]")]
     taxonomy: Option<String>,
     /// Place in the world: what is there, with its probability in a .cif
     #[arg(
@@ -92,7 +94,7 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     let is_field = matches!(content, Content::Field);
     let wanted = question(command, is_field)?;
     if let (true, Some(place)) = (is_field, wanted.point) {
-        if command.label.is_some() || wanted.region.is_some() || command.interval.is_some() {
+        if wanted.label.is_some() || wanted.region.is_some() || command.interval.is_some() {
             return Err(Error::usage(
                 "--point in a .cif asks the field itself, without other conditions than --time",
                 "leave --label, --box and --interval out, or query an exported stage",
@@ -145,7 +147,24 @@ fn question(command: &Query, is_field: bool) -> Result<ObjectQuery, Error> {
             ));
         }
     };
-    Ok(ObjectQuery { label: command.label.clone(), taxonomy: command.taxonomy.clone(), when, point, region })
+    let (taxonomy, label) = labels(command)?;
+    Ok(ObjectQuery { label, taxonomy, when, point, region })
+}
+
+/// Taxonomy and label that are looked for.
+fn labels(command: &Query) -> Result<(Option<String>, Option<String>), Error> {
+    match command.taxonomy.as_deref().and_then(|text| text.split_once('=')) {
+        None => Ok((command.taxonomy.clone(), command.label.clone())),
+        Some((taxonomy, pattern))
+            if command.label.is_none() && !taxonomy.is_empty() && !pattern.is_empty() =>
+        {
+            Ok((Some(taxonomy.to_owned()), Some(pattern.to_owned())))
+        }
+        Some(_) => Err(Error::usage(
+            "--taxonomy NAME=PATTERN needs both names, and takes the place of --label",
+            "for example --taxonomy wikidata_qcode=Q81727",
+        )),
+    }
 }
 
 fn interval(text: &str, is_field: bool) -> Result<When, Error> {

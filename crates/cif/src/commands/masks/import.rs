@@ -1,0 +1,196 @@
+//! `cif masks import`: masks of other tools as masks of a capture.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use cif_dataset::masks::{Import as Source, MaskWriter, SourceKind};
+use cif_dataset::{Dataset, OpenOptions};
+use clap::{Args, ValueEnum};
+
+use crate::commands::{LayoutName, command_line, table};
+use crate::error::Error;
+use crate::interrupt;
+use crate::progress::FrameProgress;
+
+/// Bring masks of other tools into the form that training reads
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Recognised by what they hold, or named with --from:
+
+  tracker         a PNG per frame: ids (grey or palette), or a colour per object (DEVA with Annotations/ and
+                  pred.json, XMem, Cutie ...); black is unlabelled, other colours get ids in one table for all frames
+  frame-folders   FRAME/OBJECT.png, a mask per object (SAM 2, SAM 3)
+  object-folders  OBJECT/FRAME.png, or OBJECT.FRAME.exr and OBJECT_FRAME.png without folders; PNG or EXR (Nuke)
+  mattes          FRAME.exr with a channel per object
+  arrays          NumPy ids: FRAME.npy or .npz with [height, width], or one file with [frames, height, width]
+  coco            COCO JSON: run-length codes or polygons, objects by track_id
+  label-studio    JSON export of Label Studio: brushes and polygons, objects by label
+  cvat            XML 1.1 of CVAT, for images (polygons, masks; objects by track_id, else label) or video (tracks)
+
+  cif masks import deva-output -o table-masks --capture captures/table
+  cif masks import annotations.xml -o table-masks --capture captures/table
+  cif train captures/table --masks table-masks -o table.cif
+
+Frames are found by their names, else by the numbers at the ends of the names. Masks need the size of the images. A mask
+of one object covers a pixel from one half on. Where objects overlap, the higher layer (z_order of CVAT) has the pixel, on
+one layer the object with fewer pixels in that frame, of equal ones the later. Numbers from 1 to 65535 that name all
+objects stay their ids; else objects are numbered from 1. Cryptomatte EXR files need no import: cif train CAPTURE
+--masks DIR reads them.")]
+pub(super) struct Import {
+    /// File or folder with the masks
+    source: PathBuf,
+    /// New folder for the masks
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Folder of the capture whose frames they show
+    #[arg(long, value_name = "CAPTURE")]
+    capture: PathBuf,
+    /// Read the source as this [default: what it holds]
+    #[arg(long, value_name = "TOOL")]
+    from: Option<From>,
+    /// The masks were made on images reduced by 1, 2, 4, ... [default: the largest images stored]
+    #[arg(long, value_name = "FACTOR", value_parser = clap::value_parser!(u32).range(1..=64))]
+    downscale: Option<u32>,
+    /// Read the capture as this layout where two fit
+    #[arg(long, value_name = "LAYOUT")]
+    layout: Option<LayoutName>,
+    /// Show no progress
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+/// Sources of masks.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum From {
+    Tracker,
+    FrameFolders,
+    ObjectFolders,
+    Mattes,
+    Arrays,
+    Coco,
+    LabelStudio,
+    Cvat,
+}
+
+impl From {
+    fn kind(self) -> SourceKind {
+        match self {
+            Self::Tracker => SourceKind::Tracker,
+            Self::FrameFolders => SourceKind::FrameFolders,
+            Self::ObjectFolders => SourceKind::ObjectFolders,
+            Self::Mattes => SourceKind::Mattes,
+            Self::Arrays => SourceKind::Arrays,
+            Self::Coco => SourceKind::Coco,
+            Self::LabelStudio => SourceKind::LabelStudio,
+            Self::Cvat => SourceKind::Cvat,
+        }
+    }
+}
+
+/// Pixels of objects over all masks.
+#[derive(Default)]
+struct Found {
+    /// Frames and pixels by id.
+    objects: BTreeMap<u16, (usize, u64)>,
+    masks: usize,
+    pixels: u64,
+    labelled: u64,
+    disputed: u64,
+}
+
+pub(super) fn run(command: &Import) -> Result<(), Error> {
+    let options = OpenOptions {
+        without_masks: true,
+        downscale: command.downscale,
+        layout: command.layout.map(Into::into),
+        ..OpenOptions::default()
+    };
+    let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;
+    let source =
+        Source::open(&command.source, command.from.map(From::kind), &dataset).map_err(Error::plain)?;
+    println!("read as {}", source.kind.described());
+    let writer = MaskWriter::create(&command.output).map_err(Error::plain)?;
+    interrupt::watch();
+    let mut progress = FrameProgress::new(command.quiet, dataset.frames.len());
+    let mut found = Found::default();
+    let mut without = Vec::new();
+    for (index, frame) in dataset.frames.iter().enumerate() {
+        interrupt::go_on()?;
+        progress.step();
+        let Some(drawn) = source.draw(&dataset, index).map_err(Error::plain)? else {
+            without.push(frame.name.as_str());
+            continue;
+        };
+        writer.add(&frame.name, &drawn.ids, None).map_err(Error::plain)?;
+        found.disputed += drawn.disputed;
+        found.count(&drawn.ids.pixels);
+    }
+    drop(progress);
+    if found.objects.is_empty() {
+        return Err(Error::failed(
+            format!(
+                "{}: none of its masks shows an object: every pixel is unlabelled",
+                command.source.display()
+            ),
+            "export the masks again, or name another source with --from",
+        ));
+    }
+    let (seen, empty): (Vec<_>, Vec<_>) =
+        source.instances.iter().cloned().partition(|instance| found.objects.contains_key(&instance.id));
+    writer.finish(&seen).map_err(Error::plain)?;
+
+    let mut rows = table(["id", "label", "category", "frames", "pixels"]);
+    for instance in &seen {
+        let (frames, pixels) = found.objects[&instance.id];
+        rows.add_row([
+            instance.id.to_string(),
+            instance.label.clone(),
+            instance.category.clone(),
+            frames.to_string(),
+            pixels.to_string(),
+        ]);
+    }
+    println!("{rows}");
+    println!(
+        "{} objects in {} masks of {} frames, {:.1} % of their pixels labelled, in {}",
+        seen.len(),
+        found.masks,
+        dataset.frames.len(),
+        100.0 * found.labelled as f64 / found.pixels.max(1) as f64,
+        command.output.display()
+    );
+    for note in &source.notes {
+        eprintln!("note: {note}");
+    }
+    if found.disputed > 0 {
+        eprintln!("note: {} pixels were claimed by several objects", found.disputed);
+    }
+    if let Some(first) = without.first() {
+        eprintln!("warning: {} frames have no mask, the first is {first}", without.len());
+    }
+    if !empty.is_empty() {
+        let names: Vec<&str> = empty.iter().map(|instance| instance.label.as_str()).collect();
+        eprintln!("warning: no pixel shows {}; left out of instances.json", names.join(", "));
+    }
+    let masks = std::path::absolute(&command.output).unwrap_or_else(|_| command.output.clone());
+    let words = ["train", &command.capture.display().to_string(), "--masks", &masks.display().to_string()];
+    println!("next: {} -o scene.cif", command_line(&words));
+    Ok(())
+}
+
+impl Found {
+    fn count(&mut self, ids: &[u16]) {
+        let mut here: BTreeMap<u16, u64> = BTreeMap::new();
+        for run in ids.chunk_by(|a, b| a == b).filter(|run| run[0] != 0) {
+            *here.entry(run[0]).or_default() += run.len() as u64;
+        }
+        self.masks += 1;
+        self.pixels += ids.len() as u64;
+        for (id, pixels) in here {
+            self.labelled += pixels;
+            let object = self.objects.entry(id).or_default();
+            object.0 += 1;
+            object.1 += pixels;
+        }
+    }
+}
