@@ -13,7 +13,8 @@ mod nerfstudio;
 mod neu3d;
 mod transforms;
 
-pub(crate) use colmap::sparse_folder as colmap_sparse_folder;
+pub(crate) use colmap::{named_cameras as colmap_cameras, sparse_folder as colmap_sparse_folder};
+pub(crate) use transforms::named_cameras as transforms_cameras;
 
 use std::path::{Path, PathBuf};
 
