@@ -219,7 +219,7 @@ mod tests {
     #[test]
     fn a_capture_is_read_as_it_was_meant() {
         let folder = tempfile::tempdir().unwrap();
-        let mut shots = shots(folder.path(), 12, true);
+        let shots = shots(folder.path(), 12, true);
         let mut poses = arc(12);
         poses.points = vec![Point { position: DVec3::new(0.5, -0.25, 1.0), color: [1, 2, 3] }; 40];
         poses.images.remove("007.png");
@@ -265,9 +265,10 @@ mod tests {
         }
         assert!(write(&capture, &place, &Hooks::silent()).unwrap_err().to_string().contains("already"));
         // Images without times have none in the file.
-        shots[3].time = None;
+        let mut untimed = shots.clone();
+        untimed[3].time = None;
         let place = folder.path().join("static");
-        write(&Capture { shots: &shots, ..capture }, &place, &Hooks::silent()).unwrap();
+        write(&Capture { shots: &untimed, ..capture }, &place, &Hooks::silent()).unwrap();
         let dataset = Dataset::open(&place, &OpenOptions::default()).unwrap();
         assert_eq!(dataset.times, [0.0]);
     }

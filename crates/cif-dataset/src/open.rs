@@ -41,6 +41,7 @@ impl Dataset {
         let layout = layout::recognise(root, options.layout, &mut warnings)?;
         let draft = formats::read(layout, &Source { root, options })?;
         warnings.extend(draft.warnings.iter().cloned());
+        warnings.extend(draft.unknown.clone());
         let (frames, has_alpha, stored_sizes) = frames(root, &draft, options, &mut warnings)?;
 
         let mut times: Vec<f64> = frames.iter().map(|frame| frame.time).collect();
@@ -57,6 +58,7 @@ impl Dataset {
             points: PointCloud { positions: Vec::new(), colors: Vec::new(), source: PointSource::Random },
             has_alpha,
             warnings,
+            unknown: draft.unknown.clone(),
             frame: CaptureFrame::default(),
         };
         for frame in &mut dataset.frames {

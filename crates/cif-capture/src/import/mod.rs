@@ -12,6 +12,8 @@ use crate::times::entry;
 
 mod polycam;
 mod reality_capture;
+#[cfg(test)]
+mod tests;
 
 /// Poses of a file or folder, and what the tool knows of the world.
 #[derive(Clone, Debug)]

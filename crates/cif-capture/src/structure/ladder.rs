@@ -36,9 +36,7 @@ pub enum Lenses {
 pub struct Request<'a> {
     /// Images, ordered by camera and then by time.
     pub shots: &'a [Shot],
-    /// Folder in which every image lies under its name.
-    pub images: &'a Path,
-    /// Folder of `NAME.png`, in which black is left out.
+    /// Folder of `NAME.png` for the name of every image, in which black is left out.
     pub masks: Option<&'a Path>,
     /// How images follow each other.
     pub order: Order,
@@ -70,7 +68,8 @@ pub struct Found {
 /// # Errors
 /// When pycolmap is missing or fails, the caller stops, or no setting gives any pose. A bad verdict is no error.
 pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
-    let names: Vec<String> = request.shots.iter().map(|shot| shot.name.clone()).collect();
+    let (images, masks) = (request.work.join("images"), request.work.join("masks"));
+    let names = stage(request, &images, &masks)?;
     let cameras: Vec<&str> = request.shots.iter().map(|shot| shot.camera.as_str()).collect();
     let groups = groups(request);
     let pairs = pairs(&cameras, request.order);
@@ -81,8 +80,8 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
         let solve = |runs: &[Run]| {
             let job = Job {
                 work: request.work,
-                images: request.images,
-                masks: request.masks,
+                images: &images,
+                masks: request.masks.map(|_| masks.as_path()),
                 names: &names,
                 pairs: &pairs,
                 cameras: &groups,
@@ -133,7 +132,39 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
             )
         });
     };
-    Ok(Found { tried, ..best })
+    let name = |staged: &String| names.iter().position(|name| name == staged).map(|k| &request.shots[k].name);
+    let poses = Poses {
+        images: best.poses.images.iter().filter_map(|(k, pose)| Some((name(k)?.clone(), *pose))).collect(),
+        ..best.poses
+    };
+    Ok(Found { poses, tried, ..best })
+}
+
+/// Puts images and masks into folders of their own under names that COLMAP's lists can hold, which has no spaces.
+fn stage(request: &Request<'_>, images: &Path, masks: &Path) -> Result<Vec<String>, Error> {
+    let mut names = Vec::with_capacity(request.shots.len());
+    for folder in [images, masks] {
+        std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    }
+    for (number, shot) in request.shots.iter().enumerate() {
+        let ending = shot.file.extension().map(|ending| ending.to_string_lossy().to_lowercase());
+        let name = format!("{number:06}.{}", ending.as_deref().unwrap_or("png"));
+        put(&shot.file, &images.join(&name))?;
+        if let Some(mask) = request.masks.map(|masks| masks.join(format!("{}.png", shot.name))) {
+            if mask.is_file() {
+                put(&mask, &masks.join(format!("{name}.png")))?;
+            }
+        }
+        names.push(name);
+    }
+    Ok(names)
+}
+
+/// A second name of a file; a copy where the file system has no links.
+fn put(from: &Path, to: &Path) -> Result<(), Error> {
+    // The file behind a link: a link with a relative target leads nowhere from another folder.
+    let link = std::fs::canonicalize(from).and_then(|file| std::fs::hard_link(file, to));
+    link.or_else(|_| std::fs::copy(from, to).map(drop)).map_err(Error::io("copy", from))
 }
 
 /// Features of the images, and what to give out of one setting: mapper, poses and verdict.

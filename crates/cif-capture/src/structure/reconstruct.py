@@ -1,15 +1,17 @@
-"""Poses of images through pycolmap, for ``cif capture``.
+"""Find the poses of images through pycolmap, for ``cif capture``.
 
-Reads one job as JSON from standard input and answers with one JSON object on standard output; what pycolmap itself
-prints goes to standard error, among lines ``@ WORDS`` that tell the progress.
+Reads one job as JSON from standard input and answers with one JSON object on standard output; what pycolmap
+itself prints goes to standard error, among lines ``@ WORDS`` that tell the progress.
 
-Job: ``work`` (folder for databases), ``images`` (folder), ``masks`` (folder of ``NAME.png``, black is left out, or
-null), ``names`` (images below the folder), ``pairs`` (of indices into ``names``), ``cameras`` (``names`` indices that
-share a lens, ``focal_px`` or null), ``model`` (of the lens), ``peak`` (threshold of features or null), ``runs`` (``mapper``,
-``global`` or ``incremental``, and ``seed``), ``threads``. Features and matches are kept in ``work``, for other runs of the
-same ``peak`` and number of pairs.
+Job: ``work`` (folder for databases), ``images`` (folder), ``masks`` (folder of ``NAME.png``, black is left out,
+or null), ``names`` (images in the folder, without spaces), ``pairs`` (of indices into ``names``), ``cameras``
+(``images``, indices of those that share a lens, their ``size``, and ``focal_px`` or null), ``model`` (of the
+lens), ``peak`` (threshold of features or null), ``runs`` (``mapper``, ``global`` or ``incremental``, and
+``seed``), ``threads``. Features and matches are kept in ``work``, for other runs of the same ``peak``.
 
-Answer: ``features`` (per image) and ``runs``, one for each that was asked for: the largest model with its lenses, images (``camera_from_world`` as quaternion w, x, y, z and translation), points with colour and error in pixels.
+Answer: ``features`` (per image) and ``runs``, one for each that was asked for: null, or the largest model with
+its lenses, images (``camera_from_world`` as quaternion w, x, y, z and translation), points with colour and
+error in pixels. Where pycolmap cannot be imported: ``missing``, ``python`` and ``version``.
 """
 
 import sys
@@ -23,11 +25,12 @@ from pathlib import Path  # noqa: E402
 
 
 def tell(words):
+    """Tell the progress."""
     print("@ " + words, file=sys.stderr, flush=True)
 
 
 def extract_and_match(pycolmap, job, database):
-    """Fills a database with features, lenses and verified matches."""
+    """Fill a database with features, lenses and verified matches."""
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = job["model"]
     if job["masks"]:
@@ -77,7 +80,7 @@ def extract_and_match(pycolmap, job, database):
 
 
 def reconstruct(pycolmap, job, database, mapper, seed):
-    """The model with most images, or None."""
+    """Return the model with most images, or None."""
     tell(f"poses, {mapper} mapper")
     pycolmap.set_random_seed(seed)
     output = database.with_suffix(f".{mapper}.{seed}")
@@ -98,7 +101,7 @@ def reconstruct(pycolmap, job, database, mapper, seed):
 
 
 def described(model):
-    """A model as JSON."""
+    """Return a model as JSON."""
     images = {}
     for image in model.images.values():
         if image.has_pose:
@@ -148,11 +151,12 @@ def main():
         return
     pycolmap.logging.minloglevel = 2
     peak = job["peak"] or 0
-    database = Path(job["work"]) / f"{peak}-{len(job['pairs'])}.db"
+    database = Path(job["work"]) / f"features-{peak}.db"
     if not database.exists():
         extract_and_match(pycolmap, job, database)
     with pycolmap.Database.open(database) as opened:
-        features = {image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
+        images = opened.read_all_images()
+        features = {image.name: opened.num_keypoints_for_image(image.image_id) for image in images}
     runs = []
     for run in job["runs"]:
         model = reconstruct(pycolmap, job, database, run["mapper"], run["seed"])

@@ -43,6 +43,8 @@ pub(crate) struct Draft {
     pub(crate) random_box: Option<f64>,
     pub(crate) frames_per_second: Option<f64>,
     pub(crate) warnings: Vec<String>,
+    /// What the capture does not know of its world.
+    pub(crate) unknown: Option<String>,
 }
 
 /// One frame as its files tell it.

@@ -21,6 +21,21 @@ pub(super) struct TransformsFile {
     pub(super) val_filenames: Option<Vec<PathBuf>>,
     pub(super) test_filenames: Option<Vec<PathBuf>>,
     pub(super) fps: Option<f64>,
+    /// What `cif capture` knows of the world.
+    pub(super) cif: Option<World>,
+}
+
+/// What is known of the world that poses are in. Files of others do not tell, and are taken at their word.
+#[derive(Clone, Copy, Deserialize)]
+pub(super) struct World {
+    #[serde(default = "known")]
+    pub(super) metres_known: bool,
+    #[serde(default = "known")]
+    pub(super) up_known: bool,
+}
+
+fn known() -> bool {
+    true
 }
 
 /// One frame of a file.

@@ -141,14 +141,6 @@ fn find(
             "the first frame of each (--moving finds a pose for every frame)"
         ));
     }
-    // Under their names in one folder, as pycolmap wants them.
-    let images = scratch.join("images");
-    for shot in &solved {
-        let place = images.join(&shot.name);
-        let parent = place.parent().unwrap_or(&images);
-        std::fs::create_dir_all(parent).map_err(Error::io("create", parent))?;
-        std::fs::copy(&shot.file, &place).map_err(Error::io("copy", &shot.file))?;
-    }
     let black = scratch.join("masks");
     if let Some(masks) = masks {
         let moving = command.moving_ids.as_ref().map(|ids| ids.iter().copied().collect());
@@ -159,7 +151,6 @@ fn find(
     let is_video = solved.iter().any(|shot| shot.time.is_some()) && command.times.is_none();
     let request = Request {
         shots: &solved,
-        images: &images,
         masks: masks.map(|_| black.as_path()),
         order: match command.order {
             OrderName::Sequence => Order::Sequence,
