@@ -24,6 +24,15 @@ pub struct Masks {
     pub files: BTreeMap<String, PathBuf>,
 }
 
+impl Masks {
+    /// The file of labels: in the folder of masks, else beside it, as captures have it.
+    #[must_use]
+    pub fn labels(&self) -> Option<PathBuf> {
+        let beside = cif_output::folder_of(&self.folder);
+        [&self.folder, &beside].iter().map(|folder| folder.join("instances.json")).find(|file| file.is_file())
+    }
+}
+
 /// Finds the masks of images: `NAME.png` with or without the ending of the image, below the folder or, of one camera,
 /// in it.
 ///
@@ -33,9 +42,9 @@ pub fn find(folder: &Path, shots: &[Shot]) -> Result<Masks, Error> {
     let mut files = BTreeMap::new();
     for shot in shots {
         let stem = shot.name.rsplit_once('.').map_or(shot.name.as_str(), |(stem, _)| stem);
-        let beside = |camera: &str| format!("{camera}/{}", shot.name.rsplit('/').next().unwrap_or_default());
+        // Alone, a camera has no folder; its masks may have one all the same.
         let candidates =
-            [format!("{stem}.png"), format!("{}.png", shot.name), beside(&shot.camera).replace(".jpg", ".png")];
+            [format!("{stem}.png"), format!("{}.png", shot.name), format!("{}/{stem}.png", shot.camera)];
         if let Some(found) = candidates.iter().map(|name| folder.join(name)).find(|path| path.is_file()) {
             files.insert(shot.name.clone(), found);
         }

@@ -67,8 +67,7 @@ pub fn write(capture: &Capture<'_>, place: &Path, hooks: &Hooks<'_>) -> Result<(
         frame.insert("transform_matrix".to_owned(), matrix(pose));
         frames.push(Value::Object(frame));
     }
-    let labels = capture.masks.map(|masks| masks.folder.join("instances.json"));
-    if let Some(labels) = labels.filter(|labels| labels.is_file()) {
+    if let Some(labels) = capture.masks.and_then(Masks::labels) {
         copy(&labels, &folder.path().join("masks/instances.json"))?;
     }
     let mut file = Map::new();

@@ -12,7 +12,7 @@ pub struct Choice {
     pub rate: Option<f64>,
     /// Frames in all, of every video.
     pub count: Option<usize>,
-    /// First and last second that are taken.
+    /// First second that is taken.
     pub from_s: Option<f64>,
     /// Last second that is taken.
     pub to_s: Option<f64>,

@@ -40,6 +40,9 @@ def extract_and_match(pycolmap, job, database):
     extraction.use_gpu = False
     if job["peak"]:
         extraction.sift.peak_threshold = job["peak"]
+    # An empty database, for images to be numbered in order: threads finish their features in any.
+    with pycolmap.Database.open(database):
+        pass
     tell("features")
     for camera in job["cameras"]:
         names = [job["names"][index] for index in camera["images"]]
@@ -50,11 +53,13 @@ def extract_and_match(pycolmap, job, database):
             reader.camera_params = ",".join(repr(float(value)) for value in params)
         else:
             reader.camera_params = ""
+        mode = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(database, job["images"], camera_mode=mode, image_names=names, options=reader)
         pycolmap.extract_features(
             database,
             job["images"],
             image_names=names,
-            camera_mode=pycolmap.CameraMode.SINGLE,
+            camera_mode=mode,
             reader_options=reader,
             extraction_options=extraction,
             device=pycolmap.Device.cpu,

@@ -74,5 +74,6 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         random_box: Some(BOX),
         frames_per_second,
         warnings,
+        unknown: None,
     })
 }

@@ -25,15 +25,12 @@ pub fn read_ids(path: &std::path::Path) -> Result<cif_geometry::PixelGrid<u16>, 
     crate::files::mask::decode(path)
 }
 
-/// Labels of the `instances.json` of a folder by id; empty where there is none.
+/// Labels of a file `instances.json` by id.
 ///
 /// # Errors
-/// When the file is damaged.
+/// When the file is missing or damaged.
 pub fn read_labels(
-    folder: &std::path::Path,
+    file: &std::path::Path,
 ) -> Result<std::collections::BTreeMap<u16, crate::InstanceLabel>, crate::Error> {
-    match crate::instances::file_for(folder, None) {
-        Some(file) => crate::instances::read(&file, &mut Vec::new()),
-        None => Ok(std::collections::BTreeMap::new()),
-    }
+    crate::instances::read(file, &mut Vec::new())
 }

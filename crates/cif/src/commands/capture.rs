@@ -77,6 +77,7 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
         Some(folder) => Some(masks::find(folder, &shots)?),
         None => None,
     };
+    let known = scale::Known::of(command, masks.as_ref())?;
     let mut posed = match &command.poses {
         Some(path) => {
             let Imported { poses, tool, metres_known, up_known, .. } =
@@ -95,7 +96,7 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
         }
         eprintln!("warning: the verdict says no, and the capture is written because of --accept:\n{verdict}");
     }
-    let lines = scale::settle(command, &shots, masks.as_ref(), &mut posed, &hooks)?;
+    let lines = scale::settle(command, &known, &shots, masks.as_ref(), &mut posed, &hooks)?;
     let capture = Written {
         shots: &shots,
         poses: &posed.poses,

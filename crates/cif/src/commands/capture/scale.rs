@@ -1,5 +1,7 @@
 //! Up and the metre of a capture, from what was said of them.
 
+use std::collections::BTreeMap;
+
 use cif_capture::frames::Shot;
 use cif_capture::masks::Masks;
 use cif_capture::similarity::Similarity;
@@ -11,34 +13,56 @@ use super::options::{UpName, positive};
 use super::{Capture, Posed};
 use crate::error::Error;
 
+/// A length of the scene that is known.
+pub(super) enum Known {
+    /// The longest side of an object, by its id, in metres.
+    Object(u16, f64),
+    /// The distance of two points, by their pixels, in metres.
+    Points([Vec<Click>; 2], f64),
+    /// None.
+    Nothing,
+}
+
+impl Known {
+    /// As the command line says, which is checked before work is put into poses.
+    pub(super) fn of(command: &Capture, masks: Option<&Masks>) -> Result<Self, Error> {
+        Ok(match (&command.length, masks, &command.measured) {
+            (Some(words), Some(masks), _) => {
+                Self::Object(id_of(&words[0], masks)?, metres(&words[1], "--length")?)
+            }
+            (_, _, Some(words)) => {
+                Self::Points([clicks(&words[0])?, clicks(&words[1])?], metres(&words[2], "--measured")?)
+            }
+            _ => Self::Nothing,
+        })
+    }
+}
+
 /// Turns and scales the world, and tells in two sentences what is known of it.
 pub(super) fn settle(
     command: &Capture,
+    known: &Known,
     shots: &[Shot],
     masks: Option<&Masks>,
     posed: &mut Posed,
     hooks: &Hooks<'_>,
 ) -> Result<Vec<String>, Error> {
     let mut lines = vec![up(command, posed)];
-    let ratio = match (&command.length, &command.measured) {
-        (Some(words), _) => {
-            let metres = metres(&words[1], "--length")?;
-            let masks = masks.ok_or_else(|| Error::usage("--length needs masks", "name them by --masks"))?;
-            let id = id_of(&words[0], masks)?;
-            Some((metres / known_length::measure(id, masks, shots, &posed.poses, hooks)?, "the object's length"))
+    let scale = match (known, masks) {
+        (Known::Object(id, metres), Some(masks)) => {
+            Some(metres / known_length::measure(*id, masks, shots, &posed.poses, hooks)?)
         }
-        (None, Some(words)) => {
-            let metres = metres(&words[2], "--measured")?;
-            let end = |text: &str| -> Result<DVec3, Error> { Ok(world::meet(&posed.poses, &clicks(text)?)?) };
-            Some((world::scale_of(end(&words[0])?, end(&words[1])?, metres)?, "the measured length"))
+        (Known::Points([a, b], metres), _) => {
+            let (a, b) = (world::meet(&posed.poses, a)?, world::meet(&posed.poses, b)?);
+            Some(world::scale_of(a, b, *metres)?)
         }
-        (None, None) => None,
+        _ => None,
     };
-    lines.push(match ratio {
-        Some((scale, by)) => {
+    lines.push(match scale {
+        Some(scale) => {
             posed.poses.transform(&Similarity { scale, ..Similarity::IDENTITY });
             posed.metres_known = true;
-            format!("a unit is a metre, by {by} (it was {scale:.4} m before)")
+            format!("a unit is a metre, by the known length (it was {scale:.4} m before)")
         }
         None if posed.metres_known => "a unit is a metre, as the other tool says".to_owned(),
         None => "the metre is not known: sizes, masses and falls of exported physics would be wrong; give --length \
@@ -81,14 +105,17 @@ fn metres(text: &str, flag: &str) -> Result<f64, Error> {
 
 /// The id of an object by its label or its number.
 fn id_of(name: &str, masks: &Masks) -> Result<u16, Error> {
-    let labels = cif_dataset::masks::read_labels(&masks.folder).map_err(Error::plain)?;
+    let labels = match masks.labels() {
+        Some(file) => cif_dataset::masks::read_labels(&file).map_err(Error::plain)?,
+        None => BTreeMap::new(),
+    };
     let labelled = labels.values().find(|instance| instance.label == name).map(|instance| instance.id);
     labelled.or_else(|| name.parse().ok().filter(|id| *id > 0)).ok_or_else(|| {
         let known: Vec<&str> = labels.values().map(|instance| instance.label.as_str()).collect();
         let known = if known.is_empty() { "there is no instances.json".to_owned() } else { known.join(", ") };
         Error::failed(
             format!("{}: no object is called {name:?}", masks.folder.display()),
-            format!("give the id of one that stands still, or a label of instances.json in that folder: {known}"),
+            format!("give the id of one that stands still, or a label of its instances.json: {known}"),
         )
     })
 }
