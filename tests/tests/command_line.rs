@@ -591,7 +591,9 @@ fn poses_of_other_tools_become_a_capture_with_times() {
     fs::write(folder.path().join("times.csv"), times).unwrap();
     let line = "capture photos -o table --poses poses.json --times times.csv";
     let run = cif(folder.path(), line).succeeds();
-    for told in ["4 of 4 images", "+z is up", "metre is not known", "cif masks propagate table", "cif train table"] {
+    for told in
+        ["4 of 4 images", "+z is up", "metre is not known", "cif masks propagate table", "cif train table"]
+    {
         assert!(run.stdout.contains(told), "{told}: {}", run.stdout);
     }
     let run = cif(folder.path(), "info table").succeeds();
@@ -602,8 +604,20 @@ fn poses_of_other_tools_become_a_capture_with_times() {
     assert_eq!(written["frames"][3]["file_path"], "images/view 3.png");
     // The first and the last camera are three units apart: 0.3 m, as both ends of a stick are measured.
     let pixel = |camera: f64, place: f64| 32.0 + 60.0 * (place - camera) / 4.0;
-    let point = |place: f64| format!("view 0.png:{},24/view 3.png:{},24", pixel(0.0, place), pixel(3.0, place));
-    let arguments = ["capture", "photos", "-o", "metres", "--poses", "poses.json", "--measured", &point(1.0), &point(2.0), "0.1"];
+    let point =
+        |place: f64| format!("view 0.png:{},24/view 3.png:{},24", pixel(0.0, place), pixel(3.0, place));
+    let arguments = [
+        "capture",
+        "photos",
+        "-o",
+        "metres",
+        "--poses",
+        "poses.json",
+        "--measured",
+        &point(1.0),
+        &point(2.0),
+        "0.1",
+    ];
     let run = run(CIF, folder.path(), arguments).succeeds();
     assert!(run.stdout.contains("a unit is a metre"), "{}", run.stdout);
     let written: serde_json::Value =

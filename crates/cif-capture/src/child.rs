@@ -34,8 +34,7 @@ pub(crate) fn run(
 ) -> Result<Option<Answer>, Error> {
     let name = command.get_program().to_string_lossy().into_owned();
     let lost = |error: io::Error| Error::refused(format!("{name} was lost: {error}"), "try again");
-    let started =
-        command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+    let started = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
     let mut child = match started {
         Ok(child) => child,
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
@@ -97,7 +96,8 @@ mod tests {
         let mut shell = Command::new("sh");
         shell.args(["-c", "echo one >&2; cat; echo two >&2; exit 3"]);
         let mut lines = Vec::new();
-        let answer = run(&mut shell, b"given", &|| false, |line| lines.push(line.to_owned())).unwrap().unwrap();
+        let answer =
+            run(&mut shell, b"given", &|| false, |line| lines.push(line.to_owned())).unwrap().unwrap();
         assert_eq!(answer.output, b"given");
         assert!(!answer.succeeded);
         assert_eq!(answer.last_words, "one\ntwo");

@@ -33,7 +33,13 @@ struct Seen<'a> {
 ///
 /// # Errors
 /// When few masks show all of it, or it moves.
-pub fn measure(id: u16, masks: &Masks, shots: &[Shot], poses: &Poses, hooks: &Hooks<'_>) -> Result<f64, Error> {
+pub fn measure(
+    id: u16,
+    masks: &Masks,
+    shots: &[Shot],
+    poses: &Poses,
+    hooks: &Hooks<'_>,
+) -> Result<f64, Error> {
     let masked: Vec<&Shot> = shots
         .iter()
         .filter(|shot| masks.files.contains_key(&shot.name) && poses.images.contains_key(&shot.name))
@@ -59,7 +65,10 @@ pub fn measure(id: u16, masks: &Masks, shots: &[Shot], poses: &Poses, hooks: &Ho
     }
     if seen.len() < 3 {
         return Err(Error::refused(
-            format!("the masks show all of the object in {} images, but 3 are needed to measure it", seen.len()),
+            format!(
+                "the masks show all of the object in {} images, but 3 are needed to measure it",
+                seen.len()
+            ),
             "name another object, or measure two points (--measured)",
         ));
     }
@@ -77,7 +86,8 @@ pub fn measure(id: u16, masks: &Masks, shots: &[Shot], poses: &Poses, hooks: &Ho
     }
     lengths.sort_by(f64::total_cmp);
     misses.sort_by(f64::total_cmp);
-    let (Some(length), Some(missed)) = (lengths.get(lengths.len() * 9 / 10), misses.get(misses.len() / 2)) else {
+    let (Some(length), Some(missed)) = (lengths.get(lengths.len() * 9 / 10), misses.get(misses.len() / 2))
+    else {
         return Err(Error::refused(
             "the object lies behind its cameras, so that it cannot be measured",
             "check the masks, or measure two points (--measured)",
@@ -106,8 +116,8 @@ fn longest(pixels: &[DVec2], lens: &Lens) -> f64 {
         .map(|k| {
             let direction = DVec2::from_angle(std::f64::consts::PI * k as f64 / DIRECTIONS as f64);
             let along = pixels.iter().map(|pixel| (*pixel / focal).dot(direction));
-            let [low, high] = along
-                .fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], v| [low.min(v), high.max(v)]);
+            let [low, high] =
+                along.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], v| [low.min(v), high.max(v)]);
             // From the outer edge of the first pixel to that of the last.
             high - low + 1.0 / focal.x
         })

@@ -146,7 +146,10 @@ mod tests {
         ids.pixels[8 * 20] = 7;
         let black = |moving: Option<&BTreeSet<u16>>| {
             let left = left_over(&ids, moving);
-            left.enumerate_pixels().filter(|(_, _, p)| p.0[0] == 0).map(|(x, y, _)| (x, y)).collect::<Vec<_>>()
+            left.enumerate_pixels()
+                .filter(|(_, _, p)| p.0[0] == 0)
+                .map(|(x, y, _)| (x, y))
+                .collect::<Vec<_>>()
         };
         let only = black(Some(&BTreeSet::from([4])));
         assert_eq!(only.len(), 49);

@@ -84,7 +84,8 @@ impl Impression {
     /// change few blocks, a camera that moves changes most.
     #[must_use]
     pub fn change(&self, other: &Self) -> f64 {
-        let mut changes: Vec<f64> = self.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - b).abs()).collect();
+        let mut changes: Vec<f64> =
+            self.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - b).abs()).collect();
         changes.sort_by(f64::total_cmp);
         changes.get(changes.len() / 2).copied().unwrap_or(0.0)
     }
@@ -132,6 +133,6 @@ pub(crate) mod tests {
             }
         }
         assert!(still.change(&Impression::of(&with_object)) < 1.0);
-        assert!(still.change(&Impression::of(&board(50, 9))) > 8.0);
+        assert!(still.change(&Impression::of(&board(50, 25))) > 8.0);
     }
 }

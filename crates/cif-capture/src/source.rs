@@ -60,7 +60,11 @@ pub fn sources(inputs: &[String]) -> Result<Vec<Source>, Error> {
     for source in &found {
         cif_output::check_name(&source.camera).map_err(|problem| {
             Error::refused(
-                format!("{}: its camera cannot be called {:?}: {problem}", source.path.display(), source.camera),
+                format!(
+                    "{}: its camera cannot be called {:?}: {problem}",
+                    source.path.display(),
+                    source.camera
+                ),
                 "name it, as in cam01=PATH",
             )
         })?;
@@ -101,7 +105,8 @@ fn of_input(name: Option<String>, path: PathBuf) -> Result<Vec<Source>, Error> {
     let prefix = name.map_or(String::new(), |name| name + "-");
     let videos = files(&path, &VIDEO_ENDINGS)?;
     if !videos.is_empty() {
-        let source = |path: PathBuf| Source { camera: prefix.clone() + &stem(&path), path, photographs: None };
+        let source =
+            |path: PathBuf| Source { camera: prefix.clone() + &stem(&path), path, photographs: None };
         return Ok(videos.into_iter().map(source).collect());
     }
     let mut folders = Vec::new();
@@ -154,7 +159,9 @@ mod tests {
     fn cameras_come_from_files_folders_and_names() {
         let folder = tempfile::tempdir().unwrap();
         let at = |name: &str| folder.path().join(name);
-        for name in ["walk.mp4", "photos/b.JPG", "photos/a.png", "photos/.c.png", "rig/l/1.png", "rig/r/1.png"] {
+        for name in
+            ["walk.mp4", "photos/b.JPG", "photos/a.png", "photos/.c.png", "rig/l/1.png", "rig/r/1.png"]
+        {
             write(&at(name));
         }
         for name in ["videos/one.MOV", "videos/two.mp4", "videos/notes.txt"] {

@@ -22,7 +22,8 @@ pub fn read(path: &Path) -> Result<BTreeMap<String, f64>, Error> {
         }
         // The last column is the time: names may have spaces.
         let parts = line.rsplit_once([',', ';', '\t']).or_else(|| line.rsplit_once(' '));
-        let value = parts.and_then(|(_, time)| time.trim().parse().ok()).filter(|time: &f64| time.is_finite());
+        let value =
+            parts.and_then(|(_, time)| time.trim().parse().ok()).filter(|time: &f64| time.is_finite());
         match (parts, value) {
             (Some((name, _)), Some(time)) => {
                 times.insert(name.trim().trim_matches('"').to_owned(), time);
@@ -39,16 +40,31 @@ pub fn read(path: &Path) -> Result<BTreeMap<String, f64>, Error> {
     Ok(times)
 }
 
-/// The entry of a table that belongs to an image: by full name, by name without folder, or without ending.
+/// The entry of a table that belongs to an image: by full name, by name without ending or folder, or, where one key
+/// alone fits, by name without both.
 pub(crate) fn entry<'a, T>(table: &'a BTreeMap<String, T>, name: &str) -> Option<&'a T> {
-    let stem = |name: &'a str| name.rsplit_once('.').map_or(name, |(stem, _)| stem);
-    let file = name.rsplit('/').next().unwrap_or(name);
-    let without = |name: &str| name.rsplit_once('.').map_or(name.to_owned(), |(stem, _)| stem.to_owned());
-    [name.to_owned(), without(name), file.to_owned(), without(file)]
-        .iter()
-        .find_map(|key| table.get(key))
-        // The table may have the endings that the capture lacks, or others.
-        .or_else(|| table.iter().find(|(key, _)| stem(key) == without(file)).map(|(_, value)| value))
+    let file = file_of(name);
+    let keys = [name, without_ending(name), file, without_ending(file)];
+    // The table may have folders and endings that the capture lacks.
+    let alone = |fits: &dyn Fn(&str) -> bool| {
+        let mut found = table.iter().filter(|(key, _)| fits(key)).map(|(_, value)| value);
+        found.next().filter(|_| found.next().is_none())
+    };
+    keys.iter()
+        .find_map(|key| table.get(*key))
+        .or_else(|| alone(&|key| without_ending(key) == without_ending(name)))
+        .or_else(|| alone(&|key| without_ending(file_of(key)) == without_ending(file)))
+}
+
+fn file_of(name: &str) -> &str {
+    name.rsplit(['/', '\\']).next().unwrap_or(name)
+}
+
+fn without_ending(name: &str) -> &str {
+    match name.rsplit_once('.') {
+        Some((stem, ending)) if !ending.contains('/') => stem,
+        _ => name,
+    }
 }
 
 /// Gives every image its time of a table.
@@ -83,6 +99,9 @@ mod tests {
         }
         assert_eq!(entry(&times, "a.jpg"), Some(&0.5), "another ending");
         assert_eq!(entry(&times, "e.png"), None);
+        let rig = BTreeMap::from([("left/1.png".to_owned(), 1), ("right/1.png".to_owned(), 2)]);
+        assert_eq!(entry(&rig, "1.png"), None, "two fit alike");
+        assert_eq!((entry(&rig, "right/1.jpg"), entry(&rig, "right/1.png")), (Some(&2), Some(&2)));
         std::fs::write(&path, "a.png,0.5\nb.png,soon\n").unwrap();
         let error = read(&path).unwrap_err().to_string();
         assert!(error.contains("line 2"), "{error}");

@@ -17,9 +17,8 @@ const UPRIGHT: f64 = 0.3;
 /// all of them; `None` where the cameras were not held so.
 #[must_use]
 pub fn up_of_cameras(poses: &Poses) -> Option<DVec3> {
-    let axes = |column: usize| {
-        poses.images.values().map(move |pose| pose.world_from_camera.rotation.col(column))
-    };
+    let axes =
+        |column: usize| poses.images.values().map(move |pose| pose.world_from_camera.rotation.col(column));
     let mean_up: DVec3 = -axes(1).sum::<DVec3>() / poses.images.len().max(1) as f64;
     let mut spread = nalgebra::Matrix3::<f64>::zeros();
     for axis in axes(0) {
@@ -91,7 +90,10 @@ pub fn meet(poses: &Poses, clicks: &[Click]) -> Result<DVec3, Error> {
         .fold(0.0, f64::max);
     if widest < 0.02 {
         return Err(Error::refused(
-            format!("{} clicks see the point from nearly one direction, so that it has no depth", clicks.len()),
+            format!(
+                "{} clicks see the point from nearly one direction, so that it has no depth",
+                clicks.len()
+            ),
             "click the same point in two or more images from different sides",
         ));
     }

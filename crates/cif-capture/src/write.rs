@@ -192,8 +192,8 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
-    use crate::picture::tests::board;
     use crate::picture::Impression;
+    use crate::picture::tests::board;
     use crate::similarity::tests::arc;
 
     /// Images and poses of an arc.

@@ -27,7 +27,8 @@ fn has_pycolmap() -> bool {
 
 /// A number in [0, 1) for a cell of a grid.
 fn noise(x: i64, y: i64, seed: i64) -> f64 {
-    let mut hash = (x.wrapping_mul(0x9E37_79B9) ^ y.wrapping_mul(0x85EB_CA6B) ^ seed.wrapping_mul(0xC2B2_AE35)) as u64;
+    let mut hash =
+        (x.wrapping_mul(0x9E37_79B9) ^ y.wrapping_mul(0x85EB_CA6B) ^ seed.wrapping_mul(0xC2B2_AE35)) as u64;
     hash = (hash ^ (hash >> 15)).wrapping_mul(0xD6E8_FEB8_6659_FD93);
     hash = (hash ^ (hash >> 32)).wrapping_mul(0xD6E8_FEB8_6659_FD93);
     (hash >> 40) as f64 / (1_u64 << 24) as f64
@@ -67,9 +68,7 @@ fn trace(origin: DVec3, ray: DVec3) -> f64 {
     for axis in 0..3 {
         for (number, at) in [low[axis], high[axis]].into_iter().enumerate() {
             let seed = 10 + 2 * axis as i64 + number as i64;
-            let inside = |point: DVec3| {
-                (0..3).all(|k| k == axis || (low[k]..=high[k]).contains(&point[k]))
-            };
+            let inside = |point: DVec3| (0..3).all(|k| k == axis || (low[k]..=high[k]).contains(&point[k]));
             plane(axis, at, seed, &inside);
         }
     }

@@ -65,7 +65,8 @@ fn named(name: String, camera: DraftCamera, time: Option<f64>) -> Result<NamedCa
         return Err(Error::Pose {
             path: camera.source,
             frame: name,
-            problem: "is not a rigid transform: its rotation is not orthonormal, or a value is not finite".to_owned(),
+            problem: "is not a rigid transform: its rotation is not orthonormal, or a value is not finite"
+                .to_owned(),
         });
     }
     let focal = match (camera.focal, size) {
@@ -87,7 +88,8 @@ fn named(name: String, camera: DraftCamera, time: Option<f64>) -> Result<NamedCa
         None => Err(Error::Intrinsics {
             path: camera.source,
             frame: name,
-            problem: "focal length or size of the image are missing or not positive; add fl_x, w and h".to_owned(),
+            problem: "focal length or size of the image are missing or not positive; add fl_x, w and h"
+                .to_owned(),
         }),
     }
 }

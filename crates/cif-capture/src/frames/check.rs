@@ -62,7 +62,9 @@ pub fn check(shots: &[Shot], fixed: bool, notes: &mut Notes) -> Result<(), Error
     if images < FEWEST {
         let what = if fixed { "fixed cameras" } else { "usable images" };
         return Err(Error::refused(
-            format!("{images} {what} are too few: poses need {FEWEST} at the least, and should have 20 or more"),
+            format!(
+                "{images} {what} are too few: poses need {FEWEST} at the least, and should have 20 or more"
+            ),
             "add images that overlap by two thirds, or take more frames with --rate or --count",
         ));
     }

@@ -49,7 +49,8 @@ pub fn collect(
         shots.extend(match &source.photographs {
             Some(files) => photographs::read(source, files, &prefix, choice, hooks, notes)?,
             None => {
-                let choice = Choice { sharpest: choice.sharpest.or(Some(sources.len() == 1)), ..choice.clone() };
+                let choice =
+                    Choice { sharpest: choice.sharpest.or(Some(sources.len() == 1)), ..choice.clone() };
                 video::read(source, &prefix, &choice, folder, hooks, notes)?
             }
         });

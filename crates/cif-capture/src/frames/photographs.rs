@@ -18,7 +18,8 @@ pub(super) fn read(
     hooks: &Hooks<'_>,
     notes: &mut Notes,
 ) -> Result<Vec<Shot>, Error> {
-    if choice.rate.is_some() || choice.from_s.is_some() || choice.to_s.is_some() || choice.max_side.is_some() {
+    if choice.rate.is_some() || choice.from_s.is_some() || choice.to_s.is_some() || choice.max_side.is_some()
+    {
         notes.push(format!(
             "{}: photographs are taken as they are: a rate, a range of seconds and a size are for videos",
             source.path.display()
@@ -30,8 +31,7 @@ pub(super) fn read(
         Some(count) => (0..count).map(|k| &files[k * files.len() / count]).collect(),
         None => files.iter().collect(),
     };
-    let read: Vec<Result<(Impression, (u32, u32)), Error>> =
-        files.par_iter().map(|file| Impression::of_file(file)).collect();
+    let read: Vec<_> = files.par_iter().map(|file| Impression::of_file(file)).collect();
     hooks.go_on()?;
     let mut shots = Vec::new();
     let mut empty = Vec::new();

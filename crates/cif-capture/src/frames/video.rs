@@ -47,12 +47,17 @@ fn read_with(
     }
     let black = seen.iter().filter(|frame| frame.impression.is_empty()).count();
     if black > 0 {
-        notes.push(format!("{shown}: {black} of {} frames are black or of one colour and are left out", seen.len()));
+        notes.push(format!(
+            "{shown}: {black} of {} frames are black or of one colour and are left out",
+            seen.len()
+        ));
     }
     let taken = choose(&seen, choice);
     if taken.is_empty() {
         return Err(Error::refused(
-            format!("{shown}: no frame can be taken: all are black, of one colour, or outside --from and --to"),
+            format!(
+                "{shown}: no frame can be taken: all are black, of one colour, or outside --from and --to"
+            ),
             "check the video, and the range of seconds",
         ));
     }
@@ -127,7 +132,10 @@ fn run(
                 "give a video file, or a folder of photographs",
             )
         } else {
-            Error::refused(format!("{shown}: ffmpeg fails: {words}"), "check the video, or extract its frames by hand")
+            Error::refused(
+                format!("{shown}: ffmpeg fails: {words}"),
+                "check the video, or extract its frames by hand",
+            )
         });
     }
 }

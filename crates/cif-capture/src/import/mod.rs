@@ -37,9 +37,11 @@ pub struct Imported {
 pub fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
     let is_there = |name: &str| path.join(name).exists();
     let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
-    if let Some(folder) = ["", "0", "sparse/0", "sparse", "colmap/sparse/0"].iter().map(|name| path.join(name)).find(
-        |folder| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file()),
-    ) {
+    if let Some(folder) = ["", "0", "sparse/0", "sparse", "colmap/sparse/0"]
+        .iter()
+        .map(|name| path.join(name))
+        .find(|folder| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file()))
+    {
         let (cameras, points) = foreign::read_colmap(&folder)?;
         return imported(cameras, points, "COLMAP");
     }

@@ -58,7 +58,9 @@ pub(super) fn read(folder: &Path) -> Result<Imported, Error> {
         let rotation = DMat3::from_cols(column(0)?, -column(1)?, -column(2)?);
         let world_from_camera = RigidTransform { rotation, translation: column(3)? };
         if world_from_camera.orthonormality_error() > 1e-3 || !(camera.fx > 0.0 && camera.fy > 0.0) {
-            return Err(damaged("its pose is no rigid transform, or a focal length is not positive".to_owned()));
+            return Err(damaged(
+                "its pose is no rigid transform, or a focal length is not positive".to_owned(),
+            ));
         }
         let name = file.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
         let lens = Lens {

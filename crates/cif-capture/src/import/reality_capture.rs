@@ -20,7 +20,8 @@ pub(super) fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
     let bytes = cif_input::read(path).map_err(Error::io("read", path))?;
     let text = String::from_utf8_lossy(&bytes);
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    let heading = lines.next().map(|(_, line)| line.trim().trim_start_matches('\u{feff}')).unwrap_or_default();
+    let heading =
+        lines.next().map(|(_, line)| line.trim().trim_start_matches('\u{feff}')).unwrap_or_default();
     let columns: Vec<&str> = heading.split(',').map(str::trim).collect();
     let refused = |problem: String| {
         Error::refused(
@@ -38,7 +39,8 @@ pub(super) fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
         let cells: Vec<&str> = line.split(',').map(str::trim).collect();
         let cell = |name: &str| columns.iter().position(|column| *column == name).and_then(|k| cells.get(k));
         let value = |name: &str| {
-            let value = cell(name).and_then(|text| text.parse::<f64>().ok()).filter(|value| value.is_finite());
+            let value =
+                cell(name).and_then(|text| text.parse::<f64>().ok()).filter(|value| value.is_finite());
             value.ok_or_else(|| refused(format!("line {}: column {name} has no number", number + 1)))
         };
         let or_zero = |name: &str| if columns.contains(&name) { value(name) } else { Ok(0.0) };
@@ -77,7 +79,13 @@ pub(super) fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
     if poses.images.is_empty() {
         return Err(refused("none of its images is given".to_owned()));
     }
-    Ok(Imported { poses, times: BTreeMap::new(), tool: "RealityCapture", metres_known: false, up_known: true })
+    Ok(Imported {
+        poses,
+        times: BTreeMap::new(),
+        tool: "RealityCapture",
+        metres_known: false,
+        up_known: true,
+    })
 }
 
 #[cfg(test)]

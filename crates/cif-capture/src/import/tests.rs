@@ -39,7 +39,9 @@ fn a_colmap_model_is_read_and_matched_by_name() {
     assert_eq!(found.poses.images.keys().collect::<Vec<_>>(), ["cam/two.png", "one.png"]);
     assert_eq!(found.poses.images["one.png"].world_from_camera.translation, DVec3::new(-1.0, -2.0, -3.0));
     // Turned by half about x.
-    assert!((found.poses.images["cam/two.png"].world_from_camera.translation - 4.0 * DVec3::Z).length() < 1e-9);
+    assert!(
+        (found.poses.images["cam/two.png"].world_from_camera.translation - 4.0 * DVec3::Z).length() < 1e-9
+    );
     assert_eq!((found.poses.lenses.len(), found.poses.lenses[0].distortion.radial[0]), (1, -0.1));
     assert_eq!(found.poses.points, [Point { position: DVec3::new(0.5, 0.25, 2.0), color: [10, 20, 30] }]);
     let error = read(root.path(), &shots).unwrap().matched(root.path(), &mut [shot("x.png")]).unwrap_err();
@@ -73,5 +75,8 @@ fn a_transforms_file_brings_times_too() {
 fn what_is_of_no_tool_is_refused_with_those_that_are_known() {
     let root = tempfile::tempdir().unwrap();
     let Err(Error::Refused { problem, fix }) = read(root.path(), &[]) else { panic!("poses of nothing") };
-    assert!(problem.contains("no poses") && fix.contains("COLMAP") && fix.contains("Polycam"), "{problem} {fix}");
+    assert!(
+        problem.contains("no poses") && fix.contains("COLMAP") && fix.contains("Polycam"),
+        "{problem} {fix}"
+    );
 }

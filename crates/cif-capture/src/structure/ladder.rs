@@ -92,7 +92,8 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
             };
             run(&job, hooks)
         };
-        let name = if number == 0 { "default features".to_owned() } else { format!("more features ({number})") };
+        let name =
+            if number == 0 { "default features".to_owned() } else { format!("more features ({number})") };
         let (seen, found) = rung(names.len(), &solve)?;
         features = seen;
         match found {
@@ -150,10 +151,9 @@ fn stage(request: &Request<'_>, images: &Path, masks: &Path) -> Result<Vec<Strin
         let ending = shot.file.extension().map(|ending| ending.to_string_lossy().to_lowercase());
         let name = format!("{number:06}.{}", ending.as_deref().unwrap_or("png"));
         put(&shot.file, &images.join(&name))?;
-        if let Some(mask) = request.masks.map(|masks| masks.join(format!("{}.png", shot.name))) {
-            if mask.is_file() {
-                put(&mask, &masks.join(format!("{name}.png")))?;
-            }
+        let mask = request.masks.map(|masks| masks.join(format!("{}.png", shot.name)));
+        if let Some(mask) = mask.filter(|mask| mask.is_file()) {
+            put(&mask, &masks.join(format!("{name}.png")))?;
         }
         names.push(name);
     }
@@ -178,9 +178,8 @@ fn rung(
     let features: Vec<usize> = features.into_values().collect();
     let mut runs = runs.into_iter();
     let (global, incremental) = (runs.next().flatten(), runs.next().flatten());
-    let judged = |mapper, poses: &Poses, other: Option<&Poses>| {
-        (mapper, poses.clone(), judge(poses, other, images))
-    };
+    let judged =
+        |mapper, poses: &Poses, other: Option<&Poses>| (mapper, poses.clone(), judge(poses, other, images));
     let mut best = global.as_ref().map(|global| judged("global", global, incremental.as_ref()));
     if best.as_ref().is_some_and(|(_, _, verdict)| verdict.is_good()) {
         return Ok((features, best));

@@ -138,8 +138,9 @@ struct PointJson {
 /// # Errors
 /// When Python or pycolmap is missing or fails, or the caller stops.
 pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
-    let input = serde_json::to_vec(job)
-        .map_err(|error| Error::refused(format!("a name cannot be passed to Python: {error}"), "rename it"))?;
+    let input = serde_json::to_vec(job).map_err(|error| {
+        Error::refused(format!("a name cannot be passed to Python: {error}"), "rename it")
+    })?;
     let programs = programs();
     for program in &programs {
         let mut command = Command::new(program);
@@ -154,11 +155,9 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
         let Some(answer) = child::run(&mut command, &input, hooks.should_stop, line)? else { continue };
         let parsed: Option<AnswerJson> = serde_json::from_slice(&answer.output).ok();
         return match parsed {
-            Some(AnswerJson { missing: Some(problem), python, version, .. }) => Err(pycolmap_missing(
-                &problem,
-                &python.unwrap_or_default(),
-                &version.unwrap_or_default(),
-            )),
+            Some(AnswerJson { missing: Some(problem), python, version, .. }) => {
+                Err(pycolmap_missing(&problem, &python.unwrap_or_default(), &version.unwrap_or_default()))
+            }
             Some(answer) => outcome(answer),
             None => Err(Error::refused(
                 format!("pycolmap failed:\n{}", words_of(&answer.last_words)),
@@ -168,8 +167,10 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
     }
     Err(Error::refused(
         "poses are found by pycolmap, which needs Python, and there is none on the PATH",
-        format!("install Python 3.10 to 3.13 and pycolmap (pip install pycolmap), and name it by {VARIABLE}; or give \
-                 poses of another tool with --poses"),
+        format!(
+            "install Python 3.10 to 3.13 and pycolmap (pip install pycolmap), and name it by {VARIABLE}; or give \
+                 poses of another tool with --poses"
+        ),
     ))
 }
 
@@ -204,7 +205,10 @@ fn poses(model: ModelJson) -> Result<Poses, Error> {
             ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], 0.0),
             (other, _) => {
                 let problem = format!("pycolmap answered with a lens of the unexpected kind {other}");
-                return Err(Error::refused(problem, "install the version of pycolmap that cif[capture] asks for"));
+                return Err(Error::refused(
+                    problem,
+                    "install the version of pycolmap that cif[capture] asks for",
+                ));
             }
         };
         numbers.insert(*number, lenses.len());
@@ -224,8 +228,7 @@ fn poses(model: ModelJson) -> Result<Poses, Error> {
         let lens = numbers.get(&image.camera).copied()?;
         Some(Pose { lens, world_from_camera: camera_from_world.inverse(), points: image.points })
     };
-    let images =
-        model.images.iter().filter_map(|(name, image)| Some((name.clone(), pose(image)?))).collect();
+    let images = model.images.iter().filter_map(|(name, image)| Some((name.clone(), pose(image)?))).collect();
     let points = model
         .points
         .iter()

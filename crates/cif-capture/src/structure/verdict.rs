@@ -183,7 +183,11 @@ mod tests {
     fn few_images_wrong_lenses_and_large_errors_are_told() {
         let a = arc(20);
         for (change, told) in [
-            (Box::new(|poses: &mut Poses| poses.lenses[0].focal_px = [2500.0; 2]) as Box<dyn Fn(&mut Poses)>, "focal"),
+            (
+                Box::new(|poses: &mut Poses| poses.lenses[0].focal_px = [2500.0; 2])
+                    as Box<dyn Fn(&mut Poses)>,
+                "focal",
+            ),
             (Box::new(|poses: &mut Poses| poses.lenses[0].distortion.radial[0] = -0.9), "k1"),
             (Box::new(|poses: &mut Poses| poses.reprojection_px = Some(2.6)), "points project"),
             (Box::new(|poses: &mut Poses| poses.reprojection_px = Some(0.0)), "points project"),

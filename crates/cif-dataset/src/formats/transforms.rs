@@ -92,7 +92,8 @@ pub(crate) fn named_cameras(
     let file = read(path)?;
     let cameras = file.frames.iter().map(|entry| {
         let parts = clean(&entry.file_path);
-        let name = parts.components().map(|part| part.as_os_str().to_string_lossy()).collect::<Vec<_>>().join("/");
+        let name =
+            parts.components().map(|part| part.as_os_str().to_string_lossy()).collect::<Vec<_>>().join("/");
         camera(path, &file, entry).map(|camera| (name, camera, entry.time))
     });
     Ok((cameras.collect::<Result<_, _>>()?, file.ply_file_path.as_deref().map(clean)))

@@ -27,7 +27,9 @@ const ANY_ORDER: usize = 120;
 impl From<cif_capture::Error> for Error {
     fn from(error: cif_capture::Error) -> Self {
         match error {
-            cif_capture::Error::Stopped => Self::Interrupted { message: "interrupted".to_owned(), help: None },
+            cif_capture::Error::Stopped => {
+                Self::Interrupted { message: "interrupted".to_owned(), help: None }
+            }
             cif_capture::Error::Refused { problem, fix } => Self::failed(problem, fix),
             other => Self::plain(other),
         }
@@ -182,11 +184,7 @@ fn find(
 }
 
 /// Every frame of a fixed camera has the pose of the one that was solved.
-fn all_frames(
-    poses: &Poses,
-    solved: &[Shot],
-    shots: &[Shot],
-) -> BTreeMap<String, cif_capture::poses::Pose> {
+fn all_frames(poses: &Poses, solved: &[Shot], shots: &[Shot]) -> BTreeMap<String, cif_capture::poses::Pose> {
     let of_camera: BTreeMap<&str, _> = solved
         .iter()
         .filter_map(|shot| Some((shot.camera.as_str(), *poses.images.get(&shot.name)?)))

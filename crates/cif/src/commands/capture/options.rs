@@ -94,7 +94,13 @@ pub(in crate::commands) struct Capture {
     #[arg(long, num_args = 3, value_names = ["POINT", "POINT", "METRES"], help_heading = "World")]
     pub(super) measured: Option<Vec<String>>,
     /// Up: cameras (from how they were held), unknown, or X,Y,Z in the world of --poses
-    #[arg(long, value_name = "UP", default_value = "cameras", allow_hyphen_values = true, help_heading = "World")]
+    #[arg(
+        long,
+        value_name = "UP",
+        default_value = "cameras",
+        allow_hyphen_values = true,
+        help_heading = "World"
+    )]
     pub(super) up: UpName,
     /// Show no progress
     #[arg(short, long)]

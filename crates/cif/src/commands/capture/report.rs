@@ -37,11 +37,14 @@ pub(super) fn print(
     }
     println!(
         "times: {}",
-        if timed { "of every image, seconds" } else { "none, so that the scene is taken as static (--times)" }
+        if timed {
+            "of every image, seconds"
+        } else {
+            "none, so that the scene is taken as static (--times)"
+        }
     );
-    let masked = masks.map_or(0, |masks| {
-        posed.poses.images.keys().filter(|name| masks.files.contains_key(*name)).count()
-    });
+    let masked = masks
+        .map_or(0, |masks| posed.poses.images.keys().filter(|name| masks.files.contains_key(*name)).count());
     println!("masks: {masked} of {with_pose} images");
     println!("next:");
     let scene = scene_name(&command.output).display().to_string();
@@ -55,7 +58,9 @@ pub(super) fn print(
         None => "painted".to_owned(),
     };
     if masks.is_none() {
-        println!("  paint the objects of a few of {place}/images as PNG files of ids in the folder {painted}, then");
+        println!(
+            "  paint the objects of a few of {place}/images as PNG files of ids in the folder {painted}, then"
+        );
     }
     println!("  {}", command_line(&["masks", "propagate", &place, "--keyframes", &painted, "-o", &folder]));
     println!("  {}", command_line(&["train", &place, "--masks", &folder, "-o", &scene]));
