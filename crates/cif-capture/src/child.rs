@@ -22,10 +22,12 @@ pub(crate) struct Answer {
     pub(crate) last_words: String,
 }
 
-/// Runs a program with `input` on its standard input. Every line that it writes to standard error goes to `line`.
+/// Runs a program with `input` on its standard input. Every line that it writes to standard error goes to
+/// `line`.
 ///
 /// # Errors
-/// When it cannot be started (`Ok(None)` where there is no such program), or `should_stop` says so: it is killed then.
+/// When it cannot be started (`Ok(None)` where there is no such program), or `should_stop` says so: it is
+/// killed then.
 pub(crate) fn run(
     command: &mut Command,
     input: &[u8],

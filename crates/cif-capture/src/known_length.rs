@@ -28,8 +28,8 @@ struct Seen<'a> {
     pose: &'a Pose,
 }
 
-/// Longest side of an object in the unit of the poses: seen from all around, the largest of its images that is not an
-/// outlier (90th percentile), times its distance.
+/// Longest side of an object in the unit of the poses: seen from all around, the largest of its images that is
+/// not an outlier (90th percentile), times its distance.
 ///
 /// # Errors
 /// When few masks show all of it, or it moves.

@@ -14,8 +14,8 @@
 //! | [`times`] | tables of times by file name |
 //! | [`write`](mod@write) | the capture as nerfstudio's `transforms.json` |
 //!
-//! Cameras look along +z with x right and y down until they are written. The same input gives the same capture, whatever
-//! the number of threads.
+//! Cameras look along +z with x right and y down until they are written. The same input gives the same
+//! capture, whatever the number of threads.
 
 mod child;
 mod error;

@@ -33,8 +33,8 @@ impl Masks {
     }
 }
 
-/// Finds the masks of images: `NAME.png` with or without the ending of the image, below the folder or, of one camera,
-/// in it.
+/// Finds the masks of images: `NAME.png` with or without the ending of the image, below the folder or, of one
+/// camera, in it.
 ///
 /// # Errors
 /// When there is no such folder, or it holds no mask of any image.

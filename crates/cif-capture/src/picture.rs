@@ -17,8 +17,8 @@ const BLOCK: usize = 20;
 pub struct Impression {
     /// Mean brightness, 0 to 255.
     pub brightness: f64,
-    /// Variance of the Laplacian of the reduced image over its brightness's variance, free of contrast; 0 for one
-    /// colour.
+    /// Variance of the Laplacian of the reduced image over its brightness's variance, free of contrast; 0 for
+    /// one colour.
     pub sharpness: f64,
     /// Mean brightness of blocks, row by row.
     blocks: Vec<f64>,
@@ -80,8 +80,8 @@ impl Impression {
         high < 12.0 || high - low < 2.0
     }
 
-    /// Median over blocks of the change of brightness, 0 to 255: objects that move before a camera that stands still
-    /// change few blocks, a camera that moves changes most.
+    /// Median over blocks of the change of brightness, 0 to 255: objects that move before a camera that stands
+    /// still change few blocks, a camera that moves changes most.
     #[must_use]
     pub fn change(&self, other: &Self) -> f64 {
         let mut changes: Vec<f64> =

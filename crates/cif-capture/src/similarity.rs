@@ -37,8 +37,8 @@ impl Similarity {
         }
     }
 
-    /// The similarity that brings `from` nearest to `to` in the sense of least squares; `None` for fewer than two
-    /// pairs, or where the places coincide. Places on one line leave the turn about it open.
+    /// The similarity that brings `from` nearest to `to` in the sense of least squares; `None` for fewer than
+    /// two pairs, or where the places coincide. Places on one line leave the turn about it open.
     ///
     /// Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns",
     /// IEEE TPAMI 13(4), 1991, equations 38 to 42.

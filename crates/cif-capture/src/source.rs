@@ -41,8 +41,9 @@ fn files(folder: &Path, endings: &[&str]) -> Result<Vec<PathBuf>, Error> {
     Ok(found)
 }
 
-/// The cameras of inputs: a video or a folder, each also as `NAME=PATH`. A folder of photographs is one camera, a folder
-/// of videos one camera per video, and a folder of folders of photographs one camera per folder.
+/// The cameras of inputs: a video or a folder, each also as `NAME=PATH`. A folder of photographs is one
+/// camera, a folder of videos one camera per video, and a folder of folders of photographs one camera per
+/// folder.
 ///
 /// # Errors
 /// When an input is missing or holds neither images nor videos, or two cameras have one name.

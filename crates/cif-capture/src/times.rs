@@ -6,8 +6,8 @@ use std::path::Path;
 use crate::Error;
 use crate::frames::Shot;
 
-/// Reads a table of two columns, name and seconds, divided by commas, semicolons, tabs or spaces; a first line without
-/// a number is a heading. Names may leave out folder and ending.
+/// Reads a table of two columns, name and seconds, divided by commas, semicolons, tabs or spaces; a first line
+/// without a number is a heading. Names may leave out folder and ending.
 ///
 /// # Errors
 /// When the file cannot be read, or a line does not hold a name and a number.
@@ -40,8 +40,8 @@ pub fn read(path: &Path) -> Result<BTreeMap<String, f64>, Error> {
     Ok(times)
 }
 
-/// The entry of a table that belongs to an image: by full name, by name without ending or folder, or, where one key
-/// alone fits, by name without both.
+/// The entry of a table that belongs to an image: by full name, by name without ending or folder, or, where
+/// one key alone fits, by name without both.
 pub(crate) fn entry<'a, T>(table: &'a BTreeMap<String, T>, name: &str) -> Option<&'a T> {
     let file = file_of(name);
     let keys = [name, without_ending(name), file, without_ending(file)];

@@ -32,8 +32,8 @@ pub struct Seen {
     pub impression: Impression,
 }
 
-/// Numbers of the frames to take, ascending: time is cut into windows of equal length, and each gives one frame, unless
-/// all of it is black or of one colour.
+/// Numbers of the frames to take, ascending: time is cut into windows of equal length, and each gives one
+/// frame, unless all of it is black or of one colour.
 #[must_use]
 pub fn choose(seen: &[Seen], choice: &Choice) -> Vec<usize> {
     let usable: Vec<usize> = (0..seen.len())

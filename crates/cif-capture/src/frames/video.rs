@@ -92,8 +92,8 @@ fn read_with(
     Ok(shots)
 }
 
-/// Runs ffmpeg; frames come as they are in the stream, none doubled and none dropped. `-fps_mode` says so from 5.1
-/// on, `-vsync` before.
+/// Runs ffmpeg; frames come as they are in the stream, none doubled and none dropped. `-fps_mode` says so from
+/// 5.1 on, `-vsync` before.
 fn run(
     ffmpeg: &OsStr,
     source: &Source,
@@ -173,7 +173,8 @@ fn time_of(line: &str) -> Option<f64> {
     rest.split_whitespace().next()?.parse().ok().filter(|time: &f64| time.is_finite())
 }
 
-/// Largest deviation of distances between frames from their median, as a share of it; `None` for less than three.
+/// Largest deviation of distances between frames from their median, as a share of it; `None` for less than
+/// three.
 fn spread_of_distances(seen: &[Seen]) -> Option<f64> {
     let mut distances: Vec<f64> = seen.windows(2).map(|pair| pair[1].time - pair[0].time).collect();
     distances.sort_by(f64::total_cmp);

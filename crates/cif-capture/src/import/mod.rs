@@ -105,8 +105,8 @@ fn add(poses: &mut Poses, name: String, lens: Lens, world_from_camera: cif_geome
 }
 
 impl Imported {
-    /// The same poses under the names of the images of a capture, with times where the file has them and the images do
-    /// not.
+    /// The same poses under the names of the images of a capture, with times where the file has them and the
+    /// images do not.
     ///
     /// # Errors
     /// When no image has a pose.

@@ -1,5 +1,5 @@
-//! Polycam: `keyframes/corrected_cameras/` (or `cameras/`) with one JSON file per image. ARKit's world has metres and y
-//! up; its axes are cycled so that z is up, as nerfstudio's importer does.
+//! Polycam: `keyframes/corrected_cameras/` (or `cameras/`) with one JSON file per image. ARKit's world has
+//! metres and y up; its axes are cycled so that z is up, as nerfstudio's importer does.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};

@@ -1,5 +1,5 @@
-//! RealityCapture: the registration as "Internal/External camera parameters", a CSV file. Focal lengths are of 35 mm
-//! film; angles as nerfstudio's importer reads them. The world has z up; its unit is what was set there.
+//! RealityCapture: the registration as "Internal/External camera parameters", a CSV file. Focal lengths are of
+//! 35 mm film; angles as nerfstudio's importer reads them. The world has z up; its unit is what was set there.
 
 use std::collections::BTreeMap;
 use std::path::Path;

@@ -1,9 +1,10 @@
 //! Settings of structure from motion, tried in order until one is to be believed.
 //!
-//! Each setting is solved by both mappers of COLMAP, with seeds of their own: the global one, which is given out, and the
-//! incremental one, by which it is judged; where these disagree, the incremental mapper runs once more with another
-//! seed and may be given out itself. The settings were found on small captures with moving objects: default features
-//! suffice where there is texture, a lower threshold of features is what scenes of plain objects need.
+//! Each setting is solved by both mappers of COLMAP, with seeds of their own: the global one, which is given
+//! out, and the incremental one, by which it is judged; where these disagree, the incremental mapper runs once
+//! more with another seed and may be given out itself. The settings were found on small captures with moving
+//! objects: default features suffice where there is texture, a lower threshold of features is what scenes of
+//! plain objects need.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -18,7 +19,8 @@ use crate::{Error, Hooks};
 /// Thresholds of features, in order: COLMAP's own (1/150), and lower ones for more features.
 const PEAKS: [Option<f64>; 3] = [None, Some(0.002), Some(0.001)];
 
-/// Images have, in the median, fewer features than this where they are blurred or show nothing but plain surfaces.
+/// Images have, in the median, fewer features than this where they are blurred or show nothing but plain
+/// surfaces.
 const FEW_FEATURES: usize = 40;
 
 /// Which images share a lens.
@@ -66,7 +68,8 @@ pub struct Found {
 /// Finds the poses of images.
 ///
 /// # Errors
-/// When pycolmap is missing or fails, the caller stops, or no setting gives any pose. A bad verdict is no error.
+/// When pycolmap is missing or fails, the caller stops, or no setting gives any pose. A bad verdict is no
+/// error.
 pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
     let (images, masks) = (request.work.join("images"), request.work.join("masks"));
     let names = stage(request, &images, &masks)?;
@@ -141,7 +144,8 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
     Ok(Found { poses, tried, ..best })
 }
 
-/// Puts images and masks into folders of their own under names that COLMAP's lists can hold, which has no spaces.
+/// Puts images and masks into folders of their own under names that COLMAP's lists can hold, which has no
+/// spaces.
 fn stage(request: &Request<'_>, images: &Path, masks: &Path) -> Result<Vec<String>, Error> {
     let mut names = Vec::with_capacity(request.shots.len());
     for folder in [images, masks] {

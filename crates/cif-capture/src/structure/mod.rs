@@ -1,5 +1,5 @@
-//! Where the cameras were: structure from motion through pycolmap, tried with one setting after the other until two
-//! runs agree.
+//! Where the cameras were: structure from motion through pycolmap, tried with one setting after the other
+//! until two runs agree.
 
 mod ladder;
 mod pairs;

@@ -17,11 +17,11 @@ pub enum Order {
     Any,
 }
 
-/// Pairs `(a, b)` with a < b, ascending. `cameras` tells which camera took each image; images are ordered by camera, then
-/// by time.
+/// Pairs `(a, b)` with a < b, ascending. `cameras` tells which camera took each image; images are ordered by
+/// camera, then by time.
 ///
-/// In sequences every image is matched with the ten that follow, with those 16, 32, 64, ... further on, and with those
-/// at the same share of the way in the other cameras.
+/// In sequences every image is matched with the ten that follow, with those 16, 32, 64, ... further on, and
+/// with those at the same share of the way in the other cameras.
 pub(super) fn pairs(cameras: &[&str], order: Order) -> Vec<(usize, usize)> {
     let count = cameras.len();
     if order == Order::Any && count <= EXHAUSTIVE {

@@ -1,4 +1,5 @@
-//! pycolmap, run in a Python of its own: the one that the wheel runs in, `$CIF_PYTHON`, or the first on the path.
+//! pycolmap, run in a Python of its own: the one that the wheel runs in, `$CIF_PYTHON`, or the first on the
+//! path.
 
 use std::collections::BTreeMap;
 use std::ffi::OsString;

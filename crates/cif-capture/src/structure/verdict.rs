@@ -1,5 +1,5 @@
-//! Whether poses are to be believed. "80 of 80 images" proves nothing: repeated shapes and moving objects make models
-//! that are wrong as a whole, and two runs by different mappers and seeds are seldom wrong alike.
+//! Whether poses are to be believed. "80 of 80 images" proves nothing: repeated shapes and moving objects make
+//! models that are wrong as a whole, and two runs by different mappers and seeds are seldom wrong alike.
 
 use std::fmt;
 
@@ -22,8 +22,8 @@ const RADIAL: f64 = 0.5;
 /// Points that tie every image to others.
 const POINTS: usize = 12;
 
-/// Two runs agree where places differ by less than this share of their spread, orientations by less than this angle
-/// in the median, and this share of the images has a pose in both.
+/// Two runs agree where places differ by less than this share of their spread, orientations by less than this
+/// angle in the median, and this share of the images has a pose in both.
 const PLACES: f64 = 0.035;
 const ANGLE_DEGREES: f64 = 5.0;
 const COMMON: f64 = 0.75;

@@ -57,21 +57,22 @@ pub(in crate::commands) struct Capture {
     /// Table of times: image name, comma, seconds
     #[arg(long, value_name = "FILE", help_heading = "Frames")]
     pub(super) times: Option<PathBuf>,
-    /// Folder of masks, PNG files of ids named as the images: what moves is left out of the poses, and the capture gets
-    /// the masks
+    /// Folder of masks, PNG files of ids named as the images: what moves is left out of the poses, and the
+    /// capture gets the masks
     #[arg(long, value_name = "DIR", help_heading = "Poses")]
     pub(super) masks: Option<PathBuf>,
     /// Ids of the masks that move [default: all but 0]
     #[arg(long, value_name = "ID,...", value_delimiter = ',', requires = "masks", help_heading = "Poses")]
     pub(super) moving_ids: Option<Vec<u16>>,
-    /// Focal length to start from, in pixels of the images taken [default: of EXIF, else 1.2 times the larger side]
+    /// Focal length to start from, in pixels of the images taken [default: of EXIF, else 1.2 times the larger
+    /// side]
     #[arg(long, value_name = "PIXELS", value_parser = positive, help_heading = "Poses")]
     pub(super) focal: Option<f64>,
     /// Lenses: one for all images of a size, or each camera its own
     #[arg(long, value_name = "WHICH", default_value = "one", help_heading = "Poses")]
     pub(super) lenses: LensesName,
-    /// Order of the images: sequence (neighbours overlap), any (each is matched with each), or auto: sequence for
-    /// videos, any for up to 120 photographs
+    /// Order of the images: sequence (neighbours overlap), any (each is matched with each), or auto: sequence
+    /// for videos, any for up to 120 photographs
     #[arg(long, value_name = "ORDER", default_value = "auto", help_heading = "Poses")]
     pub(super) order: OrderName,
     /// The cameras stand still: one moment gives their poses
@@ -80,8 +81,8 @@ pub(in crate::commands) struct Capture {
     /// The cameras move, though most of their pictures stays as it is
     #[arg(long, help_heading = "Poses")]
     pub(super) moving: bool,
-    /// Take poses of another tool: a COLMAP model, a nerfstudio transforms.json, a Polycam export, or a RealityCapture
-    /// registration (.csv)
+    /// Take poses of another tool: a COLMAP model, a nerfstudio transforms.json, a Polycam export, or a
+    /// RealityCapture registration (.csv)
     #[arg(long, value_name = "FROM", conflicts_with_all = ["focal", "fixed", "moving"], help_heading = "Poses")]
     pub(super) poses: Option<PathBuf>,
     /// Write the capture even where the verdict says no
