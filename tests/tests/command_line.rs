@@ -618,8 +618,8 @@ fn poses_of_other_tools_become_a_capture_with_times() {
         &point(2.0),
         "0.1",
     ];
-    let run = run(CIF, folder.path(), arguments).succeeds();
-    assert!(run.stdout.contains("a unit is a metre"), "{}", run.stdout);
+    let metric = run(CIF, folder.path(), arguments).succeeds();
+    assert!(metric.stdout.contains("a unit is a metre"), "{}", metric.stdout);
     let written: serde_json::Value =
         serde_json::from_slice(&fs::read(folder.path().join("metres/transforms.json")).unwrap()).unwrap();
     let x = |k: usize| written["frames"][k]["transform_matrix"][0][3].as_f64().unwrap();
