@@ -590,14 +590,14 @@ fn poses_of_other_tools_become_a_capture_with_times() {
     fs::write(folder.path().join("poses.json"), poses.to_string()).unwrap();
     fs::write(folder.path().join("times.csv"), times).unwrap();
     let line = "capture photos -o table --poses poses.json --times times.csv";
-    let run = cif(folder.path(), line).succeeds();
+    let made = cif(folder.path(), line).succeeds();
     for told in
         ["4 of 4 images", "+z is up", "metre is not known", "cif masks propagate table", "cif train table"]
     {
-        assert!(run.stdout.contains(told), "{told}: {}", run.stdout);
+        assert!(made.stdout.contains(told), "{told}: {}", made.stdout);
     }
-    let run = cif(folder.path(), "info table").succeeds();
-    assert!(run.stdout.contains("does not know the metre"), "{}", run.stdout);
+    let info = cif(folder.path(), "info table").succeeds();
+    assert!(info.stdout.contains("does not know the metre"), "{}", info.stdout);
     let written: serde_json::Value =
         serde_json::from_slice(&fs::read(folder.path().join("table/transforms.json")).unwrap()).unwrap();
     assert_eq!(written["frames"][3]["time"], 1.5);
