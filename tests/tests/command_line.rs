@@ -534,7 +534,8 @@ fn captures_are_refused_with_a_reason_and_nothing_is_written() {
     let photographs = folder.path().join("photos");
     fs::create_dir(&photographs).unwrap();
     let image = |name: &str, width: u32, height: u32, shift: u32| {
-        let pixel = |x: u32, y: u32| image::Luma([if ((x + shift) / 9 + y / 7) % 2 == 0 { 220 } else { 20 }]);
+        let is_light = |x: u32, y: u32| ((x + shift) / 9 + y / 7).is_multiple_of(2);
+        let pixel = |x, y| image::Luma([if is_light(x, y) { 220 } else { 20 }]);
         image::GrayImage::from_fn(width, height, pixel).save(photographs.join(name)).unwrap();
     };
     image("a.png", 64, 48, 0);
