@@ -105,20 +105,20 @@ fn photographs(folder: &Path, cameras: &[RigidTransform]) {
             let mean = offsets.iter().flat_map(|dx| offsets.map(|dy| sample(*dx, dy))).sum::<f64>() / 4.0;
             image::Luma([(255.0 * mean).clamp(0.0, 255.0) as u8])
         });
-        image.save(folder.join(format!("{k:02}.png"))).unwrap();
+        image.save(folder.join(format!("{k:02}.png"))).expect("the folder takes pictures");
     }
 }
 
 fn shots(folder: &Path) -> Vec<Shot> {
     let inputs = [format!("walk={}", folder.display())];
     let mut notes = Notes::new();
-    let sources = sources(&inputs).unwrap();
-    frames::collect(&sources, &Choice::default(), folder, &Hooks::silent(), &mut notes).unwrap()
+    let sources = sources(&inputs).expect("a folder of photographs");
+    frames::collect(&sources, &Choice::default(), folder, &Hooks::silent(), &mut notes).expect("photographs")
 }
 
 fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
     let work = folder.join(work);
-    std::fs::create_dir_all(&work).unwrap();
+    std::fs::create_dir_all(&work).expect("a new folder");
     let request = Request {
         shots,
         masks: None,
