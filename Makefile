@@ -18,12 +18,13 @@ RUFF := ruff==0.17.5
 
 # Tools that read what we write, each in an environment of its own: their versions of USD or Python differ from ours.
 MUJOCO := mujoco[usd]==4.0.0
+PYCOLMAP := pycolmap==4.2.1
 BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13
 
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build demo plugin test test-wheel test-rust test-python test-mujoco test-blender fuzz lint format clean
+.PHONY: help build demo plugin test test-wheel test-rust test-python test-mujoco test-blender test-capture fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -32,6 +33,7 @@ help:
 	@echo "make test    all tests, Rust and Python"
 	@echo "make fuzz    damaged files for every reader, MINUTES=60 long; READER= picks one"
 	@echo "make test-mujoco, make test-blender   tests with these tools, which are downloaded (75 MB, 1.1 GB)"
+	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make format  put the formatting right"
 
@@ -102,6 +104,11 @@ test-mujoco: test-wheel
 	test -x $(VENV)/mujoco/bin/python || $(PYTHON) -m venv $(VENV)/mujoco
 	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check "$(MUJOCO)"
 	CIF_TEST_MUJOCO=$(VENV)/mujoco/bin/python $(TEST_BIN)/python -m pytest tests/python/test_mujoco.py
+
+test-capture:
+	test -x $(VENV)/capture/bin/python || $(PYTHON) -m venv $(VENV)/capture
+	$(VENV)/capture/bin/python -m pip install --quiet --disable-pip-version-check "$(PYCOLMAP)"
+	CIF_PYTHON=$(abspath $(VENV)/capture/bin/python) cargo test --locked -p cif-capture
 
 # Versions of Blender whose Python is not there are skipped.
 test-blender:

@@ -50,6 +50,7 @@ fn help_teaches_the_tool() {
     let folder = folder();
     let help = cif(folder.path(), "--help").succeeds().stdout;
     for word in [
+        "capture",
         "train",
         "eval",
         "render",
@@ -573,4 +574,104 @@ fn points_behind_all_cameras_are_told() {
     }
     let info = cif(path, "info table").succeeds().stdout;
     assert!(info.contains("points.npy: 0 of its 640 points") && info.contains("640 lie behind"), "{info}");
+}
+
+#[test]
+fn captures_are_refused_with_a_reason_and_nothing_is_written() {
+    let folder = folder();
+    let photographs = folder.path().join("photos");
+    fs::create_dir(&photographs).unwrap();
+    let image = |name: &str, width: u32, height: u32, shift: u32| {
+        let is_light = |x: u32, y: u32| ((x + shift) / 9 + y / 7).is_multiple_of(2);
+        let pixel = |x, y| image::Luma([if is_light(x, y) { 220 } else { 20 }]);
+        image::GrayImage::from_fn(width, height, pixel).save(photographs.join(name)).unwrap();
+    };
+    image("a.png", 64, 48, 0);
+    image("b.png", 64, 48, 4);
+    fs::create_dir(folder.path().join("taken")).unwrap();
+    fs::write(folder.path().join("taken/x"), b"x").unwrap();
+    fs::write(folder.path().join("notes.txt"), b"x").unwrap();
+    for (line, told) in [
+        ("capture photos -o new", "2 usable images are too few"),
+        ("capture none.mp4 -o new", "no such file or folder"),
+        ("capture photos -o taken", "taken exists"),
+        ("capture photos photos -o new", "another camera is called"),
+        ("capture photos -o new --masks none", "no such folder of masks"),
+        ("capture photos -o new --poses notes.txt", "no poses of a tool that is known"),
+    ] {
+        cif(folder.path(), line).fails(1, &[told]);
+    }
+    for k in 0..4 {
+        image(&format!("c{k}.png"), 64, 48, 4 * k);
+    }
+    image("upright.png", 48, 64, 0);
+    cif(folder.path(), "capture photos -o new").fails(1, &["1 upright and 6 lying"]);
+    fs::remove_file(photographs.join("upright.png")).unwrap();
+    for k in 0..4 {
+        image(&format!("c{k}.png"), 64, 48, 0);
+    }
+    image("b.png", 64, 48, 0);
+    cif(folder.path(), "capture photos -o new").fails(1, &["stands still"]);
+    for line in ["capture photos -o new --rate 0", "capture photos -o new --up z", "capture -o new"] {
+        cif(folder.path(), line).fails(2, &[]);
+    }
+    assert!(!folder.path().join("new").exists());
+    assert!(listing(folder.path()).iter().all(|path| !path.contains("cif-tmp")));
+}
+
+#[test]
+fn poses_of_other_tools_become_a_capture_with_times() {
+    let folder = folder();
+    let photographs = folder.path().join("photos");
+    fs::create_dir(&photographs).unwrap();
+    let mut frames = Vec::new();
+    let mut times = String::from("image,seconds\n");
+    for k in 0..4_u32 {
+        let name = format!("view {k}.png");
+        let pixel = |x: u32, y: u32| image::Luma([((x * 7 + y * 3 + 11 * k) % 256) as u8]);
+        image::GrayImage::from_fn(64, 48, pixel).save(photographs.join(&name)).unwrap();
+        let x = f64::from(k);
+        frames.push(serde_json::json!({ "file_path": format!("elsewhere/{name}"),
+            "transform_matrix": [[1.0, 0.0, 0.0, x], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 1.0], [0.0, 0.0, 0.0, 1.0]] }));
+        times += &format!("{name},{}\n", 0.5 * x + 2.0);
+    }
+    let poses = serde_json::json!({ "fl_x": 60.0, "w": 64, "h": 48, "frames": frames });
+    fs::write(folder.path().join("poses.json"), poses.to_string()).unwrap();
+    fs::write(folder.path().join("times.csv"), times).unwrap();
+    let line = "capture photos -o table --poses poses.json --times times.csv";
+    let made = cif(folder.path(), line).succeeds();
+    for told in
+        ["4 of 4 images", "+z is up", "metre is not known", "cif masks propagate table", "cif train table"]
+    {
+        assert!(made.stdout.contains(told), "{told}: {}", made.stdout);
+    }
+    let info = cif(folder.path(), "info table").succeeds();
+    assert!(info.stdout.contains("does not know the metre"), "{}", info.stdout);
+    let written: serde_json::Value =
+        serde_json::from_slice(&fs::read(folder.path().join("table/transforms.json")).unwrap()).unwrap();
+    assert_eq!(written["frames"][3]["time"], 1.5);
+    assert_eq!(written["frames"][3]["file_path"], "images/view 3.png");
+    // The first and the last camera are three units apart: 0.3 m, as both ends of a stick are measured.
+    let pixel = |camera: f64, place: f64| 32.0 + 60.0 * (place - camera) / 4.0;
+    let point =
+        |place: f64| format!("view 0.png:{},24/view 3.png:{},24", pixel(0.0, place), pixel(3.0, place));
+    let arguments = [
+        "capture",
+        "photos",
+        "-o",
+        "metres",
+        "--poses",
+        "poses.json",
+        "--measured",
+        &point(1.0),
+        &point(2.0),
+        "0.1",
+    ];
+    let metric = run(CIF, folder.path(), arguments).succeeds();
+    assert!(metric.stdout.contains("a unit is a metre"), "{}", metric.stdout);
+    let written: serde_json::Value =
+        serde_json::from_slice(&fs::read(folder.path().join("metres/transforms.json")).unwrap()).unwrap();
+    let x = |k: usize| written["frames"][k]["transform_matrix"][0][3].as_f64().unwrap();
+    assert!((x(3) - x(0) - 0.3).abs() < 1e-9, "{} {}", x(3), x(0));
+    assert_eq!(written["cif"]["metres_known"], true);
 }

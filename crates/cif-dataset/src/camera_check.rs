@@ -11,7 +11,7 @@ use crate::formats::{DraftCamera, DraftFocal};
 use crate::load::same_aspect;
 
 /// Deviation from orthonormal up to which a rotation is repaired; more is an error.
-const MAX_DEVIATION: f64 = 1e-3;
+pub(crate) const ROTATION_TOLERANCE: f64 = 1e-3;
 
 /// Camera and lens of a frame at the size at which it is loaded.
 ///
@@ -91,9 +91,9 @@ fn pose(path: &Path, frame: &str, pose: RigidTransform) -> Result<RigidTransform
     if deviation.is_infinite() {
         return problem("is mirrored (its rotation has a negative determinant)".to_owned());
     }
-    if deviation > MAX_DEVIATION {
+    if deviation > ROTATION_TOLERANCE {
         return problem(format!(
-            "is not a rotation: its axes are off orthonormal by {deviation:.3} (up to {MAX_DEVIATION} is repaired)"
+            "is not a rotation: its axes are off orthonormal by {deviation:.3} (up to {ROTATION_TOLERANCE} is repaired)"
         ));
     }
     // The camera centre stays; only the axes are repaired.

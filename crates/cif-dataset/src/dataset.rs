@@ -144,6 +144,8 @@ pub struct Dataset {
     pub has_alpha: bool,
     /// Oddities met while reading, one sentence each, naming the file.
     pub warnings: Vec<String>,
+    /// A sentence on what the capture does not know of its world, its unit or its up axis; a warning too.
+    pub unknown: Option<String>,
     /// Where cameras and points lie in the coordinates of the capture; the identity for ordinary captures.
     pub frame: CaptureFrame,
 }

@@ -33,6 +33,7 @@ pub mod cryptomatte;
 mod dataset;
 mod error;
 mod files;
+pub mod foreign;
 mod formats;
 mod instances;
 mod layout;

@@ -42,6 +42,7 @@ impl Dataset {
         let mut draft = formats::read(layout, &Source { root, options })?;
         draft.leave_out(root, &options.without_cameras)?;
         warnings.extend(draft.warnings.iter().cloned());
+        warnings.extend(draft.unknown.clone());
         let (frames, has_alpha, stored_sizes) = frames(root, &draft, options, &mut warnings)?;
 
         let mut times: Vec<f64> = frames.iter().map(|frame| frame.time).collect();
@@ -58,6 +59,7 @@ impl Dataset {
             points: PointCloud { positions: Vec::new(), colors: Vec::new(), source: PointSource::Random },
             has_alpha,
             warnings,
+            unknown: draft.unknown.clone(),
             frame: CaptureFrame::default(),
         };
         for frame in &mut dataset.frames {

@@ -263,6 +263,26 @@ fn nerfstudio_frames_override_intrinsics_and_may_have_times_masks_and_points() {
 }
 
 #[test]
+fn nerfstudio_captures_may_tell_that_they_know_neither_metre_nor_up() {
+    let folder = nerfstudio(3);
+    assert!(!warns(&open(&folder), &["guesses"]), "files that do not tell are taken at their word");
+    for (metres, up, told) in [
+        (false, false, &["neither", "masses"][..]),
+        (false, true, &["metre", "masses"]),
+        (true, false, &["up", "gravity"]),
+    ] {
+        edit_json(&folder.path().join("transforms.json"), |value| {
+            value["cif"] = json!({ "metres_known": metres, "up_known": up, "poses_from": "images" });
+        });
+        assert!(warns(&open(&folder), told), "{told:?}");
+    }
+    edit_json(&folder.path().join("transforms.json"), |value| {
+        value["cif"] = json!({ "metres_known": true, "up_known": true });
+    });
+    assert!(!warns(&open(&folder), &["guesses"]));
+}
+
+#[test]
 fn colmap_text_and_binary_are_the_same_capture() {
     let (text, binary) = (colmap_text(10), colmap_binary(10));
     let (text, binary) = (open(&text), open(&binary));

@@ -23,6 +23,8 @@ pub struct Record {
     pub frame: CaptureFrame,
     /// Name of the capture that it was trained on.
     pub capture: Option<String>,
+    /// A sentence on what is not known of the world of that capture, its unit or its up axis; exports warn with it.
+    pub unknown: Option<String>,
     /// The run that trained it.
     pub run: Option<Run>,
     /// Settings of the run, for information and as the base of other runs.
@@ -99,6 +101,7 @@ const EDITS: &str = "edits";
 const DRAWING: &str = "drawing";
 const NAME: &str = "name";
 const FRAME: &str = "frame";
+const UNKNOWN: &str = "unknown";
 const EXPOSURES: &str = "exposures";
 
 impl Record {
@@ -115,7 +118,9 @@ impl Record {
             other => Map::from_iter([("note".to_owned(), other)]),
         };
         let mut record = Self { frame: take_frame(&mut notes)?, ..Self::default() };
-        record.capture = notes.get_mut(CAPTURE).and_then(Value::as_object_mut).and_then(|of| take(of, NAME));
+        let capture = notes.get_mut(CAPTURE).and_then(Value::as_object_mut);
+        (record.capture, record.unknown) =
+            capture.map_or((None, None), |of| (take(of, NAME), take(of, UNKNOWN)));
         record.run = take(&mut notes, RUN);
         record.settings = notes.remove(SETTINGS);
         record.curve = notes.remove(CURVE);
@@ -142,6 +147,9 @@ impl Record {
         };
         if let Some(name) = &self.capture {
             put(CAPTURE, NAME, json!(name));
+        }
+        if let Some(sentence) = &self.unknown {
+            put(CAPTURE, UNKNOWN, json!(sentence));
         }
         if !self.frame.is_identity() {
             put(place, FRAME, json!(self.frame));
@@ -252,6 +260,8 @@ mod tests {
             assert_eq!(moved, value, "{key}");
         }
         assert_eq!(Record::from_json(Value::Null).unwrap().to_json(), json!({}));
+        let unknown = Record { unknown: Some("its unit is not known".to_owned()), ..Record::default() };
+        assert_eq!(Record::from_json(unknown.to_json()).unwrap(), unknown);
     }
 
     #[test]

@@ -26,13 +26,23 @@ mod import;
 mod train;
 
 use std::ffi::OsString;
+use std::path::PathBuf;
 
 use pyo3::prelude::*;
+
+/// What the command runs in Python (pycolmap) runs in this one.
+fn name_python(py: Python<'_>) -> PyResult<()> {
+    if let Some(program) = py.import("sys")?.getattr("executable")?.extract::<Option<PathBuf>>()? {
+        cif::set_python(program);
+    }
+    Ok(())
+}
 
 /// Runs the command line in this process, whose signals stay with it, and returns its exit code. `arguments` start
 /// with the name of the program.
 #[pyfunction]
 fn run(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
+    name_python(py)?;
     let session = cif::interrupt::Session::begin();
     // A command asks nothing; that it ends shows by the end of its questions.
     let work = |questions: beside::Questions<(), ()>| {
@@ -45,9 +55,10 @@ fn run(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
 
 /// Runs the command line in a process that is nothing but the command, which takes its signals.
 #[pyfunction]
-fn main(py: Python<'_>, arguments: Vec<OsString>) -> i32 {
+fn main(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
+    name_python(py)?;
     cif::own_process();
-    py.detach(|| cif::run(arguments))
+    Ok(py.detach(|| cif::run(arguments)))
 }
 
 #[pymodule]

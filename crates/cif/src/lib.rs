@@ -44,6 +44,7 @@ use std::io::IsTerminal;
 use clap::Parser;
 use miette::{GraphicalReportHandler, GraphicalTheme};
 
+pub use cif_capture::structure::set_python;
 pub use error::Error;
 
 /// From here on the process ends without a word when whatever reads its output has seen enough, as in

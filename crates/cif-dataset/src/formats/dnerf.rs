@@ -75,5 +75,6 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         frames_per_second,
         left_out: Vec::new(),
         warnings,
+        unknown: None,
     })
 }

@@ -13,7 +13,8 @@ mod nerfstudio;
 mod neu3d;
 mod transforms;
 
-pub(crate) use colmap::sparse_folder as colmap_sparse_folder;
+pub(crate) use colmap::{named_cameras as colmap_cameras, sparse_folder as colmap_sparse_folder};
+pub(crate) use transforms::named_cameras as transforms_cameras;
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -45,6 +46,8 @@ pub(crate) struct Draft {
     /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
     pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
+    /// What the capture does not know of its world.
+    pub(crate) unknown: Option<String>,
 }
 
 impl Draft {

@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use super::transforms::{self, TransformsFile};
+use super::transforms::{self, TransformsFile, World};
 use super::{Draft, DraftFrame, Source, customary_points, hold_out_every_eighth, some_of};
 use crate::files::{listing, ply};
 use crate::{Error, Split};
@@ -86,8 +86,20 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         points,
         frames_per_second: file.fps,
         warnings,
+        unknown: file.cif.and_then(unknown),
         ..Draft::default()
     })
+}
+
+/// What exports of a capture guess, where it does not know the metre or up.
+fn unknown(world: World) -> Option<String> {
+    let what = match (world.metres_known, world.up_known) {
+        (true, true) => return None,
+        (false, true) => "does not know the metre: sizes and masses",
+        (true, false) => "does not know which way is up: gravity",
+        (false, false) => "knows neither the metre nor which way is up: sizes, masses and gravity",
+    };
+    Some(format!("the capture {what} of exported physics are guesses"))
 }
 
 /// Folder of a path.

@@ -21,6 +21,21 @@ pub(super) struct TransformsFile {
     pub(super) val_filenames: Option<Vec<PathBuf>>,
     pub(super) test_filenames: Option<Vec<PathBuf>>,
     pub(super) fps: Option<f64>,
+    /// What `cif capture` knows of the world.
+    pub(super) cif: Option<World>,
+}
+
+/// What is known of the world that poses are in. Files of others do not tell, and are taken at their word.
+#[derive(Clone, Copy, Deserialize)]
+pub(super) struct World {
+    #[serde(default = "known")]
+    pub(super) metres_known: bool,
+    #[serde(default = "known")]
+    pub(super) up_known: bool,
+}
+
+fn known() -> bool {
+    true
 }
 
 /// One frame of a file.
@@ -64,6 +79,24 @@ pub(super) fn read(path: &Path) -> Result<TransformsFile, Error> {
         return Err(Error::invalid(path, "`frames` is empty; list the frames there"));
     }
     Ok(file)
+}
+
+/// Cameras of a file by the paths of their images, with their times, and the file of points that it names.
+///
+/// # Errors
+/// When it is damaged.
+#[allow(clippy::type_complexity, reason = "one caller")]
+pub(crate) fn named_cameras(
+    path: &Path,
+) -> Result<(Vec<(String, DraftCamera, Option<f64>)>, Option<PathBuf>), Error> {
+    let file = read(path)?;
+    let cameras = file.frames.iter().map(|entry| {
+        let parts = clean(&entry.file_path);
+        let name =
+            parts.components().map(|part| part.as_os_str().to_string_lossy()).collect::<Vec<_>>().join("/");
+        camera(path, &file, entry).map(|camera| (name, camera, entry.time))
+    });
+    Ok((cameras.collect::<Result<_, _>>()?, file.ply_file_path.as_deref().map(clean)))
 }
 
 /// The image of a frame, with the extension where the file leaves it out.

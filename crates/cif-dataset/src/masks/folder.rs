@@ -7,7 +7,7 @@ use cif_output::{Scratch, folder_of};
 use crate::Error;
 
 /// A folder being filled beside its final place.
-pub(super) struct NewFolder {
+pub struct NewFolder {
     scratch: Scratch,
     partial: PathBuf,
     place: PathBuf,
@@ -18,7 +18,7 @@ impl NewFolder {
     ///
     /// # Errors
     /// When `place` holds something already, or its parent cannot be written.
-    pub(super) fn create(place: &Path) -> Result<Self, Error> {
+    pub fn create(place: &Path) -> Result<Self, Error> {
         check_free(place)?;
         let parent = folder_of(place);
         std::fs::create_dir_all(&parent).map_err(Error::write(&parent))?;
@@ -28,7 +28,8 @@ impl NewFolder {
     }
 
     /// Where files are written for now.
-    pub(super) fn path(&self) -> &Path {
+    #[must_use]
+    pub fn path(&self) -> &Path {
         &self.partial
     }
 
@@ -36,7 +37,7 @@ impl NewFolder {
     ///
     /// # Errors
     /// When something came to `place` in the meantime, or the folder cannot be moved.
-    pub(super) fn finish(self) -> Result<(), Error> {
+    pub fn finish(self) -> Result<(), Error> {
         let Self { scratch, partial, place } = self;
         check_free(&place)?;
         scratch.replace(&[(partial, place.clone())], None).map_err(Error::write(&place))

@@ -60,7 +60,7 @@ pub fn build_from(
             what: format!("{} Gaussians move, {} are stored", reference.len(), field.gaussians.len()),
         });
     }
-    let mut warnings = Vec::new();
+    let mut warnings: Vec<String> = field.record.unknown.iter().cloned().collect();
     let recolors = motion.recolors();
     let mut frames_of = Frames::new(motion, &time_codes.times, Frame::of(reference.clone(), recolors));
     let opacities = Opacities::of(&mut frames_of);

@@ -274,6 +274,9 @@ fn unusable_gaussians_are_left_out_and_told() {
     let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
     assert_eq!(graph.nodes[0].splats.len(), 56);
     assert!(graph.warnings.iter().any(|warning| warning.starts_with("3 Gaussians")), "{:?}", graph.warnings);
+    field.record.unknown = Some("the capture does not know the metre".to_owned());
+    let graph = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap();
+    assert_eq!(graph.warnings[0], "the capture does not know the metre");
     field.gaussians.opacity_logits.fill(-20.0);
     let error = build_from(&field, &mut |_| field.gaussians.clone(), &SceneOptions::default()).unwrap_err();
     assert!(matches!(error, SceneError::NoGaussians { invalid: 3, invisible: 97, .. }), "{error}");

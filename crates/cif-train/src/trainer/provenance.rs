@@ -36,6 +36,7 @@ impl Trainer {
             },
             frame: dataset.frame,
             capture: dataset.root.file_name().and_then(|name| name.to_str()).map(str::to_owned),
+            unknown: dataset.unknown.clone(),
             run: Some(Run {
                 complete: progress.stage == Stage::Done,
                 preset: json!(config.preset).as_str().map(str::to_owned),

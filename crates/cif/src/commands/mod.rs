@@ -5,6 +5,7 @@ mod bench_accuracy;
 mod bench_compare;
 mod bench_export;
 mod bench_hardness;
+mod capture;
 mod check;
 mod diff;
 mod eval;
@@ -59,6 +60,7 @@ pub struct Arguments {
 
 const TOUR: &str = "\
 A short tour:
+  cif capture walk.mp4 -o captures/table                 frames and cameras out of a video or photographs
   cif info captures/table                                what is in this folder?
   cif plan captures/table                                which effects does it call for?
   cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
@@ -77,6 +79,7 @@ Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Capture(capture::Capture),
     Plan(plan::Plan),
     Train(train::Train),
     Eval(eval::Eval),
@@ -156,6 +159,7 @@ impl From<Simd> for SimdLevel {
 /// Whatever keeps the command from doing what was asked.
 pub fn run(arguments: Arguments) -> Result<(), Error> {
     let run = || match arguments.command {
+        Command::Capture(command) => capture::run(&command),
         Command::Plan(command) => plan::run(&command),
         Command::Train(command) => train::run(&command),
         Command::Eval(command) => eval::run(&command),

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use cif_geometry::RigidTransform;
 use glam::{DMat3, DQuat, DVec3};
 
-use super::{Draft, DraftFrame, Source, hold_out_every_eighth, transforms};
+use super::{Draft, DraftCamera, DraftFrame, Source, hold_out_every_eighth, transforms};
 use crate::files::listing;
 use crate::points::RawPoints;
 use crate::{Error, Split};
@@ -61,48 +61,23 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let missing = |path: PathBuf, fix: &str| Error::MissingFile { path, fix: fix.to_owned() };
     let folder = sparse_folder(root)
         .ok_or_else(|| missing(root.join("sparse/0"), "a COLMAP capture keeps its reconstruction there"))?;
-    let reconstruction = if listing::is_there(&folder.join("cameras.bin")) {
-        binary::read(&folder)?
-    } else if listing::is_there(&folder.join("cameras.txt")) {
-        text::read(&folder)?
-    } else {
-        return Err(missing(
-            folder.join("cameras.bin"),
-            "export the reconstruction from COLMAP (cameras, images, points3D)",
-        ));
-    };
-    let Reconstruction { cameras, cameras_path, images, images_path, points, points_path } = reconstruction;
-    if images.is_empty() {
-        return Err(Error::invalid(&images_path, "it has no image; COLMAP registered none"));
-    }
+    let reconstruction = reconstruction(&folder)?;
+    let Reconstruction { images, images_path, .. } = &reconstruction;
     let image_folder = root.join("images");
     if !image_folder.is_dir() {
         return Err(missing(image_folder, "a COLMAP capture keeps its images there"));
     }
     let mut frames = Vec::with_capacity(images.len());
-    for image in &images {
+    for image in images {
         let relative = transforms::clean(Path::new(&image.name));
         let name = transforms::frame_name(&relative);
         let path = image_folder.join(&relative);
         if !listing::is_there(&path) {
-            return Err(Error::CameraWithoutImage { frame: name, source_file: images_path, image: path });
+            let source_file = images_path.clone();
+            return Err(Error::CameraWithoutImage { frame: name, source_file, image: path });
         }
-        let camera = cameras.get(&image.camera).ok_or_else(|| Error::Intrinsics {
-            path: images_path.clone(),
-            frame: name.clone(),
-            problem: format!(
-                "camera {} is not in {}; export both again",
-                image.camera,
-                cameras_path.display()
-            ),
-        })?;
-        let camera_from_world = pose(image).ok_or_else(|| Error::Pose {
-            path: images_path.clone(),
-            frame: name.clone(),
-            problem: "has a quaternion without length, or a value that is not finite".to_owned(),
-        })?;
         frames.push(DraftFrame {
-            camera_name: if cameras.len() == 1 {
+            camera_name: if reconstruction.cameras.len() == 1 {
                 "camera".to_owned()
             } else {
                 format!("camera_{}", image.camera)
@@ -111,7 +86,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
             split: Split::Train,
             image: path,
             mask: None,
-            camera: model::camera(camera, &cameras_path, &name, camera_from_world)?,
+            camera: camera(&reconstruction, image, &name)?,
             name,
         });
     }
@@ -126,6 +101,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
             images_path.display()
         ));
     }
+    let Reconstruction { points, points_path, .. } = reconstruction;
     Ok(Draft {
         frames,
         stored_reduction: 1,
@@ -133,6 +109,59 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         warnings,
         ..Draft::default()
     })
+}
+
+/// Reads a reconstruction.
+///
+/// # Errors
+/// When a file is missing or damaged, or it has no image.
+fn reconstruction(folder: &Path) -> Result<Reconstruction, Error> {
+    let found = if listing::is_there(&folder.join("cameras.bin")) {
+        binary::read(folder)?
+    } else if listing::is_there(&folder.join("cameras.txt")) {
+        text::read(folder)?
+    } else {
+        return Err(Error::MissingFile {
+            path: folder.join("cameras.bin"),
+            fix: "export the reconstruction from COLMAP (cameras, images, points3D)".to_owned(),
+        });
+    };
+    if found.images.is_empty() {
+        return Err(Error::invalid(&found.images_path, "it has no image; COLMAP registered none"));
+    }
+    Ok(found)
+}
+
+/// Cameras by the names of their images, and points, of a folder with a reconstruction.
+///
+/// # Errors
+/// As its files are missing or damaged.
+pub(crate) fn named_cameras(folder: &Path) -> Result<(Vec<(String, DraftCamera)>, RawPoints), Error> {
+    let reconstruction = reconstruction(folder)?;
+    let cameras = reconstruction.images.iter().map(|image| {
+        let name = image.name.clone();
+        camera(&reconstruction, image, &name).map(|camera| (name, camera))
+    });
+    Ok((cameras.collect::<Result<_, _>>()?, reconstruction.points))
+}
+
+/// The camera of an image.
+///
+/// # Errors
+/// When it is not listed or not supported, or the image has no valid pose.
+fn camera(reconstruction: &Reconstruction, image: &Image, name: &str) -> Result<DraftCamera, Error> {
+    let Reconstruction { cameras, cameras_path, images_path, .. } = reconstruction;
+    let camera = cameras.get(&image.camera).ok_or_else(|| Error::Intrinsics {
+        path: images_path.clone(),
+        frame: name.to_owned(),
+        problem: format!("camera {} is not in {}; export both again", image.camera, cameras_path.display()),
+    })?;
+    let camera_from_world = pose(image).ok_or_else(|| Error::Pose {
+        path: images_path.clone(),
+        frame: name.to_owned(),
+        problem: "has a quaternion without length, or a value that is not finite".to_owned(),
+    })?;
+    model::camera(camera, cameras_path, name, camera_from_world)
 }
 
 /// World to camera; `None` for a quaternion that is no rotation.

@@ -1,0 +1,122 @@
+//! Programs that do part of the work: run to their end, or killed when the caller asks to stop.
+
+use std::io::{self, BufRead, BufReader, Read, Write};
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+use crate::Error;
+
+/// Time between two looks whether the program has ended.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
+/// Last lines of its standard error that are kept.
+const KEPT_LINES: usize = 12;
+
+/// What a program answered.
+pub(crate) struct Answer {
+    /// Everything it wrote to standard output.
+    pub(crate) output: Vec<u8>,
+    /// True where it ended with exit code 0.
+    pub(crate) succeeded: bool,
+    /// Its last lines on standard error.
+    pub(crate) last_words: String,
+}
+
+/// Runs a program with `input` on its standard input. Every line that it writes to standard error goes to
+/// `line`.
+///
+/// # Errors
+/// When it cannot be started (`Ok(None)` where there is no such program), or `should_stop` says so: it is
+/// killed then.
+pub(crate) fn run(
+    command: &mut Command,
+    input: &[u8],
+    should_stop: &dyn Fn() -> bool,
+    mut line: impl FnMut(&str) + Send,
+) -> Result<Option<Answer>, Error> {
+    let name = command.get_program().to_string_lossy().into_owned();
+    let lost = |error: io::Error| Error::refused(format!("{name} was lost: {error}"), "try again");
+    let started = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
+    let mut child = match started {
+        Ok(child) => child,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(lost(error)),
+    };
+    let (stdin, stdout, stderr) = (child.stdin.take(), child.stdout.take(), child.stderr.take());
+    std::thread::scope(|scope| {
+        scope.spawn(move || {
+            // A program that ends before it has read everything tells why by itself.
+            let _ = stdin.map(|mut stdin| stdin.write_all(input));
+        });
+        let output = scope.spawn(move || {
+            let mut bytes = Vec::new();
+            stdout.map(|mut stdout| stdout.read_to_end(&mut bytes)).transpose().map(|_| bytes)
+        });
+        let words = scope.spawn(move || {
+            let mut kept: Vec<String> = Vec::new();
+            let mut reader = BufReader::new(stderr.into_iter().next()?);
+            let mut bytes = Vec::new();
+            while reader.read_until(b'\n', &mut bytes).is_ok_and(|read| read > 0) {
+                let text = String::from_utf8_lossy(&bytes).trim_end().to_owned();
+                line(&text);
+                if !text.is_empty() {
+                    kept.push(text);
+                }
+                if kept.len() > KEPT_LINES {
+                    kept.remove(0);
+                }
+                bytes.clear();
+            }
+            Some(kept.join("\n"))
+        });
+        let status = loop {
+            if let Some(status) = child.try_wait().map_err(lost)? {
+                break status;
+            }
+            if should_stop() {
+                let _ = child.kill();
+                let _ = child.wait();
+                return Err(Error::Stopped);
+            }
+            std::thread::sleep(LOOK_EVERY);
+        };
+        let gone = || io::Error::other("its output could not be read");
+        let output = output.join().map_err(|_| lost(gone()))?.map_err(lost)?;
+        let last_words = words.join().ok().flatten().unwrap_or_default();
+        Ok(Some(Answer { output, succeeded: status.success(), last_words }))
+    })
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    #[test]
+    fn output_and_lines_come_back() {
+        let mut shell = Command::new("sh");
+        shell.args(["-c", "echo one >&2; cat; echo two >&2; exit 3"]);
+        let mut lines = Vec::new();
+        let answer =
+            run(&mut shell, b"given", &|| false, |line| lines.push(line.to_owned())).unwrap().unwrap();
+        assert_eq!(answer.output, b"given");
+        assert!(!answer.succeeded);
+        assert_eq!(answer.last_words, "one\ntwo");
+        assert_eq!(lines, ["one", "two"]);
+    }
+
+    #[test]
+    fn a_missing_program_is_told_from_a_failing_one() {
+        assert!(run(&mut Command::new("no-such-program-here"), b"", &|| false, |_| ()).unwrap().is_none());
+    }
+
+    #[test]
+    fn a_program_is_killed_when_the_caller_stops() {
+        let begun = Instant::now();
+        let mut sleep = Command::new("sleep");
+        let stopped = run(sleep.arg("600"), b"", &|| true, |_| ());
+        assert!(matches!(stopped, Err(Error::Stopped)));
+        assert!(begun.elapsed().as_secs() < 300, "it was not waited for");
+    }
+}

@@ -1,0 +1,61 @@
+//! Captures out of videos and photographs: frames, camera poses with a verdict, scale and up axis.
+//!
+//! | module | answers |
+//! |---|---|
+//! | [`source`] | which cameras the given files and folders are |
+//! | [`frames`] | which images are taken of them, when, and what is wrong with them |
+//! | [`structure`] | where the cameras were, through pycolmap, and whether to believe it |
+//! | [`import`] | the same from files of other tools |
+//! | [`poses`] | lenses, poses and points |
+//! | [`similarity`] | similarity transforms, and how far two sets of poses are apart |
+//! | [`world`] | which way is up, and how long a metre is |
+//! | [`known_length`] | the same from an object of known length |
+//! | [`masks`] | what moves, and is left out |
+//! | [`times`] | tables of times by file name |
+//! | [`write`](mod@write) | the capture as nerfstudio's `transforms.json` |
+//!
+//! Cameras look along +z with x right and y down until they are written. The same input gives the same
+//! capture, whatever the number of threads.
+
+mod child;
+mod error;
+pub mod frames;
+pub mod import;
+pub mod known_length;
+pub mod masks;
+mod picture;
+pub mod poses;
+pub mod similarity;
+pub mod source;
+pub mod structure;
+pub mod times;
+pub mod world;
+pub mod write;
+
+pub use error::Error;
+pub use picture::Impression;
+
+/// What the caller is asked while work goes on.
+#[derive(Clone, Copy)]
+pub struct Hooks<'a> {
+    /// True where the work is to end.
+    pub should_stop: &'a (dyn Fn() -> bool + Sync),
+    /// Takes a few words about what is being done.
+    pub progress: &'a (dyn Fn(&str) + Sync),
+}
+
+impl Hooks<'_> {
+    /// Goes on to the end without a word.
+    #[must_use]
+    pub fn silent() -> Self {
+        Self { should_stop: &|| false, progress: &|_| () }
+    }
+
+    fn tell(&self, words: &str) {
+        (self.progress)(words);
+    }
+
+    fn go_on(&self) -> Result<(), Error> {
+        if (self.should_stop)() { Err(Error::Stopped) } else { Ok(()) }
+    }
+}

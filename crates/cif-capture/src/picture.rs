@@ -1,0 +1,138 @@
+//! What an image looks like from afar: how bright and sharp it is, and what changed since another one.
+
+use std::io::BufReader;
+use std::path::Path;
+
+use crate::Error;
+
+/// Size of the reduced grey images that are judged, pixels.
+pub(crate) const WIDTH: usize = 320;
+/// Rows of such an image.
+pub(crate) const HEIGHT: usize = 240;
+/// Side of the blocks that are compared, pixels of the reduced image.
+const BLOCK: usize = 20;
+
+/// A reduced image.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Impression {
+    /// Mean brightness, 0 to 255.
+    pub brightness: f64,
+    /// Variance of the Laplacian of the reduced image over its brightness's variance, free of contrast; 0 for
+    /// one colour.
+    pub sharpness: f64,
+    /// Mean brightness of blocks, row by row.
+    blocks: Vec<f64>,
+}
+
+impl Impression {
+    /// Judges a grey image of [`WIDTH`] x [`HEIGHT`] pixels.
+    pub(crate) fn of(grey: &[u8]) -> Self {
+        let at = |x: usize, y: usize| f64::from(grey[y * WIDTH + x]);
+        let count = grey.len() as f64;
+        let brightness = grey.iter().map(|value| f64::from(*value)).sum::<f64>() / count;
+        let contrast = grey.iter().map(|value| (f64::from(*value) - brightness).powi(2)).sum::<f64>() / count;
+        let mut laplacian = 0.0;
+        for y in 1..HEIGHT - 1 {
+            for x in 1..WIDTH - 1 {
+                let edge = at(x - 1, y) + at(x + 1, y) + at(x, y - 1) + at(x, y + 1) - 4.0 * at(x, y);
+                laplacian += edge * edge;
+            }
+        }
+        let inner = ((WIDTH - 2) * (HEIGHT - 2)) as f64;
+        let sharpness = if contrast > 1e-9 { laplacian / inner / contrast } else { 0.0 };
+        let mut blocks = vec![0.0; (WIDTH / BLOCK) * (HEIGHT / BLOCK)];
+        for y in 0..HEIGHT {
+            for x in 0..WIDTH {
+                blocks[y / BLOCK * (WIDTH / BLOCK) + x / BLOCK] += at(x, y) / (BLOCK * BLOCK) as f64;
+            }
+        }
+        Self { brightness, sharpness, blocks }
+    }
+
+    /// Judges an image file, and tells its size, with its alpha left out.
+    ///
+    /// # Errors
+    /// When it is no image.
+    pub(crate) fn of_file(path: &Path) -> Result<(Self, (u32, u32)), Error> {
+        let file = cif_input::open(path).map_err(Error::io("read", path))?;
+        let image = image::ImageReader::new(BufReader::new(file))
+            .with_guessed_format()
+            .map_err(Error::io("read", path))?
+            .decode()
+            .map_err(|error| {
+                Error::refused(
+                    format!("{}: this is no image that can be read: {error}", path.display()),
+                    "give PNG or JPEG files, or leave it out",
+                )
+            })?;
+        let size = (image.width(), image.height());
+        let grey = image.to_luma8();
+        let filter = image::imageops::FilterType::Triangle;
+        let small = image::imageops::resize(&grey, WIDTH as u32, HEIGHT as u32, filter);
+        Ok((Self::of(small.as_raw()), size))
+    }
+
+    /// True where nothing can be seen: all of it near black, or of one colour.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        let low = self.blocks.iter().copied().fold(f64::INFINITY, f64::min);
+        let high = self.blocks.iter().copied().fold(0.0, f64::max);
+        high < 12.0 || high - low < 2.0
+    }
+
+    /// Median over blocks of the change of brightness, 0 to 255: objects that move before a camera that stands
+    /// still change few blocks, a camera that moves changes most.
+    #[must_use]
+    pub fn change(&self, other: &Self) -> f64 {
+        let mut changes: Vec<f64> =
+            self.blocks.iter().zip(&other.blocks).map(|(a, b)| (a - b).abs()).collect();
+        changes.sort_by(f64::total_cmp);
+        changes.get(changes.len() / 2).copied().unwrap_or(0.0)
+    }
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    /// A chessboard of `side` pixels, moved by `shift`.
+    pub(crate) fn board(side: usize, shift: usize) -> Vec<u8> {
+        let square = |x: usize, y: usize| ((x + shift) / side + y / side).is_multiple_of(2);
+        (0..WIDTH * HEIGHT).map(|k| if square(k % WIDTH, k / WIDTH) { 220 } else { 30 }).collect()
+    }
+
+    #[test]
+    fn blur_lowers_sharpness_and_contrast_does_not() {
+        let sharp = board(16, 0);
+        let blurred: Vec<u8> = (0..sharp.len())
+            .map(|k| {
+                let around = (0..7).map(|d| u32::from(sharp[(k + d).min(sharp.len() - 1)])).sum::<u32>();
+                (around / 7) as u8
+            })
+            .collect();
+        let faint: Vec<u8> = sharp.iter().map(|value| value / 2).collect();
+        let of = |grey: &[u8]| Impression::of(grey).sharpness;
+        assert!(of(&blurred) < 0.7 * of(&sharp), "{} {}", of(&blurred), of(&sharp));
+        assert!((of(&faint) / of(&sharp) - 1.0).abs() < 0.05);
+    }
+
+    #[test]
+    fn what_shows_nothing_is_told() {
+        let of = |value: u8| Impression::of(&vec![value; WIDTH * HEIGHT]);
+        assert!(of(0).is_empty() && of(5).is_empty() && of(200).is_empty());
+        assert!(!Impression::of(&board(50, 0)).is_empty());
+    }
+
+    #[test]
+    fn moving_objects_are_told_from_a_moving_camera() {
+        let still = Impression::of(&board(50, 0));
+        let mut with_object = board(50, 0);
+        for y in 60..160 {
+            for x in 100..220 {
+                with_object[y * WIDTH + x] = 128;
+            }
+        }
+        assert!(still.change(&Impression::of(&with_object)) < 1.0);
+        assert!(still.change(&Impression::of(&board(50, 25))) > 8.0);
+    }
+}

@@ -1,0 +1,12 @@
+//! Where the cameras were: structure from motion through pycolmap, tried with one setting after the other
+//! until two runs agree.
+
+mod ladder;
+mod pairs;
+mod python;
+mod verdict;
+
+pub use ladder::{Found, Lenses, Request, find};
+pub use pairs::Order;
+pub use python::set_python;
+pub use verdict::{Check, Verdict, judge};

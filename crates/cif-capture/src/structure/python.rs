@@ -1,0 +1,270 @@
+//! pycolmap, run in a Python of its own: the one that the wheel runs in, `$CIF_PYTHON`, or the first on the
+//! path.
+
+use std::collections::BTreeMap;
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::OnceLock;
+
+use cif_geometry::{LensDistortion, RigidTransform};
+use glam::{DMat3, DQuat, DVec3};
+use serde::{Deserialize, Serialize};
+
+use crate::poses::{Lens, Point, Pose, Poses};
+use crate::{Error, Hooks, child};
+
+/// The program that Python runs.
+const SCRIPT: &str = include_str!("reconstruct.py");
+
+/// Environment variable that names the Python.
+const VARIABLE: &str = "CIF_PYTHON";
+
+/// Points that are seen from fewer images, or lie further from where they are seen, are left out.
+const MIN_TRACK: usize = 3;
+const MAX_ERROR_PX: f64 = 2.0;
+
+static OWN: OnceLock<PathBuf> = OnceLock::new();
+
+/// Names the Python that this process is part of; the first call counts. `CIF_PYTHON` still wins.
+pub fn set_python(program: PathBuf) {
+    let _ = OWN.set(program);
+}
+
+/// Pythons to try, in order.
+fn programs() -> Vec<OsString> {
+    if let Some(program) = std::env::var_os(VARIABLE).filter(|program| !program.is_empty()) {
+        return vec![program];
+    }
+    match OWN.get() {
+        Some(program) => vec![program.clone().into_os_string()],
+        None => ["python3", "python"].map(OsString::from).to_vec(),
+    }
+}
+
+/// Work for pycolmap; `reconstruct.py` tells what the fields mean.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Job<'a> {
+    pub(super) work: &'a Path,
+    pub(super) images: &'a Path,
+    pub(super) masks: Option<&'a Path>,
+    pub(super) names: &'a [String],
+    pub(super) pairs: &'a [(usize, usize)],
+    pub(super) cameras: &'a [Group],
+    pub(super) model: &'static str,
+    pub(super) peak: Option<f64>,
+    pub(super) runs: &'a [Run],
+    pub(super) threads: usize,
+}
+
+/// Images that share a lens.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Group {
+    pub(super) images: Vec<usize>,
+    pub(super) focal_px: Option<f64>,
+    pub(super) size: (u32, u32),
+}
+
+/// One run of a mapper.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Run {
+    pub(super) mapper: Mapper,
+    pub(super) seed: u32,
+}
+
+/// Mappers of COLMAP.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Mapper {
+    /// All images at once (GLOMAP).
+    Global,
+    /// One image after the other.
+    Incremental,
+}
+
+/// What pycolmap found.
+#[derive(Debug)]
+pub(super) struct Outcome {
+    /// Features of every image.
+    pub(super) features: BTreeMap<String, usize>,
+    /// Poses of the largest model of every run.
+    pub(super) runs: Vec<Option<Poses>>,
+}
+
+#[derive(Deserialize)]
+struct AnswerJson {
+    missing: Option<String>,
+    python: Option<String>,
+    version: Option<String>,
+    #[serde(default)]
+    features: BTreeMap<String, usize>,
+    #[serde(default)]
+    runs: Vec<Option<ModelJson>>,
+}
+
+#[derive(Deserialize)]
+struct ModelJson {
+    cameras: BTreeMap<u32, CameraJson>,
+    images: BTreeMap<String, ImageJson>,
+    points: Vec<PointJson>,
+    reprojection_px: f64,
+}
+
+#[derive(Deserialize)]
+struct CameraJson {
+    model: String,
+    width: u32,
+    height: u32,
+    params: Vec<f64>,
+}
+
+#[derive(Deserialize)]
+struct ImageJson {
+    camera: u32,
+    rotation: [f64; 4],
+    translation: [f64; 3],
+    points: usize,
+}
+
+#[derive(Deserialize)]
+struct PointJson {
+    position: [f64; 3],
+    color: [u8; 3],
+    error: f64,
+    images: usize,
+}
+
+/// Runs a job.
+///
+/// # Errors
+/// When Python or pycolmap is missing or fails, or the caller stops.
+pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
+    let input = serde_json::to_vec(job).map_err(|error| {
+        Error::refused(format!("a name cannot be passed to Python: {error}"), "rename it")
+    })?;
+    let programs = programs();
+    for program in &programs {
+        let mut command = Command::new(program);
+        command.args(["-c", SCRIPT]);
+        // A thread of one library must not start a thread per processor in another.
+        command.env("OMP_NUM_THREADS", job.threads.to_string());
+        let line = |line: &str| {
+            if let Some(words) = line.strip_prefix("@ ") {
+                (hooks.progress)(words);
+            }
+        };
+        let Some(answer) = child::run(&mut command, &input, hooks.should_stop, line)? else { continue };
+        let parsed: Option<AnswerJson> = serde_json::from_slice(&answer.output).ok();
+        return match parsed {
+            Some(AnswerJson { missing: Some(problem), python, version, .. }) => {
+                Err(pycolmap_missing(&problem, &python.unwrap_or_default(), &version.unwrap_or_default()))
+            }
+            Some(answer) => outcome(answer),
+            None => Err(Error::refused(
+                format!("pycolmap failed:\n{}", words_of(&answer.last_words)),
+                "try fewer or smaller images; if it goes on, report it with these lines",
+            )),
+        };
+    }
+    Err(Error::refused(
+        "poses are found by pycolmap, which needs Python, and there is none on the PATH",
+        format!(
+            "install Python 3.10 to 3.13 and pycolmap (pip install pycolmap), and name it by {VARIABLE}; or give \
+                 poses of another tool with --poses"
+        ),
+    ))
+}
+
+/// pycolmap cannot be imported.
+fn pycolmap_missing(problem: &str, python: &str, version: &str) -> Error {
+    Error::refused(
+        format!("poses are found by pycolmap, which Python {version} ({python}) does not have: {problem}"),
+        format!(
+            "install it: {python} -m pip install 'cif[capture]', or pip install pycolmap; {VARIABLE} names another \
+             Python; or give poses of another tool with --poses"
+        ),
+    )
+}
+
+/// The lines that pycolmap itself wrote.
+fn words_of(text: &str) -> String {
+    text.lines().filter(|line| !line.starts_with("@ ")).collect::<Vec<_>>().join("\n")
+}
+
+fn outcome(answer: AnswerJson) -> Result<Outcome, Error> {
+    let runs = answer.runs.into_iter().map(|model| model.map(poses).transpose());
+    Ok(Outcome { features: answer.features, runs: runs.collect::<Result<_, _>>()? })
+}
+
+/// A model in the types of this crate.
+fn poses(model: ModelJson) -> Result<Poses, Error> {
+    let mut numbers = BTreeMap::new();
+    let mut lenses = Vec::new();
+    for (number, camera) in &model.cameras {
+        let (focal_px, principal_px, k1) = match (camera.model.as_str(), camera.params.as_slice()) {
+            ("SIMPLE_RADIAL", &[f, cx, cy, k]) => ([f, f], [cx, cy], k),
+            ("SIMPLE_PINHOLE", &[f, cx, cy]) => ([f, f], [cx, cy], 0.0),
+            (other, _) => {
+                let problem = format!("pycolmap answered with a lens of the unexpected kind {other}");
+                return Err(Error::refused(
+                    problem,
+                    "install the version of pycolmap that cif[capture] asks for",
+                ));
+            }
+        };
+        numbers.insert(*number, lenses.len());
+        lenses.push(Lens {
+            size: (camera.width, camera.height),
+            focal_px,
+            principal_px,
+            distortion: LensDistortion { radial: [k1, 0.0, 0.0, 0.0], ..LensDistortion::default() },
+        });
+    }
+    let pose = |image: &ImageJson| {
+        let [w, x, y, z] = image.rotation;
+        let camera_from_world = RigidTransform {
+            rotation: DMat3::from_quat(DQuat::from_xyzw(x, y, z, w).normalize()),
+            translation: DVec3::from_array(image.translation),
+        };
+        let lens = numbers.get(&image.camera).copied()?;
+        Some(Pose { lens, world_from_camera: camera_from_world.inverse(), points: image.points })
+    };
+    let images = model.images.iter().filter_map(|(name, image)| Some((name.clone(), pose(image)?))).collect();
+    let points = model
+        .points
+        .iter()
+        .filter(|point| point.images >= MIN_TRACK && point.error <= MAX_ERROR_PX)
+        .map(|point| Point { position: DVec3::from_array(point.position), color: point.color })
+        .collect();
+    Ok(Poses { lenses, images, points, reprojection_px: Some(model.reprojection_px) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn models_come_in_the_axes_of_this_crate() {
+        let text = r#"{"cameras": {"3": {"model": "SIMPLE_RADIAL", "width": 64, "height": 48,
+            "params": [50.0, 32.0, 24.0, -0.1]}}, "images": {"a.png": {"camera": 3,
+            "rotation": [0.70710678, 0.0, 0.0, 0.70710678], "translation": [1.0, 2.0, 3.0], "points": 7}},
+            "points": [{"position": [1, 2, 3], "color": [9, 8, 7], "error": 0.5, "images": 4},
+            {"position": [1, 2, 9], "color": [9, 8, 7], "error": 3.5, "images": 4},
+            {"position": [1, 2, 9], "color": [9, 8, 7], "error": 0.1, "images": 2}], "reprojection_px": 0.4}"#;
+        let poses = poses(serde_json::from_str(text).unwrap()).unwrap();
+        let camera = poses.images["a.png"].world_from_camera;
+        // Camera to world: the camera's place maps to its origin.
+        assert!(camera.inverse().apply(camera.translation).length() < 1e-9);
+        assert!((camera.translation - DVec3::new(-2.0, 1.0, -3.0)).length() < 1e-6, "{camera:?}");
+        assert_eq!(poses.lenses[0].distortion.radial[0], -0.1);
+        assert_eq!(poses.points.len(), 1, "points seen by few images, or badly, are left out");
+    }
+
+    #[test]
+    fn a_missing_pycolmap_is_told_with_the_way_to_install_it() {
+        let error = pycolmap_missing("No module named 'pycolmap'", "/usr/bin/python3", "3.12.1");
+        let Error::Refused { problem, fix } = error else { panic!("another error") };
+        assert!(problem.contains("/usr/bin/python3") && problem.contains("3.12.1"), "{problem}");
+        assert!(fix.contains("pip install 'cif[capture]'") && fix.contains("--poses"), "{fix}");
+    }
+}

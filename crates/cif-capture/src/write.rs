@@ -1,0 +1,274 @@
+//! The capture as a folder in nerfstudio's layout, which `cif train` and other tools take.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use cif_dataset::masks::NewFolder;
+use serde_json::{Map, Value, json};
+
+use crate::frames::Shot;
+use crate::masks::Masks;
+use crate::poses::{Lens, Point, Pose, Poses};
+use crate::{Error, Hooks};
+
+/// Name of the file of points.
+const POINTS: &str = "points3d.ply";
+
+/// Everything that a capture holds.
+pub struct Capture<'a> {
+    /// Images; those without a pose are left out.
+    pub shots: &'a [Shot],
+    /// Poses, by name of the image.
+    pub poses: &'a Poses,
+    /// Masks of ids, to be kept beside the images.
+    pub masks: Option<&'a Masks>,
+    /// True where a unit of the poses is a metre.
+    pub metres_known: bool,
+    /// True where +z is known to be up.
+    pub up_known: bool,
+    /// How the poses came about, in words.
+    pub poses_from: &'a str,
+}
+
+/// Copies images and masks and writes cameras and points; the folder appears when all of it is there.
+///
+/// # Errors
+/// When something is at `place`, or the file system refuses.
+pub fn write(capture: &Capture<'_>, place: &Path, hooks: &Hooks<'_>) -> Result<(), Error> {
+    let folder = NewFolder::create(place)?;
+    let mut frames = Vec::new();
+    let one_lens = capture.poses.lenses.len() == 1;
+    // All images have a time, or none.
+    let timed = capture.shots.iter().all(|shot| shot.time.is_some());
+    let start = capture.shots.iter().filter_map(|shot| shot.time).fold(f64::INFINITY, f64::min);
+    for shot in capture.shots {
+        hooks.go_on()?;
+        let Some(pose) = capture.poses.images.get(&shot.name) else { continue };
+        copy(&shot.file, &inside(folder.path(), "images", &shot.name)?)?;
+        let mut frame = Map::new();
+        frame.insert("file_path".to_owned(), json!(format!("images/{}", shot.name)));
+        if let Some(time) = shot.time.filter(|_| timed) {
+            // Microseconds: cameras that record together have equal times.
+            frame.insert("time".to_owned(), json!(((time - start) * 1e6).round() / 1e6));
+        }
+        if let Some(mask) = capture.masks.and_then(|masks| masks.files.get(&shot.name)) {
+            let name = mask_name(&shot.name);
+            copy(mask, &inside(folder.path(), "masks", &name)?)?;
+            let confidence = capture.masks.map(|masks| masks.folder.join("confidence").join(&name));
+            if let Some(file) = confidence.filter(|file| file.is_file()) {
+                copy(&file, &inside(&folder.path().join("masks"), "confidence", &name)?)?;
+            }
+            frame.insert("mask_path".to_owned(), json!(format!("masks/{name}")));
+        }
+        if !one_lens {
+            insert_lens(&mut frame, &scaled(&capture.poses.lenses[pose.lens], shot.size));
+        }
+        frame.insert("transform_matrix".to_owned(), matrix(pose));
+        frames.push(Value::Object(frame));
+    }
+    if let Some(labels) = capture.masks.and_then(Masks::labels) {
+        copy(&labels, &folder.path().join("masks/instances.json"))?;
+    }
+    let mut file = Map::new();
+    file.insert("camera_model".to_owned(), json!("OPENCV"));
+    if let (true, Some(shot)) = (one_lens, capture.shots.first()) {
+        insert_lens(&mut file, &scaled(&capture.poses.lenses[0], shot.size));
+    }
+    if let Some(rate) = frames_per_second(capture.shots).filter(|_| timed) {
+        file.insert("fps".to_owned(), json!(rate));
+    }
+    if !capture.poses.points.is_empty() {
+        file.insert("ply_file_path".to_owned(), json!(POINTS));
+        let path = folder.path().join(POINTS);
+        fs::write(&path, ply(&capture.poses.points)).map_err(Error::io("write", &path))?;
+    }
+    let known = json!({
+        "metres_known": capture.metres_known,
+        "up_known": capture.up_known,
+        "poses_from": capture.poses_from,
+    });
+    file.insert("cif".to_owned(), known);
+    file.insert("frames".to_owned(), json!(frames));
+    let path = folder.path().join("transforms.json");
+    let text = format!("{:#}\n", Value::Object(file));
+    fs::write(&path, text).map_err(Error::io("write", &path))?;
+    Ok(folder.finish()?)
+}
+
+/// Name of the mask of an image.
+fn mask_name(image: &str) -> String {
+    format!("{}.png", image.rsplit_once('.').map_or(image, |(stem, _)| stem))
+}
+
+/// A file in a folder of the capture, whose folders are made.
+fn inside(folder: &Path, kind: &str, name: &str) -> Result<PathBuf, Error> {
+    let path = folder.join(kind).join(name);
+    let parent = path.parent().unwrap_or(folder);
+    fs::create_dir_all(parent).map_err(Error::io("create", parent))?;
+    Ok(path)
+}
+
+fn copy(from: &Path, to: &Path) -> Result<(), Error> {
+    // Not a link: what is done to the capture must not change the original.
+    fs::copy(from, to).map(drop).map_err(Error::io("copy", from))
+}
+
+/// Camera to world with x right, y up and z backwards.
+fn matrix(pose: &Pose) -> Value {
+    let (rotation, place) = (pose.world_from_camera.rotation, pose.world_from_camera.translation);
+    let row = |k: usize| {
+        let row = rotation.row(k);
+        [row.x, -row.y, -row.z, place[k]]
+    };
+    json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])
+}
+
+fn insert_lens(object: &mut Map<String, Value>, lens: &Lens) {
+    let [k1, k2, k3, k4] = lens.distortion.radial;
+    let [p1, p2] = lens.distortion.tangential;
+    let values = [
+        ("fl_x", lens.focal_px[0]),
+        ("fl_y", lens.focal_px[1]),
+        ("cx", lens.principal_px[0]),
+        ("cy", lens.principal_px[1]),
+        ("k1", k1),
+        ("k2", k2),
+        ("k3", k3),
+        ("k4", k4),
+        ("p1", p1),
+        ("p2", p2),
+    ];
+    object.insert("w".to_owned(), json!(lens.size.0));
+    object.insert("h".to_owned(), json!(lens.size.1));
+    object.extend(values.map(|(name, value)| (name.to_owned(), json!(value))));
+}
+
+/// A lens for images of another size: poses of other tools may be of larger ones.
+fn scaled(lens: &Lens, size: (u32, u32)) -> Lens {
+    let [x, y] = [f64::from(size.0) / f64::from(lens.size.0), f64::from(size.1) / f64::from(lens.size.1)];
+    Lens {
+        size,
+        focal_px: [lens.focal_px[0] * x, lens.focal_px[1] * y],
+        principal_px: [lens.principal_px[0] * x, lens.principal_px[1] * y],
+        distortion: lens.distortion,
+    }
+}
+
+/// Frames per second of the images of a camera, by their median distance; `None` for fewer than two.
+fn frames_per_second(shots: &[Shot]) -> Option<f64> {
+    let mut distances: Vec<f64> = shots
+        .windows(2)
+        .filter(|pair| pair[0].camera == pair[1].camera)
+        .filter_map(|pair| Some(pair[1].time? - pair[0].time?))
+        .filter(|distance| *distance > 1e-9)
+        .collect();
+    distances.sort_by(f64::total_cmp);
+    let median = distances.get(distances.len() / 2)?;
+    Some((1e3 / median).round() / 1e3)
+}
+
+/// Points as a binary PLY file.
+fn ply(points: &[Point]) -> Vec<u8> {
+    let mut bytes = format!(
+        "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\n\
+         property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+        points.len()
+    )
+    .into_bytes();
+    for point in points {
+        for value in point.position.to_array() {
+            bytes.extend((value as f32).to_le_bytes());
+        }
+        // Writing to memory does not fail.
+        let _ = bytes.write_all(&point.color);
+    }
+    bytes
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_dataset::{Dataset, OpenOptions};
+    use glam::DVec3;
+
+    use super::*;
+    use crate::picture::Impression;
+    use crate::picture::tests::board;
+    use crate::similarity::tests::arc;
+
+    /// Images and poses of an arc.
+    fn shots(folder: &Path, count: usize, times: bool) -> Vec<Shot> {
+        (0..count)
+            .map(|k| {
+                let name = format!("{k:03}.png");
+                let file = folder.join(&name);
+                image::RgbImage::from_pixel(64, 48, image::Rgb([k as u8, 90, 40])).save(&file).unwrap();
+                Shot {
+                    camera: "walk".to_owned(),
+                    name,
+                    file,
+                    time: times.then(|| 0.25 + 0.1 * k as f64),
+                    size: (64, 48),
+                    impression: Impression::of(&board(50, k)),
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn a_capture_is_read_as_it_was_meant() {
+        let folder = tempfile::tempdir().unwrap();
+        let shots = shots(folder.path(), 12, true);
+        let mut poses = arc(12);
+        poses.points = vec![Point { position: DVec3::new(0.5, -0.25, 1.0), color: [1, 2, 3] }; 40];
+        poses.images.remove("007.png");
+        let masks = folder.path().join("painted");
+        fs::create_dir_all(masks.join("confidence")).unwrap();
+        fs::write(masks.join("instances.json"), r#"[{"id": 5, "label": "red mug"}]"#).unwrap();
+        for name in ["002.png", "003.png"] {
+            image::GrayImage::from_pixel(64, 48, image::Luma([5])).save(masks.join(name)).unwrap();
+            image::GrayImage::from_pixel(64, 48, image::Luma([200]))
+                .save(masks.join("confidence").join(name))
+                .unwrap();
+        }
+        let masks = crate::masks::find(&masks, &shots).unwrap();
+        let place = folder.path().join("capture");
+        let capture = Capture {
+            shots: &shots,
+            poses: &poses,
+            masks: Some(&masks),
+            metres_known: false,
+            up_known: true,
+            poses_from: "a test",
+        };
+        write(&capture, &place, &Hooks::silent()).unwrap();
+        let dataset = Dataset::open(&place, &OpenOptions::default()).unwrap();
+        assert_eq!(dataset.frames.len(), 11, "one image has no pose");
+        assert_eq!(dataset.times.len(), 11);
+        assert_eq!(dataset.frames_per_second, Some(10.0));
+        assert_eq!(dataset.points.positions.len(), 40);
+        assert_eq!(dataset.points.positions[0], [0.5, -0.25, 1.0]);
+        assert_eq!(dataset.points.colors[0], [1, 2, 3]);
+        assert_eq!(dataset.instances.iter().map(|i| i.label.as_str()).collect::<Vec<_>>(), ["red mug"]);
+        let masked: Vec<&str> =
+            dataset.frames.iter().filter(|f| f.confidence.is_some()).map(|f| f.name.as_str()).collect();
+        assert_eq!(masked.len(), 2, "{masked:?}");
+        for frame in &dataset.frames {
+            let name = format!("{}.png", frame.name.rsplit('/').next().unwrap());
+            let pose = poses.images[&name].world_from_camera;
+            let found = frame.camera.camera_from_world.inverse();
+            assert!((found.translation - pose.translation).length() < 1e-9, "{name}");
+            assert!((found.rotation - pose.rotation).to_cols_array().iter().all(|d| d.abs() < 1e-9));
+            // Lenses were of images ten times as large.
+            assert!((frame.camera.focal_px.x - 60.0).abs() < 1e-9, "{}", frame.camera.focal_px);
+        }
+        assert!(write(&capture, &place, &Hooks::silent()).unwrap_err().to_string().contains("already"));
+        // Images without times have none in the file.
+        let mut untimed = shots.clone();
+        untimed[3].time = None;
+        let place = folder.path().join("static");
+        write(&Capture { shots: &untimed, ..capture }, &place, &Hooks::silent()).unwrap();
+        let dataset = Dataset::open(&place, &OpenOptions::default()).unwrap();
+        assert_eq!(dataset.times, [0.0]);
+    }
+}

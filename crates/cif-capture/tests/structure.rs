@@ -1,0 +1,205 @@
+//! Poses of rendered pictures, whose cameras are known; skipped where Python has no pycolmap.
+
+use std::path::Path;
+use std::process::Command;
+
+use cif_capture::frames::{self, Choice, Notes, Shot};
+use cif_capture::source::sources;
+use cif_capture::structure::{self, Found, Lenses, Order, Request};
+use cif_capture::{Error, Hooks};
+use cif_geometry::RigidTransform;
+use glam::{DMat3, DVec2, DVec3};
+
+const WIDTH: u32 = 240;
+const HEIGHT: u32 = 180;
+const FOCAL: f64 = 220.0;
+
+/// True where the Python that is taken has pycolmap.
+fn has_pycolmap() -> bool {
+    let python = std::env::var("CIF_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let found = Command::new(python).args(["-c", "import pycolmap"]).output();
+    let found = found.is_ok_and(|output| output.status.success());
+    if !found {
+        eprintln!("skipped: there is no pycolmap; CIF_PYTHON names a Python that has it");
+    }
+    found
+}
+
+/// A number in [0, 1) for a cell of a grid.
+fn noise(x: i64, y: i64, seed: i64) -> f64 {
+    let mut hash =
+        (x.wrapping_mul(0x9E37_79B9) ^ y.wrapping_mul(0x85EB_CA6B) ^ seed.wrapping_mul(0xC2B2_AE35)) as u64;
+    hash = (hash ^ (hash >> 15)).wrapping_mul(0xD6E8_FEB8_6659_FD93);
+    hash = (hash ^ (hash >> 32)).wrapping_mul(0xD6E8_FEB8_6659_FD93);
+    (hash >> 40) as f64 / (1_u64 << 24) as f64
+}
+
+/// Smooth noise of three sizes.
+fn texture(place: DVec2, seed: i64) -> f64 {
+    [4.0, 11.0, 29.0]
+        .iter()
+        .map(|frequency| {
+            let p = place * *frequency;
+            let (x, y) = (p.x.floor(), p.y.floor());
+            let [u, v] = [p.x - x, p.y - y].map(|t| t * t * (3.0 - 2.0 * t));
+            let at = |i: i64, j: i64| noise(x as i64 + i, y as i64 + j, seed);
+            (at(0, 0) * (1.0 - u) + at(1, 0) * u) * (1.0 - v) + (at(0, 1) * (1.0 - u) + at(1, 1) * u) * v
+        })
+        .sum::<f64>()
+        / 3.0
+}
+
+/// Brightness along a ray: a floor, two walls and a box on the floor.
+fn trace(origin: DVec3, ray: DVec3) -> f64 {
+    let mut nearest = (f64::INFINITY, 0.5);
+    let mut plane = |axis: usize, at: f64, seed: i64, inside: &dyn Fn(DVec3) -> bool| {
+        let distance = (at - origin[axis]) / ray[axis];
+        let point = origin + ray * distance;
+        if distance > 1e-6 && distance < nearest.0 && inside(point) {
+            let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
+            nearest = (distance, texture(DVec2::new(point[u], point[v]), seed));
+        }
+    };
+    plane(2, 0.0, 1, &|_| true);
+    plane(0, -2.0, 2, &|_| true);
+    plane(1, -2.0, 3, &|_| true);
+    let low = DVec3::new(-0.4, -0.3, 0.0);
+    let high = DVec3::new(0.4, 0.3, 0.6);
+    for axis in 0..3 {
+        for (number, at) in [low[axis], high[axis]].into_iter().enumerate() {
+            let seed = 10 + 2 * axis as i64 + number as i64;
+            let inside = |point: DVec3| (0..3).all(|k| k == axis || (low[k]..=high[k]).contains(&point[k]));
+            plane(axis, at, seed, &inside);
+        }
+    }
+    nearest.1
+}
+
+/// Cameras on an arc that look at the box.
+fn cameras(count: usize) -> Vec<RigidTransform> {
+    (0..count)
+        .map(|k| {
+            let angle = 0.2 + 1.2 * k as f64 / count as f64;
+            let place = DVec3::new(2.6 * angle.cos(), 2.6 * angle.sin(), 1.0 + 0.5 * (2.0 * angle).sin());
+            let forward = (DVec3::new(0.0, 0.0, 0.25) - place).normalize();
+            let right = forward.cross(DVec3::Z).normalize();
+            let rotation = DMat3::from_cols(right, forward.cross(right), forward);
+            RigidTransform { rotation, translation: place }
+        })
+        .collect()
+}
+
+/// Renders the views into a folder as photographs.
+fn photographs(folder: &Path, cameras: &[RigidTransform]) {
+    for (k, camera) in cameras.iter().enumerate() {
+        let image = image::GrayImage::from_fn(WIDTH, HEIGHT, |x, y| {
+            let sample = |dx: f64, dy: f64| {
+                let plane = DVec3::new(
+                    (f64::from(x) + dx - 0.5 * f64::from(WIDTH)) / FOCAL,
+                    (f64::from(y) + dy - 0.5 * f64::from(HEIGHT)) / FOCAL,
+                    1.0,
+                );
+                trace(camera.translation, camera.rotation * plane)
+            };
+            let offsets = [0.25, 0.75];
+            let mean = offsets.iter().flat_map(|dx| offsets.map(|dy| sample(*dx, dy))).sum::<f64>() / 4.0;
+            image::Luma([(255.0 * mean).clamp(0.0, 255.0) as u8])
+        });
+        image.save(folder.join(format!("{k:02}.png"))).expect("the folder takes pictures");
+    }
+}
+
+fn shots(folder: &Path) -> Vec<Shot> {
+    let inputs = [format!("walk={}", folder.display())];
+    let mut notes = Notes::new();
+    let sources = sources(&inputs).expect("a folder of photographs");
+    frames::collect(&sources, &Choice::default(), folder, &Hooks::silent(), &mut notes).expect("photographs")
+}
+
+fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
+    let work = folder.join(work);
+    std::fs::create_dir_all(&work).expect("a new folder");
+    let request = Request {
+        shots,
+        masks: None,
+        order: Order::Any,
+        lenses: Lenses::PerSize,
+        focal_px: None,
+        work: &work,
+        threads: 2,
+    };
+    structure::find(&request, &Hooks::silent())
+}
+
+#[test]
+fn cameras_of_rendered_pictures_are_found_twice_alike() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let cameras = cameras(14);
+    photographs(folder.path(), &cameras);
+    let shots = shots(folder.path());
+    let found = find(folder.path(), &shots, "first").unwrap();
+    assert!(found.verdict.is_good(), "{}", found.verdict);
+    assert_eq!(found.poses.images.len(), 14);
+    let focal = found.poses.lenses[0].focal_px[0];
+    assert!((focal / FOCAL - 1.0).abs() < 0.05, "{focal}");
+    let mut truth = found.poses.clone();
+    for (pose, camera) in truth.images.values_mut().zip(&cameras) {
+        pose.world_from_camera = *camera;
+    }
+    let difference = cif_capture::similarity::difference(&found.poses, &truth).unwrap();
+    assert!(difference.places < 0.02 && difference.median_angle.to_degrees() < 1.0, "{difference:?}");
+    let again = find(folder.path(), &shots, "second").unwrap();
+    assert_eq!(again.poses, found.poses, "the same input gives the same poses");
+}
+
+#[test]
+fn pictures_that_do_not_overlap_have_no_poses() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    for k in 0..4_i64 {
+        let image = image::GrayImage::from_fn(WIDTH, HEIGHT, |x, y| {
+            let place = DVec2::new(f64::from(x), f64::from(y)) / 60.0;
+            image::Luma([(255.0 * texture(place, 100 + k)) as u8])
+        });
+        image.save(folder.path().join(format!("{k}.png"))).unwrap();
+    }
+    let Err(Error::Refused { problem, fix }) = find(folder.path(), &shots(folder.path()), "work") else {
+        panic!("poses of nothing")
+    };
+    assert!(problem.contains("do not overlap") && fix.contains("two thirds"), "{problem} {fix}");
+    // Without any texture there are no features to begin with.
+    for k in 0..4_u8 {
+        let image = image::GrayImage::from_fn(WIDTH, HEIGHT, |x, _| image::Luma([(x / 2) as u8 + k]));
+        image.save(folder.path().join(format!("{k}.png"))).unwrap();
+    }
+    let error = find(folder.path(), &shots(folder.path()), "plain").unwrap_err().to_string();
+    assert!(error.contains("features in the median"), "{error}");
+}
+
+#[test]
+fn work_ends_when_the_caller_stops() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), &cameras(3));
+    let shots = shots(folder.path());
+    let work = folder.path().join("work");
+    std::fs::create_dir_all(&work).unwrap();
+    let request = Request {
+        shots: &shots,
+        masks: None,
+        order: Order::Any,
+        lenses: Lenses::PerSize,
+        focal_px: None,
+        work: &work,
+        threads: 1,
+    };
+    let hooks = Hooks { should_stop: &|| true, progress: &|_| () };
+    assert!(matches!(structure::find(&request, &hooks), Err(Error::Stopped)));
+}

@@ -1,0 +1,199 @@
+//! `cif capture`: videos and photographs to a capture that `cif train` takes.
+
+mod options;
+mod report;
+mod scale;
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use cif_capture::frames::{self, Choice, Notes, Shot};
+use cif_capture::import::{self, Imported};
+use cif_capture::masks::{self, Masks};
+use cif_capture::poses::Poses;
+use cif_capture::source::sources;
+use cif_capture::structure::{self, Found, Lenses, Order, Request, Verdict};
+use cif_capture::write::{self, Capture as Written};
+use cif_capture::{Hooks, times};
+
+pub(super) use self::options::Capture;
+use self::options::{LensesName, OrderName};
+use crate::error::Error;
+use crate::interrupt;
+
+/// Photographs are matched each with each up to this number, unless something else is asked for.
+const ANY_ORDER: usize = 120;
+
+impl From<cif_capture::Error> for Error {
+    fn from(error: cif_capture::Error) -> Self {
+        match error {
+            cif_capture::Error::Stopped => {
+                Self::Interrupted { message: "interrupted".to_owned(), help: None }
+            }
+            cif_capture::Error::Refused { problem, fix } => Self::failed(problem, fix),
+            other => Self::plain(other),
+        }
+    }
+}
+
+/// Poses of all images, and how they came about.
+struct Posed {
+    poses: Poses,
+    from: String,
+    verdict: Option<Verdict>,
+    metres_known: bool,
+    up_known: bool,
+}
+
+pub(super) fn run(command: &Capture) -> Result<(), Error> {
+    let place = &command.output;
+    let is_taken = match std::fs::read_dir(place) {
+        Ok(mut entries) => entries.next().is_some(),
+        Err(_) => place.exists(),
+    };
+    if is_taken {
+        return Err(Error::failed(
+            format!("{} exists", place.display()),
+            "choose another name for the capture, or remove it; nothing is overwritten",
+        ));
+    }
+    interrupt::watch();
+    let progress = |words: &str| {
+        if !command.quiet {
+            eprintln!("{words} ...");
+        }
+    };
+    let hooks = Hooks { should_stop: &interrupt::requested, progress: &progress };
+    let scratch = tempfile::Builder::new()
+        .prefix("cif-capture-")
+        .tempdir()
+        .map_err(Error::io("create a temporary folder in", &std::env::temp_dir()))?;
+    let sources = sources(&command.inputs)?;
+    let mut notes = Notes::new();
+    let mut shots =
+        frames::collect(&sources, &choice(command), &scratch.path().join("frames"), &hooks, &mut notes)?;
+    if let Some(path) = &command.times {
+        times::apply(&times::read(path)?, path, &mut shots)?;
+    }
+    let masks = match &command.masks {
+        Some(folder) => Some(masks::find(folder, &shots)?),
+        None => None,
+    };
+    let known = scale::Known::of(command, masks.as_ref())?;
+    let mut posed = match &command.poses {
+        Some(path) => {
+            let Imported { poses, tool, metres_known, up_known, .. } =
+                import::read(path, &shots)?.matched(path, &mut shots)?;
+            let from = format!("{tool} ({})", path.display());
+            Posed { poses, from, verdict: None, metres_known, up_known }
+        }
+        None => find(command, &shots, masks.as_ref(), scratch.path(), &hooks, &mut notes)?,
+    };
+    for note in &notes {
+        eprintln!("note: {note}");
+    }
+    if let Some(verdict) = posed.verdict.as_ref().filter(|verdict| !verdict.is_good()) {
+        if !command.accept {
+            return Err(report::not_believed(command, verdict, shots.len()));
+        }
+        eprintln!("warning: the verdict says no, and the capture is written because of --accept:\n{verdict}");
+    }
+    let lines = scale::settle(command, &known, &shots, masks.as_ref(), &mut posed, &hooks)?;
+    let capture = Written {
+        shots: &shots,
+        poses: &posed.poses,
+        masks: masks.as_ref(),
+        metres_known: posed.metres_known,
+        up_known: posed.up_known,
+        poses_from: &posed.from,
+    };
+    write::write(&capture, place, &hooks)?;
+    report::print(command, &shots, masks.as_ref(), &posed, &lines);
+    Ok(())
+}
+
+fn choice(command: &Capture) -> Choice {
+    Choice {
+        rate: command.rate,
+        count: command.count,
+        from_s: command.from,
+        to_s: command.to,
+        max_side: command.max_side,
+        sharpest: command.nearest.then_some(false).or(command.sharpest.then_some(true)),
+    }
+}
+
+/// Finds poses by structure from motion; of fixed cameras, by the first image of each.
+fn find(
+    command: &Capture,
+    shots: &[Shot],
+    masks: Option<&Masks>,
+    scratch: &Path,
+    hooks: &Hooks<'_>,
+    notes: &mut Notes,
+) -> Result<Posed, Error> {
+    let fixed = command.fixed || (!command.moving && frames::is_fixed(shots));
+    frames::check(shots, fixed, notes)?;
+    let mut solved: Vec<Shot> = shots.to_vec();
+    if fixed {
+        let mut seen = BTreeSet::new();
+        solved.retain(|shot| seen.insert(shot.camera.clone()));
+        notes.push(format!(
+            "the {} cameras stand still: their poses are those of one moment, {}",
+            solved.len(),
+            "the first frame of each (--moving finds a pose for every frame)"
+        ));
+    }
+    let black = scratch.join("masks");
+    if let Some(masks) = masks {
+        let moving = command.moving_ids.as_ref().map(|ids| ids.iter().copied().collect());
+        masks::leave_out(masks, &solved, moving.as_ref(), &black, hooks)?;
+    }
+    let work = scratch.join("work");
+    std::fs::create_dir_all(&work).map_err(Error::io("create", &work))?;
+    let is_video = solved.iter().any(|shot| shot.time.is_some()) && command.times.is_none();
+    let request = Request {
+        shots: &solved,
+        masks: masks.map(|_| black.as_path()),
+        order: match command.order {
+            OrderName::Sequence => Order::Sequence,
+            OrderName::Any => Order::Any,
+            OrderName::Auto if fixed || (!is_video && solved.len() <= ANY_ORDER) => Order::Any,
+            OrderName::Auto => Order::Sequence,
+        },
+        lenses: match command.lenses {
+            LensesName::One => Lenses::PerSize,
+            LensesName::Each => Lenses::PerCamera,
+        },
+        focal_px: command.focal,
+        work: &work,
+        threads: rayon::current_num_threads(),
+    };
+    let Found { mut poses, verdict, setting, tried } = structure::find(&request, hooks)?;
+    notes.extend(tried.into_iter().map(|tried| format!("not believed: {tried}")));
+    if fixed {
+        poses.images = all_frames(&poses, &solved, shots);
+    }
+    Ok(Posed {
+        poses,
+        from: format!("cif capture: pycolmap, {setting}"),
+        verdict: Some(verdict),
+        metres_known: false,
+        up_known: false,
+    })
+}
+
+/// Every frame of a fixed camera has the pose of the one that was solved.
+fn all_frames(poses: &Poses, solved: &[Shot], shots: &[Shot]) -> BTreeMap<String, cif_capture::poses::Pose> {
+    let of_camera: BTreeMap<&str, _> = solved
+        .iter()
+        .filter_map(|shot| Some((shot.camera.as_str(), *poses.images.get(&shot.name)?)))
+        .collect();
+    let pose = |shot: &Shot| Some((shot.name.clone(), *of_camera.get(shot.camera.as_str())?));
+    shots.iter().filter_map(pose).collect()
+}
+
+/// File in which a scene of this capture would be saved, for messages.
+fn scene_name(place: &Path) -> PathBuf {
+    place.with_extension("cif")
+}

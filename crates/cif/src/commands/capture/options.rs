@@ -1,0 +1,170 @@
+//! The command line of `cif capture`.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+/// Make a capture out of videos or photographs: frames, camera poses, times
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Inputs are videos and folders of photographs (PNG, JPEG), one per camera; NAME=PATH names a camera. Videos need ffmpeg
+on the PATH; poses need pycolmap, which `pip install cif[capture]` brings.
+
+  cif capture walk.mp4 -o captures/table                          150 frames of a video, the sharpest of each window
+  cif capture walk.mp4 -o captures/table --rate 5 --max-side 960
+  cif capture photos/ -o captures/garden                          photographs keep their names
+  cif capture left=a.mp4 right=b.mp4 top=c.mp4 -o captures/rig --rate 10
+  cif capture walk.mp4 -o captures/table2 --masks painted --moving-ids 1,4     what moves is left out of the poses
+  cif capture walk.mp4 -o captures/table --masks masks --length 'red mug' 0.09
+  cif capture photos/ -o captures/garden --poses colmap/sparse/0
+
+Poses are found by both mappers of COLMAP, and again with more features where these disagree. The verdict looks at the
+share of images with a pose, the reprojection error, the focal length and how far two runs are apart; where it says no,
+nothing is written (--accept writes it all the same). Poses from images know neither metre nor up: up is taken from how
+the cameras were held, the metre from --length or --measured, and the capture tells what is known.
+
+Cameras of a rig that stand still are told by their pictures; they are solved at one moment. Frames of a video are called
+by their number in the stream (000123.png), so that masks fit later calls with the same frames. Times are those of the
+stream, or of a table: one line per image with its name, a comma, and seconds.")]
+pub(in crate::commands) struct Capture {
+    /// Videos and folders of photographs, one per camera
+    #[arg(required = true, value_name = "INPUT")]
+    pub(super) inputs: Vec<String>,
+    /// New folder for the capture
+    #[arg(short, long, value_name = "DIR")]
+    pub(super) output: PathBuf,
+    /// Frames per second to take of videos
+    #[arg(long, value_name = "HZ", value_parser = positive, conflicts_with = "count", help_heading = "Frames")]
+    pub(super) rate: Option<f64>,
+    /// Frames to take of every input [default: 150 of a video, all photographs]
+    #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000), help_heading = "Frames")]
+    pub(super) count: Option<usize>,
+    /// First second of videos to take
+    #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Frames")]
+    pub(super) from: Option<f64>,
+    /// Last second of videos to take
+    #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Frames")]
+    pub(super) to: Option<f64>,
+    /// Reduce frames of videos so that their larger side has at most so many pixels
+    #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(16..=16_384), help_heading = "Frames")]
+    pub(super) max_side: Option<u32>,
+    /// Take the sharpest frame of every window, as is the default for one video
+    #[arg(long, conflicts_with = "nearest", help_heading = "Frames")]
+    pub(super) sharpest: bool,
+    /// Take the frame nearest to the middle of every window, as is the default for several videos
+    #[arg(long, help_heading = "Frames")]
+    pub(super) nearest: bool,
+    /// Table of times: image name, comma, seconds
+    #[arg(long, value_name = "FILE", help_heading = "Frames")]
+    pub(super) times: Option<PathBuf>,
+    /// Folder of masks, PNG files of ids named as the images: what moves is left out of the poses, and the
+    /// capture gets the masks
+    #[arg(long, value_name = "DIR", help_heading = "Poses")]
+    pub(super) masks: Option<PathBuf>,
+    /// Ids of the masks that move [default: all but 0]
+    #[arg(long, value_name = "ID,...", value_delimiter = ',', requires = "masks", help_heading = "Poses")]
+    pub(super) moving_ids: Option<Vec<u16>>,
+    /// Focal length to start from, in pixels of the images taken [default: of EXIF, else 1.2 times the larger
+    /// side]
+    #[arg(long, value_name = "PIXELS", value_parser = positive, help_heading = "Poses")]
+    pub(super) focal: Option<f64>,
+    /// Lenses: one for all images of a size, or each camera its own
+    #[arg(long, value_name = "WHICH", default_value = "one", help_heading = "Poses")]
+    pub(super) lenses: LensesName,
+    /// Order of the images: sequence (neighbours overlap), any (each is matched with each), or auto: sequence
+    /// for videos, any for up to 120 photographs
+    #[arg(long, value_name = "ORDER", default_value = "auto", help_heading = "Poses")]
+    pub(super) order: OrderName,
+    /// The cameras stand still: one moment gives their poses
+    #[arg(long, conflicts_with = "moving", help_heading = "Poses")]
+    pub(super) fixed: bool,
+    /// The cameras move, though most of their pictures stays as it is
+    #[arg(long, help_heading = "Poses")]
+    pub(super) moving: bool,
+    /// Take poses of another tool: a COLMAP model, a nerfstudio transforms.json, a Polycam export, or a
+    /// RealityCapture registration (.csv)
+    #[arg(long, value_name = "FROM", conflicts_with_all = ["focal", "fixed", "moving"], help_heading = "Poses")]
+    pub(super) poses: Option<PathBuf>,
+    /// Write the capture even where the verdict says no
+    #[arg(long, help_heading = "Poses")]
+    pub(super) accept: bool,
+    /// Longest side of an object of the masks that stands still, by its label or id, in metres
+    #[arg(long, num_args = 2, value_names = ["LABEL", "METRES"], requires = "masks", conflicts_with = "measured", help_heading = "World")]
+    pub(super) length: Option<Vec<String>>,
+    /// Length between two points in metres; each point is IMAGE:X,Y of two or more images, joined by /
+    #[arg(long, num_args = 3, value_names = ["POINT", "POINT", "METRES"], help_heading = "World")]
+    pub(super) measured: Option<Vec<String>>,
+    /// Up: cameras (from how they were held), unknown, or X,Y,Z in the world of --poses
+    #[arg(
+        long,
+        value_name = "UP",
+        default_value = "cameras",
+        allow_hyphen_values = true,
+        help_heading = "World"
+    )]
+    pub(super) up: UpName,
+    /// Show no progress
+    #[arg(short, long)]
+    pub(super) quiet: bool,
+}
+
+/// Which images share a lens.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub(super) enum LensesName {
+    /// All images of one size
+    One,
+    /// Those of a camera
+    Each,
+}
+
+/// How images follow each other.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+pub(super) enum OrderName {
+    /// As the input calls for
+    Auto,
+    /// Neighbours overlap
+    Sequence,
+    /// Any two may overlap
+    Any,
+}
+
+/// Where up comes from.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum UpName {
+    /// How the cameras were held.
+    Cameras,
+    /// Nowhere.
+    Unknown,
+    /// A direction in the world of the poses.
+    Given([f64; 3]),
+}
+
+impl std::str::FromStr for UpName {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text {
+            "cameras" => Ok(Self::Cameras),
+            "unknown" => Ok(Self::Unknown),
+            _ => {
+                let values: Option<Vec<f64>> = text.split(',').map(|part| part.trim().parse().ok()).collect();
+                let direction = values.and_then(|values| <[f64; 3]>::try_from(values).ok());
+                direction
+                    .filter(|d| d.iter().all(|v| v.is_finite()) && d.iter().any(|v| v.abs() > 1e-9))
+                    .map(Self::Given)
+                    .ok_or_else(|| "cameras, unknown or three numbers X,Y,Z are expected".to_owned())
+            }
+        }
+    }
+}
+
+/// A number above 0.
+pub(super) fn positive(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|value: &f64| value.is_finite() && *value > 0.0);
+    value.ok_or_else(|| "a number above 0 is expected".to_owned())
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|value: &f64| value.is_finite() && *value >= 0.0);
+    value.ok_or_else(|| "seconds from 0 on are expected".to_owned())
+}
