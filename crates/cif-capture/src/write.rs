@@ -207,7 +207,7 @@ mod tests {
                     camera: "walk".to_owned(),
                     name,
                     file,
-                    time: times.then(|| 0.25 + 0.1 * k as f64),
+                    time: times.then_some(0.25 + 0.1 * k as f64),
                     size: (64, 48),
                     impression: Impression::of(&board(50, k)),
                 }

@@ -240,10 +240,11 @@ mod tests {
         poses
     }
 
-    /// What [`rung`] gives where the mappers answer so, and the runs that it asked for.
-    fn given(
-        answer: impl Fn(Run) -> Option<Poses>,
-    ) -> (Option<(&'static str, Poses, Verdict)>, Vec<(Mapper, u32)>) {
+    /// The model of a rung: the name of its mapper, its poses and what is thought of them.
+    type Found = Option<(&'static str, Poses, Verdict)>;
+
+    /// The model that [`rung`] gives where the mappers answer so, and the runs that it asked for.
+    fn given(answer: impl Fn(Run) -> Option<Poses>) -> (Found, Vec<(Mapper, u32)>) {
         let asked = RefCell::new(Vec::new());
         let solve = |runs: &[Run]| {
             asked.borrow_mut().extend(runs.iter().map(|run| (run.mapper, run.seed)));

@@ -9,6 +9,7 @@
 //! | `outline`, `path` | how large an object is, and where it goes |
 //! | `shape` | its Gaussians alone, against crops |
 //! | `fit` | its poses and Gaussians, moved together |
+//! | `texture` | how it turns, where its outline does not tell |
 //! | `ways` | which ways of moving are tried |
 //! | `follow` | how it moves from time to time |
 //! | `trials` | which way is kept |
@@ -26,6 +27,7 @@ mod shape;
 mod start;
 #[cfg(test)]
 mod tests;
+mod texture;
 mod trials;
 mod view;
 mod ways;

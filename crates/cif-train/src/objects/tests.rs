@@ -255,6 +255,36 @@ fn a_plate_that_turns_in_place_is_found_by_its_texture() {
     assert!(turn < 8.0 && shift < 0.006, "{turn} deg, {shift} m");
 }
 
+/// A pillar on the floor that turns all the time.
+fn turning_pillar(color: impl Fn(DVec3) -> [f32; 3]) -> (Vec<ObjectView>, Vec<(DQuat, DVec3)>) {
+    let mut rng = stream(0, Purpose::Objects, 13);
+    let places: Vec<DVec3> = (0..6000)
+        .map(|_| {
+            let angle = std::f64::consts::TAU * rng.random::<f64>();
+            DVec3::new(0.04 * angle.cos(), 0.04 * angle.sin(), 0.16 * rng.random::<f64>() - 0.08)
+        })
+        .collect();
+    let pose = |k: usize| {
+        let place = DVec3::new(0.02, -0.03, 0.085);
+        (DQuat::from_rotation_z(-4.0 * k as f64 / (TIMES - 1) as f64), place)
+    };
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(pose).collect();
+    (views(solid(&places, color, 0.005), &truth, rig), truth)
+}
+
+#[test]
+fn a_pillar_that_turns_is_found_by_its_texture_and_left_at_rest_without() {
+    let (views, truth) = turning_pillar(patches);
+    let fitted = fit(&views);
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(fitted.way.contains("texture"), "{}", fitted.way);
+    assert!(turn < 8.0 && shift < 0.004, "{turn} deg, {shift} m");
+    assert_eq!(fitted.rotation, RotationEvidence::Observed);
+    let (views, _) = turning_pillar(|_| [0.7, 0.4, 0.2]);
+    let plain = fit_on(Some(&FLOOR), &views);
+    assert!(plain.is_none(), "{}", plain.unwrap().way);
+}
+
 #[test]
 fn an_object_that_the_border_cuts_is_followed_from_where_it_is_seen_best() {
     // It comes in from beside the image, and stops as soon as all of it is seen.

@@ -11,6 +11,7 @@ use super::follow::follow;
 use super::outline::{self, Outline};
 use super::path::smooth;
 use super::start::{Object, Started};
+use super::texture;
 use super::view::ObjectView;
 use super::ways::{Paths, Way, is_round};
 use crate::error::TrainError;
@@ -37,6 +38,10 @@ const UNEXPLAINED: f64 = 0.3;
 /// Error of an object that was followed, relative to that of paths, below which following is preferred: of most
 /// objects, and of round ones.
 const FOLLOW_GAIN: [f64; 2] = [0.98, 0.94];
+
+/// Largest error of turning as texture tells, relative to the best other way: a few Gaussians without texture prefer
+/// no turn.
+const TEXTURE_GAIN: f64 = 1.3;
 
 /// Largest error of rolling, relative to that of sliding, at which rolling is preferred.
 const ROLL_GAIN: f64 = 0.97;
@@ -94,12 +99,15 @@ pub(super) fn best_way<'a>(
             stands: surroundings.plane.is_some(),
             reference,
             followed: None,
+            textured: None,
         },
         train,
         left_out,
     };
     let simple = contest.simple()?;
-    let trials = if object.is_told {
+    let trials = if let Some(textured) = contest.textured(&simple, reliable)? {
+        vec![textured]
+    } else if object.is_told {
         contest.along_the_path(simple)?
     } else if rests(&simple, Way::Slide(0), REST_GAIN[0]) && !contest.is_unexplained(&simple) {
         if !contest.paths.may_turn_unseen(views) {
@@ -124,6 +132,8 @@ pub(super) fn best_way<'a>(
         (RotationEvidence::Assumed, Way::Roll(_)) => (Turns::Free, None),
         (RotationEvidence::Assumed, _) => (Turns::Given, None),
         (_, Way::Roll(factor)) => (Turns::Free, Some(outline.height / factor)),
+        // Light, which stays where it is, would pull it back.
+        (_, Way::Textured) => (Turns::Given, None),
         _ => (Turns::Free, None),
     };
     Ok(Some(Started { fit, way, rotation, error: losses[1], reference }))
@@ -136,6 +146,24 @@ impl<'a> Contest<'a> {
         self.advance(&mut trials, (0, STEPS[1]), false)?;
         self.judge(&mut trials, false);
         Ok(trials)
+    }
+
+    /// Turning as texture tells, where it does and the outline says nothing else.
+    fn textured(
+        &mut self,
+        simple: &[Trial<'_>],
+        reliable: &[usize],
+    ) -> Result<Option<Trial<'a>>, TrainError> {
+        let seen = reliable.iter().map(|view| &self.object.views[*view]);
+        self.paths.textured = texture::turns(seen, &self.paths.along, self.object.outline, self.paths.up);
+        if self.paths.textured.is_none() {
+            return Ok(None);
+        }
+        let mut trials = self.begin(&[Way::Textured], GAUSSIANS);
+        self.advance(&mut trials, (0, STEPS[1]), false)?;
+        self.judge(&mut trials, false);
+        let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
+        Ok(trials.pop().filter(|trial| trial.losses[1] <= TEXTURE_GAIN * least))
     }
 
     /// True where following may find what neither resting nor sliding explains.
@@ -194,7 +222,7 @@ impl<'a> Contest<'a> {
                 Way::Rest => (Turns::Given, None),
                 Way::Slide(_) | Way::Spin(_) => (Turns::Upright, None),
                 Way::Roll(factor) => (Turns::Free, Some(outline.height / factor)),
-                Way::Followed => (Turns::Free, None),
+                Way::Followed | Way::Textured => (Turns::Free, None),
             };
             fit.touches = !matches!(way, Way::Rest | Way::Spin(_));
             Some(Trial { way: *way, fit, losses: [0.0; 2] })

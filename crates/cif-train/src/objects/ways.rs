@@ -44,6 +44,8 @@ pub(super) enum Way {
     Roll(f64),
     /// As following it from time to time found.
     Followed,
+    /// Along the path, turning about the normal as its texture tells.
+    Textured,
 }
 
 impl Way {
@@ -55,6 +57,7 @@ impl Way {
             Self::Spin(degrees) => format!("turns {degrees} deg in place"),
             Self::Roll(factor) => format!("rolls with {factor:.2} of its height"),
             Self::Followed => "followed from time to time".to_owned(),
+            Self::Textured => "turns as its texture tells".to_owned(),
         }
     }
 
@@ -82,6 +85,8 @@ pub(super) struct Paths<'a> {
     pub(super) reference: usize,
     /// Poses that following found, where it did.
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
+    /// Turns that its texture tells, where it does.
+    pub(super) textured: Option<BTreeMap<usize, DQuat>>,
 }
 
 /// True where masks are round enough for a ball.
@@ -155,6 +160,16 @@ impl Paths<'_> {
                 let rotations = rolled(&places, self.up, self.outline.height / factor);
                 let back = rotations[origin].inverse();
                 rotations.into_iter().map(|rotation| rotation * back).collect()
+            }
+            Way::Textured => {
+                let Some(turns) = &self.textured else { return BTreeMap::new() };
+                let back = turns.get(&self.reference).copied().unwrap_or_default().inverse();
+                let mut last = DQuat::IDENTITY;
+                let mut of = |time: &usize| {
+                    last = turns.get(time).map_or(last, |turn| *turn * back);
+                    last
+                };
+                times.iter().map(&mut of).collect()
             }
             Way::Followed => {
                 let followed = self.followed.iter().flatten();
