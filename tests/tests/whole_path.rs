@@ -164,6 +164,42 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
 /// What is told to go on with can be pasted into a shell, whatever files are called.
 #[cfg(unix)]
 #[test]
+fn all_steps_are_one_command_that_stops_where_frames_have_to_be_painted() {
+    let folder = with_capture(8);
+    let path = folder.path();
+    fs::rename(path.join("table/masks"), path.join("truth")).unwrap();
+    let settings = "[stages]\ncoarse = 6\nfine = 6\ninstance = 6\n[model]\nspatial_resolution = [8, 8, 8]\n\
+                    [motion]\nrigid = false\n";
+    fs::write(path.join("tiny.toml"), settings).unwrap();
+    let line = "make table -o out --config tiny.toml --quiet";
+    cif(path, line).fails(1, &["table/rgb", "out/keyframes/000000.png", "out/keyframes/000007.png"]);
+    assert!(!path.join("out").exists());
+
+    fs::create_dir_all(path.join("out/keyframes")).unwrap();
+    for name in ["000000.png", "000007.png", "instances.json"] {
+        let from = ["truth", "table"].map(|folder| path.join(folder).join(name));
+        let from = from.iter().find(|file| file.exists()).unwrap();
+        fs::copy(from, path.join("out/keyframes").join(name)).unwrap();
+    }
+    let made = cif(path, line).succeeds();
+    for step in ["$ cif masks propagate table", "$ cif train table", "$ cif export out/scene.cif"] {
+        assert!(made.stderr.contains(step), "{step} in {}", made.stderr);
+    }
+    let query = cif(path, "query out/scene.glb --label *").succeeds();
+    assert!(query.stdout.contains("red ball") && query.stdout.contains("blue ball"), "{}", query.stdout);
+
+    // What is there is not made again, a run that was interrupted goes on, and what is out of date is told.
+    let again = cif(path, line).succeeds();
+    assert!(!again.stderr.contains('$'), "{}", again.stderr);
+    fs::remove_file(path.join("out/scene.glb")).unwrap();
+    cif(path, "train table --masks out/masks -o out/scene.cif --config tiny.toml --force --stop-after 1 -q")
+        .succeeds();
+    assert!(cif(path, line).succeeds().stderr.contains("--resume"));
+    fs::copy(path.join("truth/000003.png"), path.join("out/keyframes/000003.png")).unwrap();
+    cif(path, line).fails(1, &["out/masks is older than out/keyframes/000003.png"]);
+}
+
+#[test]
 fn the_command_to_go_on_with_can_be_pasted() {
     let folder = with_capture(4);
     let path = folder.path();

@@ -171,12 +171,14 @@ fn put(from: &Path, to: &Path) -> Result<(), Error> {
     link.or_else(|_| std::fs::copy(from, to).map(drop)).map_err(Error::io("copy", from))
 }
 
-/// Features of the images, and what to give out of one setting: mapper, poses and verdict.
-#[allow(clippy::type_complexity, reason = "one caller")]
+/// The model of one setting: the name of its mapper, its poses, and what is to be thought of them.
+type Model = (&'static str, Poses, Verdict);
+
+/// Features of the images, and the model to give out of one setting; `None` where no mapper found any pose.
 fn rung(
     images: usize,
     solve: &dyn Fn(&[Run]) -> Result<Outcome, Error>,
-) -> Result<(Vec<usize>, Option<(&'static str, Poses, Verdict)>), Error> {
+) -> Result<(Vec<usize>, Option<Model>), Error> {
     let first = [Run { mapper: Mapper::Global, seed: 1 }, Run { mapper: Mapper::Incremental, seed: 2 }];
     let Outcome { features, runs } = solve(&first)?;
     let features: Vec<usize> = features.into_values().collect();
@@ -240,11 +242,8 @@ mod tests {
         poses
     }
 
-    /// The model of a rung: the name of its mapper, its poses and what is thought of them.
-    type Found = Option<(&'static str, Poses, Verdict)>;
-
     /// The model that [`rung`] gives where the mappers answer so, and the runs that it asked for.
-    fn given(answer: impl Fn(Run) -> Option<Poses>) -> (Found, Vec<(Mapper, u32)>) {
+    fn given(answer: impl Fn(Run) -> Option<Poses>) -> (Option<Model>, Vec<(Mapper, u32)>) {
         let asked = RefCell::new(Vec::new());
         let solve = |runs: &[Run]| {
             asked.borrow_mut().extend(runs.iter().map(|run| (run.mapper, run.seed)));

@@ -17,6 +17,7 @@ mod info;
 #[cfg(feature = "wgpu")]
 mod info_gpu;
 mod label;
+mod make;
 mod masks;
 mod model_options;
 mod motion_table;
@@ -60,6 +61,7 @@ pub struct Arguments {
 
 const TOUR: &str = "\
 A short tour:
+  cif make phone.mp4 -o table                            all steps, from a video to a USD stage
   cif capture walk.mp4 -o captures/table                 frames and cameras out of a video or photographs
   cif info captures/table                                what is in this folder?
   cif plan captures/table                                which effects does it call for?
@@ -79,6 +81,7 @@ Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Make(make::Make),
     Capture(capture::Capture),
     Plan(plan::Plan),
     Train(train::Train),
@@ -158,7 +161,22 @@ impl From<Simd> for SimdLevel {
 /// # Errors
 /// Whatever keeps the command from doing what was asked.
 pub fn run(arguments: Arguments) -> Result<(), Error> {
-    let run = || match arguments.command {
+    let run = || dispatch(arguments.command);
+    match arguments.machine.threads {
+        None => run(),
+        // A pool of its own, because the command may run several times in one process.
+        Some(threads) => rayon::ThreadPoolBuilder::new()
+            .num_threads(threads as usize)
+            .build()
+            .map_err(|error| Error::plain(format!("cannot start {threads} threads: {error}")))?
+            .install(run),
+    }
+}
+
+/// Runs one command on the threads that are there.
+fn dispatch(command: Command) -> Result<(), Error> {
+    match command {
+        Command::Make(command) => make::run(&command),
         Command::Capture(command) => capture::run(&command),
         Command::Plan(command) => plan::run(&command),
         Command::Train(command) => train::run(&command),
@@ -173,15 +191,6 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
         Command::Check(command) => check::run(&command),
         Command::Masks(command) => masks::run(&command),
         Command::Bench(command) => bench::run(&command),
-    };
-    match arguments.machine.threads {
-        None => run(),
-        // A pool of its own, because the command may run several times in one process.
-        Some(threads) => rayon::ThreadPoolBuilder::new()
-            .num_threads(threads as usize)
-            .build()
-            .map_err(|error| Error::plain(format!("cannot start {threads} threads: {error}")))?
-            .install(run),
     }
 }
 

@@ -1,0 +1,202 @@
+//! `cif make`: from videos or photographs to a stage, one command after the other.
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+use cif_dataset::{Dataset, OpenOptions};
+use cif_field::Checkpoint;
+use clap::{Args, Parser};
+
+use super::{Arguments, command_line, dispatch};
+use crate::error::Error;
+
+/// The file that objects leave in: USD, where this build writes it.
+const STAGE: (&str, &str) =
+    if cfg!(feature = "usd") { ("--usd", "scene.usda") } else { ("--gltf", "scene.glb") };
+
+/// Frames that are proposed to be painted.
+const PROPOSED: usize = 4;
+
+/// Go from videos or photographs to a USD stage: all steps with their defaults
+#[derive(Debug, Args)]
+#[command(after_help = "\
+Every step is a command of its own, which is shown before it runs, and leaves its result in the output folder:
+
+  capture/     cif capture           frames, cameras, times
+  keyframes/   you                   masks of a few frames, painted: it stops here and says which
+  masks/       cif masks propagate   masks of all frames
+  scene.cif    cif train             the trained scene
+  scene.usda   cif export            one moving prim per object (scene.glb in builds without USD)
+
+The same command goes on where it stopped, also after Ctrl-C: what is there already is not made again. A step that needs
+other options can be run by hand into the same place, and what is to be made anew is removed first.
+
+  cif make phone.mp4 -o table
+  cif make left.mp4 right.mp4 -o rig --preset draft
+  cif make captures/table -o table                    a capture with masks is trained and exported at once
+  cif make captures/table -o table --masks tracked    masks of a tracker (cif masks import)")]
+pub(super) struct Make {
+    /// Videos and folders of photographs, as `cif capture` takes them, or the folder of one capture
+    #[arg(required = true, value_name = "INPUT")]
+    inputs: Vec<OsString>,
+    /// Folder for everything that is made
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Painted masks of a few frames, PNG files of ids named as the frames [default: DIR/keyframes]
+    #[arg(long, value_name = "DIR", conflicts_with = "masks")]
+    keyframes: Option<PathBuf>,
+    /// Masks of all frames, so that none has to be painted
+    #[arg(long, value_name = "DIR")]
+    masks: Option<PathBuf>,
+    /// Named settings of the training: draft, standard or paper [default: standard]
+    #[arg(long, value_name = "NAME")]
+    preset: Option<String>,
+    /// Settings file of the training
+    #[arg(long, value_name = "FILE.toml")]
+    config: Option<PathBuf>,
+    /// Show no progress
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+pub(super) fn run(command: &Make) -> Result<(), Error> {
+    let capture = command.capture()?;
+    let masks = command.masks(&capture)?;
+    let scene = command.train(&capture, masks.as_deref())?;
+    let (flag, name) = STAGE;
+    let stage = command.output.join(name);
+    if !is_made(&stage, &[&scene])? {
+        step(vec!["export".into(), scene.into(), flag.into(), stage.clone().into(), "--check".into()])?;
+    }
+    let stage = stage.display().to_string();
+    println!("made: {stage}");
+    println!("next: {}", command_line(&["query", &stage, "--label", "*"]));
+    Ok(())
+}
+
+impl Make {
+    /// The capture, made of the inputs unless they are one.
+    fn capture(&self) -> Result<PathBuf, Error> {
+        if let [input] = self.inputs.as_slice()
+            && OpenOptions::default().layout_of(Path::new(input)).is_ok()
+        {
+            return Ok(PathBuf::from(input));
+        }
+        let place = self.output.join("capture");
+        if !is_made(&place.join("transforms.json"), &[])? {
+            std::fs::create_dir_all(&self.output).map_err(Error::io("create", &self.output))?;
+            let mut words = vec!["capture".into()];
+            words.extend(self.inputs.iter().cloned());
+            words.extend(["-o".into(), place.clone().into()]);
+            step(self.quietly(words))?;
+        }
+        Ok(place)
+    }
+
+    /// The folder of masks; `None` where the capture has its own.
+    fn masks(&self, capture: &Path) -> Result<Option<PathBuf>, Error> {
+        if let Some(masks) = &self.masks {
+            return std::path::absolute(masks).map(Some).map_err(Error::io("find", masks));
+        }
+        let dataset = Dataset::open(capture, &OpenOptions::default()).map_err(Error::plain)?;
+        if dataset.frames.iter().any(|frame| frame.mask.is_some()) {
+            return Ok(None);
+        }
+        let keyframes = self.keyframes.clone().unwrap_or_else(|| self.output.join("keyframes"));
+        let masks = dataset.frames.iter().map(|frame| keyframes.join(format!("{}.png", frame.name)));
+        let painted: Vec<PathBuf> = masks.filter(|file| file.is_file()).collect();
+        if painted.is_empty() {
+            return Err(to_paint(&dataset, &keyframes));
+        }
+        let place = self.output.join("masks");
+        if !is_made(&place, &painted.iter().map(PathBuf::as_path).collect::<Vec<_>>())? {
+            std::fs::create_dir_all(&self.output).map_err(Error::io("create", &self.output))?;
+            let words = ["masks", "propagate"].map(OsString::from).into_iter().chain([
+                capture.into(),
+                "--keyframes".into(),
+                keyframes.into(),
+                "-o".into(),
+                place.clone().into(),
+            ]);
+            step(self.quietly(words.collect()))?;
+        }
+        std::path::absolute(&place).map(Some).map_err(Error::io("find", &place))
+    }
+
+    /// The trained scene; a run that was interrupted goes on.
+    fn train(&self, capture: &Path, masks: Option<&Path>) -> Result<PathBuf, Error> {
+        let scene = self.output.join("scene.cif");
+        let begun = is_made(&scene, masks.as_slice())?;
+        if begun && Checkpoint::load(&scene).map_err(Error::plain)?.training.is_none() {
+            return Ok(scene);
+        }
+        std::fs::create_dir_all(&self.output).map_err(Error::io("create", &self.output))?;
+        let mut words: Vec<OsString> =
+            vec!["train".into(), capture.into(), "-o".into(), scene.clone().into()];
+        if let Some(masks) = masks {
+            words.extend(["--masks".into(), masks.into()]);
+        }
+        if begun {
+            words.push("--resume".into());
+        } else {
+            let of = |name: &str, value: Option<OsString>| value.map(|value| [name.into(), value]);
+            let preset = of("--preset", self.preset.as_ref().map(OsString::from));
+            let config = of("--config", self.config.as_ref().map(OsString::from));
+            words.extend(preset.into_iter().chain(config).flatten());
+        }
+        step(self.quietly(words))?;
+        Ok(scene)
+    }
+
+    fn quietly(&self, mut words: Vec<OsString>) -> Vec<OsString> {
+        words.extend(self.quiet.then(|| "--quiet".into()));
+        words
+    }
+}
+
+/// True where a result is there.
+///
+/// # Errors
+/// When it is older than something that it was made of.
+fn is_made(result: &Path, of: &[&Path]) -> Result<bool, Error> {
+    let changed = |path: &Path| std::fs::metadata(path).and_then(|data| data.modified()).ok();
+    let Some(made) = changed(result) else { return Ok(false) };
+    let newer = of.iter().find(|path| changed(path).is_some_and(|changed| changed > made));
+    newer.map_or(Ok(true), |newer| {
+        Err(Error::failed(
+            format!("{} is older than {}, of which it was made", result.display(), newer.display()),
+            format!("remove it, and what was made of it, to make it again: {}", result.display()),
+        ))
+    })
+}
+
+/// Runs a command line of cif, and shows it.
+fn step(words: Vec<OsString>) -> Result<(), Error> {
+    let told: Vec<String> = words.iter().map(|word| word.to_string_lossy().into_owned()).collect();
+    eprintln!("$ {}", command_line(&told));
+    let line = std::iter::once(OsString::from("cif")).chain(words);
+    dispatch(Arguments::try_parse_from(line).map_err(Error::plain)?.command)
+}
+
+/// The stop at which a person is needed.
+fn to_paint(dataset: &Dataset, keyframes: &Path) -> Error {
+    let camera = dataset.frames.first().map(|frame| &frame.camera_name);
+    let frames: Vec<_> = dataset.frames.iter().filter(|frame| Some(&frame.camera_name) == camera).collect();
+    let count = PROPOSED.min(frames.len());
+    let line = |k: usize| {
+        // The first and the last, and some between.
+        let frame = frames[k * (frames.len() - 1) / (count - 1).max(1)];
+        format!(
+            "  {}  ->  {}",
+            frame.image.display(),
+            keyframes.join(format!("{}.png", frame.name)).display()
+        )
+    };
+    let lines: Vec<String> = (0..count).map(line).collect();
+    Error::failed(
+        format!("{} frames have to be painted:\n{}", lines.len(), lines.join("\n")),
+        "paint each object in the value of its id, 1 to 255, on 0 in an 8-bit grey or palette PNG of the same size (any \
+         paint program, or a tracker's first answer); name the ids in instances.json beside them, \
+         [{\"id\": 1, \"label\": \"red mug\"}]; then run the same command again",
+    )
+}
