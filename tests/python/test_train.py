@@ -38,6 +38,14 @@ def dataset() -> cif.Dataset:
     return cif.open_dataset(CAPTURE)
 
 
+@pytest.fixture(autouse=True)
+def interrupts() -> Iterator[None]:
+    """Let Ctrl-C raise, which programs that are started in the background ignore."""
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)
+
+
 @contextmanager
 def ctrl_c(saved: Path) -> Iterator[None]:
     """Press Ctrl-C once a run has saved a state, which it does after a second."""
