@@ -26,7 +26,9 @@ fn words(line: &str) -> Vec<String> {
 /// The command that is told below a line with these words, without the name of the program.
 fn told(run: &Run, heading: &str) -> Vec<String> {
     let mut lines = run.stderr.lines().skip_while(|line| !line.contains(heading));
-    words(lines.nth(1).expect("a command below the heading")).split_off(1)
+    let line = lines.nth(1).expect("a command below the heading");
+    // Words of this test are quoted for shells, but have no blanks.
+    line.split_whitespace().skip(1).map(|word| word.trim_matches('\'').to_owned()).collect()
 }
 
 /// A video of a picture that moves by, and a Python; false without ffmpeg.
@@ -54,11 +56,11 @@ fn prepare(folder: &Path) -> bool {
     });
     // Of one mapper alone, so that nothing confirms it.
     let answer = json!({ "features": {}, "runs": [model, null] });
-    fs::write(folder.join("answer.json"), answer.to_string()).unwrap();
+    fs::write(folder.join("answer.json"), answer.to_string()).expect("the folder takes files");
     let python = folder.join("python");
     fs::write(&python, format!("#!/bin/sh\ncat > {0}/job.json\ncat {0}/answer.json\n", folder.display()))
-        .unwrap();
-    fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).unwrap();
+        .expect("the folder takes files");
+    fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).expect("the file is there");
     true
 }
 
@@ -69,8 +71,6 @@ fn frames_and_poses_that_are_not_believed_are_kept_for_the_next_command() {
     if !prepare(path) {
         return;
     }
-    let first = cif(path, &words("capture walk.mkv -o new --rate 10 --length 'red mug' 0.1"));
-    assert_eq!(first.code, Some(2), "--length needs --masks: {}", first.stderr);
     let first = cif(path, &words("capture walk.mkv -o new --rate 10 --focal 90 --up 0,-1,0"));
     assert_eq!(first.code, Some(1));
     for word in ["not to be believed", "kept: new-unfinished has 14 frames and the poses found"] {
