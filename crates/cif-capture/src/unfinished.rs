@@ -5,11 +5,11 @@ use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::NewFolder;
 
+use crate::Error;
 use crate::frames::Shot;
 use crate::poses::Poses;
 use crate::source::Source;
 use crate::write::{self, Capture};
-use crate::Error;
 
 /// Name of the table of times.
 const TIMES: &str = "times.csv";

@@ -187,6 +187,13 @@ fn find(
     notes.extend(tried.into_iter().map(|tried| format!("not believed: {tried}")));
     if fixed {
         poses.images = all_frames(&poses, &solved, shots);
+        if verdict.is_good() || command.accept {
+            let points = structure::points_of_rig(&Request { shots, ..request }, &poses, hooks)?;
+            // Where a rig is wrong, mappers may have found points that its poses do not give.
+            if points.len() > poses.points.len() {
+                poses.points = points;
+            }
+        }
     }
     Ok(Posed {
         poses,

@@ -24,9 +24,9 @@ no capture is written (--accept writes it all the same), but frames of videos an
 and the commands that go on from there are told. Poses from images know neither metre nor up: up is taken from how
 the cameras were held, the metre from --length or --measured, and the capture tells what is known.
 
-Cameras of a rig that stand still are told by their pictures; they are solved at one moment. Frames of a video are called
-by their number in the stream (000123.png), so that masks fit later calls with the same frames. Times are those of the
-stream, or of a table: one line per image with its name, a comma, and seconds.")]
+Cameras of a rig that stand still are told by their pictures; they are solved at one moment, and give the points of four.
+Frames of a video are called by their number in the stream (000123.png), so that masks fit later calls with the same
+frames. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
 pub(in crate::commands) struct Capture {
     /// Videos and folders of photographs, one per camera
     #[arg(required = true, value_name = "INPUT")]
