@@ -1,6 +1,6 @@
-//! Points that the cameras of a rig see. One moment of few cameras gives few of them: most are seen by two cameras
-//! alone, which mappers leave out because they have no poses yet to check them by. With poses, two views tell a place
-//! as well as more, and other moments show what people or things hid.
+//! Points that the cameras of a rig see. One moment of few cameras gives few of them: most are seen by two
+//! cameras alone, which mappers leave out because they have no poses yet to check them by. With poses, two
+//! views tell a place as well as more, and other moments show what people or things hid.
 
 use std::collections::BTreeMap;
 
@@ -13,8 +13,8 @@ use crate::{Error, Hooks};
 /// Moments of the rig that are looked at; each adds about as many points, and takes as long, as the first.
 const MOMENTS: usize = 4;
 
-/// Points of images of a rig, by poses that are known and stay as they are; `request.order` and `request.masks` do
-/// not count, because the images of a moment are matched each with each and what moves stands still in them.
+/// Points of images of a rig, by poses that are known and stay as they are; `request.order` and `request.masks`
+/// do not count, because the images of a moment are matched each with each and what moves stands still in them.
 ///
 /// # Errors
 /// When pycolmap is missing or fails, or the caller stops.
@@ -51,9 +51,9 @@ pub fn points_of_rig(request: &Request<'_>, poses: &Poses, hooks: &Hooks<'_>) ->
     Ok(run(&job, hooks)?.points)
 }
 
-/// Images of some moments, spread evenly over the frames of the first camera, with a pose; and the pairs of those that
-/// are of one moment. The image of another camera is the one nearest in time, without times the one with the same
-/// number.
+/// Images of some moments, spread evenly over the frames of the first camera, with a pose; and the pairs of
+/// those that are of one moment. The image of another camera is the one nearest in time, without times the one
+/// with the same number.
 fn moments(shots: &[Shot], poses: &Poses) -> (Vec<Shot>, Vec<(usize, usize)>) {
     let mut cameras: BTreeMap<&str, Vec<&Shot>> = BTreeMap::new();
     for shot in shots.iter().filter(|shot| poses.images.contains_key(&shot.name)) {

@@ -24,8 +24,8 @@ const VARIABLE: &str = "CIF_PYTHON";
 const MIN_TRACK: usize = 3;
 const MAX_ERROR_PX: f64 = 2.0;
 
-/// Points that two images with known poses see may lie this far from where they are seen: 1.5 % of them were more
-/// than a tenth of the scene from any surface, 3 % at twice the distance.
+/// Points that two images with known poses see may lie this far from where they are seen: 1.5 % of them were
+/// more than a tenth of the scene from any surface, 3 % at twice the distance.
 const MAX_ERROR_OF_TWO_PX: f64 = 1.0;
 
 static OWN: OnceLock<PathBuf> = OnceLock::new();

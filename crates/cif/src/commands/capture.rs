@@ -188,10 +188,12 @@ fn find(
     if fixed {
         poses.images = all_frames(&poses, &solved, shots);
         if verdict.is_good() || command.accept {
-            let points = structure::points_of_rig(&Request { shots, ..request }, &poses, hooks)?;
-            // Where a rig is wrong, mappers may have found points that its poses do not give.
-            if points.len() > poses.points.len() {
-                poses.points = points;
+            match structure::points_of_rig(&Request { shots, ..request }, &poses, hooks) {
+                // Where a rig is wrong, mappers may have found points that its poses do not give.
+                Ok(points) if points.len() > poses.points.len() => poses.points = points,
+                Ok(_) => {}
+                Err(cif_capture::Error::Stopped) => return Err(cif_capture::Error::Stopped.into()),
+                Err(error) => notes.push(format!("points are those of one moment alone: {error}")),
             }
         }
     }
