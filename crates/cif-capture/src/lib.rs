@@ -13,6 +13,7 @@
 //! | [`masks`] | what moves, and is left out |
 //! | [`times`] | tables of times by file name |
 //! | [`write`](mod@write) | the capture as nerfstudio's `transforms.json` |
+//! | [`unfinished`] | what is kept where no capture is written |
 //!
 //! Cameras look along +z with x right and y down until they are written. The same input gives the same
 //! capture, whatever the number of threads.
@@ -29,6 +30,7 @@ pub mod similarity;
 pub mod source;
 pub mod structure;
 pub mod times;
+pub mod unfinished;
 pub mod world;
 pub mod write;
 

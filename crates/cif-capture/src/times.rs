@@ -41,7 +41,7 @@ pub fn read(path: &Path) -> Result<BTreeMap<String, f64>, Error> {
 }
 
 /// The entry of a table that belongs to an image: by full name, by name without ending or folder, or, where
-/// one key alone fits, by name without both.
+/// one key alone fits, by its path without ending in some folder, then by name without both.
 pub(crate) fn entry<'a, T>(table: &'a BTreeMap<String, T>, name: &str) -> Option<&'a T> {
     let file = file_of(name);
     let keys = [name, without_ending(name), file, without_ending(file)];
@@ -52,8 +52,13 @@ pub(crate) fn entry<'a, T>(table: &'a BTreeMap<String, T>, name: &str) -> Option
     };
     keys.iter()
         .find_map(|key| table.get(*key))
-        .or_else(|| alone(&|key| without_ending(key) == without_ending(name)))
+        .or_else(|| alone(&|key| is_below(without_ending(key), without_ending(name))))
         .or_else(|| alone(&|key| without_ending(file_of(key)) == without_ending(file)))
+}
+
+/// True where a path is another one, or that in some folder.
+fn is_below(path: &str, other: &str) -> bool {
+    path.strip_suffix(other).is_some_and(|folder| folder.is_empty() || folder.ends_with(['/', '\\']))
 }
 
 fn file_of(name: &str) -> &str {
@@ -102,6 +107,8 @@ mod tests {
         let rig = BTreeMap::from([("left/1.png".to_owned(), 1), ("right/1.png".to_owned(), 2)]);
         assert_eq!(entry(&rig, "1.png"), None, "two fit alike");
         assert_eq!((entry(&rig, "right/1.jpg"), entry(&rig, "right/1.png")), (Some(&2), Some(&2)));
+        let rig = BTreeMap::from([("images/left/1.png".to_owned(), 1), ("images/right/1.png".to_owned(), 2)]);
+        assert_eq!((entry(&rig, "left/1.jpg"), entry(&rig, "ft/1.jpg")), (Some(&1), None), "in a folder");
         std::fs::write(&path, "a.png,0.5\nb.png,soon\n").unwrap();
         let error = read(&path).unwrap_err().to_string();
         assert!(error.contains("line 2"), "{error}");

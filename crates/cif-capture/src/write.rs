@@ -37,38 +37,48 @@ pub struct Capture<'a> {
 /// When something is at `place`, or the file system refuses.
 pub fn write(capture: &Capture<'_>, place: &Path, hooks: &Hooks<'_>) -> Result<(), Error> {
     let folder = NewFolder::create(place)?;
+    for shot in capture.shots.iter().filter(|shot| capture.poses.images.contains_key(&shot.name)) {
+        hooks.go_on()?;
+        copy(&shot.file, &inside(folder.path(), "images", &shot.name)?)?;
+        let Some(masks) = capture.masks else { continue };
+        let Some(mask) = masks.files.get(&shot.name) else { continue };
+        let name = mask_name(&shot.name);
+        copy(mask, &inside(folder.path(), "masks", &name)?)?;
+        let confidence = masks.folder.join("confidence").join(&name);
+        if confidence.is_file() {
+            copy(&confidence, &inside(&folder.path().join("masks"), "confidence", &name)?)?;
+        }
+    }
+    if let Some(labels) = capture.masks.and_then(Masks::labels) {
+        copy(&labels, &folder.path().join("masks/instances.json"))?;
+    }
+    write_cameras(capture, folder.path())?;
+    Ok(folder.finish()?)
+}
+
+/// Writes cameras and points, `transforms.json`, into a folder.
+pub(crate) fn write_cameras(capture: &Capture<'_>, folder: &Path) -> Result<(), Error> {
     let mut frames = Vec::new();
     let one_lens = capture.poses.lenses.len() == 1;
     // All images have a time, or none.
     let timed = capture.shots.iter().all(|shot| shot.time.is_some());
     let start = capture.shots.iter().filter_map(|shot| shot.time).fold(f64::INFINITY, f64::min);
     for shot in capture.shots {
-        hooks.go_on()?;
         let Some(pose) = capture.poses.images.get(&shot.name) else { continue };
-        copy(&shot.file, &inside(folder.path(), "images", &shot.name)?)?;
         let mut frame = Map::new();
         frame.insert("file_path".to_owned(), json!(format!("images/{}", shot.name)));
         if let Some(time) = shot.time.filter(|_| timed) {
             // Microseconds: cameras that record together have equal times.
             frame.insert("time".to_owned(), json!(((time - start) * 1e6).round() / 1e6));
         }
-        if let Some(mask) = capture.masks.and_then(|masks| masks.files.get(&shot.name)) {
-            let name = mask_name(&shot.name);
-            copy(mask, &inside(folder.path(), "masks", &name)?)?;
-            let confidence = capture.masks.map(|masks| masks.folder.join("confidence").join(&name));
-            if let Some(file) = confidence.filter(|file| file.is_file()) {
-                copy(&file, &inside(&folder.path().join("masks"), "confidence", &name)?)?;
-            }
-            frame.insert("mask_path".to_owned(), json!(format!("masks/{name}")));
+        if capture.masks.is_some_and(|masks| masks.files.contains_key(&shot.name)) {
+            frame.insert("mask_path".to_owned(), json!(format!("masks/{}", mask_name(&shot.name))));
         }
         if !one_lens {
             insert_lens(&mut frame, &scaled(&capture.poses.lenses[pose.lens], shot.size));
         }
         frame.insert("transform_matrix".to_owned(), matrix(pose));
         frames.push(Value::Object(frame));
-    }
-    if let Some(labels) = capture.masks.and_then(Masks::labels) {
-        copy(&labels, &folder.path().join("masks/instances.json"))?;
     }
     let mut file = Map::new();
     file.insert("camera_model".to_owned(), json!("OPENCV"));
@@ -80,7 +90,7 @@ pub fn write(capture: &Capture<'_>, place: &Path, hooks: &Hooks<'_>) -> Result<(
     }
     if !capture.poses.points.is_empty() {
         file.insert("ply_file_path".to_owned(), json!(POINTS));
-        let path = folder.path().join(POINTS);
+        let path = folder.join(POINTS);
         fs::write(&path, ply(&capture.poses.points)).map_err(Error::io("write", &path))?;
     }
     let known = json!({
@@ -90,10 +100,9 @@ pub fn write(capture: &Capture<'_>, place: &Path, hooks: &Hooks<'_>) -> Result<(
     });
     file.insert("cif".to_owned(), known);
     file.insert("frames".to_owned(), json!(frames));
-    let path = folder.path().join("transforms.json");
+    let path = folder.join("transforms.json");
     let text = format!("{:#}\n", Value::Object(file));
-    fs::write(&path, text).map_err(Error::io("write", &path))?;
-    Ok(folder.finish()?)
+    fs::write(&path, text).map_err(Error::io("write", &path))
 }
 
 /// Name of the mask of an image.
@@ -102,14 +111,14 @@ fn mask_name(image: &str) -> String {
 }
 
 /// A file in a folder of the capture, whose folders are made.
-fn inside(folder: &Path, kind: &str, name: &str) -> Result<PathBuf, Error> {
+pub(crate) fn inside(folder: &Path, kind: &str, name: &str) -> Result<PathBuf, Error> {
     let path = folder.join(kind).join(name);
     let parent = path.parent().unwrap_or(folder);
     fs::create_dir_all(parent).map_err(Error::io("create", parent))?;
     Ok(path)
 }
 
-fn copy(from: &Path, to: &Path) -> Result<(), Error> {
+pub(crate) fn copy(from: &Path, to: &Path) -> Result<(), Error> {
     // Not a link: what is done to the capture must not change the original.
     fs::copy(from, to).map(drop).map_err(Error::io("copy", from))
 }

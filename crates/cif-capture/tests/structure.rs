@@ -4,10 +4,11 @@ use std::path::Path;
 use std::process::Command;
 
 use cif_capture::frames::{self, Choice, Notes, Shot};
+use cif_capture::poses::{Lens, Point, Pose, Poses};
 use cif_capture::source::sources;
 use cif_capture::structure::{self, Found, Lenses, Order, Request};
 use cif_capture::{Error, Hooks};
-use cif_geometry::RigidTransform;
+use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec2, DVec3};
 
 const WIDTH: u32 = 240;
@@ -153,6 +154,52 @@ fn cameras_of_rendered_pictures_are_found_twice_alike() {
     assert!(difference.places < 0.02 && difference.median_angle.to_degrees() < 1.0, "{difference:?}");
     let again = find(folder.path(), &shots, "second").unwrap();
     assert_eq!(again.poses, found.poses, "the same input gives the same poses");
+}
+
+#[test]
+fn a_rig_sees_more_points_where_its_poses_are_known() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let cameras = cameras(5);
+    photographs(folder.path(), &cameras);
+    // Each picture is a camera of its own, which took it at one moment.
+    let mut shots = shots(folder.path());
+    shots.iter_mut().for_each(|shot| shot.camera = shot.name.clone());
+    let found = find(folder.path(), &shots, "moment").unwrap();
+    let lens = Lens {
+        size: (WIDTH, HEIGHT),
+        focal_px: [FOCAL; 2],
+        principal_px: [0.5 * f64::from(WIDTH), 0.5 * f64::from(HEIGHT)],
+        distortion: LensDistortion::default(),
+    };
+    let pose = |(shot, camera): (&Shot, &RigidTransform)| {
+        (shot.name.clone(), Pose { lens: 0, world_from_camera: *camera, points: 0 })
+    };
+    let images = shots.iter().zip(&cameras).map(pose).collect();
+    let poses = Poses { lenses: vec![lens], images, ..Poses::default() };
+    let work = folder.path().join("points");
+    let request = Request {
+        shots: &shots,
+        masks: None,
+        order: Order::Any,
+        lenses: Lenses::PerSize,
+        focal_px: None,
+        work: &work,
+        threads: 2,
+    };
+    let points = structure::points_of_rig(&request, &poses, &Hooks::silent()).unwrap();
+    let before = found.poses.points.len();
+    assert!(2 * points.len() > 3 * before, "{} after {before}", points.len());
+    // They lie on the floor, a wall or the box.
+    let distance = |point: &Point| {
+        let p = point.position;
+        let outside = (p.abs() - DVec3::new(0.4, 0.3, 0.6)).max(DVec3::ZERO).length();
+        p.z.abs().min((p.x + 2.0).abs()).min((p.y + 2.0).abs()).min(outside)
+    };
+    let far = points.iter().filter(|point| distance(point) > 0.05).count();
+    assert!(far * 20 < points.len(), "{far} of {}", points.len());
 }
 
 #[test]

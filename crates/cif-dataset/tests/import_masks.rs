@@ -5,76 +5,10 @@ mod support;
 
 use std::path::Path;
 
-use cif_dataset::masks::{Import, MaskWriter, SourceKind};
-use cif_dataset::{Dataset, OpenOptions};
+use cif_dataset::masks::{Import, SourceKind};
 use serde_json::json;
+use support::imports::*;
 use support::*;
-
-/// The mask of the tests: object 1 left of column 8, object 2 right of column 24, nothing between.
-fn object_at(x: u32) -> u32 {
-    match x {
-        0..8 => 1,
-        24.. => 2,
-        _ => 0,
-    }
-}
-
-/// Imports, writes and reads back; labels and the ids in columns 3, 12 and 30 of row 5 of each frame.
-fn imported(folder: &tempfile::TempDir, source: &Path) -> (SourceKind, Vec<String>, Vec<Option<[u16; 3]>>) {
-    let dataset = open(folder);
-    let import = Import::open(source, None, &dataset).unwrap();
-    let out = folder.path().join("imported");
-    let writer = MaskWriter::create(&out).unwrap();
-    for (index, frame) in dataset.frames.iter().enumerate() {
-        if let Some(drawn) = import.draw(&dataset, index).unwrap() {
-            writer.add(&frame.name, &drawn.ids, None).unwrap();
-        }
-    }
-    writer.finish(&import.instances).unwrap();
-    let options = OpenOptions { masks: Some("imported".into()), ..OpenOptions::default() };
-    let dataset = Dataset::open(folder.path(), &options).unwrap();
-    let columns = |index| {
-        let mask = dataset.load_mask(index).unwrap();
-        mask.map(|mask| [3, 12, 30].map(|x| *mask.at(x, 5)))
-    };
-    let frames = (0..dataset.frames.len()).map(columns).collect();
-    (import.kind, dataset.instances.iter().map(|instance| instance.label.clone()).collect(), frames)
-}
-
-fn failure_of(folder: &tempfile::TempDir, source: &Path) -> String {
-    let dataset = open(folder);
-    match Import::open(source, None, &dataset) {
-        Err(error) => error.to_string(),
-        Ok(import) => {
-            let drawn = (0..dataset.frames.len()).map(|index| import.draw(&dataset, index));
-            drawn.filter_map(Result::err).next().expect("an error").to_string()
-        }
-    }
-}
-
-const BOTH: Option<[u16; 3]> = Some([1, 0, 2]);
-
-/// COCO JSON of three frames; `edit` changes it.
-fn coco(path: &Path, edit: impl FnOnce(&mut serde_json::Value)) {
-    let images: Vec<_> = (0..3)
-        .map(|k| json!({"id": 10 + k, "file_name": format!("rgb/{k:06}.jpg"), "width": WIDTH, "height": HEIGHT}))
-        .collect();
-    let (w, h) = (u64::from(WIDTH), u64::from(HEIGHT));
-    let annotations: Vec<_> = (0..3)
-        .flat_map(|k| {
-            let polygon = json!([[0, 0, 8, 0, 8, HEIGHT, 0, HEIGHT]]);
-            let runs = json!({"size": [HEIGHT, WIDTH], "counts": [24 * h, (w - 24) * h]});
-            [(1, polygon), (2, runs)].map(|(track, segmentation)| {
-                json!({"id": 2 * k + track, "image_id": 10 + k, "category_id": 7, "track_id": track,
-                       "segmentation": segmentation})
-            })
-        })
-        .collect();
-    let mut value =
-        json!({"images": images, "annotations": annotations, "categories": [{"id": 7, "name": "mug"}]});
-    edit(&mut value);
-    write_json(path, &value);
-}
 
 #[test]
 fn colours_of_a_tracker_become_ids_in_one_table() {
@@ -177,46 +111,6 @@ fn npy_header(descr: &str, shape: &str) -> Vec<u8> {
     bytes.extend((header.len() as u16).to_le_bytes());
     bytes.extend(header.as_bytes());
     bytes
-}
-
-#[test]
-fn coco_objects_go_by_their_tracks_and_share_a_category() {
-    let folder = hypernerf(4);
-    let path = folder.path().join("coco.json");
-    coco(&path, |_| {});
-    let (kind, labels, frames) = imported(&folder, &path);
-    assert_eq!((kind, labels), (SourceKind::Coco, vec!["mug 1".to_owned(), "mug 2".to_owned()]));
-    assert_eq!(frames, [BOTH, BOTH, BOTH, None]);
-}
-
-#[test]
-fn damaged_coco_is_refused_by_entry() {
-    let folder = hypernerf(3);
-    let path = folder.path().join("coco.json");
-    type Edit = fn(&mut serde_json::Value);
-    let cases: [(Edit, &[&str]); 7] = [
-        (
-            |v| v["annotations"][1]["segmentation"]["counts"][1] = json!(999_999),
-            &["annotation 2", "broken run-length"],
-        ),
-        (|v| v["annotations"][1]["segmentation"]["counts"] = json!("~~"), &["annotation 2", "no letter"]),
-        (|v| v["annotations"][0]["category_id"] = json!(8), &["annotation 1", "category_id 8"]),
-        (|v| v["annotations"][0]["image_id"] = json!(99), &["annotation 1", "image_id 99"]),
-        (|v| v["annotations"][0]["segmentation"] = json!([]), &["annotation 1", "no segmentation"]),
-        (|v| v["images"][2]["width"] = json!(64), &["000002.jpg", "64 x 24", "32 x 24", "--downscale"]),
-        (
-            |v| v["annotations"].as_array_mut().unwrap().iter_mut().for_each(|a| a["track_id"] = json!(null)),
-            &["several annotations", "track_id"],
-        ),
-    ];
-    for (edit, words) in cases {
-        coco(&path, edit);
-        holds(&failure_of(&folder, &path), words);
-    }
-    coco(&path, |_| {});
-    let text = std::fs::read_to_string(&path).unwrap();
-    write(&path, &text[..text.len() / 2]);
-    holds(&failure_of(&folder, &path), &["coco.json:", "EOF"]);
 }
 
 #[test]

@@ -36,6 +36,21 @@ pub(crate) fn coco() -> String {
     .to_string()
 }
 
+pub(crate) fn youtube_vis() -> String {
+    let (width, height) = size();
+    let runs = [u64::from(height), u64::from(width - 1) * u64::from(height)];
+    json!({
+        "videos": [{"id": 1, "file_names": ["clip/000000.jpg", "clip/000001.jpg"], "width": width, "height": height}],
+        "categories": [{"id": 3, "name": "mug"}],
+        "annotations": [
+            {"id": 1, "video_id": 1, "category_id": 3, "segmentations": [[[0, 0, 3, 0, 3, 3, 0, 3]], null]},
+            {"id": 2, "video_id": 1, "category_id": 3,
+             "segmentations": [null, {"size": [height, width], "counts": runs}]},
+        ],
+    })
+    .to_string()
+}
+
 pub(crate) fn label_studio() -> String {
     let (width, height) = size();
     // All opaque: runs of up to 2^16 values.

@@ -102,6 +102,16 @@ pub(crate) fn all() -> Vec<Reader> {
             read: |folder| mask_files::import(folder, "coco.json"),
         },
         Reader {
+            name: "masks-youtube-vis",
+            file: "vis.json",
+            form: Form::Json,
+            write: |folder| {
+                hypernerf(folder);
+                fs::write(folder.join("vis.json"), mask_files::youtube_vis()).unwrap();
+            },
+            read: |folder| mask_files::import(folder, "vis.json"),
+        },
+        Reader {
             name: "masks-label-studio",
             file: "tasks.json",
             form: Form::Json,

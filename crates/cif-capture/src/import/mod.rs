@@ -10,6 +10,7 @@ use crate::frames::Shot;
 use crate::poses::{Lens, Point, Pose, Poses};
 use crate::times::entry;
 
+mod metashape;
 mod polycam;
 mod reality_capture;
 #[cfg(test)]
@@ -56,10 +57,14 @@ pub fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
     if ending.as_deref() == Some("csv") {
         return reality_capture::read(path, shots);
     }
+    if ending.as_deref() == Some("xml") {
+        return metashape::read(path);
+    }
     Err(Error::refused(
         format!("{}: it holds no poses of a tool that is known", path.display()),
         "give a COLMAP model (cameras.bin or cameras.txt), a nerfstudio transforms.json, the folder of a Polycam \
-         export with keyframes/, or a RealityCapture registration as .csv (Internal/External camera parameters)",
+         export with keyframes/, a RealityCapture registration as .csv (Internal/External camera parameters), or \
+         cameras of Metashape as .xml (Agisoft XML)",
     ))
 }
 

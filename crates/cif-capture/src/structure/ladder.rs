@@ -19,6 +19,9 @@ use crate::{Error, Hooks};
 /// Thresholds of features, in order: COLMAP's own (1/150), and lower ones for more features.
 const PEAKS: [Option<f64>; 3] = [None, Some(0.002), Some(0.001)];
 
+/// Lenses of COLMAP that are fitted.
+pub(super) const LENS_MODEL: &str = "SIMPLE_RADIAL";
+
 /// Images have, in the median, fewer features than this where they are blurred or show nothing but plain
 /// surfaces.
 const FEW_FEATURES: usize = 40;
@@ -88,9 +91,10 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
                 names: &names,
                 pairs: &pairs,
                 cameras: &groups,
-                model: "SIMPLE_RADIAL",
+                model: LENS_MODEL,
                 peak,
                 runs,
+                poses: None,
                 threads: request.threads,
             };
             run(&job, hooks)
@@ -146,7 +150,7 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
 
 /// Puts images and masks into folders of their own under names that COLMAP's lists can hold, which has no
 /// spaces.
-fn stage(request: &Request<'_>, images: &Path, masks: &Path) -> Result<Vec<String>, Error> {
+pub(super) fn stage(request: &Request<'_>, images: &Path, masks: &Path) -> Result<Vec<String>, Error> {
     let mut names = Vec::with_capacity(request.shots.len());
     for folder in [images, masks] {
         std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
@@ -180,7 +184,7 @@ fn rung(
     solve: &dyn Fn(&[Run]) -> Result<Outcome, Error>,
 ) -> Result<(Vec<usize>, Option<Model>), Error> {
     let first = [Run { mapper: Mapper::Global, seed: 1 }, Run { mapper: Mapper::Incremental, seed: 2 }];
-    let Outcome { features, runs } = solve(&first)?;
+    let Outcome { features, runs, .. } = solve(&first)?;
     let features: Vec<usize> = features.into_values().collect();
     let mut runs = runs.into_iter();
     let (global, incremental) = (runs.next().flatten(), runs.next().flatten());
@@ -213,7 +217,7 @@ fn reason(verdict: &Verdict) -> String {
 }
 
 /// Images that share a lens.
-fn groups(request: &Request<'_>) -> Vec<Group> {
+pub(super) fn groups(request: &Request<'_>) -> Vec<Group> {
     let mut groups: BTreeMap<(&str, (u32, u32)), Vec<usize>> = BTreeMap::new();
     for (index, shot) in request.shots.iter().enumerate() {
         let camera = match request.lenses {
@@ -222,7 +226,10 @@ fn groups(request: &Request<'_>) -> Vec<Group> {
         };
         groups.entry((camera, shot.size)).or_default().push(index);
     }
-    let group = |((_, size), images)| Group { images, focal_px: request.focal_px, size };
+    let params = |(width, height): (u32, u32)| {
+        request.focal_px.map(|focal| [focal, 0.5 * f64::from(width), 0.5 * f64::from(height), 0.0])
+    };
+    let group = |((_, size), images)| Group { images, params: params(size), size };
     groups.into_iter().map(group).collect()
 }
 
@@ -247,7 +254,11 @@ mod tests {
         let asked = RefCell::new(Vec::new());
         let solve = |runs: &[Run]| {
             asked.borrow_mut().extend(runs.iter().map(|run| (run.mapper, run.seed)));
-            Ok(Outcome { features: BTreeMap::new(), runs: runs.iter().map(|run| answer(*run)).collect() })
+            Ok(Outcome {
+                features: BTreeMap::new(),
+                runs: runs.iter().map(|run| answer(*run)).collect(),
+                points: Vec::new(),
+            })
         };
         let found = rung(20, &solve).unwrap().1;
         (found, asked.into_inner())

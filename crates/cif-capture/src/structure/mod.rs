@@ -3,10 +3,12 @@
 
 mod ladder;
 mod pairs;
+mod points;
 mod python;
 mod verdict;
 
 pub use ladder::{Found, Lenses, Request, find};
 pub use pairs::Order;
+pub use points::points_of_rig;
 pub use python::set_python;
 pub use verdict::{Check, Verdict, judge};

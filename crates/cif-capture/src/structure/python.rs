@@ -24,6 +24,10 @@ const VARIABLE: &str = "CIF_PYTHON";
 const MIN_TRACK: usize = 3;
 const MAX_ERROR_PX: f64 = 2.0;
 
+/// Points that two images with known poses see may lie this far from where they are seen: 1.5 % of them were
+/// more than a tenth of the scene from any surface, 3 % at twice the distance.
+const MAX_ERROR_OF_TWO_PX: f64 = 1.0;
+
 static OWN: OnceLock<PathBuf> = OnceLock::new();
 
 /// Names the Python that this process is part of; the first call counts. `CIF_PYTHON` still wins.
@@ -54,14 +58,33 @@ pub(super) struct Job<'a> {
     pub(super) model: &'static str,
     pub(super) peak: Option<f64>,
     pub(super) runs: &'a [Run],
+    /// Where images are known to be, by name, for points.
+    pub(super) poses: Option<BTreeMap<String, KnownPose>>,
     pub(super) threads: usize,
+}
+
+/// Where an image is known to be: camera from world.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct KnownPose {
+    /// Quaternion w, x, y, z.
+    rotation: [f64; 4],
+    translation: [f64; 3],
+}
+
+impl KnownPose {
+    pub(super) fn of(world_from_camera: &RigidTransform) -> Self {
+        let camera_from_world = world_from_camera.inverse();
+        let [x, y, z, w] = DQuat::from_mat3(&camera_from_world.rotation).to_array();
+        Self { rotation: [w, x, y, z], translation: camera_from_world.translation.to_array() }
+    }
 }
 
 /// Images that share a lens.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Group {
     pub(super) images: Vec<usize>,
-    pub(super) focal_px: Option<f64>,
+    /// Of the lens to start from: focal length, principal point, distortion.
+    pub(super) params: Option<[f64; 4]>,
     pub(super) size: (u32, u32),
 }
 
@@ -89,6 +112,8 @@ pub(super) struct Outcome {
     pub(super) features: BTreeMap<String, usize>,
     /// Poses of the largest model of every run.
     pub(super) runs: Vec<Option<Poses>>,
+    /// Points that images with known poses see.
+    pub(super) points: Vec<Point>,
 }
 
 #[derive(Deserialize)]
@@ -100,6 +125,8 @@ struct AnswerJson {
     features: BTreeMap<String, usize>,
     #[serde(default)]
     runs: Vec<Option<ModelJson>>,
+    #[serde(default)]
+    points: Vec<PointJson>,
 }
 
 #[derive(Deserialize)]
@@ -132,6 +159,12 @@ struct PointJson {
     color: [u8; 3],
     error: f64,
     images: usize,
+}
+
+impl PointJson {
+    fn point(&self) -> Point {
+        Point { position: DVec3::from_array(self.position), color: self.color }
+    }
 }
 
 /// Runs a job.
@@ -193,7 +226,12 @@ fn words_of(text: &str) -> String {
 
 fn outcome(answer: AnswerJson) -> Result<Outcome, Error> {
     let runs = answer.runs.into_iter().map(|model| model.map(poses).transpose());
-    Ok(Outcome { features: answer.features, runs: runs.collect::<Result<_, _>>()? })
+    // Where poses are known, two views tell a place too, if they agree well.
+    let is_sure = |point: &&PointJson| {
+        (point.images >= MIN_TRACK && point.error <= MAX_ERROR_PX) || point.error <= MAX_ERROR_OF_TWO_PX
+    };
+    let points = answer.points.iter().filter(is_sure).map(PointJson::point).collect();
+    Ok(Outcome { features: answer.features, runs: runs.collect::<Result<_, _>>()?, points })
 }
 
 /// A model in the types of this crate.
@@ -234,7 +272,7 @@ fn poses(model: ModelJson) -> Result<Poses, Error> {
         .points
         .iter()
         .filter(|point| point.images >= MIN_TRACK && point.error <= MAX_ERROR_PX)
-        .map(|point| Point { position: DVec3::from_array(point.position), color: point.color })
+        .map(PointJson::point)
         .collect();
     Ok(Poses { lenses, images, points, reprojection_px: Some(model.reprojection_px) })
 }

@@ -3,15 +3,18 @@
 Reads one job as JSON from standard input and answers with one JSON object on standard output; what pycolmap
 itself prints goes to standard error, among lines ``@ WORDS`` that tell the progress.
 
-Job: ``work`` (folder for databases), ``images`` (folder), ``masks`` (folder of ``NAME.png``, black is left out,
-or null), ``names`` (images in the folder, without spaces), ``pairs`` (of indices into ``names``), ``cameras``
-(``images``, indices of those that share a lens, their ``size``, and ``focal_px`` or null), ``model`` (of the
-lens), ``peak`` (threshold of features or null), ``runs`` (``mapper``, ``global`` or ``incremental``, and
-``seed``), ``threads``. Features and matches are kept in ``work``, for other runs of the same ``peak``.
+Job: ``work`` (folder for databases), ``images`` (folder), ``masks`` (folder of ``NAME.png``, black is left
+out, or null), ``names`` (images in the folder, without spaces), ``pairs`` (of indices into ``names``),
+``cameras`` (``images``, indices of those that share a lens, their ``size``, and ``params`` of the lens or
+null), ``model`` (of the lens), ``peak`` (threshold of features or null), ``runs`` (``mapper``, ``global`` or
+``incremental``, and ``seed``), ``poses`` (null, or where images are known to be, by name: ``rotation`` as
+quaternion w, x, y, z and ``translation``, camera from world), ``threads``. Features and matches are kept in
+``work``, for other runs of the same ``peak``.
 
-Answer: ``features`` (per image) and ``runs``, one for each that was asked for: null, or the largest model with
+Answer: ``features`` (per image), ``runs``, one for each that was asked for: null, or the largest model with
 its lenses, images (``camera_from_world`` as quaternion w, x, y, z and translation), points with colour and
-error in pixels. Where pycolmap cannot be imported: ``missing``, ``python`` and ``version``.
+error in pixels; and ``points`` that images with known poses see. Where pycolmap cannot be imported:
+``missing``, ``python`` and ``version``.
 """
 
 import sys
@@ -46,13 +49,7 @@ def extract_and_match(pycolmap, job, database):
     tell("features")
     for camera in job["cameras"]:
         names = [job["names"][index] for index in camera["images"]]
-        if camera["focal_px"]:
-            width, height = camera["size"]
-            rest = {"SIMPLE_RADIAL": [0.0], "SIMPLE_PINHOLE": []}[job["model"]]
-            params = [camera["focal_px"], width / 2, height / 2, *rest]
-            reader.camera_params = ",".join(repr(float(value)) for value in params)
-        else:
-            reader.camera_params = ""
+        reader.camera_params = ",".join(repr(float(value)) for value in camera["params"] or [])
         mode = pycolmap.CameraMode.SINGLE
         pycolmap.import_images(database, job["images"], camera_mode=mode, image_names=names, options=reader)
         pycolmap.extract_features(
@@ -105,6 +102,44 @@ def reconstruct(pycolmap, job, database, mapper, seed):
     return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
+def triangulated(pycolmap, job, database):
+    """Return the model of images whose poses are known, with the points that two or more of them see."""
+    tell("points")
+    import numpy
+
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(database) as opened:
+        for camera in opened.read_all_cameras():
+            model.add_camera_with_trivial_rig(camera)
+        for image in opened.read_all_images():
+            pose = job["poses"][image.name]
+            w, x, y, z = pose["rotation"]
+            rotation = pycolmap.Rotation3d(numpy.array([x, y, z, w]))
+            place = pycolmap.Rigid3d(rotation, numpy.array(pose["translation"]))
+            known = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image.image_id)
+            model.add_image_with_trivial_frame(known, place)
+    output = database.with_suffix(".points")
+    output.mkdir(exist_ok=True)
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = 1
+    options.random_seed = 1
+    options.triangulation.ignore_two_view_tracks = False
+    return pycolmap.triangulate_points(model, database, job["images"], output, options=options)
+
+
+def points_of(model):
+    """Return the points of a model as JSON."""
+    return [
+        {
+            "position": [float(value) for value in point.xyz],
+            "color": [int(value) for value in point.color],
+            "error": float(point.error),
+            "images": len({element.image_id for element in point.track.elements}),
+        }
+        for _, point in sorted(model.points3D.items())
+    ]
+
+
 def described(model):
     """Return a model as JSON."""
     images = {}
@@ -127,19 +162,10 @@ def described(model):
         }
         for number, camera in model.cameras.items()
     }
-    points = [
-        {
-            "position": [float(value) for value in point.xyz],
-            "color": [int(value) for value in point.color],
-            "error": float(point.error),
-            "images": len({element.image_id for element in point.track.elements}),
-        }
-        for _, point in sorted(model.points3D.items())
-    ]
     return {
         "cameras": cameras,
         "images": images,
-        "points": points,
+        "points": points_of(model),
         "reprojection_px": float(model.compute_mean_reprojection_error()),
     }
 
@@ -166,7 +192,8 @@ def main():
     for run in job["runs"]:
         model = reconstruct(pycolmap, job, database, run["mapper"], run["seed"])
         runs.append(described(model) if model else None)
-    json.dump({"features": features, "runs": runs}, answer)
+    points = points_of(triangulated(pycolmap, job, database)) if job["poses"] else []
+    json.dump({"features": features, "runs": runs, "points": points}, answer)
     answer.flush()
 
 

@@ -6,6 +6,8 @@
     reason = "test helpers; each test file uses its own part"
 )]
 
+pub mod imports;
+
 use std::fs;
 use std::path::Path;
 

@@ -3,6 +3,7 @@
 mod options;
 mod report;
 mod scale;
+mod unfinished;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -72,43 +73,62 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
     let mut notes = Notes::new();
     let mut shots =
         frames::collect(&sources, &choice(command), &scratch.path().join("frames"), &hooks, &mut notes)?;
+    let mut unbelieved = None;
+    let made = make(command, &mut shots, scratch.path(), &hooks, &mut notes, &mut unbelieved);
+    if made.is_err() {
+        unfinished::keep(command, &sources, &shots, unbelieved.as_ref());
+    }
+    made
+}
+
+/// Finds or reads the poses of images and writes the capture. Poses that are not believed are left in `unbelieved`.
+fn make(
+    command: &Capture,
+    shots: &mut [Shot],
+    scratch: &Path,
+    hooks: &Hooks<'_>,
+    notes: &mut Notes,
+    unbelieved: &mut Option<Posed>,
+) -> Result<(), Error> {
     if let Some(path) = &command.times {
-        times::apply(&times::read(path)?, path, &mut shots)?;
+        times::apply(&times::read(path)?, path, shots)?;
     }
     let masks = match &command.masks {
-        Some(folder) => Some(masks::find(folder, &shots)?),
+        Some(folder) => Some(masks::find(folder, shots)?),
         None => None,
     };
     let known = scale::Known::of(command, masks.as_ref())?;
     let mut posed = match &command.poses {
         Some(path) => {
             let Imported { poses, tool, metres_known, up_known, .. } =
-                import::read(path, &shots)?.matched(path, &mut shots)?;
+                import::read(path, shots)?.matched(path, shots)?;
             let from = format!("{tool} ({})", path.display());
             Posed { poses, from, verdict: None, metres_known, up_known }
         }
-        None => find(command, &shots, masks.as_ref(), scratch.path(), &hooks, &mut notes)?,
+        None => find(command, shots, masks.as_ref(), scratch, hooks, notes)?,
     };
-    for note in &notes {
+    for note in notes.iter() {
         eprintln!("note: {note}");
     }
     if let Some(verdict) = posed.verdict.as_ref().filter(|verdict| !verdict.is_good()) {
         if !command.accept {
-            return Err(report::not_believed(command, verdict, shots.len()));
+            let error = report::not_believed(command, verdict, shots.len());
+            *unbelieved = Some(posed);
+            return Err(error);
         }
         eprintln!("warning: the verdict says no, and the capture is written because of --accept:\n{verdict}");
     }
-    let lines = scale::settle(command, &known, &shots, masks.as_ref(), &mut posed, &hooks)?;
+    let lines = scale::settle(command, &known, shots, masks.as_ref(), &mut posed, hooks)?;
     let capture = Written {
-        shots: &shots,
+        shots,
         poses: &posed.poses,
         masks: masks.as_ref(),
         metres_known: posed.metres_known,
         up_known: posed.up_known,
         poses_from: &posed.from,
     };
-    write::write(&capture, place, &hooks)?;
-    report::print(command, &shots, masks.as_ref(), &posed, &lines);
+    write::write(&capture, &command.output, hooks)?;
+    report::print(command, shots, masks.as_ref(), &posed, &lines);
     Ok(())
 }
 
@@ -132,7 +152,7 @@ fn find(
     hooks: &Hooks<'_>,
     notes: &mut Notes,
 ) -> Result<Posed, Error> {
-    let fixed = command.fixed || (!command.moving && frames::is_fixed(shots));
+    let fixed = is_fixed(command, shots);
     frames::check(shots, fixed, notes)?;
     let mut solved: Vec<Shot> = shots.to_vec();
     if fixed {
@@ -151,16 +171,10 @@ fn find(
     }
     let work = scratch.join("work");
     std::fs::create_dir_all(&work).map_err(Error::io("create", &work))?;
-    let is_video = solved.iter().any(|shot| shot.time.is_some()) && command.times.is_none();
     let request = Request {
         shots: &solved,
         masks: masks.map(|_| black.as_path()),
-        order: match command.order {
-            OrderName::Sequence => Order::Sequence,
-            OrderName::Any => Order::Any,
-            OrderName::Auto if fixed || (!is_video && solved.len() <= ANY_ORDER) => Order::Any,
-            OrderName::Auto => Order::Sequence,
-        },
+        order: order(command, &solved, fixed),
         lenses: match command.lenses {
             LensesName::One => Lenses::PerSize,
             LensesName::Each => Lenses::PerCamera,
@@ -173,6 +187,15 @@ fn find(
     notes.extend(tried.into_iter().map(|tried| format!("not believed: {tried}")));
     if fixed {
         poses.images = all_frames(&poses, &solved, shots);
+        if verdict.is_good() || command.accept {
+            match structure::points_of_rig(&Request { shots, ..request }, &poses, hooks) {
+                // Where a rig is wrong, mappers may have found points that its poses do not give.
+                Ok(points) if points.len() > poses.points.len() => poses.points = points,
+                Ok(_) => {}
+                Err(cif_capture::Error::Stopped) => return Err(cif_capture::Error::Stopped.into()),
+                Err(error) => notes.push(format!("points are those of one moment alone: {error}")),
+            }
+        }
     }
     Ok(Posed {
         poses,
@@ -181,6 +204,22 @@ fn find(
         metres_known: false,
         up_known: false,
     })
+}
+
+/// True where the cameras stand still, as told or seen.
+fn is_fixed(command: &Capture, shots: &[Shot]) -> bool {
+    command.fixed || (!command.moving && frames::is_fixed(shots))
+}
+
+/// How images that are solved follow each other.
+fn order(command: &Capture, solved: &[Shot], fixed: bool) -> Order {
+    let is_video = solved.iter().any(|shot| shot.time.is_some()) && command.times.is_none();
+    match command.order {
+        OrderName::Sequence => Order::Sequence,
+        OrderName::Any => Order::Any,
+        OrderName::Auto if fixed || (!is_video && solved.len() <= ANY_ORDER) => Order::Any,
+        OrderName::Auto => Order::Sequence,
+    }
 }
 
 /// Every frame of a fixed camera has the pose of the one that was solved.

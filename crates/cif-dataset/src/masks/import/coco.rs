@@ -48,9 +48,9 @@ struct Annotation {
 }
 
 #[derive(Deserialize)]
-struct Category {
-    id: Value,
-    name: String,
+pub(super) struct Category {
+    pub(super) id: Value,
+    pub(super) name: String,
 }
 
 /// An id, number or text, as text; `None` where there is none.
@@ -119,7 +119,8 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     Ok(result)
 }
 
-fn shape_of(segmentation: &Value) -> Result<Shape, String> {
+/// The pixels of a segmentation: outlines, or a run-length code by columns, as numbers or text.
+pub(super) fn shape_of(segmentation: &Value) -> Result<Shape, String> {
     const EXPECTED: &str =
         "its segmentation is neither polygons ([[x, y, ...]]) nor a run-length code ({\"size\", \"counts\"})";
     match segmentation {

@@ -25,6 +25,8 @@ pub enum SourceKind {
     Arrays,
     /// COCO JSON.
     Coco,
+    /// JSON of YouTube-VIS: videos, and objects with a mask per frame.
+    YoutubeVis,
     /// JSON export of Label Studio.
     LabelStudio,
     /// XML 1.1 of CVAT, for images or video.
@@ -42,6 +44,7 @@ impl SourceKind {
             Self::Mattes => "EXR mattes, a channel per object",
             Self::Arrays => "NumPy arrays of ids",
             Self::Coco => "COCO JSON",
+            Self::YoutubeVis => "YouTube-VIS JSON",
             Self::LabelStudio => "a Label Studio export",
             Self::Cvat => "a CVAT export",
         }
@@ -72,7 +75,7 @@ fn of_file(source: &Path) -> Result<SourceKind, Error> {
     } else if is(&files::ENDINGS) {
         "give the folder of the pictures"
     } else {
-        "give a folder of PNG, EXR or NumPy files, a JSON file of COCO or Label Studio, or an XML file of CVAT"
+        "give a folder of PNG, EXR or NumPy files, a JSON file of COCO, YouTube-VIS or Label Studio, or an XML file of CVAT"
     };
     Err(Error::invalid(source, format!("not known as masks; {fix}")))
 }
@@ -83,13 +86,16 @@ fn of_json(source: &Path) -> Result<SourceKind, Error> {
     if has(&value, "images") && has(&value, "annotations") {
         return Ok(SourceKind::Coco);
     }
+    if has(&value, "videos") && has(&value, "annotations") {
+        return Ok(SourceKind::YoutubeVis);
+    }
     if value.as_array().is_some_and(|tasks| tasks.iter().any(|task| has(task, "annotations"))) {
         return Ok(SourceKind::LabelStudio);
     }
     Err(Error::invalid(
         source,
-        "neither COCO (an object with images and annotations) nor a JSON export of Label Studio (a list of tasks with \
-         annotations); export it in one of these",
+        "neither COCO (an object with images and annotations), YouTube-VIS (with videos and annotations), nor a JSON export \
+         of Label Studio (a list of tasks with annotations); export it in one of these",
     ))
 }
 

@@ -7,7 +7,7 @@
 //! | `objects` | which objects there are, and which ids and labels they get |
 //! | `draw` | which object a pixel belongs to, where several claim it |
 //! | `runs`, `polygon`, `brush` | which pixels a run-length code, a polygon or a brush covers |
-//! | `tracker`, `files`, `mattes`, `arrays`, `coco`, `label_studio`, `cvat` | what a source holds, one file each |
+//! | `tracker`, `files`, `mattes`, `arrays`, `coco`, `youtube_vis`, `label_studio`, `cvat` | what a source holds, one file each |
 //!
 //! Readers list what a source holds without decoding pictures; [`Import::draw`] decodes one frame at a time.
 
@@ -27,6 +27,7 @@ mod runs;
 #[cfg(test)]
 mod tests;
 mod tracker;
+mod youtube_vis;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -125,6 +126,7 @@ impl Import {
             SourceKind::Mattes => mattes::list(source)?,
             SourceKind::Arrays => arrays::list(source)?,
             SourceKind::Coco => coco::list(source)?,
+            SourceKind::YoutubeVis => youtube_vis::list(source, &names)?,
             SourceKind::LabelStudio => label_studio::list(source)?,
             SourceKind::Cvat => cvat::list(source)?,
         };

@@ -20,12 +20,13 @@ on the PATH; poses need pycolmap, which `pip install cif[capture]` brings.
 
 Poses are found by both mappers of COLMAP, and again with more features where these disagree. The verdict looks at the
 share of images with a pose, the reprojection error, the focal length and how far two runs are apart; where it says no,
-nothing is written (--accept writes it all the same). Poses from images know neither metre nor up: up is taken from how
+no capture is written (--accept writes it all the same), but frames of videos and the poses are kept in DIR-unfinished,
+and the commands that go on from there are told. Poses from images know neither metre nor up: up is taken from how
 the cameras were held, the metre from --length or --measured, and the capture tells what is known.
 
-Cameras of a rig that stand still are told by their pictures; they are solved at one moment. Frames of a video are called
-by their number in the stream (000123.png), so that masks fit later calls with the same frames. Times are those of the
-stream, or of a table: one line per image with its name, a comma, and seconds.")]
+Cameras of a rig that stand still are told by their pictures; they are solved at one moment, and give the points of four.
+Frames of a video are called by their number in the stream (000123.png), so that masks fit later calls with the same
+frames. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
 pub(in crate::commands) struct Capture {
     /// Videos and folders of photographs, one per camera
     #[arg(required = true, value_name = "INPUT")]
@@ -81,8 +82,8 @@ pub(in crate::commands) struct Capture {
     /// The cameras move, though most of their pictures stays as it is
     #[arg(long, help_heading = "Poses")]
     pub(super) moving: bool,
-    /// Take poses of another tool: a COLMAP model, a nerfstudio transforms.json, a Polycam export, or a
-    /// RealityCapture registration (.csv)
+    /// Take poses of another tool: a COLMAP model, a nerfstudio transforms.json, a Polycam export, a
+    /// RealityCapture registration (.csv), or cameras of Metashape (.xml)
     #[arg(long, value_name = "FROM", conflicts_with_all = ["focal", "fixed", "moving"], help_heading = "Poses")]
     pub(super) poses: Option<PathBuf>,
     /// Write the capture even where the verdict says no

@@ -84,7 +84,7 @@ pub(super) fn not_believed(command: &Capture, verdict: &Verdict, images: usize) 
     advice.push("take poses of another tool (--poses)");
     advice.push("or write it all the same (--accept)");
     Error::failed(
-        format!("poses were found, but they are not to be believed, and nothing was written:\n{verdict}"),
+        format!("poses were found, but they are not to be believed, and no capture was written:\n{verdict}"),
         advice.join("; "),
     )
 }

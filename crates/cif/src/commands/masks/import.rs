@@ -24,6 +24,7 @@ Recognised by what they hold, or named with --from:
   mattes          FRAME.exr with a channel per object
   arrays          NumPy ids: FRAME.npy or .npz with [height, width], or one file with [frames, height, width]
   coco            COCO JSON: run-length codes or polygons, objects by track_id
+  youtube-vis     JSON of YouTube-VIS: objects of a video with a run-length code or polygons per frame
   label-studio    JSON export of Label Studio: brushes and polygons, objects by label
   cvat            XML 1.1 of CVAT, for images (polygons, masks; objects by track_id, else label) or video (tracks)
 
@@ -68,6 +69,7 @@ enum From {
     Mattes,
     Arrays,
     Coco,
+    YoutubeVis,
     LabelStudio,
     Cvat,
 }
@@ -81,6 +83,7 @@ impl From {
             Self::Mattes => SourceKind::Mattes,
             Self::Arrays => SourceKind::Arrays,
             Self::Coco => SourceKind::Coco,
+            Self::YoutubeVis => SourceKind::YoutubeVis,
             Self::LabelStudio => SourceKind::LabelStudio,
             Self::Cvat => SourceKind::Cvat,
         }
