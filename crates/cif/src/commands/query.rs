@@ -15,9 +15,7 @@ use super::scene;
 use crate::error::Error;
 use crate::formats::Content;
 
-/// Find objects by label, time, place, or masks; or tell what is at a place
-#[derive(Debug, Args)]
-#[command(after_help = "\
+const HELP: &str = "\
 Without conditions every object is listed; several conditions must all hold. Labels match the name,
 class or unique name of an object; case does not matter, * stands for any characters and ? for one.
 Boxes hold the splats to three standard deviations; volumes are those of the colliders, where there
@@ -38,8 +36,28 @@ found) named FRAME.png, FRAME_*.png or FRAME/*.png. Instances are chosen that li
 masks of training frames; --eval renders them from held-out frames and compares with the masks there.
 
   cif query table.cif --masks found --capture captures/table --eval
+
+By a prompt: Grounding DINO finds boxes (scores of 0.3) and SAM the masks in them, both ONNX models of
+yours; their masks are kept in CAPTURE/.cif-cache. Or a command of your own does it.
+
+  cif query table.cif --prompt 'steel jug' --capture captures/table --models models
+  cif query table.cif --prompt 'steel jug' --capture captures/table --models models \\
+      --protocol grouping --eval
   cif query table.cif --prompt 'steel jug' --capture captures/table \\
-      --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'")]
+      --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'
+
+Models are run by ONNX Runtime (pip install 'cif[vision]', or ORT_DYLIB_PATH); nothing is downloaded.
+Their folder has a file such as this, with the names of your exports:
+
+";
+
+fn help() -> String {
+    format!("{HELP}{}", cif_vision::models::EXAMPLE)
+}
+
+/// Find objects by label, time, place, or masks; or tell what is at a place
+#[derive(Debug, Args)]
+#[command(after_help = help())]
 pub(super) struct Query {
     /// Trained scene (.cif), or a file of any format that cif export writes
     #[arg(value_name = "FILE")]
@@ -76,6 +94,9 @@ pub(super) struct Query {
     /// Interval of time: objects that are there at any time in it
     #[arg(long, value_name = "FROM:TO", conflicts_with = "time", allow_hyphen_values = true)]
     interval: Option<String>,
+    /// Folder of ONNX models with a models.toml, which answer --prompt
+    #[arg(long, value_name = "DIR")]
+    models: Option<PathBuf>,
     /// Read layers that a stage brings in from outside its folder
     #[arg(long)]
     follow_external: bool,
@@ -89,6 +110,9 @@ pub(super) struct Query {
 pub(super) fn run(command: &Query) -> Result<(), Error> {
     if command.by_masks.is_asked() {
         return by_masks::run(command);
+    }
+    if command.models.is_some() {
+        return Err(Error::usage("--models answers --prompt", "add --prompt TEXT --capture CAPTURE"));
     }
     let content = Content::of(&command.path)?;
     let is_field = matches!(content, Content::Field);
