@@ -59,11 +59,15 @@ impl Cache {
 #[must_use]
 pub fn boxes(file: &Path, (width, height): (u32, u32)) -> Option<Vec<FoundBox>> {
     let mut reader = png::Decoder::new(BufReader::new(cif_input::open(file).ok()?)).read_info().ok()?;
+    // Before memory is taken for what a broken header says.
+    if (reader.info().width, reader.info().height) != (width, height) {
+        return None;
+    }
     let mut pixels = vec![0; reader.output_buffer_size()?];
-    let info = reader.next_frame(&mut pixels).ok()?;
+    reader.next_frame(&mut pixels).ok()?;
     reader.finish().ok()?;
     let text = reader.info().utf8_text.iter().find(|text| text.keyword == KEYWORD)?.get_text().ok()?;
-    if (info.width, info.height) == (width, height) { serde_json::from_str(&text).ok() } else { None }
+    serde_json::from_str(&text).ok()
 }
 
 /// Writes a mask, white on black, with the boxes that it was found in; missing folders on the way are made.

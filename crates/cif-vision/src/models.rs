@@ -140,10 +140,12 @@ impl Models {
         &self.folder
     }
 
-    /// True where the folder has models that make embeddings.
-    #[must_use]
-    pub fn has_embedder(&self) -> bool {
-        self.content.embedder.is_some()
+    /// Name of the models that make embeddings.
+    ///
+    /// # Errors
+    /// When the folder has none.
+    pub fn embedder_name(&self) -> Result<&str, Error> {
+        self.embedder().map(|(name, ..)| name)
     }
 
     pub(crate) fn detector(&self) -> Result<&Network, Error> {
@@ -263,8 +265,7 @@ mod tests {
         let models = Models::open(models.path()).unwrap();
         assert_eq!(models.detector().unwrap().outputs["boxes"], "b");
         assert!(models.segmenter().unwrap_err().to_string().contains("no [segmenter]"));
-        assert!(!models.has_embedder());
-        assert!(models.embedder().unwrap_err().to_string().contains("no [embedder]"));
+        assert!(models.embedder_name().unwrap_err().to_string().contains("no [embedder]"));
     }
 
     #[test]

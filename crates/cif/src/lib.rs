@@ -17,6 +17,7 @@
 //! | [`formats`] | the formats that scenes are exchanged in |
 //! | [`mask_query`] | which objects 2D masks show |
 //! | [`detector`] | what makes such masks: a command, or models |
+//! | [`instance_views`] | which views show an object best, and what they show of it |
 //! | [`ground_truth`] | exported motion against known motion |
 //! | [`error`] | what is reported, and the exit code |
 
@@ -29,6 +30,7 @@ pub mod detector;
 pub mod error;
 pub mod formats;
 pub mod ground_truth;
+pub mod instance_views;
 pub mod interrupt;
 pub mod lock;
 pub mod mask_query;

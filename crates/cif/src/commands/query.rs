@@ -1,6 +1,7 @@
 //! `cif query`: where is an object, and what is at a place?
 
 mod by_masks;
+mod by_text;
 
 use std::path::{Path, PathBuf};
 
@@ -30,6 +31,12 @@ Time in a stage or glTF file is its time code, which counts captured frames; in 
   cif query table.glb --box -0.2,-0.2,0,0.2,0.2,0.3
   cif query table.cif --label '*box' --json
   cif query table.cif --point 0.1,0.2,0.05 --time 0.5
+
+By words: with --models, the objects whose embeddings (cif embed) are nearest to the text; those with a
+* are nearer to it than to texts of anything. Else those that have most of the words in their names.
+
+  cif query table.usda --text 'something to drink from' --models models
+  cif query table.usda --text 'red mug'
 
 By masks: DIR holds what a 2D detector found on frames of the capture, as PNG files (black = not
 found) named FRAME.png, FRAME_*.png or FRAME/*.png. Instances are chosen that lie mostly inside the
@@ -94,7 +101,11 @@ pub(super) struct Query {
     /// Interval of time: objects that are there at any time in it
     #[arg(long, value_name = "FROM:TO", conflicts_with = "time", allow_hyphen_values = true)]
     interval: Option<String>,
-    /// Folder of ONNX models with a models.toml, which answer --prompt
+    /// Words that describe what to look for: by embeddings, where the file has some (cif embed) and --models are
+    /// given, else by the words of labels, classes and taxonomies
+    #[arg(long, value_name = "TEXT", conflicts_with_all = ["label", "taxonomy", "masks"])]
+    text: Option<String>,
+    /// Folder of ONNX models with a models.toml, which answer --prompt and --text
     #[arg(long, value_name = "DIR")]
     models: Option<PathBuf>,
     /// Read layers that a stage brings in from outside its folder
@@ -111,29 +122,29 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     if command.by_masks.is_asked() {
         return by_masks::run(command);
     }
-    if command.models.is_some() {
-        return Err(Error::usage("--models answers --prompt", "add --prompt TEXT --capture CAPTURE"));
+    if command.models.is_some() && command.text.is_none() {
+        return Err(Error::usage(
+            "--models answers --prompt and --text",
+            "add --text TEXT, or --prompt TEXT --capture CAPTURE",
+        ));
     }
-    let content = Content::of(&command.path)?;
-    let is_field = matches!(content, Content::Field);
+    let is_field = matches!(Content::of(&command.path)?, Content::Field);
     let wanted = question(command, is_field)?;
     if let (true, Some(place)) = (is_field, wanted.point) {
-        if wanted.label.is_some() || wanted.region.is_some() || command.interval.is_some() {
+        let others = wanted.label.is_some() || wanted.region.is_some();
+        if others || command.interval.is_some() || command.text.is_some() {
             return Err(Error::usage(
                 "--point in a .cif asks the field itself, without other conditions than --time",
-                "leave --label, --box and --interval out, or query an exported stage",
+                "leave --label, --text, --box and --interval out, or query an exported stage",
             ));
         }
         return at(command, place);
     }
+    if let Some(text) = &command.text {
+        return by_text::run(command, text, wanted);
+    }
     let place = command.path.display().to_string();
-    let found = match content {
-        Content::Field => in_scene(&command.path, wanted)?,
-        Content::Graph(format) => {
-            let options = ReadOptions { follow_external: command.follow_external };
-            format.search(&command.path, &wanted, options).map_err(Error::plain)?
-        }
-    };
+    let found = search(command, wanted)?;
     if command.json {
         println!("{:#}", json!(found));
     } else if found.is_empty() {
@@ -142,6 +153,17 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         print_table(&found);
     }
     Ok(())
+}
+
+/// Objects of the file that meet every condition.
+fn search(command: &Query, wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
+    match Content::of(&command.path)? {
+        Content::Field => in_scene(&command.path, wanted),
+        Content::Graph(format) => {
+            let options = ReadOptions { follow_external: command.follow_external };
+            format.search(&command.path, &wanted, options).map_err(Error::plain)
+        }
+    }
 }
 
 /// The conditions of the command line; times of a `.cif` are still normalised.

@@ -15,7 +15,7 @@ use crate::error::Error;
 use crate::mask_query::FoundMasks;
 use crate::pictures::Picture;
 
-/// What answers a prompt.
+/// Answers prompts.
 #[derive(Debug)]
 pub enum Detector {
     /// A command that reads frames and writes masks.

@@ -88,7 +88,7 @@ pub fn find(
     Found { votes, rows, frames: 1 }
 }
 
-/// What was found, in a view: true where any chosen instance is probable enough.
+/// The answer in a view: true where any chosen instance is probable enough.
 ///
 /// # Panics
 /// When the field has no identities.

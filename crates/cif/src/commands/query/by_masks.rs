@@ -54,7 +54,7 @@ pub(super) struct ByMasks {
     /// Keep the masks that models make in this folder, for the next time [default: .cif-cache in the capture]
     #[arg(long, value_name = "DIR", requires = "prompt", requires = "models")]
     cache: Option<PathBuf>,
-    /// How the instances are chosen
+    /// Rule by which instances are chosen
     #[arg(long, value_name = "RULE", default_value = "reproject")]
     protocol: Protocol,
     /// Capture that the masks belong to
@@ -94,7 +94,7 @@ enum Select {
     Both,
 }
 
-/// How the instances are chosen.
+/// Rule by which instances are chosen.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Protocol {
     /// Those that lie mostly inside the masks of the training frames
@@ -145,7 +145,7 @@ struct Scene<'a> {
     renderer: Renderer,
 }
 
-/// What was found.
+/// Answer to a question by masks.
 struct Answer {
     found: Found,
     /// Boxes of the prompt in the pictures that chose, by frame.
@@ -153,7 +153,7 @@ struct Answer {
     scores: Option<Agreement>,
 }
 
-/// What was asked, and where masks come from.
+/// Origin of the masks.
 enum Source<'a> {
     /// A folder that somebody filled.
     Folder(&'a Path),
