@@ -12,7 +12,7 @@ use crate::onnx::{Attribute, Element, Model};
 pub const WORDS: [&str; 11] =
     ["[UNK]", "[CLS]", "[SEP]", ".", "red", "blue", "ball", "thing", "drink", "object", "texture"];
 
-/// What the folder says of its files.
+/// Description of the files of the folder.
 pub const MANIFEST: &str = r#"
 [detector]
 model = "boxes.onnx"
@@ -297,7 +297,7 @@ fn decoder() -> Model {
         .node("Add", &["ious", "nothing"], "iou_predictions")
 }
 
-/// How much of a picture is red, and how much blue, in CLIP's normalisation.
+/// Amounts of red and of blue in a picture, in CLIP's normalisation.
 fn picture() -> Model {
     colours(
         Model::default()

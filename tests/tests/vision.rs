@@ -224,6 +224,18 @@ fn a_scene_is_asked_in_words() {
     models::write(&path.join("models"));
     let question = ["query", "scene.cif", "--capture", "table", "--models", "models", "--json"];
     let ask = |more: &[&str]| cif(path, &[&question[..], more].concat());
+    // Words of labels need no models, and those of a taxonomy are words too.
+    for (text, label, others) in
+        [("a Red thing", "red ball", 0), ("red ball", "red ball", 1), ("q18545", "red ball", 0)]
+    {
+        let run = cif(path, &["query", "scene.cif", "--text", text, "--json"]);
+        assert!(run.stderr.contains("labels, classes and taxonomies"), "{}", run.stderr);
+        let found = json(&run.succeeds().stdout);
+        assert_eq!((&found[0]["label"], &found[0]["chosen"]), (&label.into(), &true.into()), "{found:#}");
+        assert_eq!(found.as_array().unwrap().len(), 1 + others, "{found:#}");
+        assert!(found.as_array().unwrap().iter().skip(1).all(|one| one["chosen"] == false));
+    }
+    cif(path, &["query", "scene.cif", "--text", "kettle"]).fails(1, &["'kettle'", "blue ball", "red ball"]);
     if !models::can_run() {
         let without = ask(&["--prompt", "blue ball"]);
         assert!(without.code == Some(1) && without.stderr.contains("ONNX Runtime"), "{}", without.stderr);
@@ -306,13 +318,60 @@ fn a_scene_is_asked_in_words() {
     let told = nothing.succeeds().stdout;
     assert!(told.contains("in 0 of 1 pictures") && told.contains("no instance"), "{told}");
 
+    // By meaning, of which an exported file knows too.
+    let text = |file: &str, text: &str, more: &[&str]| {
+        cif(path, &[&["query", file, "--text", text, "--json"], more].concat())
+    };
+    let with = ["--models", "models"];
+    let labels = |run: Run, chosen: bool| -> Vec<String> {
+        let found = json(&run.succeeds().stdout);
+        let rows = found.as_array().unwrap().iter().filter(|one| !chosen || one["chosen"] == true);
+        rows.map(|one| one["label"].as_str().unwrap().to_owned()).collect()
+    };
+    let without = text("scene.cif", "something to drink from", &with);
+    assert!(
+        without.stderr.contains("no embeddings") && without.stderr.contains("cif embed"),
+        "{}",
+        without.stderr
+    );
+    without.fails(1, &["no object", "blue ball"]);
+    let embed = ["embed", "scene.cif", "--capture", "table", "--models", "models", "-o", "seen.cif"];
+    let told = cif(path, &embed).succeeds().stdout;
+    assert!(told.contains("red ball") && told.contains("embeddings by colours"), "{told}");
+    cif(path, &embed).fails(1, &["seen.cif exists"]);
+    cif(path, &["export", "seen.cif", "--gltf", "seen.glb"]).succeeds();
+    cif(path, &["import", "seen.glb", "-o", "back.cif"]).succeeds();
+    let about = json(&cif(path, &["info", "seen.cif", "--json"]).succeeds().stdout);
+    assert_eq!(about["embeddings"], serde_json::json!({ "model": "colours", "instances": 2 }));
+    for file in ["seen.cif", "seen.glb", "back.cif"] {
+        assert_eq!(labels(text(file, "something to drink from", &with), true), ["blue ball"], "{file}");
+        assert_eq!(labels(text(file, "red", &with), false), ["red ball", "blue ball"], "{file}");
+        assert!(labels(text(file, "texture", &with), true).is_empty(), "{file}");
+    }
+    let renamed = models::MANIFEST.replace("\"colours\"", "\"shapes\"");
+    fs::write(path.join("models/models.toml"), renamed).unwrap();
+    text("seen.glb", "red", &with).fails(1, &["embeddings of colours", "shapes", "cif embed"]);
+    let without_embedder = models::MANIFEST.split("[embedder]").next().unwrap();
+    fs::write(path.join("models/models.toml"), without_embedder).unwrap();
+    text("seen.glb", "red", &with).fails(1, &["no [embedder]"]);
+    // Without models, by words.
+    let by_words = text("seen.glb", "the RED one", &[]);
+    assert!(
+        by_words.stderr.contains("word by word") && by_words.stderr.contains("--models"),
+        "{}",
+        by_words.stderr
+    );
+    assert_eq!(labels(by_words, true), ["red ball"]);
+
     // Arguments that do not go together.
     let refused = |more: &[&str], word: &str| ask(more).fails(2, &[word]);
     refused(&["--masks", "m", "--protocol", "grouping"], "rendered view");
     refused(&["--prompt", "x", "--protocol", "grouping", "--select", "both"], "--select");
     refused(&["--prompt", "x", "--detector", "true"], "--models");
     refused(&["--prompt", " "], "names nothing");
-    cif(path, &["query", "scene.cif", "--models", "models"]).fails(2, &["--prompt"]);
+    cif(path, &["query", "scene.cif", "--models", "models"]).fails(2, &["--prompt", "--text"]);
+    cif(path, &["query", "scene.cif", "--text", "?"]).fails(2, &["no words"]);
+    cif(path, &["query", "scene.cif", "--text", "red", "--label", "x"]).fails(2, &["--label"]);
 }
 
 #[test]
