@@ -19,7 +19,7 @@ pub(crate) struct Tokenizer(Infallible);
 fn refused() -> Error {
     Error::refused(
         "this build of cif does not run models: it has no ONNX Runtime",
-        "take the Python wheel, which does, or build with --features onnx",
+        "take the Python wheel, which does, or build with --features cif/onnx",
     )
 }
 

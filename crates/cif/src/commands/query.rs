@@ -44,8 +44,9 @@ masks of training frames; --eval renders them from held-out frames and compares 
 
   cif query table.cif --masks found --capture captures/table --eval
 
-By a prompt: Grounding DINO finds boxes (scores of 0.3) and SAM the masks in them, both ONNX models of
-yours; their masks are kept in CAPTURE/.cif-cache. Or a command of your own does it.
+By a prompt: Grounding DINO finds boxes (scores above 0.3) and SAM the masks in them, both ONNX models of
+yours; --json tells the boxes, with the words that score above 0.45. Masks are kept in
+CAPTURE/.cif-cache. Or a command of your own makes them.
 
   cif query table.cif --prompt 'steel jug' --capture captures/table --models models
   cif query table.cif --prompt 'steel jug' --capture captures/table --models models \\
