@@ -2,7 +2,9 @@
 //!
 //! Source: `SamPredictor` of Segment Anything. The picture's long side becomes 1 024 pixels and its rest is padded; a
 //! box goes in as its two corners, points with the labels 2 and 3, or as it is where the decoder has an input for
-//! boxes. Of the masks that come out the one with the highest predicted IoU counts, where its logit is above 0.
+//! boxes. Of the masks that come out the one with the highest predicted IoU counts, where its logit is above 0: exports
+//! differ in which of the four masks of the model they give, and where it is one alone, as Gaussian Grouping asks for it,
+//! that is taken.
 
 use std::path::Path;
 

@@ -20,7 +20,7 @@ pub(crate) use tokens::Tokenizer;
 pub const IS_BUILT: bool = cfg!(feature = "onnx");
 
 /// A tensor by the part that it plays for us.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct Part<'a> {
     /// Key in `models.toml`.
     pub(crate) name: &'a str,
