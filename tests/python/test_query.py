@@ -185,7 +185,8 @@ def test_embeddings_leave_and_come_back(
     assert facts["embeddings"] == {"model": "clip", "instances": 1}
     out = tmp_path / "again.usda"
     assert cif.run(["export", str(tmp_path / "back.cif"), "--usd", str(out)]) == 0
-    again = Usd.Stage.Open(str(out)).GetPrimAtPath("/World/red_mug_001")
+    stage = Usd.Stage.Open(str(out))
+    again = stage.GetPrimAtPath("/World/red_mug_001")
     assert list(again.GetAttribute("cif:embedding").Get()) == pytest.approx([0.6, -0.8])
     assert again.GetAttribute("cif:embedding:model").Get() == "clip"
 
