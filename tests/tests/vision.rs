@@ -76,6 +76,11 @@ fn masks_of_a_prompt_are_those_of_the_picture() {
                 assert!((f64::from(*found) - true_side as f64).abs() < 1.5, "{boxes:?} for {left} {top}");
             }
             assert!(overlap(&mask, &shown) > 0.75, "{prompt}: {}", overlap(&mask, &shown));
+            // Of the two masks that come out for the box, the other one is all of it.
+            let [left, top, right, bottom] = boxes[0].corners;
+            let filled = mask.pixels.iter().filter(|inside| **inside).count() as f32;
+            let share = filled / ((right - left) * (bottom - top));
+            assert!(share < 0.93, "{prompt}: {share} of the box");
             assert_eq!(prompter.mask(&picture, prompt).unwrap().0, mask);
         }
         // Boxes count by their best word, and no word of them is sure.
