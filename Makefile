@@ -15,6 +15,8 @@ DEMO_LABEL := red mug
 MATURIN := maturin==1.16.0
 PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
+# Its library runs the models of tests of cif-vision; nothing else of it is needed (17 MB).
+ONNXRUNTIME := onnxruntime==1.23.2
 
 # Tools that read what we write, each in an environment of its own: their versions of USD or Python differ from ours.
 MUJOCO := mujoco[usd]==4.0.0
@@ -74,6 +76,8 @@ plugin:
 
 # CIF_TEST_GPU says what tests do with a GPU: auto (the default) takes what Vulkan, Metal or Direct3D 12 offers, software
 # such as Mesa's lavapipe too, off skips them, require fails without one.
+# CIF_TEST_ONNX says the same of ONNX Runtime, which is there.
+export CIF_TEST_ONNX ?= require
 test: test-rust test-python
 
 # In the profile and with the features of the Rust tests, so that both share their libraries: CONTRIBUTING tells more.
@@ -82,13 +86,14 @@ test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	$(BIN)/maturin build --profile dev --interpreter $(BIN)/python --out $(TEST_WHEELS)
 	test -x $(TEST_BIN)/python || $(PYTHON) -m venv $(VENV)/tests
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check $(PYTEST) $(TEST_WHEELS)/*.whl
+	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps $(ONNXRUNTIME)
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 
 # What cif-usd writes and reads is tested in a Python that has usd-core, which the wheel brings.
 test-rust: test-wheel
 	PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
 	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
-	cargo test --locked --no-fail-fast --features cif-usd/python
+	cargo test --locked --no-fail-fast --features cif-usd/python,cif-vision/onnx
 
 test-python: test-wheel
 	$(TEST_BIN)/python -m pytest

@@ -143,6 +143,54 @@ def test_query_of_our_stage_and_scene_agree(
     assert car["speed"] > np.hypot(0.5, 0.2) / (FRAMES - 1) * 12 * 0.99
 
 
+def test_words_of_a_text_find_objects(
+    stage_path: Path, foreign: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert cif.run(["query", str(stage_path), "--text", "The MUG that is red", "--json"]) == 0
+    told = capfd.readouterr()
+    assert "word by word" in told.err
+    mug, *others = json.loads(told.out)
+    assert (mug["path"], mug["chosen"], mug["score"]) == ("/World/red_mug_001", True, 0.4)
+    assert not any(other["chosen"] for other in others)
+    (lamp,) = ask(capfd, foreign, "--text", "a lamp", "--box", "-9,-9,-9,9,9,9")
+    assert lamp["path"] == "/Set/Lamp"
+    assert cif.run(["query", str(stage_path), "--text", "teapot"]) == 1
+    assert "no object" in capfd.readouterr().err
+    assert cif.run(["query", str(stage_path), "--text", "mug", "--models", str(tmp_path)]) == 1
+    assert "no models.toml" in capfd.readouterr().err
+
+
+def test_embeddings_leave_and_come_back(
+    stage_path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    # As cif embed leaves them, here by hand.
+    stage = Usd.Stage.Open(str(stage_path))
+    edited = tmp_path / "edited.usda"
+    stage.Export(str(edited))
+    stage = Usd.Stage.Open(str(edited))
+    mug = stage.GetPrimAtPath("/World/red_mug_001")
+    mug.CreateAttribute("cif:embedding", Sdf.ValueTypeNames.FloatArray).Set([0.6, -0.8])
+    mug.CreateAttribute("cif:embedding:model", Sdf.ValueTypeNames.String).Set("clip")
+    car = stage.GetPrimAtPath("/World/toy_car_002")
+    car.CreateAttribute("cif:embedding", Sdf.ValueTypeNames.FloatArray).Set([3.0, 4.0])
+    car.CreateAttribute("cif:embedding:model", Sdf.ValueTypeNames.String).Set("clip")
+    stage.GetRootLayer().Save()
+    assert cif.run(["query", str(edited), "--text", "mug"]) == 0
+    assert "embeddings are compared by models" in capfd.readouterr().err
+    assert cif.run(["import", str(edited), "-o", str(tmp_path / "back.cif")]) == 0
+    capfd.readouterr()
+    assert cif.run(["info", str(tmp_path / "back.cif"), "--json"]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    # Only directions of length 1 count.
+    assert facts["embeddings"] == {"model": "clip", "instances": 1}
+    out = tmp_path / "again.usda"
+    assert cif.run(["export", str(tmp_path / "back.cif"), "--usd", str(out)]) == 0
+    stage = Usd.Stage.Open(str(out))
+    again = stage.GetPrimAtPath("/World/red_mug_001")
+    assert list(again.GetAttribute("cif:embedding").Get()) == pytest.approx([0.6, -0.8])
+    assert again.GetAttribute("cif:embedding:model").Get() == "clip"
+
+
 def test_labels_are_edited_in_place(
     stage_path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -6,12 +6,13 @@ use std::process::Command;
 use serde_json::Value;
 
 /// Row of every crate; 0 is the lowest.
-const ROWS: [(&str, u32); 17] = [
+const ROWS: [(&str, u32); 18] = [
     ("cif-geometry", 0),
     ("cif-output", 0),
     ("cif-input", 0),
     ("cif-dataset", 1),
     ("cif-field", 1),
+    ("cif-vision", 1),
     ("cif-render", 2),
     ("cif-masks", 2),
     ("cif-capture", 2),

@@ -11,6 +11,7 @@
 //! | [`instance`] | what the instances are called |
 //! | [`timeline`] | which times were captured, and from which cameras |
 //! | [`record`] | how a field came about, and how it has to be drawn |
+//! | [`embedding`] | what objects look like, for questions in words |
 //! | [`exposure`] | what cameras make of colours |
 //! | [`field`] | all of it together |
 //! | [`fingerprint`] | whether two fields are the same |
@@ -57,6 +58,7 @@
 
 pub mod checkpoint;
 pub mod deformation;
+pub mod embedding;
 pub mod exposure;
 pub mod field;
 pub mod fingerprint;
@@ -76,6 +78,7 @@ pub mod validate;
 
 pub use checkpoint::{Checkpoint, CheckpointError, StateTensor, TrainingState};
 pub use deformation::{Deformation, DeformationConfig, Heads, TimeEncoding};
+pub use embedding::{Embedding, Embeddings};
 pub use exposure::Exposure;
 pub use field::{Field, SortMetric};
 pub use gaussians::{Gaussians, GaussiansMut};

@@ -12,7 +12,7 @@ use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
 
-use crate::Exposure;
+use crate::{Embeddings, Exposure};
 
 /// Origin of a field, and the settings by which a renderer shows it as it was trained.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -31,6 +31,8 @@ pub struct Record {
     pub settings: Option<Value>,
     /// Quality over the steps of the run, as the trainer measured it.
     pub curve: Option<Value>,
+    /// Appearance of its instances, where a model has looked at them.
+    pub embeddings: Option<Embeddings>,
     /// Edits that were brought home from exported files, oldest first.
     pub edits: Vec<Value>,
     /// Everything else: versions, counts of the capture, the imported file. No behaviour reads it.
@@ -99,6 +101,7 @@ const SETTINGS: &str = "config";
 const CURVE: &str = "curve";
 const EDITS: &str = "edits";
 const DRAWING: &str = "drawing";
+const EMBEDDINGS: &str = "embeddings";
 const NAME: &str = "name";
 const FRAME: &str = "frame";
 const UNKNOWN: &str = "unknown";
@@ -125,6 +128,13 @@ impl Record {
         record.settings = notes.remove(SETTINGS);
         record.curve = notes.remove(CURVE);
         record.edits = take(&mut notes, EDITS).unwrap_or_default();
+        if let Some(embeddings) = take::<Embeddings>(&mut notes, EMBEDDINGS) {
+            match embeddings.is_valid() {
+                true => record.embeddings = Some(embeddings),
+                // Nobody can compare with these.
+                false => drop(notes.insert(EMBEDDINGS.to_owned(), json!(embeddings))),
+            }
+        }
         record.drawing = match take(&mut notes, DRAWING) {
             Some(drawing) => drawing,
             None => drawing_of_older_files(record.settings.as_ref(), record.run.as_mut()),
@@ -162,6 +172,7 @@ impl Record {
             (SETTINGS, self.settings.clone()),
             (CURVE, self.curve.clone()),
             (EDITS, edits),
+            (EMBEDDINGS, self.embeddings.as_ref().map(|embeddings| json!(embeddings))),
             (DRAWING, drawing),
         ];
         json.extend(members.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?))));
@@ -262,6 +273,24 @@ mod tests {
         assert_eq!(Record::from_json(Value::Null).unwrap().to_json(), json!({}));
         let unknown = Record { unknown: Some("its unit is not known".to_owned()), ..Record::default() };
         assert_eq!(Record::from_json(unknown.to_json()).unwrap(), unknown);
+    }
+
+    #[test]
+    fn embeddings_come_back_exactly_and_wrong_ones_are_notes() {
+        let direction: Vec<f32> = (1..=100).map(|k| (k as f32).sin()).collect();
+        let length = direction.iter().map(|value| value * value).sum::<f32>().sqrt();
+        let direction: Vec<f32> = direction.iter().map(|value| value / length).collect();
+        let embeddings =
+            Embeddings { model: "clip".to_owned(), of: [(3, direction), (40_000, vec![1.0])].into() };
+        let record = Record { embeddings: Some(embeddings), ..Record::default() };
+        let text = record.to_json().to_string();
+        assert_eq!(Record::from_json(serde_json::from_str(&text).unwrap()).unwrap(), record);
+        for wrong in [json!({ "model": "clip", "of": { "3": [2.0] } }), json!({ "of": 1 }), json!(7)] {
+            let json = json!({ "embeddings": wrong });
+            let read = Record::from_json(json.clone()).unwrap();
+            assert_eq!(read.embeddings, None);
+            assert_eq!(read.to_json(), json);
+        }
     }
 
     #[test]

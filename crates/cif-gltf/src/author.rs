@@ -481,6 +481,7 @@ fn object_extras(node: &Node) -> Cif {
         label: node.label.clone(),
         category: node.category.clone(),
         taxonomies: node.taxonomies.clone(),
+        embedding: node.embedding.clone(),
         pivot: node.pivot.to_array(),
         motion: node.report.clone(),
         source_frames: node.source_frames,

@@ -76,6 +76,9 @@ pub(crate) struct Object {
     /// Names of its class in vocabularies of others, by taxonomy.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub(crate) taxonomies: BTreeMap<String, String>,
+    /// Its appearance, for questions in words.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) embedding: Option<cif_field::Embedding>,
     /// World units; glTF itself holds single precision only.
     pub(crate) pivot: [f64; 3],
     /// Motion model, residuals, samples.

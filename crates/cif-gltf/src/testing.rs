@@ -215,6 +215,7 @@ fn node(
         label: format!("{name} \u{676f}"),
         category: "thing".into(),
         taxonomies: [("coco".to_owned(), "cup".to_owned())].into(),
+        embedding: Some(cif_field::Embedding { model: "clip".into(), direction: vec![0.6, -0.8] }),
         pivot: if kind == NodeKind::Background { DVec3::ZERO } else { numbers.vector() },
         extent: extent::ellipsoid_bounds(&identity, &splats.means, &splats.orientations, &splats.scales),
         motion,

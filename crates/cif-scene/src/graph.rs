@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_dataset::CaptureFrame;
+use cif_field::Embedding;
 use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use glam::{DMat3, DQuat, DVec3};
@@ -109,6 +110,8 @@ pub struct Node {
     pub category: String,
     /// Names of its class in vocabularies of others, by taxonomy.
     pub taxonomies: BTreeMap<String, String>,
+    /// Its appearance, for questions in words.
+    pub embedding: Option<Embedding>,
     /// Origin of the local frame at the reference time, world.
     pub pivot: DVec3,
     /// Motion of the node.

@@ -81,6 +81,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
         label: "cloud".to_owned(),
         category: "cloud".to_owned(),
         taxonomies: Default::default(),
+        embedding: None,
         pivot: glam::DVec3::ZERO,
         motion,
         splats,

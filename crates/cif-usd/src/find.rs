@@ -183,6 +183,8 @@ impl<'a, 'py> Search<'a, 'py> {
             way.push(DVec3::new(rows[0][3], rows[1][3], rows[2][3]));
         }
         let (volume, volume_of) = volume(self.hull_volume(prim)?, &bounds);
+        let mut names: Vec<String> = by_taxonomy.values().flatten().cloned().collect();
+        names.extend(label.clone());
         // Foreign stages may use any taxonomy: whatever label there is names the object.
         let any = by_taxonomy.values().flatten().next().cloned().unwrap_or_default();
         let class = if class.is_empty() { any } else { class };
@@ -199,6 +201,8 @@ impl<'a, 'py> Search<'a, 'py> {
             volume,
             volume_of,
             speed: speed(&self.codes, &way, self.codes_per_second),
+            names,
+            embedding: crate::read::labels::embedding(self.pxr, prim)?,
         }))
     }
 

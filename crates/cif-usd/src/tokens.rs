@@ -91,6 +91,10 @@ pub const IMAGE_HEIGHT: &str = "userProperties:imageHeight";
 pub const CAMERA_CODES: &str = "cif:timeCodes";
 /// Position of a part among those of its instance.
 pub const PART_INDEX: &str = "cif:partIndex";
+/// Appearance of an instance: a vector of length 1.
+pub const EMBEDDING: &str = "cif:embedding";
+/// Model that made it.
+pub const EMBEDDING_MODEL: &str = "cif:embedding:model";
 /// Origin of a part's frame at the reference time, in the frame of its instance.
 pub const PART_PIVOT: &str = "cif:partPivot";
 

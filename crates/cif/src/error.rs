@@ -73,6 +73,16 @@ impl From<cif_exr::ExrError> for Error {
     }
 }
 
+impl From<cif_vision::Error> for Error {
+    fn from(error: cif_vision::Error) -> Self {
+        match error {
+            cif_vision::Error::Io { action, path, source } => Self::Io { action, path, source },
+            cif_vision::Error::Refused { problem, fix } => Self::failed(problem, fix),
+            other => Self::plain(other),
+        }
+    }
+}
+
 /// Error at a place in a text file.
 #[derive(Debug, thiserror::Error, Diagnostic)]
 #[error("{}:{line}: {message}", path.display())]

@@ -147,6 +147,7 @@ mod tests {
             label: "box".into(),
             category: "box".into(),
             taxonomies: Default::default(),
+            embedding: None,
             pivot: DVec3::ZERO,
             motion: Motion::Rigid(track),
             splats: Splats::default(),

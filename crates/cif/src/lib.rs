@@ -16,7 +16,8 @@
 //! | [`camera_file`] | views that no capture has |
 //! | [`formats`] | the formats that scenes are exchanged in |
 //! | [`mask_query`] | which objects 2D masks show |
-//! | [`detector`] | a command that makes such masks |
+//! | [`detector`] | what makes such masks: a command, or models |
+//! | [`instance_views`] | which views show an object best, and what they show of it |
 //! | [`ground_truth`] | exported motion against known motion |
 //! | [`error`] | what is reported, and the exit code |
 
@@ -29,6 +30,7 @@ pub mod detector;
 pub mod error;
 pub mod formats;
 pub mod ground_truth;
+pub mod instance_views;
 pub mod interrupt;
 pub mod lock;
 pub mod mask_query;
@@ -44,7 +46,7 @@ use std::io::IsTerminal;
 use clap::Parser;
 use miette::{GraphicalReportHandler, GraphicalTheme};
 
-pub use cif_capture::structure::set_python;
+pub use cif_capture::structure::{pythons, set_python};
 pub use error::Error;
 
 /// From here on the process ends without a word when whatever reads its output has seen enough, as in

@@ -205,6 +205,37 @@ pub(crate) fn all() -> Vec<Reader> {
             read: |folder| read_gltf(&folder.join("scene.gltf")),
         },
         Reader {
+            name: "models",
+            file: "models.toml",
+            form: Form::Text,
+            write: cif_test::models::write,
+            read: |folder| {
+                let models = cif_vision::Models::open(folder).map_err(|error| error.to_string())?;
+                // A manifest may leave models out.
+                models.embedder_name().map(drop).map_err(|error| error.to_string())
+            },
+        },
+        Reader {
+            name: "kept-mask",
+            file: "mask.png",
+            form: Form::Binary,
+            write: |folder| {
+                let mask =
+                    cif_geometry::PixelGrid::from_pixels(8, 6, (0..48).map(|at| at % 5 == 0).collect());
+                let found = cif_vision::grounding::FoundBox {
+                    corners: [1.0, 1.0, 7.0, 5.0],
+                    score: 0.5,
+                    words: "steel jug".to_owned(),
+                };
+                cif_vision::cache::write(&folder.join("mask.png"), &mask, &[found]).unwrap();
+            },
+            read: |folder| {
+                // A broken one is made anew, and nobody told.
+                drop(cif_vision::cache::boxes(&folder.join("mask.png"), (8, 6)));
+                Ok(())
+            },
+        },
+        Reader {
             name: "label-glb",
             file: "scene.glb",
             form: Form::Glb,

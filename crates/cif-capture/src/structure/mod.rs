@@ -10,5 +10,5 @@ mod verdict;
 pub use ladder::{Found, Lenses, Request, find};
 pub use pairs::Order;
 pub use points::points_of_rig;
-pub use python::set_python;
+pub use python::{pythons, set_python};
 pub use verdict::{Check, Verdict, judge};

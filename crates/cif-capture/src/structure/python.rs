@@ -35,8 +35,9 @@ pub fn set_python(program: PathBuf) {
     let _ = OWN.set(program);
 }
 
-/// Pythons to try, in order.
-fn programs() -> Vec<OsString> {
+/// Pythons to try for packages of Python, in order.
+#[must_use]
+pub fn pythons() -> Vec<OsString> {
     if let Some(program) = std::env::var_os(VARIABLE).filter(|program| !program.is_empty()) {
         return vec![program];
     }
@@ -175,7 +176,7 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
     let input = serde_json::to_vec(job).map_err(|error| {
         Error::refused(format!("a name cannot be passed to Python: {error}"), "rename it")
     })?;
-    let programs = programs();
+    let programs = pythons();
     for program in &programs {
         let mut command = Command::new(program);
         command.args(["-c", SCRIPT]);

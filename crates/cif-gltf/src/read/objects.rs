@@ -241,6 +241,7 @@ fn ours(prim: Prim, object: &Object) -> Prim {
         label: object.label.clone(),
         category: object.category.clone(),
         taxonomies: object.taxonomies.clone(),
+        embedding: object.embedding.clone().filter(cif_field::Embedding::is_valid),
         pivot: Some(DVec3::from_array(object.pivot)),
         keeps_pose: object.motion.model == MotionModel::Rigid,
         report: Some(object.motion.clone()),

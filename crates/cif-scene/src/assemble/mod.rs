@@ -13,7 +13,7 @@ mod track;
 
 use std::collections::BTreeMap;
 
-use cif_field::SortMetric;
+use cif_field::{Embedding, SortMetric};
 use glam::DVec3;
 
 pub use bake::{Bake, Decomposed, is_identity, uniform};
@@ -125,6 +125,8 @@ pub struct Prim {
     pub category: String,
     /// Names of its class in vocabularies of others, by taxonomy.
     pub taxonomies: BTreeMap<String, String>,
+    /// Its appearance, for questions in words.
+    pub embedding: Option<Embedding>,
     /// Path of the object's frame in that of the scene.
     pub track: Track,
     /// True when a pose without samples is a track of one sample even if it is not turned.
@@ -177,6 +179,7 @@ impl Prim {
             name: PrimName::OfLabel,
             category: label.clone(),
             taxonomies: BTreeMap::new(),
+            embedding: None,
             label,
             track: Track::still(),
             keeps_pose: false,

@@ -38,6 +38,7 @@ pub(super) fn node(mut prim: Prim, kind: NodeKind, name: String) -> Node {
         label: prim.label,
         category: prim.category,
         taxonomies: prim.taxonomies,
+        embedding: prim.embedding,
         pivot,
         extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, at_first),
         mean_occupancy: prim.mean_occupancy.unwrap_or_else(|| splats.mean_occupancy()),

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use cif_field::{Field, Gaussians, Identities, RotationEvidence};
+use cif_field::{Embedding, Field, Gaussians, Identities, RotationEvidence};
 use cif_geometry::RigidTransform;
 use glam::DVec3;
 
@@ -27,6 +27,7 @@ pub(crate) struct Naming {
     label: String,
     category: String,
     taxonomies: BTreeMap<String, String>,
+    embedding: Option<Embedding>,
 }
 
 impl Naming {
@@ -47,6 +48,7 @@ impl Naming {
                     label: instance.label.clone(),
                     category: instance.category.clone(),
                     taxonomies: instance.taxonomies.clone(),
+                    embedding: field.record.embeddings.as_ref().and_then(|all| all.embedding(instance.id)),
                 }
             }
             None => Self {
@@ -58,6 +60,7 @@ impl Naming {
                 },
                 category: naming::BACKGROUND.to_owned(),
                 taxonomies: BTreeMap::new(),
+                embedding: None,
             },
         }
     }
@@ -131,6 +134,7 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
         label: naming.label,
         category: naming.category,
         taxonomies: naming.taxonomies,
+        embedding: naming.embedding,
         pivot: group.pivot,
         extent: extent::node_bounds(&RigidTransform::IDENTITY, &splats, &motion, at_pivot),
         motion,

@@ -13,7 +13,9 @@ use cif_field::gaussians::{INITIAL_OCCUPANCY, SH_FLOATS, saturated_logit};
 use cif_field::tracks::{
     DenseTrack, Joint, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep,
 };
-use cif_field::{Field, Gaussians, Identities, Instance, Owner, Record, RecordedCamera, Timeline};
+use cif_field::{
+    Embeddings, Field, Gaussians, Identities, Instance, Owner, Record, RecordedCamera, Timeline,
+};
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
 use glam::{DMat3, DQuat, DVec3};
@@ -87,7 +89,7 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
         deformation: None,
         tracks: tracks.compact(),
         identities: has_instances.then_some(identities),
-        instances: instances.entries,
+        instances: instances.entries.clone(),
         timeline: Timeline {
             times: times.times().to_vec(),
             frames_per_second: graph.time_codes.frames_per_second,
@@ -96,12 +98,31 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
         sh_degree: degrees.max().unwrap_or(0),
         background: graph.background_color.map(|channel| channel.clamp(0.0, 1.0)),
         sort_metric: graph.sort_metric,
-        record: Record { frame: graph.frame, notes: imported, ..Record::default() },
+        record: Record {
+            frame: graph.frame,
+            embeddings: embeddings(graph, &owners, &instances.entries),
+            notes: imported,
+            ..Record::default()
+        },
     };
     field
         .validate()
         .map_err(|error| SceneError::Import { object: source.to_owned(), what: error.to_string() })?;
     Ok(field)
+}
+
+/// Appearance of the instances, by the model of the first that tells; one field has one model.
+fn embeddings(graph: &SceneGraph, owners: &[Option<u16>], instances: &[Instance]) -> Option<Embeddings> {
+    let known = || {
+        let nodes = graph.nodes.iter().zip(owners);
+        nodes.filter_map(|(node, owner)| {
+            Some((instances[usize::from((*owner)?)].id, node.embedding.as_ref()?))
+        })
+    };
+    let model = known().next()?.1.model.clone();
+    let of = known().filter(|(_, embedding)| embedding.model == model && embedding.is_valid());
+    let of = of.map(|(id, embedding)| (id, embedding.direction.clone())).collect();
+    Some(Embeddings { model, of })
 }
 
 /// Normalised time that a time code of a graph has in the field of [`field_from_graph`].

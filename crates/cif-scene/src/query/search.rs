@@ -1,5 +1,6 @@
 //! Objects by label, time and place.
 
+use cif_field::Embedding;
 use cif_geometry::Bounds;
 use glam::DVec3;
 use serde::Serialize;
@@ -63,6 +64,12 @@ pub struct ObjectMatch {
     /// World units per second that the origin of the object's frame moves: around a time code, or on average over an
     /// interval.
     pub speed: f64,
+    /// Every name that it is found by: labels of all taxonomies, and what people call it.
+    #[serde(skip)]
+    pub names: Vec<String>,
+    /// Its appearance.
+    #[serde(skip)]
+    pub embedding: Option<Embedding>,
 }
 
 impl ObjectQuery {
@@ -180,15 +187,8 @@ pub fn search(
     };
     let (mut known, mut labelled, mut found) = (Vec::new(), false, Vec::new());
     for node in &graph.nodes {
-        let names: Vec<&String> = [
-            (TAXONOMY_CLASS, &node.label),
-            (TAXONOMY_CLASS, &node.category),
-            (TAXONOMY_INSTANCE, &node.name),
-        ]
-        .into_iter()
-        .chain(node.taxonomies.iter().map(|(taxonomy, name)| (taxonomy.as_str(), name)))
-        .filter_map(|(taxonomy, name)| wanted.counts(taxonomy).then_some(name))
-        .collect();
+        let names: Vec<&String> =
+            all_names(node).filter_map(|(taxonomy, name)| wanted.counts(taxonomy).then_some(name)).collect();
         let carries = names.iter().any(|name| matcher.as_ref().is_none_or(|pattern| pattern.matches(name)));
         known.extend(names.into_iter().cloned());
         labelled |= carries;
@@ -200,6 +200,13 @@ pub fn search(
         Some(label_query) if !labelled => Err(label_query.unknown(place, known)),
         _ => Ok(found),
     }
+}
+
+/// Names of a node with their taxonomies.
+fn all_names(node: &Node) -> impl Iterator<Item = (&str, &String)> {
+    let own =
+        [(TAXONOMY_CLASS, &node.label), (TAXONOMY_CLASS, &node.category), (TAXONOMY_INSTANCE, &node.name)];
+    own.into_iter().chain(node.taxonomies.iter().map(|(taxonomy, name)| (taxonomy.as_str(), name)))
 }
 
 fn describe(
@@ -237,6 +244,8 @@ fn describe(
         volume,
         volume_of,
         speed: speed(sampled, &way, graph.time_codes.frames_per_second) * world_per_unit,
+        names: all_names(node).map(|(_, name)| name.clone()).collect(),
+        embedding: node.embedding.clone(),
     })
 }
 

@@ -61,6 +61,8 @@ impl Trainer {
             }),
             settings: Some(json!(config)),
             curve: (!progress.curve.points.is_empty()).then(|| json!(progress.curve)),
+            // Of what training goes on with, nobody has looked at what it looks like now.
+            embeddings: None,
             edits: Vec::new(),
             notes: members(json!({
                 "generator": { "name": "cif", "version": env!("CARGO_PKG_VERSION") },

@@ -30,6 +30,10 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
         prim.set(&format!("{}:{taxonomy}", tokens::LABELS), "TokenArray", VARYING, labels)?;
     }
     prim.set_custom(tokens::USER_LABEL, "String", &node.label)?;
+    if let Some(embedding) = &node.embedding {
+        prim.set_custom(tokens::EMBEDDING, "FloatArray", pxr.float_array(&embedding.direction)?)?;
+        prim.set_custom(tokens::EMBEDDING_MODEL, "String", &embedding.model)?;
+    }
     properties(scene, &prim, node)?;
     visibility(&prim, node)?;
     transforms::order(pxr, &prim)?;

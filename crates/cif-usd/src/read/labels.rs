@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use cif_field::RotationEvidence;
+use cif_field::{Embedding, RotationEvidence};
 use cif_scene::{MotionModel, VisibilitySample, naming};
 use pyo3::prelude::*;
 
@@ -51,6 +51,19 @@ pub(super) fn recorded<'py>(pxr: &Pxr<'py>, prim: &Bound<'py, PyAny>) -> PyResul
         rotation: rotation.and_then(|rotation| serde_json::from_value(rotation).ok()),
         report: plain(prim, instance::REPORT, &time)?,
     }))
+}
+
+/// Recorded appearance of a prim.
+pub(crate) fn embedding<'py>(pxr: &Pxr<'py>, prim: &Bound<'py, PyAny>) -> PyResult<Option<Embedding>> {
+    let time = pxr.earliest()?;
+    let (Some(model), Some(values)) =
+        (plain::<String>(prim, tokens::EMBEDDING_MODEL, &time)?, value(prim, tokens::EMBEDDING, &time)?)
+    else {
+        return Ok(None);
+    };
+    let numbers = values.try_iter().and_then(|values| values.map(|value| value?.extract::<f32>()).collect());
+    let embedding = numbers.ok().map(|direction| Embedding { model, direction });
+    Ok(embedding.filter(Embedding::is_valid))
 }
 
 /// Semantic labels of a prim in a taxonomy.

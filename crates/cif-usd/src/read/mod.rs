@@ -5,7 +5,7 @@ mod cameras;
 mod expansion;
 mod frames;
 mod joints;
-mod labels;
+pub(crate) mod labels;
 mod layer_spec;
 mod nesting;
 mod nodes;

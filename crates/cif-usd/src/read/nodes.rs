@@ -100,6 +100,7 @@ pub(super) fn read<'py>(reading: &Reading<'_, 'py>, owner: &Owner<'py>) -> Resul
         label,
         category,
         taxonomies: labels::others(reading.pxr, &owner.prim).map_err(python)?,
+        embedding: labels::embedding(reading.pxr, &owner.prim).map_err(python)?,
         // Of what stands still the transform tells the pivot.
         pivot: recorded.pivot.filter(|_| !track.samples.is_empty()),
         track,

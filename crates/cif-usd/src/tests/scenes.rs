@@ -1,6 +1,6 @@
 //! Random small scenes.
 
-use cif_field::RotationEvidence;
+use cif_field::{Embedding, RotationEvidence};
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform, spherical_harmonics};
 use cif_scene::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, CaptureFrame, ConvexHull, DenseMotion,
@@ -260,6 +260,13 @@ impl Maker {
             taxonomies: match kind {
                 NodeKind::Instance { .. } => [("wikidata_qcode".to_owned(), "Q81727".to_owned())].into(),
                 NodeKind::Background => Default::default(),
+            },
+            embedding: match kind {
+                NodeKind::Instance { id, .. } => {
+                    let angle = f32::from(id);
+                    Some(Embedding { model: "clip".to_owned(), direction: vec![angle.sin(), angle.cos()] })
+                }
+                NodeKind::Background => None,
             },
             pivot,
             motion,

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use cif_dataset::{Dataset, PointSource, Split};
-use cif_field::{Checkpoint, Field};
+use cif_field::{Checkpoint, Field, Record};
 use cif_geometry::Bounds;
 use cif_scene::SceneOptions;
 use cif_scene::build::assignment::members;
@@ -112,6 +112,10 @@ fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
 
 fn scene_facts(checkpoint: &Checkpoint) -> Facts {
     let field: &Field = &checkpoint.field;
+    // Nobody reads their numbers.
+    let embeddings = field.record.embeddings.as_ref();
+    let embeddings = embeddings.map(|all| json!({ "model": all.model, "instances": all.of.len() }));
+    let record = Record { embeddings: None, ..field.record.clone() };
     let means = Bounds::around(field.gaussians.means.iter().map(|p| DVec3::from(p.map(f64::from))));
     let owned = members(field, &SceneOptions::default());
     let instances: Vec<Value> = field
@@ -143,7 +147,8 @@ fn scene_facts(checkpoint: &Checkpoint) -> Facts {
         ("resumable".to_owned(), json!(checkpoint.training.is_some())),
         ("work".to_owned(), json!(field.record.run.as_ref().and_then(|run| run.notes.get("work")))),
         ("curve".to_owned(), json!(field.record.curve)),
-        ("provenance".to_owned(), field.record.to_json()),
+        ("embeddings".to_owned(), json!(embeddings)),
+        ("provenance".to_owned(), record.to_json()),
     ]
 }
 
@@ -179,7 +184,7 @@ fn print(facts: &Facts) {
             Value::Object(items) if name == "provenance" => {
                 println!("{name:>28}  {}", items.keys().cloned().collect::<Vec<_>>().join(", "));
             }
-            Value::Null if name == "curve" || name == "work" => {}
+            Value::Null if ["curve", "embeddings", "work"].contains(&name.as_str()) => {}
             Value::Object(items) if name == "work" => print_work(items),
             value if name == "curve" => print_curve(value),
             value => println!("{name:>28}  {}", one_line(value)),

@@ -8,6 +8,7 @@ mod bench_hardness;
 mod capture;
 mod check;
 mod diff;
+mod embed;
 mod eval;
 mod eval_motion;
 mod export;
@@ -70,6 +71,7 @@ A short tour:
   cif export table.cif --usd table.usda                  one moving prim per object
   cif import table.usda --base table.cif -o new.cif      edits of that file come home
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
+  cif query table.usda --text 'something to drink from'  what could that be? (with cif embed, by meaning)
   cif label table.usda --instance 3 'blue mug'           give it another name
   cif check table.cif                                    is it numerically sound?
 
@@ -92,6 +94,7 @@ enum Command {
     Diff(diff::Diff),
     Query(query::Query),
     Label(label::Label),
+    Embed(embed::Embed),
     Info(info::Info),
     Check(check::Check),
     Masks(masks::Masks),
@@ -187,6 +190,7 @@ fn dispatch(command: Command) -> Result<(), Error> {
         Command::Diff(command) => diff::run(&command),
         Command::Query(command) => query::run(&command),
         Command::Label(command) => label::run(&command),
+        Command::Embed(command) => embed::run(&command),
         Command::Info(command) => info::run(&command),
         Command::Check(command) => check::run(&command),
         Command::Masks(command) => masks::run(&command),

@@ -1,6 +1,7 @@
 //! `cif query`: where is an object, and what is at a place?
 
 mod by_masks;
+mod by_text;
 
 use std::path::{Path, PathBuf};
 
@@ -15,9 +16,7 @@ use super::scene;
 use crate::error::Error;
 use crate::formats::Content;
 
-/// Find objects by label, time, place, or masks; or tell what is at a place
-#[derive(Debug, Args)]
-#[command(after_help = "\
+const HELP: &str = "\
 Without conditions every object is listed; several conditions must all hold. Labels match the name,
 class or unique name of an object; case does not matter, * stands for any characters and ? for one.
 Boxes hold the splats to three standard deviations; volumes are those of the colliders, where there
@@ -33,13 +32,40 @@ Time in a stage or glTF file is its time code, which counts captured frames; in 
   cif query table.cif --label '*box' --json
   cif query table.cif --point 0.1,0.2,0.05 --time 0.5
 
+By words: with --models, the objects whose embeddings (cif embed) are nearest to the text; those with a
+* are nearer to it than to texts of anything. Else those that have most of the words in their names.
+
+  cif query table.usda --text 'something to drink from' --models models
+  cif query table.usda --text 'red mug'
+
 By masks: DIR holds what a 2D detector found on frames of the capture, as PNG files (black = not
 found) named FRAME.png, FRAME_*.png or FRAME/*.png. Instances are chosen that lie mostly inside the
 masks of training frames; --eval renders them from held-out frames and compares with the masks there.
 
   cif query table.cif --masks found --capture captures/table --eval
+
+By a prompt: Grounding DINO finds boxes (scores above 0.3) and SAM the masks in them, both ONNX models of
+yours; --json tells the boxes, with the words that score above 0.45. Masks are kept in
+CAPTURE/.cif-cache. Or a command of your own makes them.
+
+  cif query table.cif --prompt 'steel jug' --capture captures/table --models models
+  cif query table.cif --prompt 'steel jug' --capture captures/table --models models \\
+      --protocol grouping --eval
   cif query table.cif --prompt 'steel jug' --capture captures/table \\
-      --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'")]
+      --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'
+
+Models are run by ONNX Runtime (pip install 'cif[vision]', or ORT_DYLIB_PATH); nothing is downloaded.
+Their folder has a file such as this, with the names of your exports:
+
+";
+
+fn help() -> String {
+    format!("{HELP}{}", cif_vision::models::EXAMPLE)
+}
+
+/// Find objects by label, time, place, or masks; or tell what is at a place
+#[derive(Debug, Args)]
+#[command(after_help = help())]
 pub(super) struct Query {
     /// Trained scene (.cif), or a file of any format that cif export writes
     #[arg(value_name = "FILE")]
@@ -76,6 +102,13 @@ pub(super) struct Query {
     /// Interval of time: objects that are there at any time in it
     #[arg(long, value_name = "FROM:TO", conflicts_with = "time", allow_hyphen_values = true)]
     interval: Option<String>,
+    /// Words that describe what to look for: by embeddings, where the file has some (cif embed) and --models are
+    /// given, else by the words of labels, classes and taxonomies
+    #[arg(long, value_name = "TEXT", conflicts_with_all = ["label", "taxonomy", "masks"])]
+    text: Option<String>,
+    /// Folder of ONNX models with a models.toml, which answer --prompt and --text
+    #[arg(long, value_name = "DIR")]
+    models: Option<PathBuf>,
     /// Read layers that a stage brings in from outside its folder
     #[arg(long)]
     follow_external: bool,
@@ -90,26 +123,29 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     if command.by_masks.is_asked() {
         return by_masks::run(command);
     }
-    let content = Content::of(&command.path)?;
-    let is_field = matches!(content, Content::Field);
+    if command.models.is_some() && command.text.is_none() {
+        return Err(Error::usage(
+            "--models answers --prompt and --text",
+            "add --text TEXT, or --prompt TEXT --capture CAPTURE",
+        ));
+    }
+    let is_field = matches!(Content::of(&command.path)?, Content::Field);
     let wanted = question(command, is_field)?;
     if let (true, Some(place)) = (is_field, wanted.point) {
-        if wanted.label.is_some() || wanted.region.is_some() || command.interval.is_some() {
+        let others = wanted.label.is_some() || wanted.region.is_some();
+        if others || command.interval.is_some() || command.text.is_some() {
             return Err(Error::usage(
                 "--point in a .cif asks the field itself, without other conditions than --time",
-                "leave --label, --box and --interval out, or query an exported stage",
+                "leave --label, --text, --box and --interval out, or query an exported stage",
             ));
         }
         return at(command, place);
     }
+    if let Some(text) = &command.text {
+        return by_text::run(command, text, wanted);
+    }
     let place = command.path.display().to_string();
-    let found = match content {
-        Content::Field => in_scene(&command.path, wanted)?,
-        Content::Graph(format) => {
-            let options = ReadOptions { follow_external: command.follow_external };
-            format.search(&command.path, &wanted, options).map_err(Error::plain)?
-        }
-    };
+    let found = search(command, wanted)?;
     if command.json {
         println!("{:#}", json!(found));
     } else if found.is_empty() {
@@ -118,6 +154,17 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         print_table(&found);
     }
     Ok(())
+}
+
+/// Objects of the file that meet every condition.
+fn search(command: &Query, wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
+    match Content::of(&command.path)? {
+        Content::Field => in_scene(&command.path, wanted),
+        Content::Graph(format) => {
+            let options = ReadOptions { follow_external: command.follow_external };
+            format.search(&command.path, &wanted, options).map_err(Error::plain)
+        }
+    }
 }
 
 /// The conditions of the command line; times of a `.cif` are still normalised.

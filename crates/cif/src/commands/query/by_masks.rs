@@ -1,24 +1,31 @@
 //! `cif query --masks` and `--prompt`: the objects that a 2D detector shows.
 
-use std::path::PathBuf;
+mod report;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::found_masks;
 use cif_dataset::{Dataset, Split};
 use cif_field::Field;
 use cif_geometry::PixelGrid;
-use cif_render::RenderSettings;
 use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::{Channels, RenderSettings};
+use cif_vision::Models;
+use cif_vision::grounding::FoundBox;
 use clap::{Args, ValueEnum};
-use serde_json::json;
 
 use super::Query;
 use crate::commands::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, scene};
-use crate::detector::{Detected, detect};
+use crate::detector::{Asked, Detector};
 use crate::error::Error;
 use crate::formats;
-use crate::mask_query::{Agreement, Found, FoundMasks, GATE, Selection, agreement, find, render};
-use crate::pictures::save_grey;
+use crate::mask_query::{self, Agreement, Found, FoundMasks, GATE, Selection, agreement, grouping};
+use crate::pictures::{rgb_picture, save_grey};
 use crate::{interrupt, output};
+
+/// Folder inside a capture that keeps masks of models. Readers of captures pass over hidden folders.
+const CACHE: &str = ".cif-cache";
 
 /// Masks that a detector found, and their use.
 #[derive(Debug, Args)]
@@ -32,19 +39,24 @@ pub(super) struct ByMasks {
         conflicts_with_all = ["label", "taxonomy", "point", "region", "time", "interval", "prompt"]
     )]
     masks: Option<PathBuf>,
-    /// Text for the detector
+    /// Words for the detector
     #[arg(
         long,
         value_name = "TEXT",
         requires = "capture",
-        requires = "detector",
-        conflicts_with_all = ["label", "taxonomy", "point", "region", "time", "interval"]
+        conflicts_with_all = ["label", "taxonomy", "point", "region", "time", "interval", "text"]
     )]
     prompt: Option<String>,
     /// Command that reads the frames in {frames} and writes the masks of {prompt} into {masks}; without
     /// these words the folder of frames, the folder of masks and the prompt are its last arguments
-    #[arg(long, value_name = "CMD", requires = "prompt")]
+    #[arg(long, value_name = "CMD", requires = "prompt", conflicts_with = "models")]
     detector: Option<String>,
+    /// Keep the masks that models make in this folder, for the next time [default: .cif-cache in the capture]
+    #[arg(long, value_name = "DIR", requires = "prompt", requires = "models")]
+    cache: Option<PathBuf>,
+    /// Rule by which instances are chosen
+    #[arg(long, value_name = "RULE", default_value = "reproject")]
+    protocol: Protocol,
     /// Capture that the masks belong to
     #[arg(long, value_name = "CAPTURE")]
     capture: Option<PathBuf>,
@@ -52,9 +64,9 @@ pub(super) struct ByMasks {
     #[arg(long, value_name = "SET", default_value = "instance")]
     select: Select,
     /// Least foreground of a pixel of the rendered masks, 0 to 1: below it a pixel is background. The paper has no
-    /// such gate (0)
-    #[arg(long, value_name = "SHARE", default_value_t = GATE, value_parser = share, requires = "eval")]
-    foreground: f32,
+    /// such gate (0) [default: 0.5]
+    #[arg(long, value_name = "SHARE", value_parser = share, requires = "eval")]
+    foreground: Option<f32>,
     /// Render the result from held-out frames and compare it with the masks there
     #[arg(long, requires = "capture")]
     eval: bool,
@@ -72,7 +84,7 @@ pub(super) struct ByMasks {
 }
 
 /// Which Gaussians make up the result.
-#[derive(Clone, Copy, Debug, ValueEnum)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum Select {
     /// Those of the chosen instances
     Instance,
@@ -80,6 +92,26 @@ enum Select {
     Gaussian,
     /// Those that are both: a part of an instance
     Both,
+}
+
+/// Rule by which instances are chosen.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Protocol {
+    /// Those that lie mostly inside the masks of the training frames
+    Reproject,
+    /// Those with more than 0.7 of their pixels inside the mask of the first held-out view as it is rendered; their
+    /// answer in a view are the pixels with a probability above 0.2, as in Gaussian Grouping
+    Grouping,
+}
+
+impl Protocol {
+    /// As it is typed.
+    fn name(self) -> &'static str {
+        match self {
+            Self::Reproject => "reproject",
+            Self::Grouping => "grouping",
+        }
+    }
 }
 
 impl From<Select> for Selection {
@@ -105,11 +137,36 @@ fn share(text: &str) -> Result<f32, String> {
     if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("expected 0 to 1".to_owned()) }
 }
 
+/// A scene and the capture whose frames are asked.
+struct Scene<'a> {
+    field: &'a Field,
+    dataset: &'a Dataset,
+    settings: RenderSettings,
+    renderer: Renderer,
+}
+
+/// Answer to a question by masks.
+struct Answer {
+    found: Found,
+    /// Boxes of the prompt in the pictures that chose, by frame.
+    boxes: BTreeMap<String, Vec<FoundBox>>,
+    scores: Option<Agreement>,
+}
+
+/// Origin of the masks.
+enum Source<'a> {
+    /// A folder that somebody filled.
+    Folder(&'a Path),
+    /// A prompt for a detector.
+    Prompt(&'a str, Detector),
+}
+
 pub(super) fn run(command: &Query) -> Result<(), Error> {
     let options = &command.by_masks;
     let Some(capture) = &options.capture else {
         return Err(Error::usage("masks belong to frames", "name their capture with --capture"));
     };
+    let source = source(command, capture)?;
     if !formats::is_field(&command.path) {
         return Err(Error::usage(
             format!(
@@ -142,40 +199,55 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     }
     let settings = scene::render_settings(&field);
     interrupt::watch();
-    let detected: Option<Detected> = match (&options.prompt, &options.detector) {
-        (Some(prompt), Some(detector)) => {
-            let asked: Vec<usize> = (0..dataset.frames.len())
-                .filter(|index| options.eval || dataset.frames[*index].split == Split::Train)
-                .collect();
-            Some(detect(&dataset, &asked, settings.background, detector, prompt)?)
-        }
-        _ => None,
+    let mut scene =
+        Scene { field: &field, dataset: &dataset, settings, renderer: Renderer::new(SimdLevel::Auto) };
+    let answer = match options.protocol {
+        Protocol::Reproject => by_reprojection(&mut scene, &source, options)?,
+        Protocol::Grouping => by_grouping(&mut scene, &source, options)?,
     };
-    let given = match (&detected, &options.masks) {
-        (None, Some(folder)) => {
-            Some(FoundMasks { files: found_masks(&dataset, folder).map_err(Error::plain)?, loaded: false })
-        }
-        _ => None,
-    };
-    let Some(masks) = detected.as_ref().map(|detected| &detected.masks).or(given.as_ref()) else {
-        return Err(Error::usage("no masks", "give --masks, or --prompt with --detector"));
-    };
-    if !dataset.train_frames().iter().any(|index| !masks.files[*index].is_empty()) {
-        return Err(Error::failed(
-            "no training frame has a mask, so nobody can be asked",
-            "run the detector on training frames; cif info CAPTURE lists them",
+    report::print(command, &answer);
+    Ok(())
+}
+
+/// Where masks come from, as far as the command line goes together.
+fn source<'a>(command: &'a Query, capture: &Path) -> Result<Source<'a>, Error> {
+    let options = &command.by_masks;
+    let is_grouping = options.protocol == Protocol::Grouping;
+    if is_grouping && (options.select != Select::Instance || options.foreground.is_some()) {
+        return Err(Error::usage(
+            "--protocol grouping answers by instances and their probabilities",
+            "leave --select and --foreground out, or take --protocol reproject",
         ));
     }
-    let mut renderer = Renderer::new(SimdLevel::Auto);
-    let found =
-        find(&field, &dataset, masks, options.select.into(), &mut renderer, &settings, interrupt::go_on)?;
-    let scores = if options.eval {
-        Some(evaluate(&field, &dataset, masks, &found, &mut renderer, &settings, options)?)
-    } else {
-        None
-    };
-    report(command, &found, scores.as_ref());
-    Ok(())
+    match (&options.prompt, &options.masks) {
+        (Some(prompt), _) if prompt.trim().is_empty() => {
+            Err(Error::usage("--prompt names nothing", "for example --prompt 'steel jug'"))
+        }
+        (Some(prompt), _) => {
+            let detector = match (&options.detector, &command.models) {
+                (Some(detector), _) => Detector::Command(detector.clone()),
+                (None, Some(folder)) => {
+                    let cache = options.cache.clone().unwrap_or_else(|| capture.join(CACHE));
+                    Detector::Models(Box::new(Models::open(folder)?), cache)
+                }
+                (None, None) => {
+                    return Err(Error::usage(
+                        "--prompt is answered by models or by a command of your own",
+                        "give --models DIR, a folder of ONNX models, or --detector CMD",
+                    ));
+                }
+            };
+            Ok(Source::Prompt(prompt, detector))
+        }
+        (None, Some(_)) if is_grouping => Err(Error::usage(
+            "--protocol grouping asks a detector about a rendered view, for which a folder has no mask",
+            "give --prompt with --models or --detector",
+        )),
+        (None, Some(folder)) => Ok(Source::Folder(folder)),
+        (None, None) => {
+            Err(Error::usage("no masks", "give --masks, or --prompt with --models or --detector"))
+        }
+    }
 }
 
 impl From<cif_dataset::Error> for Error {
@@ -184,17 +256,94 @@ impl From<cif_dataset::Error> for Error {
     }
 }
 
-/// Compares on the held-out frames. Of a detector that was run here, no mask means that it found nothing; of a
-/// folder, that it was not asked.
+/// Instances that lie inside the masks of the training frames, and how well they agree on the held-out ones.
+fn by_reprojection(scene: &mut Scene<'_>, source: &Source<'_>, options: &ByMasks) -> Result<Answer, Error> {
+    let Scene { field, dataset, .. } = *scene;
+    let mut detected = None;
+    let given;
+    let masks: &FoundMasks = match source {
+        Source::Prompt(prompt, detector) => {
+            let asked: Vec<usize> = (0..dataset.frames.len())
+                .filter(|index| options.eval || dataset.frames[*index].split == Split::Train)
+                .collect();
+            &detected.insert(scene.detect(detector, prompt, &asked)?).masks
+        }
+        Source::Folder(folder) => {
+            given = FoundMasks { files: found_masks(dataset, folder).map_err(Error::plain)?, loaded: false };
+            &given
+        }
+    };
+    if !dataset.train_frames().iter().any(|index| !masks.files[*index].is_empty()) {
+        return Err(Error::failed(
+            "no training frame has a mask, so nobody can be asked",
+            "run the detector on training frames; cif info CAPTURE lists them",
+        ));
+    }
+    let selection = options.select.into();
+    let Scene { renderer, settings, .. } = scene;
+    let found = mask_query::find(field, dataset, masks, selection, renderer, settings, interrupt::go_on)?;
+    let gate = options.foreground.unwrap_or(GATE);
+    let scores = options.eval.then(|| {
+        evaluate(scene, masks, options, |scene, index| {
+            let frame = &dataset.frames[index];
+            let Scene { renderer, settings, .. } = scene;
+            mask_query::render(field, &found.rows, gate, &frame.camera, frame.time, renderer, settings)
+        })
+    });
+    let boxes = detected.map(|detected| detected.boxes).unwrap_or_default();
+    Ok(Answer { found, boxes, scores: scores.transpose()? })
+}
+
+/// Instances that lie inside the mask of the first view as it is rendered, and how well they agree on the held-out
+/// frames.
+fn by_grouping(scene: &mut Scene<'_>, source: &Source<'_>, options: &ByMasks) -> Result<Answer, Error> {
+    let Source::Prompt(prompt, detector) = source else { unreachable!("refused with the arguments") };
+    let Scene { field, dataset, .. } = *scene;
+    let held_out = dataset.val_frames();
+    let first = held_out.first().copied().unwrap_or(0);
+    let frame = &dataset.frames[first];
+    let plain = Channels { depth: false, instances: false };
+    let Scene { renderer, settings, .. } = &mut *scene;
+    let view = rgb_picture(&renderer.render(field, &frame.camera, frame.time, settings, plain).color);
+    let asked = Asked { dataset, frames: &[first], picture: &|_| Ok(view.clone()) };
+    let detected = detector.detect(&asked, prompt)?;
+    let mask = dataset.load_found_mask(first, &detected.masks.files[first], true)?;
+    let found = grouping::find(field, &mask, &frame.camera, frame.time, renderer, settings);
+    let boxes = detected.boxes;
+    if !options.eval {
+        return Ok(Answer { found, boxes, scores: None });
+    }
+    let truth = scene.detect(detector, prompt, &held_out)?;
+    let scores = evaluate(scene, &truth.masks, options, |scene, index| {
+        let frame = &dataset.frames[index];
+        let Scene { renderer, settings, .. } = scene;
+        grouping::render(field, &found.votes, &frame.camera, frame.time, renderer, settings)
+    })?;
+    Ok(Answer { found, boxes, scores: Some(scores) })
+}
+
+impl Scene<'_> {
+    /// Asks a detector about captured frames.
+    fn detect(
+        &self,
+        detector: &Detector,
+        prompt: &str,
+        frames: &[usize],
+    ) -> Result<crate::detector::Detected, Error> {
+        let picture = |index| self.dataset.load_image(index, self.settings.background).map_err(Error::plain);
+        detector.detect(&Asked { dataset: self.dataset, frames, picture: &picture }, prompt)
+    }
+}
+
+/// Compares on the held-out frames what `render` makes of them. Of a detector that was run here, no mask means that it
+/// found nothing; of a folder, that it was not asked.
 fn evaluate(
-    field: &Field,
-    dataset: &Dataset,
+    scene: &mut Scene<'_>,
     masks: &FoundMasks,
-    found: &Found,
-    renderer: &mut Renderer,
-    settings: &RenderSettings,
     options: &ByMasks,
+    mut render: impl FnMut(&mut Scene<'_>, usize) -> PixelGrid<bool>,
 ) -> Result<Agreement, Error> {
+    let dataset = scene.dataset;
     let mut pairs = Vec::new();
     for index in dataset.val_frames() {
         let (frame, files) = (&dataset.frames[index], &masks.files[index]);
@@ -203,8 +352,7 @@ fn evaluate(
         }
         interrupt::go_on()?;
         let truth = dataset.load_found_mask(index, files, masks.loaded)?;
-        let rendered =
-            render(field, &found.rows, options.foreground, &frame.camera, frame.time, renderer, settings);
+        let rendered = render(scene, index);
         if let Some(folder) = &options.output {
             let picture: PixelGrid<u16> = rendered.map(|inside| if *inside { u16::MAX } else { 0 });
             save_grey(&output::inside(folder, &frame.name, "png")?, &picture)?;
@@ -218,49 +366,4 @@ fn evaluate(
         ));
     }
     Ok(agreement(pairs))
-}
-
-fn report(command: &Query, found: &Found, scores: Option<&Agreement>) {
-    let options = &command.by_masks;
-    if command.json {
-        let mut report = json!({
-            "instances": found.votes,
-            "gaussians": found.rows.len(),
-            "select": Selection::from(options.select),
-            "frames": found.frames,
-        });
-        if let Some(prompt) = &options.prompt {
-            report["prompt"] = json!(prompt);
-        }
-        if let Some(scores) = scores {
-            report["eval"] = json!(scores);
-        }
-        println!("{report:#}");
-        return;
-    }
-    if found.votes.iter().all(|vote| !vote.chosen) {
-        println!("no instance lies inside the masks of {} frames", found.frames);
-    }
-    let mut table = crate::commands::table(["", "id", "label", "class", "inside"]);
-    for vote in &found.votes {
-        table.add_row([
-            if vote.chosen { "*".to_owned() } else { String::new() },
-            vote.id.to_string(),
-            vote.label.clone(),
-            vote.category.clone(),
-            format!("{:.3}", vote.score),
-        ]);
-    }
-    println!("{table}");
-    println!("* chosen, by {} training frames; {} Gaussians", found.frames, found.rows.len());
-    if let Some(scores) = scores {
-        let number = |value: Option<f64>| value.map_or("n/a".to_owned(), |value| format!("{value:.2}"));
-        println!(
-            "held-out frames: mAcc {}, mIoU {} over {} ({} more where nothing was found)",
-            number(scores.macc),
-            number(scores.miou),
-            scores.frames,
-            scores.empty_frames
-        );
-    }
 }

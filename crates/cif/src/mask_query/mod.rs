@@ -11,6 +11,10 @@
 //! - rendered mask: `F > A / 2` with `F = sum over the chosen Gaussians of W_i` and the instance coverage A, where
 //!   the foreground f is at least a gate. The paper has no such gate (0); [`GATE`] keeps faint stray occupancy on the
 //!   background out.
+//!
+//! [`grouping`] has another rule, which asks one rendered view.
+
+pub mod grouping;
 
 use std::collections::BTreeSet;
 use std::path::PathBuf;

@@ -7,52 +7,36 @@
 //! The command writes masks named alike, one or several per frame (`NAME.png`, `NAME_1.png`, ...), in which black
 //! is "not found"; a frame without a mask counts as one where nothing was found. Both folders are temporary.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use cif_dataset::Dataset;
 use cif_dataset::masks::{flat_name, found_masks};
-use tempfile::TempDir;
 
+use super::{Asked, Detected, temporary};
 use crate::error::Error;
 use crate::interrupt;
 use crate::mask_query::FoundMasks;
 use crate::output::{self, Outputs};
-use crate::pictures::{Picture, save_rgb};
+use crate::pictures::save_rgb;
 
 /// Most bytes and lines of a failing command's last words.
 const TAIL: (u64, usize) = (4096, 12);
 
-/// Masks of a detector; they are deleted with it.
-#[derive(Debug)]
-pub struct Detected {
-    /// The masks.
-    pub masks: FoundMasks,
-    _folder: TempDir,
-}
-
 /// Time between two looks whether the command has ended.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// Runs a detector on frames of a capture.
+/// Runs a detector on pictures of frames.
 ///
 /// # Errors
 /// When the command cannot be split or started, fails (with the end of what it said), or writes no mask of any
 /// frame. Nothing is left behind.
-pub fn detect(
-    dataset: &Dataset,
-    frames: &[usize],
-    background: [f32; 3],
-    command: &str,
-    prompt: &str,
-) -> Result<Detected, Error> {
-    let folder = tempfile::Builder::new()
-        .prefix("cif-detect-")
-        .tempdir()
-        .map_err(Error::io("create a temporary folder in", &std::env::temp_dir()))?;
+pub(super) fn detect(asked: &Asked<'_>, command: &str, prompt: &str) -> Result<Detected, Error> {
+    let dataset = asked.dataset;
+    let folder = temporary()?;
     let (images, masks) = (folder.path().join("frames"), folder.path().join("masks"));
     for inside in [&images, &masks] {
         std::fs::create_dir(inside).map_err(Error::io("create the folder", inside))?;
@@ -60,11 +44,10 @@ pub fn detect(
     let words = words(command, &images, &masks, prompt)?;
     // Frames of several folders may have one flat name.
     let mut outputs = Outputs::new(false);
-    for index in frames {
+    for index in asked.frames {
         let name = flat_name(&dataset.frames[*index].name);
         outputs.picture(&images, &name, "png")?;
-        let image: Picture = dataset.load_image(*index, background).map_err(Error::plain)?;
-        save_rgb(&output::inside(&images, &name, "png")?, &image)?;
+        save_rgb(&output::inside(&images, &name, "png")?, &(asked.picture)(*index)?)?;
     }
     run(&words, &folder.path().join("stderr"))?;
     let files = found_masks(dataset, &masks).map_err(|_| {
@@ -73,7 +56,8 @@ pub fn detect(
             "it has to write PNG files named as the frames into the folder {masks}; see cif query --help",
         )
     })?;
-    Ok(Detected { masks: FoundMasks { files, loaded: true }, _folder: folder })
+    let masks = FoundMasks { files, loaded: true };
+    Ok(Detected { masks, boxes: BTreeMap::new(), _folder: Some(folder) })
 }
 
 /// The words of a command with its placeholders filled in.

@@ -1,0 +1,103 @@
+//! The library of ONNX Runtime: `ORT_DYLIB_PATH`, or the one in the Python package `onnxruntime`.
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+use crate::Error;
+
+/// Environment variable that names the library.
+pub const VARIABLE: &str = "ORT_DYLIB_PATH";
+
+/// Prints the folder of the package without importing it, and nothing where it is missing.
+const SCRIPT: &str = "import importlib.util as u; s = u.find_spec('onnxruntime'); \
+                      print(s.submodule_search_locations[0] if s and s.submodule_search_locations else '', end='')";
+
+/// Finds the library: what `ORT_DYLIB_PATH` names, else that of the first of `pythons` which has the package.
+///
+/// # Errors
+/// When there is none, or the variable names no file.
+pub fn find(pythons: &[OsString]) -> Result<PathBuf, Error> {
+    find_named(std::env::var_os(VARIABLE), pythons)
+}
+
+fn find_named(named: Option<OsString>, pythons: &[OsString]) -> Result<PathBuf, Error> {
+    if let Some(named) = named.filter(|name| !name.is_empty()) {
+        let path = PathBuf::from(named);
+        cif_input::check(&path).map_err(|error| {
+            Error::refused(
+                format!("{VARIABLE} names {}: {error}", path.display()),
+                "give the path of libonnxruntime.so, libonnxruntime.dylib or onnxruntime.dll",
+            )
+        })?;
+        return Ok(path);
+    }
+    pythons.iter().find_map(|python| library_in(&package(python)?.join("capi"))).ok_or_else(|| {
+        let asked: Vec<_> = pythons.iter().map(|python| python.to_string_lossy()).collect();
+        Error::refused(
+            format!(
+                "models are run by ONNX Runtime, whose library is not there (looked for the Python package \
+                 onnxruntime with {})",
+                asked.join(", ")
+            ),
+            format!(
+                "pip install 'cif[vision]', or pip install onnxruntime; or name the library by {VARIABLE}"
+            ),
+        )
+    })
+}
+
+/// Folder of the Python package.
+fn package(python: &OsString) -> Option<PathBuf> {
+    let asked = Command::new(python).args(["-c", SCRIPT]).stdin(Stdio::null()).stderr(Stdio::null()).output();
+    let output = asked.ok().filter(|output| output.status.success())?.stdout;
+    let folder = String::from_utf8(output).ok()?;
+    (!folder.is_empty()).then(|| PathBuf::from(folder))
+}
+
+/// The library in a folder: `libonnxruntime.so.1.23.0` and alike, not those of its providers.
+fn library_in(folder: &Path) -> Option<PathBuf> {
+    let is_library = |name: &str| {
+        name == "onnxruntime.dll"
+            || name
+                .strip_prefix("libonnxruntime.")
+                .is_some_and(|rest| rest.starts_with("so") || rest.ends_with("dylib"))
+    };
+    let files = std::fs::read_dir(folder).ok()?.flatten().map(|entry| entry.path());
+    let mut found: Vec<PathBuf> = files
+        .filter(|path| path.file_name().and_then(|name| name.to_str()).is_some_and(is_library))
+        .collect();
+    found.sort();
+    found.pop()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_library_is_told_from_its_providers() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["libonnxruntime_providers_shared.so", "onnxruntime_pybind11_state.so", "__init__.py"] {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        assert_eq!(library_in(folder.path()), None);
+        for name in ["libonnxruntime.so.1.23.0", "libonnxruntime.1.23.0.dylib", "onnxruntime.dll"] {
+            let path = folder.path().join(name);
+            std::fs::write(&path, "").unwrap();
+            assert_eq!(library_in(folder.path()).as_deref(), Some(&*path));
+            std::fs::remove_file(path).unwrap();
+        }
+        assert_eq!(library_in(&folder.path().join("nowhere")), None);
+    }
+
+    #[test]
+    fn pythons_without_the_package_are_told() {
+        let named = find_named(Some("no/libonnxruntime.so".into()), &[]).unwrap_err().to_string();
+        assert!(named.contains(VARIABLE) && named.contains("no/libonnxruntime.so"), "{named}");
+        let error = find_named(None, &["no-such-python".into()]).unwrap_err();
+        let Error::Refused { problem, fix } = error else { panic!("another error") };
+        assert!(problem.contains("no-such-python"), "{problem}");
+        assert!(fix.contains("pip install") && fix.contains(VARIABLE), "{fix}");
+    }
+}
