@@ -10,7 +10,7 @@ pub const MAX_ALPHA: f32 = 0.99;
 /// saturated Gaussian never ends a pixel by itself.
 pub const MIN_TRANSMITTANCE: f32 = 1e-4;
 
-/// Screen-space dilation added to both diagonal entries of a projected covariance, px^2.
+/// Screen-space dilation of images at the resolution of a capture, px^2.
 pub const LOW_PASS: f32 = 0.3;
 
 /// Floor of the antialiasing opacity factor.

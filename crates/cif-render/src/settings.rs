@@ -3,6 +3,7 @@
 use cif_field::SortMetric;
 
 use crate::Channels;
+use crate::constants::LOW_PASS;
 
 /// Where the blending weight of the instance pass comes from.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -56,6 +57,8 @@ pub struct RenderSettings {
     pub background: [f32; 3],
     /// Gaussians nearer than this camera depth are culled, metres.
     pub near: f32,
+    /// Dilation added to both diagonal entries of a projected covariance, px^2.
+    pub low_pass: f32,
     /// Compensates opacity for the low-pass dilation (rho of methods reference 3.1).
     pub antialiased: bool,
     /// Depth order.
@@ -72,6 +75,7 @@ impl Default for RenderSettings {
             sh_degree: 3,
             background: [1.0; 3],
             near: 0.2,
+            low_pass: LOW_PASS,
             antialiased: false,
             sort_metric: SortMetric::Z,
             deform: true,

@@ -93,7 +93,7 @@ impl State {
             antialiased: self.config.antialiased,
             sort_metric: self.config.sort_metric,
             deform: self.field.deformation.is_some(),
-            instances: None,
+            ..RenderSettings::default()
         }
     }
 

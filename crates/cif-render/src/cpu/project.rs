@@ -9,8 +9,7 @@ use cif_geometry::scalar::sigmoid;
 use cif_geometry::{PinholeCamera, quaternion, spherical_harmonics};
 
 use crate::constants::{
-    JACOBIAN_MARGIN, LOG_SCALE_RANGE, LOW_PASS, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
-    MIN_ANTIALIASING,
+    JACOBIAN_MARGIN, LOG_SCALE_RANGE, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA, MIN_ANTIALIASING,
 };
 use crate::{Blending, OccupancySource, RenderSettings};
 
@@ -30,6 +29,7 @@ pub(super) struct ViewConstants {
     pub(super) width: u32,
     pub(super) height: u32,
     near: f32,
+    low_pass: f32,
     sh_degree: u8,
     antialiased: bool,
     sort_metric: SortMetric,
@@ -57,6 +57,7 @@ impl ViewConstants {
             width: camera.width,
             height: camera.height,
             near: settings.near,
+            low_pass: settings.low_pass,
             sh_degree: settings.sh_degree,
             antialiased: settings.antialiased,
             sort_metric: settings.sort_metric,
@@ -222,10 +223,10 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
     }
     let [t0, t1] = image_spread;
     let sharp = [dot(t0, t0), dot(t0, t1), dot(t1, t1)];
-    let blurred = [sharp[0] + LOW_PASS, sharp[1], sharp[2] + LOW_PASS];
+    let blurred = [sharp[0] + view.low_pass, sharp[1], sharp[2] + view.low_pass];
     let normal = cross(t0, t1);
     let sharp_determinant = dot(normal, normal);
-    let det = sharp_determinant + LOW_PASS * (sharp[0] + sharp[2]) + LOW_PASS * LOW_PASS;
+    let det = sharp_determinant + view.low_pass * (sharp[0] + sharp[2]) + view.low_pass * view.low_pass;
     if !det.is_finite() {
         return None;
     }
@@ -367,12 +368,12 @@ pub(super) fn project_backward(
     let base_opacity = sigmoid(posed.opacity_logit);
 
     // Step 1: v_T = -L^T M W with W = L T, whose first row is L00 (t0 - C01 / C11 t1): the difference is
-    // (0.3 t0 + t1 x (t0 x t1)) / C11, in which nothing cancels for needles.
+    // (low_pass t0 + t1 x (t0 x t1)) / C11, in which nothing cancels for needles.
     let [l00, l01, l11] = f.factor;
     let [t0, t1] = f.image_spread;
     let turned = cross(t1, f.normal);
     let scale = l00 / f.blurred[2];
-    let w0 = [0, 1, 2].map(|c| scale * (LOW_PASS * t0[c] + turned[c]));
+    let w0 = [0, 1, 2].map(|c| scale * (view.low_pass * t0[c] + turned[c]));
     let w1 = t1.map(|entry| l11 * entry);
     let mut m = v.moments;
     let mut v_image_spread = [[0.0; 3]; 2];

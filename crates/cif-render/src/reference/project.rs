@@ -9,8 +9,7 @@ use super::constant;
 use super::matrix::{Matrix, apply, cross, dot, multiply, scale_columns, transpose};
 use super::scene::Gaussian;
 use crate::constants::{
-    JACOBIAN_MARGIN, LOG_SCALE_RANGE, LOW_PASS, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
-    MIN_ANTIALIASING,
+    JACOBIAN_MARGIN, LOG_SCALE_RANGE, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA, MIN_ANTIALIASING,
 };
 use crate::settings::{OccupancySource, RenderSettings};
 
@@ -145,7 +144,8 @@ struct Footprint<R> {
     normal: [R; 3],
     /// det C0.
     sharp_determinant: R,
-    /// C as 00, 01, 11, and its determinant.
+    /// Low-pass dilation, px^2; C as 00, 01, 11, and its determinant.
+    low_pass: R,
     dilated: [R; 3],
     determinant: R,
     /// rho, and whether it sits on its floor.
@@ -162,16 +162,13 @@ impl<R: Real> Footprint<R> {
     }
 
     /// Rows of `W = L T`, with entries in [-1, 1]. The first is `L00 (t0 - C01 / C11 t1)`, whose difference is
-    /// `(0.3 t0 + t1 x (t0 x t1)) / C11`, without the cancellation for needles.
+    /// `(low_pass t0 + t1 x (t0 x t1)) / C11`, without the cancellation for needles.
     fn whitened_spread(&self) -> [[R; 3]; 2] {
         let [l00, _, l11] = self.factor();
         let [t0, t1] = self.image_spread;
         let turned = cross(t1, self.normal);
         let scale = l00 / self.dilated[2];
-        [
-            std::array::from_fn(|c| scale * (constant::<R>(LOW_PASS) * t0[c] + turned[c])),
-            t1.map(|entry| l11 * entry),
-        ]
+        [std::array::from_fn(|c| scale * (self.low_pass * t0[c] + turned[c])), t1.map(|entry| l11 * entry)]
     }
 }
 
@@ -218,7 +215,7 @@ fn measure<R: Real>(
     let sharp = [dot(t0, t0), dot(t0, t1), dot(t1, t1)];
     let normal = cross(t0, t1);
     let sharp_determinant = dot(normal, normal);
-    let low_pass = constant::<R>(LOW_PASS);
+    let low_pass = constant::<R>(settings.low_pass);
     let dilated = [sharp[0] + low_pass, sharp[1], sharp[2] + low_pass];
     let determinant = sharp_determinant + low_pass * (sharp[0] + sharp[2]) + low_pass * low_pass;
     if !determinant.is_finite() {
@@ -238,6 +235,7 @@ fn measure<R: Real>(
         image_spread,
         normal,
         sharp_determinant,
+        low_pass,
         dilated,
         determinant,
         antialiasing,

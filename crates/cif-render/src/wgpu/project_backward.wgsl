@@ -71,7 +71,7 @@ fn project_backward(@builtin(workgroup_id) workgroup: vec3u, @builtin(local_invo
     // Step 1: v_T = -L^T M W with W = L T, whose first row is L00 (t0 - C01 / C11 t1): the difference is
     // (0.3 t0 + t1 x (t0 x t1)) / C11, in which nothing cancels for needles.
     let turned = cross(f.image_1, f.normal);
-    let w0 = f.factor.x / f.blurred.z * (LOW_PASS * f.image_0 + turned);
+    let w0 = f.factor.x / f.blurred.z * (view.low_pass * f.image_0 + turned);
     let w1 = f.factor.z * f.image_1;
     var m = vec3f(g0.zw, g1.x);
     var v_image_0 = vec3f(0.0);

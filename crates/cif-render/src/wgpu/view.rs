@@ -9,7 +9,7 @@ use super::gaussians::PACKED_SH_WORDS;
 use super::kernel::{Constant, MAX_WORKGROUPS, Snippet, constants, structures};
 use super::layout::Shared;
 use crate::constants::{
-    JACOBIAN_MARGIN, LOG_SCALE_RANGE, LOW_PASS, MAX_ALPHA, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
+    JACOBIAN_MARGIN, LOG_SCALE_RANGE, MAX_ALPHA, MAX_COVARIANCE, MAX_POSITION_GRADIENT, MIN_ALPHA,
     MIN_ANTIALIASING, MIN_COVERAGE, MIN_LABEL_PROBABILITY, MIN_TRANSMITTANCE, TILE,
 };
 use crate::{GeometryPath, InstanceNormalisation, OccupancySource, RenderSettings};
@@ -111,8 +111,12 @@ crate::shared_struct! {
         pub mean_geometry: f32,
         /// First row of tiles that is drawn; rows of tiles and of pixels that come out are counted from there.
         pub first_row: u32,
+        /// Dilation added to both diagonal entries of a projected covariance, px^2.
+        pub low_pass: f32,
+        /// Pads to 8 bytes.
+        pub unused: u32,
         /// Pads to 16 bytes.
-        pub unused: [u32; 4],
+        pub unused_pair: [u32; 2],
     }
 }
 
@@ -191,6 +195,7 @@ impl View {
             size: [camera.width, camera.height],
             tiles: [camera.width.div_ceil(TILE), camera.height.div_ceil(TILE)],
             near: settings.near,
+            low_pass: settings.low_pass,
             gaussians: gaussians as u32,
             sh_degree: u32::from(settings.sh_degree),
             antialiased: u32::from(settings.antialiased),
@@ -234,7 +239,6 @@ fn shared_constants() -> String {
         ("MIN_ALPHA", Float(MIN_ALPHA)),
         ("MAX_ALPHA", Float(MAX_ALPHA)),
         ("MIN_TRANSMITTANCE", Float(MIN_TRANSMITTANCE)),
-        ("LOW_PASS", Float(LOW_PASS)),
         ("MIN_ANTIALIASING", Float(MIN_ANTIALIASING)),
         ("LOG_SCALE_LOW", Float(LOG_SCALE_RANGE.0)),
         ("LOG_SCALE_HIGH", Float(LOG_SCALE_RANGE.1)),

@@ -339,6 +339,7 @@ fn colour_only() {
 #[test]
 fn every_image_setting() {
     check("antialiased", &config(), &RenderSettings { antialiased: true, ..settings() }, |_| {});
+    check("another low pass", &config(), &RenderSettings { low_pass: 0.05, ..settings() }, |_| {});
     let by_distance = RenderSettings { sort_metric: SortMetric::Distance, ..settings() };
     check("distance", &config(), &by_distance, |_| {});
     for sh_degree in 0..3 {

@@ -79,6 +79,13 @@ fn antialiased() {
 }
 
 #[test]
+fn another_low_pass() {
+    let settings = RenderSettings { low_pass: 0.1, ..settings() };
+    let case = Case::clear(SyntheticConfig::default(), settings, |_| {});
+    check_gradients("another low pass", &case);
+}
+
+#[test]
 fn lower_harmonics_degrees() {
     for sh_degree in 0..3 {
         let settings = RenderSettings { sh_degree, ..settings() };

@@ -12,10 +12,13 @@ use rand_pcg::Pcg64;
 use super::outline::Outline;
 use super::plane::Plane;
 use super::shape::{Adam, Pose, Shape};
-use super::view::{ObjectView, Seen};
+use super::view::{ObjectView, Seen, is_one_camera};
 
 /// Rates of turns, radians, and of translations, of the size.
 const POSE_RATE: f64 = 0.02;
+
+/// Rate of the distance from the camera off the support, relative to that of other shifts.
+const DEPTH_RATE: f64 = 3.0;
 
 /// Weight of accelerations and changes of turning, where an object is hardly seen.
 const ACCELERATION: f64 = 0.02;
@@ -71,6 +74,8 @@ pub(super) struct Fit<'a> {
     pub(super) rng: Pcg64,
     /// True where it stands on the plane at times that are not in the air.
     pub(super) touches: bool,
+    /// Times at which it may be off the plane.
+    pub(super) air: Vec<usize>,
     moments: BTreeMap<usize, PoseMoments>,
 }
 
@@ -156,10 +161,7 @@ impl<'a> Fit<'a> {
         shape: Shape,
         rng: Pcg64,
     ) -> Self {
-        let one_camera = {
-            let mut seen = std::collections::BTreeSet::new();
-            views.iter().all(|view| seen.insert(view.time_index))
-        };
+        let one_camera = is_one_camera(views);
         let (turns, rolls) = (Turns::Free, None);
         Self {
             views,
@@ -174,6 +176,7 @@ impl<'a> Fit<'a> {
             one_camera,
             rng,
             touches: true,
+            air: outline.air.clone(),
             moments: BTreeMap::new(),
         }
     }
@@ -234,7 +237,7 @@ impl<'a> Fit<'a> {
             gradient.turn += of_pose.turn;
             gradient.translation += of_pose.translation;
         }
-        *pose = self.moved(pose, &gradient, moments, rate);
+        *pose = self.moved(view, pose, &gradient, moments, rate);
     }
 
     /// Mean loss over views, by their visible shares.
@@ -268,20 +271,37 @@ impl<'a> Fit<'a> {
         for (time, gradient) in gradients {
             let Some(pose) = self.poses.get(&time) else { continue };
             let mut moments = self.moments.remove(&time).unwrap_or_else(fresh_moments);
-            let moved = self.moved(pose, &gradient, &mut moments, pose_rate);
+            let view = self.views.iter().find(|view| view.time_index == time).unwrap_or(view);
+            let moved = self.moved(view, pose, &gradient, &mut moments, pose_rate);
             self.moments.insert(time, moments);
             self.poses.insert(time, moved);
         }
     }
 
-    /// A pose after a step against its gradient.
-    fn moved(&self, pose: &Pose, gradient: &PoseGradient, moments: &mut PoseMoments, rate: f64) -> Pose {
+    /// A pose after a step against its gradient, at the time of a view.
+    fn moved(
+        &self,
+        view: &ObjectView,
+        pose: &Pose,
+        gradient: &PoseGradient,
+        moments: &mut PoseMoments,
+        rate: f64,
+    ) -> Pose {
         let (mut turn, mut shift) = (DVec3::ZERO, DVec3::ZERO);
         let [of_turns, of_shifts] = moments;
         let values = |v: DVec3| v.to_array().into_iter();
         of_turns.step(values(gradient.turn), POSE_RATE * rate, |k, step| turn[k] = -step);
         let rate = POSE_RATE * rate * self.size();
-        of_shifts.step(values(gradient.translation), rate, |k, step| shift[k] = -step);
+        if self.one_camera && self.air.contains(&view.time_index) {
+            // Along the axes of the camera: off its support, nothing but its size tells how far away it is, which is
+            // weak beside what tells its place in the image.
+            let axes = view.camera.camera_from_world.rotation;
+            of_shifts.step(values(axes * gradient.translation), rate, |k, step| shift[k] = -step);
+            shift.z *= DEPTH_RATE;
+            shift = axes.transpose() * shift;
+        } else {
+            of_shifts.step(values(gradient.translation), rate, |k, step| shift[k] = -step);
+        }
         turn = match (self.turns, &self.plane) {
             (Turns::Given, _) => DVec3::ZERO,
             (Turns::Upright, Some(plane)) => plane.normal * plane.normal.dot(turn),
@@ -339,11 +359,10 @@ impl<'a> Fit<'a> {
         2.0 * DEPTH * ray.dot(pose.translation - *place) / (size * size) * ray
     }
 
-    /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane; `None` at times off
-    /// the plane, and where several cameras tell the distance.
+    /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane, or no deeper at times off
+    /// the plane; `None` where nothing needs to move, and where several cameras tell the distance.
     fn contact(&self, shape: &Shape, time: usize, pose: &Pose) -> Option<(PoseGradient, Vec<DVec3>)> {
-        let plane =
-            self.plane.filter(|_| self.touches && self.one_camera && !self.outline.air.contains(&time))?;
+        let plane = self.plane.filter(|_| self.touches && self.one_camera)?;
         let size = self.size();
         let g = shape.gaussians();
         let normal = pose.rotation.inverse() * plane.normal;
@@ -374,6 +393,9 @@ impl<'a> Fit<'a> {
         }
         weights.iter_mut().for_each(|weight| *weight /= total);
         let height: f64 = heights.iter().zip(&weights).map(|(height, weight)| height * weight).sum();
+        if height > 0.0 && self.air.contains(&time) {
+            return None;
+        }
         let c = 2.0 * CONTACT * height / (size * size);
         let mut lever = DVec3::ZERO;
         let mut of_centres = Vec::with_capacity(g.len());

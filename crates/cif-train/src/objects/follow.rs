@@ -14,9 +14,7 @@ use crate::stop::Stop;
 /// Steps of the shape at the first time, per level.
 const FIRST: usize = 120;
 
-/// Times around the first that one camera shows from so many sides that they are begun together, as if the object
-/// did not turn between them, and their steps.
-const TOGETHER: usize = 6;
+/// Steps of the shape at several first times.
 const BEGIN: usize = 600;
 
 /// Steps of a pose, per level; of a second time, whose speed is not known, twice as many.
@@ -43,7 +41,8 @@ const UNSEEN: f64 = 0.1;
 /// Visible share from which turns are tried.
 const SEEN: f64 = 0.3;
 
-/// Finds poses of further times, nearest to `reference` first, which has one; `path` tells where the object is.
+/// Finds poses of further times, nearest to `reference` first, which has one, as others may; `path` tells where the
+/// object is.
 ///
 /// # Errors
 /// [`TrainError::Stopped`] when the run is to stop.
@@ -61,14 +60,14 @@ pub(super) fn follow(
     }
     let Some(first) = at.get(&reference).cloned() else { return Ok(()) };
     let mut order: Vec<usize> =
-        at.keys().copied().filter(|t| *t != reference && path.contains_key(t)).collect();
+        at.keys().copied().filter(|t| !fit.poses.contains_key(t) && path.contains_key(t)).collect();
     order.sort_by_key(|time| time.abs_diff(reference));
-    if fit.one_camera && fit.outline.is_surrounded {
-        let rotation = fit.poses[&reference].rotation;
-        for time in order.drain(..TOGETHER.min(order.len())) {
-            fit.poses.insert(time, Pose { rotation, translation: path[&time] });
-        }
-        carve(fit, &at, BEGIN, 1.0);
+    if fit.poses.len() > 1 {
+        let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
+        // What rests does so exactly.
+        let pose_rate = if fit.outline.is_surrounded { 1.0 } else { 0.0 };
+        let level = fit.trial_level();
+        fit.steps(&known, BEGIN, |share| (if share < 0.5 { 1.0 } else { 0.5 }, pose_rate, level));
     } else {
         for level in levels {
             for step in 0..FIRST {
@@ -101,7 +100,9 @@ pub(super) fn follow(
 /// show of its far side is a guess.
 fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>, steps: usize, pose_rate: f64) {
     let count = fit.shape.gaussians().len();
-    let Some(shape) = hull(fit.views, &fit.poses, (fit.outline.size(), None), count, fit.near, &mut fit.rng)
+    let upright = fit.outline.upright(fit.plane.as_ref());
+    let bound: Option<&dyn Fn(DVec3) -> bool> = if fit.outline.is_surrounded { None } else { Some(&upright) };
+    let Some(shape) = hull(fit.views, &fit.poses, (fit.outline.size(), bound), count, fit.near, &mut fit.rng)
     else {
         return;
     };

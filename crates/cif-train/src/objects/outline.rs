@@ -26,6 +26,13 @@ const PARALLEL: f64 = 1e-9;
 /// Share of the pixels of a mask that lie within its radius of its middle.
 const WITHIN: f64 = 0.98;
 
+/// Length of a mask in its widths from which it is that of a bar, and the sine of the angle between its long axis and
+/// the way down from which the bar lies.
+const BAR: (f64, f64) = (2.2, 0.15);
+
+/// Room that an object has around its height and radius, of them.
+const ROOM: f64 = 1.1;
+
 /// Path and size of an object.
 #[derive(Clone, Debug)]
 pub(super) struct Outline {
@@ -49,6 +56,20 @@ impl Outline {
     pub(super) fn size(&self) -> f64 {
         self.height.max(self.radius)
     }
+
+    /// Test of places about the centre, as the object stands on a plane: few views do not tell how deep it is, its
+    /// outline on the plane does. True of all places without a plane.
+    pub(super) fn upright(&self, plane: Option<&Plane>) -> impl Fn(DVec3) -> bool + use<> {
+        let (height, radius) = (ROOM * self.height, ROOM * self.radius);
+        let normal = plane.map(|plane| plane.normal);
+        move |place| {
+            normal.is_none_or(|normal| {
+                let up = normal.dot(place);
+                let across = (place.length_squared() - up * up).max(0.0).sqrt();
+                up.abs() < height && across < radius
+            })
+        }
+    }
 }
 
 /// Reading of one mask.
@@ -56,6 +77,8 @@ struct Reading {
     height: f64,
     radius: f64,
     roundness: f64,
+    /// True of a bar that lies.
+    is_bar: bool,
 }
 
 /// The point nearest to rays through the middles of masks, by weights; `None` where they are parallel.
@@ -182,10 +205,15 @@ fn implied_size(view: &ObjectView, plane: &Plane, height: f64) -> Option<f64> {
 fn median_reading(views: &[&ObjectView], plane: &Plane) -> Option<Reading> {
     let readings: Vec<Reading> = views.iter().filter_map(|view| read(view, plane)).collect();
     let of = |value: fn(&Reading) -> f64| median(&mut readings.iter().map(value).collect::<Vec<_>>());
+    // A bar looks shorter from its ends.
+    let mut bars: Vec<f64> = readings.iter().filter(|r| r.is_bar).map(|r| r.radius).collect();
+    bars.sort_by(f64::total_cmp);
+    let longest = bars.get(bars.len() * 9 / 10).filter(|_| 2 * bars.len() > readings.len());
     (!readings.is_empty()).then(|| Reading {
         height: of(|reading| reading.height),
-        radius: of(|reading| reading.radius),
+        radius: longest.copied().unwrap_or_else(|| of(|reading| reading.radius)),
         roundness: of(|reading| reading.roundness),
+        is_bar: longest.is_some(),
     })
 }
 
@@ -247,19 +275,43 @@ fn read(view: &ObjectView, plane: &Plane) -> Option<Reading> {
         share * 4.0 * moments.col(axis)[axis].sqrt() + (1.0 - share) * (range(axis) + more)
     };
     let (along, wide) = (extent(0, 0.5), extent(1, 0.0));
+    let bar = bar(&places, mean, moments);
     let sine = -slope / ray.length();
     let cosine = (1.0 - sine * sine).max(1e-6).sqrt();
     let focal = camera.focal_px.x;
     let mut depth = plane.meet(camera.centre(), ray, 0.0)?;
     let (mut height, mut radius) = (0.0, 0.0);
     for _ in 0..20 {
-        radius = 0.5 * wide * depth / focal;
+        radius = 0.5 * bar.map_or(wide, |[length, _]| length) * depth / focal;
         let extent = along * depth / focal;
         let cylinder = ((extent - 2.0 * radius * sine) / cosine).max(0.3 * radius);
         let ellipsoid =
             ((0.5 * extent).powi(2) - (radius * sine).powi(2)).max((0.15 * radius).powi(2)).sqrt() / cosine;
-        height = share * ellipsoid + (1.0 - share) * 0.5 * cylinder;
+        // A bar that lies is as high as it is thick.
+        let upright = 0.5 * bar.map_or(cylinder, |[_, thickness]| thickness * depth / focal);
+        height = share * ellipsoid + (1.0 - share) * upright;
         depth = plane.meet(camera.centre(), ray, height)?;
     }
-    Some(Reading { height, radius, roundness })
+    Some(Reading { height, radius, roundness, is_bar: bar.is_some() })
+}
+
+/// Length and thickness, pixels, of a mask that is long across the way down, as of a bar that lies; places are along and
+/// across the way down.
+fn bar(places: &[DVec2], mean: DVec2, moments: DMat2) -> Option<[f64; 2]> {
+    let half = 0.5 * (moments.x_axis.x - moments.y_axis.y);
+    let spread = half.hypot(moments.x_axis.y);
+    let middle = 0.5 * (moments.x_axis.x + moments.y_axis.y);
+    // Angle of the long axis from the way down.
+    let angle = 0.5 * moments.x_axis.y.atan2(half);
+    let is_long = middle + spread > BAR.0 * BAR.0 * (middle - spread);
+    if !is_long || angle.sin().abs() < BAR.1 {
+        return None;
+    }
+    let along = DVec2::new(angle.cos(), angle.sin());
+    Some([along, along.perp()].map(|axis| {
+        let mut values: Vec<f64> = places.iter().map(|place| (*place - mean).dot(axis)).collect();
+        values.sort_by(f64::total_cmp);
+        let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
+        at(0.99) - at(0.01) + 0.5
+    }))
 }

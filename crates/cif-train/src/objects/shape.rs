@@ -196,7 +196,7 @@ impl Shape {
             },
             ..crop.camera
         };
-        let settings = RenderSettings { background, ..self.settings };
+        let settings = RenderSettings { background, low_pass: crop.low_pass, ..self.settings };
         let color = self.renderer.forward(&self.field, &camera, 0.0, &settings, None).color;
         let ones = vec![1.0; self.len()];
         let request = BlendRequest { values: &ones[..], channels: 1, blending: Blending::Color };

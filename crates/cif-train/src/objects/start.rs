@@ -16,7 +16,7 @@ use super::path::smooth;
 use super::plane::Plane;
 use super::shape::{Pose, Shape};
 use super::trials::{self, GAUSSIANS, STEPS};
-use super::view::ObjectView;
+use super::view::{ObjectView, is_one_camera};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
@@ -27,6 +27,13 @@ const FEWEST_TIMES: usize = 8;
 
 /// Times at which an object must be seen to be followed.
 const FEWEST_SEEN: usize = 5;
+
+/// Times that one camera shows from so many sides that they are begun together, as if the object did not turn between
+/// them.
+const TOGETHER: usize = 7;
+
+/// Step from time to time, of the size, up to which an object that leaves its support stands still on it.
+const STANDS: f64 = 0.03;
 
 /// Gaussians of an object that is followed.
 const FOLLOWED: usize = 300;
@@ -178,27 +185,56 @@ impl<'a> Object<'a> {
         times.max_by(|a, b| seen(a).total_cmp(&seen(b)))
     }
 
-    /// The object at one time of its path, from which it is followed to others.
-    pub(super) fn first(&self, path: &BTreeMap<usize, DVec3>, time: usize) -> Option<Fit<'a>> {
-        let poses = BTreeMap::from([(time, Pose { rotation: DQuat::IDENTITY, translation: path[&time] })]);
-        let plane = self.surroundings.plane;
-        // One view does not tell how deep an object is: its outline on the plane does.
-        let within = |place: DVec3| {
-            let up = plane.map_or(0.0, |plane| plane.normal.dot(place));
-            let across = (place.length_squared() - up * up).max(0.0).sqrt();
-            up.abs() < 1.1 * self.outline.height && across < 1.1 * self.outline.radius
-        };
-        let bound: Option<&dyn Fn(DVec3) -> bool> = if plane.is_some() { Some(&within) } else { None };
+    /// Time from which an object is followed to others of its path, among `times`, and the object there: as it rests
+    /// before it is lifted, or after; where it looks from one side to the next as if it did not turn; else as one time
+    /// shows it.
+    pub(super) fn first(&self, path: &BTreeMap<usize, DVec3>, times: &[usize]) -> Option<(usize, Fit<'a>)> {
+        let at = |place: DVec3| Pose { rotation: DQuat::IDENTITY, translation: place };
+        let rests = self.rests(path).into_iter().max_by_key(Vec::len).unwrap_or_default();
+        let rests: Vec<usize> = rests.into_iter().filter(|time| times.contains(time)).collect();
+        let reference = self.best_seen(if rests.is_empty() { times } else { &rests }.iter().copied())?;
+        let mut poses = BTreeMap::from([(reference, at(path[&reference]))]);
+        if !rests.is_empty() {
+            let middle = rests.iter().map(|time| path[time]).sum::<DVec3>() / rests.len() as f64;
+            poses.extend(rests.iter().map(|time| (*time, at(middle))));
+        } else if self.outline.is_surrounded && is_one_camera(self.views) {
+            let mut near = times.to_vec();
+            near.sort_by_key(|time| time.abs_diff(reference));
+            poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
+        }
+        let upright = self.outline.upright(self.surroundings.plane);
         let (size, near) = (self.outline.size(), self.surroundings.near);
-        let shape = hull(self.views, &poses, (size, bound), FOLLOWED, near, &mut self.rng())?;
-        Some(self.fit(poses, shape, self.rng()))
+        let shape = hull(self.views, &poses, (size, Some(&upright)), FOLLOWED, near, &mut self.rng())?;
+        let mut fit = self.fit(poses, shape, self.rng());
+        fit.air = self.may_be_off(path);
+        Some((reference, fit))
+    }
+
+    /// Runs of times at which an object that leaves its support stands in one place on it; none of other objects.
+    pub(super) fn rests(&self, path: &BTreeMap<usize, DVec3>) -> Vec<Vec<usize>> {
+        let air = &self.outline.air;
+        let times: Vec<usize> = path.keys().copied().collect();
+        let stands = |a: &usize, b: &usize| {
+            let step = (path[b] - path[a]).length() / (b - a) as f64;
+            step < STANDS * self.outline.size() && !air.contains(a) && !air.contains(b)
+        };
+        let runs = times.chunk_by(stands).filter(|run| !air.is_empty() && run.len() > 2);
+        runs.map(<[usize]>::to_vec).collect()
+    }
+
+    /// Times at which an object that is followed may be off its support: all at which it does not rest, where it
+    /// leaves it at all.
+    pub(super) fn may_be_off(&self, path: &BTreeMap<usize, DVec3>) -> Vec<usize> {
+        let rests: Vec<usize> = self.rests(path).into_iter().flatten().collect();
+        let leaves = !self.outline.air.is_empty();
+        path.keys().copied().filter(|time| leaves && !rests.contains(time)).collect()
     }
 
     /// An object that is mostly cut or hidden, followed from time to time.
     fn followed(&self, path: &BTreeMap<usize, DVec3>) -> Result<Option<Started<'a>>, TrainError> {
-        let reference = self.best_seen(path.keys().copied()).filter(|_| path.len() >= FEWEST_SEEN);
-        let Some(reference) = reference else { return Ok(None) };
-        let Some(mut fit) = self.first(path, reference) else { return Ok(None) };
+        let times: Vec<usize> = path.keys().copied().collect();
+        let first = self.first(path, &times).filter(|_| path.len() >= FEWEST_SEEN);
+        let Some((reference, mut fit)) = first else { return Ok(None) };
         let all: Vec<usize> = self.views_at(path).collect();
         follow(&mut fit, reference, path, &all, self.surroundings.stop)?;
         let error = fit.mean_loss(&all, 0);

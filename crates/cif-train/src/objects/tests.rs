@@ -220,7 +220,7 @@ fn a_textured_ball_is_found_to_roll_and_a_plain_one_is_assumed_to() {
     assert!(turn < 25.0 && shift < 0.01, "{turn} deg, {shift} m, {}", textured.way);
     assert!(textured.way.starts_with("rolls"), "{}", textured.way);
     let plain = fit(&views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth, moving));
-    assert_eq!(plain.rotation, RotationEvidence::Assumed);
+    assert_eq!(plain.rotation, RotationEvidence::Assumed, "{}, {}", plain.way, plain.error);
     assert!(plain.way.starts_with("rolls"), "{}", plain.way);
     let (turn, shift) = errors(&plain.poses, &truth);
     // Nothing but its outline, of 30 pixels, tells how far it went: 400 degrees.
@@ -323,6 +323,43 @@ fn several_cameras_follow_an_object_that_is_lifted_and_tilted() {
     let (turn, shift) = errors(&fitted.poses, &truth);
     assert!(turn < 3.0 && shift < 0.004, "{turn} deg, {shift} m, {}", fitted.way);
     assert_eq!(fitted.rotation, RotationEvidence::Observed);
+}
+
+#[test]
+fn one_camera_follows_an_object_from_where_it_stood_to_its_other_side() {
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+        .map(|k| {
+            let share = ((k as f64 - 7.0) / 15.0).clamp(0.0, 1.0);
+            let turn = DQuat::from_rotation_x(-std::f64::consts::FRAC_PI_2 * share);
+            let height = 0.05 + 0.4 * share * (1.0 - share);
+            (turn, DVec3::new(-0.08 + 0.16 * share, 0.05 * share, height))
+        })
+        .collect();
+    let fitted = fit(&views(solid(&box_places(), patches, 0.006), &truth, moving));
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(fitted.way.starts_with("followed"), "{}", fitted.way);
+    assert!(turn < 8.0 && shift < 0.015, "{turn} deg, {shift} m");
+}
+
+#[test]
+fn a_bar_that_rolls_about_its_long_axis_is_found_by_its_texture() {
+    let mut rng = stream(0, Purpose::Objects, 14);
+    let places: Vec<DVec3> = (0..2500)
+        .map(|_| {
+            let angle = std::f64::consts::TAU * rng.random::<f64>();
+            DVec3::new(0.025 * angle.cos(), 0.22 * (rng.random::<f64>() - 0.5), 0.025 * angle.sin())
+        })
+        .collect();
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+        .map(|k| {
+            let way = 0.2 * k as f64 / (TIMES - 1) as f64;
+            (DQuat::from_rotation_y(way / 0.03), DVec3::new(-0.1 + way, 0.0, 0.03))
+        })
+        .collect();
+    let fitted = fit(&views(solid(&places, patches, 0.005), &truth, moving));
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(fitted.way.starts_with("rolls"), "{}", fitted.way);
+    assert!(turn < 15.0 && shift < 0.006, "{turn} deg, {shift} m");
 }
 
 /// One camera that looks from another side at every time.

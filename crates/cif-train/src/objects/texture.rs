@@ -1,5 +1,6 @@
-//! Turns of an object about the upright axis, read from its texture as several cameras see it: solids of revolution,
-//! whose outline is the same from all sides, show them by nothing else. The surface is unrolled from a cylinder at every
+//! Turns of an object about the upright axis, as several cameras see it, or of a bar about its long axis, read from its
+//! texture: solids of revolution, whose outline is the same from all sides, show them by nothing else. The surface is
+//! unrolled from a cylinder at every
 //! time; what stays in place between times is light, and what moves around tells the turn.
 
 use std::collections::BTreeMap;
@@ -9,6 +10,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::outline::Outline;
+use super::shape::Pose;
 use super::view::ObjectView;
 
 /// Places around and along the axis at which the surface is looked at.
@@ -31,17 +33,23 @@ const APART: f64 = 10.0;
 /// Total turn, degrees, from which the texture has been seen elsewhere than at the start.
 const SMALLEST: f64 = 60.0;
 
-/// Share of the brightness that the turn must explain, and how many times that of the middle of all turns, and of the
-/// best that differs by more than so many degrees in all.
+/// Share of the brightness that the turn must explain, and the difference of total turns, degrees, from which another
+/// is a rival.
 const EXPLAINED: f64 = 0.2;
-const ABOVE_CHANCE: f64 = 3.0;
-const RIVAL: (f64, f64) = (1.5, 120.0);
+const RIVAL: f64 = 120.0;
+
+/// How many times what the middle of all turns explains, and the best rival, the turn must: of any turn, and of one that
+/// rolling lets expect.
+const CLEAR: [(f64, f64); 2] = [(3.0, 1.5), (1.5, 1.25)];
 
 /// Root mean square of the texture, relative to its brightness, below which it may be noise.
 const FAINT: f64 = 0.02;
 
 /// Turns around what a constant rate tells that are tried at each time, places around, and rounds of that.
 const REFINED: (i64, usize) = (3, 3);
+
+/// Turn of a bar, of that of rolling without slip, from which it rolls, and up to which it is looked for.
+const SLIPS: (f64, f64) = (0.7, 1.4);
 
 /// Fewest times that are compared.
 const FEWEST: usize = 8;
@@ -52,6 +60,19 @@ struct Surface {
     weights: Vec<f64>,
 }
 
+/// The cylinder whose surface is looked at, at one time.
+struct Cylinder {
+    centre: DVec3,
+    /// Unit vectors along its axis, and across it, from which angles are counted.
+    axis: DVec3,
+    across: DVec3,
+    radius: f64,
+    half_length: f64,
+}
+
+/// Views by time.
+type Views<'a> = BTreeMap<usize, Vec<&'a ObjectView>>;
+
 /// Rotations about `up` by time that explain how the texture goes around; `None` where it does not tell them. `path`
 /// is that of the centre.
 pub(super) fn turns<'a>(
@@ -60,52 +81,112 @@ pub(super) fn turns<'a>(
     outline: &Outline,
     up: DVec3,
 ) -> Option<BTreeMap<usize, DQuat>> {
-    let mut at: BTreeMap<usize, Vec<&ObjectView>> = BTreeMap::new();
-    for view in views.filter(|view| path.contains_key(&view.time_index)) {
-        at.entry(view.time_index).or_default().push(view);
-    }
+    let at = by_time(views, |time| path.contains_key(&time))?;
     // One camera shows too little of the surface at a time to tell a turn from a roll.
-    if at.len() < FEWEST || at.values().any(|views| views.len() < 2) {
+    if at.values().any(|views| views.len() < 2) {
         return None;
     }
-    let times: Vec<usize> = at.keys().copied().collect();
-    let unrolled = |(time, views): (&usize, &Vec<&ObjectView>)| unroll(views, path[time], outline, up);
+    let cylinder = |time: &usize| Cylinder {
+        centre: path[time],
+        axis: up,
+        across: up.any_orthonormal_vector(),
+        radius: outline.radius,
+        half_length: outline.height,
+    };
+    let (first, last) = (*at.keys().next()?, *at.keys().next_back()?);
+    let shares: Vec<f64> = at.keys().map(|time| (time - first) as f64 / (last - first) as f64).collect();
+    let surfaces = unrolled(&at, cylinder);
+    let (_, found) = told(&surfaces, &shares, FASTEST * (last - first) as f64, CLEAR[0])?;
+    Some(at.keys().zip(found).map(|(time, turn)| (*time, DQuat::from_scaled_axis(turn * up))).collect())
+}
+
+/// Turns, radians, of a bar about its long axis by time that explain how its texture goes around, near those of
+/// rolling without slip; `None` where it does not tell them. `poses` are those without these turns, `axis` is its long
+/// axis in its own frame, and `rolled` tells the turns of rolling by time.
+pub(super) fn rolls<'a>(
+    views: impl Iterator<Item = &'a ObjectView>,
+    poses: &BTreeMap<usize, Pose>,
+    (axis, up): (DVec3, DVec3),
+    rolled: &BTreeMap<usize, f64>,
+    outline: &Outline,
+) -> Option<BTreeMap<usize, f64>> {
+    let at = by_time(views, |time| poses.contains_key(&time))?;
+    let cylinder = |time: &usize| {
+        let axis = poses[time].rotation * axis;
+        Cylinder {
+            centre: poses[time].translation,
+            axis,
+            across: (up - up.dot(axis) * axis).normalize_or(axis.any_orthonormal_vector()),
+            radius: outline.height,
+            half_length: outline.radius,
+        }
+    };
+    let most = at.keys().map(|time| rolled[time].abs()).fold(0.0, f64::max);
+    let shares: Vec<f64> = at.keys().map(|time| rolled[time] / most.max(1e-9)).collect();
+    let (total, found) = told(&unrolled(&at, cylinder), &shares, SLIPS.1 * most.to_degrees(), CLEAR[1])?;
+    (total >= SLIPS.0 * most.to_degrees()).then(|| at.keys().copied().zip(found).collect())
+}
+
+/// Views by time, where there are enough.
+fn by_time<'a>(
+    views: impl Iterator<Item = &'a ObjectView>,
+    is_wanted: impl Fn(usize) -> bool,
+) -> Option<Views<'a>> {
+    let mut at = Views::new();
+    for view in views.filter(|view| is_wanted(view.time_index)) {
+        at.entry(view.time_index).or_default().push(view);
+    }
+    (at.len() >= FEWEST).then_some(at)
+}
+
+/// Surfaces by time, without what is light.
+fn unrolled(at: &Views<'_>, cylinder: impl Fn(&usize) -> Cylinder + Sync) -> Vec<Surface> {
+    let unrolled = |(time, views): (&usize, &Vec<&ObjectView>)| unroll(views, &cylinder(time));
     let mut surfaces: Vec<Surface> = at.par_iter().map(unrolled).collect();
     take_light_away(&mut surfaces);
-    let duration = (times[times.len() - 1] - times[0]) as f64;
-    let places = |rate: f64| -> Vec<f64> {
-        times.iter().map(|time| rate * (time - times[0]) as f64 / 360.0 * AROUND as f64).collect()
+    surfaces
+}
+
+/// Total turn, degrees, at most `most` either way, that explains surfaces best when they turn by shares of it, and the
+/// turn of each, radians; `None` where the texture does not tell.
+fn told(
+    surfaces: &[Surface],
+    shares: &[f64],
+    most: f64,
+    (above_chance, above_rival): (f64, f64),
+) -> Option<(f64, Vec<f64>)> {
+    let places = |total: f64| -> Vec<f64> {
+        shares.iter().map(|share| share * total / 360.0 * AROUND as f64).collect()
     };
-    let count = (FASTEST * duration / APART) as i64;
-    let rates: Vec<f64> = (-count..=count).map(|k| k as f64 * APART / duration).collect();
-    let scores: Vec<f64> = rates.par_iter().map(|rate| explained(&surfaces, &places(*rate))).collect();
-    let best = (0..rates.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]))?;
+    let count = (most / APART) as i64;
+    let totals: Vec<f64> = (-count..=count).map(|k| k as f64 * APART).collect();
+    let scores: Vec<f64> = totals.par_iter().map(|total| explained(surfaces, &places(*total))).collect();
+    let best = (0..totals.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b]))?;
     let mut sorted = scores.clone();
     sorted.sort_by(f64::total_cmp);
     let chance = sorted[sorted.len() / 2];
-    let is_rival = |k: &usize| (rates[*k] - rates[best]).abs() * duration > RIVAL.1;
-    let rival = (0..rates.len()).filter(is_rival).map(|k| scores[k]).fold(0.0, f64::max);
-    let is_told = scores[best] > EXPLAINED.max(ABOVE_CHANCE * chance).max(RIVAL.0 * rival);
+    let is_rival = |k: &usize| (totals[*k] - totals[best]).abs() > RIVAL;
+    let rival = (0..totals.len()).filter(is_rival).map(|k| scores[k]).fold(0.0, f64::max);
+    let is_told = scores[best] > EXPLAINED.max(above_chance * chance).max(above_rival * rival);
     let seen: f64 = surfaces.iter().flat_map(|surface| &surface.weights).sum();
     let strength = (scores[best] * surfaces.iter().map(power).sum::<f64>() / seen.max(1e-9)).sqrt();
-    if !is_told || strength < FAINT || (rates[best] * duration).abs() < SMALLEST {
+    if !is_told || strength < FAINT || totals[best].abs() < SMALLEST {
         return None;
     }
-    let found = refined(&surfaces, places(rates[best]));
-    let rotation = |place: &f64| DQuat::from_axis_angle(up, place / AROUND as f64 * TAU);
-    Some(times.iter().copied().zip(found.iter().map(rotation)).collect())
+    let found = refined(surfaces, places(totals[best]));
+    Some((totals[best], found.iter().map(|place| place / AROUND as f64 * TAU).collect()))
 }
 
-/// The surface of a cylinder about the upright axis through a place, as views of one time show it.
-fn unroll(views: &[&ObjectView], centre: DVec3, outline: &Outline, up: DVec3) -> Surface {
-    let across = up.any_orthonormal_vector();
-    let beside = up.cross(across);
+/// The surface of a cylinder, as views of one time show it.
+fn unroll(views: &[&ObjectView], cylinder: &Cylinder) -> Surface {
+    let Cylinder { centre, axis, across, radius, half_length } = *cylinder;
+    let beside = axis.cross(across);
     let mut surface = Surface { values: vec![0.0; AROUND * ALONG], weights: vec![0.0; AROUND * ALONG] };
     for place in 0..AROUND * ALONG {
         let angle = ((place / ALONG) as f64 + 0.5) / AROUND as f64 * TAU;
         let share = ((place % ALONG) as f64 + 0.5) / ALONG as f64 * 2.0 - 1.0;
         let outward = angle.cos() * across + angle.sin() * beside;
-        let point = centre + INSIDE[0] * outline.radius * outward + INSIDE[1] * share * outline.height * up;
+        let point = centre + INSIDE[0] * radius * outward + INSIDE[1] * share * half_length * axis;
         let mut sum = 0.0;
         for view in views {
             let facing = outward.dot((view.camera.centre() - point).normalize_or_zero());

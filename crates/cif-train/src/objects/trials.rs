@@ -13,7 +13,7 @@ use super::path::smooth;
 use super::start::{Object, Started};
 use super::texture;
 use super::view::ObjectView;
-use super::ways::{Paths, Way, is_round};
+use super::ways::{Bar, Paths, Way, is_round, long_axis};
 use crate::error::TrainError;
 
 /// Gaussians of a trial.
@@ -27,7 +27,7 @@ const HOPELESS: f64 = 1.2;
 
 /// Error of resting, relative to that of sliding without a turn, and to that of the way that is kept, up to which an
 /// object is taken to rest.
-const REST_GAIN: [f64; 2] = [1.5, 1.25];
+const REST_GAIN: [f64; 2] = [1.5, 1.15];
 
 /// Steps of poses of times that were left out.
 const SETTLE: usize = 40;
@@ -43,12 +43,16 @@ const FOLLOW_GAIN: [f64; 2] = [0.98, 0.94];
 /// no turn.
 const TEXTURE_GAIN: f64 = 1.3;
 
-/// Largest error of rolling, relative to that of sliding, at which rolling is preferred.
-const ROLL_GAIN: f64 = 0.97;
+/// Largest error of rolling, relative to that of sliding, at which rolling is preferred: of most objects, and of round
+/// ones.
+const ROLL_GAIN: [f64; 2] = [0.97, 0.94];
 
 /// Error by which rivals must be told apart, relative: of most objects, and of round ones, whose shading prefers no
 /// turn; and the turn from which they are rivals, degrees.
 const RIVAL: ([f64; 2], i32) = ([1.02, 1.06], 60);
+
+/// Difference of errors up to which turns of round things are the same.
+const SAME: f64 = 0.002;
 
 /// Most rivals that are tried again with all pixels, of paths and of rolls, their errors relative to the best, of
 /// rolls the second, and Gaussians and steps.
@@ -155,7 +159,15 @@ impl<'a> Contest<'a> {
         reliable: &[usize],
     ) -> Result<Option<Trial<'a>>, TrainError> {
         let seen = reliable.iter().map(|view| &self.object.views[*view]);
-        self.paths.textured = texture::turns(seen, &self.paths.along, self.object.outline, self.paths.up);
+        let (outline, up, reference) = (self.object.outline, self.paths.up, self.paths.reference);
+        self.paths.textured = if let Some(bar) = bar(simple, up) {
+            let rolled = bar.rolled(up, outline.height, reference);
+            let turns = texture::rolls(seen, &bar.poses, (bar.axis, up), &rolled, outline);
+            turns.map(|turns| bar.turned(&turns))
+        } else {
+            let turns = texture::turns(seen, &self.paths.along, outline, up);
+            turns.map(|turns| self.paths.turned(&turns))
+        };
         if self.paths.textured.is_none() {
             return Ok(None);
         }
@@ -166,6 +178,13 @@ impl<'a> Contest<'a> {
         Ok(trials.pop().filter(|trial| trial.losses[1] <= TEXTURE_GAIN * least))
     }
 
+    /// True where views of all sides show how it turns from time to time, or it is lifted from where it stood, so that
+    /// its path does not tell.
+    fn may_be_followed(&self) -> bool {
+        let outline = self.object.outline;
+        outline.is_surrounded || (!is_round(outline) && !self.object.rests(&self.paths.along).is_empty())
+    }
+
     /// True where following may find what neither resting nor sliding explains.
     fn is_unexplained(&self, simple: &[Trial<'_>]) -> bool {
         self.object.outline.is_surrounded && simple.iter().all(|trial| trial.losses[1] > UNEXPLAINED)
@@ -174,11 +193,11 @@ impl<'a> Contest<'a> {
     /// All other ways along the path, beside the simple ones.
     fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = simple;
-        if self.object.outline.is_surrounded {
-            // Views of all sides show how it turns from time to time.
-            let known = self.train.iter().map(|view| self.object.views[*view].time_index);
-            let reference = self.object.best_seen(known).unwrap_or(self.paths.reference);
-            if let Some(mut fit) = self.object.first(&self.paths.along, reference) {
+        if self.may_be_followed() {
+            let mut known: Vec<usize> =
+                self.train.iter().map(|view| self.object.views[*view].time_index).collect();
+            known.dedup();
+            if let Some((reference, mut fit)) = self.object.first(&self.paths.along, &known) {
                 follow(&mut fit, reference, &self.paths.along, &self.train, self.object.surroundings.stop)?;
                 self.paths.followed = Some(fit.poses);
             }
@@ -209,7 +228,6 @@ impl<'a> Contest<'a> {
     }
 
     fn begin(&self, ways: &[Way], gaussians: usize) -> Vec<Trial<'a>> {
-        let outline = self.object.outline;
         let begin = |way: &Way| {
             let mut rng = self.object.rng();
             let mut poses = self.paths.poses(*way);
@@ -221,9 +239,12 @@ impl<'a> Contest<'a> {
             (fit.turns, fit.rolls) = match way {
                 Way::Rest => (Turns::Given, None),
                 Way::Slide(_) | Way::Spin(_) => (Turns::Upright, None),
-                Way::Roll(factor) => (Turns::Free, Some(outline.height / factor)),
+                Way::Roll(factor) => (Turns::Free, Some(self.paths.outline.height / factor)),
                 Way::Followed | Way::Textured => (Turns::Free, None),
             };
+            if *way == Way::Followed {
+                fit.air = self.object.may_be_off(&self.paths.along);
+            }
             fit.touches = !matches!(way, Way::Rest | Way::Spin(_));
             Some(Trial { way: *way, fit, losses: [0.0; 2] })
         };
@@ -276,13 +297,20 @@ impl<'a> Contest<'a> {
                 }
             }
             let level = if finely { 0 } else { trial.fit.trial_level() };
-            if self.object.outline.is_surrounded && trial.way != Way::Rest {
+            if self.may_be_followed() && trial.way != Way::Rest {
                 self.settle(&mut trial.fit, level);
             }
             let judged = if self.left_out.is_empty() { &self.train } else { &self.left_out };
             trial.losses[1] = trial.fit.mean_loss(judged, level);
         });
     }
+}
+
+/// The bar that slides, if it is one.
+fn bar(simple: &[Trial<'_>], up: DVec3) -> Option<Bar> {
+    let slides = simple.iter().find(|trial| trial.way == Way::Slide(0))?;
+    let axis = long_axis(slides.fit.shape.gaussians(), up)?;
+    Some(Bar { poses: slides.fit.poses.clone(), axis })
 }
 
 /// Drops trials that are far from the best on the views that they are fitted to, but for ways that are always kept.
@@ -352,7 +380,7 @@ fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvide
         return Some((moving, RotationEvidence::Observed));
     }
     if let Some((way, error)) = roll
-        && error <= ROLL_GAIN * turning_error
+        && error <= ROLL_GAIN[usize::from(is_round)] * turning_error
     {
         return Some((way, RotationEvidence::Observed));
     }
@@ -361,7 +389,9 @@ fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvide
         difference.min(360 - difference) >= RIVAL.1
     };
     let rival = best(&|way| way.degrees().is_some_and(apart));
-    if rival.is_some_and(|(_, error)| error < RIVAL.0[usize::from(is_round)] * turning_error) {
+    let same = if is_round { SAME } else { 0.0 };
+    let least = (RIVAL.0[usize::from(is_round)] * turning_error).max(turning_error + same);
+    if rival.is_some_and(|(_, error)| error < least) {
         let has = |wanted: &Way| trials.iter().any(|trial| trial.way == *wanted);
         if is_round && in_contact && has(&Way::Roll(1.0)) {
             return Some((Way::Roll(1.0), RotationEvidence::Assumed));

@@ -1,9 +1,10 @@
 //! An object as one frame shows it: a crop around its mask, at several resolutions.
 
+use std::collections::BTreeSet;
 use std::sync::Arc;
 
 use cif_geometry::{PinholeCamera, PixelGrid};
-use cif_render::UNLABELLED;
+use cif_render::{RenderSettings, UNLABELLED};
 use glam::DVec2;
 
 use crate::frames::TrainFrame;
@@ -28,6 +29,9 @@ pub(super) struct Crop {
     pub(super) known: Vec<f32>,
     /// Pixels of the mask, at least 4.
     pub(super) pixels: f32,
+    /// Dilation with which Gaussians look as they do in the whole image, its pixels joined: that of whole pixels would
+    /// make small images of an object too large, and it would be put too far away.
+    pub(super) low_pass: f32,
 }
 
 /// The object in a frame.
@@ -184,6 +188,12 @@ pub(super) fn set_visible(views: &mut [ObjectView]) {
     }
 }
 
+/// True with one view at most of every time.
+pub(super) fn is_one_camera(views: &[ObjectView]) -> bool {
+    let mut seen = BTreeSet::new();
+    views.iter().all(|view| seen.insert(view.time_index))
+}
+
 /// Middle value; 0 of nothing.
 pub(super) fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);
@@ -249,6 +259,7 @@ fn crop(
         mask,
         known,
         pixels: covered.max(4.0),
+        low_pass: RenderSettings::default().low_pass / (factor * factor) as f32,
     }
 }
 

@@ -3,7 +3,9 @@
 
 use std::collections::BTreeMap;
 
+use cif_field::Gaussians;
 use glam::{DQuat, DVec3};
+use nalgebra::{Matrix3, Vector3};
 
 use super::outline::Outline;
 use super::shape::Pose;
@@ -20,6 +22,9 @@ const ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
 
 /// Rolling radii tried of other things, whose height tells it less well.
 const OTHER_ROLLS: [f64; 12] = [0.64, 0.68, 0.72, 0.76, 0.8, 0.84, 0.88, 0.92, 0.96, 1.0, 1.04, 1.08];
+
+/// Length of a bar in its widths, and the cosine between its long axis and the normal up to which it lies.
+const BAR: (f64, f64) = (2.0, 0.3);
 
 /// Roundness of masks from which an object may roll as a ball.
 const ROUND: f64 = 0.93;
@@ -44,7 +49,7 @@ pub(super) enum Way {
     Roll(f64),
     /// As following it from time to time found.
     Followed,
-    /// Along the path, turning about the normal as its texture tells.
+    /// Along the path, turning about the normal, or its own long axis, as its texture tells.
     Textured,
 }
 
@@ -85,8 +90,8 @@ pub(super) struct Paths<'a> {
     pub(super) reference: usize,
     /// Poses that following found, where it did.
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
-    /// Turns that its texture tells, where it does.
-    pub(super) textured: Option<BTreeMap<usize, DQuat>>,
+    /// Poses with turns that its texture tells, where it does.
+    pub(super) textured: Option<BTreeMap<usize, Pose>>,
 }
 
 /// True where masks are round enough for a ball.
@@ -131,6 +136,17 @@ impl Paths<'_> {
         std::iter::once(Way::Rest).chain(SPINS.map(Way::Spin)).collect()
     }
 
+    /// Poses along the path with turns, from none at the reference.
+    pub(super) fn turned(&self, turns: &BTreeMap<usize, DQuat>) -> BTreeMap<usize, Pose> {
+        let back = turns.get(&self.reference).copied().unwrap_or_default().inverse();
+        let mut rotation = DQuat::IDENTITY;
+        let pose = |(time, place): (&usize, &DVec3)| {
+            rotation = turns.get(time).map_or(rotation, |turn| *turn * back);
+            (*time, Pose { rotation, translation: *place })
+        };
+        self.along.iter().map(pose).collect()
+    }
+
     /// Poses of a way at the times of the path.
     pub(super) fn poses(&self, way: Way) -> BTreeMap<usize, Pose> {
         let times: Vec<usize> = self.along.keys().copied().collect();
@@ -161,19 +177,11 @@ impl Paths<'_> {
                 let back = rotations[origin].inverse();
                 rotations.into_iter().map(|rotation| rotation * back).collect()
             }
-            Way::Textured => {
-                let Some(turns) = &self.textured else { return BTreeMap::new() };
-                let back = turns.get(&self.reference).copied().unwrap_or_default().inverse();
-                let mut last = DQuat::IDENTITY;
-                let mut of = |time: &usize| {
-                    last = turns.get(time).map_or(last, |turn| *turn * back);
-                    last
-                };
-                times.iter().map(&mut of).collect()
-            }
-            Way::Followed => {
-                let followed = self.followed.iter().flatten();
-                return followed
+            Way::Followed | Way::Textured => {
+                let found = if way == Way::Followed { &self.followed } else { &self.textured };
+                return found
+                    .iter()
+                    .flatten()
                     .filter(|(time, _)| self.along.contains_key(time))
                     .map(|(t, p)| (*t, *p))
                     .collect();
@@ -184,6 +192,62 @@ impl Paths<'_> {
         let pose = |(k, rotation)| (times[k], Pose { rotation, translation: place(k) });
         rotations.into_iter().enumerate().map(pose).collect()
     }
+}
+
+/// A bar that lies: its poses without turns about its long axis, and that axis in its own frame.
+pub(super) struct Bar {
+    pub(super) poses: BTreeMap<usize, Pose>,
+    pub(super) axis: DVec3,
+}
+
+impl Bar {
+    /// Turns about its long axis by time, radians, as far as it goes across it; from zero at `reference`.
+    pub(super) fn rolled(&self, up: DVec3, radius: f64, reference: usize) -> BTreeMap<usize, f64> {
+        let mut angle = 0.0;
+        let mut angles = BTreeMap::new();
+        let mut last: Option<&Pose> = None;
+        for (time, pose) in &self.poses {
+            if let Some(last) = last {
+                let turn = up.cross(pose.translation - last.translation) / radius;
+                angle += turn.dot(pose.rotation * self.axis);
+            }
+            angles.insert(*time, angle);
+            last = Some(pose);
+        }
+        let origin = angles.get(&reference).copied().unwrap_or(0.0);
+        angles.values_mut().for_each(|angle| *angle -= origin);
+        angles
+    }
+
+    /// Its poses, turned about its long axis.
+    pub(super) fn turned(&self, turns: &BTreeMap<usize, f64>) -> BTreeMap<usize, Pose> {
+        let pose = |(time, pose): (&usize, &Pose)| {
+            let turn = DQuat::from_axis_angle(self.axis, *turns.get(time)?);
+            Some((*time, Pose { rotation: pose.rotation * turn, ..*pose }))
+        };
+        self.poses.iter().filter_map(pose).collect()
+    }
+}
+
+/// Long axis of Gaussians, as of a bar that lies in a plane.
+pub(super) fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<DVec3> {
+    let weight = |row: usize| 1.0 / (1.0 + f64::from(-gaussians.opacity_logits[row]).exp());
+    let place = |row: usize| DVec3::from_array(gaussians.means[row].map(f64::from));
+    let rows = || 0..gaussians.len();
+    let total: f64 = rows().map(weight).sum();
+    let middle = rows().map(|row| weight(row) * place(row)).sum::<DVec3>() / total.max(1e-9);
+    let mut moments = Matrix3::zeros();
+    for row in rows() {
+        let d = Vector3::from((place(row) - middle).to_array());
+        moments += weight(row) * d * d.transpose();
+    }
+    let eigen = moments.symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_by(|a, b| eigen.eigenvalues[*b].total_cmp(&eigen.eigenvalues[*a]));
+    let axis = eigen.eigenvectors.column(order[0]);
+    let axis = DVec3::new(axis[0], axis[1], axis[2]);
+    let is_long = eigen.eigenvalues[order[0]] > BAR.0 * BAR.0 * eigen.eigenvalues[order[1]];
+    (is_long && axis.dot(up).abs() < BAR.1).then_some(axis)
 }
 
 /// Turns of a ball that rolls without slip from place to place.

@@ -93,8 +93,8 @@ fn footprint_of(mean: vec3f, raw_log_scale: vec3f, quaternion: vec4f) -> Footpri
     // |t0 x t1|^2: a sum of squares has nothing to cancel, however thin the Gaussian.
     f.normal = cross(f.image_0, f.image_1);
     f.sharp_determinant = dot(f.normal, f.normal);
-    f.blurred = sharp + vec3f(LOW_PASS, 0.0, LOW_PASS);
-    let determinant = f.sharp_determinant + LOW_PASS * (sharp.x + sharp.z) + LOW_PASS * LOW_PASS;
+    f.blurred = sharp + vec3f(view.low_pass, 0.0, view.low_pass);
+    let determinant = f.sharp_determinant + view.low_pass * (sharp.x + sharp.z) + view.low_pass * view.low_pass;
     if (!is_finite(determinant)) {
         return f;
     }
