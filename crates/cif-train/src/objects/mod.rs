@@ -9,6 +9,7 @@
 //! | `outline`, `path` | how large an object is, and where it goes |
 //! | `shape` | its Gaussians alone, against crops |
 //! | `fit` | its poses and Gaussians, moved together |
+//! | `priors` | how it moves where pictures say little |
 //! | `texture` | how it turns, where its outline does not tell |
 //! | `ways` | which ways of moving are tried |
 //! | `follow` | how it moves from time to time |
@@ -23,6 +24,7 @@ mod outline;
 mod parts;
 mod path;
 mod plane;
+mod priors;
 mod shape;
 mod start;
 #[cfg(test)]

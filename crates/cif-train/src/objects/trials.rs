@@ -13,7 +13,7 @@ use super::path::smooth;
 use super::start::{Object, Started};
 use super::texture;
 use super::view::ObjectView;
-use super::ways::{Bar, Paths, Way, is_round, long_axis};
+use super::ways::{Bar, Paths, Way, is_round};
 use crate::error::TrainError;
 
 /// Gaussians of a trial.
@@ -160,7 +160,9 @@ impl<'a> Contest<'a> {
     ) -> Result<Option<Trial<'a>>, TrainError> {
         let seen = reliable.iter().map(|view| &self.object.views[*view]);
         let (outline, up, reference) = (self.object.outline, self.paths.up, self.paths.reference);
-        self.paths.textured = if let Some(bar) = bar(simple, up) {
+        let slides = simple.iter().find(|trial| trial.way == Way::Slide(0)).map(|trial| &trial.fit);
+        let bar = slides.and_then(|fit| Bar::of(fit.shape.gaussians(), &fit.poses, up));
+        self.paths.textured = if let Some(bar) = bar {
             let rolled = bar.rolled(up, outline.height, reference);
             let turns = texture::rolls(seen, &bar.poses, (bar.axis, up), &rolled, outline);
             turns.map(|turns| bar.turned(&turns))
@@ -304,13 +306,6 @@ impl<'a> Contest<'a> {
             trial.losses[1] = trial.fit.mean_loss(judged, level);
         });
     }
-}
-
-/// The bar that slides, if it is one.
-fn bar(simple: &[Trial<'_>], up: DVec3) -> Option<Bar> {
-    let slides = simple.iter().find(|trial| trial.way == Way::Slide(0))?;
-    let axis = long_axis(slides.fit.shape.gaussians(), up)?;
-    Some(Bar { poses: slides.fit.poses.clone(), axis })
 }
 
 /// Drops trials that are far from the best on the views that they are fitted to, but for ways that are always kept.

@@ -201,6 +201,11 @@ pub(super) struct Bar {
 }
 
 impl Bar {
+    /// The bar that Gaussians in poses are, if they are long and lie.
+    pub(super) fn of(gaussians: &Gaussians, poses: &BTreeMap<usize, Pose>, up: DVec3) -> Option<Self> {
+        Some(Self { axis: long_axis(gaussians, up)?, poses: poses.clone() })
+    }
+
     /// Turns about its long axis by time, radians, as far as it goes across it; from zero at `reference`.
     pub(super) fn rolled(&self, up: DVec3, radius: f64, reference: usize) -> BTreeMap<usize, f64> {
         let mut angle = 0.0;
@@ -230,7 +235,7 @@ impl Bar {
 }
 
 /// Long axis of Gaussians, as of a bar that lies in a plane.
-pub(super) fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<DVec3> {
+fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<DVec3> {
     let weight = |row: usize| 1.0 / (1.0 + f64::from(-gaussians.opacity_logits[row]).exp());
     let place = |row: usize| DVec3::from_array(gaussians.means[row].map(f64::from));
     let rows = || 0..gaussians.len();
