@@ -16,7 +16,7 @@ use super::view::{ObjectView, Seen, is_one_camera};
 /// Rates of turns, radians, and of translations, of the size.
 const POSE_RATE: f64 = 0.02;
 
-/// Rate of the distance from the camera off the support, relative to that of other shifts.
+/// Rate of the distance from the camera of what leaves its support, relative to that of other shifts.
 const DEPTH_RATE: f64 = 3.0;
 
 /// Background that losses are compared on.
@@ -270,7 +270,7 @@ impl<'a> Fit<'a> {
         let values = |v: DVec3| v.to_array().into_iter();
         of_turns.step(values(gradient.turn), POSE_RATE * rate, |k, step| turn[k] = -step);
         let rate = POSE_RATE * rate * self.size();
-        if self.one_camera && self.air.contains(&view.time_index) {
+        if self.one_camera && !self.air.is_empty() {
             // Along the axes of the camera: off its support, nothing but its size tells how far away it is, which is
             // weak beside what tells its place in the image.
             let axes = view.camera.camera_from_world.rotation;

@@ -338,7 +338,7 @@ fn one_camera_follows_an_object_from_where_it_stood_to_its_other_side() {
     let fitted = fit(&views(solid(&box_places(), patches, 0.006), &truth, moving));
     let (turn, shift) = errors(&fitted.poses, &truth);
     assert!(fitted.way.starts_with("followed"), "{}", fitted.way);
-    assert!(turn < 8.0 && shift < 0.015, "{turn} deg, {shift} m");
+    assert!(turn < 10.0 && shift < 0.015, "{turn} deg, {shift} m");
 }
 
 #[test]
