@@ -71,7 +71,7 @@ pub fn run_line(program: &str, folder: &Path, line: &str) -> Run {
     run(program, folder, line.split_whitespace())
 }
 
-/// What the command wrote as JSON.
+/// JSON that the command wrote.
 ///
 /// # Panics
 /// When it is none.

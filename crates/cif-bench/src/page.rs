@@ -11,7 +11,7 @@ use crate::error::Error;
 /// Style of all pages.
 const STYLE: &str = include_str!("page.css");
 
-/// What stands at the top of a page, as text.
+/// Head of a page, as text.
 pub(crate) struct Header<'a> {
     pub(crate) title: &'a str,
     pub(crate) heading: &'a str,
@@ -20,7 +20,7 @@ pub(crate) struct Header<'a> {
     /// Vector instructions.
     pub(crate) simd: &'a str,
     pub(crate) command: &'a str,
-    /// What is missing and how to get it; `None` on a whole page.
+    /// The missing part and how to get it; `None` on a whole page.
     pub(crate) missing: Option<String>,
 }
 

@@ -12,7 +12,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// Last lines of its standard error that are kept.
 const KEPT_LINES: usize = 12;
 
-/// What a program answered.
+/// Answer of a program.
 pub(crate) struct Answer {
     /// Everything it wrote to standard output.
     pub(crate) output: Vec<u8>,

@@ -37,7 +37,7 @@ pub mod write;
 pub use error::Error;
 pub use picture::Impression;
 
-/// What the caller is asked while work goes on.
+/// Questions to the caller while work goes on.
 #[derive(Clone, Copy)]
 pub struct Hooks<'a> {
     /// True where the work is to end.

@@ -1,4 +1,4 @@
-//! What an image looks like from afar: how bright and sharp it is, and what changed since another one.
+//! An image from afar: how bright and sharp it is, and what changed since another one.
 
 use std::io::BufReader;
 use std::path::Path;

@@ -18,6 +18,19 @@ pub struct Lens {
     pub distortion: LensDistortion,
 }
 
+#[cfg(test)]
+impl Lens {
+    /// A lens of small pictures.
+    pub(crate) fn small() -> Self {
+        Self {
+            size: (64, 48),
+            focal_px: [60.0; 2],
+            principal_px: [32.0, 24.0],
+            distortion: LensDistortion::default(),
+        }
+    }
+}
+
 /// Where an image was taken.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Pose {

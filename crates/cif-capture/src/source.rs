@@ -1,4 +1,4 @@
-//! What a capture is made of: videos and folders of photographs, one per camera.
+//! Sources of a capture: videos and folders of photographs, one per camera.
 
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ const VIDEO_ENDINGS: [&str; 10] = ["mp4", "mov", "m4v", "mkv", "avi", "webm", "m
 /// Endings of images that can be read.
 const IMAGE_ENDINGS: [&str; 3] = ["png", "jpg", "jpeg"];
 
-/// What one camera recorded.
+/// Recording of one camera.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Source {
     /// Name of the camera: a folder of that name holds its images.

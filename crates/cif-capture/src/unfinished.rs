@@ -1,4 +1,4 @@
-//! What was made of videos and photographs before a capture was refused or interrupted, kept for the next try.
+//! Frames and poses made before a capture was refused or interrupted, kept for the next try.
 
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -108,7 +108,7 @@ mod tests {
     use crate::picture::tests::board;
     use crate::poses::{Lens, Pose};
     use crate::{Hooks, frames, import, source, times};
-    use cif_geometry::{LensDistortion, RigidTransform};
+    use cif_geometry::RigidTransform;
     use glam::{DMat3, DVec3};
 
     /// Frames of two videos; the third of each has no pose.
@@ -118,13 +118,7 @@ mod tests {
             path: folder.join(format!("{camera}.mp4")),
             photographs: None,
         });
-        let lens = Lens {
-            size: (64, 48),
-            focal_px: [60.0; 2],
-            principal_px: [32.0, 24.0],
-            distortion: LensDistortion::default(),
-        };
-        let mut poses = Poses { lenses: vec![lens], ..Poses::default() };
+        let mut poses = Poses { lenses: vec![Lens::small()], ..Poses::default() };
         let mut shots = Vec::new();
         for (k, source) in sources.iter().enumerate() {
             for n in 0..3_u8 {

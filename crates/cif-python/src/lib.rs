@@ -30,7 +30,7 @@ use std::path::PathBuf;
 
 use pyo3::prelude::*;
 
-/// What the command runs in Python (pycolmap) runs in this one.
+/// Python that the command runs pycolmap in: this one.
 fn name_python(py: Python<'_>) -> PyResult<()> {
     if let Some(program) = py.import("sys")?.getattr("executable")?.extract::<Option<PathBuf>>()? {
         cif::set_python(program);

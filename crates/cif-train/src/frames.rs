@@ -38,7 +38,7 @@ pub(crate) struct FrameStore {
     ahead: Option<Ahead>,
 }
 
-/// What makes of the files of a frame what is trained on.
+/// Steps from the files of a frame to the images that are trained on.
 #[derive(Clone)]
 struct Decoding {
     label_of_id: Vec<u16>,

@@ -1,4 +1,4 @@
-//! What keeps images from becoming a capture, told before work is put into them.
+//! Reasons why images cannot become a capture, told before work is put into them.
 
 use std::collections::{BTreeMap, BTreeSet};
 

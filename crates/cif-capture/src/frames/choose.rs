@@ -28,7 +28,7 @@ pub struct Choice {
 pub struct Seen {
     /// Seconds in the stream.
     pub time: f64,
-    /// What it looks like.
+    /// Its looks.
     pub impression: Impression,
 }
 

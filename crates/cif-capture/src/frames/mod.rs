@@ -27,7 +27,7 @@ pub struct Shot {
     pub time: Option<f64>,
     /// Width and height, pixels.
     pub size: (u32, u32),
-    /// What it looks like from afar.
+    /// Its looks from afar.
     pub impression: Impression,
 }
 

@@ -60,7 +60,7 @@ pub struct Request<'a> {
 pub struct Found {
     /// Poses of the setting that was believed, else of the best one.
     pub poses: Poses,
-    /// What speaks for and against them.
+    /// Arguments for and against them.
     pub verdict: Verdict,
     /// The setting, in words.
     pub setting: String,
@@ -209,7 +209,7 @@ fn rung(
     Ok((features, best))
 }
 
-/// What speaks against poses, in short.
+/// Arguments against poses, in short.
 fn reason(verdict: &Verdict) -> String {
     let against: Vec<&str> =
         verdict.checks.iter().filter(|check| !check.holds).map(|check| check.words.as_str()).collect();

@@ -83,7 +83,7 @@ fn moments(shots: &[Shot], poses: &Poses) -> (Vec<Shot>, Vec<(usize, usize)>) {
 
 #[cfg(test)]
 mod tests {
-    use cif_geometry::{LensDistortion, RigidTransform};
+    use cif_geometry::RigidTransform;
 
     use super::*;
     use crate::picture::Impression;
@@ -92,13 +92,7 @@ mod tests {
 
     /// Frames of cameras at these times; all but those of camera `x` have a pose.
     fn rig(cameras: &[(&str, &[Option<f64>])]) -> (Vec<Shot>, Poses) {
-        let lens = Lens {
-            size: (64, 48),
-            focal_px: [60.0; 2],
-            principal_px: [32.0, 24.0],
-            distortion: LensDistortion::default(),
-        };
-        let mut poses = Poses { lenses: vec![lens], ..Poses::default() };
+        let mut poses = Poses { lenses: vec![Lens::small()], ..Poses::default() };
         let mut shots = Vec::new();
         for (camera, times) in cameras {
             for (k, time) in times.iter().enumerate() {

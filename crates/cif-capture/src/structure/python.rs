@@ -106,7 +106,7 @@ pub(super) enum Mapper {
     Incremental,
 }
 
-/// What pycolmap found.
+/// Findings of pycolmap.
 #[derive(Debug)]
 pub(super) struct Outcome {
     /// Features of every image.

@@ -1,4 +1,4 @@
-//! Whether poses are to be believed. "80 of 80 images" proves nothing: repeated shapes and moving objects make
+//! Judgement of poses. "80 of 80 images" proves nothing: repeated shapes and moving objects make
 //! models that are wrong as a whole, and two runs by different mappers and seeds are seldom wrong alike.
 
 use std::fmt;
@@ -31,13 +31,13 @@ const COMMON: f64 = 0.75;
 /// One thing that was looked at.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Check {
-    /// What, with the figures.
+    /// The argument, with its figures.
     pub words: String,
     /// True where it speaks for the poses.
     pub holds: bool,
 }
 
-/// What speaks for and against poses.
+/// Arguments for and against poses.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Verdict {
     /// Everything that was looked at.

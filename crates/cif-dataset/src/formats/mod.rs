@@ -46,7 +46,7 @@ pub(crate) struct Draft {
     /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
     pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
-    /// What the capture does not know of its world.
+    /// Facts of its world that the capture does not know.
     pub(crate) unknown: Option<String>,
 }
 

@@ -91,7 +91,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     })
 }
 
-/// What exports of a capture guess, where it does not know the metre or up.
+/// Guesses of exports of a capture, where it does not know the metre or up.
 fn unknown(world: World) -> Option<String> {
     let what = match (world.metres_known, world.up_known) {
         (true, true) => return None,

@@ -21,11 +21,11 @@ pub(super) struct TransformsFile {
     pub(super) val_filenames: Option<Vec<PathBuf>>,
     pub(super) test_filenames: Option<Vec<PathBuf>>,
     pub(super) fps: Option<f64>,
-    /// What `cif capture` knows of the world.
+    /// Knowledge of `cif capture` of the world.
     pub(super) cif: Option<World>,
 }
 
-/// What is known of the world that poses are in. Files of others do not tell, and are taken at their word.
+/// Knowledge of the world that poses are in. Files of others do not tell, and are taken at their word.
 #[derive(Clone, Copy, Deserialize)]
 pub(super) struct World {
     #[serde(default = "known")]

@@ -28,7 +28,7 @@ pub const TOLERANCE: f64 = 0.05;
 /// Coverage below which a pixel shows no surface.
 const COVERED: f32 = 0.5;
 
-/// What training views show of a field.
+/// Parts of a field that training views show.
 #[derive(Clone, Debug)]
 pub struct TrainingViews {
     /// Cameras with depth z, metres; infinite where nothing is.

@@ -87,15 +87,8 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
             "train it with instance masks",
         ));
     }
-    let dataset = CaptureOptions {
-        masks: None,
-        no_masks: true,
-        downscale: command.downscale.or(scene::trained_downscale(field)),
-        center_principal_point: false,
-        layout: command.layout,
-        frames: command.frames.clone(),
-    }
-    .open(&command.capture)?;
+    let options = CaptureOptions::pictures_of(field, command.downscale, command.layout, &command.frames);
+    let dataset = options.open(&command.capture)?;
     print_warnings(&dataset);
     print_misfits(field, &dataset, Split::Train);
     interrupt::watch();

@@ -255,6 +255,23 @@ impl From<LayoutName> for cif_dataset::Layout {
 }
 
 impl CaptureOptions {
+    /// The pictures of a capture, without masks, reduced as a scene was trained unless `downscale` says otherwise.
+    fn pictures_of(
+        field: &cif_field::Field,
+        downscale: Option<u32>,
+        layout: Option<LayoutName>,
+        frames: &FrameOptions,
+    ) -> Self {
+        Self {
+            masks: None,
+            no_masks: true,
+            downscale: downscale.or(scene::trained_downscale(field)),
+            center_principal_point: false,
+            layout,
+            frames: frames.clone(),
+        }
+    }
+
     fn options(&self) -> cif_dataset::OpenOptions {
         cif_dataset::OpenOptions {
             masks: self.masks.clone(),

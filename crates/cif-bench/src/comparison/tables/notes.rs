@@ -1,4 +1,4 @@
-//! What readers have to know of the numbers.
+//! Remarks that readers of the numbers need.
 
 use super::super::published::PUBLISHED;
 use super::super::title;

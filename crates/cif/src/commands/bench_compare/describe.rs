@@ -1,4 +1,4 @@
-//! What the page of a comparison says of it.
+//! Text of the page of a comparison.
 
 use std::path::PathBuf;
 

@@ -1,4 +1,4 @@
-//! What `cif capture` tells at the end: what was found, what is missing, and the command that goes on.
+//! Summary of `cif capture`: what was found, what is missing, and the command that goes on.
 
 use std::collections::BTreeSet;
 

@@ -1,4 +1,4 @@
-//! What `cif capture` keeps where it writes no capture, and the commands that go on from there.
+//! Files that `cif capture` keeps where it writes no capture, and the commands that go on from there.
 
 use cif_capture::frames::Shot;
 use cif_capture::source::Source;

@@ -183,15 +183,8 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
             "train it with instance masks",
         ));
     }
-    let dataset = CaptureOptions {
-        masks: None,
-        no_masks: true,
-        downscale: options.downscale.or(scene::trained_downscale(&field)),
-        center_principal_point: false,
-        layout: options.layout,
-        frames: options.frames.clone(),
-    }
-    .open(capture)?;
+    let pictures = CaptureOptions::pictures_of(&field, options.downscale, options.layout, &options.frames);
+    let dataset = pictures.open(capture)?;
     print_warnings(&dataset);
     print_misfits(&field, &dataset, Split::Train);
     if let Some(folder) = &options.output {
