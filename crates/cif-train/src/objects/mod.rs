@@ -10,13 +10,14 @@
 //! | `shape` | its Gaussians alone, against crops |
 //! | `fit` | its poses and Gaussians, moved together |
 //! | `priors` | how it moves where pictures say little |
-//! | `texture` | how it turns, where its outline does not tell |
+//! | `texture`, `ball`, `sphere` | how it turns, where its outline does not tell |
 //! | `ways` | which ways of moving are tried |
 //! | `follow` | how it moves from time to time |
 //! | `trials` | which way is kept |
 //! | `start` | everything in order |
 //! | `parts` | which part of it turns on a hinge or slides |
 
+mod ball;
 mod fit;
 mod follow;
 mod order;
@@ -26,6 +27,7 @@ mod path;
 mod plane;
 mod priors;
 mod shape;
+mod sphere;
 mod start;
 #[cfg(test)]
 mod tests;

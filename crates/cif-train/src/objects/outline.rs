@@ -24,7 +24,7 @@ const SHORTEST_RUN: usize = 3;
 const PARALLEL: f64 = 1e-9;
 
 /// Share of the pixels of a mask that lie within its radius of its middle.
-const WITHIN: f64 = 0.98;
+pub(super) const WITHIN: f64 = 0.98;
 
 /// Length of a mask in its widths from which it is that of a bar, and the sine of the angle between its long axis and
 /// the way down from which the bar lies.

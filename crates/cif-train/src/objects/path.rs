@@ -23,7 +23,16 @@ const BESIDE: usize = 2;
 const CROSSES: f64 = 0.7;
 
 /// Rounds of reweighting of rays, by their distances from the path.
-const ROUNDS: usize = 5;
+const ROUNDS: usize = 8;
+
+/// Times at the ends of a path that stay what they are in all rounds.
+const ENDS: usize = 3;
+
+/// Second difference, in middles of these, from which a path bends as where something bounces.
+const KINK: f64 = 4.0;
+
+/// Least stiffness there, of that elsewhere.
+const LOOSE: f64 = 0.05;
 
 /// The path that stays near `raw` where the object is well seen, and bends little, by its stiffness; `times` of the
 /// whole sequence.
@@ -44,7 +53,8 @@ pub(super) fn smooth(
         let weight = seen * seen * cut + 1e-4;
         (DMat3::IDENTITY * weight, weight * raw[time])
     };
-    even(&keys, &keys.iter().map(near).collect::<Vec<_>>(), stiffness, times).unwrap_or_else(|| raw.clone())
+    let near: Vec<(DMat3, DVec3)> = keys.iter().map(near).collect();
+    even(&keys, &near, &vec![stiffness; keys.len()], times).unwrap_or_else(|| raw.clone())
 }
 
 /// The path that passes near the rays of one view per time and bends little; nothing where neighbouring rays hardly
@@ -62,22 +72,33 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
         return BTreeMap::new();
     }
     let mut weights: Vec<f64> = views.iter().map(|view| view.visible.powi(2) + 1e-4).collect();
+    let mut stiffness = vec![CROSSING; keys.len()];
     let mut path = BTreeMap::new();
-    for _ in 0..ROUNDS {
+    for round in 0..ROUNDS {
         let near = |(view, weight): (&&ObjectView, &f64)| {
             let across = *weight * across(&view.camera, view.centroid);
             (across, across * view.camera.centre())
         };
         let near: Vec<(DMat3, DVec3)> = views.iter().zip(&weights).map(near).collect();
-        let Some(found) = even(&keys, &near, CROSSING, times) else { return BTreeMap::new() };
+        let Some(found) = even(&keys, &near, &stiffness, times) else { return BTreeMap::new() };
         let distance = |view: &&ObjectView| {
             let offset = found[&view.time_index] - view.camera.centre();
-            (across(&view.camera, view.centroid) * offset).length()
+            let pixel = offset.length() / view.camera.focal_px.x;
+            (across(&view.camera, view.centroid) * offset).length() / pixel
         };
         let distances: Vec<f64> = views.iter().map(distance).collect();
         let large = 2.0 * median(&mut distances.clone());
-        for ((weight, view), distance) in weights.iter_mut().zip(&views).zip(&distances) {
+        // Nothing else tells where its ends are.
+        let inner = ENDS..keys.len().saturating_sub(ENDS);
+        for k in inner.clone().filter(|_| round + 1 >= ROUNDS / 2) {
+            let (weight, view, distance) = (&mut weights[k], &views[k], distances[k]);
             *weight = (view.visible.powi(2) + 1e-4) / (1.0 + (distance / large.max(1e-12)).powi(2));
+        }
+        // What is thrown bends little but where it bounces.
+        let bends: Vec<f64> = (0..keys.len()).map(|k| bend(&keys, &found, k).length()).collect();
+        let large = KINK * median(&mut bends.clone());
+        for k in inner {
+            stiffness[k] = CROSSING * (1.0 / (1.0 + (bends[k] / large.max(1e-12)).powi(2))).max(LOOSE);
         }
         path = found;
     }
@@ -89,7 +110,7 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
 fn even(
     keys: &[usize],
     near: &[(DMat3, DVec3)],
-    stiffness: f64,
+    stiffness: &[f64],
     times: usize,
 ) -> Option<BTreeMap<usize, DVec3>> {
     let n = keys.len();
@@ -101,12 +122,10 @@ fn even(
             (0..3).for_each(|j| matrix[(3 * k + i, 3 * k + j)] += weight.col(j)[i]);
         }
     }
-    let stiffness = stiffness * (times as f64 / 60.0).powi(4);
+    let scale = (times as f64 / 60.0).powi(4);
     for k in 1..n - 1 {
-        let (before, after) = ((keys[k] - keys[k - 1]) as f64, (keys[k + 1] - keys[k]) as f64);
-        let scale = 2.0 / (before + after);
-        let row =
-            [(k - 1, scale / before), (k, -scale * (1.0 / before + 1.0 / after)), (k + 1, scale / after)];
+        let stiffness = stiffness[k] * scale;
+        let row = second_difference(keys, k);
         for (i, a) in row {
             for (j, b) in row {
                 (0..3).for_each(|axis| matrix[(3 * i + axis, 3 * j + axis)] += stiffness * a * b);
@@ -116,4 +135,19 @@ fn even(
     let solved = matrix.cholesky()?.solve(&target);
     let place = |k: usize| DVec3::new(solved[3 * k], solved[3 * k + 1], solved[3 * k + 2]);
     Some(keys.iter().enumerate().map(|(k, time)| (*time, place(k))).collect())
+}
+
+/// Places and factors of the second difference of a path at one of its times, which is not the first or the last.
+fn second_difference(keys: &[usize], k: usize) -> [(usize, f64); 3] {
+    let (before, after) = ((keys[k] - keys[k - 1]) as f64, (keys[k + 1] - keys[k]) as f64);
+    let scale = 2.0 / (before + after);
+    [(k - 1, scale / before), (k, -scale * (1.0 / before + 1.0 / after)), (k + 1, scale / after)]
+}
+
+/// Second difference of a path at one of its times; zero at the first and the last.
+fn bend(keys: &[usize], path: &BTreeMap<usize, DVec3>, k: usize) -> DVec3 {
+    if k == 0 || k + 1 == keys.len() {
+        return DVec3::ZERO;
+    }
+    second_difference(keys, k).iter().map(|(k, factor)| *factor * path[&keys[*k]]).sum()
 }

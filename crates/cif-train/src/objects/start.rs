@@ -33,7 +33,7 @@ const FEWEST_SEEN: usize = 5;
 const TOGETHER: usize = 7;
 
 /// Step from time to time, of the size, up to which an object that leaves its support stands still on it.
-const STANDS: f64 = 0.03;
+pub(super) const STANDS: f64 = 0.03;
 
 /// Gaussians of an object that is followed.
 const FOLLOWED: usize = 300;

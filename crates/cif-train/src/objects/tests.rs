@@ -37,7 +37,7 @@ pub(super) fn rig(_: usize) -> Vec<PinholeCamera> {
 }
 
 /// A camera above the floor, which looks at its origin.
-fn camera(angle: f64) -> PinholeCamera {
+pub(super) fn camera(angle: f64) -> PinholeCamera {
     let centre = DVec3::new(1.1 * angle.sin(), -1.1 * angle.cos(), 0.8);
     let forward = (DVec3::new(0.0, 0.0, 0.05) - centre).normalize();
     let right = forward.cross(DVec3::Z).normalize();
@@ -62,7 +62,7 @@ pub(super) fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f
 }
 
 /// Views of a solid on its way.
-fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Vec<ObjectView> {
+pub(super) fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Vec<ObjectView> {
     let group_of = vec![0; gaussians.len()];
     views_of_groups(gaussians, group_of, &[poses.to_vec()], cameras)
 }
@@ -190,7 +190,7 @@ fn a_textured_box_that_slides_and_turns_is_found() {
     assert!(fitted.error < 0.1, "{}", fitted.error);
 }
 
-fn sphere_places(radius: f64) -> Vec<DVec3> {
+pub(super) fn sphere_places(radius: f64) -> Vec<DVec3> {
     let mut rng = stream(0, Purpose::Objects, 10);
     (0..1200)
         .map(|_| {

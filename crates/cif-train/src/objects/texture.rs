@@ -52,7 +52,7 @@ const REFINED: (i64, usize) = (3, 3);
 const SLIPS: (f64, f64) = (0.7, 1.4);
 
 /// Fewest times that are compared.
-const FEWEST: usize = 8;
+pub(super) const FEWEST: usize = 8;
 
 /// Brightness of the unrolled surface at one time, and its weight where it was seen.
 struct Surface {

@@ -6,6 +6,7 @@ use cif_field::tracks::RotationEvidence;
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::ball;
 use super::fit::{Fit, Turns, fresh_moments};
 use super::follow::follow;
 use super::outline::{self, Outline};
@@ -167,7 +168,11 @@ impl<'a> Contest<'a> {
             let turns = texture::rolls(seen, &bar.poses, (bar.axis, up), &rolled, outline);
             turns.map(|turns| bar.turned(&turns))
         } else {
-            let turns = texture::turns(seen, &self.paths.along, outline, up);
+            let turns = texture::turns(seen.clone(), &self.paths.along, outline, up);
+            let turns = turns.or_else(|| {
+                let seen: Vec<&ObjectView> = seen.collect();
+                ball::turns(&seen, &self.paths.along, outline, &self.paths.rolls())
+            });
             turns.map(|turns| self.paths.turned(&turns))
         };
         if self.paths.textured.is_none() {

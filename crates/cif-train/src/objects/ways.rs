@@ -125,6 +125,14 @@ impl Paths<'_> {
         ways
     }
 
+    /// Rotations of the ways of rolling.
+    pub(super) fn rolls(&self) -> Vec<BTreeMap<usize, DQuat>> {
+        let rolls = self.ways().into_iter().filter(|way| matches!(way, Way::Roll(_)));
+        let rotations =
+            |way: Way| self.poses(way).into_iter().map(|(time, pose)| (time, pose.rotation)).collect();
+        rolls.map(rotations).collect()
+    }
+
     /// True where an object may turn in place without a change of its outline, and texture would show it.
     pub(super) fn may_turn_unseen(&self, views: &[ObjectView]) -> bool {
         let mut areas: Vec<f64> = views.iter().map(ObjectView::area).collect();

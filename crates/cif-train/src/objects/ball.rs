@@ -1,0 +1,357 @@
+//! Turns of a ball from its texture, however it turns: its outline is a circle from all sides, so every pixel shows a
+//! known place of a sphere, and the rotations are those under which the times show one texture. The first are those of
+//! the few times in a row that agree best with an even turn; the others follow from time to time.
+
+use std::collections::BTreeMap;
+
+use glam::{DQuat, DVec3};
+use rayon::prelude::*;
+
+use super::outline::Outline;
+use super::sphere::{Agreement, Side, Texture, is_disc, take_light_away};
+use super::start::STANDS;
+use super::texture::FEWEST;
+use super::view::{ObjectView, median};
+
+/// Times in a row that are taken to turn evenly, and how many of them lie between beginnings that are tried.
+const WINDOW: usize = 6;
+const STRIDE: usize = 3;
+
+/// Fastest turn, radians from one time of the sequence to the next, and the difference of turns that are tried.
+const FASTEST: f64 = 0.8;
+const APART: f64 = 0.1;
+
+/// Times ahead that are looked at, with the same turn, for the turn of the next.
+const AHEAD: usize = 5;
+
+/// Largest change of the turn from time to time, radians per time, and what it costs in agreement.
+const CHANGE: f64 = 0.3;
+const CHANGE_COST: f64 = 0.3;
+
+/// Times that all are followed again, with the texture that was found.
+const AGAIN: usize = 2;
+
+/// Rounds in which each time is turned to agree with all others, and the first and smallest of these turns, radians.
+const ROUNDS: usize = 4;
+const REFINED: [f64; 2] = [0.16, 0.01];
+
+/// Cost in agreement of the largest change of the turn, away from the middle of the neighbours.
+const UNEVEN_COST: f64 = 0.1;
+
+/// Agreement of the times from which the texture tells the turns, and share of it that rolling may have.
+const TOLD: f64 = 0.3;
+const ROLLS: f64 = 0.3;
+
+/// Root mean square of the logarithms of the texture below which it may be light.
+const FAINT: f64 = 0.15;
+
+/// Agreement with the others, of the middle one, from which a time is turned well.
+const WELL: f64 = 0.7;
+
+/// Rotations of a ball by time, relative to some frame of it, that explain how its texture moves; `None` where it does not
+/// tell them, or tells that it rolls: `rolls` are rotations of rolling without slip. `path` is that of the centre.
+pub(super) fn turns(
+    views: &[&ObjectView],
+    path: &BTreeMap<usize, DVec3>,
+    outline: &Outline,
+    rolls: &[BTreeMap<usize, DQuat>],
+) -> Option<BTreeMap<usize, DQuat>> {
+    let mut at: BTreeMap<usize, Vec<&ObjectView>> = BTreeMap::new();
+    for view in views.iter().filter(|view| path.contains_key(&view.time_index)) {
+        at.entry(view.time_index).or_default().push(view);
+    }
+    if at.len() < FEWEST || !is_disc(views) {
+        return None;
+    }
+    let side =
+        |(time, views): (&usize, &Vec<&ObjectView>)| Side::of(*time, views, path[time], outline.size());
+    let mut sides: Vec<Side> = at.iter().map(side).collect();
+    let moves = |time: usize| {
+        let next = path.range(time + 1..).next().or_else(|| path.range(..time).next_back());
+        next.is_some_and(|(other, place)| {
+            (*place - path[&time]).length() > STANDS * outline.size() * time.abs_diff(*other) as f64
+        })
+    };
+    take_light_away(&mut sides, moves);
+    let found = followed_turns(&sides)?;
+    let told = agreement(&sides, &found);
+    let agrees = |roll: &BTreeMap<usize, DQuat>| -> f64 {
+        agreement(&sides, &sides.iter().map(|side| roll[&side.time]).collect::<Vec<_>>())
+    };
+    let rolls = rolls.iter().map(agrees).fold(0.0, f64::max);
+    let is_told = told > TOLD && rolls < ROLLS * told && told.sqrt() * Side::strength(&sides) > FAINT;
+    is_told.then(|| sides.iter().map(|side| side.time).zip(found).collect())
+}
+
+/// Rotations of all sides that make one texture of them.
+fn followed_turns(sides: &[Side]) -> Option<Vec<DQuat>> {
+    let evens = even_turns(sides);
+    let best = evens.iter().max_by(|a, b| a.agreement.total_cmp(&b.agreement))?;
+    let mut turns = grown(sides, &evens, best, Texture::empty());
+    refine(sides, &mut turns);
+    for _ in 0..AGAIN {
+        turns = grown(sides, &evens, best, well_told(sides, &turns));
+        refine(sides, &mut turns);
+    }
+    Some(turns)
+}
+
+/// Texture without sides that agree least with the others, which may be turned wrongly.
+fn well_told(sides: &[Side], turns: &[DQuat]) -> Texture {
+    let own: Vec<Texture> = sides.iter().zip(turns).map(|(side, turn)| Texture::of(side, *turn)).collect();
+    let mut all = Texture::empty();
+    own.iter().for_each(|own| all.add(own));
+    let agreement = |k: usize| {
+        let mut others = all.clone();
+        others.subtract(&own[k]);
+        others.agreement(&sides[k], turns[k]).share()
+    };
+    let agreements: Vec<f64> = (0..sides.len()).map(agreement).collect();
+    let least = WELL * median(&mut agreements.clone());
+    let mut texture = Texture::empty();
+    own.iter()
+        .zip(&agreements)
+        .filter(|(_, agreement)| **agreement > least)
+        .for_each(|(own, _)| texture.add(own));
+    texture
+}
+
+/// Turns on a grid of a spacing within a distance of the origin, nearest first.
+fn grid(reach: f64, spacing: f64) -> Vec<DVec3> {
+    let count = (reach / spacing).floor() as i32;
+    let mut turns: Vec<DVec3> = Vec::new();
+    for x in -count..=count {
+        for y in -count..=count {
+            for z in -count..=count {
+                let turn = spacing * DVec3::new(f64::from(x), f64::from(y), f64::from(z));
+                if turn.length() <= reach + 1e-9 {
+                    turns.push(turn);
+                }
+            }
+        }
+    }
+    turns.sort_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
+    turns
+}
+
+/// Agreement of sides that turn evenly, by so much from one time of the sequence to the next.
+fn even_agreement(sides: &[Side], turn: DVec3) -> f64 {
+    let mut texture = Texture::empty();
+    let mut sum = Agreement::default();
+    for side in sides {
+        let steps = side.time as f64 - sides[0].time as f64;
+        let rotation = DQuat::from_scaled_axis(steps * turn);
+        sum += texture.agreement(side, rotation);
+        texture.add(&Texture::of(side, rotation));
+    }
+    sum.share()
+}
+
+/// A few sides in a row that turn evenly.
+struct Even {
+    /// Place of the first of them.
+    first: usize,
+    /// Turn from one time of the sequence to the next.
+    turn: DVec3,
+    agreement: f64,
+}
+
+/// Even turns of a few sides in a row, from place to place.
+fn even_turns(sides: &[Side]) -> Vec<Even> {
+    let turns = grid(FASTEST, APART);
+    let best = |first: usize| {
+        let few = &sides[first..(first + WINDOW).min(sides.len())];
+        let mut best = Even { first, turn: DVec3::ZERO, agreement: f64::NEG_INFINITY };
+        let mut take = |turn: DVec3| {
+            let agreement = even_agreement(few, turn);
+            if agreement > best.agreement {
+                best = Even { first, turn, agreement };
+            }
+            best.turn
+        };
+        let mut middle = DVec3::ZERO;
+        for turn in &turns {
+            middle = take(*turn);
+        }
+        for spacing in [APART / 2.0, APART / 4.0] {
+            let around = middle;
+            for change in grid(1.8 * spacing, spacing) {
+                middle = take(around + change);
+            }
+        }
+        best
+    };
+    let starts: Vec<usize> = (0..sides.len().saturating_sub(WINDOW - 1)).step_by(STRIDE).collect();
+    let found: Vec<Even> = starts.into_par_iter().map(best).collect();
+    found
+}
+
+/// Rotations of all sides, followed in both directions from some that turn evenly; `texture` is what is known of it.
+fn grown(sides: &[Side], evens: &[Even], start: &Even, mut texture: Texture) -> Vec<DQuat> {
+    let Even { first, turn, .. } = *start;
+    let last = (first + WINDOW).min(sides.len()) - 1;
+    let mut turns = vec![DQuat::IDENTITY; sides.len()];
+    for k in first..=last {
+        let steps = sides[k].time as f64 - sides[first].time as f64;
+        turns[k] = DQuat::from_scaled_axis(steps * turn);
+        texture.add(&Texture::of(&sides[k], turns[k]));
+    }
+    // Turn that agrees best among those of the few sides around one.
+    let even = |k: usize| {
+        let around = evens.iter().filter(|even| (even.first..even.first + WINDOW).contains(&k));
+        around.max_by(|a, b| a.agreement.total_cmp(&b.agreement)).map_or(turn, |even| even.turn)
+    };
+    let mut rate = turn;
+    for k in last + 1..sides.len() {
+        let ahead = (k..sides.len()).take(AHEAD);
+        turns[k] = followed(sides, (k - 1, turns[k - 1]), ahead, &texture, (&mut rate, even(k)));
+        texture.add(&Texture::of(&sides[k], turns[k]));
+    }
+    rate = turn;
+    for k in (0..first).rev() {
+        let ahead = (0..=k).rev().take(AHEAD);
+        turns[k] = followed(sides, (k + 1, turns[k + 1]), ahead, &texture, (&mut rate, even(k)));
+        texture.add(&Texture::of(&sides[k], turns[k]));
+    }
+    turns
+}
+
+/// Rotation of the first of some sides, all of which turn on evenly from a known one, near the rate of before.
+fn followed(
+    sides: &[Side],
+    (known, from): (usize, DQuat),
+    ahead: impl Iterator<Item = usize> + Clone,
+    texture: &Texture,
+    (rate, even): (&mut DVec3, DVec3),
+) -> DQuat {
+    let rotation = |turn: DVec3, k: usize| {
+        let steps = sides[k].time as f64 - sides[known].time as f64;
+        DQuat::from_scaled_axis(steps * turn) * from
+    };
+    let score = |turn: DVec3| {
+        let mut sum = Agreement::default();
+        ahead.clone().for_each(|k| sum += texture.agreement(&sides[k], rotation(turn, k)));
+        let change = (turn - *rate).length().min(2.0 * (turn - even).length() + 0.1);
+        sum.share() - CHANGE_COST * change * change / (CHANGE * CHANGE)
+    };
+    let mut best = (score(*rate), *rate);
+    for around in [*rate, even] {
+        for change in grid(CHANGE, APART) {
+            let found = score(around + change);
+            if found > best.0 {
+                best = (found, around + change);
+            }
+        }
+    }
+    for (reach, spacing) in [(0.09, 0.05), (0.045, 0.025)] {
+        let middle = best.1;
+        for change in grid(reach, spacing) {
+            let found = score(middle + change);
+            if found > best.0 {
+                best = (found, middle + change);
+            }
+        }
+    }
+    *rate = best.1;
+    let next = ahead.clone().next().unwrap_or(known);
+    rotation(*rate, next)
+}
+
+/// Turns every side to agree with all others.
+fn refine(sides: &[Side], turns: &mut [DQuat]) {
+    let mut texture = Texture::empty();
+    sides.iter().zip(turns.iter()).for_each(|(side, turn)| texture.add(&Texture::of(side, *turn)));
+    for _ in 0..ROUNDS {
+        for k in 0..sides.len() {
+            let (side, turn) = (&sides[k], turns[k]);
+            texture.subtract(&Texture::of(side, turn));
+            let between = (k > 0 && k + 1 < sides.len()).then(|| {
+                let [a, b, c] = [k - 1, k, k + 1].map(|k| sides[k].time as f64);
+                turns[k - 1].slerp(turns[k + 1], (b - a) / (c - a))
+            });
+            let score = |turn: DQuat| {
+                let off = between.map_or(0.0, |between| turn.angle_between(between) / CHANGE);
+                texture.agreement(side, turn).share() - UNEVEN_COST * off * off
+            };
+            let mut best = (score(turn), turn);
+            let mut size = REFINED[0];
+            while size >= REFINED[1] {
+                let middle = best.1;
+                for axis in 0..3 {
+                    for sign in [-1.0, 1.0] {
+                        let mut change = DVec3::ZERO;
+                        change[axis] = sign * size;
+                        let turn = DQuat::from_scaled_axis(change) * middle;
+                        let found = score(turn);
+                        if found > best.0 {
+                            best = (found, turn);
+                        }
+                    }
+                }
+                if best.1 == middle {
+                    size *= 0.5;
+                }
+            }
+            turns[k] = best.1;
+            texture.add(&Texture::of(side, best.1));
+        }
+    }
+}
+
+/// Agreement of all sides in some rotations with the texture of the others.
+fn agreement(sides: &[Side], turns: &[DQuat]) -> f64 {
+    let mut texture = Texture::empty();
+    let mut sum = Agreement::default();
+    for (side, turn) in sides.iter().zip(turns) {
+        sum += texture.agreement(side, *turn);
+        texture.add(&Texture::of(side, *turn));
+    }
+    sum.share()
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_geometry::PinholeCamera;
+
+    use super::super::outline::outline;
+    use super::super::tests::{TIMES, camera, patches, solid, sphere_places, views};
+    use super::*;
+
+    /// One camera that sees another side of the floor at every time.
+    fn around(time: usize) -> Vec<PinholeCamera> {
+        vec![camera(2.4 * time as f64)]
+    }
+
+    /// Turns found of a ball that flies and turns evenly about a tilted axis, by time.
+    fn thrown(color: impl Fn(DVec3) -> [f32; 3], turn: DVec3) -> Option<BTreeMap<usize, DQuat>> {
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+            .map(|time| {
+                let share = time as f64 / (TIMES - 1) as f64;
+                let place = DVec3::new(0.3 * share - 0.15, 0.0, 0.06 + 0.6 * share * (1.0 - share));
+                (DQuat::from_scaled_axis(time as f64 * turn), place)
+            })
+            .collect();
+        let views = views(solid(&sphere_places(0.05), color, 0.006), &truth, around);
+        let outline = outline(&views, None, TIMES).unwrap();
+        let seen: Vec<&ObjectView> = views.iter().collect();
+        turns(&seen, &outline.path, &outline, &[])
+    }
+
+    #[test]
+    fn turns_in_flight_show_by_the_texture() {
+        let turn = DVec3::new(0.1, 0.12, -0.15);
+        let found = thrown(patches, turn).unwrap();
+        let mut errors: Vec<f64> = (1..TIMES)
+            .map(|time| {
+                let relative = found[&time] * found[&0].inverse();
+                relative.angle_between(DQuat::from_scaled_axis(time as f64 * turn)).to_degrees()
+            })
+            .collect();
+        assert!(median(&mut errors) < 10.0, "{errors:.0?}");
+    }
+
+    #[test]
+    fn a_plain_ball_does_not_show_its_turns() {
+        assert!(thrown(|_| [0.8, 0.5, 0.2], DVec3::new(0.1, 0.12, -0.15)).is_none());
+    }
+}
