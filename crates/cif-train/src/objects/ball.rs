@@ -8,10 +8,10 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::outline::Outline;
-use super::sphere::{Agreement, Side, Texture, is_disc, take_light_away};
+use super::sphere::{Agreement, Side, Texture, take_light_away};
 use super::start::STANDS;
 use super::texture::FEWEST;
-use super::view::{ObjectView, median};
+use super::view::{ObjectView, are_discs, median};
 
 /// Times in a row that are taken to turn evenly, and how many of them lie between beginnings that are tried.
 const WINDOW: usize = 6;
@@ -60,7 +60,7 @@ pub(super) fn turns(
     for view in views.iter().filter(|view| path.contains_key(&view.time_index)) {
         at.entry(view.time_index).or_default().push(view);
     }
-    if at.len() < FEWEST || !is_disc(views) {
+    if at.len() < FEWEST || !are_discs(views.iter().copied()) {
         return None;
     }
     let side =

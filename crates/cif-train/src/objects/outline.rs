@@ -6,7 +6,7 @@ use glam::{DMat2, DVec2, DVec3};
 
 use super::path;
 use super::plane::Plane;
-use super::view::{ObjectView, median};
+use super::view::{ObjectView, WITHIN, are_discs, median};
 use crate::tracks::nearest_to_rays;
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
@@ -22,9 +22,6 @@ const SHORTEST_RUN: usize = 3;
 
 /// Determinant up to which rays count as parallel.
 const PARALLEL: f64 = 1e-9;
-
-/// Share of the pixels of a mask that lie within its radius of its middle.
-pub(super) const WITHIN: f64 = 0.98;
 
 /// Length of a mask in its widths from which it is that of a bar, and the sine of the angle between its long axis and
 /// the way down from which the bar lies.
@@ -110,7 +107,7 @@ pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>, times: usize)
     let found = outline.get_or_insert_with(|| Outline {
         height: radius,
         radius,
-        roundness: 0.0,
+        roundness: if are_discs(views.iter()) { 1.0 } else { 0.0 },
         path: BTreeMap::new(),
         air: Vec::new(),
         stiffness,

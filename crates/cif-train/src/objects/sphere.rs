@@ -5,7 +5,6 @@ use std::f64::consts::PI;
 use glam::{DMat3, DQuat, DVec3, dvec2};
 use nalgebra::{Matrix4, Vector4};
 
-use super::outline::WITHIN;
 use super::texture::FEWEST;
 use super::view::{ObjectView, median};
 
@@ -27,9 +26,6 @@ const CELLS: usize = 10;
 
 /// Weight of places that are not seen, so that a few that agree by chance do not tell.
 const UNSEEN: f64 = 0.1;
-
-/// Share of a whole mask in the disc around its middle from which it is that of a ball.
-const DISC: f64 = 0.9;
 
 /// A place of the sphere at one time.
 struct Sample {
@@ -76,13 +72,6 @@ impl Side {
         let squares: f64 = samples().map(|sample| sample.weight * sample.value.length_squared()).sum();
         (squares / samples().map(|sample| sample.weight).sum::<f64>().max(1e-9)).sqrt()
     }
-}
-
-/// True where whole masks are discs.
-pub(super) fn is_disc(views: &[&ObjectView]) -> bool {
-    let share = |view: &&&ObjectView| view.area() / (PI * view.reach(WITHIN).powi(2));
-    median(&mut views.iter().filter(|view| view.is_whole()).map(|view| share(&view)).collect::<Vec<_>>())
-        > DISC
 }
 
 /// Places of the sphere that a view shows, without shading.

@@ -1,6 +1,7 @@
 //! An object as one frame shows it: a crop around its mask, at several resolutions.
 
 use std::collections::BTreeSet;
+use std::f64::consts::PI;
 use std::sync::Arc;
 
 use cif_geometry::{PinholeCamera, PixelGrid};
@@ -17,6 +18,12 @@ const FEWEST_PIXELS: usize = 12;
 
 /// Share of a reduced pixel that the mask must have for its colour to count.
 const COLOR_SHARE: f32 = 0.3;
+
+/// Share of the pixels of a mask that lie within its radius of its middle.
+pub(super) const WITHIN: f64 = 0.98;
+
+/// Share of a whole mask in the disc around its middle from which it is that of a ball.
+const DISC: f64 = 0.9;
 
 /// The crop at a resolution.
 pub(super) struct Crop {
@@ -192,6 +199,12 @@ pub(super) fn set_visible(views: &mut [ObjectView]) {
 pub(super) fn is_one_camera(views: &[ObjectView]) -> bool {
     let mut seen = BTreeSet::new();
     views.iter().all(|view| seen.insert(view.time_index))
+}
+
+/// True where whole masks are discs, as those of balls.
+pub(super) fn are_discs<'a>(views: impl Iterator<Item = &'a ObjectView>) -> bool {
+    let share = |view: &ObjectView| view.area() / (PI * view.reach(WITHIN).powi(2));
+    median(&mut views.filter(|view| view.is_whole()).map(share).collect::<Vec<_>>()) > DISC
 }
 
 /// Middle value; 0 of nothing.

@@ -1,5 +1,4 @@
 //! The command on a GPU (or lavapipe): `CIF_TEST_GPU=off|auto|require` says whether one is used.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::fs;
 use std::path::Path;

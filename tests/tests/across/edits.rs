@@ -1,5 +1,4 @@
 //! A file that left comes home: as a scene of its own, and with its edits onto the scene that it came from.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::collections::BTreeMap;
 use std::fs;

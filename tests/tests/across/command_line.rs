@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::Path;
 
-#[path = "../../crates/cif-dataset/tests/support/mod.rs"]
+#[path = "../../../crates/cif-dataset/tests/support/mod.rs"]
 mod captures;
 
 use cif_field::{Field, Gaussians, RecordedCamera, SortMetric, Timeline};

@@ -1,5 +1,4 @@
 //! Objects found again: in EXR files, by place, time and 2D masks, and under another name.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::fs;
 use std::path::Path;

@@ -1,6 +1,5 @@
 //! Questions in words, with models that the tests write themselves. `CIF_TEST_ONNX=off|auto|require` says whether those
 //! run that need the library of ONNX Runtime.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::fs;
 use std::path::Path;

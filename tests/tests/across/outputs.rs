@@ -1,5 +1,4 @@
 //! Nothing of the user's is ever overwritten: inputs, photographs, devices, links; and nothing unfinished stays.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::fs;
 use std::path::Path;

@@ -1,5 +1,4 @@
 //! `cif check`: sound scenes pass, broken ones are told with counts and places, and repaired into a new file.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::fs;
 use std::path::Path;

@@ -1,6 +1,5 @@
 //! The same seed gives the same scene: byte for byte on any number of threads, and as good with any vector
 //! instructions.
-#![allow(clippy::unwrap_used)] // Helpers of tests.
 
 use std::path::Path;
 

@@ -14,7 +14,7 @@ fn cif(folder: &Path, line: &str) -> Run {
 }
 
 /// A small model and few steps.
-const SHORT: &str = "--quick --set stages.coarse=30 --set stages.fine=120 --set stages.instance=40 \
+const SHORT: &str = "--quick --set motion.rigid=false --set stages.coarse=30 --set stages.fine=120 --set stages.instance=40 \
                      --set model.spatial_resolution=[8,8,8] --set model.width=16 --set model.channels=4";
 
 #[test]

@@ -1,0 +1,21 @@
+//! Cases that need several crates, and the command as it is run: one binary, so that it is linked once and its tests
+//! share the processors.
+#![allow(clippy::unwrap_used)] // Helpers of tests.
+
+mod accuracy;
+mod bench;
+mod check;
+mod command_line;
+mod compare;
+mod dependency_direction;
+mod determinism;
+mod edits;
+mod gpu;
+mod hard_captures;
+mod hard_cases;
+mod objects;
+mod outputs;
+mod render_memory;
+mod unfinished_capture;
+mod vision;
+mod whole_path;
