@@ -38,9 +38,14 @@ const REFINED: [f64; 2] = [0.16, 0.01];
 /// Cost in agreement of the largest change of the turn, away from the middle of the neighbours.
 const UNEVEN_COST: f64 = 0.1;
 
-/// Agreement of the times from which the texture tells the turns, and share of it that rolling may have.
+/// Agreement of the times from which the texture tells the turns, how many times that of no turn it must be, and share
+/// of it that rolling may have.
 const TOLD: f64 = 0.3;
+const RESTS: f64 = 1.3;
 const ROLLS: f64 = 0.3;
+
+/// Pixels of a mask below which it may look like a disc by chance.
+const FEWEST_PIXELS: f64 = 150.0;
 
 /// Root mean square of the logarithms of the texture below which it may be light.
 const FAINT: f64 = 0.15;
@@ -60,7 +65,8 @@ pub(super) fn turns(
     for view in views.iter().filter(|view| path.contains_key(&view.time_index)) {
         at.entry(view.time_index).or_default().push(view);
     }
-    if at.len() < FEWEST || !are_discs(views.iter().copied()) {
+    let mut areas: Vec<f64> = views.iter().map(|view| view.area()).collect();
+    if at.len() < FEWEST || median(&mut areas) < FEWEST_PIXELS || !are_discs(views.iter().copied()) {
         return None;
     }
     let side =
@@ -79,7 +85,10 @@ pub(super) fn turns(
         agreement(&sides, &sides.iter().map(|side| roll[&side.time]).collect::<Vec<_>>())
     };
     let rolls = rolls.iter().map(agrees).fold(0.0, f64::max);
-    let is_told = told > TOLD && rolls < ROLLS * told && told.sqrt() * Side::strength(&sides) > FAINT;
+    let rests = agreement(&sides, &vec![DQuat::IDENTITY; sides.len()]);
+    let is_told = told > TOLD.max(RESTS * rests)
+        && rolls < ROLLS * told
+        && told.sqrt() * Side::strength(&sides) > FAINT;
     is_told.then(|| sides.iter().map(|side| side.time).zip(found).collect())
 }
 
