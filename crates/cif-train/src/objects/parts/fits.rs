@@ -1,0 +1,203 @@
+//! Guesses with Gaussians of their own: base, part, joint and values moved together, to the body that is kept.
+
+use std::collections::BTreeMap;
+
+use cif_field::Gaussians;
+use cif_field::tracks::JointKind;
+use glam::{DQuat, DVec3};
+
+use super::super::shape::Pose;
+use super::body::{Body, Hinge, between, range};
+use super::guesses::Guess;
+use super::promise::LOOKS;
+use super::scope::Search;
+use super::search::search;
+
+/// Gaussians of base and part, and steps, of fine fits.
+pub(super) const FINELY: ([usize; 2], usize) = ([500, 250], 500);
+
+/// Places of a hinge that are tried about that of a fit: steps to each side of it, and a step, of the size.
+const PLACES: i32 = 3;
+const PLACE: f64 = 0.13;
+
+/// Opacity, as a logit, that the base starts with where the part is.
+const FAINT: f32 = -2.0;
+
+/// Opacity, as a logit, below which a Gaussian is dropped.
+const SEEN: f32 = -3.0;
+
+/// A guess under way, with the loss on the views that it is fitted to.
+pub(super) struct Fit<'a> {
+    pub(super) guess: Guess,
+    pub(super) body: Body<'a>,
+    pub(super) loss: f64,
+}
+
+/// Keeps the best of the fits, in their order, and the best slide among them.
+pub(super) fn keep_kinds(fits: &mut Vec<Fit<'_>>, count: usize) {
+    fits.sort_by(|a, b| a.loss.total_cmp(&b.loss));
+    let slide = fits.iter().position(|fit| fit.guess.hinge.kind == JointKind::Prismatic);
+    if let Some(place) = slide.filter(|place| *place >= count) {
+        fits.swap(count - 1, place);
+    }
+    fits.truncate(count);
+}
+
+impl<'a> Search<'a> {
+    /// A guess with Gaussians of its own, moved with the joint.
+    pub(super) fn begun(
+        &self,
+        guess: Guess,
+        values: &BTreeMap<usize, f64>,
+        ([of_base, of_part], steps): ([usize; 2], usize),
+        level: usize,
+    ) -> Option<Fit<'a>> {
+        let hinge = guess.hinge;
+        let posed = self.base.iter().map(|(time, pose)| (*time, hinge.posed(pose, between(values, *time))));
+        let posed: BTreeMap<usize, Pose> = posed.collect();
+        let mut base = self.hull(self.base, None, of_base)?;
+        base.fade(FAINT, |place| guess.has(place, 0.0));
+        let margin = 0.1 * self.size;
+        let inside = |place: DVec3| guess.has(place, margin);
+        let mut part = self.hull(&posed, Some(&inside), of_part)?;
+        part.fade(FAINT, |place| !guess.has(place, 0.0));
+        let members: Vec<bool> = (0..base.gaussians().len() + part.gaussians().len())
+            .map(|row| row >= base.gaussians().len())
+            .collect();
+        let times = self.times(usize::MAX);
+        let values = times.keys().map(|time| (*time, between(values, *time))).collect();
+        let mut body = self.body(base.joined(&part), Some((hinge, members, values)));
+        body.steps(&self.train, steps, level, |share| if share < 0.2 { (1.0, 0.0) } else { (1.0, 1.0) });
+        let loss = body.mean_loss(&self.train, level);
+        Some(Fit { guess, body, loss })
+    }
+
+    /// The joint of a body and its values, a hinge where it explains most: it was guessed at a side of the hull, which
+    /// is too wide where few directions see the object, and angles follow the place.
+    pub(super) fn placed(
+        &self,
+        guess: &Guess,
+        mut body: Body<'a>,
+        level: usize,
+    ) -> (Hinge, BTreeMap<usize, f64>) {
+        let hinge = body.hinge.unwrap_or(guess.hinge);
+        if guess.is_round || hinge.kind == JointKind::Prismatic {
+            return (hinge, body.values);
+        }
+        let times = self.times(LOOKS);
+        let (first, second) = hinge.axis.any_orthonormal_pair();
+        let mut best = (hinge, BTreeMap::new(), f64::INFINITY);
+        for (i, j) in (-PLACES..=PLACES).flat_map(|i| (-PLACES..=PLACES).map(move |j| (i, j))) {
+            let aside = PLACE * self.size * (f64::from(i) * first + f64::from(j) * second);
+            let moved = Hinge { point: hinge.point + aside, ..hinge };
+            body.hinge = Some(moved);
+            let (values, loss) = search(&body, &times, (&guess.values, false), level);
+            if loss < best.2 {
+                best = (moved, values, loss);
+            }
+        }
+        let (placed, values, _) = best;
+        if placed == hinge { (hinge, body.values) } else { (placed, values) }
+    }
+
+    /// A fit whose values were searched for again at all times, and moved on from there.
+    pub(super) fn finely_valued(&self, fit: Fit<'a>, steps: usize, level: usize) -> Fit<'a> {
+        let Fit { guess, mut body, .. } = fit;
+        let all = self.times(usize::MAX);
+        let (low, high) = body.values.values().fold((0.0_f64, 0.0_f64), |(l, h), v| (l.min(*v), h.max(*v)));
+        let widened = 0.25 * (high - low) + 0.05 * guess.hinge.unit(self.size);
+        let count = 25;
+        let finer: Vec<f64> = (0..count)
+            .map(|k| low - widened + (high - low + 2.0 * widened) * f64::from(k) / f64::from(count - 1))
+            .collect();
+        let again = if guess.is_round { (&guess.values[..], true) } else { (&finer[..], false) };
+        let (found, _) = search(&body, &all, again, level);
+        // The search is coarse: what is as good stays.
+        let mut shape = body.shape.copied();
+        for (time, value) in found {
+            let views = &all[&time];
+            let mut loss = |value: f64| {
+                views.iter().map(|view| body.loss_with(&mut shape, *view, level, value)).sum::<f64>()
+            };
+            if loss(value) < loss(body.value_at(time)) {
+                body.values.insert(time, value);
+            }
+        }
+        body.steps(&self.train, steps, level, |share| {
+            let rate = if share < 0.5 { 1.0 } else { 0.3 };
+            (rate, rate)
+        });
+        let loss = body.mean_loss(&self.train, level);
+        Fit { guess, body, loss }
+    }
+
+    /// The body that is kept, fitted to all views that show it well: at the value 0 as it is seen first.
+    pub(super) fn finished(&self, mut body: Body<'a>, errors: [f64; 2]) -> Option<Jointed> {
+        let all: Vec<usize> = self.train.iter().chain(&self.left_out).copied().collect();
+        body.steps(&all, FINELY.1, 0, |share| (0.6 * 0.1_f64.powf(share), 0.5 * 0.1_f64.powf(share)));
+        let hinge = body.hinge?;
+        let start = *body.values.values().next()?;
+        let members = body.part_rows();
+        let g = body.shape.gaussians();
+        let kept = |wanted: bool| {
+            let mut own = g.clone();
+            let is_wanted = |row: usize| members[row] == wanted && g.opacity_logits[row] > SEEN;
+            own.retain(&(0..g.len()).map(is_wanted).collect::<Vec<_>>());
+            own
+        };
+        let mut part = kept(true);
+        let (turn, place) = hinge.pose(start);
+        for (mean, quaternion) in part.means.iter_mut().zip(&mut part.quaternions) {
+            let moved = turn * (DVec3::from_array(mean.map(f64::from)) - hinge.point) + place;
+            *mean = moved.as_vec3().to_array();
+            let [w, x, y, z] = quaternion.map(f64::from);
+            let turned = turn * DQuat::from_xyzw(x, y, z, w);
+            *quaternion = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
+        }
+        // It opens towards positive values.
+        let most = body
+            .values
+            .values()
+            .map(|value| value - start)
+            .fold(0.0, |most: f64, value| if value.abs() > most.abs() { value } else { most });
+        let sign = if most < 0.0 { -1.0 } else { 1.0 };
+        let values = self.base.keys().map(|time| (*time, sign * (body.value_at(*time) - start))).collect();
+        let hinge = Hinge { axis: sign * hinge.axis, ..hinge };
+        Some(Jointed { base: kept(false), part, hinge, values, errors })
+    }
+}
+
+/// An object that rests and a part of it that moves, in the world.
+#[derive(Clone, Debug)]
+pub(crate) struct Jointed {
+    pub(crate) base: Gaussians,
+    /// As at the value 0.
+    pub(crate) part: Gaussians,
+    pub(crate) hinge: Hinge,
+    /// Radians or metres, by time.
+    pub(crate) values: BTreeMap<usize, f64>,
+    /// Errors on pixels left out: with the joint, and without.
+    pub(crate) errors: [f64; 2],
+}
+
+impl Jointed {
+    /// The same elsewhere.
+    pub(super) fn moved(mut self, by: DVec3) -> Self {
+        for mean in self.base.means.iter_mut().chain(&mut self.part.means) {
+            *mean = (DVec3::from_array(mean.map(f64::from)) + by).as_vec3().to_array();
+        }
+        self.hinge.point += by;
+        self
+    }
+
+    /// The joint in words, with the range of its values.
+    pub(crate) fn told(&self) -> String {
+        let (low, high) = range(&self.values);
+        match self.hinge.kind {
+            JointKind::Revolute => {
+                format!("a part turns on a hinge, {:.0} to {:.0} deg", low.to_degrees(), high.to_degrees())
+            }
+            JointKind::Prismatic => format!("a part slides, {low:.3} to {high:.3}"),
+        }
+    }
+}

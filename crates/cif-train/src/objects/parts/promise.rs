@@ -1,0 +1,111 @@
+//! Guesses that promise something: their values searched for at some times, with the static Gaussians cut in two.
+
+use std::collections::BTreeMap;
+
+use glam::DVec3;
+use rand::RngExt;
+use rayon::prelude::*;
+
+use super::super::view::Seen;
+use super::body::Body;
+use super::guesses::{Guess, Sides, guesses};
+use super::scope::Search;
+use super::search::search;
+
+/// Times that guesses are searched at, one view each.
+pub(super) const LOOKS: usize = 12;
+
+/// Places that the box is looked for among, of these the fewest that tell it, and the share of views that may have
+/// them beside the mask.
+const CANDIDATES: usize = 8000;
+const FEWEST_INSIDE: usize = 50;
+const BESIDE: f64 = 0.03;
+
+/// Distance, of the size, within which two axes of one direction are the same joint.
+const ALIKE: f64 = 0.25;
+
+/// Further turns of the box about the direction away from the support, degrees.
+const TURNS: [f64; 2] = [30.0, 60.0];
+
+/// Least and largest share of the Gaussians that a part may have.
+const PART: [f64; 2] = [0.03, 0.7];
+
+/// Loss of the best guess, of that of the static body, from which nothing is looked for.
+const PROMISE: f64 = 0.99;
+
+impl<'a> Search<'a> {
+    /// Guesses with their values, best first; none where none promises anything.
+    pub(super) fn tried(&self, rough: &Body<'a>) -> Vec<(Guess, BTreeMap<usize, f64>, f64)> {
+        let means = &rough.shape.gaussians().means;
+        let places: Vec<DVec3> = means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))).collect();
+        let carved = self.carved();
+        let inside = if carved.len() < FEWEST_INSIDE { &places } else { &carved };
+        let plane = self.object.surroundings.plane;
+        let up = self.up.unwrap_or(DVec3::Z);
+        let sides = Sides::around(inside, up);
+        let (times, level) = (self.times(LOOKS), self.level());
+        let try_one = |guess: Guess| {
+            let members: Vec<bool> = places.iter().map(|place| guess.has(*place, 0.0)).collect();
+            let share = members.iter().filter(|member| **member).count() as f64 / members.len() as f64;
+            if !(PART[0]..=PART[1]).contains(&share) {
+                return None;
+            }
+            let body = self.body(rough.shape.copied(), Some((guess.hinge, members, BTreeMap::new())));
+            let (values, loss) = search(&body, &times, (&guess.values, guess.is_round), level);
+            Some((guess, values, loss))
+        };
+        let try_all =
+            |sides: &Sides| -> Vec<_> { guesses(sides, plane).into_par_iter().filter_map(try_one).collect() };
+        let mut tried = try_all(&sides);
+        let (_, still) = search(rough, &times, (&[0.0], false), level);
+        let best = tried.iter().map(|(.., loss)| *loss).fold(f64::INFINITY, f64::min);
+        if best > PROMISE * still {
+            return Vec::new();
+        }
+        if self.one_camera {
+            // The hull of few directions hardly tells how the box is turned.
+            for degrees in TURNS {
+                tried.extend(try_all(&sides.turned(degrees.to_radians(), inside)));
+            }
+        }
+        tried.sort_by(|a, b| a.2.total_cmp(&b.2));
+        // Of joints about one axis the best.
+        let mut distinct: Vec<(Guess, BTreeMap<usize, f64>, f64)> = Vec::new();
+        for (guess, values, loss) in tried {
+            if !distinct.iter().any(|(other, ..)| guess.hinge.is_like(&other.hinge, ALIKE * self.size)) {
+                distinct.push((guess, values, loss));
+            }
+        }
+        distinct
+    }
+
+    /// Places that all views which show the object well have inside its mask, above what it stands on.
+    fn carved(&self) -> Vec<DVec3> {
+        let mut rng = self.object.rng();
+        let reach = 1.6 * self.size;
+        let mut inside = Vec::new();
+        for _ in 0..CANDIDATES {
+            let place = reach * DVec3::from(std::array::from_fn(|_| 2.0 * rng.random::<f64>() - 1.0));
+            if !self.is_within(place) {
+                continue;
+            }
+            let (mut own, mut beside) = (0_u32, 0_u32);
+            for view in &self.train {
+                let view = &self.object.views[*view];
+                let Some(pose) = self.base.get(&view.time_index) else { continue };
+                match view.at(pose.rotation * place + pose.translation) {
+                    Seen::Object(_) => own += 1,
+                    Seen::Nothing => beside += 1,
+                    Seen::Other | Seen::Outside => {}
+                }
+                if f64::from(beside) > BESIDE * self.train.len() as f64 {
+                    break;
+                }
+            }
+            if own > 0 && f64::from(beside) <= BESIDE * f64::from(own + beside) {
+                inside.push(place);
+            }
+        }
+        inside
+    }
+}

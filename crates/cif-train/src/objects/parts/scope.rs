@@ -1,0 +1,104 @@
+//! The object that is searched for parts: its views, its static body, and places that it may fill.
+
+use std::collections::BTreeMap;
+
+use glam::DVec3;
+
+use super::super::fit::hull;
+use super::super::shape::{Pose, Shape};
+use super::super::start::Object;
+use super::super::view::median;
+use super::body::{Body, Hinge};
+
+/// Most views of a time that values are searched on.
+const VIEWS: usize = 2;
+
+/// Reach of an object that one camera sees, of the radius of its outline.
+const ACROSS: f64 = 1.1;
+
+/// Shared facts of a search.
+pub(super) struct Search<'a> {
+    pub(super) object: Object<'a>,
+    /// World from object, by time.
+    pub(super) base: &'a BTreeMap<usize, Pose>,
+    pub(super) train: Vec<usize>,
+    pub(super) left_out: Vec<usize>,
+    pub(super) size: f64,
+    /// Direction away from the support, in the frame of the object, where there is one.
+    pub(super) up: Option<DVec3>,
+    /// True with one camera per time.
+    pub(super) one_camera: bool,
+}
+
+impl<'a> Search<'a> {
+    /// Reduction at which guesses are compared.
+    pub(super) fn level(&self) -> usize {
+        let mut areas: Vec<f64> = self.train.iter().map(|view| self.object.views[*view].area()).collect();
+        usize::from(median(&mut areas) > 1500.0)
+    }
+
+    pub(super) fn hull(
+        &self,
+        poses: &BTreeMap<usize, Pose>,
+        bound: Option<&dyn Fn(DVec3) -> bool>,
+        count: usize,
+    ) -> Option<Shape> {
+        let near = self.object.surroundings.near;
+        let reach = 1.3 * self.size;
+        // A part leaves the room of the base.
+        let bounded = bound.is_none();
+        let inside =
+            |place: DVec3| (!bounded || self.is_within(place)) && bound.is_none_or(|bound| bound(place));
+        let bound: Option<&dyn Fn(DVec3) -> bool> = Some(&inside);
+        let mut shape = hull(self.object.views, poses, (reach, bound), count, near, &mut self.object.rng())?;
+        shape.fade(0.0, |_| true);
+        Some(shape)
+    }
+
+    pub(super) fn body(
+        &self,
+        shape: Shape,
+        part: Option<(Hinge, Vec<bool>, BTreeMap<usize, f64>)>,
+    ) -> Body<'a> {
+        Body::new((self.object.views, self.base), shape, part, (self.size, self.up), self.object.rng())
+    }
+
+    /// The object without parts.
+    pub(super) fn rigid(&self, gaussians: usize, steps: usize, level: usize) -> Option<Body<'a>> {
+        let mut body = self.body(self.hull(self.base, None, gaussians)?, None);
+        body.steps(&self.train, steps, level, |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0));
+        Some(body)
+    }
+
+    /// Views of some times, one each, or of all times, a few each.
+    pub(super) fn times(&self, count: usize) -> BTreeMap<usize, Vec<usize>> {
+        let mut of: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
+        for view in &self.train {
+            of.entry(self.object.views[*view].time_index).or_default().push(*view);
+        }
+        let all = of.len();
+        let wanted = count.min(all).max(2);
+        let kept: Vec<usize> = (0..wanted).map(|k| k * (all - 1) / (wanted - 1)).collect();
+        let mut times: BTreeMap<usize, Vec<usize>> = of
+            .into_iter()
+            .enumerate()
+            .filter(|(k, _)| kept.contains(k))
+            .map(|(_, of_time)| of_time)
+            .collect();
+        for (k, views) in times.values_mut().enumerate() {
+            let wanted = if count < all { 1 } else { VIEWS.min(views.len()) };
+            *views = (0..wanted).map(|view| views[(k + view * views.len() / wanted) % views.len()]).collect();
+        }
+        times
+    }
+
+    /// True for places that what the object stands on leaves room for and that, where one camera sees it at a time and
+    /// does not tell how deep it is, are not farther away from its middle than it is wide.
+    pub(super) fn is_within(&self, place: DVec3) -> bool {
+        let Some((plane, up)) = self.object.surroundings.plane.zip(self.up) else { return true };
+        let Some(pose) = self.base.values().next() else { return true };
+        let across = (place - up * up.dot(place)).length();
+        let is_near = !self.one_camera || across < ACROSS * self.object.outline.radius;
+        is_near && plane.height(pose.rotation * place + pose.translation) > -0.05 * self.size
+    }
+}
