@@ -323,7 +323,7 @@ mod tests {
     use cif_geometry::PinholeCamera;
 
     use super::super::outline::outline;
-    use super::super::tests::{TIMES, camera, patches, solid, sphere_places, views};
+    use super::super::testing::{TIMES, camera, patches, solid, sphere_places, views};
     use super::*;
 
     /// One camera that sees another side of the floor at every time.

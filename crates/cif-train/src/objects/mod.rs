@@ -30,6 +30,8 @@ mod shape;
 mod sphere;
 mod start;
 #[cfg(test)]
+mod testing;
+#[cfg(test)]
 mod tests;
 mod texture;
 mod trials;

@@ -1,112 +1,20 @@
 //! Objects whose motion is known, rendered and found again.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
 
-use cif_field::tracks::{RotationEvidence, TrackGroup, TrackPose, Tracks};
-use cif_field::{Field, Gaussians};
-use cif_geometry::{PinholeCamera, RigidTransform};
-use cif_render::cpu::{Renderer, SimdLevel};
-use cif_render::{Channels, RenderSettings, synthetic};
-use glam::{DMat3, DQuat, DVec2, DVec3};
+use cif_field::tracks::RotationEvidence;
+use cif_geometry::PinholeCamera;
+use glam::{DQuat, DVec3};
 use rand::RngExt;
 
-use super::order::Order;
-use super::plane::Plane;
-use super::start::{Fitted, Object, Surroundings, fit_object};
-use super::view::{ObjectView, set_visible};
-use super::{outline, plane};
-use crate::frames::TrainFrame;
+use super::outline;
+use super::plane::{self, Plane};
+use super::start::{Fitted, fit_object};
+use super::testing::{
+    Cameras, FLOOR, TIMES, camera, moving, patches, rig, solid, sphere_places, views, with_object,
+};
+use super::view::ObjectView;
 use crate::random::{Purpose, stream};
-use crate::stop::Stop;
-
-pub(super) const TIMES: usize = 30;
-pub(super) const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };
-
-/// Cameras by time.
-pub(super) type Cameras = fn(usize) -> Vec<PinholeCamera>;
-
-/// One camera, on an arc above the floor.
-pub(super) fn moving(time: usize) -> Vec<PinholeCamera> {
-    vec![camera(0.5 + 0.9 * time as f64 / TIMES as f64)]
-}
-
-/// Five cameras that stay in place.
-pub(super) fn rig(_: usize) -> Vec<PinholeCamera> {
-    [0.0, 1.2, 2.5, 3.7, 5.0].map(camera).to_vec()
-}
-
-/// A camera above the floor, which looks at its origin.
-pub(super) fn camera(angle: f64) -> PinholeCamera {
-    let centre = DVec3::new(1.1 * angle.sin(), -1.1 * angle.cos(), 0.8);
-    let forward = (DVec3::new(0.0, 0.0, 0.05) - centre).normalize();
-    let right = forward.cross(DVec3::Z).normalize();
-    let rotation = DMat3::from_cols(right, forward.cross(right), forward).transpose();
-    PinholeCamera {
-        width: 160,
-        height: 120,
-        focal_px: DVec2::splat(330.0),
-        principal_px: DVec2::new(80.0, 60.0),
-        camera_from_world: RigidTransform { rotation, translation: -(rotation * centre) },
-    }
-}
-
-/// Opaque Gaussians at places around the origin, in colours of these places.
-pub(super) fn solid(places: &[DVec3], color: impl Fn(DVec3) -> [f32; 3], size: f32) -> Gaussians {
-    let means: Vec<[f32; 3]> = places.iter().map(|p| p.to_array().map(|v| v as f32)).collect();
-    let colors: Vec<[f32; 3]> = places.iter().map(|p| color(*p)).collect();
-    let mut gaussians = Gaussians::from_points(&means, &colors).unwrap();
-    gaussians.log_scales.fill([size.ln(); 3]);
-    gaussians.opacity_logits.fill(4.0);
-    gaussians
-}
-
-/// Views of a solid on its way.
-pub(super) fn views(gaussians: Gaussians, poses: &[(DQuat, DVec3)], cameras: Cameras) -> Vec<ObjectView> {
-    let group_of = vec![0; gaussians.len()];
-    views_of_groups(gaussians, group_of, &[poses.to_vec()], cameras)
-}
-
-/// Views of Gaussians in groups, each on its way.
-pub(super) fn views_of_groups(
-    gaussians: Gaussians,
-    group_of: Vec<u32>,
-    poses: &[Vec<(DQuat, DVec3)>],
-    cameras: Cameras,
-) -> Vec<ObjectView> {
-    let time = |k: usize| k as f64 / (TIMES - 1) as f64;
-    let group = |poses: &Vec<(DQuat, DVec3)>| {
-        let poses = poses.iter().enumerate().map(|(k, (rotation, translation))| TrackPose {
-            time: time(k),
-            translation: *translation,
-            rotation: *rotation,
-        });
-        TrackGroup { deformed: false, poses: poses.collect(), ..TrackGroup::still("solid", DVec3::ZERO) }
-    };
-    let groups = poses.iter().map(group).collect();
-    let scene = synthetic::generate(&synthetic::SyntheticConfig::default()).field;
-    let field = Field {
-        gaussians,
-        identities: None,
-        deformation: None,
-        tracks: Some(Tracks { group_of, groups }),
-        ..scene
-    };
-    let settings = RenderSettings { sh_degree: 0, background: [0.6, 0.6, 0.55], ..RenderSettings::default() };
-    let mut renderer = Renderer::new(SimdLevel::Auto);
-    let behind: Arc<[bool]> = Arc::new([false; 2]);
-    let mut views = Vec::new();
-    for (k, camera) in (0..TIMES).flat_map(|k| cameras(k).into_iter().map(move |camera| (k, camera))) {
-        let channels = Channels { depth: false, instances: false };
-        let image = renderer.render(&field, &camera, time(k), &settings, channels);
-        let labels = image.alpha.map(|alpha| u16::from(*alpha > 0.5));
-        let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
-        let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0 });
-        views.extend(ObjectView::new((1, &behind), k, &camera, &frame));
-    }
-    set_visible(&mut views);
-    views
-}
 
 fn fit(views: &[ObjectView]) -> Fitted {
     fit_on(Some(&FLOOR), views).unwrap()
@@ -114,28 +22,6 @@ fn fit(views: &[ObjectView]) -> Fitted {
 
 fn fit_on(plane: Option<&Plane>, views: &[ObjectView]) -> Option<Fitted> {
     with_object(plane, views, |object| fit_object(object).unwrap())
-}
-
-/// The object of some views, with facts about its surroundings.
-pub(super) fn with_object<T>(
-    plane: Option<&Plane>,
-    views: &[ObjectView],
-    act: impl FnOnce(Object<'_>) -> T,
-) -> T {
-    let outline = outline::outline(views, plane, TIMES).unwrap();
-    let stop = Stop::default();
-    let order = Order::among(&[], 2);
-    let surroundings = Surroundings {
-        plane,
-        up: DVec3::Z,
-        order: &order,
-        times: TIMES,
-        near: 0.05,
-        seed: 0,
-        gaussians: 150,
-        stop: &stop,
-    };
-    act(Object { label: 1, views, outline: &outline, is_told: false, surroundings })
 }
 
 /// Largest error of turns relative to the first pose, degrees, and mean error of displacements, metres.
@@ -165,15 +51,6 @@ fn box_places() -> Vec<DVec3> {
         .collect()
 }
 
-/// Patches of colour.
-pub(super) fn patches(p: DVec3) -> [f32; 3] {
-    let cell = (p * 40.0).floor();
-    std::array::from_fn(|k| {
-        let wave = (cell.x * (2.1 + k as f64) + cell.y * 3.7 + cell.z * (5.3 - k as f64)).sin();
-        (0.5 + 0.45 * wave) as f32
-    })
-}
-
 #[test]
 fn a_textured_box_that_slides_and_turns_is_found() {
     let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
@@ -188,18 +65,6 @@ fn a_textured_box_that_slides_and_turns_is_found() {
     assert!(turn < 4.0 && shift < 0.008, "{turn} deg, {shift} m, {}", fitted.way);
     assert_eq!(fitted.rotation, RotationEvidence::Observed);
     assert!(fitted.error < 0.1, "{}", fitted.error);
-}
-
-pub(super) fn sphere_places(radius: f64) -> Vec<DVec3> {
-    let mut rng = stream(0, Purpose::Objects, 10);
-    (0..1200)
-        .map(|_| {
-            let z = 2.0 * rng.random::<f64>() - 1.0;
-            let angle = std::f64::consts::TAU * rng.random::<f64>();
-            let flat = (1.0 - z * z).sqrt();
-            radius * DVec3::new(flat * angle.cos(), flat * angle.sin(), z)
-        })
-        .collect()
 }
 
 /// Rolls without slip, with a radius up to the middle of its outermost Gaussians and their thickness.

@@ -7,7 +7,9 @@ use glam::{DQuat, DVec3};
 use rand::RngExt;
 
 use super::super::parts;
-use super::super::tests::{Cameras, FLOOR, TIMES, moving, patches, rig, solid, views_of_groups, with_object};
+use super::super::testing::{
+    Cameras, FLOOR, TIMES, moving, patches, rig, solid, views_of_groups, with_object,
+};
 use super::super::view::ObjectView;
 use super::Jointed;
 use crate::random::{Purpose, stream};
