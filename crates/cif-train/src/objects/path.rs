@@ -6,7 +6,7 @@ use std::collections::BTreeMap;
 use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, DVector};
 
-use super::view::{ObjectView, median};
+use super::view::{ObjectView, are_discs, median};
 use crate::tracks::across;
 
 /// Weights of squared second differences, in steps of a 60th of the sequence: of paths that a plane cuts from rays,
@@ -23,15 +23,14 @@ const BESIDE: usize = 2;
 const CROSSES: f64 = 0.7;
 
 /// Rounds of reweighting of rays, by their distances from the path.
-const ROUNDS: usize = 8;
+const ROUNDS: usize = 5;
 
-/// Times at the ends of a path that stay what they are in all rounds.
-const ENDS: usize = 3;
+/// The same of what bounces, the rounds of these in which all rays are sure, and times at the ends that stay as they are.
+const BOUNCING: (usize, usize, usize) = (8, 3, 3);
 
-/// Second difference, in middles of these, from which a path bends as where something bounces.
+/// Second difference, in middles of these, from which a path bends as where something bounces, and its least stiffness
+/// there, of that elsewhere.
 const KINK: f64 = 4.0;
-
-/// Least stiffness there, of that elsewhere.
 const LOOSE: f64 = 0.05;
 
 /// The path that stays near `raw` where the object is well seen, and bends little, by its stiffness; `times` of the
@@ -73,8 +72,13 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
     }
     let mut weights: Vec<f64> = views.iter().map(|view| view.visible.powi(2) + 1e-4).collect();
     let mut stiffness = vec![CROSSING; keys.len()];
+    // Balls bounce; the middles of their masks are sure, so that a path that bends there is found before rays are told
+    // to be off it. Nothing else tells where its ends are.
+    let bounces = are_discs(views.iter().copied());
+    let (rounds, sure, ends) = if bounces { BOUNCING } else { (ROUNDS, 0, 0) };
+    let inner = ends..keys.len().saturating_sub(ends);
     let mut path = BTreeMap::new();
-    for round in 0..ROUNDS {
+    for round in 0..rounds {
         let near = |(view, weight): (&&ObjectView, &f64)| {
             let across = *weight * across(&view.camera, view.centroid);
             (across, across * view.camera.centre())
@@ -83,21 +87,17 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
         let Some(found) = even(&keys, &near, &stiffness, times) else { return BTreeMap::new() };
         let distance = |view: &&ObjectView| {
             let offset = found[&view.time_index] - view.camera.centre();
-            let pixel = offset.length() / view.camera.focal_px.x;
-            (across(&view.camera, view.centroid) * offset).length() / pixel
+            (across(&view.camera, view.centroid) * offset).length()
         };
         let distances: Vec<f64> = views.iter().map(distance).collect();
         let large = 2.0 * median(&mut distances.clone());
-        // Nothing else tells where its ends are.
-        let inner = ENDS..keys.len().saturating_sub(ENDS);
-        for k in inner.clone().filter(|_| round + 1 >= ROUNDS / 2) {
-            let (weight, view, distance) = (&mut weights[k], &views[k], distances[k]);
-            *weight = (view.visible.powi(2) + 1e-4) / (1.0 + (distance / large.max(1e-12)).powi(2));
+        for k in inner.clone().filter(|_| round >= sure) {
+            let seen = views[k].visible.powi(2) + 1e-4;
+            weights[k] = seen / (1.0 + (distances[k] / large.max(1e-12)).powi(2));
         }
-        // What is thrown bends little but where it bounces.
         let bends: Vec<f64> = (0..keys.len()).map(|k| bend(&keys, &found, k).length()).collect();
         let large = KINK * median(&mut bends.clone());
-        for k in inner {
+        for k in inner.clone().filter(|_| bounces) {
             stiffness[k] = CROSSING * (1.0 / (1.0 + (bends[k] / large.max(1e-12)).powi(2))).max(LOOSE);
         }
         path = found;
