@@ -226,7 +226,7 @@ fn scenes_of_a_comparison_answer_questions_in_words() {
 
     // Numbers are those of the masks of the held-out frames, by hand.
     let dataset =
-        cif_dataset::Dataset::open(&path.join("table"), &cif_dataset::OpenOptions::default()).unwrap();
+        cif_dataset::Dataset::open(path.join("table"), &cif_dataset::OpenOptions::default()).unwrap();
     let masks: Vec<_> =
         dataset.val_frames().into_iter().map(|index| dataset.load_mask(index).unwrap().unwrap()).collect();
     let of = |head: &str, question: &str| {

@@ -13,18 +13,21 @@ impl Queries {
              answer, and over seeds with the sample standard deviation; the best of a column is marked, among lines that \
              were answered by the same rule. The paper scored the same, against masks of its detector."
                 .to_owned(),
-            "labels: the instances that have the most words of the question in their labels, classes and taxonomies, \
-             pixel by pixel as the head decodes them, where its foreground or probability is at least a half (cif query --text)."
+            "labels: the instances that have the most words of the question in their labels, classes and taxonomies \
+             (cif query --text), pixel by pixel as the head decodes them, where its foreground or probability is \
+             at least a half. Heads without a class for unlabelled pixels (VLGS, Dr. Splat, Trace3D) give the \
+             background to instances too, which counts against their answers."
                 .to_owned(),
         ];
         if self.has_models {
             notes.push(
-                "reproject: the instances of which more than half lies inside the masks that Grounding DINO and SAM make of \
-                 the question on the training frames (cif query --prompt); the answer in a view are the pixels that are \
-                 mostly of their Gaussians, where the foreground is at least a half. grouping: those with more than 0.7 of their pixels inside the mask of the first \
-                 held-out view as the scene renders it; the answer are the pixels with a probability above 0.2, as in the \
-                 released code of Gaussian Grouping, which the paper cites for this task. Both go by the one label that a \
-                 head gives every Gaussian."
+                "reproject: the instances of which more than half lies inside the masks that Grounding DINO and SAM \
+                 make of the question on the training frames (cif query --prompt); the answer in a view are the \
+                 pixels that are mostly of their Gaussians, where the foreground is at least a half. grouping: those \
+                 with more than 0.7 of their pixels inside the mask of the first held-out view as the scene renders \
+                 it; the answer are the pixels with a probability above 0.2, as in the released code of Gaussian \
+                 Grouping, which the paper cites for this task. Both go by the one label that a head gives every \
+                 Gaussian."
                     .to_owned(),
             );
         } else {
