@@ -100,6 +100,22 @@ pub fn write(folder: &Path, frames: usize) {
         .expect("the points can be written");
 }
 
+/// Writes feature maps of the training frames of a capture of so many images, each pixel the code of its mask value.
+///
+/// # Panics
+/// When the folder cannot be written, or a mask not be read.
+pub fn write_maps(capture: &Path, frames: usize, maps: &Path, code: impl Fn(u8) -> [f32; 3]) {
+    fs::create_dir_all(maps).expect("the folder can be made");
+    for id in (0..frames).filter(|frame| frame % 4 != 2).map(|frame| format!("{frame:06}")) {
+        let mask =
+            image::open(capture.join(format!("masks/{id}.png"))).expect("the mask can be read").into_luma8();
+        let data: Vec<u8> =
+            mask.pixels().flat_map(|pixel| code(pixel.0[0])).flat_map(f32::to_le_bytes).collect();
+        let shape = [mask.height() as usize, mask.width() as usize, 3];
+        fs::write(maps.join(format!("{id}.npy")), npy("<f4", &shape, &data)).expect("the map can be written");
+    }
+}
+
 /// Writes the known motion of a capture of so many images: `motion.json`, and `tracks.npz` with 16 points per ball.
 ///
 /// # Panics

@@ -48,18 +48,18 @@ pub(crate) fn undistort_image(
     PixelGrid::from_pixels(image.width, image.height, pixels)
 }
 
-/// Nearest-pixel resampling; beyond the captured mask nothing is labelled.
-pub(crate) fn undistort_mask(
-    mask: &PixelGrid<u16>,
+/// Nearest-pixel resampling; beyond the captured mask nothing is labelled (the default of its pixels).
+pub(crate) fn undistort_mask<T: Copy + Default>(
+    mask: &PixelGrid<T>,
     camera: &PinholeCamera,
     lens: &LensDistortion,
-) -> PixelGrid<u16> {
+) -> PixelGrid<T> {
     let (width, height) = (f64::from(mask.width), f64::from(mask.height));
     let pixels = captured_positions(camera, lens)
         .into_iter()
         .map(|p| {
             let inside = p.x >= 0.0 && p.y >= 0.0 && p.x < width && p.y < height;
-            if inside { *mask.at(p.x as u32, p.y as u32) } else { 0 }
+            if inside { *mask.at(p.x as u32, p.y as u32) } else { T::default() }
         })
         .collect();
     PixelGrid::from_pixels(mask.width, mask.height, pixels)
@@ -128,6 +128,6 @@ mod tests {
     fn an_absurd_lens_does_not_panic() {
         let lens = LensDistortion { radial: [1e300, -1e300, 1e300, 0.0], ..lens() };
         undistort_image(&captured(|_| 1.0), &camera(), &lens);
-        undistort_mask(&PixelGrid::filled(64, 48, 1), &camera(), &lens);
+        undistort_mask(&PixelGrid::filled(64, 48, 1_u16), &camera(), &lens);
     }
 }

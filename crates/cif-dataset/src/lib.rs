@@ -32,6 +32,7 @@ mod camera_check;
 pub mod cryptomatte;
 mod dataset;
 mod error;
+mod feature_maps;
 mod files;
 pub mod foreign;
 mod formats;
@@ -54,5 +55,6 @@ pub use dataset::{
     PointSource, Split,
 };
 pub use error::Error;
+pub use feature_maps::feature_maps;
 pub use motion_truth::{MotionTruth, TrueMotion};
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

@@ -192,3 +192,45 @@ fn motion_counts_at_times_at_which_enough_of_an_instance_is_seen() {
     let seen = truth.seen_steps(&open(&folder)).unwrap();
     assert_eq!(seen.into_iter().collect::<Vec<_>>(), [(1, vec![2]), (2, vec![1, 2])]);
 }
+
+#[test]
+fn feature_maps_are_read_at_the_size_of_images_and_belong_to_training_frames() {
+    let folder = hypernerf(6);
+    let dataset = open(&folder);
+    let maps = folder.path().join("maps");
+    // Half the size of the images; one pixel is not a number, one is 0.
+    let (width, height) = (WIDTH as usize / 2, HEIGHT as usize / 2);
+    let mut values: Vec<f64> = (0..width * height * 3).map(|at| 1.0 + at as f64 / 4.0).collect();
+    values[4] = f64::NAN;
+    values[6..9].fill(0.0);
+    let shape = format!("({height}, {width}, 3)");
+    for index in dataset.train_frames() {
+        write(&maps.join(format!("{}_clip.npy", dataset.frames[index].name)), npy_of(&shape, &values));
+    }
+    let files = cif_dataset::feature_maps(&dataset, &maps).unwrap();
+    assert_eq!(files.keys().copied().collect::<Vec<_>>(), dataset.train_frames());
+    let (index, path) = files.first_key_value().unwrap();
+    let map = dataset.load_feature_map(*index, path).unwrap();
+    assert_eq!((map.width, map.height), (WIDTH, HEIGHT));
+    assert_eq!((*map.at(0, 0), *map.at(1, 1)), ([1.0, 1.25, 1.5], [1.0, 1.25, 1.5]));
+    assert_eq!((*map.at(2, 0), *map.at(5, 1), *map.at(6, 0)), ([0.0; 3], [0.0; 3], [3.25, 3.5, 3.75]));
+
+    let refused = |bytes: &[u8], words: &[&str]| {
+        write(path, bytes);
+        holds(&dataset.load_feature_map(*index, path).unwrap_err().to_string(), words);
+    };
+    refused(&npy(4, 3, &[0.0; 12]), &["[4, 3]", "[height, width, 3]"]);
+    refused(&npy_of("(24, 8, 3)", &[0.0; 24 * 8 * 3]), &["8 x 24", "aspect"]);
+    refused(&npy_of("(3, 4, 3)", &[f64::INFINITY; 36]), &["infinite", "NaN"]);
+    refused(b"no array", &["_clip.npy", "NumPy"]);
+    std::fs::write(path.with_file_name(format!("{}_b.npy", dataset.frames[*index].name)), b"").unwrap();
+    holds(
+        &cif_dataset::feature_maps(&dataset, &maps).unwrap_err().to_string(),
+        &["several feature maps", "_b.npy"],
+    );
+    std::fs::remove_dir_all(&maps).unwrap();
+    std::fs::create_dir(&maps).unwrap();
+    let name = &dataset.frames[dataset.train_frames()[0]].name;
+    let told = cif_dataset::feature_maps(&dataset, &maps).unwrap_err().to_string();
+    holds(&told, &["maps", &format!("{name}.npy"), "has no feature map"]);
+}

@@ -4,6 +4,7 @@
 mod ahead;
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use ahead::Ahead;
@@ -27,6 +28,8 @@ pub(crate) struct TrainFrame {
     pub labels: Option<PixelGrid<u16>>,
     /// Labelled pixels.
     pub labelled: usize,
+    /// The feature map, 0 in all channels where there is no feature; `None` where none was given.
+    pub features: Option<Arc<PixelGrid<[f32; 3]>>>,
 }
 
 /// All training frames of a capture.
@@ -43,6 +46,8 @@ pub(crate) struct FrameStore {
 struct Decoding {
     label_of_id: Vec<u16>,
     background: [f32; 3],
+    /// Files of feature maps, by index in the capture.
+    maps: BTreeMap<usize, PathBuf>,
     /// New labels of masks that show other objects, by index in the capture.
     switched: BTreeMap<usize, BTreeMap<u16, u16>>,
 }
@@ -55,10 +60,11 @@ const LEAST_CONFIDENCE: u8 = 192;
 const BATCH: usize = 32;
 
 impl FrameStore {
-    /// Decodes frames until the budget is used.
+    /// Decodes frames, with their feature maps where there are `maps`, until the budget is used.
     pub(crate) fn open(
         dataset: &Dataset,
         background: [f32; 3],
+        maps: BTreeMap<usize, PathBuf>,
         budget: u64,
         stop: &Stop,
     ) -> Result<Self, TrainError> {
@@ -68,7 +74,7 @@ impl FrameStore {
         }
         let training = dataset.frames.iter().enumerate().filter(|(_, f)| f.split == Split::Train);
         let frames = training.map(|(index, _)| (index, None)).collect();
-        let decoding = Arc::new(Decoding { label_of_id, background, switched: BTreeMap::new() });
+        let decoding = Arc::new(Decoding { label_of_id, background, maps, switched: BTreeMap::new() });
         let mut store = Self { frames, decoding, ahead: None };
         if store.frames.is_empty() {
             return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
@@ -177,7 +183,7 @@ impl FrameStore {
         for (renamed, (index, frame)) in found {
             if let Some(frame) = frame {
                 let labels = frame.labels.as_ref().map(|labels| put_right(labels, &renamed));
-                *frame = Arc::new(TrainFrame::new(frame.image.clone(), labels));
+                *frame = Arc::new(TrainFrame::new(frame.image.clone(), labels, frame.features.clone()));
             }
             Arc::make_mut(&mut self.decoding).switched.insert(*index, renamed);
         }
@@ -199,6 +205,7 @@ impl FrameStore {
                 image: frame.image.clone(),
                 labels: frame.labels.as_ref().map(|labels| labels.map(rename)),
                 labelled: frame.labelled,
+                features: frame.features.clone(),
             });
         }
     }
@@ -223,19 +230,26 @@ impl Decoding {
                 }
             }
         }
-        Ok(TrainFrame::new(data.image, labels))
+        let features = self.maps.get(&index).map(|path| dataset.load_feature_map(index, path)).transpose()?;
+        Ok(TrainFrame::new(data.image, labels, features.map(Arc::new)))
     }
 }
 
 impl TrainFrame {
-    fn new(image: PixelGrid<[u8; 3]>, labels: Option<PixelGrid<u16>>) -> Self {
+    fn new(
+        image: PixelGrid<[u8; 3]>,
+        labels: Option<PixelGrid<u16>>,
+        features: Option<Arc<PixelGrid<[f32; 3]>>>,
+    ) -> Self {
         let count = |grid: &PixelGrid<u16>| grid.pixels.iter().filter(|l| **l != UNLABELLED).count();
         let labelled = labels.as_ref().map_or(0, count);
-        Self { image, labels, labelled }
+        Self { image, labels, labelled, features }
     }
 
     fn bytes(&self) -> u64 {
-        (self.image.pixels.len() * 3 + self.labels.as_ref().map_or(0, |grid| grid.pixels.len() * 2)) as u64
+        let of_labels = self.labels.as_ref().map_or(0, |grid| grid.pixels.len() * 2);
+        let of_features = self.features.as_ref().map_or(0, |grid| grid.pixels.len() * 12);
+        (self.image.pixels.len() * 3 + of_labels + of_features) as u64
     }
 }
 
@@ -248,8 +262,9 @@ mod tests {
     fn unsure_pixels_are_unlabelled_and_the_others_keep_their_labels() {
         let folder = tempfile::tempdir().unwrap();
         let mut dataset = capture(folder.path(), Scene { times: 1, views: 2, ..Scene::default() });
-        let open =
-            |dataset: &Dataset| FrameStore::open(dataset, [1.0; 3], u64::MAX, &Stop::default()).unwrap();
+        let open = |dataset: &Dataset| {
+            FrameStore::open(dataset, [1.0; 3], BTreeMap::new(), u64::MAX, &Stop::default()).unwrap()
+        };
         let certain = open(&dataset);
         // Rows alternate between just too little and just enough.
         let path = folder.path().join("confidence.png");
@@ -269,7 +284,7 @@ mod tests {
         assert_eq!(unsure.get(&dataset, 0).unwrap().labelled, labelled(&after));
         // Frames without a confidence are as before, and so are frames that memory has no room for.
         assert_eq!(labels(&unsure, 1), labels(&certain, 1));
-        let none_kept = FrameStore::open(&dataset, [1.0; 3], 0, &Stop::default()).unwrap();
+        let none_kept = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Stop::default()).unwrap();
         assert_eq!(none_kept.not_kept(), none_kept.len());
         assert_eq!(labels(&none_kept, 0), after);
     }
@@ -278,7 +293,8 @@ mod tests {
     fn frames_read_ahead_are_those_read_when_they_are_needed() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 2, views: 3, ..Scene::default() });
-        let open = |budget| FrameStore::open(&dataset, [1.0; 3], budget, &Stop::default()).unwrap();
+        let open =
+            |budget| FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Stop::default()).unwrap();
         let (kept, mut read) = (open(u64::MAX), open(0));
         let same = |a: &FrameStore, b: &FrameStore, k: usize| {
             let (a, b) = (a.get(&dataset, k).unwrap(), b.get(&dataset, k).unwrap());
@@ -308,7 +324,7 @@ mod tests {
     fn no_more_frames_are_read_ahead_than_there_is_room_for() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 8, views: 3, ..Scene::default() });
-        let store = FrameStore::open(&dataset, [1.0; 3], 0, &Stop::default()).unwrap();
+        let store = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Stop::default()).unwrap();
         assert!(store.len() > ahead::MOST);
         for _ in 0..3 {
             store.expect(0..store.len());
@@ -320,7 +336,7 @@ mod tests {
     fn a_damaged_frame_read_ahead_is_named_when_it_is_needed() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
-        let store = FrameStore::open(&dataset, [1.0; 3], 0, &Stop::default()).unwrap();
+        let store = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Stop::default()).unwrap();
         let image = &dataset.frames[store.index(1)].image;
         std::fs::write(image, b"no image").unwrap();
         store.expect([0, 1]);

@@ -14,7 +14,7 @@ use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::frames::{FrameStore, TrainFrame};
 use crate::guidance::{Guidance, Pulls};
-use crate::heads::{self, Head, HeadTensors, Pass, ValueHead};
+use crate::heads::{self, Head, HeadTensors, Pass, Target, ValueHead};
 use crate::optimiser::Optimiser;
 use crate::poses::PoseMoments;
 use crate::progress::Progress;
@@ -79,9 +79,9 @@ impl State {
         heads::value_head(&self.head, &self.config)
     }
 
-    /// The same once it has started: views then show its labels.
+    /// The same once it has started, where it tells labels: views then show them.
     pub(crate) fn started_head(&self) -> Option<&dyn ValueHead> {
-        self.value_head().filter(|_| !self.head_tensors.is_empty())
+        self.value_head().filter(|head| head.target() == Target::Labels && !self.head_tensors.is_empty())
     }
 
     /// Settings of a view without instances.

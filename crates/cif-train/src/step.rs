@@ -3,8 +3,8 @@
 
 use std::sync::Arc;
 
-use cif_geometry::PinholeCamera;
-use cif_render::{BlendedImage, RenderSettings};
+use cif_geometry::{PinholeCamera, PixelGrid};
+use cif_render::{BlendedImage, RenderSettings, UNLABELLED};
 
 use crate::adam::PlaneWeights;
 use crate::config::TrainConfig;
@@ -26,7 +26,7 @@ pub(crate) struct StepView {
     pub leaves_judged: bool,
 }
 
-/// A camera whose blended values train a head, and the masks that they are held to with the weight of each.
+/// A camera whose blended values train a head, and the frames that they are held to with the weight of each.
 #[derive(Clone)]
 pub(crate) struct HeadTarget {
     pub camera: PinholeCamera,
@@ -46,8 +46,15 @@ impl HeadTarget {
     ) -> HeadLoss {
         let mut sum = HeadLoss::default();
         for (frame, share) in &self.masks {
-            let Some(labels) = &frame.labels else { continue };
-            let view = HeadView { blended, labels, seed };
+            let unlabelled;
+            let labels = match &frame.labels {
+                Some(labels) => labels,
+                None => {
+                    unlabelled = PixelGrid::filled(blended.width, blended.height, UNLABELLED);
+                    &unlabelled
+                }
+            };
+            let view = HeadView { blended, labels, features: frame.features.as_deref(), seed };
             let HeadLoss { loss, unsupported } = head.loss(tensors, &view, weight * share, v_blended);
             sum.loss += f64::from(*share) * loss;
             sum.unsupported += unsupported;

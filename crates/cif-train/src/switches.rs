@@ -181,7 +181,7 @@ mod tests {
                     })
                     .collect(),
             );
-            colors(&TrainFrame { image, labels: Some(labels), labelled: 0 })
+            colors(&TrainFrame { image, labels: Some(labels), labelled: 0, features: None })
         };
         (0..count).map(frame).collect()
     }

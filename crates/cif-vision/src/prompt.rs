@@ -27,6 +27,27 @@ impl<'a> Prompter<'a> {
         Self { models, pythons, thresholds, opened: None }
     }
 
+    /// Opens the models, so that what is missing is told before the first question.
+    ///
+    /// # Errors
+    /// When a model is missing or does not fit, or the library that runs it is not there.
+    pub fn open(&mut self) -> Result<(), Error> {
+        self.opened().map(drop)
+    }
+
+    fn opened(&mut self) -> Result<&mut (Detector, Segmenter), Error> {
+        if self.opened.is_none() {
+            // What the folder lacks is told before the library is looked for.
+            self.models.detector()?;
+            self.models.segmenter()?;
+            let library = library::find(self.pythons)?;
+            let detector = Detector::open(&library, self.models)?;
+            self.opened = Some((detector, Segmenter::open(&library, self.models)?));
+        }
+        let Some(opened) = &mut self.opened else { unreachable!("opened above") };
+        Ok(opened)
+    }
+
     /// Pixels of a picture that show what a prompt names, and the boxes that they were found in, best first.
     ///
     /// # Errors
@@ -36,16 +57,9 @@ impl<'a> Prompter<'a> {
         picture: &Picture,
         prompt: &str,
     ) -> Result<(PixelGrid<bool>, Vec<FoundBox>), Error> {
-        if self.opened.is_none() {
-            // What the folder lacks is told before the library is looked for.
-            self.models.detector()?;
-            self.models.segmenter()?;
-            let library = library::find(self.pythons)?;
-            let detector = Detector::open(&library, self.models)?;
-            self.opened = Some((detector, Segmenter::open(&library, self.models)?));
-        }
-        let Some((detector, segmenter)) = &mut self.opened else { unreachable!("opened above") };
-        let boxes = detector.boxes(picture, prompt, self.thresholds)?;
+        let thresholds = self.thresholds;
+        let (detector, segmenter) = self.opened()?;
+        let boxes = detector.boxes(picture, prompt, thresholds)?;
         let corners: Vec<[f32; 4]> = boxes.iter().map(|found| found.corners).collect();
         Ok((segmenter.mask(picture, &corners)?, boxes))
     }

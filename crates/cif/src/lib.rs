@@ -18,6 +18,7 @@
 //! | [`mask_query`] | which objects 2D masks show |
 //! | [`detector`] | what makes such masks: a command, or models |
 //! | [`instance_views`] | which views show an object best, and what they show of it |
+//! | [`words`] | words of a text, matched with the names of objects |
 //! | [`ground_truth`] | exported motion against known motion |
 //! | [`error`] | what is reported, and the exit code |
 
@@ -39,6 +40,7 @@ pub mod pictures;
 pub mod progress;
 pub mod settings;
 pub mod training;
+pub mod words;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;

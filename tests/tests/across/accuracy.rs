@@ -142,3 +142,48 @@ fn a_report_holds_its_ladders_and_goes_on_where_it_stopped() {
     cif(path, "bench accuracy table -o table --quick").fails(1, &["not empty"]);
     cif(path, "bench accuracy table -o report --ladders none").fails(2, &["iterations", "export"]);
 }
+
+#[test]
+fn the_configuration_of_the_paper_is_a_ladder_of_its_own_with_what_there_is_time_for() {
+    let folder = capture::in_folder(8);
+    let path = folder.path();
+    let base = "--set stages.coarse=5 --set stages.fine=20 --set stages.instance=10 --set model.max_initial_points=300";
+    let paper = "--paper-set model.max_initial_points=300 --paper-set model.spatial_resolution=[8,8,8]";
+    let line = format!(
+        "bench accuracy table -o paper --no-masks --ladders paper --paper-share 0.002 {paper} {base} {SMALL}"
+    );
+    let told = cif(path, &line).succeeds().stderr;
+    assert!(
+        told.contains("[1/2] paper: base: ") && told.contains("[2/2] paper: paper, 0.2 % of its steps: "),
+        "{told}"
+    );
+    let report = json(&fs::read_to_string(path.join("paper/report.json")).unwrap());
+    let rung = report["rungs"].as_array().unwrap().iter().find(|rung| rung["id"] == "paper").unwrap();
+    let settings = [
+        "preset=paper",
+        "0.002 of its steps",
+        "model.max_initial_points=300",
+        "model.spatial_resolution=[8,8,8]",
+    ];
+    assert_eq!(rung["settings"], serde_json::json!(settings));
+    assert!(rung["psnr"].is_number(), "{rung:#}");
+    let kept = json(&fs::read_to_string(path.join("paper/rungs/paper.json")).unwrap());
+    let trained = &kept["fingerprint"]["settings"];
+    // Steps are shortened, what else the paper has for this layout is as it is.
+    assert_eq!(
+        trained["stages"],
+        serde_json::json!({
+            "coarse": 6, "fine": 20, "fine_includes_coarse": false, "instance": 6, "batch": 2,
+        })
+    );
+    assert_eq!((&trained["rates"]["schedule_steps"], &trained["downscale"]), (&40.into(), &2.into()));
+    assert_eq!(trained["densify"]["max_gaussians"], 360_000);
+    let page = fs::read_to_string(path.join("paper/report.html")).unwrap();
+    for part in ["The paper's configuration", "<code>0.002 of its steps</code>", "--paper-share 0.002"] {
+        assert!(page.contains(part), "{part}");
+    }
+
+    cif(path, "bench accuracy table -o x --paper-share 0.5").fails(2, &["--paper-share", "--ladders paper"]);
+    cif(path, "bench accuracy table -o x --ladders paper --paper-share 0").fails(2, &["above 0"]);
+    cif(path, "bench accuracy table -o x --ladders paper --paper-set model.wdth=3").fails(1, &["model.wdth"]);
+}

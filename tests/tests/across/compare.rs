@@ -169,3 +169,191 @@ fn a_comparison_has_a_video_of_its_runs() {
     assert!(numbers[0] >= 3 * capture::WIDTH && numbers[1] >= capture::HEIGHT, "{told}: three parts");
     assert!(numbers[2] >= 61, "{told}: between two held-out frames there are sixty pictures");
 }
+
+/// Questions about the small capture.
+const QUESTIONS: &str = r#"
+[[capture]]
+name = "table"
+
+[[capture.question]]
+text = "the Red thing"
+answer = ["red ball"]
+
+[[capture.question]]
+text = "a ball"
+answer = ["Ball"]
+
+[[capture.question]]
+text = "steel jug"
+answer = [7]
+
+[[capture]]
+name = "elsewhere"
+
+[[capture.question]]
+text = "mug"
+answer = [1]
+"#;
+
+#[test]
+fn scenes_of_a_comparison_answer_questions_in_words() {
+    let folder = capture::in_folder(8);
+    let path = folder.path();
+    fs::write(path.join("q.toml"), QUESTIONS).unwrap();
+    let line = |more: &str| {
+        format!(
+            "bench compare table -o out --heads cif,dr-splat --seeds 1 --iterations 8 {SMALL_MODEL} \
+             {SHORT} --queries q.toml {more}"
+        )
+    };
+    let told = cif(path, &line("")).succeeds();
+    assert!(told.stderr.contains("elsewhere is not compared here"), "{}", told.stderr);
+    assert!(told.stdout.contains("| Dr. Splat | labels | "), "{}", told.stdout);
+    let answers = json_file(&path.join("out/queries.json"));
+    let answers = answers.as_array().unwrap();
+    let named = |answer: &Value| {
+        let text = |key: &str| answer[key].as_str().unwrap().to_owned();
+        (text("head"), text("question"), text("by"), answer["chosen"].clone())
+    };
+    let expected = ["cif", "dr-splat"].map(|head| {
+        [("the Red thing", vec![3]), ("a ball", vec![3, 7]), ("steel jug", vec![])].map(
+            |(question, chosen)| {
+                (head.to_owned(), question.to_owned(), "labels".to_owned(), serde_json::json!(chosen))
+            },
+        )
+    });
+    assert_eq!(answers.iter().map(named).collect::<Vec<_>>(), expected.concat());
+
+    // Numbers are those of the masks of the held-out frames, by hand.
+    let dataset =
+        cif_dataset::Dataset::open(path.join("table"), &cif_dataset::OpenOptions::default()).unwrap();
+    let masks: Vec<_> =
+        dataset.val_frames().into_iter().map(|index| dataset.load_mask(index).unwrap().unwrap()).collect();
+    let of = |head: &str, question: &str| {
+        answers.iter().find(|answer| answer["head"] == head && answer["question"] == question).unwrap()
+    };
+    let scene = path.join("out/runs/table.seed0.cif.cif");
+    let field = cif_field::Field::load(&scene).unwrap();
+    let options = cif_train::metrics::EvaluationOptions::held_out(&field);
+    let mut both = Vec::new();
+    cif_train::metrics::evaluate::<cif_train::metrics::EvaluationError>(&field, &dataset, &options, |view| {
+        let shown = view.rendered.instances.as_ref().unwrap().foreground_label();
+        let shown = cif_train::metrics::mask_ids(&field, &shown).pixels;
+        let truth = &view.truth.mask.as_ref().unwrap().pixels;
+        let count = |of: &dyn Fn(bool, bool) -> bool| {
+            truth.iter().zip(&shown).filter(|(truth, shown)| of(**truth == 3, **shown == 3)).count() as f64
+        };
+        let pixels = truth.len() as f64;
+        both.push((count(&|a, b| a == b) / pixels, count(&|a, b| a && b) / count(&|a, b| a || b)));
+        Ok(())
+    })
+    .unwrap();
+    let frames = both.len() as f64;
+    let mean = |of: fn(&(f64, f64)) -> f64| 100.0 * both.iter().map(of).sum::<f64>() / frames;
+    let red = of("cif", "the Red thing");
+    let close = |value: &Value, expected: f64| (value.as_f64().unwrap() - expected).abs() < 1e-9;
+    assert!(
+        close(&red["macc"], mean(|frame| frame.0)) && close(&red["miou"], mean(|frame| frame.1)),
+        "{red:#}"
+    );
+    // No label has a word of this one: nothing is shown, and what is not the ball agrees.
+    let blue = |mask: &cif_geometry::PixelGrid<u16>| {
+        mask.pixels.iter().filter(|id| **id == 7).count() as f64 / mask.pixels.len() as f64
+    };
+    let rest = 100.0 * masks.iter().map(|mask| 1.0 - blue(mask)).sum::<f64>() / frames;
+    for head in ["cif", "dr-splat"] {
+        let jug = of(head, "steel jug");
+        assert!(close(&jug["macc"], rest) && close(&jug["miou"], 0.0), "{jug:#}");
+        assert_eq!((&jug["frames"], &jug["empty_frames"]), (&masks.len().into(), &0.into()));
+    }
+    for extension in ["md", "csv", "tex"] {
+        let text = fs::read_to_string(path.join(format!("out/queries.{extension}"))).unwrap();
+        assert!(text.contains("steel jug"), "{extension}");
+    }
+    let page = fs::read_to_string(path.join("out/compare.html")).unwrap();
+    for part in ["Questions in words", "No models were given", "&#39;a ball&#39; mIoU %"] {
+        assert!(page.contains(part) || page.contains(&part.replace("&#39;", "'")), "{part}");
+    }
+
+    // Answers are kept until a question changes; without time nobody is asked.
+    let told = cif(path, &line("")).succeeds().stderr;
+    assert_eq!(told.matches("questions: kept, ").count(), 2, "{told}");
+    fs::write(path.join("q.toml"), QUESTIONS.replace("steel jug", "steel pot")).unwrap();
+    let told = cif(path, &line("--budget 0s")).succeeds();
+    assert!(told.stderr.contains("questions that 2 scenes have not answered"), "{}", told.stderr);
+    assert!(
+        told.stdout.contains("Not done yet, and not in the means: table with CIF (seed 0)"),
+        "{}",
+        told.stdout
+    );
+    assert_eq!(json_file(&path.join("out/queries.json")), serde_json::json!([]));
+
+    let asked = |text: &str, words: &[&str]| {
+        fs::write(path.join("q.toml"), text).unwrap();
+        cif(path, "bench compare table -o other --queries q.toml").fails(1, words);
+    };
+    asked(&QUESTIONS.replace("[7]", "[8]"), &["q.toml", "'steel jug'", "no instance is 8", "7 blue ball"]);
+    asked(&QUESTIONS.replace("answer = [7]", "anser = [7]"), &["q.toml:15", "anser"]);
+    asked(&QUESTIONS.replace("\"table\"", "\"tabel\""), &["tabel, elsewhere", "table"]);
+    cif(path, "bench compare table -o other --queries no.toml").fails(1, &["no.toml"]);
+    cif(path, "bench compare table -o other --models m").fails(2, &["--queries"]);
+    fs::write(path.join("q.toml"), QUESTIONS).unwrap();
+    cif(path, "bench compare table -o other --queries q.toml --models table").fails(1, &["models.toml"]);
+    assert!(!path.join("other/runs").exists(), "nothing is begun");
+    let help = cif(path, "bench compare --help").succeeds().stdout;
+    assert!(help.contains("[[capture.question]]"), "{help}");
+}
+
+#[test]
+fn feature_maps_are_learnt_and_asked() {
+    let folder = capture::in_folder(8);
+    let path = folder.path();
+    let code = |id: u8| match u16::from(id) {
+        capture::ROLLING => [1.0, 0.0, 0.0],
+        capture::STANDING => [0.0, 2.0, 0.0],
+        _ => [0.0, 0.0, 1.0],
+    };
+    capture::write_maps(&path.join("table"), 8, &path.join("maps"), code);
+    let questions = "anything = [[0.0, 0.1, 1.0]]\n[[capture]]\nname = \"table\"\nmaps = \"maps\"\n\
+                     [[capture.question]]\ntext = \"blue\"\nanswer = [7]\ncode = [0.0, 1.0, 0.0]\n";
+    fs::write(path.join("q.toml"), questions).unwrap();
+    let line = format!(
+        "bench compare table -o out --heads dr-splat,4d-langsplat --seeds 1 --iterations 60 --queries q.toml \
+         {SMALL_MODEL} --set stages.coarse=60 --set stages.fine=150 --set densify.max_gaussians=600"
+    );
+    let told = cif(path, &line).succeeds();
+    assert!(told.stdout.contains("| 4D LangSplat (time-agnostic) | relevance | "), "{}", told.stdout);
+    let answers = json_file(&path.join("out/queries.json"));
+    let by: Vec<(&str, &str)> = answers
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|answer| (answer["head"].as_str().unwrap(), answer["by"].as_str().unwrap()))
+        .collect();
+    assert_eq!(by, [("dr-splat", "labels"), ("4d-langsplat", "relevance")]);
+    assert!(answers[1]["miou"].as_f64() > Some(30.0) && answers[1]["frames"] == 2, "{answers:#}");
+    // It has no labels, and so no row among those that are scored by them.
+    let rows = json_file(&path.join("out/panoptic.json"));
+    assert_eq!(rows.as_array().unwrap().iter().map(|row| &row["head"]).collect::<Vec<_>>(), ["dr-splat"]);
+    let page = fs::read_to_string(path.join("out/compare.html")).unwrap();
+    assert!(page.contains("<td>relevance</td>") && page.contains("features that it learnt"));
+
+    let scene = "out/runs/table.seed0.4d-langsplat.cif";
+    cif(path, &format!("eval {scene} table --json scores.json")).succeeds();
+    let scores = json_file(&path.join("scores.json"));
+    assert!(scores["psnr"].is_number() && scores["macc_pix"].is_null(), "{scores:#}");
+    cif(path, &format!("export {scene} --gltf scene.glb")).succeeds();
+    cif(path, &format!("info {scene}")).succeeds();
+    let base = "out/runs/table.seed0.base.cif";
+    cif(path, &format!("train table -o x.cif --from {base} --head 4d-langsplat")).fails(1, &["head.maps"]);
+
+    fs::remove_file(path.join("maps/000004.npy")).unwrap();
+    let other = line.replace("-o out", "-o other");
+    cif(path, &other).fails(1, &["maps", "000004", "[height, width, 3]"]);
+    fs::write(path.join("q.toml"), questions.replace("maps = \"maps\"\n", "")).unwrap();
+    cif(path, &other).fails(1, &["'blue'", "no maps"]);
+    fs::write(path.join("q.toml"), questions.replace("code = [0.0, 1.0, 0.0]\n", "")).unwrap();
+    cif(path, &other).fails(1, &["'blue'", "no code"]);
+    cif(path, "bench compare table -o other --heads 4d-langsplat").fails(2, &["--queries"]);
+    assert!(!path.join("other/runs").exists(), "nothing is begun");
+}

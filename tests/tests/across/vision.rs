@@ -387,3 +387,52 @@ fn folders_without_models_are_refused() {
     fs::remove_file(path.join("models/decoder.onnx")).unwrap();
     ask().fails(1, &["models.toml", "decoder.onnx", "nothing is downloaded"]);
 }
+
+#[test]
+fn scenes_of_a_comparison_are_asked_by_both_protocols() {
+    if !models::can_run() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path();
+    capture::write(&path.join("table"), 8);
+    models::write(&path.join("models"));
+    let questions = serde_json::json!({ "capture": [{ "name": "table", "question": [
+        { "text": "red", "answer": ["red ball"] }, { "text": "blue", "answer": [STANDING] },
+    ] }] });
+    fs::write(path.join("q.json"), questions.to_string()).unwrap();
+    let settings = "--set stages.coarse=100 --set stages.fine=200 --set model.spatial_resolution=[16,16,16] \
+                    --set densify.until=150 --set densify.max_gaussians=1500";
+    let line = format!(
+        "bench compare table -o out --heads cif --seeds 1 --iterations 60 --queries q.json --models models {settings}"
+    );
+    let told = run(CIF, path, line.split_whitespace()).succeeds();
+    assert!(told.stdout.contains("Grounding DINO") && !told.stdout.contains("No models"), "{}", told.stdout);
+    assert!(path.join("table/.cif-cache").is_dir(), "masks are kept for the next question");
+    let answers = json(&fs::read_to_string(path.join("out/queries.json")).unwrap());
+    let answers = answers.as_array().unwrap();
+    assert_eq!(answers.len(), 2 * 3);
+    for answer in answers {
+        let id = if answer["question"] == "red" { ROLLING } else { STANDING };
+        let wrong = answer["chosen"] != serde_json::json!([id]);
+        assert!(!wrong && answer["miou"].as_f64() > Some(30.0), "{answer:#}");
+        let (head, by) = (answer["head"].as_str().unwrap(), answer["by"].as_str().unwrap());
+        if by == "labels" || id == STANDING {
+            continue;
+        }
+        // Their instances are those that `cif query` finds in the scene.
+        let scene = format!("out/runs/table.seed0.{head}.cif");
+        let prompt = answer["question"].as_str().unwrap();
+        let question =
+            ["query", &scene, "--capture", "table", "--models", "models", "--json", "--prompt", prompt];
+        let found = cif(path, &[&question[..], &["--protocol", by]].concat()).succeeds().stdout;
+        let found = json(&found);
+        let chosen: Vec<_> =
+            found["instances"].as_array().unwrap().iter().filter(|one| one["chosen"] == true).collect();
+        assert_eq!(chosen.iter().map(|one| one["id"].clone()).collect::<Vec<_>>(), [serde_json::json!(id)]);
+    }
+    let page = fs::read_to_string(path.join("out/compare.html")).unwrap();
+    assert!(page.contains("<td>grouping</td>") && page.contains("<td>reproject</td>"));
+    let told = run(CIF, path, line.split_whitespace()).succeeds().stderr;
+    assert_eq!(told.matches("questions: kept, ").count(), 1, "{told}");
+}

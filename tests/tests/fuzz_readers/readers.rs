@@ -205,6 +205,22 @@ pub(crate) fn all() -> Vec<Reader> {
             read: |folder| read_gltf(&folder.join("scene.gltf")),
         },
         Reader {
+            name: "feature-map",
+            file: "maps/000001.npy",
+            form: Form::Binary,
+            write: |folder| {
+                capture::write(folder, 4);
+                capture::write_maps(folder, 4, &folder.join("maps"), |id| [f32::from(id); 3]);
+            },
+            read: |folder| {
+                let dataset =
+                    Dataset::open(folder, &OpenOptions::default()).map_err(|error| error.to_string())?;
+                let maps = cif_dataset::feature_maps(&dataset, &folder.join("maps"))
+                    .map_err(|error| error.to_string())?;
+                dataset.load_feature_map(1, &maps[&1]).map(drop).map_err(|error| error.to_string())
+            },
+        },
+        Reader {
             name: "models",
             file: "models.toml",
             form: Form::Text,

@@ -9,7 +9,14 @@ pub enum Work {
     /// Trains with settings, each `key=value`, over those of the base; none is the base itself.
     Train(Vec<String>),
     /// Trains with another preset.
-    Preset(&'static str),
+    Preset {
+        /// Its name.
+        name: &'static str,
+        /// Steps of all stages, with everything that counts in steps, as a share of those of the preset.
+        share: f64,
+        /// Settings over it, each `key=value`.
+        settings: Vec<String>,
+    },
     /// Renders the base with the reference, in `f64` or `f32`.
     Reference {
         /// In 64 bits rather than 32.
@@ -65,8 +72,9 @@ pub struct Ladder {
 pub const BASE: &str = "base";
 
 /// Names of all ladders, in the order of the report.
-pub const NAMES: [&str; 12] = [
+pub const NAMES: [&str; 13] = [
     "presets",
+    PAPER,
     "iterations",
     "resolution",
     "gaussians",
@@ -79,6 +87,18 @@ pub const NAMES: [&str; 12] = [
     "render",
     "export",
 ];
+
+/// The ladder of the configuration of the paper, which takes so long that it has to be asked for.
+pub const PAPER: &str = "paper";
+
+/// The configuration of the paper as a rung: how much of it there is time for.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Paper {
+    /// Share of its steps, (0, 1].
+    pub share: f64,
+    /// Settings over it, each `key=value`.
+    pub settings: Vec<String>,
+}
 
 /// Settings of the base over `draft` in a quick report: enough to show every effect, small enough for minutes.
 pub const QUICK_BASE: [&str; 15] = [
@@ -100,7 +120,7 @@ pub const QUICK_BASE: [&str; 15] = [
 ];
 
 /// Settings of the base that rungs multiply.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Base {
     /// Fewer rungs.
     pub quick: bool,
@@ -126,6 +146,8 @@ pub struct Base {
     pub has_instances: bool,
     /// The instance loss moves Gaussians.
     pub instances_move_geometry: bool,
+    /// The configuration of the paper, where it is asked for.
+    pub paper: Option<Paper>,
 }
 
 fn train(id: &str, label: impl Into<String>, settings: &[String]) -> Rung {
@@ -149,13 +171,33 @@ fn ladder(name: &'static str, base: &Base) -> Ladder {
     let scaled = |value: u32, factor: f64| (f64::from(value) * factor).round().max(1.0) as u32;
     let (title, about, rungs) = match name {
         "presets" => {
-            let named = |name: &'static str| rung(&format!("preset-{name}"), name, Work::Preset(name));
+            let whole = |name| Work::Preset { name, share: 1.0, settings: Vec::new() };
+            let named = |name: &'static str| rung(&format!("preset-{name}"), name, whole(name));
             let rungs = if quick {
                 vec![train("", "quick base", &[]), named("draft")]
             } else {
                 vec![named("draft"), named("standard")]
             };
             ("Presets", "Named settings, all of them at once.", rungs)
+        }
+        PAPER => {
+            let rungs = base.paper.as_ref().map_or_else(Vec::new, |Paper { share, settings }| {
+                let percent = format!("{:.3}", 100.0 * share);
+                let percent = percent.trim_end_matches('0').trim_end_matches('.');
+                let label = match *share < 1.0 {
+                    true => format!("paper, {percent} % of its steps"),
+                    false => "paper".to_owned(),
+                };
+                let work = Work::Preset { name: PAPER, share: *share, settings: settings.clone() };
+                vec![train("", "base", &[]), rung(PAPER, &label, work)]
+            });
+            (
+                "The paper's configuration",
+                "The preset `paper` for the layout of the capture: batch, planes, network, losses, densification and rates \
+                 as published. Where its row says so, it has a share of the published steps, with everything that counts in \
+                 steps shortened alike, or the settings named there; without, it is whole.",
+                rungs,
+            )
         }
         "iterations" => (
             "Iterations",
@@ -398,13 +440,15 @@ mod tests {
             is_dynamic: true,
             has_instances: true,
             instances_move_geometry: false,
+            paper: None,
         }
     }
 
     #[test]
     fn every_ladder_has_rungs_and_equal_files_do_equal_work() {
         for quick in [true, false] {
-            let all = ladders(&base(quick));
+            let paper = Some(Paper { share: 0.125, settings: vec!["downscale=1".to_owned()] });
+            let all = ladders(&Base { paper, ..base(quick) });
             assert_eq!(all.iter().map(|ladder| ladder.name).collect::<Vec<_>>(), NAMES);
             let mut work: BTreeMap<String, Work> = BTreeMap::new();
             for rung in all.iter().flat_map(|ladder| &ladder.rungs) {
@@ -413,6 +457,18 @@ mod tests {
             }
             assert_eq!(work[BASE], Work::Train(Vec::new()));
         }
+    }
+
+    #[test]
+    fn the_configuration_of_the_paper_is_a_rung_where_it_is_asked_for() {
+        assert!(ladders(&base(false)).iter().all(|ladder| ladder.name != PAPER));
+        let with = |share| Base { paper: Some(Paper { share, settings: Vec::new() }), ..base(false) };
+        let rungs =
+            |share| ladders(&with(share)).into_iter().find(|ladder| ladder.name == PAPER).unwrap().rungs;
+        assert_eq!(rungs(0.125)[1].label, "paper, 12.5 % of its steps");
+        assert_eq!((&rungs(1.0)[1].label[..], &rungs(1.0)[0].id[..]), ("paper", BASE));
+        let work = Work::Preset { name: "paper", share: 0.125, settings: Vec::new() };
+        assert_eq!(rungs(0.125)[1].work, work);
     }
 
     #[test]

@@ -567,6 +567,7 @@ mod tests {
             is_dynamic: true,
             has_instances: true,
             instances_move_geometry: false,
+            paper: None,
         };
         let record = |k: usize| Record {
             cpu_s: 1.0 + k as f64,

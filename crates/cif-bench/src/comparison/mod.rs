@@ -7,6 +7,7 @@
 //! | `run` | how a run is trained and scored |
 //! | `published` | what the paper published, taken against other masks |
 //! | `tables` | means, spreads and the best of them, as text, CSV, JSON and LaTeX |
+//! | `queries` | how questions in words are answered |
 //! | `crops` | the part of a picture in which the runs differ most |
 //! | `page` | the page |
 //!
@@ -15,6 +16,7 @@
 mod crops;
 pub mod page;
 mod published;
+pub mod queries;
 pub mod record;
 pub mod run;
 pub mod tables;
@@ -50,6 +52,15 @@ impl Contender {
         }
     }
 
+    /// The head, where nothing of it is left out.
+    #[must_use]
+    pub fn whole(&self) -> Option<HeadName> {
+        match self {
+            Self::Head(head) => Some(*head),
+            Self::Without(_) => None,
+        }
+    }
+
     /// The head that it trains.
     #[must_use]
     pub fn head(self) -> HeadName {
@@ -72,6 +83,7 @@ pub fn title(name: &str, camera: &str) -> String {
         "sa4d" => format!("SA4D (camera {camera})"),
         "vlgs" => "VLGS (re-implementation)".to_owned(),
         "trace3d" => "Trace3D".to_owned(),
+        "4d-langsplat" => "4D LangSplat (time-agnostic)".to_owned(),
         "i" => "(i) constant occupancy".to_owned(),
         "ii" => "(ii) opacity as occupancy".to_owned(),
         "iii" => "(iii) no calibration".to_owned(),

@@ -7,6 +7,7 @@ use cif_geometry::PixelGrid;
 use image::ImageReader;
 
 use super::crops::Crop;
+use super::queries::{PUBLISHED_HEADING, Queries, shown};
 use super::record::Record;
 use super::tables::{MEASURES, Missing, Subject, cells};
 use super::title;
@@ -37,6 +38,8 @@ pub struct Comparison {
     pub ablations: bool,
     /// The only camera that SA4D trained on; empty for all.
     pub camera: String,
+    /// Questions in words and their answers, where any were asked.
+    pub queries: Option<Queries>,
     /// Colour of pixels without a label in pictures of labels.
     pub empty: [u8; 3],
 }
@@ -55,8 +58,8 @@ pub struct Video {
 /// Numbers of the ablations, in the order of tables; the last is the whole method.
 const ABLATIONS: [&str; 5] = ["i", "ii", "iii", "iv", "v"];
 
-/// Writes the page `compare.html` and the tables `panoptic` and, where there are any, `ablation`, each as `.md`,
-/// `.csv`, `.json` and `.tex`.
+/// Writes the page `compare.html` and the tables `panoptic` and, where there are any, `ablation` and `queries`, each as
+/// `.md`, `.csv`, `.json` and `.tex`.
 ///
 /// # Errors
 /// When a file cannot be written or a picture not be read.
@@ -67,11 +70,12 @@ pub fn write(
     records: &[Record],
 ) -> Result<(), Error> {
     let is_ablation = |record: &&Record| ABLATIONS.contains(&record.row.head.as_str());
-    let rows = |of_ablation: bool| {
-        let of = records.iter().filter(|record| is_ablation(record) == of_ablation);
-        of.map(|record| record.row.clone()).collect::<Vec<_>>()
+    // Heads that only answer questions have no labels to be scored.
+    let is_head = |record: &&Record| comparison.heads.contains(&record.row.head);
+    let rows = |of: &dyn Fn(&&Record) -> bool| {
+        records.iter().filter(of).map(|record| record.row.clone()).collect::<Vec<_>>()
     };
-    let (panoptic, mut ablation) = (rows(false), rows(true));
+    let (panoptic, mut ablation) = (rows(&is_head), rows(&is_ablation));
     // The whole method is the row of its head.
     let whole = panoptic.iter().filter(|row| row.head == "cif").cloned();
     ablation.extend(whole.map(|row| super::record::Row { head: "v".to_owned(), ..row }));
@@ -90,18 +94,22 @@ pub fn write(
         subjects.push(("ablation", &of_parts));
     }
     for (name, subject) in &subjects {
-        let forms = [
-            ("md", subject.markdown()),
-            ("csv", subject.csv()),
-            ("json", subject.json()),
-            ("tex", subject.latex()),
-        ];
-        for (extension, text) in forms {
-            write_file(&folder.join(format!("{name}.{extension}")), text.as_bytes())?;
-        }
+        let texts = [subject.markdown(), subject.csv(), subject.json(), subject.latex()];
+        write_forms(folder, name, texts)?;
+    }
+    if let Some(queries) = &comparison.queries {
+        write_forms(folder, "queries", [queries.markdown(), queries.csv(), queries.json(), queries.latex()])?;
     }
     let page = page(runs, comparison, &subjects, records)?;
     write_file(&folder.join("compare.html"), page.as_bytes())
+}
+
+/// Writes a table as Markdown, CSV, JSON and LaTeX.
+fn write_forms(folder: &Path, name: &str, texts: [String; 4]) -> Result<(), Error> {
+    for (extension, text) in ["md", "csv", "json", "tex"].into_iter().zip(texts) {
+        write_file(&folder.join(format!("{name}.{extension}")), text.as_bytes())?;
+    }
+    Ok(())
 }
 
 fn page(
@@ -131,10 +139,6 @@ fn page(
             let measures = MEASURES.iter().map(|measure| measure.name);
             let headings = std::iter::once("").chain(measures).chain([published.as_str()]);
             let rows = table.lines.iter().map(|line| {
-                let cell = |(text, best): (String, bool)| match best {
-                    true => format!("<strong>{}</strong>", escape(&text)),
-                    false => escape(&text),
-                };
                 let measured = cells(line).into_iter().map(cell);
                 let row = std::iter::once(escape(&line.title)).chain(measured);
                 ("", row.chain([escape(&line.published)]).collect())
@@ -149,6 +153,9 @@ fn page(
             page::figure(&mut page, &plot, caption);
         }
         page += "</section>\n";
+    }
+    if let Some(queries) = &comparison.queries {
+        answers(&mut page, queries);
     }
     pictures(&mut page, runs, comparison, records)?;
     if !comparison.videos.is_empty() {
@@ -166,6 +173,32 @@ fn page(
          the same masks and the same frames.",
     );
     Ok(page)
+}
+
+/// A cell of a table, and whether it is the best of its column.
+fn cell((text, best): (String, bool)) -> String {
+    if best { format!("<strong>{}</strong>", escape(&text)) } else { escape(&text) }
+}
+
+/// Questions in words, a table per capture.
+fn answers(page: &mut String, queries: &Queries) {
+    page.push_str("<section id=\"queries\">\n<h2>Questions in words</h2>\n");
+    for table in queries.tables() {
+        let _ = writeln!(page, "<h3>{}</h3>", escape(&table.caption));
+        let escaped: Vec<String> = table.headings.iter().map(|heading| escape(heading)).collect();
+        let headings = escaped.iter().map(String::as_str);
+        let headings = ["", "by"].into_iter().chain(headings).chain([PUBLISHED_HEADING]);
+        let rows = table.lines.iter().map(|line| {
+            let row = [escape(&line.title), line.way.name().to_owned()].into_iter();
+            let row = row.chain(line.cells.iter().map(shown).map(cell));
+            ("", row.chain([escape(&line.published)]).collect())
+        });
+        page::table(page, headings, rows);
+    }
+    for note in queries.notes() {
+        let _ = writeln!(page, "<p class=\"how\">{}</p>", escape(&note));
+    }
+    page.push_str("</section>\n");
 }
 
 /// mIoU against processor time.
@@ -257,6 +290,7 @@ fn pictures(
 
 #[cfg(test)]
 mod tests {
+    use super::super::queries::{Answer, Way};
     use super::super::record::Row;
     use super::*;
 
@@ -297,6 +331,23 @@ mod tests {
             heads: ["cif", "vlgs"].map(str::to_owned).to_vec(),
             ablations: true,
             camera: String::new(),
+            queries: Some(Queries {
+                questions: vec![("table <1>".into(), vec!["what is <red>?".into()])],
+                answers: vec![Answer {
+                    capture: "table <1>".into(),
+                    head: "cif".into(),
+                    seed: 0,
+                    question: "what is <red>?".into(),
+                    by: Way::Labels,
+                    macc: Some(98.5),
+                    miou: Some(76.25),
+                    frames: 2,
+                    empty_frames: 0,
+                    chosen: vec![3],
+                }],
+                heads: vec!["cif".into()],
+                ..Queries::default()
+            }),
             empty: [0; 3],
         };
         std::fs::write(runs.file("table.mp4"), b"video").unwrap();
@@ -314,6 +365,9 @@ mod tests {
             "src=\"data:video/mp4;base64,dmlkZW8=\"",
             "From left to right: colours, CIF.",
             "<strong>72.00</strong>",
+            "'what is &lt;red&gt;?' mIoU %",
+            "76.25",
+            "No models were given",
         ] {
             assert!(page.contains(part), "{part}");
         }
@@ -329,14 +383,14 @@ mod tests {
             ["i", "v"],
             "the whole method is its row of the other table"
         );
-        for name in ["panoptic", "ablation"] {
+        for name in ["panoptic", "ablation", "queries"] {
             for extension in ["md", "csv", "tex"] {
                 assert!(!text(&format!("{name}.{extension}")).is_empty());
             }
         }
-        let alone = Comparison { ablations: false, missing: Vec::new(), ..comparison };
+        let alone = Comparison { ablations: false, missing: Vec::new(), queries: None, ..comparison };
         let other = tempfile::tempdir().unwrap();
         write(other.path(), &runs, &alone, &records[..2]).unwrap();
-        assert!(!other.path().join("ablation.md").exists());
+        assert!(!other.path().join("ablation.md").exists() && !other.path().join("queries.md").exists());
     }
 }

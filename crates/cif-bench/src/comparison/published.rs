@@ -15,6 +15,13 @@ pub(super) struct Published {
     pub(super) psnr: Option<f64>,
 }
 
+/// Scores of a question in words that were published, percent.
+#[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
+pub(super) struct PublishedAnswer {
+    pub(super) macc: f64,
+    pub(super) miou: f64,
+}
+
 /// Where they were published.
 #[derive(Debug, Deserialize)]
 pub(super) struct Source {
@@ -40,18 +47,34 @@ pub(super) struct PublishedTables {
     /// Means over the scenes of a data set, by head.
     pub(super) means: BTreeMap<String, BTreeMap<String, Published>>,
     pub(super) ablation: PublishedAblation,
+    /// Questions in words by scene, then by question, then by head.
+    pub(super) queries: BTreeMap<String, BTreeMap<String, BTreeMap<String, PublishedAnswer>>>,
+    /// Means over all of them, by head.
+    pub(super) query_means: BTreeMap<String, PublishedAnswer>,
 }
 
 /// The tables of the paper.
 pub(super) static PUBLISHED: LazyLock<PublishedTables> =
     LazyLock::new(|| serde_json::from_str(include_str!("published.json")).expect("data of this crate"));
 
+/// What is known of the scene that a capture is called after.
+fn of_scene<'a, T>(scenes: &'a BTreeMap<String, T>, capture: &str) -> Option<&'a T> {
+    let plain = |name: &str| name.to_lowercase().replace(['-', '_', ' '], "");
+    scenes.iter().find(|(scene, _)| plain(scene) == plain(capture)).map(|(_, known)| known)
+}
+
 impl PublishedTables {
     /// Scores of a head on a scene that a capture is called after.
     pub(super) fn of_capture(&self, capture: &str, head: &str) -> Option<Published> {
-        let plain = |name: &str| name.to_lowercase().replace(['-', '_', ' '], "");
-        let scene = self.panoptic.iter().find(|(scene, _)| plain(scene) == plain(capture))?;
-        scene.1.get(head).copied()
+        of_scene(&self.panoptic, capture)?.get(head).copied()
+    }
+
+    /// Scores of questions, by question and head, on a scene that a capture is called after.
+    pub(super) fn queries_of_capture(
+        &self,
+        capture: &str,
+    ) -> Option<&BTreeMap<String, BTreeMap<String, PublishedAnswer>>> {
+        of_scene(&self.queries, capture)
     }
 }
 
@@ -88,5 +111,24 @@ mod tests {
         assert_eq!(PUBLISHED.of_capture("Split_Cookie", "cif").unwrap().macc_pix, 97.93);
         assert!(PUBLISHED.of_capture("tabletop", "cif").is_none());
         assert_eq!(PUBLISHED.ablation.rows["iii"].psnr, Some(26.73));
+    }
+
+    #[test]
+    fn means_of_questions_are_those_of_all() {
+        for (head, mean) in &PUBLISHED.query_means {
+            let answers: Vec<&PublishedAnswer> = PUBLISHED
+                .queries
+                .values()
+                .flat_map(BTreeMap::values)
+                .filter_map(|heads| heads.get(head))
+                .collect();
+            let of = |score: fn(&PublishedAnswer) -> f64| {
+                answers.iter().map(|answer| score(answer)).sum::<f64>() / answers.len() as f64
+            };
+            assert_eq!(answers.len(), 4, "{head}");
+            assert!((mean.macc - of(|answer| answer.macc)).abs() < 6e-3, "{head}");
+            assert!((mean.miou - of(|answer| answer.miou)).abs() < 6e-3, "{head}");
+        }
+        assert_eq!(PUBLISHED.queries_of_capture("Espresso").unwrap()["coaster"]["4d-langsplat"].miou, 0.43);
     }
 }

@@ -213,7 +213,7 @@ pub(crate) fn decode_matte(path: &Path) -> Result<PixelGrid<bool>, Error> {
 }
 
 /// Nearest-neighbour resize: never invents an id (methods reference 7, row 39).
-pub(crate) fn nearest_resize(mask: &PixelGrid<u16>, width: u32, height: u32) -> PixelGrid<u16> {
+pub(crate) fn nearest_resize<T: Copy>(mask: &PixelGrid<T>, width: u32, height: u32) -> PixelGrid<T> {
     if (mask.width, mask.height) == (width, height) {
         return mask.clone();
     }

@@ -42,13 +42,20 @@ pub(crate) enum Elements {
 /// # Errors
 /// When the file is not such a matrix, or shorter than its header claims.
 pub(crate) fn read_matrix(path: &Path) -> Result<Matrix, Error> {
-    let bytes = cif_input::read(path).map_err(Error::read(path))?;
-    let Array { shape, values } =
-        parse(&bytes, Elements::Floats).map_err(|problem| Error::invalid(path, problem))?;
+    let Array { shape, values } = read_floats(path)?;
     match *shape {
         [rows, columns] => Ok(Matrix { rows, columns, values }),
         _ => Err(Error::invalid(path, format!("shape {shape:?} where two dimensions are expected"))),
     }
+}
+
+/// Reads an array of 4- or 8-byte floats.
+///
+/// # Errors
+/// As [`read_matrix`], for any number of dimensions.
+pub(crate) fn read_floats(path: &Path) -> Result<Array, Error> {
+    let bytes = cif_input::read(path).map_err(Error::read(path))?;
+    parse(&bytes, Elements::Floats).map_err(|problem| Error::invalid(path, problem))
 }
 
 /// Reads an array of integers: a `.npy` file, or a `.npz` archive that holds one array.

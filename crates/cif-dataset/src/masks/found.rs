@@ -25,6 +25,26 @@ pub fn flat_name(frame: &str) -> String {
 /// # Errors
 /// When there is no such folder, or none of its PNG files belongs to a frame.
 pub fn found_masks(dataset: &Dataset, folder: &Path) -> Result<Vec<Vec<PathBuf>>, Error> {
+    let (masks, files) = files_of_frames(dataset, folder, "png")?;
+    if masks.iter().all(Vec::is_empty) {
+        let example = dataset.frames.first().map(|frame| frame.name.as_str()).unwrap_or_default();
+        return Err(Error::MaskFolder {
+            folder: folder.to_owned(),
+            problem: format!(
+                "none of its {files} PNG files belongs to a frame; name them as the frames, e.g. {example}.png"
+            ),
+        });
+    }
+    Ok(masks)
+}
+
+/// Files of a folder with an ending by frame, `[frames]`, as [`found_masks`] tells whose they are, and how many there
+/// are in all.
+pub(crate) fn files_of_frames(
+    dataset: &Dataset,
+    folder: &Path,
+    ending: &str,
+) -> Result<(Vec<Vec<PathBuf>>, usize), Error> {
     if !folder.is_dir() {
         return Err(Error::MissingFolder { path: folder.to_owned() });
     }
@@ -41,34 +61,24 @@ pub fn found_masks(dataset: &Dataset, folder: &Path) -> Result<Vec<Vec<PathBuf>>
         names.entry(stem).or_insert(index);
     }
     let mut files = Vec::new();
-    collect(folder, &mut files)?;
-    let mut masks = vec![Vec::new(); dataset.frames.len()];
+    collect(folder, ending, &mut files)?;
+    let mut of_frames = vec![Vec::new(); dataset.frames.len()];
     for file in &files {
         let inside = file.strip_prefix(folder).unwrap_or(file).with_extension("");
         let inside = inside.to_string_lossy().replace('\\', "/");
         if let Some(index) = frame_of(&inside, &names) {
-            masks[index].push(file.clone());
+            of_frames[index].push(file.clone());
         }
     }
-    if masks.iter().all(Vec::is_empty) {
-        let example = dataset.frames.first().map(|frame| frame.name.as_str()).unwrap_or_default();
-        return Err(Error::MaskFolder {
-            folder: folder.to_owned(),
-            problem: format!(
-                "none of its {} PNG files belongs to a frame; name them as the frames, e.g. {example}.png",
-                files.len()
-            ),
-        });
-    }
-    Ok(masks)
+    Ok((of_frames, files.len()))
 }
 
-/// PNG files of a folder and its subfolders, in order of their names.
-fn collect(folder: &Path, files: &mut Vec<PathBuf>) -> Result<(), Error> {
+/// Files of a folder and its subfolders with an ending, in order of their names.
+fn collect(folder: &Path, ending: &str, files: &mut Vec<PathBuf>) -> Result<(), Error> {
     for path in listing::entries(folder)? {
         if path.is_dir() {
-            collect(&path, files)?;
-        } else if listing::has_extension(&path, &["png"]) {
+            collect(&path, ending, files)?;
+        } else if listing::has_extension(&path, &[ending]) {
             files.push(path);
         }
     }

@@ -13,6 +13,7 @@ mod writer;
 mod zigzag;
 
 pub use folder::NewFolder;
+pub(crate) use found::files_of_frames;
 pub use found::{flat_name, found_masks};
 pub use import::{Drawn, Import, SourceKind};
 pub use split::{KeptInstance, RemovedInstance, SplitReport, split_tracker_masks};

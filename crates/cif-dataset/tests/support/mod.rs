@@ -92,9 +92,14 @@ pub fn write_wide_mask(path: &Path, width: u32, height: u32, id: impl Fn(u32, u3
         .unwrap();
 }
 
-/// A NumPy array of doubles.
+/// A NumPy matrix of doubles.
 pub fn npy(rows: usize, columns: usize, values: &[f64]) -> Vec<u8> {
-    let mut header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': ({rows}, {columns}), }}");
+    npy_of(&format!("({rows}, {columns})"), values)
+}
+
+/// A NumPy array of doubles; the shape as Python writes it.
+pub fn npy_of(shape: &str, values: &[f64]) -> Vec<u8> {
+    let mut header = format!("{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}");
     while (header.len() + 11) % 64 != 0 {
         header.push(' ');
     }

@@ -294,7 +294,7 @@ pub struct InstanceConfig {
 #[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct HeadConfig {
-    /// Its name: `cif` (default), `dr-splat`, `gaussian-grouping`, `sa4d`, `vlgs` or `trace3d`.
+    /// Its name: `cif` (default), `dr-splat`, `gaussian-grouping`, `sa4d`, `vlgs`, `trace3d` or `4d-langsplat`.
     pub name: HeadName,
     /// With `dr-splat`: contributors of a pixel that count, of the first 100. Default 0, as many as in its published
     /// command: 45.
@@ -302,6 +302,9 @@ pub struct HeadConfig {
     /// With `sa4d`: the only camera whose frames train, as its released code has it on Neu3D (`cam16`). Default: none,
     /// all cameras train.
     pub camera: String,
+    /// With `4d-langsplat`: the folder of feature maps that it learns, `FRAME.npy` for every training frame, floats of
+    /// `[height, width, 3]`; see [`cif_dataset::feature_maps`]. Default: none.
+    pub maps: String,
 }
 
 /// Instance-guided resampling (methods reference 6). Steps count from the start of the instance stage.

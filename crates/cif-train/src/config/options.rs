@@ -48,12 +48,28 @@ pub enum HeadName {
     Vlgs,
     /// Gaussians of several labels split or deleted, then codes learnt by contrast.
     Trace3d,
+    /// Three language channels learnt of given feature maps. It tells no instances apart, and answers questions alone.
+    #[serde(rename = "4d-langsplat")]
+    LangSplat,
 }
 
 impl HeadName {
     /// Every head, in the order of tables.
-    pub const ALL: [Self; 6] =
-        [Self::Cif, Self::GaussianGrouping, Self::Sa4d, Self::Vlgs, Self::DrSplat, Self::Trace3d];
+    pub const ALL: [Self; 7] = [
+        Self::Cif,
+        Self::GaussianGrouping,
+        Self::Sa4d,
+        Self::Vlgs,
+        Self::DrSplat,
+        Self::Trace3d,
+        Self::LangSplat,
+    ];
+
+    /// True when it tells labels of pixels; false when it only answers questions.
+    #[must_use]
+    pub fn tells_labels(self) -> bool {
+        self != Self::LangSplat
+    }
 
     /// As in settings, file names and tables.
     #[must_use]
@@ -65,6 +81,7 @@ impl HeadName {
             Self::Sa4d => "sa4d",
             Self::Vlgs => "vlgs",
             Self::Trace3d => "trace3d",
+            Self::LangSplat => "4d-langsplat",
         }
     }
 
@@ -79,6 +96,8 @@ impl HeadName {
             Self::Vlgs => 15_000,
             // Splitting and deleting, then lifting.
             Self::Trace3d => 9_000 + 20_000,
+            // Of the language channels, on Gaussians that move.
+            Self::LangSplat => 10_000,
         }
     }
 }

@@ -56,6 +56,13 @@ impl TrainConfig {
             "expected false, or stages.fine of at least stages.coarse",
         )?;
 
+        check(
+            self.head.name != super::HeadName::LangSplat || !self.head.maps.is_empty(),
+            "head.maps",
+            "empty",
+            "expected the folder of feature maps that 4d-langsplat learns: --set head.maps=DIR",
+        )?;
+
         at_least("model.max_initial_points", model.max_initial_points, 1, "expected at least 1")?;
         open_unit("model.initial_opacity", model.initial_opacity)?;
         for (axis, nodes) in model.spatial_resolution.iter().enumerate() {

@@ -108,6 +108,16 @@ pub fn choose(base: &TrainConfig, calibration: &Calibration, work: Workload, sec
     Choice { config, base_s, expected_s, changes }
 }
 
+/// Settings with so many times the steps, and with everything that counts in steps stretched or shortened
+/// alike, down to a least number of steps between events; what only makes long runs longer stays where it is
+/// when they are stretched.
+#[must_use]
+pub fn stretched(base: &TrainConfig, factor: f64) -> TrainConfig {
+    let mut config = base.clone();
+    set_schedule(&mut config, base, factor);
+    config
+}
+
 /// Schedule of `base`, stretched or shortened, with everything that counts in steps.
 fn set_schedule(config: &mut TrainConfig, base: &TrainConfig, factor: f64) {
     let scaled = |steps: u32, least: u32| {
@@ -127,6 +137,7 @@ fn set_schedule(config: &mut TrainConfig, base: &TrainConfig, factor: f64) {
     config.densify.from = shortened(base.densify.from, 20);
     config.densify.every = shortened(base.densify.every, 20);
     config.densify.prune_every = shortened(base.densify.prune_every, 20);
+    config.densify.opacity_reset_every = shortened(base.densify.opacity_reset_every, 1);
     config.densify.until = scaled(base.densify.until, 1);
     config.resample.from = shortened(base.resample.from, 10);
     config.resample.every = shortened(base.resample.every, 10);

@@ -9,4 +9,4 @@ mod calibrate;
 mod choose;
 
 pub use calibrate::{Calibration, calibrate};
-pub use choose::{Change, Choice, Workload, choose};
+pub use choose::{Change, Choice, Workload, choose, stretched};

@@ -6,10 +6,10 @@ use cif_field::Field;
 use cif_field::checkpoint::TrainingState;
 use cif_geometry::PinholeCamera;
 use cif_render::cpu::Renderer;
-use cif_render::{InstanceImage, RenderSettings, RenderedImage};
+use cif_render::{BlendedImage, InstanceImage, RenderSettings, RenderedImage};
 use serde::{Deserialize, Serialize};
 
-use super::{Head, HeadTensors, ValueHead, blended, configured, instance_image, value_head};
+use super::{Head, HeadTensors, Target, ValueHead, blended, configured, instance_image, value_head};
 use crate::config::{HeadConfig, TrainConfig};
 use crate::error::TrainError;
 
@@ -61,6 +61,24 @@ impl Decoder {
         self.head.name()
     }
 
+    /// True when it tells labels of pixels; false when it only answers questions.
+    #[must_use]
+    pub fn tells_labels(&self) -> bool {
+        self.values().target() == Target::Labels
+    }
+
+    /// What the head blends over a view, `[height, width, C]`.
+    #[must_use]
+    pub fn blended(
+        &self,
+        renderer: &mut Renderer,
+        field: &Field,
+        view: (&PinholeCamera, f64),
+        settings: &RenderSettings,
+    ) -> BlendedImage {
+        blended(renderer, (self.values(), &self.tensors), field, view, settings)
+    }
+
     fn values(&self) -> &dyn ValueHead {
         value_head(&self.head, &self.config).expect("a head with values of its own")
     }
@@ -75,8 +93,7 @@ impl Decoder {
         settings: &RenderSettings,
         rendered: &RenderedImage,
     ) -> InstanceImage {
-        let head = self.values();
-        let blended = blended(renderer, (head, &self.tensors), field, view, settings);
-        instance_image(head, &self.tensors, &blended, &rendered.alpha)
+        let blended = self.blended(renderer, field, view, settings);
+        instance_image(self.values(), &self.tensors, &blended, &rendered.alpha)
     }
 }

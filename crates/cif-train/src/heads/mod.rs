@@ -4,6 +4,7 @@
 //! |---|---|
 //! | `cif` | the head of the paper |
 //! | `dr_splat`, `gaussian_grouping`, `sa4d`, `vlgs`, `trace3d` | those of the systems that it is compared with |
+//! | `lang_splat` | that of a system which tells no instances apart, but answers questions |
 //! | `classifier` | codes told apart by a linear classifier, and neighbours that agree: what several of these share |
 //! | `tensors` | what heads learn, with gradients and moments |
 //! | `views` | the training views as heads may look at them between steps |
@@ -22,6 +23,7 @@ mod classifier;
 mod decoder;
 mod dr_splat;
 mod gaussian_grouping;
+pub mod lang_splat;
 mod sa4d;
 mod tensors;
 mod trace3d;
@@ -41,6 +43,7 @@ pub use self::cif::Cif;
 pub use self::decoder::Decoder;
 pub use self::dr_splat::DrSplat;
 pub use self::gaussian_grouping::GaussianGrouping;
+pub use self::lang_splat::LangSplat;
 pub use self::sa4d::Sa4d;
 pub use self::tensors::HeadTensors;
 pub use self::trace3d::Trace3d;
@@ -61,6 +64,7 @@ pub fn configured(config: &HeadConfig) -> Arc<dyn Head> {
         HeadName::Sa4d => Arc::new(Sa4d::new(&config.camera)),
         HeadName::Vlgs => Arc::new(Vlgs),
         HeadName::Trace3d => Arc::new(Trace3d),
+        HeadName::LangSplat => Arc::new(LangSplat),
     }
 }
 
@@ -91,6 +95,16 @@ pub struct HeadLoss {
     pub unsupported: f64,
 }
 
+/// What the blended values of a head are held to.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Target {
+    /// Labels of masks, which it tells back.
+    #[default]
+    Labels,
+    /// Feature maps that were given ([`HeadConfig::maps`]); it tells no labels.
+    Features,
+}
+
 /// A view of a step, blended.
 #[derive(Clone, Copy, Debug)]
 pub struct HeadView<'a> {
@@ -98,6 +112,8 @@ pub struct HeadView<'a> {
     pub blended: &'a BlendedImage,
     /// Dense indices + 1, 0 where there is none.
     pub labels: &'a PixelGrid<u16>,
+    /// The feature map, 0 in all channels where there is no feature; `None` without maps.
+    pub features: Option<&'a PixelGrid<[f32; 3]>>,
     /// Names the random choices of the head in this view and step.
     pub seed: u64,
 }
@@ -147,6 +163,11 @@ pub struct CameraBlending {
 
 /// A head that blends values of its own. Gradients reach its tensors, and its own opacities where it has such.
 pub trait ValueHead: Send + Sync {
+    /// What its blended values are held to.
+    fn target(&self) -> Target {
+        Target::Labels
+    }
+
     /// Tensors: with a row per Gaussian, or of a fixed size.
     fn parameters(&self) -> Vec<Parameter>;
 

@@ -20,6 +20,15 @@ pub(crate) fn labels(field: &Field) -> PixelGrid<u16> {
     PixelGrid::from_pixels(field.len() as u32, 1, labels)
 }
 
+/// Features of the pixels, some without.
+pub(crate) fn features(field: &Field) -> PixelGrid<[f32; 3]> {
+    let feature = |row: usize| match row % 6 {
+        5 => [0.0; 3],
+        _ => [0, 1, 2].map(|k| ((row * 5 + k * 3) % 7) as f32 / 3.5 - 0.9),
+    };
+    PixelGrid::from_pixels(field.len() as u32, 1, (0..field.len()).map(feature).collect())
+}
+
 /// Tensors at the start of the stage.
 pub(crate) fn tensors(head: &dyn ValueHead, field: &Field) -> HeadTensors {
     HeadTensors::start(head, field, 5)
@@ -42,7 +51,7 @@ pub(crate) fn loss(head: &dyn ValueHead, tensors: &mut HeadTensors, field: &Fiel
     let blended = BlendedImage { width: field.len() as u32, height: 1, channels, values };
     let labels = labels(field);
     let mut v_values = vec![0.0; blended.values.len()];
-    let view = HeadView { blended: &blended, labels: &labels, seed: SEED };
+    let view = HeadView { blended: &blended, labels: &labels, features: Some(&features(field)), seed: SEED };
     let loss = head.loss(tensors, &view, 1.0, &mut v_values);
     head.values_backward(tensors, field, TIME, &v_values);
     loss.loss

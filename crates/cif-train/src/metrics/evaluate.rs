@@ -169,7 +169,7 @@ pub fn evaluate<E: From<EvaluationError>>(
             dataset.load_frame(index, options.settings.background).map_err(EvaluationError::Dataset)?;
         let start = Instant::now();
         let mut rendered = renderer.render(field, &frame.camera, frame.time, &options.settings, channels);
-        if let Some(decoder) = options.decoder {
+        if let Some(decoder) = options.decoder.filter(|decoder| decoder.tells_labels()) {
             let view = (&frame.camera, frame.time);
             let decoded = decoder.instances(&mut renderer, field, view, &options.settings, &rendered);
             rendered.instances = Some(decoded);

@@ -100,7 +100,7 @@ pub(super) fn views_of_groups(
         let image = renderer.render(&field, &camera, time(k), &settings, channels);
         let labels = image.alpha.map(|alpha| u16::from(*alpha > 0.5));
         let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
-        let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0 });
+        let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0, features: None });
         views.extend(ObjectView::new((1, &behind), k, &camera, &frame));
     }
     set_visible(&mut views);

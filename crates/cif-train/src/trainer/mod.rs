@@ -61,6 +61,7 @@ mod step;
 mod still;
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 use std::sync::Arc;
 
 use cif_dataset::Dataset;
@@ -78,7 +79,7 @@ use self::pacing::Pacing;
 use self::resume::SavedHead;
 use self::saving::Saving;
 use crate::clock::{Clock, SystemClock};
-use crate::config::TrainConfig;
+use crate::config::{HeadName, TrainConfig};
 use crate::curve::Curve;
 use crate::densify::DensifyStatistics;
 use crate::engine::Engine;
@@ -212,7 +213,11 @@ impl Trainer {
             return Err(TrainError::RecordedMotion { groups: tracks.groups.len() });
         }
         let budget = u64::from(config.frame_memory_mib) << 20;
-        let mut frames = FrameStore::open(&dataset, config.background, budget, &stop)?;
+        let maps = match config.head.name {
+            HeadName::LangSplat => cif_dataset::feature_maps(&dataset, Path::new(&config.head.maps))?,
+            _ => BTreeMap::new(),
+        };
+        let mut frames = FrameStore::open(&dataset, config.background, maps, budget, &stop)?;
         let has_instances =
             config.effects.instances && !dataset.instances.is_empty() && frames.has_labels(&dataset);
         let mut warnings = Vec::new();

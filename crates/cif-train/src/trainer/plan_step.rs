@@ -15,7 +15,7 @@ use crate::config::{Ablation, TrainConfig};
 use crate::error::TrainError;
 use crate::exposure::RATES;
 use crate::frames::MOST_AHEAD;
-use crate::heads::{CameraBlending, Phase, ValueHead};
+use crate::heads::{CameraBlending, Phase, Target, ValueHead};
 use crate::metrics::image::{ssim, unit_color};
 use crate::optimiser::StepRates;
 use crate::random::{Purpose, stream};
@@ -154,7 +154,7 @@ impl Trainer {
 }
 
 impl Trainer {
-    /// Targets of a head in a step: views with masks, and cameras between them where it asks for such.
+    /// Targets of a head in a step: views with masks, or feature maps, and cameras between them where it asks for such.
     fn head_targets(
         &self,
         head: &dyn ValueHead,
@@ -162,8 +162,12 @@ impl Trainer {
         views: &[StepView],
     ) -> Result<Vec<HeadTarget>, TrainError> {
         let frames = &self.state.dataset.frames;
-        let masked = || views.iter().filter(|view| view.frame.labels.is_some());
-        let mut targets: Vec<HeadTarget> = masked()
+        let shows = |view: &&StepView| match head.target() {
+            Target::Labels => view.frame.labels.is_some(),
+            Target::Features => view.frame.features.is_some(),
+        };
+        let shown = || views.iter().filter(shows);
+        let mut targets: Vec<HeadTarget> = shown()
             .map(|view| HeadTarget {
                 camera: frames[view.index].camera,
                 time: frames[view.index].time,
@@ -172,7 +176,7 @@ impl Trainer {
             .collect();
         let Some(blending) = head.camera_blending() else { return Ok(targets) };
         let mut random = stream(self.state.config.seed, Purpose::HeadCameras, u64::from(iteration));
-        for view in masked() {
+        for view in shown() {
             targets.extend(self.between(view, &blending, &mut random)?);
         }
         Ok(targets)

@@ -11,7 +11,7 @@ use crate::densify::DensifyStatistics;
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, TrainEvent};
-use crate::heads;
+use crate::heads::{self, Target};
 use crate::optimiser::Optimiser;
 use crate::progress::{AfterStep, Progress};
 use crate::schedule::falls_on;
@@ -322,8 +322,14 @@ impl Trainer {
             && stage == Stage::Done
             && self.state.field.identities.is_some()
         {
-            let labels = head.label_of_rows(&self.state.head_tensors, &self.state.field);
-            self.state.field.identities = Some(heads::identities(&labels));
+            self.state.field.identities = match head.target() {
+                Target::Labels => {
+                    let labels = head.label_of_rows(&self.state.head_tensors, &self.state.field);
+                    Some(heads::identities(&labels))
+                }
+                // Nobody says whose a Gaussian is.
+                Target::Features => None,
+            };
             self.state.optimiser.start_identities(&self.state.field);
         }
         self.engine.changed(Changed::Everything);

@@ -6,8 +6,10 @@ use std::sync::LazyLock;
 use crate::support::{Scene, capture, small_config, without_record};
 use cif_dataset::Dataset;
 use cif_field::{Checkpoint, Field};
+use cif_render::cpu::{Renderer, SimdLevel};
 use cif_train::config::HeadConfig;
 use cif_train::heads::Decoder;
+use cif_train::heads::lang_splat::relevance::Question;
 use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, evaluate};
 use cif_train::{Control, HeadName, Outcome, Stage, TrainConfig, TrainEvent, Trainer};
 
@@ -40,8 +42,37 @@ fn start(head: HeadConfig, steps: u32) -> Trainer {
 }
 
 fn named(name: HeadName) -> HeadConfig {
-    HeadConfig { name, ..HeadConfig::default() }
+    let maps = match name {
+        HeadName::LangSplat => MAPS.path().display().to_string(),
+        _ => String::new(),
+    };
+    HeadConfig { name, maps, ..HeadConfig::default() }
 }
+
+/// Code of an instance in feature maps, by its place among the ids; 0 for none.
+fn code(place: usize) -> [f32; 3] {
+    [[0.2, 0.2, 0.2], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]][place]
+}
+
+/// Feature maps of the training frames: a code per instance, and one for the rest.
+static MAPS: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
+    let (folder, (_, dataset, _)) = (tempfile::tempdir().unwrap(), &*RECONSTRUCTION);
+    for index in dataset.train_frames() {
+        let mask = dataset.load_mask(index).unwrap().unwrap();
+        let place = |id: &u16| dataset.instances.iter().position(|one| one.id == *id).map_or(0, |k| k + 1);
+        let values = mask.pixels.iter().flat_map(|id| code(place(id))).flat_map(f32::to_le_bytes);
+        let shape = format!("({}, {}, 3)", mask.height, mask.width);
+        let header = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}\n");
+        let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
+        bytes.extend((header.len() as u16).to_le_bytes());
+        bytes.extend(header.as_bytes());
+        bytes.extend(values);
+        let path = folder.path().join(format!("{}.npy", dataset.frames[index].name));
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, bytes).unwrap();
+    }
+    folder
+});
 
 fn finish(mut trainer: Trainer) -> Checkpoint {
     assert_eq!(trainer.run(&mut |_, _| Control::Continue).unwrap(), Outcome::Finished);
@@ -154,8 +185,51 @@ fn trace3d_splits_deletes_and_lifts() {
 }
 
 #[test]
+fn lang_splat_learns_maps_and_answers_questions() {
+    let scene = finish(start(named(HeadName::LangSplat), 150));
+    gaussians_stay(&scene.field);
+    assert!(scene.field.identities.is_none(), "it says of no Gaussian whose it is");
+    let path = RECONSTRUCTION.0.path().join("4d-langsplat.cif");
+    scene.save(&path).unwrap();
+    let read = Checkpoint::load(&path).unwrap();
+    let decoder = Decoder::of_scene(&read.field, read.head.as_ref().unwrap()).unwrap();
+    assert!(!decoder.tells_labels());
+    let scores = scored(&read.field, Some(&decoder)).overall;
+    assert!(scores.instance.macc_pix.is_none() && scores.psnr.is_some(), "{scores:?}");
+    let dataset = &RECONSTRUCTION.1;
+    let settings = EvaluationOptions::held_out(&read.field).settings;
+    let mut renderer = Renderer::new(SimdLevel::Auto);
+    let (mut agreeing, mut pixels, mut overlaps) = (0, 0, Vec::new());
+    for index in dataset.val_frames() {
+        let (frame, mask) = (&dataset.frames[index], dataset.load_mask(index).unwrap().unwrap());
+        let features = decoder.blended(&mut renderer, &read.field, (&frame.camera, frame.time), &settings);
+        for (k, instance) in dataset.instances.iter().enumerate() {
+            let question = Question { code: code(k + 1), anything: vec![code(0)] };
+            let answer = question.answer(&features);
+            let of = |counts: &dyn Fn(bool, bool) -> bool| {
+                let pairs = answer.pixels.iter().zip(&mask.pixels);
+                pairs.filter(|(answer, id)| counts(**answer, **id == instance.id)).count()
+            };
+            agreeing += of(&|a, b| a == b);
+            pixels += mask.pixels.len();
+            overlaps.push(of(&|a, b| a && b) as f64 / of(&|a, b| a || b).max(1) as f64);
+        }
+    }
+    let accuracy = 100.0 * agreeing as f64 / pixels as f64;
+    let overlap = 100.0 * overlaps.iter().sum::<f64>() / overlaps.len() as f64;
+    println!("4d-langsplat: {accuracy:.2} of pixels, {overlap:.2} mIoU");
+    assert!(accuracy > 90.0 && overlap > 50.0, "{accuracy} {overlap}");
+    repeats(&named(HeadName::LangSplat), 8);
+    let nowhere = HeadConfig { maps: "nowhere".into(), ..named(HeadName::LangSplat) };
+    let (_, dataset, reconstruction) = &*RECONSTRUCTION;
+    let config = TrainConfig { head: nowhere, ..config() };
+    let told = Trainer::from_scene(dataset.clone(), config, reconstruction.clone(), "base.cif");
+    assert!(told.err().unwrap().to_string().contains("nowhere"));
+}
+
+#[test]
 fn runs_of_heads_go_on_where_they_were_stopped() {
-    for name in [HeadName::GaussianGrouping, HeadName::Trace3d] {
+    for name in [HeadName::GaussianGrouping, HeadName::Trace3d, HeadName::LangSplat] {
         let whole = finish(start(named(name), 29));
         let mut stopped = start(named(name), 29);
         let outcome = stopped.run(&mut |event, _| match event {
@@ -188,7 +262,9 @@ fn losses(mut trainer: Trainer) -> (Vec<f64>, Field) {
 #[test]
 fn heads_learn_the_same_on_a_gpu() {
     let Some(gpu) = cif_render::wgpu::testing::gpu() else { return };
-    for name in [HeadName::GaussianGrouping, HeadName::Sa4d, HeadName::Vlgs, HeadName::Trace3d] {
+    let heads =
+        [HeadName::GaussianGrouping, HeadName::Sa4d, HeadName::Vlgs, HeadName::Trace3d, HeadName::LangSplat];
+    for name in heads {
         let started = || {
             let (_, dataset, reconstruction) = &*RECONSTRUCTION;
             let mut config = TrainConfig { head: named(name), ..config() };

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 
-use cif_bench::accuracy::ladders::{BASE, Base, NAMES, QUICK_BASE};
+use cif_bench::accuracy::ladders::{BASE, Base, NAMES, PAPER, Paper, QUICK_BASE};
 use cif_bench::accuracy::measure::{self, Training};
 use cif_bench::accuracy::record::Record;
 use cif_bench::accuracy::report::{self, Measured, Subject};
@@ -18,6 +18,7 @@ use cif_render::RenderedImage;
 use cif_render::cpu::SimdLevel;
 use cif_render::quality::{FINAL, Quality};
 use cif_train::config::InstanceGeometry;
+use cif_train::fit::stretched;
 use cif_train::metrics::{FrameView, trained_settings};
 use cif_train::{Preset, Stop, SystemClock, TrainConfig, Trainer};
 use clap::Args;
@@ -42,6 +43,14 @@ settings have, as `cif train --effects all` does.
   cif bench accuracy captures/table -o report --ladders iterations,gaussians
   cif bench accuracy captures/table -o report --preset draft --set seed=3
 
+The ladder `paper` trains the preset `paper` beside the base, as published for the layout of the capture. That takes
+hours, so that it is measured only where it is named, with a quarter of its steps unless --paper-share says otherwise:
+the steps of all stages and everything that counts in steps are shortened alike, while batch, planes, network, losses,
+rates, Gaussians and images stay as published. What else there is no time for is reduced by --paper-set; the page tells
+both beside the numbers. A step has two or four views and no limit on Gaussians that acts: limiting these saves most.
+
+  cif bench accuracy captures/table -o paper --ladders paper --paper-set densify.max_gaussians=20000
+
 The page also tells how the objects of the base move: a picture of their paths, and where the capture
 has motion.json and tracks.npz, the scores of `cif eval` for every object.
 
@@ -61,9 +70,15 @@ pub(super) struct BenchAccuracy {
     /// Small scenes, reduced images and fewer rungs, in five minutes
     #[arg(long, conflicts_with = "preset")]
     quick: bool,
-    /// Ladders to measure, comma separated [default: all that say something of the capture]
+    /// Ladders to measure, comma separated [default: all but `paper` that say something of the capture]
     #[arg(long, value_name = "NAME,...", value_delimiter = ',', value_parser = clap::builder::PossibleValuesParser::new(NAMES))]
     ladders: Vec<String>,
+    /// Share of the steps of the preset `paper` in its ladder, above 0 and up to 1 for all [default: 0.25]
+    #[arg(long, value_name = "SHARE", value_parser = share, conflicts_with = "quick")]
+    paper_share: Option<f64>,
+    /// Any setting of that preset by its key, e.g. --paper-set densify.max_gaussians=20000; may be repeated
+    #[arg(long, value_name = "TABLE.KEY=VALUE", conflicts_with = "quick")]
+    paper_set: Vec<String>,
     /// Named settings of the base: draft, standard or paper [default: standard]
     #[arg(long, value_name = "NAME")]
     preset: Option<String>,
@@ -77,8 +92,44 @@ pub(super) struct BenchAccuracy {
     capture_options: CaptureOptions,
 }
 
+/// Share of the published steps that the preset `paper` is measured with, unless the user says otherwise.
+const PAPER_SHARE: f64 = 0.25;
+
+/// A number in (0, 1].
+fn share(text: &str) -> Result<f64, String> {
+    let share: f64 = text.parse().map_err(|_| "expected a number".to_owned())?;
+    if share > 0.0 && share <= 1.0 {
+        Ok(share)
+    } else {
+        Err("expected a number above 0 and up to 1".to_owned())
+    }
+}
+
+impl BenchAccuracy {
+    /// The configuration of the paper, where its ladder is named.
+    fn paper(&self) -> Result<Option<Paper>, Error> {
+        if self.ladders.iter().any(|name| name == PAPER) {
+            let share = self.paper_share.unwrap_or(PAPER_SHARE);
+            return Ok(Some(Paper { share, settings: self.paper_set.clone() }));
+        }
+        if self.paper_share.is_some() || !self.paper_set.is_empty() {
+            return Err(Error::usage(
+                "--paper-share and --paper-set are of the ladder `paper`, which is not measured here",
+                "add --ladders paper",
+            ));
+        }
+        Ok(None)
+    }
+}
+
 pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
-    let check = |layout| base_config(command, layout).map(drop);
+    let paper = command.paper()?;
+    let check = |layout| {
+        if let Some(Paper { share, settings }) = &paper {
+            of_preset(PAPER, *share, settings, layout)?;
+        }
+        base_config(command, layout).map(drop)
+    };
     let layout = command.capture_options.layout_after(&command.capture, check)?;
     let wanted = base_config(command, layout)?.downscale;
     let goes_on = command.output.join("rungs").is_dir();
@@ -115,6 +166,7 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         is_dynamic: dataset.times.len() > 1,
         has_instances: dataset.frames.iter().any(|frame| frame.mask.is_some()),
         instances_move_geometry: config.instance.geometry != InstanceGeometry::Off,
+        paper,
     };
     let mut all = ladders(&base);
     all.retain(|ladder| command.ladders.is_empty() || command.ladders.iter().any(|name| name == ladder.name));
@@ -231,6 +283,21 @@ fn base_config(command: &BenchAccuracy, layout: cif_dataset::Layout) -> Result<T
     layers.validated()
 }
 
+/// Settings of a preset with a share of its steps, and others over them.
+fn of_preset(
+    name: &str,
+    share: f64,
+    settings: &[String],
+    layout: cif_dataset::Layout,
+) -> Result<TrainConfig, Error> {
+    let config = TrainConfig::preset(train::preset(name, "ladders")?, layout);
+    let mut layers = Layers::new(if share < 1.0 { stretched(&config, share) } else { config });
+    for assignment in settings {
+        layers.assignment(assignment)?;
+    }
+    layers.validated()
+}
+
 /// A report under way.
 struct Bench {
     capture: CaptureOptions,
@@ -279,7 +346,7 @@ impl Bench {
     /// Everything that a record depends on.
     fn fingerprint(&self, rung: &Rung) -> Value {
         let training = match &rung.work {
-            Work::Train(_) | Work::Preset(_) => {
+            Work::Train(_) | Work::Preset { .. } => {
                 self.settings(rung).map(|config| json!(config)).unwrap_or_default()
             }
             _ => json!(self.config),
@@ -303,7 +370,7 @@ impl Bench {
 
     /// Steps that a rung trains; none where it uses the scene of the base.
     fn expected_steps(&self, rung: &Rung) -> u64 {
-        let trains = matches!(rung.work, Work::Train(_) | Work::Preset(_));
+        let trains = matches!(rung.work, Work::Train(_) | Work::Preset { .. });
         let config = self.settings(rung).ok().filter(|_| trains);
         config.map_or(0, |config| {
             let stages = [config.stages.coarse, config.fine_iterations(), config.stages.instance];
@@ -314,9 +381,8 @@ impl Bench {
     /// Settings that a rung trains with.
     fn settings(&self, rung: &Rung) -> Result<TrainConfig, Error> {
         let config = match &rung.work {
-            Work::Preset(name) => {
-                let mut config =
-                    TrainConfig::preset(train::preset(name, "ladder presets")?, self.dataset.layout);
+            Work::Preset { name, share, settings } => {
+                let mut config = of_preset(name, *share, settings, self.dataset.layout)?;
                 config.seed = self.config.seed;
                 config.downscale = config.downscale.or(self.config.downscale);
                 config
@@ -338,8 +404,13 @@ impl Bench {
         if let Work::Train(settings) = &rung.work {
             return self.train(rung, settings.clone(), heading);
         }
-        if let Work::Preset(name) = &rung.work {
-            return self.train(rung, vec![format!("preset={name}")], heading);
+        if let Work::Preset { name, share, settings } = &rung.work {
+            let mut all = vec![format!("preset={name}")];
+            if *share < 1.0 {
+                all.push(format!("{share} of its steps"));
+            }
+            all.extend(settings.iter().cloned());
+            return self.train(rung, all, heading);
         }
         if self.base.is_none() {
             let base =
@@ -382,7 +453,7 @@ impl Bench {
                 }
             }
             Work::Export(tolerance) => measure::export(field, tolerance, &mut record)?,
-            Work::Train(_) | Work::Preset(_) => unreachable!("handled above"),
+            Work::Train(_) | Work::Preset { .. } => unreachable!("handled above"),
         }
         Ok(Some(record))
     }
@@ -446,6 +517,12 @@ impl Bench {
         }
         if !command.ladders.is_empty() {
             line += &format!(" --ladders {}", command.ladders.join(","));
+        }
+        if let Some(share) = command.paper_share {
+            line += &format!(" --paper-share {share}");
+        }
+        for assignment in &command.paper_set {
+            line += &format!(" --paper-set {assignment}");
         }
         if let Some(preset) = &command.preset {
             line += &format!(" --preset {preset}");
@@ -555,6 +632,7 @@ mod tests {
             is_dynamic: true,
             has_instances: true,
             instances_move_geometry: false,
+            paper: None,
         };
         let mut trained = 0;
         for rung in ladders(&base).into_iter().flat_map(|ladder| ladder.rungs) {

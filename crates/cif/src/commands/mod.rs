@@ -1,5 +1,6 @@
 //! The subcommands, one file each.
 
+mod asked;
 mod bench;
 mod bench_accuracy;
 mod bench_compare;

@@ -28,7 +28,8 @@ fn refuse_folder(path: &Path) -> Result<(), Error> {
     Ok(())
 }
 
-/// Loads a `.cif` file with the head that tells labels of its pixels, where its identity rows do not.
+/// Loads a `.cif` file with the head that tells labels of its pixels, where its identity rows do not; a head that tells
+/// none is left out.
 ///
 /// # Errors
 /// As [`load`], and when the head does not fit the scene.
@@ -38,7 +39,7 @@ pub(super) fn load_with_head(path: &Path) -> Result<(Field, Option<Decoder>), Er
     let Some(head) = head else { return Ok((field, None)) };
     let decoder = Decoder::of_scene(&field, &head);
     decoder
-        .map(|decoder| (field, Some(decoder)))
+        .map(|decoder| (field, Some(decoder).filter(Decoder::tells_labels)))
         .map_err(|error| Error::plain(format!("{}: {error}", path.display())))
 }
 

@@ -158,7 +158,8 @@ struct Settings {
     /// Fraction of Gaussians relocated per resampling event
     #[arg(long, value_name = "FRACTION")]
     resampling_rate: Option<f64>,
-    /// Head that the instance stage trains: the paper's, or that of a system it is compared with
+    /// Head that the instance stage trains: the paper's, or that of a system it is compared with; 4d-langsplat learns
+    /// the feature maps of --set head.maps=DIR, and tells no instances
     #[arg(long, value_name = "NAME")]
     head: Option<HeadArgument>,
     /// Switch a part of the method off; may be repeated
@@ -188,6 +189,8 @@ pub(super) enum HeadArgument {
     Sa4d,
     Vlgs,
     Trace3d,
+    #[value(name = "4d-langsplat")]
+    LangSplat,
 }
 
 impl HeadArgument {
@@ -199,6 +202,7 @@ impl HeadArgument {
             Self::Sa4d => HeadName::Sa4d,
             Self::Vlgs => HeadName::Vlgs,
             Self::Trace3d => HeadName::Trace3d,
+            Self::LangSplat => HeadName::LangSplat,
         }
     }
 }

@@ -245,29 +245,29 @@ pub fn render(
     PixelGrid::from_pixels(camera.width, camera.height, pixels)
 }
 
-/// Compares rendered masks with those of the detector, both by frame.
+impl FrameAgreement {
+    /// Compares a rendered mask with the true one, or that of a detector.
+    #[must_use]
+    pub fn of(name: &str, rendered: &PixelGrid<bool>, truth: &PixelGrid<bool>) -> Self {
+        let (mut agree, mut both, mut either) = (0_u64, 0_u64, 0_u64);
+        for (a, b) in rendered.pixels.iter().zip(&truth.pixels) {
+            agree += u64::from(a == b);
+            both += u64::from(*a && *b);
+            either += u64::from(*a || *b);
+        }
+        let percent = |part: u64, whole: u64| 100.0 * part as f64 / whole as f64;
+        let shown = truth.pixels.contains(&true);
+        Self {
+            name: name.to_owned(),
+            accuracy: percent(agree, truth.pixels.len() as u64),
+            iou: shown.then(|| percent(both, either)),
+        }
+    }
+}
+
+/// Means over frames.
 #[must_use]
-pub fn agreement<'a>(
-    frames: impl IntoIterator<Item = (&'a str, PixelGrid<bool>, PixelGrid<bool>)>,
-) -> Agreement {
-    let per_frame: Vec<FrameAgreement> = frames
-        .into_iter()
-        .map(|(name, rendered, truth)| {
-            let (mut agree, mut both, mut either) = (0_u64, 0_u64, 0_u64);
-            for (a, b) in rendered.pixels.iter().zip(&truth.pixels) {
-                agree += u64::from(a == b);
-                both += u64::from(*a && *b);
-                either += u64::from(*a || *b);
-            }
-            let percent = |part: u64, whole: u64| 100.0 * part as f64 / whole as f64;
-            let shown = truth.pixels.contains(&true);
-            FrameAgreement {
-                name: name.to_owned(),
-                accuracy: percent(agree, truth.pixels.len() as u64),
-                iou: shown.then(|| percent(both, either)),
-            }
-        })
-        .collect();
+pub fn agreement(per_frame: Vec<FrameAgreement>) -> Agreement {
     let counted: Vec<(f64, f64)> =
         per_frame.iter().filter_map(|frame| Some((frame.accuracy, frame.iou?))).collect();
     let mean = |values: &mut dyn Iterator<Item = f64>| {
@@ -306,13 +306,15 @@ mod tests {
     #[test]
     fn agreement_counts_all_pixels_and_skips_empty_frames() {
         let grid = |pixels: &[u8]| PixelGrid::from_pixels(4, 1, pixels.iter().map(|p| *p == 1).collect());
-        let result = agreement([
+        let frames = [
             ("a", grid(&[1, 1, 0, 0]), grid(&[1, 0, 0, 0])),
             ("b", grid(&[0, 0, 0, 0]), grid(&[0, 0, 0, 1])),
             ("c", grid(&[1, 0, 0, 0]), grid(&[0, 0, 0, 0])),
-        ]);
+        ];
+        let of = |(name, rendered, truth): &(&str, _, _)| FrameAgreement::of(name, rendered, truth);
+        let result = agreement(frames.iter().map(of).collect());
         assert_eq!((result.macc, result.miou), (Some(75.0), Some(25.0)));
         assert_eq!((result.frames, result.empty_frames, result.per_frame[2].iou), (2, 1, None));
-        assert_eq!(agreement([]).miou, None);
+        assert_eq!(agreement(Vec::new()).miou, None);
     }
 }

@@ -6,6 +6,26 @@ use serde_json::json;
 
 use super::{MEASURES, Subject, cells};
 
+/// Text for LaTeX.
+pub(in super::super) fn latex_text(text: &str) -> String {
+    let text = text.replace('\\', "\\textbackslash{}");
+    let text = ['%', '_', '&', '#', '$', '{', '}'].into_iter().fold(text, |text, sign| {
+        // A backslash that was replaced has braces of its own.
+        if matches!(sign, '{' | '}') { text } else { text.replace(sign, &format!("\\{sign}")) }
+    });
+    text.replace(" ± ", " $\\pm$ ").replace('–', "--")
+}
+
+/// Text for CSV, which may hold anything.
+pub(in super::super) fn csv_text(text: &str) -> String {
+    format!("\"{}\"", text.replace('"', "\"\""))
+}
+
+/// A number for CSV, nothing where there is none.
+pub(in super::super) fn csv_number(value: Option<f64>) -> String {
+    value.map_or(String::new(), |value| value.to_string())
+}
+
 impl Subject<'_> {
     /// The tables as Markdown.
     #[must_use]
@@ -34,37 +54,33 @@ impl Subject<'_> {
     /// The tables as LaTeX, for the package `booktabs`.
     #[must_use]
     pub fn latex(&self) -> String {
-        let plain = |text: &str| {
-            let text = text.replace('\\', "\\textbackslash{}");
-            let text = ['%', '_', '&', '#', '$', '{', '}'].into_iter().fold(text, |text, sign| {
-                // A backslash that was replaced has braces of its own.
-                if matches!(sign, '{' | '}') { text } else { text.replace(sign, &format!("\\{sign}")) }
-            });
-            text.replace(" ± ", " $\\pm$ ").replace('–', "--")
-        };
         let mut text = String::new();
         for table in self.tables() {
             let _ = writeln!(text, "% {}", table.caption);
             let _ = writeln!(text, "\\begin{{tabular}}{{l{}l}}\n\\toprule", "r".repeat(MEASURES.len()));
-            let headings: Vec<String> = MEASURES.iter().map(|measure| plain(measure.name)).collect();
+            let headings: Vec<String> = MEASURES.iter().map(|measure| latex_text(measure.name)).collect();
             let _ = writeln!(
                 text,
                 "{} & {} & {} \\\\\n\\midrule",
-                plain(&table.caption),
+                latex_text(&table.caption),
                 headings.join(" & "),
-                plain(&self.published_heading())
+                latex_text(&self.published_heading())
             );
             for line in &table.lines {
-                let cells: Vec<String> = cells(line)
-                    .into_iter()
-                    .map(
-                        |(text, best)| {
-                            if best { format!("\\textbf{{{}}}", plain(&text)) } else { plain(&text) }
-                        },
-                    )
-                    .collect();
-                let published = plain(&line.published);
-                let _ = writeln!(text, "{} & {} & {published} \\\\", plain(&line.title), cells.join(" & "));
+                let cells: Vec<String> =
+                    cells(line)
+                        .into_iter()
+                        .map(|(text, best)| {
+                            if best {
+                                format!("\\textbf{{{}}}", latex_text(&text))
+                            } else {
+                                latex_text(&text)
+                            }
+                        })
+                        .collect();
+                let published = latex_text(&line.published);
+                let _ =
+                    writeln!(text, "{} & {} & {published} \\\\", latex_text(&line.title), cells.join(" & "));
             }
             text.push_str("\\bottomrule\n\\end{tabular}\n\n");
         }
@@ -79,10 +95,10 @@ impl Subject<'_> {
     pub fn csv(&self) -> String {
         let mut text =
             String::from("capture,head,seed,macc_pix,macc_inst,miou,psnr,ssim,gaussians,seconds\n");
-        let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
         for row in self.rows {
-            let capture = format!("\"{}\"", row.capture.replace('"', "\"\""));
-            let scores = [row.macc_pix, row.macc_inst, row.miou, row.psnr, row.ssim].map(number).join(",");
+            let capture = csv_text(&row.capture);
+            let scores =
+                [row.macc_pix, row.macc_inst, row.miou, row.psnr, row.ssim].map(csv_number).join(",");
             let _ = writeln!(
                 text,
                 "{capture},{},{},{scores},{},{}",

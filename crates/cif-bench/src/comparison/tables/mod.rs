@@ -10,6 +10,8 @@ mod notes;
 
 use std::collections::BTreeSet;
 
+pub(super) use self::forms::{csv_number, csv_text, latex_text};
+pub(super) use self::notes::missing_note;
 use super::published::{PUBLISHED, Published};
 use super::record::Row;
 use super::title;
@@ -38,7 +40,7 @@ impl Mean {
         Self { mean: Some(mean), spread }
     }
 
-    fn text(self, digits: usize) -> String {
+    pub(super) fn text(self, digits: usize) -> String {
         match (self.mean, self.spread) {
             (None, _) => "–".to_owned(),
             (Some(mean), None) => format!("{mean:.digits$}"),

@@ -43,27 +43,27 @@ impl Subject<'_> {
                     .to_owned(),
             );
         }
-        notes.extend(self.missing_note());
-        notes
-    }
-
-    /// Runs of these tables that are not done yet, by capture and head.
-    fn missing_note(&self) -> Option<String> {
         let of_tables: Vec<&Missing> =
             self.missing.iter().filter(|missing| self.names.contains(&missing.head)).collect();
-        let mut told: Vec<String> = Vec::new();
-        for (k, first) in of_tables.iter().enumerate() {
-            let same = |other: &&&Missing| (&other.capture, &other.head) == (&first.capture, &first.head);
-            if of_tables[..k].iter().any(|earlier| same(&earlier)) {
-                continue;
-            }
-            let seeds: Vec<String> =
-                of_tables.iter().filter(same).map(|missing| missing.seed.to_string()).collect();
-            let name = title(&first.head, self.camera);
-            told.push(format!("{} with {name} (seed {})", first.capture, seeds.join(", ")));
-        }
-        (!told.is_empty()).then(|| {
-            format!("Not done yet, and not in the means: {}. The same command goes on.", told.join("; "))
-        })
+        notes.extend(missing_note(&of_tables, self.camera));
+        notes
     }
+}
+
+/// Runs that are not done yet, by capture and head.
+pub(in super::super) fn missing_note(missing: &[&Missing], camera: &str) -> Option<String> {
+    let mut told: Vec<String> = Vec::new();
+    for (k, first) in missing.iter().enumerate() {
+        let same = |other: &&&Missing| (&other.capture, &other.head) == (&first.capture, &first.head);
+        if missing[..k].iter().any(|earlier| same(&earlier)) {
+            continue;
+        }
+        let seeds: Vec<String> =
+            missing.iter().filter(same).map(|missing| missing.seed.to_string()).collect();
+        let name = title(&first.head, camera);
+        told.push(format!("{} with {name} (seed {})", first.capture, seeds.join(", ")));
+    }
+    (!told.is_empty()).then(|| {
+        format!("Not done yet, and not in the means: {}. The same command goes on.", told.join("; "))
+    })
 }

@@ -2,10 +2,9 @@
 
 use std::path::PathBuf;
 
-use cif_bench::comparison::Contender;
 use cif_bench::comparison::page::{Comparison, Video};
 use cif_dataset::Split;
-use cif_train::Trainer;
+use cif_train::{HeadName, Trainer};
 
 use super::runs::{Bench, empty};
 use super::{BenchCompare, Capture, Iterations};
@@ -14,7 +13,7 @@ use super::{BenchCompare, Capture, Iterations};
 pub(super) fn describe(
     command: &BenchCompare,
     captures: &[Capture],
-    contenders: &[Contender],
+    heads: &[HeadName],
     bench: &Bench,
     videos: Vec<Video>,
 ) -> Comparison {
@@ -65,10 +64,12 @@ pub(super) fn describe(
     for assignment in &command.set {
         line += &format!(" --set {assignment}");
     }
-    let heads = contenders.iter().filter_map(|contender| match contender {
-        Contender::Head(head) => Some(head.name().to_owned()),
-        Contender::Without(_) => None,
-    });
+    if let Some(queries) = &command.queries {
+        line += &format!(" --queries {}", folder(queries));
+    }
+    if let Some(models) = &command.models {
+        line += &format!(" --models {}", folder(models));
+    }
     Comparison {
         description: format!("{}. Every head trains {steps}; {seeds}.", of_captures.join("; ")),
         command: line,
@@ -76,9 +77,10 @@ pub(super) fn describe(
         simd: Trainer::vector_instructions(),
         missing: bench.missing.clone(),
         videos,
-        heads: heads.collect(),
+        heads: heads.iter().filter(|head| head.tells_labels()).map(|head| head.name().to_owned()).collect(),
         ablations: command.ablations,
         camera: captures.first().map(|capture| capture.config.head.camera.clone()).unwrap_or_default(),
+        queries: None,
         empty: empty(),
     }
 }

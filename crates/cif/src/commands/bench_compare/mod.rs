@@ -1,13 +1,16 @@
 //! `cif bench compare`: the tables of the paper on captures of one's own.
 
+mod answers;
 mod describe;
+mod questions;
 mod runs;
 mod video;
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use cif_bench::comparison::page;
+use cif_bench::comparison::page::{self, Comparison};
 use cif_bench::comparison::run::Subject;
 use cif_bench::comparison::{ABLATIONS, Contender};
 use cif_bench::records::Records;
@@ -23,9 +26,7 @@ use crate::error::Error;
 use crate::settings::Layers;
 use crate::{interrupt, output};
 
-/// Compare the method with other systems and without its parts, on one reconstruction per capture and seed
-#[derive(Debug, Args)]
-#[command(after_help = "\
+const HELP: &str = "\
 Every capture is reconstructed once per seed; every head then trains on that reconstruction, sees the same masks and is
 scored on the held-out frames as `cif eval` scores its scene. All train what their settings have, as `cif train
 --effects all` does.
@@ -39,9 +40,33 @@ where it stopped. --budget 2h begins no new run after that long. With --video, t
 frames of one camera in the order of their times, and straight from one to the next.
 
 --iterations published trains every head as long as its own publication does: Gaussian Grouping 30 000 steps, SA4D 5 000,
-VLGS 15 000, Trace3D 29 000, CIF 3 000; Dr. Splat trains nothing. VLGS is a re-implementation, because there is no
+VLGS 15 000, Trace3D 29 000, 4D LangSplat 10 000, CIF 3 000; Dr. Splat trains nothing. VLGS is a re-implementation, because there is no
 public code; the page says so beside its numbers. Published numbers stand in a column of their own: they were taken
-against other masks.")]
+against other masks.
+
+Questions in words: --queries FILE has the scene of every head answer questions, and compares the answers with the masks
+of the instances that FILE names, in held-out frames: queries.md, .csv, .json and .tex, and a table in the page. They are
+answered by the words of labels and classes, as by cif query --text, and with --models by the masks that Grounding DINO
+and SAM make of them, as by cif query --prompt with --protocol reproject and grouping; cif query --help describes the
+folder of models.
+
+  cif bench compare captures/table -o compare --queries questions.toml --models models
+
+The head 4d-langsplat takes part in questions alone. It learns feature maps of yours, three floats per pixel of every
+training frame (0 or NaN where a pixel has none), and answers by how near its pixels are to the code that your encoder
+makes of a question; maps and codes stand in FILE.
+
+FILE is TOML, or JSON of the same names where its name ends in .json:
+
+";
+
+fn help() -> String {
+    format!("{HELP}{}", questions::EXAMPLE)
+}
+
+/// Compare the method with other systems and without its parts, on one reconstruction per capture and seed
+#[derive(Debug, Args)]
+#[command(after_help = help())]
 pub(super) struct BenchCompare {
     /// Folders of the captures
     #[arg(required = true)]
@@ -64,6 +89,12 @@ pub(super) struct BenchCompare {
     /// Compare the method without its parts too
     #[arg(long)]
     ablations: bool,
+    /// Questions in words per capture with the instances that are their answers, in a file described below
+    #[arg(long, value_name = "FILE")]
+    queries: Option<PathBuf>,
+    /// Folder of ONNX models with a models.toml, which answer the questions of --queries too
+    #[arg(long, value_name = "DIR", requires = "queries")]
+    models: Option<PathBuf>,
     /// Begin no new run after so long: 90s, 5m, "1h 30m". Runs under way are finished, the tables say what is missing,
     /// and the same command goes on
     #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
@@ -116,6 +147,10 @@ struct Capture {
 }
 
 pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
+    let file = command.queries.as_deref().map(questions::File::read).transpose()?;
+    if let Some(models) = &command.models {
+        answers::check(models)?;
+    }
     let goes_on = command.output.join("runs").is_dir();
     output::check_folder(&command.output, command.force || goes_on)?;
     let captures = command
@@ -131,13 +166,23 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
             ));
         }
     }
-    let runs = Records::inside(&command.output)?;
-    let contenders = contenders(command);
+    let questions = file.as_ref().map(|file| file.of(&captures)).transpose()?;
+    let maps: BTreeMap<String, PathBuf> =
+        questions.iter().flatten().filter_map(|of| Some((of.capture.clone(), of.maps.clone()?))).collect();
+    let contenders = contenders(command, !maps.is_empty())?;
+    for (name, maps) in &maps {
+        if contenders.contains(&Contender::Head(HeadName::LangSplat))
+            && let Some(capture) = captures.iter().find(|capture| capture.name == *name)
+        {
+            cif_dataset::feature_maps(&capture.dataset, maps)?;
+        }
+    }
     if command.video {
         video::check()?;
     }
+    let runs = Records::inside(&command.output)?;
     interrupt::watch();
-    let mut bench = Bench::new(runs, command.iterations, command.budget);
+    let mut bench = Bench::new(runs, command.iterations, command.budget, maps);
     for capture in &captures {
         for seed in 0..u64::from(command.seeds) {
             let mut config = capture.config.clone();
@@ -146,13 +191,18 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
             bench.compare(&subject, &contenders)?;
         }
     }
+    let heads: Vec<HeadName> = contenders.iter().filter_map(Contender::whole).collect();
+    let of_run = (&*command.output, command.models.as_deref());
+    let ask = |questions: &Vec<_>| answers::ask(&mut bench, &captures, questions, &heads, of_run);
+    let queries = questions.as_ref().map(ask).transpose()?;
     let videos = match command.video && bench.ended != Some(Ended::Interrupted) {
         true => video::write_all(&command.output, &bench, &captures)?,
         false => Vec::new(),
     };
-    let comparison = describe(command, &captures, &contenders, &bench, videos);
+    let comparison = Comparison { queries, ..describe(command, &captures, &heads, &bench, videos) };
     page::write(&command.output, &bench.runs, &comparison, &bench.records)?;
     let page = command.output.join("compare.html");
+    let unanswered = comparison.queries.as_ref().map_or(0, |queries| queries.missing.len());
     let left = bench.missing.len();
     if bench.ended == Some(Ended::Interrupted) {
         return Err(Error::Interrupted {
@@ -160,22 +210,36 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
             help: Some("the same command goes on".to_owned()),
         });
     }
-    let text = std::fs::read_to_string(command.output.join("panoptic.md"))
-        .map_err(Error::io("read", &command.output))?;
-    println!("{text}");
+    for name in ["panoptic.md", "queries.md"].into_iter().take(1 + usize::from(comparison.queries.is_some()))
+    {
+        let path = command.output.join(name);
+        println!("{}", std::fs::read_to_string(&path).map_err(Error::io("read", &path))?);
+    }
     eprintln!("wrote {}", page.display());
     if bench.ended == Some(Ended::OutOfTime) {
+        let answers = match unanswered {
+            0 => String::new(),
+            scenes => format!(", and with the questions that {scenes} scenes have not answered"),
+        };
         eprintln!(
-            "the budget is used up; the same command goes on with the {left} runs that are not done yet"
+            "the budget is used up; the same command goes on with the {left} runs that are not done yet{answers}"
         );
     }
     Ok(())
 }
 
 /// Runs of every capture and seed, in the order of tables.
-fn contenders(command: &BenchCompare) -> Vec<Contender> {
-    let wanted = |head: &HeadName| {
-        command.heads.is_empty() || command.heads.iter().any(|argument| argument.head() == *head)
+fn contenders(command: &BenchCompare, has_maps: bool) -> Result<Vec<Contender>, Error> {
+    let is_named = |head: HeadName| command.heads.iter().any(|argument| argument.head() == head);
+    if is_named(HeadName::LangSplat) && !has_maps {
+        return Err(Error::usage(
+            "4d-langsplat learns feature maps and answers questions, and no capture has maps",
+            "name their folder in the file of --queries, see cif bench compare --help, or leave the head out",
+        ));
+    }
+    let wanted = |head: &HeadName| match command.heads.is_empty() {
+        true => head.tells_labels() || has_maps,
+        false => is_named(*head),
     };
     let mut contenders: Vec<Contender> =
         HeadName::ALL.into_iter().filter(wanted).map(Contender::Head).collect();
@@ -186,7 +250,7 @@ fn contenders(command: &BenchCompare) -> Vec<Contender> {
         }
         contenders.extend(ABLATIONS.map(|(ablation, _)| Contender::Without(ablation)));
     }
-    contenders
+    Ok(contenders)
 }
 
 /// Opens a capture, with the settings of its reconstruction.

@@ -1,6 +1,8 @@
 //! The runs of a comparison, one after the other: what is kept is not done again.
 
+use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write};
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use cif_bench::comparison::Contender;
@@ -30,6 +32,8 @@ pub(super) enum Ended {
 pub(super) struct Bench {
     iterations: Iterations,
     pub(super) runs: Records<Record>,
+    /// Folders of feature maps, by capture.
+    maps: BTreeMap<String, PathBuf>,
     /// Runs that are done, in the order of tables.
     pub(super) records: Vec<Record>,
     /// Runs that are not.
@@ -41,9 +45,15 @@ pub(super) struct Bench {
 }
 
 impl Bench {
-    pub(super) fn new(runs: Records<Record>, iterations: Iterations, budget: Option<Duration>) -> Self {
+    pub(super) fn new(
+        runs: Records<Record>,
+        iterations: Iterations,
+        budget: Option<Duration>,
+        maps: BTreeMap<String, PathBuf>,
+    ) -> Self {
         Self {
             iterations,
+            maps,
             runs,
             records: Vec::new(),
             missing: Vec::new(),
@@ -60,7 +70,7 @@ impl Bench {
         let heading = format!("{}, seed {}", subject.capture, subject.config.seed);
         let mut base = None;
         for contender in contenders {
-            let config = self.settings(subject, *contender);
+            let Some(config) = self.settings(subject, *contender) else { continue };
             let id = id(subject.capture, config.seed, contender.name());
             let fingerprint = json!({
                 "version": env!("CARGO_PKG_VERSION"),
@@ -108,8 +118,9 @@ impl Bench {
         Ok(())
     }
 
-    /// Settings of a run; those of the steps of the method hold for the method.
-    fn settings(&self, subject: &Subject<'_>, contender: Contender) -> TrainConfig {
+    /// Settings of a run; those of the steps of the method hold for the method. `None` where the capture has not what a
+    /// head learns.
+    fn settings(&self, subject: &Subject<'_>, contender: Contender) -> Option<TrainConfig> {
         let steps = match contender {
             Contender::Head(HeadName::Cif) | Contender::Without(_) => subject.config.stages.instance,
             Contender::Head(head) => self.iterations.of(head),
@@ -118,11 +129,14 @@ impl Bench {
         if let Contender::Without(ablation) = contender {
             config.instance.ablate.insert(ablation);
         }
-        config
+        if config.head.name == HeadName::LangSplat {
+            config.head.maps = self.maps.get(subject.capture)?.display().to_string();
+        }
+        Some(config)
     }
 
     /// True while new runs begin.
-    fn begins(&mut self) -> bool {
+    pub(super) fn begins(&mut self) -> bool {
         if self.ended.is_none() && self.deadline.is_some_and(|deadline| Instant::now() >= deadline) {
             self.ended = Some(Ended::OutOfTime);
         }
@@ -130,7 +144,7 @@ impl Bench {
     }
 
     /// Tells how far a run is.
-    fn show_share(&self, heading: &str, what: &str, done: u64, whole: u64) {
+    pub(super) fn show_share(&self, heading: &str, what: &str, done: u64, whole: u64) {
         self.show(&format!("{heading}: {what}: {} %", 100 * done / whole.max(1)), false);
     }
 

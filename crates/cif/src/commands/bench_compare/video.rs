@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
 use cif_bench::comparison::page::Video;
-use cif_bench::comparison::record::Record;
+use cif_bench::comparison::record::{Record, Row};
 use cif_bench::comparison::title;
 use cif_dataset::{Dataset, Frame, Split};
 use cif_field::Field;
@@ -14,6 +14,7 @@ use cif_geometry::PinholeCamera;
 use cif_output::Scratch;
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, RenderSettings};
+use cif_train::HeadName;
 use cif_train::heads::Decoder;
 use cif_train::metrics::mask_ids;
 
@@ -54,8 +55,10 @@ fn failed(problem: &str) -> Error {
 pub(super) fn write_all(folder: &Path, bench: &Bench, captures: &[Capture]) -> Result<Vec<Video>, Error> {
     let mut videos = Vec::new();
     for capture in captures {
-        let of_seed =
-            |record: &&Record| record.row.capture == capture.name && record.row.seed == capture.config.seed;
+        let of_seed = |record: &&Record| {
+            let Row { capture: of, head, seed, .. } = &record.row;
+            *of == capture.name && *seed == capture.config.seed && head != HeadName::LangSplat.name()
+        };
         let records: Vec<&Record> = bench.records.iter().filter(of_seed).collect();
         let path = path(&capture.dataset);
         if records.is_empty() || path.is_empty() {

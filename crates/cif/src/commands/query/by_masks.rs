@@ -7,25 +7,19 @@ use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::found_masks;
 use cif_dataset::{Dataset, Split};
-use cif_field::Field;
 use cif_geometry::PixelGrid;
-use cif_render::cpu::{Renderer, SimdLevel};
-use cif_render::{Channels, RenderSettings};
-use cif_vision::Models;
 use cif_vision::grounding::FoundBox;
 use clap::{Args, ValueEnum};
 
 use super::Query;
+use crate::commands::asked::{self, AskedScene};
 use crate::commands::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, scene};
-use crate::detector::{Asked, Detector};
+use crate::detector::Detector;
 use crate::error::Error;
 use crate::formats;
-use crate::mask_query::{self, Agreement, Found, FoundMasks, GATE, Selection, agreement, grouping};
-use crate::pictures::{rgb_picture, save_grey};
+use crate::mask_query::{Agreement, Found, FoundMasks, FrameAgreement, GATE, Selection, agreement};
+use crate::pictures::save_grey;
 use crate::{interrupt, output};
-
-/// Folder inside a capture that keeps masks of models. Readers of captures pass over hidden folders.
-const CACHE: &str = ".cif-cache";
 
 /// Masks that a detector found, and their use.
 #[derive(Debug, Args)]
@@ -137,14 +131,6 @@ fn share(text: &str) -> Result<f32, String> {
     if (0.0..=1.0).contains(&share) { Ok(share) } else { Err("expected 0 to 1".to_owned()) }
 }
 
-/// A scene and the capture whose frames are asked.
-struct Scene<'a> {
-    field: &'a Field,
-    dataset: &'a Dataset,
-    settings: RenderSettings,
-    renderer: Renderer,
-}
-
 /// Answer to a question by masks.
 struct Answer {
     found: Found,
@@ -190,13 +176,11 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     if let Some(folder) = &options.output {
         output::check_folder(folder, false)?;
     }
-    let settings = scene::render_settings(&field);
     interrupt::watch();
-    let mut scene =
-        Scene { field: &field, dataset: &dataset, settings, renderer: Renderer::new(SimdLevel::Auto) };
+    let mut scene = AskedScene::new(&field, &dataset);
     let answer = match options.protocol {
-        Protocol::Reproject => by_reprojection(&mut scene, &source, options)?,
-        Protocol::Grouping => by_grouping(&mut scene, &source, options)?,
+        Protocol::Reproject => by_reprojection(&mut scene, &dataset, &source, options)?,
+        Protocol::Grouping => by_grouping(&mut scene, &dataset, &source, options)?,
     };
     report::print(command, &answer);
     Ok(())
@@ -219,10 +203,7 @@ fn source<'a>(command: &'a Query, capture: &Path) -> Result<Source<'a>, Error> {
         (Some(prompt), _) => {
             let detector = match (&options.detector, &command.models) {
                 (Some(detector), _) => Detector::Command(detector.clone()),
-                (None, Some(folder)) => {
-                    let cache = options.cache.clone().unwrap_or_else(|| capture.join(CACHE));
-                    Detector::Models(Box::new(Models::open(folder)?), cache)
-                }
+                (None, Some(folder)) => asked::models(folder, capture, options.cache.clone())?,
                 (None, None) => {
                     return Err(Error::usage(
                         "--prompt is answered by models or by a command of your own",
@@ -250,8 +231,12 @@ impl From<cif_dataset::Error> for Error {
 }
 
 /// Instances that lie inside the masks of the training frames, and how well they agree on the held-out ones.
-fn by_reprojection(scene: &mut Scene<'_>, source: &Source<'_>, options: &ByMasks) -> Result<Answer, Error> {
-    let Scene { field, dataset, .. } = *scene;
+fn by_reprojection(
+    scene: &mut AskedScene<'_>,
+    dataset: &Dataset,
+    source: &Source<'_>,
+    options: &ByMasks,
+) -> Result<Answer, Error> {
     let mut detected = None;
     let given;
     let masks: &FoundMasks = match source {
@@ -272,72 +257,43 @@ fn by_reprojection(scene: &mut Scene<'_>, source: &Source<'_>, options: &ByMasks
             "run the detector on training frames; cif info CAPTURE lists them",
         ));
     }
-    let selection = options.select.into();
-    let Scene { renderer, settings, .. } = scene;
-    let found = mask_query::find(field, dataset, masks, selection, renderer, settings, interrupt::go_on)?;
+    let found = scene.reproject(masks, options.select.into())?;
     let gate = options.foreground.unwrap_or(GATE);
-    let scores = options.eval.then(|| {
-        evaluate(scene, masks, options, |scene, index| {
-            let frame = &dataset.frames[index];
-            let Scene { renderer, settings, .. } = scene;
-            mask_query::render(field, &found.rows, gate, &frame.camera, frame.time, renderer, settings)
-        })
-    });
+    let scores = options
+        .eval
+        .then(|| evaluate(dataset, masks, options, |index| scene.reprojected(&found, gate, index)));
+    let scores = scores.transpose()?;
     let boxes = detected.map(|detected| detected.boxes).unwrap_or_default();
-    Ok(Answer { found, boxes, scores: scores.transpose()? })
+    Ok(Answer { found, boxes, scores })
 }
 
 /// Instances that lie inside the mask of the first view as it is rendered, and how well they agree on the held-out
 /// frames.
-fn by_grouping(scene: &mut Scene<'_>, source: &Source<'_>, options: &ByMasks) -> Result<Answer, Error> {
+fn by_grouping(
+    scene: &mut AskedScene<'_>,
+    dataset: &Dataset,
+    source: &Source<'_>,
+    options: &ByMasks,
+) -> Result<Answer, Error> {
     let Source::Prompt(prompt, detector) = source else { unreachable!("refused with the arguments") };
-    let Scene { field, dataset, .. } = *scene;
-    let held_out = dataset.val_frames();
-    let first = held_out.first().copied().unwrap_or(0);
-    let frame = &dataset.frames[first];
-    let plain = Channels { depth: false, instances: false };
-    let Scene { renderer, settings, .. } = &mut *scene;
-    let view = rgb_picture(&renderer.render(field, &frame.camera, frame.time, settings, plain).color);
-    let asked = Asked { dataset, frames: &[first], picture: &|_| Ok(view.clone()) };
-    let detected = detector.detect(&asked, prompt)?;
-    let mask = dataset.load_found_mask(first, &detected.masks.files[first], true)?;
-    let found = grouping::find(field, &mask, &frame.camera, frame.time, renderer, settings);
-    let boxes = detected.boxes;
+    let (found, boxes) = scene.group(detector, prompt)?;
     if !options.eval {
         return Ok(Answer { found, boxes, scores: None });
     }
-    let truth = scene.detect(detector, prompt, &held_out)?;
-    let scores = evaluate(scene, &truth.masks, options, |scene, index| {
-        let frame = &dataset.frames[index];
-        let Scene { renderer, settings, .. } = scene;
-        grouping::render(field, &found.votes, &frame.camera, frame.time, renderer, settings)
-    })?;
+    let truth = scene.detect(detector, prompt, &dataset.val_frames())?;
+    let scores = evaluate(dataset, &truth.masks, options, |index| scene.grouped(&found, index))?;
     Ok(Answer { found, boxes, scores: Some(scores) })
-}
-
-impl Scene<'_> {
-    /// Asks a detector about captured frames.
-    fn detect(
-        &self,
-        detector: &Detector,
-        prompt: &str,
-        frames: &[usize],
-    ) -> Result<crate::detector::Detected, Error> {
-        let picture = |index| self.dataset.load_image(index, self.settings.background).map_err(Error::plain);
-        detector.detect(&Asked { dataset: self.dataset, frames, picture: &picture }, prompt)
-    }
 }
 
 /// Compares on the held-out frames what `render` makes of them. Of a detector that was run here, no mask means that it
 /// found nothing; of a folder, that it was not asked.
 fn evaluate(
-    scene: &mut Scene<'_>,
+    dataset: &Dataset,
     masks: &FoundMasks,
     options: &ByMasks,
-    mut render: impl FnMut(&mut Scene<'_>, usize) -> PixelGrid<bool>,
+    mut render: impl FnMut(usize) -> PixelGrid<bool>,
 ) -> Result<Agreement, Error> {
-    let dataset = scene.dataset;
-    let mut pairs = Vec::new();
+    let mut frames = Vec::new();
     for index in dataset.val_frames() {
         let (frame, files) = (&dataset.frames[index], &masks.files[index]);
         if files.is_empty() && !masks.loaded {
@@ -345,18 +301,18 @@ fn evaluate(
         }
         interrupt::go_on()?;
         let truth = dataset.load_found_mask(index, files, masks.loaded)?;
-        let rendered = render(scene, index);
+        let rendered = render(index);
         if let Some(folder) = &options.output {
             let picture: PixelGrid<u16> = rendered.map(|inside| if *inside { u16::MAX } else { 0 });
             save_grey(&output::inside(folder, &frame.name, "png")?, &picture)?;
         }
-        pairs.push((frame.name.as_str(), rendered, truth));
+        frames.push(FrameAgreement::of(&frame.name, &rendered, &truth));
     }
-    if pairs.is_empty() {
+    if frames.is_empty() {
         return Err(Error::failed(
             "no held-out frame has a mask, so there is nothing to compare with",
             "run the detector on held-out frames too, or leave --eval out",
         ));
     }
-    Ok(agreement(pairs))
+    Ok(agreement(frames))
 }

@@ -10,6 +10,7 @@ use serde_json::json;
 
 use super::{Query, point};
 use crate::error::Error;
+use crate::words::{self, words};
 
 /// Texts of anything: an object that is nearer to one of them than to the question is no answer. Source: LERF (2023),
 /// whose relevancy above a half is that.
@@ -103,17 +104,10 @@ fn cosine(a: &[f32], b: &[f32]) -> f64 {
 /// Objects that have any word of the text in their names, those with the most first; these are the answer.
 fn by_words(text: &str, objects: Vec<ObjectMatch>, place: &Path) -> Result<Vec<Scored>, Error> {
     let asked = words(text);
-    let mut known: BTreeSet<String> = BTreeSet::new();
-    let mut scored = Vec::new();
-    for object in objects {
-        let own: BTreeSet<String> = object.names.iter().flat_map(|name| words(name)).collect();
-        let shared = asked.intersection(&own).count();
-        known.insert(object.found.label.clone());
-        if shared > 0 {
-            scored.push(Scored { score: shared as f64 / asked.len() as f64, chosen: false, object });
-        }
-    }
-    if scored.is_empty() {
+    let share = |object: &ObjectMatch| words::share(&asked, object.names.iter().map(String::as_str));
+    let shares: Vec<f64> = objects.iter().map(share).collect();
+    if shares.iter().all(|share| *share <= 0.0) {
+        let known: BTreeSet<String> = objects.into_iter().map(|object| object.found.label).collect();
         let known: Vec<String> = known.into_iter().collect();
         let known = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
         return Err(Error::failed(
@@ -121,20 +115,15 @@ fn by_words(text: &str, objects: Vec<ObjectMatch>, place: &Path) -> Result<Vec<S
             "use words of the labels; embeddings, which cif embed makes, are found by meaning",
         ));
     }
+    let chosen = words::best(&shares);
+    let mut scored: Vec<Scored> = objects
+        .into_iter()
+        .zip(shares.into_iter().zip(chosen))
+        .filter(|(_, (score, _))| *score > 0.0)
+        .map(|(object, (score, chosen))| Scored { object, score, chosen })
+        .collect();
     scored.sort_by(|a, b| b.score.total_cmp(&a.score));
-    let best = scored[0].score;
-    for one in &mut scored {
-        one.chosen = one.score >= best;
-    }
     Ok(scored)
-}
-
-/// Words of a text in lower case, without numbers such as those at the end of unique names.
-fn words(text: &str) -> BTreeSet<String> {
-    text.split(|letter: char| !letter.is_alphanumeric())
-        .filter(|word| word.chars().any(char::is_alphabetic))
-        .map(str::to_lowercase)
-        .collect()
 }
 
 fn report(command: &Query, scored: &[Scored]) {
@@ -163,18 +152,5 @@ fn report(command: &Query, scored: &[Scored]) {
     println!("{table}");
     if !scored.iter().any(|one| one.chosen) {
         println!("none is nearer to the text than to 'object', 'things', 'stuff' or 'texture'");
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn words_are_compared_without_case_and_numbers() {
-        let of = |text: &str| words(text).into_iter().collect::<Vec<_>>();
-        assert_eq!(of("The red_Mug_001, MUG!"), ["mug", "red", "the"]);
-        assert_eq!(of("Q81727"), ["q81727"]);
-        assert!(of(" 12 -- ").is_empty());
     }
 }
