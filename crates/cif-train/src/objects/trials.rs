@@ -168,11 +168,12 @@ impl<'a> Contest<'a> {
             let turns = texture::rolls(seen, &bar.poses, (bar.axis, up), &rolled, outline);
             turns.map(|turns| bar.turned(&turns))
         } else {
-            let turns = texture::turns(seen.clone(), &self.paths.along, outline, up);
-            let turns = turns.or_else(|| {
+            let mut turns = texture::turns(seen.clone(), &self.paths.along, outline, up);
+            // What stays in place neither rolls nor flies.
+            if turns.is_none() && self.paths.shifts() {
                 let seen: Vec<&ObjectView> = seen.collect();
-                ball::turns(&seen, &self.paths.along, outline, &self.paths.rolls())
-            });
+                turns = ball::turns(&seen, &self.paths.along, outline, &self.paths.rolls());
+            }
             turns.map(|turns| self.paths.turned(&turns))
         };
         if self.paths.textured.is_none() {
