@@ -4,24 +4,26 @@ use cif_geometry::PixelGrid;
 use rayon::prelude::*;
 
 use super::Mask;
+use super::agree::agreed;
 use super::belief::Belief;
-use crate::plane::Tap;
+use crate::plane::{Plane, Tap};
 
 /// Keeps a way that is unreliable or far in time in play.
 const FLOOR: f32 = 0.02;
 
-/// Blends beliefs about a frame, each weighed by its share and by its reliability at the pixel, and takes the most
-/// probable class of every pixel of the image. Its confidence is its probability.
+/// Blends beliefs about a frame, each weighed by its share and by its reliability at the pixel, lets pixels follow their
+/// neighbours of the same colour (`lab`), and takes the most probable class of every pixel of the image. Its confidence
+/// is its probability.
 pub(super) fn mask(
     ways: &[(f32, &Belief)],
+    lab: &[Plane; 3],
     ids: &[u16],
     (width, height): (usize, usize),
     full: (usize, usize),
 ) -> Mask {
     let classes = ids.len();
     let mut shares = vec![0.0_f32; width * height * classes];
-    let mut best = vec![(0_u16, 0.0_f32); width * height];
-    shares.par_chunks_mut(classes).zip(&mut best).enumerate().for_each(|(pixel, (shares, best))| {
+    shares.par_chunks_mut(classes).enumerate().for_each(|(pixel, shares)| {
         let mut sum = 0.0;
         for (share, belief) in ways {
             let weight = (share + FLOOR) * (belief.reliability[pixel] + FLOOR);
@@ -30,8 +32,8 @@ pub(super) fn mask(
             shares.iter_mut().zip(theirs).for_each(|(share, other)| *share += weight * other);
         }
         shares.iter_mut().for_each(|share| *share /= sum);
-        *best = most_probable(shares);
     });
+    let shares = agreed(&shares, classes, lab);
     let with_confidence = |(class, share): (u16, f32)| (ids[usize::from(class)], (share * 255.0 + 0.5) as u8);
     let enlarged = (width, height) != full;
     let (full_width, full_height) = full;
@@ -42,7 +44,7 @@ pub(super) fn mask(
             || vec![0.0_f32; classes],
             |sum, pixel| {
                 if !enlarged {
-                    return with_confidence(best[pixel]);
+                    return with_confidence(most_probable(&shares[pixel * classes..(pixel + 1) * classes]));
                 }
                 let x = ((pixel % full_width) as f32 + 0.5) * step.0 - 0.5;
                 let y = ((pixel / full_width) as f32 + 0.5) * step.1 - 0.5;
