@@ -15,26 +15,32 @@ const ANYWAY: f32 = 0.01;
 /// Keeps every class possible when evidence is multiplied.
 const FLOOR: f32 = 0.01;
 
-/// Pixels that are surer than this of a class ask nobody.
-const SURE: f32 = 0.97;
+/// Probability from which a pixel is sure of its class. Where those around are sure of the same, it asks nobody.
+const SURE: f32 = 0.8;
 
 /// Probabilities of classes, `[pixels][classes]`, each multiplied by the mean of those around, weighed by how alike their
 /// colours are, and normalised: one round of a mean field. Source: Kraehenbuehl and Koltun, "Efficient Inference in Fully
 /// Connected CRFs with Gaussian Edge Potentials", NIPS 2011, equation 4, here between neighbours alone.
 pub(super) fn agreed(shares: &[f32], classes: usize, lab: &[Plane; 3]) -> Vec<f32> {
     let (width, height) = (lab[0].width, lab[0].height);
+    let surest = |shares: &[f32]| shares.iter().position(|share| *share > SURE);
+    let sure: Vec<Option<usize>> = shares.par_chunks(classes).map(surest).collect();
     let mut out = shares.to_vec();
     out.par_chunks_mut(width * classes).enumerate().for_each(|(y, row)| {
         let mut around = vec![0.0_f32; classes];
         for (x, own) in row.chunks_exact_mut(classes).enumerate() {
-            if own.iter().any(|share| *share > SURE) {
+            let at = y * width + x;
+            let columns = x.saturating_sub(1)..(x + 2).min(width);
+            let rows = y.saturating_sub(1)..(y + 2).min(height);
+            let alike =
+                |row: usize| sure[row * width..][columns.clone()].iter().all(|other| *other == sure[at]);
+            if sure[at].is_some() && rows.clone().all(alike) {
                 continue;
             }
-            let at = y * width + x;
             around.fill(0.0);
             let mut total = 0.0;
-            for other_y in y.saturating_sub(1)..(y + 2).min(height) {
-                for other_x in x.saturating_sub(1)..(x + 2).min(width) {
+            for other_y in rows {
+                for other_x in columns.clone() {
                     let other = other_y * width + other_x;
                     if other == at {
                         continue;
@@ -65,9 +71,11 @@ mod tests {
 
     #[test]
     fn a_pixel_in_doubt_follows_what_has_its_colour() {
-        // A row of two colours: what is in doubt beside the border belongs to its own side, and what is sure stays.
-        let lab = [0; 3].map(|_| Plane { width: 6, height: 1, data: vec![10.0, 10.0, 10.0, 80.0, 80.0, 80.0] });
-        let shares = [[0.9, 0.1], [0.9, 0.1], [0.45, 0.55], [0.55, 0.45], [0.1, 0.9], [0.02, 0.98]].concat();
+        // A row of two colours: what is in doubt beside the border belongs to its own side; what is sure among its like
+        // stays.
+        let lab =
+            [0; 3].map(|_| Plane { width: 6, height: 1, data: vec![10.0, 10.0, 10.0, 80.0, 80.0, 80.0] });
+        let shares = [[0.9, 0.1], [0.9, 0.1], [0.45, 0.55], [0.55, 0.45], [0.1, 0.9], [0.1, 0.9]].concat();
         let found = agreed(&shares, 2, &lab);
         assert!(found[4] > 0.6, "{found:?}");
         assert!(found[7] > 0.6, "{found:?}");
