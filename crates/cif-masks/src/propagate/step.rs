@@ -174,3 +174,19 @@ fn largest(values: &mut [f32], others: &[f32]) {
         *value = value.max(*other);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn looks_decide_where_motion_is_not_trusted() {
+        let combined = |trust: f32| {
+            let mut shares = [0.9, 0.1];
+            combine(&mut shares, &[0.3, 0.7], 1.0, trust);
+            shares
+        };
+        assert!(combined(1.0)[0] > 0.75, "{:?}", combined(1.0));
+        assert!(combined(0.0)[1] > 0.55, "{:?}", combined(0.0));
+    }
+}
