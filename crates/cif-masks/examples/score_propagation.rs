@@ -1,19 +1,21 @@
-//! Scores propagation against the exact masks of a capture: every STEP-th frame of its first camera is a keyframe, and
-//! the others are compared.
+//! Scores propagation against the exact masks of a capture: every STEP-th frame of its first camera is a keyframe, or
+//! those that are listed, and the others are compared. With a folder, the masks are written into it.
 //!
-//! `cargo run --release -p cif-masks --example score_propagation -- CAPTURE STEP`
+//! `cargo run --release -p cif-masks --example score_propagation -- CAPTURE STEP|FRAME,FRAME,... [DIR]`
 
 use std::collections::BTreeMap;
 use std::time::Instant;
 
+use cif_dataset::masks::MaskWriter;
 use cif_dataset::{Dataset, OpenOptions};
 use cif_geometry::PixelGrid;
 use cif_masks::{Clip, Keyframe, Mask, propagate};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     let arguments: Vec<String> = std::env::args().collect();
-    let [_, capture, step] = &arguments[..] else { return Err("give a capture and a step".into()) };
-    let step: usize = step.parse()?;
+    let [_, capture, keys, folder @ ..] = &arguments[..] else {
+        return Err("give a capture, and a step or frames".into());
+    };
     let dataset = Dataset::open(capture, &OpenOptions::default())?;
     let camera = &dataset.frames[0].camera_name;
     let frames: Vec<usize> =
@@ -23,8 +25,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .map(|k| dataset.load_mask(*k)?.ok_or_else(|| "a frame without a mask".into()))
         .collect::<Result<Vec<PixelGrid<u16>>, Box<dyn std::error::Error>>>()?;
     let last = frames.len() - 1;
+    let keys: Vec<usize> = match keys.parse() {
+        Ok(step) => (0..last).step_by(step).chain([last]).collect(),
+        Err(_) => keys.split(',').map(str::parse).collect::<Result<_, _>>()?,
+    };
     let keyframes: BTreeMap<usize, Keyframe> =
-        (0..last).step_by(step).chain([last]).map(|k| (k, Keyframe::painted(truth[k].clone()))).collect();
+        keys.iter().map(|k| (*k, Keyframe::painted(truth[*k].clone()))).collect();
 
     let mut masks: Vec<Option<Mask>> = vec![None; frames.len()];
     let image = |k: usize| Ok(dataset.load_image(frames[k], [1.0; 3])?);
@@ -36,6 +42,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     })?;
     let milliseconds = start.elapsed().as_secs_f64() * 1e3 / frames.len() as f64;
 
+    if let [folder] = folder {
+        let writer = MaskWriter::create(folder.as_ref())?;
+        for (frame, mask) in frames.iter().zip(masks.iter().flatten()) {
+            writer.add(&dataset.frames[*frame].name, &mask.ids, Some(&mask.confidence))?;
+        }
+        writer.finish(&dataset.instances)?;
+    }
     let others: Vec<(&Mask, &PixelGrid<u16>)> = (0..frames.len())
         .filter(|k| !keyframes.contains_key(k))
         .filter_map(|k| Some((masks[k].as_ref()?, &truth[k])))

@@ -9,8 +9,10 @@
 //! | [`window`] | flows and looks of some frames in a row |
 //! | [`belief`] | probabilities of classes per pixel |
 //! | [`step`] | from one frame to the next |
+//! | [`agree`] | pixels that follow their neighbours of the same colour |
 //! | [`fuse`] | ids and confidence from one belief or two |
 
+mod agree;
 pub(crate) mod belief;
 mod fuse;
 mod step;
@@ -26,7 +28,7 @@ use crate::appearance::{Features, Forest, Samples};
 use crate::picture::Picture;
 use belief::{Belief, Stored};
 use step::Step;
-use window::Window;
+use window::{Seen, Window};
 
 /// Longest side at which images are followed, pixels; larger ones are reduced, and their masks enlarged at the end.
 const LONGEST_SIDE: usize = 640;
@@ -226,8 +228,8 @@ impl<'a> Run<'a> {
 
     /// Frames that a window takes with its flows and looks.
     fn window_frames(&self) -> usize {
-        // Two flows of two numbers of four bytes, and a byte per class.
-        let frame = self.size.0 * self.size.1 * (16 + self.classes.ids.len());
+        // Two flows of two numbers of four bytes with their trust, three of colour, and a byte per class.
+        let frame = self.size.0 * self.size.1 * (36 + self.classes.ids.len());
         (WINDOW_BYTES / frame.max(1)).clamp(2, WINDOW_FRAMES)
     }
 
@@ -238,9 +240,12 @@ impl<'a> Run<'a> {
 
     fn step(&self, window: &Window, from: usize, to: usize, known: &Belief) -> Result<Belief, Error> {
         self.go_on()?;
-        let (forth, back) = window.flows(from, to);
         let (width, height) = self.size;
-        Ok(Step { width, height, back, forth, looks: window.looks(to) }.take(known))
+        Ok(Step { width, height, way: window.way(from, to), seen: window.seen(to) }.take(known))
+    }
+
+    fn mask(&self, ways: &[(f32, &Belief)], seen: &Seen) -> Mask {
+        fuse::mask(ways, &seen.lab, &self.classes.ids, self.size, self.full)
     }
 
     /// From a keyframe through frames that have no keyframe beyond them.
@@ -263,7 +268,7 @@ impl<'a> Run<'a> {
             for next in some {
                 belief = self.step(&window, at, *next, &belief)?;
                 at = *next;
-                done(at, fuse::mask(&[(1.0, &belief)], &self.classes.ids, self.size, self.full))?;
+                done(at, self.mask(&[(1.0, &belief)], window.seen(at)))?;
             }
         }
         Ok(())
@@ -305,7 +310,7 @@ impl<'a> Run<'a> {
                 let forward = forwards[&at].restored();
                 let share = (last - at) as f32 / (last - first) as f32;
                 let ways = [(share, &forward), (1.0 - share, &belief)];
-                done(at, fuse::mask(&ways, &self.classes.ids, self.size, self.full))?;
+                done(at, self.mask(&ways, these.seen(at)))?;
             }
         }
         Ok(())

@@ -2,19 +2,23 @@
 
 use rayon::prelude::*;
 
+use super::agree::agreed;
 use super::belief::Belief;
-use crate::flow::Flow;
+use super::window::{Seen, Way};
 use crate::plane::Tap;
-
-/// Disagreement of forward and backward flow at which motion is trusted by exp(-1/2), pixels.
-const DISAGREEMENT: f32 = 1.0;
 
 /// Keeps every class possible when evidence is multiplied.
 const FLOOR: f32 = 0.02;
 
-/// Share by which a pixel is drawn to its most probable class after every step: without it, beliefs blur from
-/// resampling.
+/// Share by which a pixel whose motion is trusted is drawn to its most probable class after every step: without it,
+/// beliefs blur from resampling.
 const HARDENING: f32 = 0.5;
+
+/// Least sum, in units of 1 / 255, of what a pixel looks like over classes that may be there: below, looks say little.
+const LEAST_LOOKS: f32 = 25.0;
+
+/// Rounds in which pixels follow their neighbours.
+const ROUNDS: usize = 2;
 
 /// Distance, in pixels of the halved grid, over which a class may appear beside where motion brought it.
 const SUPPORT: usize = 2;
@@ -25,18 +29,17 @@ pub(super) struct Step<'a> {
     pub(super) width: usize,
     /// Rows of the frames.
     pub(super) height: usize,
-    /// Flow from the frame that is stepped to, back to the one that is known.
-    pub(super) back: &'a Flow,
-    /// Flow from the known frame to the one that is stepped to.
-    pub(super) forth: &'a Flow,
-    /// Appearance of the pixels of the frame that is stepped to, `[pixels][classes]`, 1 / 255.
-    pub(super) looks: &'a [u8],
+    /// Motion from the known frame.
+    pub(super) way: &'a Way,
+    /// The frame that is stepped to.
+    pub(super) seen: &'a Seen,
 }
 
 impl Step<'_> {
     /// The belief about the frame that is stepped to: the known one brought along by flow, times what pixels look like,
-    /// where classes may only be near where motion brought them. Where forward and backward flow contradict each other
-    /// (occlusion, or no structure to follow), the belief becomes less reliable.
+    /// where classes may only be near where motion brought them. Where motion is not to be trusted (occlusion, or no
+    /// structure to follow), looks alone speak, and the belief becomes less reliable. At last, pixels follow their
+    /// neighbours of the same colour.
     pub(super) fn take(&self, known: &Belief) -> Belief {
         let (width, classes) = (self.width, known.classes);
         let pixels = width * self.height;
@@ -46,12 +49,9 @@ impl Step<'_> {
             |(y, (moved, reliability))| {
                 for x in 0..width {
                     let at = y * width + x;
-                    let (u, v) = (self.back.u.data[at], self.back.v.data[at]);
+                    let (u, v) = (self.way.back.u.data[at], self.way.back.v.data[at]);
                     let tap = Tap::new(width, self.height, x as f32 + u, y as f32 + v);
-                    let du = u + tap.of(&self.forth.u.data);
-                    let dv = v + tap.of(&self.forth.v.data);
-                    let trust = (-(du * du + dv * dv) / (2.0 * DISAGREEMENT * DISAGREEMENT)).exp();
-                    reliability[x] = trust * tap.of(&known.reliability);
+                    reliability[x] = self.way.trust[at] * tap.of(&known.reliability);
                     tap.of_rows(&known.shares, classes, &mut moved[x * classes..(x + 1) * classes]);
                 }
             },
@@ -65,34 +65,39 @@ impl Step<'_> {
                 support.at(x, y, &mut near);
                 // What is unlabelled may be anywhere.
                 near[0] = 1.0;
-                let seen = &self.looks[at * classes..(at + 1) * classes];
+                let seen = &self.seen.looks[at * classes..(at + 1) * classes];
                 let mut sum = 0.0;
                 for ((look, seen), near) in looks.iter_mut().zip(seen).zip(&near) {
                     *look = f32::from(*seen) * (near + FLOOR);
                     sum += *look;
                 }
-                let scale = 1.0 / sum.max(f32::MIN_POSITIVE);
-                combine(&mut row[x * classes..(x + 1) * classes], &looks, scale);
+                let scale = 1.0 / sum.max(LEAST_LOOKS);
+                combine(&mut row[x * classes..(x + 1) * classes], &looks, scale, self.way.trust[at]);
             }
         });
+        for _ in 0..ROUNDS {
+            moved = agreed(&moved, classes, &self.seen.lab);
+        }
         Belief { classes, shares: moved, reliability }
     }
 }
 
-/// The normalised geometric mean of what motion and looks say, drawn to its most probable class.
-fn combine(shares: &mut [f32], looks: &[f32], scale: f32) {
+/// The normalised geometric mean of what motion, as far as it is trusted, and looks say, drawn to its most probable class.
+fn combine(shares: &mut [f32], looks: &[f32], scale: f32, trust: f32) {
+    let unknown = (1.0 - trust) / shares.len() as f32;
     let mut sum = 0.0;
     let (mut best, mut most) = (0, 0.0);
     for (class, (share, look)) in shares.iter_mut().zip(looks).enumerate() {
-        *share = ((*share + FLOOR) * (look * scale + FLOOR)).sqrt();
+        *share = ((trust * *share + unknown + FLOOR) * (look * scale + FLOOR)).sqrt();
         sum += *share;
         if *share > most {
             (best, most) = (class, *share);
         }
     }
-    let scale = (1.0 - HARDENING) / sum;
+    let hardening = HARDENING * trust;
+    let scale = (1.0 - hardening) / sum;
     shares.iter_mut().for_each(|share| *share *= scale);
-    shares[best] += HARDENING;
+    shares[best] += hardening;
 }
 
 /// Where classes may be: their shares widened, on a grid of half the size.
@@ -167,5 +172,21 @@ impl Support {
 fn largest(values: &mut [f32], others: &[f32]) {
     for (value, other) in values.iter_mut().zip(others) {
         *value = value.max(*other);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn looks_decide_where_motion_is_not_trusted() {
+        let combined = |trust: f32| {
+            let mut shares = [0.9, 0.1];
+            combine(&mut shares, &[0.3, 0.7], 1.0, trust);
+            shares
+        };
+        assert!(combined(1.0)[0] > 0.75, "{:?}", combined(1.0));
+        assert!(combined(0.0)[1] > 0.55, "{:?}", combined(0.0));
     }
 }

@@ -1,4 +1,4 @@
-//! Flows and looks of some frames in a row.
+//! Motion between frames in a row, and their looks.
 
 use std::ops::RangeInclusive;
 
@@ -9,14 +9,66 @@ use crate::Error;
 use crate::appearance::{Features, Forest};
 use crate::flow::{Flow, Pyramid, flow};
 use crate::picture::Picture;
+use crate::plane::{Plane, Tap};
+
+/// Disagreement of forward and backward flow at which motion is trusted by exp(-1/2), pixels.
+const DISAGREEMENT: f32 = 1.0;
+
+/// Change of colour along the flow at which motion is trusted by exp(-1/2), in the units of [`Picture::lab`].
+const RECOLORED: f32 = 25.0;
+
+/// Standard deviation of the blur under which colours are compared, pixels.
+const COLOR_BLUR: f32 = 1.0;
+
+/// Motion from a frame to one of its neighbours.
+pub(super) struct Way {
+    /// Flow from the frame that is stepped to, back to the one that is known.
+    pub(super) back: Flow,
+    /// Per pixel of the frame that is stepped to, 0 to 1: how well the flow is to be trusted.
+    pub(super) trust: Vec<f32>,
+}
+
+impl Way {
+    /// `back` leads from the pixels of `to` into `from`, `forth` from there. What comes into sight has nothing to come
+    /// from: the flows contradict each other, or lead to something of another colour.
+    fn new(back: Flow, forth: &Flow, to: &[Plane; 3], from: &[Plane; 3]) -> Self {
+        let (width, height) = (back.u.width, back.u.height);
+        let trust = (0..width * height).map(|at| {
+            let (u, v) = (back.u.data[at], back.v.data[at]);
+            let tap = Tap::new(width, height, (at % width) as f32 + u, (at / width) as f32 + v);
+            let (du, dv) = (u + tap.of(&forth.u.data), v + tap.of(&forth.v.data));
+            let mut square = (du * du + dv * dv) / (DISAGREEMENT * DISAGREEMENT);
+            for (to, from) in to.iter().zip(from) {
+                square += ((to.data[at] - tap.of(&from.data)) / RECOLORED).powi(2);
+            }
+            (-0.5 * square).exp()
+        });
+        Self { trust: trust.collect(), back }
+    }
+}
+
+/// A frame of a window.
+struct Prepared {
+    pyramid: Pyramid,
+    /// L*a*b*, blurred a little.
+    lab: [Plane; 3],
+    looks: Vec<u8>,
+}
 
 /// Facts about some frames in a row that propagation needs.
 pub(super) struct Window {
     first: usize,
-    /// Between each frame and the next: flow to the next, flow back.
-    flows: Vec<[Flow; 2]>,
-    /// Per frame, `[pixels][classes]`, 1 / 255.
-    looks: Vec<Vec<u8>>,
+    /// Between each frame and the next: the way there, and the way back.
+    ways: Vec<[Way; 2]>,
+    frames: Vec<Seen>,
+}
+
+/// Facts about one frame.
+pub(super) struct Seen {
+    /// Which class its pixels look like, `[pixels][classes]`, 1 / 255.
+    pub(super) looks: Vec<u8>,
+    /// L*a*b* of its pixels, blurred a little.
+    pub(super) lab: [Plane; 3],
 }
 
 impl Window {
@@ -31,7 +83,7 @@ impl Window {
         forest: &Forest,
     ) -> Result<Self, Error> {
         let first = *frames.start();
-        let prepared: Vec<(Pyramid, Vec<u8>)> = frames
+        let prepared: Vec<Prepared> = frames
             .into_par_iter()
             .map(|frame| {
                 if (clip.stop)() {
@@ -39,31 +91,49 @@ impl Window {
                 }
                 let picture = Picture::new(&(clip.image)(frame)?, width, height);
                 let looks = forest.classify(&Features::new(&picture));
-                Ok((Pyramid::new(picture.brightness), looks))
+                let lab = picture.lab.each_ref().map(|plane| plane.blurred(COLOR_BLUR));
+                Ok(Prepared { pyramid: Pyramid::new(picture.brightness), lab, looks })
             })
             .collect::<Result<_, Error>>()?;
-        let (pyramids, looks): (Vec<Pyramid>, Vec<Vec<u8>>) = prepared.into_iter().unzip();
-        let flows = pyramids
+        let ways = prepared
             .par_windows(2)
             .map(|pair| {
                 if (clip.stop)() {
                     return Err(Error::Stopped);
                 }
-                let (there, back) = rayon::join(|| flow(&pair[0], &pair[1]), || flow(&pair[1], &pair[0]));
-                Ok([there, back])
+                let (a, b) = (&pair[0], &pair[1]);
+                let (there, back) =
+                    rayon::join(|| flow(&a.pyramid, &b.pyramid), || flow(&b.pyramid, &a.pyramid));
+                let to_later = Way::new(back.clone(), &there, &b.lab, &a.lab);
+                Ok([to_later, Way::new(there, &back, &a.lab, &b.lab)])
             })
             .collect::<Result<_, Error>>()?;
-        Ok(Self { first, flows, looks })
+        let frames = prepared.into_iter().map(|Prepared { lab, looks, .. }| Seen { looks, lab }).collect();
+        Ok(Self { first, ways, frames })
     }
 
-    /// Flows between two neighbouring frames: there, and back.
-    pub(super) fn flows(&self, from: usize, to: usize) -> (&Flow, &Flow) {
-        let [to_later, to_earlier] = &self.flows[from.min(to) - self.first];
-        if from < to { (to_later, to_earlier) } else { (to_earlier, to_later) }
+    /// Motion from a frame to its neighbour.
+    pub(super) fn way(&self, from: usize, to: usize) -> &Way {
+        let [to_later, to_earlier] = &self.ways[from.min(to) - self.first];
+        if from < to { to_later } else { to_earlier }
     }
 
-    /// Appearance of the pixels of a frame.
-    pub(super) fn looks(&self, frame: usize) -> &[u8] {
-        &self.looks[frame - self.first]
+    /// Looks and colours of a frame.
+    pub(super) fn seen(&self, frame: usize) -> &Seen {
+        &self.frames[frame - self.first]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn flow_to_another_colour_is_not_trusted() {
+        // Flows that agree, over a pixel that changes its colour and one that keeps it.
+        let still = || Flow { u: Plane::filled(2, 1, 0.0), v: Plane::filled(2, 1, 0.0) };
+        let lab = |first: f32| [0; 3].map(|_| Plane { width: 2, height: 1, data: vec![first, 40.0] });
+        let trust = Way::new(still(), &still(), &lab(90.0), &lab(40.0)).trust;
+        assert!(trust[0] < 0.05 && trust[1] > 0.99, "{trust:?}");
     }
 }
