@@ -16,6 +16,10 @@ pub(crate) const DECAY: [f64; 2] = [0.9, 0.99];
 /// Keeps steps finite where gradients vanish.
 pub(crate) const EPSILON: f64 = 1e-15;
 
+/// Rate of turns, radians, of that of translations, shares of the size: light, which stays where it is, turns objects
+/// back from what their fits found.
+pub(crate) const TURN_RATE: f64 = 0.25;
+
 /// Values of a pose: turn, translation.
 const WIDTH: usize = 6;
 
@@ -38,8 +42,8 @@ impl PoseMoments {
         Self { first: vec![[0.0; WIDTH]; poses], second: vec![[0.0; WIDTH]; poses], steps: vec![0; poses] }
     }
 
-    /// Moves the poses that views were drawn of: turns at `rate` radians, where they are not assumed, translations at as
-    /// much of the `sizes` of the groups, metres.
+    /// Moves the poses that views were drawn of: translations at `rate` of the `sizes` of the groups, metres, turns, where
+    /// they are not assumed, at [`TURN_RATE`] of as many radians.
     pub(crate) fn step(
         &mut self,
         tracks: &mut Tracks,
@@ -70,7 +74,7 @@ impl PoseMoments {
                     taken[k] = (*first / bias[0]) / ((*second / bias[1]).sqrt() + EPSILON);
                 }
                 if turns {
-                    let turn = -rate * DVec3::from_slice(&taken[..3]);
+                    let turn = -TURN_RATE * rate * DVec3::from_slice(&taken[..3]);
                     pose.rotation = (pose.rotation * DQuat::from_scaled_axis(turn)).normalize();
                 }
                 pose.translation -= rate * size * DVec3::from_slice(&taken[3..]);

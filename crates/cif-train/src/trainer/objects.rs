@@ -19,9 +19,8 @@ use crate::stage::Stage;
 const MOST_ERROR: [f64; 2] = [0.22, 0.15];
 const MOST_SETTLED: f64 = 0.095;
 
-/// Rates of poses at the start and the end of the fine stage, radians, and shares of the size of the object: small, for
-/// light, which stays where it is, pulls objects back from turns that their fits found.
-const RATES: [f32; 2] = [0.001, 5e-5];
+/// Rates of poses at the start and the end of the fine stage, shares of the size of the object.
+const RATES: [f32; 2] = [0.004, 2e-4];
 
 /// Steps of the fine stage in which poses stay, while everything settles around them.
 const FROZEN: u32 = 300;

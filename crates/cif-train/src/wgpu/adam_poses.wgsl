@@ -1,5 +1,6 @@
-// The optimiser's step of the poses that views were drawn of, and their limits: turns by radians, unless they are
-// assumed, translations by shares of the size of the group, half of the largest extent of its Gaussians. Gradients
+// The optimiser's step of the poses that views were drawn of, and their limits: translations by shares of
+// the size of the group, half of the largest extent of its Gaussians, turns by a part of as many radians, unless they
+// are assumed. Gradients
 // become zero. A workgroup per group.
 // Rust twin: poses.rs, `PoseMoments::step` and `object_sizes`. Source: methods reference of motion, 2.1.
 
@@ -75,7 +76,7 @@ fn move_pose(at: u32, size: f32, turns: bool) {
     let by_turn = (first_turn / bias_1) / (sqrt(second_turn / bias_2) + POSE_EPSILON);
     let by_translation = (first_translation / bias_1) / (sqrt(second_translation / bias_2) + POSE_EPSILON);
     if turns {
-        poses[at].rotation = normalize(product(poses[at].rotation, small_turn(-rates.rate * by_turn)));
+        poses[at].rotation = normalize(product(poses[at].rotation, small_turn(-POSE_TURN_RATE * rates.rate * by_turn)));
     }
     poses[at].offset -= vec4f(rates.rate * size * by_translation, 0.0);
 }

@@ -302,6 +302,7 @@ const CONSTANTS: Snippet = Snippet {
             ("POSE_SHARE_1", Constant::Float((1.0 - poses::DECAY[0]) as f32)),
             ("POSE_SHARE_2", Constant::Float((1.0 - poses::DECAY[1]) as f32)),
             ("POSE_EPSILON", Constant::Float(poses::EPSILON as f32)),
+            ("POSE_TURN_RATE", Constant::Float(poses::TURN_RATE as f32)),
             ("POSE_STEPS", Constant::Float(poses::COUNTED_STEPS as f32)),
         ])
     },
