@@ -8,6 +8,7 @@
 //! | `published` | what the paper published, taken against other masks |
 //! | `tables` | means, spreads and the best of them, as text, CSV, JSON and LaTeX |
 //! | `queries` | how questions in words are answered |
+//! | `text` | tables as Markdown and LaTeX |
 //! | `crops` | the part of a picture in which the runs differ most |
 //! | `page` | the page |
 //!
@@ -20,6 +21,7 @@ pub mod queries;
 pub mod record;
 pub mod run;
 pub mod tables;
+mod text;
 
 use cif_train::{Ablation, HeadName};
 

@@ -4,8 +4,8 @@ use std::fmt::Write;
 
 use serde_json::json;
 
-use super::super::tables::{csv_number, csv_text, latex_text};
-use super::{Cell, DIGITS, Line, Queries};
+use super::super::text::{self, TextLine, TextTable, csv_number, csv_text};
+use super::{Cell, DIGITS, Line, Queries, Table};
 
 /// Heading of the column of published numbers.
 pub(in super::super) const PUBLISHED_HEADING: &str = "published mAcc / mIoU, other masks";
@@ -19,55 +19,29 @@ impl Queries {
     /// The tables as Markdown.
     #[must_use]
     pub fn markdown(&self) -> String {
-        let mut text = String::new();
-        for table in self.tables() {
-            let _ = writeln!(text, "**{}**\n", table.caption);
-            let _ = writeln!(text, "| | by | {} | {PUBLISHED_HEADING} |", table.headings.join(" | "));
-            let _ = writeln!(text, "|---|---{}|---|", "|---:".repeat(table.headings.len()));
-            for Line { title, way, cells, published } in &table.lines {
-                let cells = cells.iter().map(shown);
-                let cells: Vec<String> =
-                    cells.map(|(text, best)| if best { format!("**{text}**") } else { text }).collect();
-                let _ = writeln!(text, "| {title} | {} | {} | {published} |", way.name(), cells.join(" | "));
-            }
-            text.push('\n');
-        }
-        for note in self.notes() {
-            let _ = writeln!(text, "{note}\n");
-        }
-        text
+        text::markdown(&self.texts(), &self.notes())
     }
 
     /// The tables as LaTeX, for the package `booktabs`.
     #[must_use]
     pub fn latex(&self) -> String {
-        let mut text = String::new();
-        for table in self.tables() {
-            let _ = writeln!(text, "% {}", table.caption);
-            let columns = "r".repeat(table.headings.len());
-            let _ = writeln!(text, "\\begin{{tabular}}{{ll{columns}l}}\n\\toprule");
-            let headings: Vec<String> = table.headings.iter().map(|heading| latex_text(heading)).collect();
-            let _ = writeln!(
-                text,
-                "{} & by & {} & {PUBLISHED_HEADING} \\\\\n\\midrule",
-                latex_text(&table.caption),
-                headings.join(" & ")
-            );
-            for Line { title, way, cells, published } in &table.lines {
-                let cell = |(text, best): (String, bool)| match best {
-                    true => format!("\\textbf{{{}}}", latex_text(&text)),
-                    false => latex_text(&text),
-                };
-                let cells: Vec<String> = cells.iter().map(shown).map(cell).collect();
-                let (title, published) = (latex_text(title), latex_text(published));
-                let _ = writeln!(text, "{title} & {} & {} & {published} \\\\", way.name(), cells.join(" & "));
-            }
-            text.push_str("\\bottomrule\n\\end{tabular}\n\n");
-        }
-        for note in self.notes() {
-            let _ = writeln!(text, "% {note}");
-        }
-        text
+        text::latex(&self.texts(), &self.notes())
+    }
+
+    fn texts(&self) -> Vec<TextTable> {
+        let line = |Line { title, way, cells, published }: Line| TextLine {
+            texts: vec![title, way.name().to_owned()],
+            numbers: cells.iter().map(shown).collect(),
+            published,
+        };
+        let table = |table: Table| TextTable {
+            caption: table.caption,
+            texts: vec!["by"],
+            numbers: table.headings,
+            published: PUBLISHED_HEADING.to_owned(),
+            lines: table.lines.into_iter().map(line).collect(),
+        };
+        self.tables().into_iter().map(table).collect()
     }
 
     /// Every answer as CSV.

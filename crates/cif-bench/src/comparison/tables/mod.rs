@@ -10,7 +10,6 @@ mod notes;
 
 use std::collections::BTreeSet;
 
-pub(super) use self::forms::{csv_number, csv_text, latex_text};
 pub(super) use self::notes::missing_note;
 use super::published::{PUBLISHED, Published};
 use super::record::Row;
