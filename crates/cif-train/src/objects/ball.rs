@@ -320,16 +320,9 @@ fn agreement(sides: &[Side], turns: &[DQuat]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use cif_geometry::PinholeCamera;
-
     use super::super::outline::outline;
-    use super::super::testing::{TIMES, camera, patches, solid, sphere_places, views};
+    use super::super::testing::{TIMES, jumping, patches, solid, sphere_places, views};
     use super::*;
-
-    /// One camera that sees another side of the floor at every time.
-    fn around(time: usize) -> Vec<PinholeCamera> {
-        vec![camera(2.4 * time as f64)]
-    }
 
     /// Turns found of a ball that flies and turns evenly about a tilted axis, by time.
     fn thrown(color: impl Fn(DVec3) -> [f32; 3], turn: DVec3) -> Option<BTreeMap<usize, DQuat>> {
@@ -340,7 +333,7 @@ mod tests {
                 (DQuat::from_scaled_axis(time as f64 * turn), place)
             })
             .collect();
-        let views = views(solid(&sphere_places(0.05), color, 0.006), &truth, around);
+        let views = views(solid(&sphere_places(0.05), color, 0.006), &truth, jumping);
         let outline = outline(&views, None, TIMES).unwrap();
         let seen: Vec<&ObjectView> = views.iter().collect();
         turns(&seen, &outline.path, &outline, &[])

@@ -59,6 +59,14 @@ pub(super) fn smooth(
 /// The path that passes near the rays of one view per time and bends little; nothing where neighbouring rays hardly
 /// cross. Rays far from it count less: what hides a part of an object moves the middle of its mask.
 pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DVec3> {
+    // Balls bounce.
+    let bounces = are_discs(views.iter().filter(|view| !view.cut));
+    along_rays(views, times, bounces)
+}
+
+/// The same, where it is known whether it bounces: the middle of its masks is then sure, so that a path that bends
+/// somewhere is found before rays are told to be off it. Nothing else tells where its ends are.
+fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usize, DVec3> {
     let views: Vec<&ObjectView> = views.iter().filter(|view| !view.cut).collect();
     let rays: Vec<DVec3> = views.iter().map(|view| view.camera.ray(view.centroid).normalize()).collect();
     let keys: Vec<usize> = views.iter().map(|view| view.time_index).collect();
@@ -72,9 +80,6 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
     }
     let mut weights: Vec<f64> = views.iter().map(|view| view.visible.powi(2) + 1e-4).collect();
     let mut stiffness = vec![CROSSING; keys.len()];
-    // Balls bounce; the middles of their masks are sure, so that a path that bends there is found before rays are told
-    // to be off it. Nothing else tells where its ends are.
-    let bounces = are_discs(views.iter().copied());
     let (rounds, sure, ends) = if bounces { BOUNCING } else { (ROUNDS, 0, 0) };
     let inner = ends..keys.len().saturating_sub(ends);
     let mut path = BTreeMap::new();
@@ -150,4 +155,28 @@ fn bend(keys: &[usize], path: &BTreeMap<usize, DVec3>, k: usize) -> DVec3 {
         return DVec3::ZERO;
     }
     second_difference(keys, k).iter().map(|(k, factor)| *factor * path[&keys[*k]]).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DQuat;
+
+    use super::super::testing::{TIMES, jumping, solid, sphere_places, views};
+    use super::*;
+
+    #[test]
+    fn a_path_that_bounces_is_nearer_where_it_does() {
+        let height = |time: usize| {
+            let share = (time % 15) as f64 / 15.0;
+            0.05 + 0.6 * share * (1.0 - share)
+        };
+        let place = |time: usize| DVec3::new(0.01 * time as f64 - 0.15, 0.0, height(time));
+        let still = DQuat::IDENTITY;
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (still, place(time))).collect();
+        let views = views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth, jumping);
+        let error = |path: &BTreeMap<usize, DVec3>| (path[&15] - place(15)).length();
+        let [found, smooth] =
+            [crossing(&views, TIMES), along_rays(&views, TIMES, false)].map(|path| error(&path));
+        assert!(found < 0.75 * smooth, "{found} m, {smooth} m if it did not bounce");
+    }
 }

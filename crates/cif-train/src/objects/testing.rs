@@ -35,6 +35,11 @@ pub(super) fn rig(_: usize) -> Vec<PinholeCamera> {
     [0.0, 1.2, 2.5, 3.7, 5.0].map(camera).to_vec()
 }
 
+/// One camera that looks from another side at every time.
+pub(super) fn jumping(time: usize) -> Vec<PinholeCamera> {
+    vec![camera(2.4 * time as f64)]
+}
+
 /// A camera above the floor, which looks at its origin.
 pub(super) fn camera(angle: f64) -> PinholeCamera {
     let centre = DVec3::new(1.1 * angle.sin(), -1.1 * angle.cos(), 0.8);

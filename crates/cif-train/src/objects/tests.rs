@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 
 use cif_field::tracks::RotationEvidence;
-use cif_geometry::PinholeCamera;
 use glam::{DQuat, DVec3};
 use rand::RngExt;
 
@@ -11,7 +10,7 @@ use super::outline;
 use super::plane::{self, Plane};
 use super::start::{Fitted, fit_object};
 use super::testing::{
-    Cameras, FLOOR, TIMES, camera, moving, patches, rig, solid, sphere_places, views, with_object,
+    Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views, with_object,
 };
 use super::view::ObjectView;
 use crate::random::{Purpose, stream};
@@ -225,11 +224,6 @@ fn a_bar_that_rolls_about_its_long_axis_is_found_by_its_texture() {
     let (turn, shift) = errors(&fitted.poses, &truth);
     assert!(fitted.way.starts_with("rolls"), "{}", fitted.way);
     assert!(turn < 15.0 && shift < 0.006, "{turn} deg, {shift} m");
-}
-
-/// One camera that looks from another side at every time.
-fn jumping(time: usize) -> Vec<PinholeCamera> {
-    vec![camera(2.4 * time as f64)]
 }
 
 #[test]
