@@ -21,6 +21,9 @@ const STRIDE: usize = 3;
 const FASTEST: f64 = 0.8;
 const APART: f64 = 0.1;
 
+/// The same of grids around the best of these.
+const FINER: [f64; 2] = [APART / 2.0, APART / 4.0];
+
 /// Times ahead that are looked at, with the same turn, for the turn of the next.
 const AHEAD: usize = 5;
 
@@ -143,17 +146,33 @@ fn grid(reach: f64, spacing: f64) -> Vec<DVec3> {
     turns
 }
 
-/// Agreement of sides that turn evenly, by so much from one time of the sequence to the next.
-fn even_agreement(sides: &[Side], turn: DVec3) -> f64 {
-    let mut texture = Texture::empty();
-    let mut sum = Agreement::default();
-    for side in sides {
-        let steps = side.time as f64 - sides[0].time as f64;
-        let rotation = DQuat::from_scaled_axis(steps * turn);
-        sum += texture.agreement(side, rotation);
-        texture.add(&Texture::of(side, rotation));
+/// The best of some turn and its score, and of those a grid away from a middle.
+fn best_around(
+    mut best: (f64, DVec3),
+    (middle, changes): (DVec3, &[DVec3]),
+    score: impl Fn(DVec3) -> f64,
+) -> (f64, DVec3) {
+    for change in changes {
+        let found = score(middle + *change);
+        if found > best.0 {
+            best = (found, middle + *change);
+        }
     }
-    sum.share()
+    best
+}
+
+/// The same on ever finer grids around the best.
+fn refined(mut best: (f64, DVec3), score: impl Fn(DVec3) -> f64) -> (f64, DVec3) {
+    for spacing in FINER {
+        best = best_around(best, (best.1, &grid(1.8 * spacing, spacing)), &score);
+    }
+    best
+}
+
+/// Rotations of sides that turn evenly, by so much from one time of the sequence to the next, from none at the first.
+fn evenly(sides: &[Side], turn: DVec3) -> Vec<DQuat> {
+    let steps = |side: &Side| side.time as f64 - sides[0].time as f64;
+    sides.iter().map(|side| DQuat::from_scaled_axis(steps(side) * turn)).collect()
 }
 
 /// A few sides in a row that turn evenly.
@@ -170,29 +189,13 @@ fn even_turns(sides: &[Side]) -> Vec<Even> {
     let turns = grid(FASTEST, APART);
     let best = |first: usize| {
         let few = &sides[first..(first + WINDOW).min(sides.len())];
-        let mut best = Even { first, turn: DVec3::ZERO, agreement: f64::NEG_INFINITY };
-        let mut take = |turn: DVec3| {
-            let agreement = even_agreement(few, turn);
-            if agreement > best.agreement {
-                best = Even { first, turn, agreement };
-            }
-            best.turn
-        };
-        let mut middle = DVec3::ZERO;
-        for turn in &turns {
-            middle = take(*turn);
-        }
-        for spacing in [APART / 2.0, APART / 4.0] {
-            let around = middle;
-            for change in grid(1.8 * spacing, spacing) {
-                middle = take(around + change);
-            }
-        }
-        best
+        let score = |turn: DVec3| agreement(few, &evenly(few, turn));
+        let coarse = best_around((f64::NEG_INFINITY, DVec3::ZERO), (DVec3::ZERO, &turns), score);
+        let (agreement, turn) = refined(coarse, score);
+        Even { first, turn, agreement }
     };
     let starts: Vec<usize> = (0..sides.len().saturating_sub(WINDOW - 1)).step_by(STRIDE).collect();
-    let found: Vec<Even> = starts.into_par_iter().map(best).collect();
-    found
+    starts.into_par_iter().map(best).collect()
 }
 
 /// Rotations of all sides, followed in both directions from some that turn evenly; `texture` is what is known of it.
@@ -200,10 +203,9 @@ fn grown(sides: &[Side], evens: &[Even], start: &Even, mut texture: Texture) -> 
     let Even { first, turn, .. } = *start;
     let last = (first + WINDOW).min(sides.len()) - 1;
     let mut turns = vec![DQuat::IDENTITY; sides.len()];
-    for k in first..=last {
-        let steps = sides[k].time as f64 - sides[first].time as f64;
-        turns[k] = DQuat::from_scaled_axis(steps * turn);
-        texture.add(&Texture::of(&sides[k], turns[k]));
+    for (k, rotation) in (first..=last).zip(evenly(&sides[first..=last], turn)) {
+        turns[k] = rotation;
+        texture.add(&Texture::of(&sides[k], rotation));
     }
     // Turn that agrees best among those of the few sides around one.
     let even = |k: usize| {
@@ -243,25 +245,13 @@ fn followed(
         let change = (turn - *rate).length().min(2.0 * (turn - even).length() + 0.1);
         sum.share() - CHANGE_COST * change * change / (CHANGE * CHANGE)
     };
+    let changes = grid(CHANGE, APART);
     let mut best = (score(*rate), *rate);
     for around in [*rate, even] {
-        for change in grid(CHANGE, APART) {
-            let found = score(around + change);
-            if found > best.0 {
-                best = (found, around + change);
-            }
-        }
+        best = best_around(best, (around, &changes), score);
     }
-    for (reach, spacing) in [(0.09, 0.05), (0.045, 0.025)] {
-        let middle = best.1;
-        for change in grid(reach, spacing) {
-            let found = score(middle + change);
-            if found > best.0 {
-                best = (found, middle + change);
-            }
-        }
-    }
-    *rate = best.1;
+    let (_, turn) = refined(best, score);
+    *rate = turn;
     let next = ahead.clone().next().unwrap_or(known);
     rotation(*rate, next)
 }

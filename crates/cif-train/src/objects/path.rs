@@ -100,10 +100,12 @@ fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usi
             let seen = views[k].visible.powi(2) + 1e-4;
             weights[k] = seen / (1.0 + (distances[k] / large.max(1e-12)).powi(2));
         }
-        let bends: Vec<f64> = (0..keys.len()).map(|k| bend(&keys, &found, k).length()).collect();
-        let large = KINK * median(&mut bends.clone());
-        for k in inner.clone().filter(|_| bounces) {
-            stiffness[k] = CROSSING * (1.0 / (1.0 + (bends[k] / large.max(1e-12)).powi(2))).max(LOOSE);
+        if bounces {
+            let bends: Vec<f64> = (0..keys.len()).map(|k| bend(&keys, &found, k).length()).collect();
+            let large = KINK * median(&mut bends.clone());
+            for k in inner.clone() {
+                stiffness[k] = CROSSING * (1.0 / (1.0 + (bends[k] / large.max(1e-12)).powi(2))).max(LOOSE);
+            }
         }
         path = found;
     }
