@@ -186,9 +186,12 @@ impl Trainer {
         let mut fresh = Gaussians::from_points(&positions, &colors)?;
         fresh.opacity_logits.fill(logit(OPACITY));
         fresh.occupancy_logits.fill(logit(self.state.config.instance.occupancy));
-        self.state.field.gaussians.append(&fresh);
-        self.state.guidance.guides.push(Guide { track, reference });
-        self.state.guidance.guide_of.resize(self.state.field.len(), self.state.guidance.guides.len() as u16);
+        // Objects with poses came in between, which no path holds.
+        let State { field, guidance, .. } = &mut self.state;
+        guidance.guide_of.resize(field.len(), 0);
+        field.gaussians.append(&fresh);
+        guidance.guides.push(Guide { track, reference });
+        guidance.guide_of.resize(field.len(), guidance.guides.len() as u16);
         Ok(())
     }
 

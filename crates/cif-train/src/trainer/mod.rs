@@ -39,6 +39,8 @@ mod gpu_tests;
 pub(crate) mod guard_tests;
 mod guidance;
 #[cfg(test)]
+mod guidance_tests;
+#[cfg(test)]
 mod head_tests;
 mod heads;
 mod identity;
