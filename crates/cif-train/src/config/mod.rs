@@ -15,7 +15,7 @@ use serde::{Deserialize, Serialize};
 
 pub use options::{
     Ablation, Excess, HeadName, InstanceGeometry, LabelShares, Normalisation, ObjectMotion, OccupancyStart,
-    Preset, ScaleCorrection, WeakSet,
+    Preset, ScaleCorrection, WeakSet, Weakness,
 };
 pub use validate::ConfigError;
 
@@ -323,6 +323,8 @@ pub struct ResampleConfig {
     pub gamma_floor: f32,
     /// Candidates of weak draws, `members` (default) or `literal` (A10).
     pub weak_set: WeakSet,
+    /// Strength by whose inverse candidates are drawn, `visibility` (default) or `occupancy` (as in `paper`).
+    pub weakness: Weakness,
     /// Largest share of the candidates of an instance that one event relocates, (0, 1], default 0.5. The paper states
     /// no limit: with 1 (as in `paper`) only one member of the instance is sure to stay, so that there is something to
     /// copy.

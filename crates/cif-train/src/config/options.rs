@@ -177,6 +177,17 @@ pub enum WeakSet {
     Literal,
 }
 
+/// Strength of a weak candidate, by whose inverse weak draws are made.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Weakness {
+    /// Its occupancy x identity (methods reference 6.1), however much of the picture it draws.
+    Occupancy,
+    /// The larger of that and its opacity: what draws the surroundings of an instance stays where it is.
+    #[default]
+    Visibility,
+}
+
 /// Relocations that an instance has too few weak candidates for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]

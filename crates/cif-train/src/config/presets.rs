@@ -73,6 +73,7 @@ fn paper(layout: Layout) -> TrainConfig {
         from: 100,
         until: 2_500,
         every: 100,
+        weakness: super::Weakness::Occupancy,
         weak_share: 1.0,
         excess: super::Excess::Share,
         ..config.resample
@@ -286,6 +287,7 @@ impl Default for ResampleConfig {
             rate: 0.01,
             gamma_floor: 1e-3,
             weak_set: super::WeakSet::Members,
+            weakness: super::Weakness::Visibility,
             weak_share: 0.5,
             excess: super::Excess::Drop,
             scale_correction: super::ScaleCorrection::Off,

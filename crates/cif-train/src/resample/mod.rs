@@ -12,7 +12,7 @@ use rand_distr::{Distribution, StandardNormal};
 pub use conserve::{conserved_logit, footprint_integral, scale_correction};
 pub use draw::{draw_with_replacement, draw_without_replacement, limited_shares, shares};
 
-use crate::config::{Excess, LabelShares, ResampleConfig, ScaleCorrection, WeakSet};
+use crate::config::{Excess, LabelShares, ResampleConfig, ScaleCorrection, WeakSet, Weakness};
 use crate::densify::in_world;
 use crate::estimate::most_probable;
 
@@ -80,8 +80,8 @@ fn gammas(field: &Field, identities: &Identities, context: &ResampleContext<'_>)
     gamma
 }
 
-/// Draws the pairs of one event: weak ones without replacement with weight 1 / gamma, then a source for each
-/// with weight gamma, among Gaussians that support the instance and are not weak in this event.
+/// Draws the pairs of one event: weak ones without replacement with weight 1 / strength (see [`Weakness`]), then a
+/// source for each with weight gamma, among Gaussians that support the instance and are not weak in this event.
 ///
 /// Shares that an instance cannot use (too few candidates, see [`ResampleConfig::weak_share`]) are left out or go to the
 /// others, see [`ResampleConfig::excess`]; those of an instance without a source are left out.
@@ -133,7 +133,12 @@ pub fn choose(field: &Field, context: &ResampleContext<'_>, rng: &mut impl Rng) 
             .iter()
             .map(|row| {
                 let floor = f64::from(context.config.gamma_floor);
-                1.0 / gamma_of(identities, &gamma, *row as usize, label as u16).unwrap_or(floor)
+                let strength = gamma_of(identities, &gamma, *row as usize, label as u16).unwrap_or(floor);
+                let opacity = f64::from(sigmoid(field.gaussians.opacity_logits[*row as usize]));
+                match context.config.weakness {
+                    Weakness::Occupancy => 1.0 / strength,
+                    Weakness::Visibility => 1.0 / strength.max(opacity),
+                }
             })
             .collect();
         weak[label] =

@@ -97,6 +97,25 @@ fn draws_beyond_the_weak_share_are_dropped_or_shared_and_one_member_stays() {
 }
 
 #[test]
+fn what_draws_the_surroundings_of_an_instance_stays() {
+    let mut scene = field();
+    // Of both instances; hardly occupied, but half of them opaque.
+    scene.gaussians.occupancy_logits[..20].fill(-6.0);
+    for (row, logit) in scene.gaussians.opacity_logits[..20].iter_mut().enumerate() {
+        *logit = if row < 10 { 4.0 } else { -6.0 };
+    }
+    let opaque = |weakness: Weakness| {
+        let config = ResampleConfig { rate: 0.1, weakness, ..ResampleConfig::default() };
+        let plans = (0..50)
+            .map(|seed| choose(&scene, &context(&config, &[false; 40]), &mut Pcg64::seed_from_u64(seed)));
+        plans.map(|plan| plan.pairs.iter().filter(|pair| pair.weak < 10).count()).sum::<usize>()
+    };
+    // Four of 40 per event.
+    assert!((70..130).contains(&opaque(Weakness::Occupancy)), "{}", opaque(Weakness::Occupancy));
+    assert!(opaque(Weakness::Visibility) < 5, "{}", opaque(Weakness::Visibility));
+}
+
+#[test]
 fn flagged_rows_are_never_sources() {
     let config = ResampleConfig { rate: 0.25, ..ResampleConfig::default() };
     let unseen: Vec<bool> = (0..40).map(|k| k >= 20).collect();
