@@ -19,7 +19,7 @@ use serde::ser::{Serialize, Serializer};
 pub use choice::{Basis, EffectChoice};
 
 use self::evidence::Evidence;
-use crate::config::TrainConfig;
+use crate::config::{ObjectMotion, TrainConfig};
 use crate::error::TrainError;
 use crate::trainer::automatic_time_nodes;
 
@@ -67,6 +67,8 @@ pub enum EffectKind {
     Appearing,
     /// Paths of travelling objects from their masks.
     Guidance,
+    /// Objects that move as a whole, or have a part on a joint: poses instead of the network.
+    Objects,
     /// Exposure and white balance per camera.
     Exposure,
     /// Compensation of opacity for the low-pass filter.
@@ -81,13 +83,14 @@ pub enum EffectKind {
 
 impl EffectKind {
     /// Those that `--effects` switches.
-    pub const SWITCHED: [Self; 9] = [
+    pub const SWITCHED: [Self; 10] = [
         Self::Motion,
         Self::Shape,
         Self::ViewDependence,
         Self::Instances,
         Self::Appearing,
         Self::Guidance,
+        Self::Objects,
         Self::Exposure,
         Self::Antialiasing,
         Self::Physics,
@@ -104,6 +107,7 @@ impl EffectKind {
             Self::Instances => "instances",
             Self::Appearing => "appearing",
             Self::Guidance => "guidance",
+            Self::Objects => "objects",
             Self::Exposure => "exposure",
             Self::Antialiasing => "antialiasing",
             Self::Lens => "lens",
@@ -237,6 +241,10 @@ fn set(kind: EffectKind, extent: Extent, config: &mut TrainConfig) {
             } else if (config.motion.guidance, config.motion.stillness) == (0.0, 0.0) {
                 (config.motion.guidance, config.motion.stillness) = (GUIDANCE, STILLNESS);
             }
+        }
+        EffectKind::Objects => {
+            config.motion.rigid = extent != Extent::Off;
+            config.motion.parts &= config.motion.rigid;
         }
         // Off, it leaves a preset that moves opacities as it is; `shape` judges these.
         EffectKind::Appearing => config.model.heads.opacity |= extent != Extent::Off,
@@ -405,6 +413,15 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
             },
             format!("{} steps before the fine stage", config.motion.rehearsal),
         ));
+        if effects.last().is_some_and(|guidance| guidance.decision != Decision::Off) {
+            let preset = if config.motion.rigid { Extent::Needed } else { Extent::Off };
+            let (words, why) = objects(found, config);
+            let cost = "a fit per object before the fine stage; then poses instead of the network";
+            effects.push(effect(EffectKind::Objects, preset, preset, &words, why, cost.to_owned()));
+            if let Some(objects) = effects.last_mut().filter(|effect| effect.decision != Decision::Off) {
+                objects.flag = "--motion-of 'LABEL=free' or '=rigid', or --effects -objects".to_owned();
+            }
+        }
     }
 
     if let Some((cameras, factor)) = found.exposures {
@@ -488,6 +505,36 @@ fn motion(found: &Evidence) -> (bool, String) {
         ),
         None => (true, format!("{} times; the cameras move, so that training must tell", found.times)),
     }
+}
+
+/// The motion that is tried for every instance, and why: training decides between poses and the network.
+fn objects(found: &Evidence, config: &TrainConfig) -> (String, String) {
+    let told = &config.motion.of;
+    let untold: Vec<&str> =
+        found.travelling.iter().map(String::as_str).filter(|label| !told.contains_key(*label)).collect();
+    let of = |motion: ObjectMotion| {
+        told.iter().filter(move |(_, told)| **told == motion).map(|(label, _)| format!("{label} (told)"))
+    };
+    let rigid: Vec<String> =
+        untold.iter().map(|label| (*label).to_owned()).chain(of(ObjectMotion::Rigid)).collect();
+    let free: Vec<String> = of(ObjectMotion::Free).collect();
+    let rest = found.instances.saturating_sub(untold.len() + told.len());
+    let mut words = Vec::new();
+    if !rigid.is_empty() {
+        words.push(format!("rigid, if pixels left out agree, else free: {}", rigid.join(", ")));
+    }
+    if !free.is_empty() {
+        words.push(format!("free: {}", free.join(", ")));
+    }
+    let joints = if config.motion.parts { ", unless a joint or a turn in place is found" } else { "" };
+    if rest > 0 {
+        words.push(format!("static: the other {rest}{joints}"));
+    }
+    let why = match &found.travelling[..] {
+        [] => "by their masks, none travels".to_owned(),
+        labels => format!("by their masks these travel: {}", labels.join(", ")),
+    };
+    (words.join("; "), why)
 }
 
 /// Number of travelling instances, in words; empty where none travels.

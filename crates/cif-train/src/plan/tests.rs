@@ -113,6 +113,7 @@ fn every_effect_says_why_and_what_decides_otherwise() {
             "instances",
             "appearing",
             "guidance",
+            "objects",
             "exposure",
             "antialiasing",
             "lens",
@@ -121,6 +122,27 @@ fn every_effect_says_why_and_what_decides_otherwise() {
         ]
     );
     assert_eq!(json["effects"][4]["decision"], "on");
+}
+
+#[test]
+fn the_motion_that_is_tried_is_told_object_by_object() {
+    let found = Evidence { travelling: vec!["ball".to_owned(), "scarf".to_owned()], ..found() };
+    let mut told = TrainConfig::default();
+    told.motion.of.insert("scarf".to_owned(), ObjectMotion::Free);
+    let plan = EffectPlan { effects: decide(&found, &told, &"auto".parse().unwrap()) };
+    let Some(Decision::Value(words)) = plan.decision(EffectKind::Objects) else { panic!("{plan:?}") };
+    assert!(
+        words.starts_with("rigid, if pixels left out agree, else free: ball; free: scarf (told);"),
+        "{words}"
+    );
+    assert!(words.contains("static: the other 3, unless a joint"), "{words}");
+    plan.apply(&mut told);
+    assert!(told.motion.rigid && told.motion.parts);
+    let (plan, config) = self::plan(&found, "auto,-objects");
+    assert_eq!(plan.decision(EffectKind::Objects), Some(&Decision::Off));
+    assert!(!config.motion.rigid && !config.motion.parts);
+    // Without paths nothing is fitted.
+    assert!(self::plan(&found, "auto,-guidance").0.decision(EffectKind::Objects).is_none());
 }
 
 #[test]
