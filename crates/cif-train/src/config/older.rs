@@ -1,12 +1,23 @@
 //! Settings recorded by earlier versions.
 
-use serde_json::Value;
+use serde_json::{Map, Value};
 
 use super::TrainConfig;
 
 /// Settings that there are no longer, with the value that leaves a run as it is without them.
 fn removed() -> [(&'static str, Value); 2] {
     [("/stages/tile_share", 1.0.into()), ("/adam/fresh_row_bias_correction", false.into())]
+}
+
+/// Settings that there were not, with the value that runs went by.
+fn added() -> [(&'static str, Value); 1] {
+    [("/resample/weakness", "occupancy".into())]
+}
+
+/// The table that holds a setting, and its key.
+fn place<'a>(json: &'a mut Value, path: &'static str) -> Option<(&'a mut Map<String, Value>, &'static str)> {
+    let (parent, key) = path.rsplit_once('/')?;
+    Some((json.pointer_mut(parent)?.as_object_mut()?, key))
 }
 
 impl TrainConfig {
@@ -16,9 +27,7 @@ impl TrainConfig {
     /// When they are none, or ask for something that this version cannot do, by name.
     pub fn recorded(mut json: Value) -> Result<Self, String> {
         for (path, harmless) in removed() {
-            let Some((parent, key)) = path.rsplit_once('/') else { continue };
-            let table = json.pointer_mut(parent).and_then(Value::as_object_mut);
-            if let Some(value) = table.and_then(|table| table.remove(key))
+            if let Some(value) = place(&mut json, path).and_then(|(table, key)| table.remove(key))
                 && value != harmless
             {
                 let name = path.trim_start_matches('/').replace('/', ".");
@@ -27,22 +36,30 @@ impl TrainConfig {
                 ));
             }
         }
+        for (path, former) in added() {
+            if let Some((table, key)) = place(&mut json, path) {
+                table.entry(key).or_insert(former);
+            }
+        }
         serde_json::from_value(json).map_err(|error| error.to_string())
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use super::super::Weakness;
     use super::*;
 
     #[test]
-    fn settings_that_did_nothing_are_dropped_and_others_are_named() {
+    fn settings_that_did_nothing_are_dropped_others_are_named_and_new_ones_stay_as_they_were() {
         let config = TrainConfig { seed: 9, ..TrainConfig::default() };
         let mut json = serde_json::to_value(&config).unwrap();
         assert_eq!(TrainConfig::recorded(json.clone()).unwrap(), config);
         json["stages"]["tile_share"] = 1.0.into();
         json["adam"]["fresh_row_bias_correction"] = false.into();
         assert_eq!(TrainConfig::recorded(json.clone()).unwrap(), config);
+        json["resample"].as_object_mut().unwrap().remove("weakness");
+        assert_eq!(TrainConfig::recorded(json.clone()).unwrap().resample.weakness, Weakness::Occupancy);
         json["stages"]["tile_share"] = 0.5.into();
         let error = TrainConfig::recorded(json).unwrap_err();
         assert!(error.contains("stages.tile_share = 0.5"), "{error}");
