@@ -512,20 +512,20 @@ fn objects(found: &Evidence, config: &TrainConfig) -> (String, String) {
     let told = &config.motion.of;
     let untold: Vec<&str> =
         found.travelling.iter().map(String::as_str).filter(|label| !told.contains_key(*label)).collect();
-    let of = |motion: ObjectMotion| {
-        told.iter().filter(move |(_, told)| **told == motion).map(|(label, _)| format!("{label} (told)"))
-    };
-    let rigid: Vec<String> =
-        untold.iter().map(|label| (*label).to_owned()).chain(of(ObjectMotion::Rigid)).collect();
-    let free: Vec<String> = of(ObjectMotion::Free).collect();
-    let rest = found.instances.saturating_sub(untold.len() + told.len());
     let mut words = Vec::new();
-    if !rigid.is_empty() {
-        words.push(format!("rigid, if pixels left out agree, else free: {}", rigid.join(", ")));
+    if !untold.is_empty() {
+        words.push(format!("rigid, if pixels left out agree, else free: {}", untold.join(", ")));
     }
-    if !free.is_empty() {
-        words.push(format!("free: {}", free.join(", ")));
+    // What is told is not judged.
+    for (name, motion) in [("rigid", ObjectMotion::Rigid), ("free", ObjectMotion::Free)] {
+        let labels: Vec<String> = (told.iter().filter(|(_, told)| **told == motion))
+            .map(|(label, _)| format!("{label} (told)"))
+            .collect();
+        if !labels.is_empty() {
+            words.push(format!("{name}: {}", labels.join(", ")));
+        }
     }
+    let rest = found.instances.saturating_sub(untold.len() + told.len());
     let joints = if config.motion.parts { ", unless a joint or a turn in place is found" } else { "" };
     if rest > 0 {
         words.push(format!("static: the other {rest}{joints}"));

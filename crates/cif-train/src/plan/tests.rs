@@ -138,6 +138,10 @@ fn the_motion_that_is_tried_is_told_object_by_object() {
     assert!(words.contains("static: the other 3, unless a joint"), "{words}");
     plan.apply(&mut told);
     assert!(told.motion.rigid && told.motion.parts);
+    // What is told is not judged.
+    told.motion.of.insert("ball".to_owned(), ObjectMotion::Rigid);
+    let (words, _) = objects(&found, &told);
+    assert!(words.starts_with("rigid: ball (told); free: scarf (told); static: the other 3"), "{words}");
     let (plan, config) = self::plan(&found, "auto,-objects");
     assert_eq!(plan.decision(EffectKind::Objects), Some(&Decision::Off));
     assert!(!config.motion.rigid && !config.motion.parts);
