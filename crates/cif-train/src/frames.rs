@@ -17,7 +17,7 @@ use rayon::prelude::*;
 
 use crate::error::TrainError;
 use crate::stop::Stop;
-use crate::switches::{colors, put_right, switches};
+use crate::switches::{Seen, put_right, switches};
 use crate::tracks::{misfits, observe};
 
 /// A decoded frame.
@@ -175,7 +175,8 @@ impl FrameStore {
     ) -> Result<&BTreeMap<usize, BTreeMap<u16, u16>>, TrainError> {
         let of = |k: usize| {
             stop.check()?;
-            Ok(colors(&*self.get(dataset, k)?))
+            let frame = &dataset.frames[self.index(k)];
+            Ok(Seen::of(&*self.get(dataset, k)?, &frame.camera_name, frame.time_index))
         };
         let seen: Vec<_> = (0..self.len()).into_par_iter().map(of).collect::<Result<_, TrainError>>()?;
         let found =

@@ -135,7 +135,8 @@ fn switch_warning(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u1
     let found: Vec<String> = pairs.chain(singles).collect();
     (!found.is_empty()).then(|| {
         format!(
-            "masks show other objects by their colours, frames: {} (motion.switches = false keeps such masks)",
+            "masks show other objects by their colours and places, frames: {} (motion.switches = false keeps such \
+             masks)",
             found.join(", ")
         )
     })

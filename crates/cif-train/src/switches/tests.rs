@@ -1,0 +1,161 @@
+use super::*;
+
+const RED: [u8; 3] = [200, 30, 30];
+const GREEN: [u8; 3] = [30, 180, 40];
+const BLUE: [u8; 3] = [30, 60, 210];
+const GREY: [u8; 3] = [120, 120, 120];
+const STRIPES: [[u8; 3]; 2] = [[240, 240, 230], [20, 20, 120]];
+
+const SIZE: [u32; 2] = [60, 20];
+
+/// A rectangle of pixels: left, top, width and height.
+type Rectangle = [u32; 4];
+
+/// Frame `time` of a camera: what is there (colour and rectangle), and what is labelled (label and rectangle).
+fn frame(time: usize, things: &[([u8; 3], Rectangle)], masks: &[(u16, Rectangle)]) -> Seen {
+    fn paint<T: Copy>(filled: T, painted: &[(T, Rectangle)]) -> PixelGrid<T> {
+        let mut grid = PixelGrid::filled(SIZE[0], SIZE[1], filled);
+        for (value, [left, top, width, height]) in painted {
+            for at in 0..width * height {
+                let (x, y) = (left + at % width, top + at / width);
+                grid.pixels[(y * SIZE[0] + x) as usize] = *value;
+            }
+        }
+        grid
+    }
+    let frame =
+        TrainFrame { image: paint(GREY, things), labels: Some(paint(0, masks)), labelled: 0, features: None };
+    Seen::of(&frame, "camera", time)
+}
+
+/// A red thing (1), a green one (2) and a striped one (3) in shadow and light; `shown` tells which a mask shows.
+fn frames(count: usize, shown: impl Fn(usize, u16) -> Option<u16>) -> Vec<Seen> {
+    let frame = |k: usize| {
+        let label_at = |at: u32| (at % 30 / 10) as u16 + 1;
+        let color = |at: u32| {
+            let light = 0.9 + 0.1 * (k as f64 + f64::from(at) * 0.01).sin();
+            let color = match shown(k, label_at(at)) {
+                Some(1) => RED,
+                Some(2) => GREEN,
+                _ => STRIPES[(at / 2 % 2) as usize],
+            };
+            color.map(|c| (f64::from(c) * light) as u8)
+        };
+        let label = |at: u32| Some(label_at(at)).filter(|label| shown(k, *label).is_some()).unwrap_or(0);
+        let image = PixelGrid::from_pixels(30, 10, (0..300).map(color).collect());
+        let labels = PixelGrid::from_pixels(30, 10, (0..300).map(label).collect());
+        Seen::of(&TrainFrame { image, labels: Some(labels), labelled: 0, features: None }, "camera", k)
+    };
+    (0..count).map(frame).collect()
+}
+
+#[test]
+fn exchanged_masks_are_put_back_and_others_are_taken_away() {
+    let shown = |k: usize, label: u16| match (k, label) {
+        (5 | 6, 1) => Some(2),
+        (5 | 6, 2) => Some(1),
+        // The red thing is hidden, and its mask on the striped one.
+        (11, 1) => Some(3),
+        // One mask is missing, which is no switch.
+        (13, 2) => None,
+        (_, label) => Some(label),
+    };
+    let found = switches(&frames(20, shown));
+    for (k, renamed) in found.iter().enumerate() {
+        let expected = match k {
+            5 | 6 => BTreeMap::from([(1, 2), (2, 1)]),
+            11 => BTreeMap::from([(1, UNLABELLED)]),
+            _ => BTreeMap::new(),
+        };
+        assert_eq!(*renamed, expected, "frame {k}");
+    }
+    let labels = PixelGrid::from_pixels(3, 1, vec![1, 2, 3]);
+    assert_eq!(put_right(&labels, &found[5]).pixels, [2, 1, 3]);
+}
+
+#[test]
+fn light_and_twins_and_too_many_switches_change_nothing() {
+    assert!(switches(&frames(20, |_, label| Some(label))).iter().all(BTreeMap::is_empty));
+    let twins = |k: usize, label: u16| Some(if label == 2 || k == 7 { 1 } else { label });
+    let found = switches(&frames(20, twins));
+    assert!(found.iter().all(|renamed| !renamed.contains_key(&1) && !renamed.contains_key(&2)), "{found:?}");
+    let often = |k: usize, label: u16| Some(if k.is_multiple_of(2) && label < 3 { 3 - label } else { label });
+    assert!(switches(&frames(20, often)).iter().all(BTreeMap::is_empty));
+    assert!(switches(&frames(4, |k, l| Some(if k == 1 { 2 } else { l }))).iter().all(BTreeMap::is_empty));
+    assert!(switches(&[]).is_empty());
+}
+
+/// Two things of these colours, one of which moves, with their labels exchanged in some of 20 frames.
+fn pair(colors: [[u8; 3]; 2], exchanged: impl Fn(usize) -> bool) -> Vec<Seen> {
+    let frame = |k: usize| {
+        let places = [[5 + k as u32 / 2, 4, 8, 8], [40, 6, 8, 8]];
+        let labels = if exchanged(k) { [2, 1] } else { [1, 2] };
+        let things = [0, 1].map(|thing| (colors[thing], places[thing]));
+        frame(k, &things, &[0, 1].map(|thing| (labels[thing], places[thing])))
+    };
+    (0..20).map(frame).collect()
+}
+
+#[test]
+fn masks_of_equal_things_that_change_places_are_put_back() {
+    let both = BTreeMap::from([(1, 2), (2, 1)]);
+    // For a while, until the end, and from the beginning.
+    for span in [8..12, 15..20, 0..4] {
+        let found = switches(&pair([RED, RED], |k| span.contains(&k)));
+        for (k, renamed) in found.iter().enumerate() {
+            assert_eq!(*renamed == both, span.contains(&k), "frame {k} of {span:?}: {renamed:?}");
+        }
+    }
+    // Nobody knows which is which.
+    assert!(switches(&pair([RED, RED], |k| k < 9)).iter().all(BTreeMap::is_empty));
+}
+
+#[test]
+fn colors_overrule_places() {
+    // Two things that do change places: the masks follow their colours.
+    let crossing = |k: usize| {
+        let places = [[5, 4, 8, 8], [40, 6, 8, 8]];
+        let places = if k < 16 { places } else { [places[1], places[0]] };
+        frame(k, &[(RED, places[0]), (GREEN, places[1])], &[(1, places[0]), (2, places[1])])
+    };
+    let found = switches(&(0..20).map(crossing).collect::<Vec<_>>());
+    assert!(found.iter().all(BTreeMap::is_empty), "{found:?}");
+}
+
+/// A red thing (1) that rests beside a blue one (2), whose mask is another one in one of 20 frames.
+fn resting(at: usize, mask: Rectangle) -> Vec<Seen> {
+    let (red, blue) = ([10, 5, 8, 8], [18, 5, 20, 8]);
+    let frame = |k: usize| {
+        let of_red = if k == at { mask } else { red };
+        frame(k, &[(RED, red), (BLUE, blue)], &[(2, blue), (1, of_red)])
+    };
+    (0..20).map(frame).collect()
+}
+
+#[test]
+fn masks_without_the_place_and_the_colors_of_their_object_are_taken_away() {
+    let taken = |seen: &[Seen]| -> Vec<usize> {
+        let found = switches(seen);
+        let of_red = |renamed: &BTreeMap<u16, u16>| renamed.get(&1) == Some(&UNLABELLED);
+        assert!(found.iter().all(|renamed| !renamed.contains_key(&2)), "{found:?}");
+        (0..found.len()).filter(|k| of_red(&found[*k])).collect()
+    };
+    // On the ground somewhere else, and over the edge of the blue thing as well.
+    assert_eq!(taken(&resting(7, [45, 12, 5, 5])), [7]);
+    assert_eq!(taken(&resting(7, [10, 5, 20, 8])), [7]);
+    // A part of it, of its colours; a little too large; and where it is, but of another colour, as in a shadow.
+    assert!(taken(&resting(7, [10, 5, 3, 8])).is_empty());
+    assert!(taken(&resting(7, [9, 4, 10, 9])).is_empty());
+    let shadow = |k: usize| {
+        let color = if (5..9).contains(&k) { [60, 10, 10] } else { RED };
+        frame(k, &[(color, [10, 5, 8, 8])], &[(1, [10, 5, 8, 8])])
+    };
+    assert!(taken(&(0..20).map(shadow).collect::<Vec<_>>()).is_empty());
+    // Where the camera jumps, only colours tell.
+    let jumps = |k: usize| {
+        let left = if k.is_multiple_of(2) { 5 } else { 40 };
+        let mask = if k == 7 { [20, 10, 8, 8] } else { [left, 5, 8, 8] };
+        frame(k, &[(RED, [left, 5, 8, 8])], &[(1, mask)])
+    };
+    assert_eq!(taken(&(0..20).map(jumps).collect::<Vec<_>>()), [7]);
+}
