@@ -7,7 +7,7 @@ use glam::{DMat2, DVec2, DVec3};
 use super::path;
 use super::plane::Plane;
 use super::view::{ObjectView, WITHIN, are_discs, median};
-use crate::tracks::nearest_to_rays;
+use crate::tracks::{across, nearest_to_rays};
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
@@ -78,9 +78,37 @@ struct Reading {
     is_bar: bool,
 }
 
-/// The point nearest to rays through the middles of masks, by weights; `None` where they are parallel.
+/// Rays from which some may be told to miss the others, and the distance, in middle ones, at which a ray counts half.
+const MOST_MEET: usize = 4;
+const FAR: f64 = 3.0;
+
+/// The point nearest to rays through the middles of masks, by weights; `None` where they are parallel. Of several rays,
+/// those that miss the point where most others meet count less: masks that show more than the object, or another.
 pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64)>) -> Option<DVec3> {
-    nearest_to_rays(views.map(|(view, weight)| (&view.camera, view.centroid, weight)), PARALLEL)
+    let views: Vec<(&ObjectView, f64)> = views.collect();
+    let nearest = |shares: &[(usize, f64)]| {
+        let rays =
+            shares.iter().map(|(k, share)| (&views[*k].0.camera, views[*k].0.centroid, views[*k].1 * share));
+        nearest_to_rays(rays, PARALLEL)
+    };
+    let all: Vec<(usize, f64)> = (0..views.len()).map(|k| (k, 1.0)).collect();
+    if views.len() < MOST_MEET {
+        return nearest(&all);
+    }
+    let distances = |point: DVec3| -> Vec<f64> {
+        let distance = |(view, _): &(&ObjectView, f64)| {
+            (across(&view.camera, view.centroid) * (point - view.camera.centre())).length()
+        };
+        views.iter().map(distance).collect()
+    };
+    // Of the points where two rays meet, and that where all do, the one that is nearest to the middle ray.
+    let pairs = (0..views.len()).flat_map(|a| (0..a).map(move |b| vec![(a, 1.0), (b, 1.0)]));
+    let points = pairs.chain([all]).filter_map(|rays| nearest(&rays));
+    let middle = |point: DVec3| median(&mut distances(point));
+    let (point, middle) = points.map(|point| (point, middle(point))).min_by(|a, b| a.1.total_cmp(&b.1))?;
+    let far = (FAR * middle).max(1e-9);
+    let share = |distance: f64| 1.0 / (1.0 + (distance / far).powi(4));
+    nearest(&distances(point).into_iter().map(share).enumerate().collect::<Vec<_>>())
 }
 
 /// Outline of the views of an object: on a plane where there is one, seen by several cameras at a time, or by one that
@@ -132,6 +160,7 @@ fn meetings(views: &[ObjectView]) -> BTreeMap<usize, DVec3> {
 
 /// Outline of the views of an object on a plane; `None` where no mask is seen from above.
 fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
+    let is_ball = are_discs(views.iter());
     let whole: Vec<&ObjectView> = match views.iter().filter(|view| view.is_whole()).collect::<Vec<_>>() {
         whole if !whole.is_empty() => whole,
         _ => match views.iter().filter(|view| !view.cut).collect::<Vec<_>>() {
@@ -140,7 +169,7 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
         },
     };
     let mut grounded = whole.clone();
-    let mut medians = median_reading(&grounded, plane)?;
+    let mut medians = median_reading(&grounded, plane, is_ball)?;
     for _ in 0..3 {
         let mut sizes: Vec<f64> =
             whole.iter().filter_map(|view| implied_size(view, plane, medians.height)).collect();
@@ -150,7 +179,7 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
             implied_size(view, plane, medians.height).is_some_and(|size| size <= AIR * low)
         };
         let found: Vec<&ObjectView> = whole.iter().filter(is_grounded).copied().collect();
-        let Some(reading) = median_reading(&found, plane) else { break };
+        let Some(reading) = median_reading(&found, plane, is_ball) else { break };
         (grounded, medians) = (found, reading);
     }
     let mut sizes: Vec<f64> =
@@ -163,7 +192,7 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
     let larger = views.iter().filter(|view| looks_larger(view)).count();
     let leaves = larger as f64 > (1.0 - GROUNDED) * uncut as f64;
     if !leaves {
-        medians = median_reading(&whole, plane)?;
+        medians = median_reading(&whole, plane, is_ball)?;
     }
     let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
     for view in views {
@@ -199,8 +228,8 @@ fn implied_size(view: &ObjectView, plane: &Plane, height: f64) -> Option<f64> {
     Some(view.area().sqrt() * depth / view.camera.focal_px.x)
 }
 
-fn median_reading(views: &[&ObjectView], plane: &Plane) -> Option<Reading> {
-    let readings: Vec<Reading> = views.iter().filter_map(|view| read(view, plane)).collect();
+fn median_reading(views: &[&ObjectView], plane: &Plane, is_ball: bool) -> Option<Reading> {
+    let readings: Vec<Reading> = views.iter().filter_map(|view| read(view, plane, is_ball)).collect();
     let of = |value: fn(&Reading) -> f64| median(&mut readings.iter().map(value).collect::<Vec<_>>());
     // A bar looks shorter from its ends.
     let mut bars: Vec<f64> = readings.iter().filter(|r| r.is_bar).map(|r| r.radius).collect();
@@ -215,8 +244,8 @@ fn median_reading(views: &[&ObjectView], plane: &Plane) -> Option<Reading> {
 }
 
 /// Half height and radius of the upright cylinder, or the ellipsoid, on the plane that fills the extent of a mask
-/// along and across the image of the normal.
-fn read(view: &ObjectView, plane: &Plane) -> Option<Reading> {
+/// along and across the image of the normal. That of a ball is an ellipsoid, however rough its masks are.
+fn read(view: &ObjectView, plane: &Plane, is_ball: bool) -> Option<Reading> {
     let camera = &view.camera;
     let ray = camera.ray(view.centroid);
     let slope = plane.normal.dot(ray);
@@ -260,7 +289,7 @@ fn read(view: &ObjectView, plane: &Plane) -> Option<Reading> {
             inside += 1.0;
         }
     }
-    let roundness = inside / (joined - inside);
+    let roundness: f64 = if is_ball { 1.0 } else { inside / (joined - inside) };
     let share = 0.5 + 0.5 * ((roundness - 0.93) / 0.04).clamp(0.0, 1.0);
     let range = |axis: usize| {
         let mut values: Vec<f64> = places.iter().map(|place| place[axis]).collect();
