@@ -6,7 +6,7 @@ use glam::{DMat2, DVec2, DVec3};
 
 use super::path;
 use super::plane::Plane;
-use super::view::{ObjectView, WITHIN, are_discs, median};
+use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median};
 use crate::tracks::{across, nearest_to_rays};
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
@@ -22,6 +22,11 @@ const SHORTEST_RUN: usize = 3;
 
 /// Determinant up to which rays count as parallel.
 const PARALLEL: f64 = 1e-9;
+
+/// Times before and after one among which its size is the middle one, and the usual change by it, of the size, from which
+/// masks are rough.
+const STEADY: usize = 2;
+const ROUGH: f64 = 0.005;
 
 /// Length of a mask in its widths from which it is that of a bar, and the sine of the angle between its long axis and
 /// the way down from which the bar lies.
@@ -185,27 +190,27 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
     let mut sizes: Vec<f64> =
         grounded.iter().filter_map(|view| implied_size(view, plane, medians.height)).collect();
     let in_contact = median(&mut sizes);
-    let looks_larger = |view: &ObjectView| {
-        !view.cut && implied_size(view, plane, medians.height).is_some_and(|size| size > AIR * in_contact)
-    };
+    let larger = steady_sizes(views, plane, medians.height);
+    let larger = larger.iter().filter(|size| size.is_some_and(|size| size > AIR * in_contact)).count();
     let uncut = views.iter().filter(|view| !view.cut).count();
-    let larger = views.iter().filter(|view| looks_larger(view)).count();
     let leaves = larger as f64 > (1.0 - GROUNDED) * uncut as f64;
     if !leaves {
         medians = median_reading(&whole, plane, is_ball)?;
     }
     let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
-    for view in views {
+    for (view, size) in views.iter().zip(steady_sizes(views, plane, medians.height)) {
         let ray = view.camera.ray(view.centroid);
         let Some(mut depth) = plane.meet(view.camera.centre(), ray, medians.height) else { continue };
-        let size = implied_size(view, plane, medians.height).unwrap_or(0.0);
-        if leaves && !view.cut && size > in_contact {
+        if leaves
+            && let Some(size) = size
+            && size > in_contact
+        {
             depth *= in_contact / size;
         }
         let (sum, weight, touches) = sums.entry(view.time_index).or_insert((DVec3::ZERO, 0.0, false));
         *sum += view.area() * (view.camera.centre() + depth * ray);
         *weight += view.area();
-        *touches |= !leaves || (!view.cut && (size / in_contact - 1.0).abs() < SAME_SIZE);
+        *touches |= !leaves || size.is_some_and(|size| (size / in_contact - 1.0).abs() < SAME_SIZE);
     }
     let touching: Vec<(usize, bool)> = sums.iter().map(|(time, (_, _, touches))| (*time, *touches)).collect();
     let runs = touching.chunk_by(|a, b| a.1 == b.1);
@@ -226,6 +231,21 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
 fn implied_size(view: &ObjectView, plane: &Plane, height: f64) -> Option<f64> {
     let depth = plane.meet(view.camera.centre(), view.camera.ray(view.centroid), height)?;
     Some(view.area().sqrt() * depth / view.camera.focal_px.x)
+}
+
+/// Sizes that masks imply in the order of their times, `None` for those that the border cuts. Those of rough masks are
+/// the middle ones of a few times, so that their objects do not seem to come nearer and go.
+fn steady_sizes(views: &[ObjectView], plane: &Plane, height: f64) -> Vec<Option<f64>> {
+    let of = |view: &ObjectView| implied_size(view, plane, height).filter(|_| !view.cut);
+    let sizes: Vec<Option<f64>> = views.iter().map(of).collect();
+    let middle = |k: usize| {
+        let near = k.saturating_sub(STEADY)..(k + STEADY + 1).min(sizes.len());
+        sizes[k].map(|_| median(&mut sizes[near].iter().flatten().copied().collect::<Vec<_>>()))
+    };
+    let steady: Vec<Option<f64>> = (0..sizes.len()).map(middle).collect();
+    let both = sizes.iter().flatten().zip(steady.iter().flatten());
+    let mut changes: Vec<f64> = both.map(|(size, steady)| (size / steady - 1.0).abs()).collect();
+    if is_one_camera(views) && median(&mut changes) > ROUGH { steady } else { sizes }
 }
 
 fn median_reading(views: &[&ObjectView], plane: &Plane, is_ball: bool) -> Option<Reading> {
@@ -340,4 +360,56 @@ fn bar(places: &[DVec2], mean: DVec2, moments: DMat2) -> Option<[f64; 2]> {
         let at = |share: f64| values[((values.len() - 1) as f64 * share).round() as usize];
         at(0.99) - at(0.01) + 0.5
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DQuat;
+    use rand::RngExt;
+
+    use super::super::testing::{FLOOR, TIMES, moving, rig, solid, sphere_places, views};
+    use super::*;
+    use crate::random::{Purpose, stream};
+
+    const RADIUS: f64 = 0.05;
+
+    /// A plain ball that rests on the floor, at one time or at all.
+    fn ball(times: usize, cameras: super::super::testing::Cameras) -> Vec<ObjectView> {
+        let rests = (DQuat::IDENTITY, DVec3::new(0.0, 0.0, RADIUS));
+        let mut all =
+            views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &[rests; TIMES], cameras);
+        all.retain(|view| view.time_index < times);
+        all
+    }
+
+    #[test]
+    fn rays_that_miss_the_others_do_not_move_the_point() {
+        let mut views = ball(1, rig);
+        let point = |views: &[ObjectView]| meeting_point(views.iter().map(|view| (view, 1.0))).unwrap();
+        let clean = point(&views);
+        views[2].centroid += DVec2::new(25.0, -10.0);
+        views[4].centroid += DVec2::new(-5.0, 30.0);
+        assert!((point(&views) - clean).length() < 0.003, "{} and {clean}", point(&views));
+        // Three cannot tell which misses.
+        views.truncate(3);
+        assert!((point(&views) - clean).length() > 0.01);
+    }
+
+    #[test]
+    fn rough_masks_of_a_ball_tell_its_size() {
+        let mut views = ball(TIMES, moving);
+        let mut rng = stream(0, Purpose::Objects, 3);
+        for view in &mut views {
+            // The outline goes in and out by some pixels.
+            let phase = rng.random::<f64>() * 6.0;
+            let middle = view.centroid;
+            view.pixels.retain(|[x, y]| {
+                let d = DVec2::new(f64::from(*x) + 0.5, f64::from(*y) + 0.5) - middle;
+                d.length() < RADIUS * 240.0 * (1.0 + 0.06 * (3.0 * d.y.atan2(d.x) + phase).sin())
+            });
+        }
+        let found = outline(&views, Some(&FLOOR), TIMES).unwrap();
+        assert!(found.air.is_empty(), "{:?}", found.air);
+        assert!((found.height / found.radius - 1.0).abs() < 0.06, "{} and {}", found.height, found.radius);
+    }
 }

@@ -1,11 +1,12 @@
 //! The path of an object's centre: smoothed, or found where the rays of one camera cross that sees it from other sides
 //! soon after.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, DVector};
 
+use super::outline::Outline;
 use super::view::{ObjectView, are_discs, median};
 use crate::tracks::across;
 
@@ -17,6 +18,12 @@ pub(super) const CROSSING: f64 = 0.01;
 
 /// Weight of a time whose masks are cut by the border.
 const CUT: f64 = 0.05;
+
+/// Distance of a place from between those before and after, in sizes and in usual ones, from which it is aside, and the
+/// largest share of such places.
+const ASIDE: f64 = 1.0;
+const OF_USUAL: f64 = 5.0;
+const ASIDE_SHARE: f64 = 0.2;
 
 /// Times on either side among which rays cross, and the angle from which they do, radians.
 const BESIDE: usize = 2;
@@ -33,27 +40,58 @@ const BOUNCING: (usize, usize, usize) = (8, 3, 3);
 const KINK: f64 = 4.0;
 const LOOSE: f64 = 0.05;
 
-/// The path that stays near `raw` where the object is well seen, and bends little, by its stiffness; `times` of the
-/// whole sequence.
+/// The path that stays near `raw` where the object, of this size, is well seen, and bends little, by its stiffness;
+/// `times` of the whole sequence. Of an object that stays on its support it passes by places that are far aside of
+/// those before and after them, where a mask shows something else as well.
 pub(super) fn smooth(
     raw: &BTreeMap<usize, DVec3>,
     views: &[ObjectView],
     times: usize,
-    stiffness: f64,
+    outline: &Outline,
 ) -> BTreeMap<usize, DVec3> {
     let keys: Vec<usize> = raw.keys().copied().collect();
     if keys.len() < 3 {
         return raw.clone();
     }
+    let aside = if outline.air.is_empty() { aside(raw, outline.size()) } else { BTreeSet::new() };
     let near = |time: &usize| {
         let of = || views.iter().filter(|view| view.time_index == *time);
         let seen = of().map(|view| view.visible).fold(0.0, f64::max);
         let cut = if of().any(|view| view.cut) { CUT } else { 1.0 };
-        let weight = seen * seen * cut + 1e-4;
+        let weight = if aside.contains(time) { 0.0 } else { seen * seen * cut } + 1e-4;
         (DMat3::IDENTITY * weight, weight * raw[time])
     };
     let near: Vec<(DMat3, DVec3)> = keys.iter().map(near).collect();
-    even(&keys, &near, &vec![stiffness; keys.len()], times).unwrap_or_else(|| raw.clone())
+    even(&keys, &near, &vec![outline.stiffness; keys.len()], times).unwrap_or_else(|| raw.clone())
+}
+
+/// Times at which a path of an object of this size jumps aside, and back.
+fn aside(raw: &BTreeMap<usize, DVec3>, size: f64) -> BTreeSet<usize> {
+    let mut kept: Vec<usize> = raw.keys().copied().collect();
+    let mut found = BTreeSet::new();
+    let most = (ASIDE_SHARE * kept.len() as f64) as usize;
+    while found.len() < most && kept.len() > 3 {
+        // From between those beside it; at the ends from where the next two lead.
+        let jump = |k: usize| {
+            let last = kept.len() - 1;
+            let [a, b] = if k == 0 {
+                [1, 2]
+            } else if k == last {
+                [last - 1, last - 2]
+            } else {
+                [k - 1, k + 1]
+            };
+            let [time, a, b] = [k, a, b].map(|k| kept[k]);
+            let share = (time as f64 - a as f64) / (b as f64 - a as f64);
+            (raw[&time] - raw[&a].lerp(raw[&b], share)).length()
+        };
+        let jumps: Vec<f64> = (0..kept.len()).map(jump).collect();
+        let far = (ASIDE * size).max(OF_USUAL * median(&mut jumps.clone()));
+        let largest = (0..jumps.len()).max_by(|a, b| jumps[*a].total_cmp(&jumps[*b]));
+        let Some(k) = largest.filter(|k| jumps[*k] > far) else { break };
+        found.insert(kept.remove(k));
+    }
+    found
 }
 
 /// The path that passes near the rays of one view per time and bends little; nothing where neighbouring rays hardly
@@ -165,6 +203,20 @@ mod tests {
 
     use super::super::testing::{TIMES, jumping, solid, sphere_places, views};
     use super::*;
+
+    #[test]
+    fn places_aside_of_a_path_are_passed_by() {
+        let straight = |time: usize| (time, DVec3::new(0.02 * time as f64, 0.1, 0.0));
+        let bends = |time: usize| (time, DVec3::new((0.3 * time as f64).sin(), 0.1, 0.0));
+        for wrong in [0, 7, 19] {
+            let mut path: BTreeMap<usize, DVec3> = (0..20).map(straight).collect();
+            assert!(aside(&path, 0.05).is_empty());
+            path.insert(wrong, DVec3::new(0.02 * wrong as f64, -0.2, 0.0));
+            assert_eq!(aside(&path, 0.05), BTreeSet::from([wrong]));
+        }
+        // Fast, but not aside.
+        assert!(aside(&(0..20).map(bends).collect(), 0.05).is_empty());
+    }
 
     #[test]
     fn a_path_that_bounces_is_nearer_where_it_does() {

@@ -107,7 +107,7 @@ pub(super) struct Started<'a> {
 pub(super) fn fit_object(object: Object<'_>) -> Result<Option<Fitted>, TrainError> {
     let Object { views, outline, .. } = object;
     let stop = object.surroundings.stop;
-    let path = smooth(&outline.path, views, object.surroundings.times, outline.stiffness);
+    let path = smooth(&outline.path, views, object.surroundings.times, outline);
     let reliable: Vec<usize> = object.views_at(&path).filter(|view| views[*view].is_reliable()).collect();
     let mut good: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
     good.dedup();

@@ -87,7 +87,7 @@ pub(super) fn best_way<'a>(
 ) -> Result<Option<Started<'a>>, TrainError> {
     let Object { views, outline, surroundings, .. } = object;
     let raw: BTreeMap<usize, DVec3> = good.iter().map(|time| (*time, outline.path[time])).collect();
-    let along = smooth(&raw, views, surroundings.times, outline.stiffness);
+    let along = smooth(&raw, views, surroundings.times, outline);
     let reference = object.best_seen(good.iter().copied()).unwrap_or(good[0]);
     let (train, left_out) = split(views, reliable, good);
     let is_trained = |time: usize| train.iter().any(|view| views[*view].time_index == time);
