@@ -175,8 +175,9 @@ impl FrameStore {
     ) -> Result<&BTreeMap<usize, BTreeMap<u16, u16>>, TrainError> {
         let of = |k: usize| {
             stop.check()?;
-            let frame = &dataset.frames[self.index(k)];
-            Ok(Seen::of(&*self.get(dataset, k)?, &frame.camera_name, frame.time_index))
+            let of = &dataset.frames[self.index(k)];
+            let frame = self.get(dataset, k)?;
+            Ok(Seen::of(&frame.image, frame.labels.as_ref(), &of.camera_name, of.time_index))
         };
         let seen: Vec<_> = (0..self.len()).into_par_iter().map(of).collect::<Result<_, TrainError>>()?;
         let found =

@@ -4,9 +4,11 @@ use std::collections::BTreeMap;
 
 use cif_dataset::{Dataset, Frame, PointSource, Split};
 use glam::DVec3;
+use rayon::prelude::*;
 
 use crate::config::MotionConfig;
 use crate::error::TrainError;
+use crate::switches::{Seen, put_right, switches};
 use crate::tracks::{Observation, misfits, observe, travels};
 
 /// Masks that are looked at, spread evenly over the training frames.
@@ -159,12 +161,24 @@ impl<'a> Sightings<'a> {
         }
         let mut masked = masked.to_vec();
         masked.sort_by_key(|(_, frame)| frame.time_index);
-        let (mut frames, mut seen) = (Vec::new(), Vec::new());
-        for (index, frame) in spread(&masked, MASKS) {
-            let Some(mask) = dataset.load_mask(index)? else { continue };
+        let load = |(index, frame): (usize, &'a Frame)| {
+            let Some(mask) = dataset.load_mask(index)? else { return Ok(None) };
+            let image = dataset.load_image(index, [1.0; 3])?;
+            let seen = Seen::of(&image, Some(&mask), &frame.camera_name, frame.time_index);
+            Ok(Some((frame, mask, seen)))
+        };
+        let loaded: Vec<_> =
+            spread(&masked, MASKS).into_par_iter().map(load).collect::<Result<_, TrainError>>()?;
+        let (mut frames, mut masks, mut seen) = (Vec::new(), Vec::new(), Vec::new());
+        for (frame, mask, of) in loaded.into_iter().flatten() {
             frames.push(frame);
-            seen.push(observe(&mask, &frame.camera, frame.time_index));
+            masks.push(mask);
+            seen.push(of);
         }
+        // As training puts them right.
+        let seen = masks.iter().zip(switches(&seen)).map(|(mask, renamed)| put_right(mask, &renamed));
+        let mut seen: Vec<BTreeMap<u16, Observation>> =
+            seen.zip(&frames).map(|(mask, frame)| observe(&mask, &frame.camera, frame.time_index)).collect();
         // A wrong camera shows everything somewhere else, as if it travelled.
         for wrong in misfits(&seen, f64::from(MotionConfig::default().misfit)).into_iter().rev() {
             frames.remove(wrong);

@@ -16,8 +16,6 @@ use std::collections::BTreeMap;
 use cif_geometry::PixelGrid;
 use cif_render::UNLABELLED;
 
-use crate::frames::TrainFrame;
-
 use colors::{Colors, FEWEST_PIXELS, UNUSUAL, usual};
 use place::{Place, places};
 
@@ -55,12 +53,17 @@ pub(crate) struct Seen {
 }
 
 impl Seen {
-    /// The masks of a frame that a camera took at a time of the capture.
-    pub(crate) fn of(frame: &TrainFrame, camera: &str, time: usize) -> Self {
+    /// The masks, if there are any, of an image that a camera took at a time of the capture.
+    pub(crate) fn of(
+        image: &PixelGrid<[u8; 3]>,
+        labels: Option<&PixelGrid<u16>>,
+        camera: &str,
+        time: usize,
+    ) -> Self {
         let mut seen = Self { camera: camera.to_owned(), time, masks: Vec::new() };
-        let Some(labels) = &frame.labels else { return seen };
+        let Some(labels) = labels else { return seen };
         let mut pixels: BTreeMap<u16, Vec<[u8; 3]>> = BTreeMap::new();
-        for (label, color) in labels.pixels.iter().zip(&frame.image.pixels) {
+        for (label, color) in labels.pixels.iter().zip(&image.pixels) {
             if *label != UNLABELLED {
                 pixels.entry(*label).or_default().push(*color);
             }

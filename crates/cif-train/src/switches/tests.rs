@@ -23,9 +23,7 @@ fn frame(time: usize, things: &[([u8; 3], Rectangle)], masks: &[(u16, Rectangle)
         }
         grid
     }
-    let frame =
-        TrainFrame { image: paint(GREY, things), labels: Some(paint(0, masks)), labelled: 0, features: None };
-    Seen::of(&frame, "camera", time)
+    Seen::of(&paint(GREY, things), Some(&paint(0, masks)), "camera", time)
 }
 
 /// A red thing (1), a green one (2) and a striped one (3) in shadow and light; `shown` tells which a mask shows.
@@ -44,7 +42,7 @@ fn frames(count: usize, shown: impl Fn(usize, u16) -> Option<u16>) -> Vec<Seen> 
         let label = |at: u32| Some(label_at(at)).filter(|label| shown(k, *label).is_some()).unwrap_or(0);
         let image = PixelGrid::from_pixels(30, 10, (0..300).map(color).collect());
         let labels = PixelGrid::from_pixels(30, 10, (0..300).map(label).collect());
-        Seen::of(&TrainFrame { image, labels: Some(labels), labelled: 0, features: None }, "camera", k)
+        Seen::of(&image, Some(&labels), "camera", k)
     };
     (0..count).map(frame).collect()
 }
