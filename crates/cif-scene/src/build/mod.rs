@@ -19,8 +19,9 @@ use crate::build::node::{Naming, NodeInput};
 use crate::build::source::FieldMotion;
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::joint::{ToldParts, jointed_groups};
+use crate::motion::choose;
+use crate::motion::loose::{self, Change};
 use crate::motion::{MovingGroup, trimmed_box, vector};
-use crate::motion::{choose, loose};
 use crate::shape::{colliders, proxy};
 use crate::{MotionModel, MotionSource, SceneError, SceneOptions, naming, world};
 
@@ -67,7 +68,8 @@ pub fn build_from(
     let visible = visible_rows(&reference, &opacities.peak, options, &mut warnings)?;
     let identities = assignment::most_probable(field);
     let owners = assignment::assign(field, &identities, &visible, options);
-    let grouped = rows_of_nodes(field, &visible, &owners, &mut frames_of, options);
+    let grouped =
+        rows_of_nodes(field, &visible, &owners, &mut frames_of, (&reference, &opacities.peak), options);
     let (group_owners, mut groups) = moving_groups(grouped, &reference, &opacities.peak, options);
     let jointed = jointed_groups(field, groups.iter().map(|group| &group.rows[..]));
     for ((_, group), jointed) in
@@ -264,31 +266,64 @@ fn rows_of_nodes(
     visible: &[u32],
     owners: &[Option<usize>],
     frames: &mut Frames<'_>,
+    (reference, opacities): (&Gaussians, &[f32]),
     options: &SceneOptions,
 ) -> Vec<NodeRows> {
     let mut rows: Vec<Vec<u32>> = vec![Vec::new(); field.instances.len() + 1];
     for (&row, owner) in visible.iter().zip(owners) {
         rows[owner.unwrap_or(field.instances.len())].push(row);
     }
-    let background = rows.pop().unwrap_or_default();
-    let mut node = |owner: Option<usize>, rows: Vec<u32>| {
-        let moves = loose::loose(frames, &rows);
-        NodeRows { owner, rows, moves }
-    };
-    let mut nodes: Vec<NodeRows> =
-        rows.into_iter().enumerate().map(|(index, rows)| node(Some(index), rows)).collect();
-    let background = node(None, background);
-    if options.most_expensive_motion == MotionModel::Dense {
+    let mut background = rows.pop().unwrap_or_default();
+    let may_be_dense = options.most_expensive_motion == MotionModel::Dense;
+    let mut nodes: Vec<NodeRows> = Vec::with_capacity(rows.len() + 2);
+    for (index, mut rows) in rows.into_iter().enumerate() {
+        let mut changes = loose::changes(frames, &rows);
+        if may_be_dense {
+            let weights = weights(&rows, reference, opacities);
+            let passing = passing(field, &rows, &changes, &weights);
+            let all = rows.into_iter().zip(changes).zip(passing);
+            let (gone, kept): (Vec<_>, Vec<_>) = all.partition(|(_, passes)| *passes);
+            background.extend(gone.into_iter().map(|((row, _), _)| row));
+            (rows, changes) = kept.into_iter().map(|(kept, _)| kept).unzip();
+        }
+        let moves = changes.iter().map(Change::shows).collect();
+        nodes.push(NodeRows { owner: Some(index), rows, moves });
+    }
+    background.sort_unstable();
+    let moves: Vec<bool> = loose::changes(frames, &background).iter().map(Change::shows).collect();
+    if may_be_dense {
         for wanted in [false, true] {
-            let own = background.rows.iter().zip(&background.moves).filter(|(_, moves)| **moves == wanted);
+            let own = background.iter().zip(&moves).filter(|(_, moves)| **moves == wanted);
             let (rows, moves) = own.map(|(row, moves)| (*row, *moves)).unzip();
             nodes.push(NodeRows { owner: None, rows, moves });
         }
     } else {
-        nodes.push(background);
+        nodes.push(NodeRows { owner: None, rows: background, moves });
     }
     nodes.retain(|node| !node.rows.is_empty());
     nodes
+}
+
+/// For each row of an instance, true where it shows what passes over an instance at rest: it travels by the network,
+/// and such rows are so few that the instance stands still.
+fn passing(field: &Field, rows: &[u32], changes: &[Change], weights: &[f64]) -> Vec<bool> {
+    let by_network =
+        |row: u32| field.tracks.as_ref().is_none_or(|tracks| tracks.group(row as usize).is_none());
+    let travels: Vec<bool> =
+        rows.iter().zip(changes).map(|(row, change)| by_network(*row) && change.travels()).collect();
+    let moving =
+        |of: &dyn Fn(usize) -> bool| -> f64 { (0..rows.len()).filter(|k| of(*k)).map(|k| weights[k]).sum() };
+    let allowed = INSTANCE_TRIM * weights.iter().sum::<f64>();
+    if moving(&|k| changes[k].shows()) <= allowed { travels } else { vec![false; rows.len()] }
+}
+
+/// Weights of rows: opacity times size.
+fn weights(rows: &[u32], reference: &Gaussians, opacities: &[f32]) -> Vec<f64> {
+    let weight = |row: usize| {
+        let size = (vector(reference.log_scales[row]).element_sum() / 3.0).exp();
+        f64::from(opacities[row]) * size
+    };
+    rows.iter().map(|row| weight(*row as usize)).collect()
 }
 
 /// Groups of rows that move together, and whose they are.
@@ -301,14 +336,7 @@ fn moving_groups(
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
     for NodeRows { owner, rows, moves } in nodes {
-        let weights: Vec<f64> = rows
-            .iter()
-            .map(|&row| {
-                let row = row as usize;
-                let size = (vector(reference.log_scales[row]).element_sum() / 3.0).exp();
-                f64::from(opacities[row]) * size
-            })
-            .collect();
+        let weights = weights(&rows, reference, opacities);
         let (low, high) = trimmed_box(&rows, &weights, &reference.means);
         let size = (high - low).length();
         // The background is as large as the room; its motion is judged by the scale of the objects in it.

@@ -3,7 +3,9 @@
 //! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, though
 //! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections
 //! and things without a mask do move. The two leave as nodes of their own: one constant, and one with a path for
-//! every splat, so that a few moving splats neither freeze nor make thousands of others move.
+//! every splat, so that a few moving splats neither freeze nor make thousands of others move. Splats of an instance at
+//! rest that travel farther than they are large show something else that passes over it, its shadow mostly: they leave
+//! with what moves of the background.
 
 use cif_geometry::quaternion;
 use glam::DVec3;
@@ -18,9 +20,12 @@ use crate::motion::{dot, vector};
 /// most.
 const LEAST_CHANGE: f64 = 0.3;
 
+/// Distance from which a splat travels, in units of its own largest standard deviation.
+const TRAVELS: f64 = 2.0;
+
 /// Ranges of place and size of one splat over time, and its largest turn since the first.
 #[derive(Clone, Copy, Default)]
-struct Change {
+pub(crate) struct Change {
     low: DVec3,
     high: DVec3,
     low_scale: DVec3,
@@ -28,10 +33,10 @@ struct Change {
     turn: f64,
 }
 
-/// For each of `rows`, true where it moves or deforms over the sampled times.
-pub(crate) fn loose(frames: &mut Frames<'_>, rows: &[u32]) -> Vec<bool> {
+/// How each of `rows` changes over the sampled times.
+pub(crate) fn changes(frames: &mut Frames<'_>, rows: &[u32]) -> Vec<Change> {
     if !frames.moves() {
-        return vec![false; rows.len()];
+        return vec![Change::default(); rows.len()];
     }
     let first = frames.at(0);
     let mut changes: Vec<Change> = rows
@@ -55,16 +60,23 @@ pub(crate) fn loose(frames: &mut Frames<'_>, rows: &[u32]) -> Vec<bool> {
             }
         });
     }
-    changes.iter().map(Change::shows).collect()
+    changes
 }
 
 impl Change {
-    fn shows(&self) -> bool {
+    /// True where it moves or deforms as far as a picture shows.
+    pub(crate) fn shows(&self) -> bool {
         let mut scales = ((self.low_scale + self.high_scale) / 2.0).exp().to_array();
         scales.sort_by(f64::total_cmp);
         let [least, middle, most] = scales;
         (self.high - self.low).length() > LEAST_CHANGE * middle
             || (self.high_scale - self.low_scale).max_element() > LEAST_CHANGE
             || self.turn * (1.0 - least / most) > LEAST_CHANGE
+    }
+
+    /// True where it goes farther than it is large.
+    pub(crate) fn travels(&self) -> bool {
+        let largest = ((self.low_scale + self.high_scale) / 2.0).exp().max_element();
+        (self.high - self.low).length() > TRAVELS * largest
     }
 }

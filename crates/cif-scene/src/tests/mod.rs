@@ -143,6 +143,43 @@ fn stragglers_do_not_spoil_a_rigid_instance() {
 }
 
 #[test]
+fn what_passes_over_an_instance_at_rest_leaves_with_the_moving_background() {
+    let field = field(1);
+    let passing = |rows: std::ops::Range<usize>, far: f32| {
+        let field = &field;
+        move |time: f64| {
+            let mut gaussians = field.gaussians.clone();
+            rows.clone().for_each(|row| gaussians.means[row][2] += far * time as f32);
+            gaussians
+        }
+    };
+    let nodes = |mut source: &dyn Fn(f64) -> Gaussians,
+                 options: &SceneOptions|
+     -> Vec<(String, MotionModel, usize)> {
+        let graph = build_from(&field, &mut source, options).unwrap();
+        graph.nodes.iter().map(|node| (node.name.clone(), node.model(), node.splats.len())).collect()
+    };
+    let node = |name: &str, model: MotionModel, splats: usize| (name.to_owned(), model, splats);
+    let (usual, rigid) = (
+        SceneOptions::default(),
+        SceneOptions { most_expensive_motion: MotionModel::Rigid, ..SceneOptions::default() },
+    );
+    let whole = node("red_mug_001", MotionModel::Static, 60);
+    // A shadow of two splats, which moves as it was trained.
+    let shadow = nodes(&passing(10..12, 3.0), &usual);
+    assert!(shadow.contains(&node("red_mug_001", MotionModel::Static, 58)), "{shadow:?}");
+    assert!(shadow.contains(&node("background_moving", MotionModel::Dense, 2)), "{shadow:?}");
+    // No more than trembles, or where motion may not be dense, they stay with the instance.
+    let trembling = nodes(&passing(10..12, 0.01), &usual);
+    assert!(trembling.contains(&whole), "{trembling:?}");
+    let frozen = nodes(&passing(10..12, 3.0), &rigid);
+    assert!(frozen.contains(&whole), "{frozen:?}");
+    // So many are a part that moves.
+    let part = nodes(&passing(10..30, 3.0), &usual);
+    assert!(part.iter().all(|(name, _, splats)| name != "red_mug_001" || *splats == 60), "{part:?}");
+}
+
+#[test]
 fn noise_inside_the_tolerance_is_static_and_averaged() {
     let field = field(1);
     let mut source = |time: f64| {
