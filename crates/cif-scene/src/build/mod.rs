@@ -7,6 +7,8 @@ pub(crate) mod node;
 mod posed;
 pub mod source;
 
+use std::collections::BTreeSet;
+
 use cif_field::{Field, Gaussians};
 use cif_geometry::quaternion;
 use glam::DVec3;
@@ -19,7 +21,7 @@ use crate::build::node::{Naming, NodeInput};
 use crate::build::source::FieldMotion;
 use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::joint::{ToldParts, jointed_groups};
-use crate::motion::choose;
+use crate::motion::choose::{self, Chosen};
 use crate::motion::loose::{self, Change};
 use crate::motion::{MovingGroup, trimmed_box, vector};
 use crate::shape::{colliders, proxy};
@@ -68,16 +70,32 @@ pub fn build_from(
     let visible = visible_rows(&reference, &opacities.peak, options, &mut warnings)?;
     let identities = assignment::most_probable(field);
     let owners = assignment::assign(field, &identities, &visible, options);
-    let grouped =
-        rows_of_nodes(field, &visible, &owners, &mut frames_of, (&reference, &opacities.peak), options);
-    let (group_owners, mut groups) = moving_groups(grouped, &reference, &opacities.peak, options);
-    let jointed = jointed_groups(field, groups.iter().map(|group| &group.rows[..]));
-    for ((_, group), jointed) in
-        group_owners.iter().zip(&mut groups).zip(&jointed).filter(|((owner, _), _)| owner.is_some())
-    {
-        group.told = ToldParts::of(field, &group.rows, jointed, &time_codes.times);
-    }
-    let chosen = choose::choose(&mut groups, &mut frames_of, &time_codes.samples, options);
+    // Instances at rest, which something passes over: known once all have been looked at.
+    let mut at_rest = BTreeSet::new();
+    let (group_owners, groups, chosen) = loop {
+        let grouped = rows_of_nodes(field, &visible, &owners, &at_rest, &mut frames_of, options);
+        let (group_owners, mut groups) = moving_groups(grouped, &reference, &opacities.peak, options);
+        let jointed = jointed_groups(field, groups.iter().map(|group| &group.rows[..]));
+        for ((_, group), jointed) in
+            group_owners.iter().zip(&mut groups).zip(&jointed).filter(|((owner, _), _)| owner.is_some())
+        {
+            group.told = ToldParts::of(field, &group.rows, jointed, &time_codes.times);
+        }
+        let chosen = choose::choose(&mut groups, &mut frames_of, &time_codes.samples, options);
+        let rest = group_owners
+            .iter()
+            .zip(&groups)
+            .zip(&chosen)
+            .filter(|(_, chosen)| matches!(chosen, Chosen::Static));
+        let passed: Vec<usize> = rest
+            .filter_map(|((owner, group), _)| owner.filter(|_| group.is_passed))
+            .filter(|owner| !at_rest.contains(owner))
+            .collect();
+        if passed.is_empty() || options.most_expensive_motion != MotionModel::Dense {
+            break (group_owners, groups, chosen);
+        }
+        at_rest.extend(passed);
+    };
 
     let input = NodeInput { field, reference: &reference, identities: &identities };
     let mut nodes: Vec<Node> = Vec::with_capacity(groups.len());
@@ -257,16 +275,25 @@ struct NodeRows {
     rows: Vec<u32>,
     /// For each row, true where it moves as far as a picture shows.
     moves: Vec<bool>,
+    /// True of an instance some of whose splats go farther than they are large, by the network.
+    is_passed: bool,
 }
 
-/// Rows of every node: instances in the order of the table, then of the background what stands still and what moves,
-/// if the motion may be dense; empty ones left out.
+impl NodeRows {
+    fn of(owner: Option<usize>, rows: Vec<(u32, Change)>, is_passed: bool) -> Self {
+        let (rows, changes): (_, Vec<Change>) = rows.into_iter().unzip();
+        Self { owner, rows, moves: changes.iter().map(Change::shows).collect(), is_passed }
+    }
+}
+
+/// Rows of every node: instances in the order of the table, without what passes over those `at_rest`, then of the
+/// background what stands still and what moves, if the motion may be dense; empty ones left out.
 fn rows_of_nodes(
     field: &Field,
     visible: &[u32],
     owners: &[Option<usize>],
+    at_rest: &BTreeSet<usize>,
     frames: &mut Frames<'_>,
-    (reference, opacities): (&Gaussians, &[f32]),
     options: &SceneOptions,
 ) -> Vec<NodeRows> {
     let mut rows: Vec<Vec<u32>> = vec![Vec::new(); field.instances.len() + 1];
@@ -274,47 +301,34 @@ fn rows_of_nodes(
         rows[owner.unwrap_or(field.instances.len())].push(row);
     }
     let mut background = rows.pop().unwrap_or_default();
-    let may_be_dense = options.most_expensive_motion == MotionModel::Dense;
+    let passes = |row: u32, change: &Change| {
+        let by_network = field.tracks.as_ref().is_none_or(|tracks| tracks.group(row as usize).is_none());
+        by_network && change.travels()
+    };
     let mut nodes: Vec<NodeRows> = Vec::with_capacity(rows.len() + 2);
-    for (index, mut rows) in rows.into_iter().enumerate() {
-        let mut changes = loose::changes(frames, &rows);
-        if may_be_dense {
-            let weights = weights(&rows, reference, opacities);
-            let passing = passing(field, &rows, &changes, &weights);
-            let all = rows.into_iter().zip(changes).zip(passing);
-            let (gone, kept): (Vec<_>, Vec<_>) = all.partition(|(_, passes)| *passes);
-            background.extend(gone.into_iter().map(|((row, _), _)| row));
-            (rows, changes) = kept.into_iter().map(|(kept, _)| kept).unzip();
+    for (index, rows) in rows.into_iter().enumerate() {
+        let changes = loose::changes(frames, &rows);
+        let mut own: Vec<(u32, Change)> = rows.into_iter().zip(changes).collect();
+        let is_passed = own.iter().any(|(row, change)| passes(*row, change));
+        if at_rest.contains(&index) {
+            let (passing, rest): (Vec<_>, Vec<_>) =
+                own.into_iter().partition(|(row, change)| passes(*row, change));
+            background.extend(passing.into_iter().map(|(row, _)| row));
+            own = rest;
         }
-        let moves = changes.iter().map(Change::shows).collect();
-        nodes.push(NodeRows { owner: Some(index), rows, moves });
+        nodes.push(NodeRows::of(Some(index), own, is_passed));
     }
     background.sort_unstable();
-    let moves: Vec<bool> = loose::changes(frames, &background).iter().map(Change::shows).collect();
-    if may_be_dense {
-        for wanted in [false, true] {
-            let own = background.iter().zip(&moves).filter(|(_, moves)| **moves == wanted);
-            let (rows, moves) = own.map(|(row, moves)| (*row, *moves)).unzip();
-            nodes.push(NodeRows { owner: None, rows, moves });
-        }
+    let changes = loose::changes(frames, &background);
+    let background: Vec<(u32, Change)> = background.into_iter().zip(changes).collect();
+    if options.most_expensive_motion == MotionModel::Dense {
+        let (moving, still) = background.into_iter().partition(|(_, change)| change.shows());
+        nodes.extend([still, moving].map(|rows| NodeRows::of(None, rows, false)));
     } else {
-        nodes.push(NodeRows { owner: None, rows: background, moves });
+        nodes.push(NodeRows::of(None, background, false));
     }
     nodes.retain(|node| !node.rows.is_empty());
     nodes
-}
-
-/// For each row of an instance, true where it shows what passes over an instance at rest: it travels by the network,
-/// and such rows are so few that the instance stands still.
-fn passing(field: &Field, rows: &[u32], changes: &[Change], weights: &[f64]) -> Vec<bool> {
-    let by_network =
-        |row: u32| field.tracks.as_ref().is_none_or(|tracks| tracks.group(row as usize).is_none());
-    let travels: Vec<bool> =
-        rows.iter().zip(changes).map(|(row, change)| by_network(*row) && change.travels()).collect();
-    let moving =
-        |of: &dyn Fn(usize) -> bool| -> f64 { (0..rows.len()).filter(|k| of(*k)).map(|k| weights[k]).sum() };
-    let allowed = INSTANCE_TRIM * weights.iter().sum::<f64>();
-    if moving(&|k| changes[k].shows()) <= allowed { travels } else { vec![false; rows.len()] }
 }
 
 /// Weights of rows: opacity times size.
@@ -335,7 +349,7 @@ fn moving_groups(
 ) -> (Vec<Option<usize>>, Vec<MovingGroup>) {
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
-    for NodeRows { owner, rows, moves } in nodes {
+    for NodeRows { owner, rows, moves, is_passed } in nodes {
         let weights = weights(&rows, reference, opacities);
         let (low, high) = trimmed_box(&rows, &weights, &reference.means);
         let size = (high - low).length();
@@ -355,6 +369,7 @@ fn moving_groups(
             MovingGroup::new(rows, weights, pivot, owner.is_some(), trim, tolerance, &reference.means);
         let moving: f64 =
             group.weights.iter().zip(moves).filter(|(_, moves)| *moves).map(|(weight, _)| weight).sum();
+        group.is_passed = is_passed;
         group.stands_still = moving <= trim * group.weights.iter().sum::<f64>();
         group_owners.push(owner);
         groups.push(group);

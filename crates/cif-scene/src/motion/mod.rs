@@ -46,6 +46,8 @@ pub struct MovingGroup {
     pub is_body: bool,
     /// True where all but the outliers stand still as far as a picture shows ([`crate::motion::loose`]).
     pub stands_still: bool,
+    /// True where some splats travel that may show what passes over it ([`crate::motion::loose`]).
+    pub is_passed: bool,
     /// Share of the weight that may be outliers.
     pub trim: f64,
     /// Largest decisive residual allowed, world units.
@@ -248,6 +250,7 @@ impl MovingGroup {
             pivot,
             is_body,
             stands_still: false,
+            is_passed: false,
             trim,
             tolerance,
             static_shape: MeanShape::default(),
