@@ -20,6 +20,9 @@ const GROUNDED: f64 = 0.9;
 const SAME_SIZE: f64 = 0.03;
 const SHORTEST_RUN: usize = 3;
 
+/// Roundness of rough masks from which they are those of a ball, if they are discs too.
+const BALL: f64 = 0.93;
+
 /// Determinant up to which rays count as parallel.
 const PARALLEL: f64 = 1e-9;
 
@@ -165,7 +168,6 @@ fn meetings(views: &[ObjectView]) -> BTreeMap<usize, DVec3> {
 
 /// Outline of the views of an object on a plane; `None` where no mask is seen from above.
 fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
-    let is_ball = are_discs(views.iter());
     let whole: Vec<&ObjectView> = match views.iter().filter(|view| view.is_whole()).collect::<Vec<_>>() {
         whole if !whole.is_empty() => whole,
         _ => match views.iter().filter(|view| !view.cut).collect::<Vec<_>>() {
@@ -173,6 +175,7 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
             _ => views.iter().collect(),
         },
     };
+    let is_ball = are_discs(views.iter()) && median_reading(&whole, plane, false)?.roundness > BALL;
     let mut grounded = whole.clone();
     let mut medians = median_reading(&grounded, plane, is_ball)?;
     for _ in 0..3 {
@@ -405,7 +408,7 @@ mod tests {
             let middle = view.centroid;
             view.pixels.retain(|[x, y]| {
                 let d = DVec2::new(f64::from(*x) + 0.5, f64::from(*y) + 0.5) - middle;
-                d.length() < RADIUS * 240.0 * (1.0 + 0.06 * (3.0 * d.y.atan2(d.x) + phase).sin())
+                d.length() < RADIUS * 240.0 * (1.0 + 0.04 * (3.0 * d.y.atan2(d.x) + phase).sin())
             });
         }
         let found = outline(&views, Some(&FLOOR), TIMES).unwrap();

@@ -40,8 +40,8 @@ const BOUNCING: (usize, usize, usize) = (8, 3, 3);
 const KINK: f64 = 4.0;
 const LOOSE: f64 = 0.05;
 
-/// The path that stays near `raw` where the object, of this size, is well seen, and bends little, by its stiffness;
-/// `times` of the whole sequence. Of an object that stays on its support it passes by places that are far aside of
+/// The path that stays near `raw` where the object is well seen, and bends little, by its stiffness; `times` of the
+/// whole sequence. Of an object that stays on its support it passes by places that are far aside of
 /// those before and after them, where a mask shows something else as well.
 pub(super) fn smooth(
     raw: &BTreeMap<usize, DVec3>,
