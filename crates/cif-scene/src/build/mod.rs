@@ -331,15 +331,6 @@ fn rows_of_nodes(
     nodes
 }
 
-/// Weights of rows: opacity times size.
-fn weights(rows: &[u32], reference: &Gaussians, opacities: &[f32]) -> Vec<f64> {
-    let weight = |row: usize| {
-        let size = (vector(reference.log_scales[row]).element_sum() / 3.0).exp();
-        f64::from(opacities[row]) * size
-    };
-    rows.iter().map(|row| weight(*row as usize)).collect()
-}
-
 /// Groups of rows that move together, and whose they are.
 fn moving_groups(
     nodes: Vec<NodeRows>,
@@ -350,7 +341,14 @@ fn moving_groups(
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
     for NodeRows { owner, rows, moves, is_passed } in nodes {
-        let weights = weights(&rows, reference, opacities);
+        let weights: Vec<f64> = rows
+            .iter()
+            .map(|&row| {
+                let row = row as usize;
+                let size = (vector(reference.log_scales[row]).element_sum() / 3.0).exp();
+                f64::from(opacities[row]) * size
+            })
+            .collect();
         let (low, high) = trimmed_box(&rows, &weights, &reference.means);
         let size = (high - low).length();
         // The background is as large as the room; its motion is judged by the scale of the objects in it.

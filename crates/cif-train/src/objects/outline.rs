@@ -26,6 +26,12 @@ const BALL: f64 = 0.93;
 /// Determinant up to which rays count as parallel.
 const PARALLEL: f64 = 1e-9;
 
+/// Fewest rays of which some may be told to miss the others, most of which pairs are tried, and the distance, in middle
+/// ones, at which a ray counts half.
+const FEWEST_RAYS: usize = 4;
+const MOST_PAIRED: usize = 32;
+const FAR: f64 = 3.0;
+
 /// Times before and after one among which its size is the middle one, and the usual change by it, of the size, from which
 /// masks are rough.
 const STEADY: usize = 2;
@@ -86,10 +92,6 @@ struct Reading {
     is_bar: bool,
 }
 
-/// Rays from which some may be told to miss the others, and the distance, in middle ones, at which a ray counts half.
-const MOST_MEET: usize = 4;
-const FAR: f64 = 3.0;
-
 /// The point nearest to rays through the middles of masks, by weights; `None` where they are parallel. Of several rays,
 /// those that miss the point where most others meet count less: masks that show more than the object, or another.
 pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64)>) -> Option<DVec3> {
@@ -100,7 +102,7 @@ pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64
         nearest_to_rays(rays, PARALLEL)
     };
     let all: Vec<(usize, f64)> = (0..views.len()).map(|k| (k, 1.0)).collect();
-    if views.len() < MOST_MEET {
+    if views.len() < FEWEST_RAYS {
         return nearest(&all);
     }
     let distances = |point: DVec3| -> Vec<f64> {
@@ -110,7 +112,9 @@ pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64
         views.iter().map(distance).collect()
     };
     // Of the points where two rays meet, and that where all do, the one that is nearest to the middle ray.
-    let pairs = (0..views.len()).flat_map(|a| (0..a).map(move |b| vec![(a, 1.0), (b, 1.0)]));
+    let paired: Vec<usize> = (0..views.len()).step_by(views.len().div_ceil(MOST_PAIRED)).collect();
+    let pairs = (0..paired.len()).flat_map(|a| (0..a).map(move |b| (a, b)));
+    let pairs = pairs.map(|(a, b)| vec![(paired[a], 1.0), (paired[b], 1.0)]);
     let points = pairs.chain([all]).filter_map(|rays| nearest(&rays));
     let middle = |point: DVec3| median(&mut distances(point));
     let (point, middle) = points.map(|point| (point, middle(point))).min_by(|a, b| a.1.total_cmp(&b.1))?;

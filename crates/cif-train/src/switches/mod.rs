@@ -26,7 +26,7 @@ const FEWEST: usize = 8;
 const LIKE: f64 = 0.93;
 const MORE: f64 = 0.12;
 
-/// Largest share of the masks of an object that may be switched; beyond, nobody knows what is usual.
+/// Largest share of the masks of an object that may be switched, or stray; beyond, nobody knows what is usual.
 const MOST: f64 = 0.4;
 
 /// Captured times between two frames of which one tells of the other.

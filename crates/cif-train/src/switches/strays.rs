@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 
 use super::colors::{FEWEST_PIXELS, UNUSUAL, Usual, usual};
-use super::{Mask, Now, Sequence};
+use super::{MOST, Mask, Now, Sequence};
 
 /// By how much less than usual the colours of a mask are those of its object: where nothing is at its place in the
 /// frames before and after, and where these tell nothing, because the object or the camera is too fast.
@@ -23,9 +23,6 @@ const SHARE: f64 = 0.5;
 
 /// Share of the area of a mask below which those before and after are smaller than it.
 const SMALLER: f64 = 0.6;
-
-/// Largest share of the masks of an object that may stray; beyond, nobody knows what is usual.
-const MOST: f64 = 0.4;
 
 /// Takes stray masks away.
 pub(super) fn take_away(sequences: &[Sequence], frames: &mut [Now<'_>]) {
