@@ -310,7 +310,7 @@ fn agreement(sides: &[Side], turns: &[DQuat]) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::outline::outline;
+    use super::super::outline::outlines;
     use super::super::testing::{TIMES, jumping, patches, solid, sphere_places, views};
     use super::*;
 
@@ -324,7 +324,7 @@ mod tests {
             })
             .collect();
         let views = views(solid(&sphere_places(0.05), color, 0.006), &truth, jumping);
-        let outline = outline(&views, None, TIMES).unwrap();
+        let outline = outlines(&views, None, TIMES).remove(0);
         let seen: Vec<&ObjectView> = views.iter().collect();
         turns(&seen, &outline.path, &outline, &[])
     }

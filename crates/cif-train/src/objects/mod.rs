@@ -92,11 +92,11 @@ pub(crate) fn fit(
     is_told: bool,
 ) -> Result<Found, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
-    let Some(outline) = outline::outline(&views, surroundings.plane, surroundings.times) else {
+    let outlines = outline::outlines(&views, surroundings.plane, surroundings.times);
+    if outlines.is_empty() {
         return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
-    };
-    let fitted =
-        start::fit_object(Object { label, views: &views, outline: &outline, is_told, surroundings })?;
+    }
+    let fitted = start::fit_object(&Object::by_outlines(label, &views, &outlines, is_told, surroundings))?;
     Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))
 }
 
@@ -112,11 +112,12 @@ pub(crate) fn find_part(
     surroundings: Surroundings<'_>,
 ) -> Result<Option<Jointed>, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
-    let Some(outline) = outline::outline(&views, surroundings.plane, surroundings.times) else {
-        return Ok(None);
-    };
-    let object = Object { label, views: &views, outline: &outline, is_told: false, surroundings };
-    parts::find(object)
+    let outlines = outline::outlines(&views, surroundings.plane, surroundings.times);
+    let objects = Object::by_outlines(label, &views, &outlines, false, surroundings);
+    // What opens looks larger, as if it came nearer: its size is then that of other times.
+    let found = objects.into_iter().take(2).map(parts::find);
+    let found: Vec<_> = found.collect::<Result<_, TrainError>>()?;
+    Ok(found.into_iter().flatten().min_by(|a, b| a.errors[0].total_cmp(&b.errors[0])))
 }
 
 /// The object in all training frames that show it, in the order of times.

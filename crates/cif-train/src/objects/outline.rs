@@ -37,6 +37,12 @@ const FAR: f64 = 3.0;
 const STEADY: usize = 2;
 const ROUGH: f64 = 0.005;
 
+/// Height of an object in its usual tallest pose, of that in its lowest, from which it may topple.
+const TOPPLES: f64 = 1.5;
+
+/// Visible share from which a mask tells how high it is.
+const MOSTLY_SEEN: f64 = 0.6;
+
 /// Length of a mask in its widths from which it is that of a bar, and the sine of the angle between its long axis and
 /// the way down from which the bar lies.
 const BAR: (f64, f64) = (2.2, 0.15);
@@ -123,18 +129,46 @@ pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64
     nearest(&distances(point).into_iter().map(share).enumerate().collect::<Vec<_>>())
 }
 
-/// Outline of the views of an object: on a plane where there is one, seen by several cameras at a time, or by one that
-/// sees it from other sides soon after; `None` where nothing tells where it is. `times` are those of the sequence.
-pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Option<Outline> {
-    let mut outline = plane.and_then(|plane| on_plane(views, plane));
-    let (met, stiffness) = match meetings(views) {
-        // A plane tells depths better than few rays.
-        met if met.is_empty() && outline.is_none() => (path::crossing(views, times), path::CROSSING),
-        met => (met, path::MEETING),
-    };
-    if met.is_empty() {
-        return outline;
+/// How an object is taken to stand on its plane.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stance {
+    /// At all times, as high as it is at most times.
+    Stays,
+    /// Not where it looks larger than there.
+    MayLeave,
+    /// At all times, as high as its mask is then.
+    Topples,
+}
+
+/// Outlines that the views of an object may have; none where nothing tells where it is. Several cameras at a time tell
+/// one. One camera leaves open whether what looks larger comes nearer or shows a broader side, and whether what looks
+/// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross tell its
+/// path too. `times` are those of the sequence.
+pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Vec<Outline> {
+    let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, plane, stance));
+    let met = meetings(views);
+    if !met.is_empty() {
+        let on_plane = on_plane(Stance::MayLeave);
+        return vec![surrounded(views, on_plane, (met, path::MEETING))];
     }
+    let mut found: Vec<Outline> = on_plane(Stance::Stays).into_iter().collect();
+    let leaves = on_plane(Stance::MayLeave).filter(|outline| !outline.air.is_empty());
+    // A plane tells depths better than few rays.
+    if found.is_empty() || leaves.is_some() {
+        let crossing = Some(path::crossing(views, times)).filter(|path| !path.is_empty());
+        found.extend(leaves);
+        found.extend(crossing.map(|path| surrounded(views, None, (path, path::CROSSING))));
+    }
+    found.extend(on_plane(Stance::Topples));
+    found
+}
+
+/// Outline of an object whose centres are known by time, with the stiffness of their path, beside what a plane tells.
+fn surrounded(
+    views: &[ObjectView],
+    on_plane: Option<Outline>,
+    (met, stiffness): (BTreeMap<usize, DVec3>, f64),
+) -> Outline {
     let radius_of = |view: &ObjectView| {
         let depth = view.camera.project(*met.get(&view.time_index)?)?.1;
         Some(view.reach(WITHIN) * depth / view.camera.focal_px.x)
@@ -144,7 +178,7 @@ pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>, times: usize)
         radii = views.iter().filter_map(radius_of).collect();
     }
     let radius = median(&mut radii);
-    let found = outline.get_or_insert_with(|| Outline {
+    let mut outline = on_plane.unwrap_or_else(|| Outline {
         height: radius,
         radius,
         roundness: if are_discs(views.iter()) { 1.0 } else { 0.0 },
@@ -153,9 +187,9 @@ pub(super) fn outline(views: &[ObjectView], plane: Option<&Plane>, times: usize)
         stiffness,
         is_surrounded: true,
     });
-    (found.stiffness, found.is_surrounded) = (stiffness, true);
-    found.air.clear();
-    found.path.extend(met);
+    (outline.stiffness, outline.is_surrounded) = (stiffness, true);
+    outline.air.clear();
+    outline.path.extend(met);
     outline
 }
 
@@ -170,8 +204,9 @@ fn meetings(views: &[ObjectView]) -> BTreeMap<usize, DVec3> {
     several.filter_map(|(time, views)| Some((time, meeting_point(views.into_iter())?))).collect()
 }
 
-/// Outline of the views of an object on a plane; `None` where no mask is seen from above.
-fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
+/// Outline of the views of an object on a plane; `None` where no mask is seen from above, or nothing tells that it moves
+/// in this way.
+fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outline> {
     let whole: Vec<&ObjectView> = match views.iter().filter(|view| view.is_whole()).collect::<Vec<_>>() {
         whole if !whole.is_empty() => whole,
         _ => match views.iter().filter(|view| !view.cut).collect::<Vec<_>>() {
@@ -200,14 +235,19 @@ fn on_plane(views: &[ObjectView], plane: &Plane) -> Option<Outline> {
     let larger = steady_sizes(views, plane, medians.height);
     let larger = larger.iter().filter(|size| size.is_some_and(|size| size > AIR * in_contact)).count();
     let uncut = views.iter().filter(|view| !view.cut).count();
-    let leaves = larger as f64 > (1.0 - GROUNDED) * uncut as f64;
+    let leaves = stance == Stance::MayLeave && larger as f64 > (1.0 - GROUNDED) * uncut as f64;
     if !leaves {
         medians = median_reading(&whole, plane, is_ball)?;
     }
+    let mut heights = vec![medians.height; views.len()];
+    if stance == Stance::Topples {
+        heights = steady_heights(views, plane, medians.height)?;
+        medians.height = heights.iter().copied().fold(0.0, f64::max);
+    }
     let mut sums: BTreeMap<usize, (DVec3, f64, bool)> = BTreeMap::new();
-    for (view, size) in views.iter().zip(steady_sizes(views, plane, medians.height)) {
+    for ((view, size), height) in views.iter().zip(steady_sizes(views, plane, medians.height)).zip(heights) {
         let ray = view.camera.ray(view.centroid);
-        let Some(mut depth) = plane.meet(view.camera.centre(), ray, medians.height) else { continue };
+        let Some(mut depth) = plane.meet(view.camera.centre(), ray, height) else { continue };
         if leaves
             && let Some(size) = size
             && size > in_contact
@@ -253,6 +293,26 @@ fn steady_sizes(views: &[ObjectView], plane: &Plane, height: f64) -> Vec<Option<
     let both = sizes.iter().flatten().zip(steady.iter().flatten());
     let mut changes: Vec<f64> = both.map(|(size, steady)| (size / steady - 1.0).abs()).collect();
     if is_one_camera(views) && median(&mut changes) > ROUGH { steady } else { sizes }
+}
+
+/// Heights of the centre by view, as the masks of a few times imply them; `None` where they hardly change.
+fn steady_heights(views: &[ObjectView], plane: &Plane, usual: f64) -> Option<Vec<f64>> {
+    let of = |view: &ObjectView| {
+        let is_seen = !view.cut && view.visible >= MOSTLY_SEEN;
+        let reading = is_seen.then(|| read(view, plane, false)).flatten();
+        reading.map(|reading| reading.height)
+    };
+    let heights: Vec<Option<f64>> = views.iter().map(of).collect();
+    let middle = |k: usize| {
+        let near = k.saturating_sub(STEADY)..(k + STEADY + 1).min(heights.len());
+        let mut near: Vec<f64> = heights[near].iter().flatten().copied().collect();
+        if near.is_empty() { usual } else { median(&mut near) }
+    };
+    let steady: Vec<f64> = (0..heights.len()).map(middle).collect();
+    let mut sorted = steady.clone();
+    sorted.sort_by(f64::total_cmp);
+    let at = |share: f64| sorted[((sorted.len() - 1) as f64 * share) as usize];
+    (is_one_camera(views) && at(0.9) > TOPPLES * at(0.1)).then_some(steady)
 }
 
 fn median_reading(views: &[&ObjectView], plane: &Plane, is_ball: bool) -> Option<Reading> {
@@ -415,8 +475,8 @@ mod tests {
                 d.length() < RADIUS * 240.0 * (1.0 + 0.04 * (3.0 * d.y.atan2(d.x) + phase).sin())
             });
         }
-        let found = outline(&views, Some(&FLOOR), TIMES).unwrap();
-        assert!(found.air.is_empty(), "{:?}", found.air);
+        let found = outlines(&views, Some(&FLOOR), TIMES);
+        let [found] = &found[..] else { panic!("{} outlines", found.len()) };
         assert!((found.height / found.radius - 1.0).abs() < 0.06, "{} and {}", found.height, found.radius);
     }
 }

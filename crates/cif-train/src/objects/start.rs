@@ -7,11 +7,12 @@ use cif_field::Gaussians;
 use cif_field::tracks::RotationEvidence;
 use glam::{DQuat, DVec3};
 use rand_pcg::Pcg64;
+use rayon::prelude::*;
 
 use super::fit::{Fit, Turns, between, hull};
 use super::follow::follow;
 use super::order::Order;
-use super::outline::Outline;
+use super::outline::{Outline, meeting_point};
 use super::path::smooth;
 use super::plane::Plane;
 use super::shape::{Pose, Shape};
@@ -56,6 +57,10 @@ pub(crate) struct Fitted {
     pub(crate) rotation: RotationEvidence,
     /// Error on pixels that were left out.
     pub(crate) error: f64,
+    /// The same, had it not turned.
+    pub(crate) unturned: Option<f64>,
+    /// True of a ball.
+    pub(crate) is_ball: bool,
     /// True where the poses of what was left out were moved onto it before, so that errors are smaller.
     pub(crate) is_settled: bool,
     /// Way of moving that was kept, in words.
@@ -87,36 +92,42 @@ pub(super) struct Object<'a> {
     pub(super) outline: &'a Outline,
     /// True where it is told to move as a whole.
     pub(super) is_told: bool,
+    /// Place of the outline among those that the object may have: those beside the first suggest no ways of moving but
+    /// what following finds.
+    pub(super) place: usize,
+    /// Number of these outlines: several are compared with all pixels.
+    pub(super) outlines: usize,
     pub(super) surroundings: Surroundings<'a>,
 }
 
 /// An object in one of the ways of moving.
 pub(super) struct Started<'a> {
     pub(super) fit: Fit<'a>,
+    /// Centre of its outline by time, smoothed.
+    pub(super) path: BTreeMap<usize, DVec3>,
     pub(super) way: Way,
     pub(super) rotation: RotationEvidence,
     pub(super) error: f64,
+    /// Error of moving without a turn.
+    pub(super) unturned: Option<f64>,
     /// Time that shows most of it.
     pub(super) reference: usize,
 }
 
-/// Fits an object; `None` where it rests, or its masks do not tell enough.
+/// Fits an object that has one of several outlines; `None` where it rests, or its masks do not tell enough.
 ///
 /// # Errors
 /// [`TrainError::Stopped`] when the run is to stop.
-pub(super) fn fit_object(object: Object<'_>) -> Result<Option<Fitted>, TrainError> {
-    let Object { views, outline, .. } = object;
-    let stop = object.surroundings.stop;
-    let path = smooth(&outline.path, views, object.surroundings.times, outline);
-    let reliable: Vec<usize> = object.views_at(&path).filter(|view| views[*view].is_reliable()).collect();
-    let mut good: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
-    good.dedup();
-    let started = if good.len() < FEWEST_TIMES {
-        object.followed(&path)?
-    } else {
-        trials::best_way(object, (&reliable, &good))?
+pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, TrainError> {
+    let begin = |object: &Object<'a>| -> Result<Option<(Object<'a>, Started<'a>)>, TrainError> {
+        Ok(object.begun()?.map(|started| (*object, started)))
     };
-    let Some(Started { mut fit, way, rotation, error, reference }) = started else { return Ok(None) };
+    let begun: Vec<_> = objects.par_iter().map(begin).collect::<Result<_, TrainError>>()?;
+    let best = begun.into_iter().flatten().min_by(|a, b| a.1.error.total_cmp(&b.1.error));
+    let Some((object, Started { mut fit, path, way, rotation, error, unturned, reference })) = best else {
+        return Ok(None);
+    };
+    let (outline, stop) = (object.outline, object.surroundings.stop);
     grow(&mut fit, &path);
     stop.check()?;
     let all: Vec<usize> = object.views_at(&fit.poses).collect();
@@ -149,12 +160,49 @@ pub(super) fn fit_object(object: Object<'_>) -> Result<Option<Fitted>, TrainErro
         reference: fit.poses.get(&reference).map_or(at_rest, |p| (p.rotation, p.translation)),
         rotation,
         error,
+        unturned,
+        is_ball: outline.roundness >= 1.0,
         is_settled: outline.is_surrounded && fit.one_camera,
         way: way.told(),
     }))
 }
 
 impl<'a> Object<'a> {
+    /// An object by each of the outlines that it may have.
+    pub(super) fn by_outlines(
+        label: u16,
+        views: &'a [ObjectView],
+        outlines: &'a [Outline],
+        is_told: bool,
+        surroundings: Surroundings<'a>,
+    ) -> Vec<Self> {
+        let of = |(place, outline)| Object {
+            label,
+            views,
+            outline,
+            is_told,
+            place,
+            outlines: outlines.len(),
+            surroundings,
+        };
+        outlines.iter().enumerate().map(of).collect()
+    }
+
+    /// The object in the best way of moving along the path of its outline; `None` where it rests, or its masks do not
+    /// tell enough.
+    fn begun(self) -> Result<Option<Started<'a>>, TrainError> {
+        let Object { views, outline, .. } = self;
+        let path = smooth(&outline.path, views, self.surroundings.times, outline);
+        let reliable: Vec<usize> = self.views_at(&path).filter(|view| views[*view].is_reliable()).collect();
+        let mut good: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
+        good.dedup();
+        if good.len() < FEWEST_TIMES {
+            self.followed(path)
+        } else {
+            trials::best_way(self, path, (&reliable, &good))
+        }
+    }
+
     /// Random numbers of the object, from their start.
     pub(super) fn rng(&self) -> Pcg64 {
         stream(self.surroundings.seed, Purpose::Objects, u64::from(self.label))
@@ -210,7 +258,7 @@ impl<'a> Object<'a> {
         Some((reference, fit))
     }
 
-    /// Runs of times at which an object that leaves its support stands in one place on it; none of other objects.
+    /// Runs of times at which an object stands in one place on its support.
     pub(super) fn rests(&self, path: &BTreeMap<usize, DVec3>) -> Vec<Vec<usize>> {
         let air = &self.outline.air;
         let times: Vec<usize> = path.keys().copied().collect();
@@ -218,7 +266,7 @@ impl<'a> Object<'a> {
             let step = (path[b] - path[a]).length() / (b - a) as f64;
             step < STANDS * self.outline.size() && !air.contains(a) && !air.contains(b)
         };
-        let runs = times.chunk_by(stands).filter(|run| !air.is_empty() && run.len() > 2);
+        let runs = times.chunk_by(stands).filter(|run| run.len() > 2);
         runs.map(<[usize]>::to_vec).collect()
     }
 
@@ -231,15 +279,31 @@ impl<'a> Object<'a> {
     }
 
     /// An object that is mostly cut or hidden, followed from time to time.
-    fn followed(&self, path: &BTreeMap<usize, DVec3>) -> Result<Option<Started<'a>>, TrainError> {
+    fn followed(&self, path: BTreeMap<usize, DVec3>) -> Result<Option<Started<'a>>, TrainError> {
         let times: Vec<usize> = path.keys().copied().collect();
-        let first = self.first(path, &times).filter(|_| path.len() >= FEWEST_SEEN);
+        let first = self.first(&path, &times).filter(|_| path.len() >= FEWEST_SEEN);
         let Some((reference, mut fit)) = first else { return Ok(None) };
-        let all: Vec<usize> = self.views_at(path).collect();
-        follow(&mut fit, reference, path, &all, self.surroundings.stop)?;
+        let all: Vec<usize> = self.views_at(&path).collect();
+        follow(&mut fit, reference, &path, &all, self.surroundings.stop)?;
         let error = fit.mean_loss(&all, 0);
+        if !self.is_told && self.at_rest(&all).is_some_and(|rests| rests <= trials::REST_GAIN[1] * error) {
+            return Ok(None);
+        }
         let (way, rotation) = (Way::Followed, RotationEvidence::Observed);
-        Ok(Some(Started { fit, way, rotation, error, reference }))
+        Ok(Some(Started { fit, path, way, rotation, error, unturned: None, reference }))
+    }
+
+    /// Error of the object in one place, on the views that it is fitted to.
+    fn at_rest(&self, views: &[usize]) -> Option<f64> {
+        let place = meeting_point(views.iter().map(|k| (&self.views[*k], self.views[*k].visible.powi(2))))?;
+        let rests = Pose { rotation: DQuat::IDENTITY, translation: place };
+        let poses = views.iter().map(|k| (self.views[*k].time_index, rests)).collect();
+        let shape = self.hull(&poses, FOLLOWED, &mut self.rng())?;
+        let mut fit = self.fit(poses, shape, self.rng());
+        fit.turns = Turns::Given;
+        fit.touches = false;
+        fit.steps(views, STEPS[1], |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, 0));
+        Some(fit.mean_loss(views, 0))
     }
 }
 

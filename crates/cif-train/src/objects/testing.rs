@@ -112,13 +112,13 @@ pub(super) fn views_of_groups(
     views
 }
 
-/// The object of some views, with facts about its surroundings.
-pub(super) fn with_object<T>(
+/// The object of some views, by the outlines that it may have, with facts about its surroundings.
+pub(super) fn with_objects<T>(
     plane: Option<&Plane>,
     views: &[ObjectView],
-    act: impl FnOnce(Object<'_>) -> T,
+    act: impl FnOnce(&[Object<'_>]) -> T,
 ) -> T {
-    let outline = outline::outline(views, plane, TIMES).unwrap();
+    let outlines = outline::outlines(views, plane, TIMES);
     let stop = Stop::default();
     let order = Order::among(&[], 2);
     let surroundings = Surroundings {
@@ -131,7 +131,7 @@ pub(super) fn with_object<T>(
         gaussians: 150,
         stop: &stop,
     };
-    act(Object { label: 1, views, outline: &outline, is_told: false, surroundings })
+    act(&Object::by_outlines(1, views, &outlines, false, surroundings))
 }
 
 /// Patches of colour.

@@ -10,7 +10,7 @@ use super::outline;
 use super::plane::{self, Plane};
 use super::start::{Fitted, fit_object};
 use super::testing::{
-    Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views, with_object,
+    Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views, with_objects,
 };
 use super::view::ObjectView;
 use crate::random::{Purpose, stream};
@@ -20,7 +20,7 @@ fn fit(views: &[ObjectView]) -> Fitted {
 }
 
 fn fit_on(plane: Option<&Plane>, views: &[ObjectView]) -> Option<Fitted> {
-    with_object(plane, views, |object| fit_object(object).unwrap())
+    with_objects(plane, views, |objects| fit_object(objects).unwrap())
 }
 
 /// Largest error of turns relative to the first pose, degrees, and mean error of displacements, metres.
@@ -39,15 +39,20 @@ fn errors(found: &BTreeMap<usize, (DQuat, DVec3)>, truth: &[(DQuat, DVec3)]) -> 
     (turn, shift / found.len() as f64)
 }
 
-fn box_places() -> Vec<DVec3> {
+/// Places on the sides of a box, by half its extents.
+fn sides(half: DVec3) -> Vec<DVec3> {
     let mut rng = stream(0, Purpose::Objects, 9);
     (0..1500)
         .map(|k| {
-            let mut p = DVec3::from(std::array::from_fn(|_| 0.045 * (2.0 * rng.random::<f64>() - 1.0)));
-            p[k % 3] = if (k / 3) % 2 == 0 { 0.045 } else { -0.045 };
-            p
+            let mut p = DVec3::from(std::array::from_fn(|_| 2.0 * rng.random::<f64>() - 1.0));
+            p[k % 3] = if (k / 3) % 2 == 0 { 1.0 } else { -1.0 };
+            half * p
         })
         .collect()
+}
+
+fn box_places() -> Vec<DVec3> {
+    sides(DVec3::splat(0.045))
 }
 
 #[test]
@@ -95,6 +100,55 @@ fn a_textured_ball_is_found_to_roll_and_a_plain_one_is_assumed_to() {
 fn what_rests_is_left_alone() {
     let rests = vec![(DQuat::from_rotation_z(0.4), DVec3::new(0.05, 0.02, 0.05)); TIMES];
     assert!(fit_on(Some(&FLOOR), &views(solid(&box_places(), patches, 0.006), &rests, moving)).is_none());
+}
+
+#[test]
+fn what_rests_and_is_cut_at_all_times_is_left_alone() {
+    let beside: Cameras = |time| vec![camera(0.9 + 0.2 * time as f64 / TIMES as f64)];
+    let right = DVec3::new(1.0_f64.cos(), 1.0_f64.sin(), 0.0);
+    let rests = vec![(DQuat::IDENTITY, 0.31 * right + 0.05 * DVec3::Z); TIMES];
+    let views = views(solid(&box_places(), patches, 0.006), &rests, beside);
+    assert!(views.iter().all(|view| view.cut));
+    assert!(fit_on(Some(&FLOOR), &views).is_none());
+}
+
+#[test]
+fn what_shows_a_broader_side_is_not_lifted() {
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+        .map(|k| {
+            // Its end is seen for a while.
+            let share = (k as f64 / 15.0 - 1.0).max(0.0);
+            let place = DVec3::new(0.12 - 0.24 * share, 0.2 * share - 0.1, 0.045);
+            (DQuat::from_rotation_z(0.8 + 1.8 * share), place)
+        })
+        .collect();
+    let long = sides(DVec3::new(0.04, 0.1, 0.04));
+    let views = views(solid(&long, patches, 0.006), &truth, moving);
+    let lifted = outline::outlines(&views, Some(&FLOOR), TIMES).iter().any(|outline| !outline.air.is_empty());
+    assert!(lifted, "its size alone would tell that it is lifted");
+    let (turn, shift) = errors(&fit(&views).poses, &truth);
+    assert!(turn < 6.0 && shift < 0.015, "{turn} deg, {shift} m");
+}
+
+/// A box that stands, falls over its edge, and lies.
+fn falling() -> Vec<(DQuat, DVec3)> {
+    let edge = DVec3::new(0.03, 0.0, 0.0);
+    (0..TIMES)
+        .map(|k| {
+            let share = ((k as f64 - 12.0) / 6.0).clamp(0.0, 1.0);
+            let turn = DQuat::from_rotation_y(std::f64::consts::FRAC_PI_2 * share * share);
+            (turn, edge + turn * (DVec3::new(0.0, 0.0, 0.08) - edge) + 0.005 * DVec3::Z)
+        })
+        .collect()
+}
+
+#[test]
+fn what_falls_over_is_followed() {
+    let truth = falling();
+    let tall = sides(DVec3::new(0.03, 0.03, 0.08));
+    let fitted = fit(&views(solid(&tall, patches, 0.006), &truth, moving));
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(turn < 15.0 && shift < 0.02, "{turn} deg, {shift} m, {}", fitted.way);
 }
 
 #[test]
@@ -245,9 +299,8 @@ fn a_camera_that_jumps_follows_what_is_thrown_and_spins() {
 #[test]
 fn one_camera_without_a_support_says_nothing_of_distances() {
     let truth = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
-    assert!(
-        outline::outline(&views(solid(&box_places(), patches, 0.006), &truth, moving), None, TIMES).is_none()
-    );
+    let views = views(solid(&box_places(), patches, 0.006), &truth, moving);
+    assert!(outline::outlines(&views, None, TIMES).is_empty());
 }
 
 #[test]

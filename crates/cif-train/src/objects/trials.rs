@@ -28,13 +28,17 @@ const HOPELESS: f64 = 1.2;
 
 /// Error of resting, relative to that of sliding without a turn, and to that of the way that is kept, up to which an
 /// object is taken to rest.
-const REST_GAIN: [f64; 2] = [1.5, 1.15];
+pub(super) const REST_GAIN: [f64; 2] = [1.5, 1.15];
 
 /// Steps of poses of times that were left out.
 const SETTLE: usize = 40;
 
-/// Error from which neither resting nor sliding explains what is seen.
-const UNEXPLAINED: f64 = 0.3;
+/// Error from which neither resting nor sliding explains what is seen, and that of a way that does, of it.
+const UNEXPLAINED: f64 = 0.1;
+const EXPLAINED: f64 = 0.5;
+
+/// Largest error of turning in place.
+const MOST_IN_PLACE: f64 = 0.1;
 
 /// Error of an object that was followed, relative to that of paths, below which following is preferred: of most
 /// objects, and of round ones.
@@ -83,6 +87,7 @@ struct Contest<'a> {
 /// The best way of moving of an object that is seen well at enough times; `None` where it rests.
 pub(super) fn best_way<'a>(
     object: Object<'a>,
+    path: BTreeMap<usize, DVec3>,
     (reliable, good): (&[usize], &[usize]),
 ) -> Result<Option<Started<'a>>, TrainError> {
     let Object { views, outline, surroundings, .. } = object;
@@ -110,16 +115,19 @@ pub(super) fn best_way<'a>(
         left_out,
     };
     let simple = contest.simple()?;
+    let simple_errors = [Way::Rest, Way::Slide(0)].map(|way| error_of(&simple, way));
+    let stays = rests(&simple, Way::Slide(0), REST_GAIN[0]);
+    let is_unexplained = contest.is_unexplained(&simple);
     let trials = if let Some(textured) = contest.textured(&simple, reliable)? {
         vec![textured]
     } else if object.is_told {
         contest.along_the_path(simple)?
-    } else if rests(&simple, Way::Slide(0), REST_GAIN[0]) && !contest.is_unexplained(&simple) {
+    } else if stays && !is_unexplained {
         if !contest.paths.may_turn_unseen(views) {
             return Ok(None);
         }
         contest.finely(&contest.paths.spins())?
-    } else if contest.paths.shifts() || contest.is_unexplained(&simple) {
+    } else if contest.paths.shifts() || is_unexplained {
         contest.along_the_path(simple)?
     } else {
         return Ok(None);
@@ -133,6 +141,15 @@ pub(super) fn best_way<'a>(
     let Some(Trial { mut fit, losses, .. }) = trials.into_iter().find(|trial| trial.way == kept) else {
         return Ok(None);
     };
+    // What stays in place and looks otherwise in every turn deforms, or opens.
+    let most = match simple_errors[0] {
+        _ if matches!(way, Way::Spin(_)) => MOST_IN_PLACE,
+        Some(rests) if stays && is_unexplained => EXPLAINED * rests,
+        _ => f64::INFINITY,
+    };
+    if losses[1] > most && !object.is_told {
+        return Ok(None);
+    }
     (fit.turns, fit.rolls) = match (rotation, way) {
         (RotationEvidence::Assumed, Way::Roll(_)) => (Turns::Free, None),
         (RotationEvidence::Assumed, _) => (Turns::Given, None),
@@ -141,7 +158,8 @@ pub(super) fn best_way<'a>(
         (_, Way::Textured) => (Turns::Given, None),
         _ => (Turns::Free, None),
     };
-    Ok(Some(Started { fit, way, rotation, error: losses[1], reference }))
+    let unturned = simple_errors[1];
+    Ok(Some(Started { fit, path, way, rotation, error: losses[1], unturned, reference }))
 }
 
 impl<'a> Contest<'a> {
@@ -210,7 +228,12 @@ impl<'a> Contest<'a> {
                 self.paths.followed = Some(fit.poses);
             }
         }
-        let mut more = self.begin(&self.paths.ways(), GAUSSIANS);
+        let ways = if self.object.place > 0 && self.paths.followed.is_some() {
+            vec![Way::Followed]
+        } else {
+            self.paths.ways()
+        };
+        let mut more = self.begin(&ways, GAUSSIANS);
         self.advance(&mut more, (0, STEPS[0]), false)?;
         give_up_hopeless(&mut more, |way| matches!(way, Way::Followed | Way::Roll(_)));
         self.advance(&mut more, (STEPS[0], STEPS[1]), false)?;
@@ -218,7 +241,7 @@ impl<'a> Contest<'a> {
         trials.extend(more);
         let rivals = rivals(&trials);
         // Shading prefers no turn of round things, at any resolution.
-        if is_round(self.object.outline) || rivals.len() < 2 {
+        if is_round(self.object.outline) || (rivals.len() < 2 && self.object.outlines < 2) {
             return Ok(trials);
         }
         self.finely(&rivals)
@@ -358,10 +381,14 @@ fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
     rivals
 }
 
+/// Error of a way that was tried, on the views that were left out.
+fn error_of(trials: &[Trial<'_>], way: Way) -> Option<f64> {
+    trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1])
+}
+
 /// True where the error of resting is at most `gain` times that of a way of moving.
 fn rests(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
-    let error = |way: Way| trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1]);
-    error(Way::Rest).zip(error(way)).is_some_and(|(rest, moves)| rest <= gain * moves)
+    error_of(trials, Way::Rest).zip(error_of(trials, way)).is_some_and(|(rest, moves)| rest <= gain * moves)
 }
 
 /// The best way of moving, and whether the pictures tell its turns.

@@ -7,8 +7,33 @@ use glam::{DQuat, DVec3};
 
 use super::Trainer;
 use super::guard_tests::support::{Scene, capture, small_config};
+use super::objects::is_rigid;
 use crate::objects::Fitted;
 use crate::stage::Stage;
+
+#[test]
+fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
+    let fitted = |(error, unturned), rotation, is_ball| Fitted {
+        poses: BTreeMap::new(),
+        gaussians: Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap(),
+        reference: (DQuat::IDENTITY, DVec3::ZERO),
+        rotation,
+        error,
+        unturned: Some(unturned),
+        is_ball,
+        is_settled: true,
+        way: "told".to_owned(),
+    };
+    let (observed, assumed) = (RotationEvidence::Observed, RotationEvidence::Assumed);
+    let kept = |errors, rotation, is_ball| is_rigid(&fitted(errors, rotation, is_ball), 0.22);
+    assert!(kept((0.09, 0.09), assumed, false));
+    // Something that deforms moves no better when it turns.
+    assert!(!kept((0.12, 0.13), observed, false));
+    assert!(kept((0.12, 0.3), observed, false));
+    assert!(!kept((0.12, 0.3), assumed, false));
+    assert!(kept((0.2, 0.2), assumed, true));
+    assert!(!kept((0.3, 0.5), observed, true));
+}
 
 #[test]
 fn paths_hold_no_object_that_has_poses() {
@@ -28,6 +53,8 @@ fn paths_hold_no_object_that_has_poses() {
         reference: pose,
         rotation: RotationEvidence::Observed,
         error: 0.0,
+        unturned: None,
+        is_ball: false,
         is_settled: false,
         way: "told".to_owned(),
     };

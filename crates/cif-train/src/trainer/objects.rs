@@ -19,11 +19,30 @@ use crate::stage::Stage;
 const MOST_ERROR: [f64; 2] = [0.22, 0.15];
 const MOST_SETTLED: f64 = 0.095;
 
+/// The same of balls, which do not deform.
+const MOST_OF_BALL: f64 = 0.24;
+
+/// Error, of that without a turn, up to which an object is rigid all the same: rough masks leave errors, but no turn
+/// explains what deforms.
+const TURN_EXPLAINS: f64 = 0.5;
+
 /// Rates of poses at the start and the end of the fine stage, shares of the size of the object.
 const RATES: [f32; 2] = [0.004, 2e-4];
 
 /// Steps of the fine stage in which poses stay, while everything settles around them.
 const FROZEN: u32 = 300;
+
+/// True where poses explain an object, given the largest error of those that were not moved onto what was left out.
+pub(super) fn is_rigid(fitted: &Fitted, most: f64) -> bool {
+    let most = match (fitted.is_ball, fitted.is_settled) {
+        (true, _) => MOST_OF_BALL,
+        (false, true) => MOST_SETTLED,
+        (false, false) => most,
+    };
+    let turns = fitted.rotation == RotationEvidence::Observed;
+    let explains = |unturned: f64| turns && fitted.error <= TURN_EXPLAINS * unturned;
+    fitted.error <= most || fitted.unturned.is_some_and(explains)
+}
 
 impl Trainer {
     /// Finds objects that move although no path of theirs shows it: a little, late, or in place.
@@ -113,11 +132,10 @@ impl Trainer {
             }
             let is_told = *told == Some(ObjectMotion::Rigid);
             let found = objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told)?;
-            let most = |fitted: &Fitted| if fitted.is_settled { MOST_SETTLED } else { most };
             Ok((
                 *label,
                 match found {
-                    Found::Moves(fitted) if !is_told && fitted.error > most(&fitted) => Found::Nothing,
+                    Found::Moves(fitted) if !is_told && !is_rigid(&fitted, most) => Found::Nothing,
                     found => found,
                 },
             ))

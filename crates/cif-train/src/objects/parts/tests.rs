@@ -8,14 +8,14 @@ use rand::RngExt;
 
 use super::super::parts;
 use super::super::testing::{
-    Cameras, FLOOR, TIMES, moving, patches, rig, solid, views_of_groups, with_object,
+    Cameras, FLOOR, TIMES, moving, patches, rig, solid, views_of_groups, with_objects,
 };
 use super::super::view::ObjectView;
 use super::Jointed;
 use crate::random::{Purpose, stream};
 
 fn find(views: &[ObjectView]) -> Option<Jointed> {
-    with_object(Some(&FLOOR), views, |object| parts::find(object).unwrap())
+    with_objects(Some(&FLOOR), views, |objects| parts::find(objects[0]).unwrap())
 }
 
 /// Places on the faces of a box.
