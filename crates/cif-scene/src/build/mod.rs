@@ -31,6 +31,8 @@ use crate::{MotionModel, MotionSource, SceneError, SceneOptions, naming, world};
 const INSTANCE_TRIM: f64 = 0.05;
 /// The same for the background, where unlabelled things may move.
 const BACKGROUND_TRIM: f64 = 0.01;
+/// Parts of the moving background for each that an instance may have: it shows the shadows of many objects.
+const SHADOWS: usize = 4;
 
 /// Builds the scene graph of a field; the trained deformation moves it.
 ///
@@ -91,7 +93,7 @@ pub fn build_from(
             .filter_map(|((owner, group), _)| owner.filter(|_| group.is_passed))
             .filter(|owner| !at_rest.contains(owner))
             .collect();
-        if passed.is_empty() || options.most_expensive_motion != MotionModel::Dense {
+        if passed.is_empty() || options.most_expensive_motion < MotionModel::Parts {
             break (group_owners, groups, chosen);
         }
         at_rest.extend(passed);
@@ -277,17 +279,20 @@ struct NodeRows {
     moves: Vec<bool>,
     /// True of an instance some of whose splats go farther than they are large, by the network.
     is_passed: bool,
+    /// True where they may move as one body or as a few: an instance, and what moves of the background where not every
+    /// splat may have a path of its own.
+    is_body: bool,
 }
 
 impl NodeRows {
-    fn of(owner: Option<usize>, rows: Vec<(u32, Change)>, is_passed: bool) -> Self {
+    fn of(owner: Option<usize>, rows: Vec<(u32, Change)>, [is_passed, is_body]: [bool; 2]) -> Self {
         let (rows, changes): (_, Vec<Change>) = rows.into_iter().unzip();
-        Self { owner, rows, moves: changes.iter().map(Change::shows).collect(), is_passed }
+        Self { owner, rows, moves: changes.iter().map(Change::shows).collect(), is_passed, is_body }
     }
 }
 
 /// Rows of every node: instances in the order of the table, without what passes over those `at_rest`, then of the
-/// background what stands still and what moves, if the motion may be dense; empty ones left out.
+/// background what stands still and what moves, if the motion may be of parts; empty ones left out.
 fn rows_of_nodes(
     field: &Field,
     visible: &[u32],
@@ -316,16 +321,18 @@ fn rows_of_nodes(
             background.extend(passing.into_iter().map(|(row, _)| row));
             own = rest;
         }
-        nodes.push(NodeRows::of(Some(index), own, is_passed));
+        nodes.push(NodeRows::of(Some(index), own, [is_passed, true]));
     }
     background.sort_unstable();
     let changes = loose::changes(frames, &background);
     let background: Vec<(u32, Change)> = background.into_iter().zip(changes).collect();
-    if options.most_expensive_motion == MotionModel::Dense {
+    if options.most_expensive_motion >= MotionModel::Parts {
         let (moving, still) = background.into_iter().partition(|(_, change)| change.shows());
-        nodes.extend([still, moving].map(|rows| NodeRows::of(None, rows, false)));
+        let by_parts = options.most_expensive_motion == MotionModel::Parts;
+        nodes.push(NodeRows::of(None, still, [false; 2]));
+        nodes.push(NodeRows::of(None, moving, [false, by_parts]));
     } else {
-        nodes.push(NodeRows::of(None, background, false));
+        nodes.push(NodeRows::of(None, background, [false; 2]));
     }
     nodes.retain(|node| !node.rows.is_empty());
     nodes
@@ -340,7 +347,7 @@ fn moving_groups(
 ) -> (Vec<Option<usize>>, Vec<MovingGroup>) {
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
-    for NodeRows { owner, rows, moves, is_passed } in nodes {
+    for NodeRows { owner, rows, moves, is_passed, is_body } in nodes {
         let weights: Vec<f64> = rows
             .iter()
             .map(|&row| {
@@ -360,14 +367,14 @@ fn moving_groups(
             None if largest_instance > 0.0 => largest_instance.min(size),
             None => size,
         };
-        let pivot = if owner.is_some() { (low + high) / 2.0 } else { DVec3::ZERO };
+        let pivot = if is_body { (low + high) / 2.0 } else { DVec3::ZERO };
         let trim = if owner.is_some() { INSTANCE_TRIM } else { BACKGROUND_TRIM };
         let tolerance = options.tolerance.in_world_units(yardstick);
-        let mut group =
-            MovingGroup::new(rows, weights, pivot, owner.is_some(), trim, tolerance, &reference.means);
+        let mut group = MovingGroup::new(rows, weights, pivot, is_body, trim, tolerance, &reference.means);
         let moving: f64 =
             group.weights.iter().zip(moves).filter(|(_, moves)| *moves).map(|(weight, _)| weight).sum();
         group.is_passed = is_passed;
+        group.most_parts = options.max_parts * if owner.is_some() { 1 } else { SHADOWS };
         group.stands_still = moving <= trim * group.weights.iter().sum::<f64>();
         group_owners.push(owner);
         groups.push(group);

@@ -160,16 +160,18 @@ fn what_passes_over_an_instance_at_rest_leaves_with_the_moving_background() {
         graph.nodes.iter().map(|node| (node.name.clone(), node.model(), node.splats.len())).collect()
     };
     let node = |name: &str, model: MotionModel, splats: usize| (name.to_owned(), model, splats);
-    let (usual, rigid) = (
-        SceneOptions::default(),
-        SceneOptions { most_expensive_motion: MotionModel::Rigid, ..SceneOptions::default() },
-    );
+    let at_most = |model| SceneOptions { most_expensive_motion: model, ..SceneOptions::default() };
+    let (usual, parts, rigid) =
+        (SceneOptions::default(), at_most(MotionModel::Parts), at_most(MotionModel::Rigid));
     let whole = node("red_mug_001", MotionModel::Static, 60);
     // A shadow of two splats, which moves as it was trained.
     let shadow = nodes(&passing(10..12, 3.0), &usual);
     assert!(shadow.contains(&node("red_mug_001", MotionModel::Static, 58)), "{shadow:?}");
     assert!(shadow.contains(&node("background_moving", MotionModel::Dense, 2)), "{shadow:?}");
-    // No more than trembles, or where motion may not be dense, they stay with the instance.
+    // Where not every splat may have a path of its own, they move as one.
+    let shadow = nodes(&passing(10..12, 3.0), &parts);
+    assert!(shadow.contains(&node("background_moving", MotionModel::Rigid, 2)), "{shadow:?}");
+    // No more than trembles, or where nothing but bodies may move, they stay with the instance.
     let trembling = nodes(&passing(10..12, 0.01), &usual);
     assert!(trembling.contains(&whole), "{trembling:?}");
     let frozen = nodes(&passing(10..12, 3.0), &rigid);

@@ -1,17 +1,30 @@
 //! Turns of a ball from its texture, however it turns: its outline is a circle from all sides, so every pixel shows a
 //! known place of a sphere, and the rotations are those under which the times show one texture. The first are those of
-//! the few times in a row that agree best with an even turn; the others follow from time to time.
+//! the few times in a row that agree best with an even turn; the others follow from time to time. Several cameras show
+//! most of the ball at a time, so that each time is turned by itself, however fast it turns.
 
 use std::collections::BTreeMap;
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
+use super::fit::log;
 use super::outline::Outline;
 use super::sphere::{Agreement, Side, Texture, take_light_away};
 use super::start::STANDS;
 use super::texture::FEWEST;
 use super::view::{ObjectView, are_discs, median};
+
+/// Difference of turns that are tried of every time, where several cameras show it, radians; and the share of the places
+/// that these are judged by.
+const ANY_APART: f64 = 0.2;
+const FEW: usize = 4;
+
+/// Cost in agreement, per radian of change, of such turns: of several that agree, the most even is taken.
+const FAST_COST: f64 = 0.06;
+
+/// Agreement of the times from which such turns are told: among so many some agree by chance.
+const TOLD_OF_ANY: f64 = 0.45;
 
 /// Times in a row that are taken to turn evenly, and how many of them lie between beginnings that are tried.
 const WINDOW: usize = 6;
@@ -47,7 +60,10 @@ const TOLD: f64 = 0.3;
 const RESTS: f64 = 1.3;
 const ROLLS: f64 = 0.3;
 
-/// Pixels of a mask below which it may look like a disc by chance.
+/// Cameras of a time from which most of the ball is seen.
+const SEVERAL: usize = 3;
+
+/// Pixels of the masks of a time below which they may look like discs by chance.
 const FEWEST_PIXELS: f64 = 150.0;
 
 /// Root mean square of the logarithms of the texture below which it may be light.
@@ -68,10 +84,12 @@ pub(super) fn turns(
     for view in views.iter().filter(|view| path.contains_key(&view.time_index)) {
         at.entry(view.time_index).or_default().push(view);
     }
-    let mut areas: Vec<f64> = views.iter().map(|view| view.area()).collect();
+    let mut areas: Vec<f64> =
+        at.values().map(|views| views.iter().map(|view| view.area()).sum::<f64>()).collect();
     if at.len() < FEWEST || median(&mut areas) < FEWEST_PIXELS || !are_discs(views.iter().copied()) {
         return None;
     }
+    let are_surrounded = 2 * at.values().filter(|views| views.len() >= SEVERAL).count() > at.len();
     let side =
         |(time, views): (&usize, &Vec<&ObjectView>)| Side::of(*time, views, path[time], outline.size());
     let mut sides: Vec<Side> = at.iter().map(side).collect();
@@ -82,14 +100,18 @@ pub(super) fn turns(
         })
     };
     take_light_away(&mut sides, moves);
-    let found = followed_turns(&sides)?;
+    let (found, least) = if are_surrounded {
+        (turns_by_themselves(&sides)?, TOLD_OF_ANY)
+    } else {
+        (followed_turns(&sides)?, TOLD)
+    };
     let told = agreement(&sides, &found);
     let agrees = |roll: &BTreeMap<usize, DQuat>| -> f64 {
         agreement(&sides, &sides.iter().map(|side| roll[&side.time]).collect::<Vec<_>>())
     };
     let rolls = rolls.iter().map(agrees).fold(0.0, f64::max);
     let rests = agreement(&sides, &vec![DQuat::IDENTITY; sides.len()]);
-    let is_told = told > TOLD.max(RESTS * rests)
+    let is_told = told > least.max(RESTS * rests)
         && rolls < ROLLS * told
         && told.sqrt() * Side::strength(&sides) > FAINT;
     is_told.then(|| sides.iter().map(|side| side.time).zip(found).collect())
@@ -104,6 +126,46 @@ fn followed_turns(sides: &[Side]) -> Option<Vec<DQuat>> {
     for _ in 0..AGAIN {
         turns = grown(sides, &evens, best, well_told(sides, &turns));
         refine(sides, &mut turns);
+    }
+    Some(turns)
+}
+
+/// The same of sides each of which shows most of the ball: outward from the one that shows most, each is turned as it
+/// agrees best with those before, whatever the turn between them.
+fn turns_by_themselves(sides: &[Side]) -> Option<Vec<DQuat>> {
+    let first = (0..sides.len()).max_by(|a, b| sides[*a].weight().total_cmp(&sides[*b].weight()))?;
+    let mut order: Vec<usize> = (0..sides.len()).collect();
+    order.sort_by_key(|k| k.abs_diff(first));
+    let all = grid(std::f64::consts::PI, ANY_APART);
+    let mut turns = vec![DQuat::IDENTITY; sides.len()];
+    let mut texture = Texture::of(&sides[first], DQuat::IDENTITY);
+    let found = |texture: &Texture, turns: &[DQuat], k: usize| {
+        let beside = if k < first { k + 1 } else { k - 1 };
+        let from = turns[beside];
+        // The turn between the two before leads on.
+        let before = if k < first { beside + 1 } else { beside.wrapping_sub(1) };
+        let is_known = if k < first { before <= first } else { beside > first };
+        let rate = if is_known { log(from * turns[before].inverse()) } else { DVec3::ZERO };
+        let rotation = |turn: DVec3| (DQuat::from_scaled_axis(turn) * from).normalize();
+        let cost = |turn: DVec3| FAST_COST * (turn - rate).length().min(std::f64::consts::PI);
+        let few = sides[k].few(FEW);
+        let rough = |turn: DVec3| texture.agreement(&few, rotation(turn)).share() - cost(turn);
+        let scores: Vec<f64> = all.par_iter().map(|turn| rough(*turn)).collect();
+        let best = (0..all.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b])).map_or(rate, |k| all[k]);
+        let score = |turn: DVec3| texture.agreement(&sides[k], rotation(turn)).share() - cost(turn);
+        let coarse = best_around((score(rate), rate), (best, &grid(ANY_APART, APART)), score);
+        rotation(refined(coarse, score).1)
+    };
+    for k in order.iter().copied().filter(|k| *k != first) {
+        turns[k] = found(&texture, &turns, k);
+        texture.add(&Texture::of(&sides[k], turns[k]));
+    }
+    for _ in 0..AGAIN {
+        for k in order.iter().copied().filter(|k| *k != first) {
+            texture.subtract(&Texture::of(&sides[k], turns[k]));
+            turns[k] = found(&texture, &turns, k);
+            texture.add(&Texture::of(&sides[k], turns[k]));
+        }
     }
     Some(turns)
 }
@@ -311,39 +373,62 @@ fn agreement(sides: &[Side], turns: &[DQuat]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::super::outline::outlines;
-    use super::super::testing::{TIMES, jumping, patches, solid, sphere_places, views};
+    use super::super::testing::{Cameras, TIMES, jumping, patches, rig, solid, sphere_places, views};
     use super::*;
 
-    /// Turns found of a ball that flies and turns evenly about a tilted axis, by time.
-    fn thrown(color: impl Fn(DVec3) -> [f32; 3], turn: DVec3) -> Option<BTreeMap<usize, DQuat>> {
+    /// Turns found of a ball that flies, with these rotations, by time.
+    fn thrown(
+        color: impl Fn(DVec3) -> [f32; 3],
+        rotation: impl Fn(usize) -> DQuat,
+        cameras: Cameras,
+    ) -> Option<BTreeMap<usize, DQuat>> {
         let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
             .map(|time| {
                 let share = time as f64 / (TIMES - 1) as f64;
                 let place = DVec3::new(0.3 * share - 0.15, 0.0, 0.06 + 0.6 * share * (1.0 - share));
-                (DQuat::from_scaled_axis(time as f64 * turn), place)
+                (rotation(time), place)
             })
             .collect();
-        let views = views(solid(&sphere_places(0.05), color, 0.006), &truth, jumping);
+        let views = views(solid(&sphere_places(0.05), color, 0.006), &truth, cameras);
         let outline = outlines(&views, None, TIMES).remove(0);
         let seen: Vec<&ObjectView> = views.iter().collect();
         turns(&seen, &outline.path, &outline, &[])
     }
 
+    /// Rotation of a ball that turns evenly about a tilted axis.
+    fn even(time: usize) -> DQuat {
+        DQuat::from_scaled_axis(time as f64 * DVec3::new(0.1, 0.12, -0.15))
+    }
+
+    /// Middle error of turns relative to the first, degrees.
+    fn error(found: &BTreeMap<usize, DQuat>, truth: impl Fn(usize) -> DQuat) -> f64 {
+        let of = |time: usize| {
+            let relative = found[&time] * found[&0].inverse();
+            relative.angle_between(truth(time) * truth(0).inverse()).to_degrees()
+        };
+        median(&mut (1..TIMES).map(of).collect::<Vec<_>>())
+    }
+
     #[test]
     fn turns_in_flight_show_by_the_texture() {
-        let turn = DVec3::new(0.1, 0.12, -0.15);
-        let found = thrown(patches, turn).unwrap();
-        let mut errors: Vec<f64> = (1..TIMES)
-            .map(|time| {
-                let relative = found[&time] * found[&0].inverse();
-                relative.angle_between(DQuat::from_scaled_axis(time as f64 * turn)).to_degrees()
-            })
-            .collect();
-        assert!(median(&mut errors) < 10.0, "{errors:.0?}");
+        let error = error(&thrown(patches, even, jumping).unwrap(), even);
+        assert!(error < 10.0, "{error}");
+    }
+
+    #[test]
+    fn several_cameras_show_turns_however_fast() {
+        // A third of a turn from time to time, and the other way round after a bounce.
+        let fast = |time: usize| {
+            let turned = if time < 15 { time } else { 30 - time };
+            DQuat::from_scaled_axis(2.1 * turned as f64 * DVec3::new(0.4, 0.7, -0.6).normalize())
+        };
+        let error = error(&thrown(patches, fast, rig).unwrap(), fast);
+        assert!(error < 8.0, "{error}");
     }
 
     #[test]
     fn a_plain_ball_does_not_show_its_turns() {
-        assert!(thrown(|_| [0.8, 0.5, 0.2], DVec3::new(0.1, 0.12, -0.15)).is_none());
+        assert!(thrown(|_| [0.8, 0.5, 0.2], even, jumping).is_none());
+        assert!(thrown(|_| [0.8, 0.5, 0.2], even, rig).is_none());
     }
 }

@@ -47,6 +47,11 @@ const MOSTLY_SEEN: f64 = 0.6;
 /// the way down from which the bar lies.
 const BAR: (f64, f64) = (2.2, 0.15);
 
+/// Of so many times the lowest is one at which an object stands, and limits of its height there, of that which its
+/// outlines tell.
+const LOWEST: usize = 8;
+const STANDS: (f64, f64) = (0.4, 1.5);
+
 /// Room that an object has around its height and radius, of them.
 const ROOM: f64 = 1.1;
 
@@ -149,7 +154,7 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
     let met = meetings(views);
     if !met.is_empty() {
         let on_plane = on_plane(Stance::MayLeave);
-        return vec![surrounded(views, on_plane, (met, path::MEETING))];
+        return vec![surrounded(views, (plane, on_plane), (met, path::MEETING))];
     }
     let mut found: Vec<Outline> = on_plane(Stance::Stays).into_iter().collect();
     let leaves = on_plane(Stance::MayLeave).filter(|outline| !outline.air.is_empty());
@@ -157,7 +162,7 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
     if found.is_empty() || leaves.is_some() {
         let crossing = Some(path::crossing(views, times)).filter(|path| !path.is_empty());
         found.extend(leaves);
-        found.extend(crossing.map(|path| surrounded(views, None, (path, path::CROSSING))));
+        found.extend(crossing.map(|path| surrounded(views, (None, None), (path, path::CROSSING))));
     }
     found.extend(on_plane(Stance::Topples));
     found
@@ -166,7 +171,7 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
 /// Outline of an object whose centres are known by time, with the stiffness of their path, beside what a plane tells.
 fn surrounded(
     views: &[ObjectView],
-    on_plane: Option<Outline>,
+    (plane, on_plane): (Option<&Plane>, Option<Outline>),
     (met, stiffness): (BTreeMap<usize, DVec3>, f64),
 ) -> Outline {
     let radius_of = |view: &ObjectView| {
@@ -187,10 +192,24 @@ fn surrounded(
         stiffness,
         is_surrounded: true,
     });
+    if stiffness == path::MEETING
+        && let Some(height) = plane.and_then(|plane| standing_height(&met, plane, outline.height))
+    {
+        outline.height = height;
+    }
     (outline.stiffness, outline.is_surrounded) = (stiffness, true);
     outline.air.clear();
     outline.path.extend(met);
     outline
+}
+
+/// Height above the plane at which an object stands whose centres are known: that of its lowest times. `None` where these
+/// are few, or far from what its outlines tell, so that it may never stand.
+fn standing_height(met: &BTreeMap<usize, DVec3>, plane: &Plane, told: f64) -> Option<f64> {
+    let mut heights: Vec<f64> = met.values().map(|centre| plane.height(*centre)).collect();
+    heights.sort_by(f64::total_cmp);
+    let height = *heights.get(heights.len() / LOWEST).filter(|_| heights.len() >= LOWEST)?;
+    (STANDS.0 * told..STANDS.1 * told).contains(&height).then_some(height)
 }
 
 /// Centres at times that several cameras see, where their rays meet.
@@ -478,5 +497,18 @@ mod tests {
         let found = outlines(&views, Some(&FLOOR), TIMES);
         let [found] = &found[..] else { panic!("{} outlines", found.len()) };
         assert!((found.height / found.radius - 1.0).abs() < 0.06, "{} and {}", found.height, found.radius);
+    }
+
+    #[test]
+    fn what_several_cameras_see_stands_as_high_as_at_its_lowest() {
+        let lifted = |time: usize| (time, DVec3::new(0.1, 0.0, 0.05 + 0.02 * time.saturating_sub(6) as f64));
+        let met: BTreeMap<usize, DVec3> = (0..TIMES).map(lifted).collect();
+        assert_eq!(standing_height(&met, &FLOOR, 0.07), Some(0.05));
+        // Too high to stand, by its outlines; too few times.
+        assert_eq!(standing_height(&met, &FLOOR, 0.02), None);
+        assert_eq!(standing_height(&(0..5).map(lifted).collect(), &FLOOR, 0.07), None);
+        // Outlines of a ball tell its height worse than the places where its rays meet.
+        let found = outlines(&ball(TIMES, rig), Some(&FLOOR), TIMES).remove(0);
+        assert!((found.height - RADIUS).abs() < 0.002, "{}", found.height);
     }
 }

@@ -28,6 +28,7 @@ const CELLS: usize = 10;
 const UNSEEN: f64 = 0.1;
 
 /// A place of the sphere at one time.
+#[derive(Clone, Copy)]
 struct Sample {
     /// Unit vector from the middle, in the world.
     outward: DVec3,
@@ -64,6 +65,16 @@ impl Side {
     /// The side that views of a time show of a ball of this radius, here.
     pub(super) fn of(time: usize, views: &[&ObjectView], centre: DVec3, radius: f64) -> Self {
         Self { time, samples: views.iter().flat_map(|view| samples(view, centre, radius)).collect() }
+    }
+
+    /// The side by every so manyth of its places.
+    pub(super) fn few(&self, step: usize) -> Self {
+        Self { time: self.time, samples: self.samples.iter().step_by(step).copied().collect() }
+    }
+
+    /// Weight of all that it shows.
+    pub(super) fn weight(&self) -> f64 {
+        self.samples.iter().map(|sample| sample.weight).sum()
     }
 
     /// Root mean square of the values of some sides.
