@@ -31,8 +31,6 @@ use crate::{MotionModel, MotionSource, SceneError, SceneOptions, naming, world};
 const INSTANCE_TRIM: f64 = 0.05;
 /// The same for the background, where unlabelled things may move.
 const BACKGROUND_TRIM: f64 = 0.01;
-/// Parts of the moving background for each that an instance may have: it shows the shadows of many objects.
-const SHADOWS: usize = 4;
 
 /// Builds the scene graph of a field; the trained deformation moves it.
 ///
@@ -374,7 +372,6 @@ fn moving_groups(
         let moving: f64 =
             group.weights.iter().zip(moves).filter(|(_, moves)| *moves).map(|(weight, _)| weight).sum();
         group.is_passed = is_passed;
-        group.most_parts = options.max_parts * if owner.is_some() { 1 } else { SHADOWS };
         group.stands_still = moving <= trim * group.weights.iter().sum::<f64>();
         group_owners.push(owner);
         groups.push(group);

@@ -139,7 +139,7 @@ fn fit_parts_where_needed(
         .zip(own)
         .map(|(group, own)| {
             let start = Instant::now();
-            let fitted = (!own.is_empty()).then(|| fit_parts(group, &own)).flatten();
+            let fitted = (!own.is_empty()).then(|| fit_parts(group, &own, options)).flatten();
             group.seconds += start.elapsed().as_secs_f64();
             fitted
         })
@@ -147,12 +147,12 @@ fn fit_parts_where_needed(
 }
 
 /// The fewest parts inside the tolerance, or else the best there are.
-fn fit_parts(group: &MovingGroup, own: &[Frame]) -> Option<FittedParts> {
+fn fit_parts(group: &MovingGroup, own: &[Frame], options: &SceneOptions) -> Option<FittedParts> {
     if let Some(told) = &group.told {
         let partition = Partition { labels: told.labels.clone(), count: told.parts.len() + 1, decisive: 0.0 };
         return Some(fit_partition(group, own, &partition));
     }
-    let partitions = parts::partitions(own, &group.weights, group.tolerance, group.trim, group.most_parts);
+    let partitions = parts::partitions(own, &group.weights, group.tolerance, group.trim, options.max_parts);
     let promising = partitions.iter().filter(|partition| partition.decisive <= PROMISING * group.tolerance);
     let mut best: Option<FittedParts> = None;
     let mut keep_better = |fitted: FittedParts| {

@@ -48,8 +48,6 @@ pub struct MovingGroup {
     pub stands_still: bool,
     /// True where some splats travel that may show what passes over it ([`crate::motion::loose`]).
     pub is_passed: bool,
-    /// Most parts that it may move as.
-    pub most_parts: usize,
     /// Share of the weight that may be outliers.
     pub trim: f64,
     /// Largest decisive residual allowed, world units.
@@ -253,7 +251,6 @@ impl MovingGroup {
             is_body,
             stands_still: false,
             is_passed: false,
-            most_parts: 1,
             trim,
             tolerance,
             static_shape: MeanShape::default(),
