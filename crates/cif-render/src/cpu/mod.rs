@@ -47,6 +47,7 @@ pub use counts::IdentityCounts;
 pub use level::SimdLevel;
 pub use products::{Products, Side};
 pub use renderer::{
-    BandRequest, BlendWeightGradients, ForwardPass, NotFinite, RenderedBand, Renderer, ViewStatistics,
+    BandRequest, BlendWeightGradients, ForwardPass, NotFinite, RenderedBand, Renderer, ViewCotangents,
+    ViewStatistics,
 };
 pub use timing::StageTimes;

@@ -28,6 +28,20 @@ struct LabelMass {
     values: Vec<f32>,
 }
 
+/// Gradients of a loss by what the last forward pass made of a view.
+#[derive(Clone, Copy, Debug)]
+pub struct ViewCotangents<'a> {
+    /// dL/dcolour per pixel.
+    pub color: &'a PixelGrid<[f32; 3]>,
+    /// dL/dalpha per pixel ([`Renderer::alpha`]), or empty.
+    pub alpha: &'a [f32],
+    /// Factor of the view's mean instance loss.
+    pub instance_weight: f32,
+    /// By what the deformation adds to the centres, `[N, 3]`, or empty: these train the deformation, and leave the
+    /// canonical centres to the image.
+    pub displacements: &'a [[f32; 3]],
+}
+
 impl Renderer {
     /// Adds the gradients of the last forward pass: `v_color` is dL/dcolour per pixel, `instance_weight`
     /// multiplies the view's mean instance loss.
@@ -42,32 +56,29 @@ impl Renderer {
         instance_weight: f32,
         gradients: &mut Gradients,
     ) {
-        self.backward_displaced(field, v_color, instance_weight, &[], gradients);
+        let cotangents = ViewCotangents { color: v_color, alpha: &[], instance_weight, displacements: &[] };
+        self.backward_of(field, &cotangents, gradients);
     }
 
-    /// [`Self::backward`] with gradients of its own by what the deformation adds to the centres, `[N, 3]`, or
-    /// empty: they train the deformation, and leave the canonical centres to the image.
+    /// Adds the gradients of the last forward pass, given those by everything that it made.
     ///
     /// # Panics
     /// As [`Self::backward`].
-    pub fn backward_displaced(
-        &mut self,
-        field: &Field,
-        v_color: &PixelGrid<[f32; 3]>,
-        instance_weight: f32,
-        v_displacements: &[[f32; 3]],
-        gradients: &mut Gradients,
-    ) {
+    pub fn backward_of(&mut self, field: &Field, cotangents: &ViewCotangents<'_>, gradients: &mut Gradients) {
         let (view, settings, _) = self.tape.view.expect("backward follows a forward pass");
+        let v_color = cotangents.color;
         assert_eq!((v_color.width, v_color.height), (view.width, view.height), "cotangent size");
+        assert!(
+            cotangents.alpha.is_empty() || cotangents.alpha.len() == v_color.pixels.len(),
+            "cotangent size"
+        );
         let mut times = self.times;
-        let (pairs, label_mass) = timed(&mut times.rasterize_backward, || {
-            self.rasterize_backward(field, v_color, instance_weight, &settings)
-        });
+        let (pairs, label_mass) =
+            timed(&mut times.rasterize_backward, || self.rasterize_backward(field, cotangents, &settings));
         self.inspect_pairs(&pairs, &label_mass.values);
         timed(&mut times.project_backward, || self.calibration_backward(field, &label_mass, gradients));
         self.times = times;
-        self.splats_backward(field, &pairs, v_displacements, gradients);
+        self.splats_backward(field, &pairs, cotangents.displacements, gradients);
     }
 
     /// Carries gradients of (tile, splat) pairs, and those by what the deformation adds to the centres, to the
@@ -149,12 +160,12 @@ impl Renderer {
     fn rasterize_backward(
         &self,
         field: &Field,
-        v_color: &PixelGrid<[f32; 3]>,
-        instance_weight: f32,
+        cotangents: &ViewCotangents<'_>,
         settings: &RenderSettings,
     ) -> (Vec<SplatGradient>, LabelMass) {
         let tape = &self.tape;
         let lists = &tape.lists;
+        let instance_weight = cotangents.instance_weight;
         let trains_instances = instance_weight != 0.0 && tape.labelled_pixels > 0;
         let rows = field.identities.as_ref().map(|rows| IdentityRows::new(rows, &tape.probabilities));
         let instances = |tile: usize| {
@@ -185,7 +196,7 @@ impl Renderer {
             }
             let place = self.place(tile);
             let entries = lists.tile(tile);
-            let mut cotangents = tile_cotangents(&place, &v_color.pixels, &tape.color);
+            let mut cotangents = tile_cotangents(&place, cotangents, &tape.color, &tape.tiles[tile]);
             let instances = instances(tile).map(|(labels, rows)| {
                 let (inverse_probability, coverage_ratio) =
                     instance_cotangents(labels, &tape.tiles[tile], settings);
@@ -331,18 +342,28 @@ impl Renderer {
     }
 }
 
-/// Gradients of the colour loss by the colours of a tile's pixels.
-fn tile_cotangents(place: &TilePlace, v_color: &[[f32; 3]], color: &[[f32; 3]]) -> TileCotangents {
+/// Gradients by what the pixels of a tile show.
+fn tile_cotangents(
+    place: &TilePlace,
+    v: &ViewCotangents<'_>,
+    color: &[[f32; 3]],
+    image: &TileImage,
+) -> TileCotangents {
     let zero = [[0.0; LANES]; GROUPS];
     let mut cotangents = TileCotangents { color: [zero; 3], remainder: zero };
     for group in 0..GROUPS {
         for lane in 0..LANES {
             if let Some(pixel) = place.pixel(group, lane) {
-                let (v, c) = (v_color[pixel], color[pixel]);
+                let (v_color, c) = (v.color.pixels[pixel], color[pixel]);
                 for channel in 0..3 {
-                    cotangents.color[channel][group][lane] = v[channel];
+                    cotangents.color[channel][group][lane] = v_color[channel];
                 }
-                cotangents.remainder[group][lane] = v[0] * c[0] + v[1] * c[1] + v[2] * c[2];
+                let remainder = &mut cotangents.remainder[group][lane];
+                *remainder = v_color[0] * c[0] + v_color[1] * c[1] + v_color[2] * c[2];
+                if let Some(v_alpha) = v.alpha.get(pixel) {
+                    // As a background does that takes this much away.
+                    *remainder -= v_alpha * image.transmittance[group][lane];
+                }
             }
         }
     }
