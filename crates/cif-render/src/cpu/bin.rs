@@ -98,12 +98,13 @@ pub(super) struct TileLists {
 /// Bytes of a (tile, splat) pair while lists without the pairs of each splat are built.
 pub(super) const PAIR_BYTES: u64 = (size_of::<(u32, u8)>() + size_of::<TileEntry>()) as u64;
 
-/// Sorts splats front to back; ties keep the order of the Gaussians.
-pub(super) fn sort_by_depth(splats: &mut [Splat]) {
-    // Positive floats order like their bits; the index breaks ties.
-    splats.par_sort_unstable_by_key(|splat| {
-        (u64::from(splat.order.to_bits()) << 32) | u64::from(splat.gaussian)
-    });
+/// Sorts splats front to back; ties keep the order that they come in, which is that of the Gaussians.
+pub(super) fn sort_by_depth(splats: &mut Vec<Splat>) {
+    // Keys are moved around instead of splats. Positive floats order like their bits; the position breaks ties.
+    let key = |(position, splat): (usize, &Splat)| u64::from(splat.order.to_bits()) << 32 | position as u64;
+    let mut keys: Vec<u64> = splats.iter().enumerate().map(key).collect();
+    keys.par_sort_unstable();
+    *splats = keys.into_iter().map(|key| splats[(key & u64::from(u32::MAX)) as usize]).collect();
 }
 
 /// Most (tile, splat) pairs of a view: positions are 32-bit.

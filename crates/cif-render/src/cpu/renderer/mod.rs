@@ -202,7 +202,7 @@ impl Renderer {
         timed(&mut times.deform, || {
             let deformation = field.deformation.as_ref().filter(|_| settings.deform);
             let tracks = field.tracks.as_ref().map(|tracks| tracks.at(time));
-            pose(level, field, deformation, tracks, time, &mut tape.posed);
+            pose(level, field, deformation, tracks, (time, settings.sh_degree), &mut tape.posed);
             deformed = deformation.map_or(0, |deformation| deformation.moving_rows(field.len()).count());
         });
         timed(&mut times.project, || {
