@@ -67,11 +67,12 @@ impl TileRegion {
     pub(super) fn reached(&self, splat: &Splat) -> [Range<u32>; 2] {
         let range = |axis: usize, first: u32, count: u32| {
             let tile = TILE as f32;
-            let low = ((splat.mean[axis] - splat.extent[axis]) / tile).floor();
-            let high = ((splat.mean[axis] + splat.extent[axis]) / tile).floor();
+            let low = (splat.mean[axis] - splat.extent[axis]) / tile;
+            let high = (splat.mean[axis] + splat.extent[axis]) / tile;
             let end = first + count;
+            // Nothing is below 0 here, so that what is cut off is what `floor` takes away, which may be a call.
             let low = low.max(first as f32).min(end as f32) as u32;
-            let high = (high + 1.0).max(first as f32).min(end as f32) as u32;
+            let high = if high < first as f32 { first } else { (high.min(end as f32) as u32 + 1).min(end) };
             low..high.max(low)
         };
         [range(0, self.first_column, self.columns), range(1, self.first_row, self.rows)]

@@ -212,9 +212,14 @@ impl Renderer {
                 .into_par_iter()
                 .map(|chunk| {
                     let rows = chunk * CHUNK..n.min((chunk + 1) * CHUNK);
-                    dispatch!(level, _simd => rows
-                        .filter_map(|row| project(&view, &posed.at(row), row as u32))
-                        .collect())
+                    let mut splats = Vec::with_capacity(rows.len());
+                    // No `filter_map`: its closure would not be compiled for the instructions.
+                    dispatch!(level, _simd => for row in rows {
+                        if let Some(splat) = project(&view, &posed.at(row), row as u32) {
+                            splats.push(splat);
+                        }
+                    });
+                    splats
                 })
                 .collect();
             tape.splats.clear();
