@@ -117,10 +117,11 @@ fn multiply_tiles<S: Simd>(
 /// True with vectors of 16 and 32 registers for them.
 #[inline(always)]
 fn has_many_registers<S: Simd>(simd: S) -> bool {
-    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
-    return matches!(simd.level(), Level::Avx512(_));
-    #[cfg(not(any(target_arch = "x86", target_arch = "x86_64")))]
-    return false;
+    match simd.level() {
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        Level::Avx512(_) => true,
+        _ => false,
+    }
 }
 
 /// One entry of a product.
