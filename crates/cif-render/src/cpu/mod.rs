@@ -47,7 +47,6 @@ pub use counts::IdentityCounts;
 pub use level::SimdLevel;
 pub use products::{Products, Side};
 pub use renderer::{
-    BandRequest, BlendWeightGradients, ForwardPass, NotFinite, RenderedBand, Renderer, ViewCotangents,
-    ViewStatistics,
+    BandRequest, BlendWeightGradients, ForwardPass, NotFinite, RenderedBand, Renderer, ViewStatistics,
 };
 pub use timing::StageTimes;

@@ -17,7 +17,7 @@ use cif_render::{
     OccupancySource, RenderSettings, RenderedImage,
 };
 
-use crate::renderers::{Path, Seen, everywhere, fast_gradient, forward_and_backward, on_processor};
+use crate::renderers::{Path, Seen, everywhere, fast_gradient, forward_and_backward};
 use crate::support::{Cotangents, Mismatches, Worst, pixel_discontinuity, render};
 
 /// Relative width of the boundary band: above the rounding of a weight in single precision.
@@ -334,23 +334,6 @@ fn colour_only() {
     let settings = RenderSettings { instances: None, ..settings() };
     check("colour only", &SyntheticConfig { instances: 0, ..config() }, &settings, |_| {});
     check("colour only, identities unused", &config(), &settings, |_| {});
-}
-
-#[test]
-fn losses_of_alpha() {
-    let mut expected = Expected::of("alpha", &config(), &settings(), |_| {});
-    let mut alpha = Cotangents::random(5, config().width, config().height).alpha.unwrap();
-    for (v, near) in alpha.pixels.iter_mut().zip(&expected.band) {
-        *v *= f64::from(u8::from(!near));
-    }
-    expected.cotangents.alpha = Some(alpha);
-    let scene = Scene::from_field(&expected.synthetic.field);
-    expected.gradients = expected.cotangents.backward(&scene, &expected.forward);
-    for actual in on_processor(&expected.synthetic, &settings(), &expected.cotangents) {
-        let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
-        expected.compare(&actual, Tolerances::of(actual.path), &mut mismatches, &mut worst);
-        mismatches.finish(&format!("alpha, {:?}", actual.path));
-    }
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! A training view through every renderer, in one form that is compared with the reference in double precision.
 
 use cif_field::parameters::Parameter;
-use cif_render::cpu::{ForwardPass, Renderer, SimdLevel, ViewCotangents};
+use cif_render::cpu::{ForwardPass, Renderer, SimdLevel};
 use cif_render::reference::Scene;
 use cif_render::synthetic::SyntheticScene;
 use cif_render::{Gradients, RenderSettings};
@@ -116,14 +116,7 @@ pub(crate) fn forward_and_backward(
     let mut renderer = Renderer::new(simd);
     let forward = renderer.forward(&scene.field, &scene.camera, scene.time, settings, Some(&scene.labels));
     let v_color = cotangents.color.map(|color| color.map(|v| v as f32));
-    let v_alpha: Vec<f32> = cotangents.alpha.iter().flat_map(|v| &v.pixels).map(|v| *v as f32).collect();
-    let cotangents = ViewCotangents {
-        color: &v_color,
-        alpha: &v_alpha,
-        instance_weight: cotangents.instance_weight as f32,
-        displacements: &[],
-    };
-    renderer.backward_of(&scene.field, &cotangents, gradients);
+    renderer.backward(&scene.field, &v_color, cotangents.instance_weight as f32, gradients);
     forward
 }
 

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use cif_field::Field;
 use cif_geometry::{PixelGrid, quaternion};
-use cif_render::cpu::{BlendWeightGradients, IdentityCounts, Renderer, SimdLevel, ViewCotangents};
+use cif_render::cpu::{BlendWeightGradients, IdentityCounts, Renderer, SimdLevel};
 use cif_render::{BlendRequest, Channels, GeometryPath, Gradients, RenderSettings, RenderedImage};
 
 use super::{Changed, Engine, Views};
@@ -171,13 +171,13 @@ impl Processor {
         let v_displacements = pulls.map_or_else(Vec::new, |pulls| {
             state.guidance.gradients(&pulls, &state.field, self.renderer.posed_means())
         });
-        let cotangents = ViewCotangents {
-            color: &self.v_color,
-            alpha: &[],
+        self.renderer.backward_displaced(
+            &state.field,
+            &self.v_color,
             instance_weight,
-            displacements: &v_displacements,
-        };
-        self.renderer.backward_of(&state.field, &cotangents, &mut state.gradients);
+            &v_displacements,
+            &mut state.gradients,
+        );
         let fault = self.renderer.take_not_finite().map(Fault::from);
         let statistics = self.renderer.statistics();
         let gaussians = state.field.gaussians.len();

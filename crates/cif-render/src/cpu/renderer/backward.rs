@@ -28,20 +28,6 @@ struct LabelMass {
     values: Vec<f32>,
 }
 
-/// Gradients of a loss by what the last forward pass made of a view.
-#[derive(Clone, Copy, Debug)]
-pub struct ViewCotangents<'a> {
-    /// dL/dcolour per pixel.
-    pub color: &'a PixelGrid<[f32; 3]>,
-    /// dL/dalpha per pixel ([`Renderer::alpha`]), or empty.
-    pub alpha: &'a [f32],
-    /// Factor of the view's mean instance loss.
-    pub instance_weight: f32,
-    /// By what the deformation adds to the centres, `[N, 3]`, or empty: these train the deformation, and leave the
-    /// canonical centres to the image.
-    pub displacements: &'a [[f32; 3]],
-}
-
 impl Renderer {
     /// Adds the gradients of the last forward pass: `v_color` is dL/dcolour per pixel, `instance_weight`
     /// multiplies the view's mean instance loss.
@@ -56,29 +42,32 @@ impl Renderer {
         instance_weight: f32,
         gradients: &mut Gradients,
     ) {
-        let cotangents = ViewCotangents { color: v_color, alpha: &[], instance_weight, displacements: &[] };
-        self.backward_of(field, &cotangents, gradients);
+        self.backward_displaced(field, v_color, instance_weight, &[], gradients);
     }
 
-    /// Adds the gradients of the last forward pass, given those by everything that it made.
+    /// [`Self::backward`] with gradients of its own by what the deformation adds to the centres, `[N, 3]`, or
+    /// empty: they train the deformation, and leave the canonical centres to the image.
     ///
     /// # Panics
     /// As [`Self::backward`].
-    pub fn backward_of(&mut self, field: &Field, cotangents: &ViewCotangents<'_>, gradients: &mut Gradients) {
+    pub fn backward_displaced(
+        &mut self,
+        field: &Field,
+        v_color: &PixelGrid<[f32; 3]>,
+        instance_weight: f32,
+        v_displacements: &[[f32; 3]],
+        gradients: &mut Gradients,
+    ) {
         let (view, settings, _) = self.tape.view.expect("backward follows a forward pass");
-        let v_color = cotangents.color;
         assert_eq!((v_color.width, v_color.height), (view.width, view.height), "cotangent size");
-        assert!(
-            cotangents.alpha.is_empty() || cotangents.alpha.len() == v_color.pixels.len(),
-            "cotangent size"
-        );
         let mut times = self.times;
-        let (pairs, label_mass) =
-            timed(&mut times.rasterize_backward, || self.rasterize_backward(field, cotangents, &settings));
+        let (pairs, label_mass) = timed(&mut times.rasterize_backward, || {
+            self.rasterize_backward(field, v_color, instance_weight, &settings)
+        });
         self.inspect_pairs(&pairs, &label_mass.values);
         timed(&mut times.project_backward, || self.calibration_backward(field, &label_mass, gradients));
         self.times = times;
-        self.splats_backward(field, &pairs, cotangents.displacements, gradients);
+        self.splats_backward(field, &pairs, v_displacements, gradients);
     }
 
     /// Carries gradients of (tile, splat) pairs, and those by what the deformation adds to the centres, to the
@@ -160,12 +149,12 @@ impl Renderer {
     fn rasterize_backward(
         &self,
         field: &Field,
-        cotangents: &ViewCotangents<'_>,
+        v_color: &PixelGrid<[f32; 3]>,
+        instance_weight: f32,
         settings: &RenderSettings,
     ) -> (Vec<SplatGradient>, LabelMass) {
         let tape = &self.tape;
         let lists = &tape.lists;
-        let instance_weight = cotangents.instance_weight;
         let trains_instances = instance_weight != 0.0 && tape.labelled_pixels > 0;
         let rows = field.identities.as_ref().map(|rows| IdentityRows::new(rows, &tape.probabilities));
         let instances = |tile: usize| {
@@ -196,7 +185,7 @@ impl Renderer {
             }
             let place = self.place(tile);
             let entries = lists.tile(tile);
-            let mut cotangents = tile_cotangents(&place, cotangents, &tape.color, &tape.tiles[tile]);
+            let mut cotangents = tile_cotangents(&place, &v_color.pixels, &tape.color);
             let instances = instances(tile).map(|(labels, rows)| {
                 let (inverse_probability, coverage_ratio) =
                     instance_cotangents(labels, &tape.tiles[tile], settings);
@@ -352,28 +341,18 @@ fn has_posed_sh(field: &Field, row: usize) -> bool {
         || field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some())
 }
 
-/// Gradients by what the pixels of a tile show.
-fn tile_cotangents(
-    place: &TilePlace,
-    v: &ViewCotangents<'_>,
-    color: &[[f32; 3]],
-    image: &TileImage,
-) -> TileCotangents {
+/// Gradients of the colour loss by the colours of a tile's pixels.
+fn tile_cotangents(place: &TilePlace, v_color: &[[f32; 3]], color: &[[f32; 3]]) -> TileCotangents {
     let zero = [[0.0; LANES]; GROUPS];
     let mut cotangents = TileCotangents { color: [zero; 3], remainder: zero };
     for group in 0..GROUPS {
         for lane in 0..LANES {
             if let Some(pixel) = place.pixel(group, lane) {
-                let (v_color, c) = (v.color.pixels[pixel], color[pixel]);
+                let (v, c) = (v_color[pixel], color[pixel]);
                 for channel in 0..3 {
-                    cotangents.color[channel][group][lane] = v_color[channel];
+                    cotangents.color[channel][group][lane] = v[channel];
                 }
-                let remainder = &mut cotangents.remainder[group][lane];
-                *remainder = v_color[0] * c[0] + v_color[1] * c[1] + v_color[2] * c[2];
-                if let Some(v_alpha) = v.alpha.get(pixel) {
-                    // As a background does that takes this much away.
-                    *remainder -= v_alpha * image.transmittance[group][lane];
-                }
+                cotangents.remainder[group][lane] = v[0] * c[0] + v[1] * c[1] + v[2] * c[2];
             }
         }
     }

@@ -158,7 +158,9 @@ impl Renderer {
         let (lists, tiles) = (&self.tape.lists, &self.tape.tiles);
         let width = band.image.color.width;
         self.gather_color(&mut band.image.color.pixels);
-        self.gather_alpha(&mut band.image.alpha.pixels);
+        gather_tiles(lists, width, &mut band.image.alpha.pixels, |tile, group, lane| {
+            1.0 - tiles[tile].transmittance[group][lane]
+        });
         if let Some(depth) = &mut band.image.depth {
             gather_tiles(lists, width, &mut depth.pixels, |tile, group, lane| {
                 let tile = &tiles[tile];

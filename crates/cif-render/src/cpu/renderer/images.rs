@@ -114,26 +114,6 @@ impl Renderer {
         found
     }
 
-    /// Alpha of every pixel of the view that [`Self::forward`] saw last: what its Gaussians hide of the background.
-    ///
-    /// # Panics
-    /// Without such a view.
-    #[must_use]
-    pub fn alpha(&self) -> Vec<f32> {
-        let (view, ..) = self.tape.view.expect("a view was rendered");
-        let mut alpha = vec![0.0; view.width as usize * view.height as usize];
-        self.gather_alpha(&mut alpha);
-        alpha
-    }
-
-    /// Alpha of the tiles that were blended last, into the rows of the image that hold them.
-    pub(super) fn gather_alpha(&self, rows: &mut [f32]) {
-        let (view, ..) = self.tape.view.expect("a view was projected");
-        gather_tiles(&self.tape.lists, view.width, rows, |tile, group, lane| {
-            1.0 - self.tape.tiles[tile].transmittance[group][lane]
-        });
-    }
-
     /// Colours on the background of the tiles that were blended last, into the rows of the image that hold them.
     pub(super) fn gather_color(&self, rows: &mut [[f32; 3]]) {
         let (view, settings, _) = self.tape.view.expect("a view was rendered");

@@ -26,7 +26,6 @@ use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
-pub use self::backward::ViewCotangents;
 pub use self::banded::{BandRequest, RenderedBand};
 pub use self::blend::BlendWeightGradients;
 pub use self::inspect::NotFinite;
