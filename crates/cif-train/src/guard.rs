@@ -10,6 +10,7 @@
 use cif_field::Field;
 use cif_render::Gradients;
 use cif_render::cpu::NotFinite;
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -78,14 +79,23 @@ impl Rollbacks {
 
 /// The first value above a limit or not a number.
 fn first_beyond(values: &[f32], limit: f32) -> Option<usize> {
-    let within = |values: &[f32]| values.iter().fold(true, |all, value| all & (value.abs() <= limit));
+    let level = Level::new();
     values.par_chunks(CHUNK).enumerate().find_map_first(|(chunk, values)| {
-        if within(values) {
+        if dispatch!(level, _simd => are_within(values, limit)) {
             return None;
         }
-        let position = values.iter().position(|value| !within(std::slice::from_ref(value)))?;
+        let position = values.iter().position(|value| !are_within(std::slice::from_ref(value), limit))?;
         Some(chunk * CHUNK + position)
     })
+}
+
+#[inline(always)]
+fn are_within(values: &[f32], limit: f32) -> bool {
+    let mut all = true;
+    for value in values {
+        all &= value.abs() <= limit;
+    }
+    all
 }
 
 pub(crate) fn fault(part: &'static str, tensor: &str, values: &[f32], limit: f32) -> Option<Fault> {

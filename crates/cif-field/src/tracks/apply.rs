@@ -197,10 +197,11 @@ impl<'a> TracksAtTime<'a> {
         self.groups.iter().any(|group| !group.is_still())
     }
 
-    /// True where colours turn or are sampled, or learned colour changes are undone.
+    /// True where canonical colours of this degree of spherical harmonics turn, which those of degree 0 do not, or are
+    /// sampled.
     #[must_use]
-    pub fn changes_sh(&self) -> bool {
-        self.groups.iter().any(|group| group.turned || !group.deformed || group.colors.is_some())
+    pub fn changes_colors(&self, degree: u8) -> bool {
+        self.groups.iter().any(|group| (group.turned && degree > 0) || group.colors.is_some())
     }
 
     /// Puts the tracks onto `posed`, the canonical Gaussians with the learned deformation at this time.
@@ -253,7 +254,7 @@ impl<'a> TracksAtTime<'a> {
                     *occupancy_logit = HIDDEN_LOGIT;
                 }
             });
-        if !posed.sh_coefficients.is_empty() && self.changes_sh() {
+        if !posed.sh_coefficients.is_empty() {
             self.turn_colors(canonical, posed.sh_coefficients);
         }
     }

@@ -67,11 +67,12 @@ impl TileRegion {
     pub(super) fn reached(&self, splat: &Splat) -> [Range<u32>; 2] {
         let range = |axis: usize, first: u32, count: u32| {
             let tile = TILE as f32;
-            let low = ((splat.mean[axis] - splat.extent[axis]) / tile).floor();
-            let high = ((splat.mean[axis] + splat.extent[axis]) / tile).floor();
+            let low = (splat.mean[axis] - splat.extent[axis]) / tile;
+            let high = (splat.mean[axis] + splat.extent[axis]) / tile;
             let end = first + count;
+            // Nothing is below 0 here, so that what is cut off is what `floor` takes away, which may be a call.
             let low = low.max(first as f32).min(end as f32) as u32;
-            let high = (high + 1.0).max(first as f32).min(end as f32) as u32;
+            let high = if high < first as f32 { first } else { (high.min(end as f32) as u32 + 1).min(end) };
             low..high.max(low)
         };
         [range(0, self.first_column, self.columns), range(1, self.first_row, self.rows)]
@@ -98,12 +99,13 @@ pub(super) struct TileLists {
 /// Bytes of a (tile, splat) pair while lists without the pairs of each splat are built.
 pub(super) const PAIR_BYTES: u64 = (size_of::<(u32, u8)>() + size_of::<TileEntry>()) as u64;
 
-/// Sorts splats front to back; ties keep the order of the Gaussians.
-pub(super) fn sort_by_depth(splats: &mut [Splat]) {
-    // Positive floats order like their bits; the index breaks ties.
-    splats.par_sort_unstable_by_key(|splat| {
-        (u64::from(splat.order.to_bits()) << 32) | u64::from(splat.gaussian)
-    });
+/// Sorts splats front to back; ties keep the order that they come in, which is that of the Gaussians.
+pub(super) fn sort_by_depth(splats: &mut Vec<Splat>) {
+    // Keys are moved around instead of splats. Positive floats order like their bits; the position breaks ties.
+    let key = |(position, splat): (usize, &Splat)| u64::from(splat.order.to_bits()) << 32 | position as u64;
+    let mut keys: Vec<u64> = splats.iter().enumerate().map(key).collect();
+    keys.par_sort_unstable();
+    *splats = keys.into_iter().map(|key| splats[(key & u64::from(u32::MAX)) as usize]).collect();
 }
 
 /// Most (tile, splat) pairs of a view: positions are 32-bit.

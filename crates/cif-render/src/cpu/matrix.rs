@@ -80,27 +80,47 @@ fn multiply_tiles<S: Simd>(
     let Shape { rows, columns, .. } = shape;
     let whole_rows = rows / TILE_ROWS * TILE_ROWS;
     let wide = columns / WIDE * WIDE;
-    for column in (0..wide).step_by(WIDE) {
+    // Two vectors beside each other share what is read of the left side, where registers hold their sums.
+    let paired = if has_many_registers(simd) { columns / (2 * WIDE) * (2 * WIDE) } else { 0 };
+    for column in (0..paired).step_by(2 * WIDE) {
         for row in (0..whole_rows).step_by(TILE_ROWS) {
-            wide_tile::<S, TILE_ROWS>(simd, shape, left, right, start, rectify, out, (row, column));
+            wide_tile::<S, TILE_ROWS, 2>(simd, shape, left, right, start, rectify, out, (row, column));
         }
         for row in whole_rows..rows {
-            wide_tile::<S, 1>(simd, shape, left, right, start, rectify, out, (row, column));
+            wide_tile::<S, 1, 2>(simd, shape, left, right, start, rectify, out, (row, column));
+        }
+    }
+    for column in (paired..wide).step_by(WIDE) {
+        for row in (0..whole_rows).step_by(TILE_ROWS) {
+            wide_tile::<S, TILE_ROWS, 1>(simd, shape, left, right, start, rectify, out, (row, column));
+        }
+        for row in whole_rows..rows {
+            wide_tile::<S, 1, 1>(simd, shape, left, right, start, rectify, out, (row, column));
         }
     }
     let narrow = columns / COLUMNS * COLUMNS;
     if wide < narrow {
         for row in (0..whole_rows).step_by(TILE_ROWS) {
-            narrow_tile::<S, TILE_ROWS>(simd, shape, left, right, start, rectify, out, (row, wide));
+            narrow_tile::<S, TILE_ROWS, 1>(simd, shape, left, right, start, rectify, out, (row, wide));
         }
         for row in whole_rows..rows {
-            narrow_tile::<S, 1>(simd, shape, left, right, start, rectify, out, (row, wide));
+            narrow_tile::<S, 1, 1>(simd, shape, left, right, start, rectify, out, (row, wide));
         }
     }
     for column in narrow..columns {
         for row in 0..rows {
             single(shape, left, right, start, rectify, out, (row, column));
         }
+    }
+}
+
+/// True with vectors of 16 and 32 registers for them.
+#[inline(always)]
+fn has_many_registers<S: Simd>(simd: S) -> bool {
+    match simd.level() {
+        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+        Level::Avx512(_) => true,
+        _ => false,
     }
 }
 
@@ -130,11 +150,11 @@ fn single(
     out[at] = if rectify { sum.max(0.0) } else { sum };
 }
 
-/// One tile of `R` rows by one vector of columns; the two widths differ in the vector type alone.
+/// One tile of `R` rows by `C` vectors of columns; the two widths differ in the vector type alone.
 macro_rules! tile {
     ($name:ident, $vector:ident, $width:expr) => {
         #[inline(always)]
-        fn $name<S: Simd, const R: usize>(
+        fn $name<S: Simd, const R: usize, const C: usize>(
             simd: S,
             shape: Shape,
             left: Left<'_>,
@@ -145,39 +165,51 @@ macro_rules! tile {
             (row, column): (usize, usize),
         ) {
             let Shape { rows, inner, columns } = shape;
-            let mut sums: [$vector<S>; R] = match start {
-                Start::Bias(bias) => [$vector::from_slice(simd, &bias[column..column + $width]); R],
-                Start::Out => std::array::from_fn(|r| {
-                    let at = (row + r) * columns + column;
-                    $vector::from_slice(simd, &out[at..at + $width])
-                }),
-            };
-            let right =
-                right.chunks_exact(columns).map(|b| $vector::from_slice(simd, &b[column..column + $width]));
+            let zero = $vector::splat(simd, 0.0);
+            let mut sums = [[zero; C]; R];
+            for r in 0..R {
+                let (from, at) = match start {
+                    Start::Bias(bias) => (bias, column),
+                    Start::Out => (&*out, (row + r) * columns + column),
+                };
+                for c in 0..C {
+                    sums[r][c] = $vector::from_slice(simd, &from[at + c * $width..at + (c + 1) * $width]);
+                }
+            }
+            let right = right.chunks_exact(columns);
             match left {
                 Left::Rows(values) => {
                     let values: [&[f32]; R] =
                         std::array::from_fn(|r| &values[(row + r) * inner..(row + r + 1) * inner]);
-                    for (k, b) in right.take(inner).enumerate() {
-                        for r in 0..R {
-                            sums[r] = b.mul_add($vector::splat(simd, values[r][k]), sums[r]);
+                    for (k, right) in right.take(inner).enumerate() {
+                        let right = &right[column..column + C * $width];
+                        for c in 0..C {
+                            let b = $vector::from_slice(simd, &right[c * $width..(c + 1) * $width]);
+                            for r in 0..R {
+                                sums[r][c] = b.mul_add($vector::splat(simd, values[r][k]), sums[r][c]);
+                            }
                         }
                     }
                 }
                 Left::Columns(values) => {
-                    for (values, b) in values.chunks_exact(rows).zip(right) {
+                    for (values, right) in values.chunks_exact(rows).zip(right) {
                         let values: &[f32; R] = values[row..row + R].try_into().expect("a slice of R values");
-                        for r in 0..R {
-                            sums[r] = b.mul_add($vector::splat(simd, values[r]), sums[r]);
+                        let right = &right[column..column + C * $width];
+                        for c in 0..C {
+                            let b = $vector::from_slice(simd, &right[c * $width..(c + 1) * $width]);
+                            for r in 0..R {
+                                sums[r][c] = b.mul_add($vector::splat(simd, values[r]), sums[r][c]);
+                            }
                         }
                     }
                 }
             }
-            let zero = $vector::splat(simd, 0.0);
-            for (r, sum) in sums.into_iter().enumerate() {
-                let at = (row + r) * columns + column;
-                let sum = if rectify { sum.max(zero) } else { sum };
-                sum.store_slice(&mut out[at..at + $width]);
+            for r in 0..R {
+                for c in 0..C {
+                    let at = (row + r) * columns + column + c * $width;
+                    let sum = if rectify { sums[r][c].max(zero) } else { sums[r][c] };
+                    sum.store_slice(&mut out[at..at + $width]);
+                }
             }
         }
     };

@@ -155,18 +155,22 @@ struct Footprint {
     compensation_floored: bool,
 }
 
+#[inline(always)]
 fn dot(a: Vector, b: Vector) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
+#[inline(always)]
 fn cross(a: Vector, b: Vector) -> Vector {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
+#[inline(always)]
 fn transform(m: &Matrix, v: Vector) -> Vector {
     [0, 1, 2].map(|r| m[r][0] * v[0] + m[r][1] * v[1] + m[r][2] * v[2])
 }
 
+#[inline(always)]
 fn multiply(a: &Matrix, b: &Matrix) -> Matrix {
     let mut product = [[0.0; 3]; 3];
     for r in 0..3 {
@@ -177,6 +181,7 @@ fn multiply(a: &Matrix, b: &Matrix) -> Matrix {
     product
 }
 
+#[inline(always)]
 fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
     let rotated = transform(&view.rotation, posed.mean);
     let in_camera = [0, 1, 2].map(|k| rotated[k] + view.translation[k]);
@@ -258,6 +263,7 @@ fn footprint(view: &ViewConstants, posed: &Posed<'_>) -> Option<Footprint> {
 }
 
 /// Unit direction from the camera to a point, and its distance.
+#[inline(always)]
 fn view_direction(view: &ViewConstants, mean: Vector) -> (Vector, f32) {
     let offset = [0, 1, 2].map(|k| mean[k] - view.centre[k]);
     let distance = (offset[0] * offset[0] + offset[1] * offset[1] + offset[2] * offset[2]).sqrt().max(1e-8);
@@ -265,6 +271,7 @@ fn view_direction(view: &ViewConstants, mean: Vector) -> (Vector, f32) {
 }
 
 /// Colour before the clamp at 0.
+#[inline(always)]
 fn color_unclamped(view: &ViewConstants, direction: Vector, sh: &[f32; SH_FLOATS]) -> Vector {
     let basis = spherical_harmonics::basis(direction, view.sh_degree);
     let mut color = [0.5; 3];
@@ -277,6 +284,7 @@ fn color_unclamped(view: &ViewConstants, direction: Vector, sh: &[f32; SH_FLOATS
 }
 
 /// Projects one Gaussian; `None` where it draws nothing.
+#[inline(always)]
 pub(super) fn project(view: &ViewConstants, posed: &Posed<'_>, gaussian: u32) -> Option<Splat> {
     let footprint = footprint(view, posed)?;
     let base_opacity = sigmoid(posed.opacity_logit);
@@ -357,6 +365,7 @@ pub(super) struct PosedGradient {
 }
 
 /// Carries a splat's gradient to the raw parameters; spherical harmonics are added to `v_sh`.
+#[inline(always)]
 pub(super) fn project_backward(
     view: &ViewConstants,
     posed: &Posed<'_>,

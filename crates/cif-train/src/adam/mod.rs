@@ -2,11 +2,12 @@
 //! methods reference 1.1 and 7 (rows 24 to 26).
 //!
 //! Every float is updated from its own gradient and moments alone, so results do not depend on the number of
-//! threads. Gradients are set to zero once used.
+//! threads, nor on the vector instructions, which the widest are taken of. Gradients are set to zero once used.
 
 pub(crate) mod planes;
 mod regularizer;
 
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 pub use planes::{PlaneWeights, step_planes};
@@ -132,6 +133,7 @@ impl Moments {
         assert_eq!(gradients.len(), self.first.len(), "gradients and moments differ in length");
         self.steps += 1;
         let bias = (BiasCorrection::after(self.steps), epsilon);
+        let level = Level::new();
         let width = self.width.max(1);
         let chunk_rows = (CHUNK / width).max(1);
         parameters
@@ -141,44 +143,8 @@ impl Moments {
             .zip(self.second.par_chunks_mut(chunk_rows * width))
             .enumerate()
             .map(|(chunk, (((p, g), m), v))| {
-                if !all_finite(g) {
-                    return Err(NotFinite);
-                }
-                match rates {
-                    RowRates::Uniform(rate) if visible.is_none() => {
-                        update(p, g, m, v, rate, bias);
-                    }
-                    _ => {
-                        let pattern = rates.pattern();
-                        let rows = p
-                            .chunks_mut(width)
-                            .zip(g.chunks_mut(width))
-                            .zip(m.chunks_mut(width))
-                            .zip(v.chunks_mut(width));
-                        for (row, (((p, g), m), v)) in rows.enumerate() {
-                            let row = chunk * chunk_rows + row;
-                            if visible.is_some_and(|visible| visible[row] <= 0.0) {
-                                continue;
-                            }
-                            match rates {
-                                RowRates::Uniform(rate) => update(p, g, m, v, rate, bias),
-                                RowRates::Split { active, .. } => {
-                                    let n = active.min(width);
-                                    update_with_rates(
-                                        &mut p[..n],
-                                        &g[..n],
-                                        &mut m[..n],
-                                        &mut v[..n],
-                                        &pattern[..n],
-                                        bias,
-                                    );
-                                }
-                            }
-                        }
-                    }
-                }
-                g.fill(0.0);
-                Ok(())
+                let visible = visible.map(|visible| &visible[chunk * chunk_rows..]);
+                dispatch!(level, _simd => step_rows((p, g, m, v), width, rates, visible, bias))
             })
             .reduce(|| Ok(()), Result::and)
     }
@@ -239,7 +205,46 @@ impl RowRates {
     }
 }
 
+/// A step of some rows: parameters, gradients, first and second moments. With `visible`, only rows with a positive entry
+/// there change.
+#[inline(always)]
+fn step_rows(
+    (p, g, m, v): (&mut [f32], &mut [f32], &mut [f32], &mut [f32]),
+    width: usize,
+    rates: RowRates,
+    visible: Option<&[f32]>,
+    bias: (BiasCorrection, f32),
+) -> Result<(), NotFinite> {
+    if !all_finite(g) {
+        return Err(NotFinite);
+    }
+    match rates {
+        RowRates::Uniform(rate) if visible.is_none() => update(p, g, m, v, rate, bias),
+        _ => {
+            let pattern = rates.pattern();
+            let rows = p.chunks_mut(width).zip(g.chunks(width));
+            let rows = rows.zip(m.chunks_mut(width)).zip(v.chunks_mut(width));
+            for (row, (((p, g), m), v)) in rows.enumerate() {
+                if visible.is_some_and(|visible| visible[row] <= 0.0) {
+                    continue;
+                }
+                match rates {
+                    RowRates::Uniform(rate) => update(p, g, m, v, rate, bias),
+                    RowRates::Split { active, .. } => {
+                        let n = active.min(width);
+                        let (p, g, m, v) = (&mut p[..n], &g[..n], &mut m[..n], &mut v[..n]);
+                        update_with_rates(p, g, m, v, &pattern[..n], bias);
+                    }
+                }
+            }
+        }
+    }
+    g.fill(0.0);
+    Ok(())
+}
+
 /// True when every value is finite: a product with zero is zero for those alone.
+#[inline(always)]
 fn all_finite(values: &[f32]) -> bool {
     let mut lanes = [0.0_f32; 16];
     let blocks = values.chunks_exact(16);
@@ -264,6 +269,7 @@ fn move_by(p: &mut f32, g: f32, m: &mut f32, v: &mut f32, rate: f32, (second, ep
     *p -= if *v >= f32::MIN_POSITIVE { step } else { 0.0 };
 }
 
+#[inline(always)]
 fn update(
     p: &mut [f32],
     g: &[f32],
@@ -278,6 +284,7 @@ fn update(
     }
 }
 
+#[inline(always)]
 fn update_with_rates(
     p: &mut [f32],
     g: &[f32],

@@ -2,6 +2,7 @@
 //! Source: methods reference 1.4 and 11 (idea 13).
 
 use cif_field::deformation::{DeformationConfig, PlaneLayout, is_time_plane};
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 use super::{BiasCorrection, EPSILON, Moments, NotFinite, all_finite, update};
@@ -124,10 +125,13 @@ pub fn step_planes(
             }
         }
     }
-    bands.into_par_iter().map(|band| sweep(band, rate, bias)).reduce(|| Ok(()), Result::and)
+    let level = Level::new();
+    let sweep = |band| dispatch!(level, _simd => sweep(band, rate, bias));
+    bands.into_par_iter().map(sweep).reduce(|| Ok(()), Result::and)
 }
 
 /// Updates a band row by row; old values of the two rows above are kept aside.
+#[inline(always)]
 fn sweep(band: Band<'_>, rate: f32, bias: BiasCorrection) -> Result<(), NotFinite> {
     if !all_finite(band.gradients) {
         return Err(NotFinite);
@@ -158,6 +162,9 @@ fn sweep(band: Band<'_>, rate: f32, bias: BiasCorrection) -> Result<(), NotFinit
             let here = if row + 2 < band.rows { smooth } else { 0.0 };
             let one_up = if row >= 1 && row + 1 < band.rows { -2.0 * smooth } else { 0.0 };
             let two_up = if row >= 2 { smooth } else { 0.0 };
+            let gradient = &mut gradient[..n];
+            let (above_2, above_1, current) = (&above_2[..n], &above_1[..n], &current[..n]);
+            let (below_1, below_2) = (&below_1[..n], &below_2[..n]);
             for k in 0..n {
                 let (a2, a1, c, b1, b2) = (above_2[k], above_1[k], current[k], below_1[k], below_2[k]);
                 gradient[k] +=

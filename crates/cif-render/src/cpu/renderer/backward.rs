@@ -101,10 +101,10 @@ impl Renderer {
                 groups_backward(tracks, &at, time, &field.gaussians, &mut v_posed, gradients);
             });
         }
-        if !v_posed.sh_coefficients.is_empty() {
-            let total = gradients.gaussians.sh_coefficients.as_flattened_mut();
-            for (total, v) in total.iter_mut().zip(v_posed.sh_coefficients.as_flattened()) {
-                *total += v;
+        let total = gradients.gaussians.sh_coefficients.iter_mut();
+        for (row, (total, v)) in total.zip(&v_posed.sh_coefficients).enumerate() {
+            if has_posed_sh(field, row) {
+                total.iter_mut().zip(v).for_each(|(total, v)| *total += v);
             }
         }
         self.inspect_posed_gradients(&v_posed, gradients);
@@ -238,7 +238,6 @@ impl Renderer {
             .zip(gradients.radii.par_chunks_mut(CHUNK))
             .enumerate()
             .for_each(|(chunk, (((total, of_view), screen), radii))| {
-                let sh = if moves_sh { of_view.sh_coefficients } else { total.sh_coefficients };
                 dispatch!(level, _simd => for row in 0..radii.len() {
                     let gaussian = chunk * CHUNK + row;
                     let rank = rank_of[gaussian];
@@ -254,8 +253,13 @@ impl Renderer {
                     if v == SplatGradient::default() {
                         continue;
                     }
+                    let sh = if moves_sh && has_posed_sh(field, gaussian) {
+                        &mut of_view.sh_coefficients[row]
+                    } else {
+                        &mut total.sh_coefficients[row]
+                    };
                     let PosedGradient { mean, log_scale, quaternion, opacity_logit, occupancy_logit } =
-                        project_backward(view, &posed.at(gaussian), splat, &v, &mut sh[row]);
+                        project_backward(view, &posed.at(gaussian), splat, &v, sh);
                     for axis in 0..2 {
                         screen[row][axis] += half[axis] * v.mean[axis];
                     }
@@ -329,6 +333,12 @@ impl Renderer {
             gradients.log_calibrations[entry] -= value;
         }
     }
+}
+
+/// True for rows whose colours may be moved: by the deformation, or by the pose of their group.
+fn has_posed_sh(field: &Field, row: usize) -> bool {
+    field.deformation.as_ref().is_some_and(|deformation| deformation.config.heads.sh)
+        || field.tracks.as_ref().is_some_and(|tracks| tracks.group(row).is_some())
 }
 
 /// Gradients of the colour loss by the colours of a tile's pixels.

@@ -201,7 +201,7 @@ impl Renderer {
         timed(&mut times.deform, || {
             let deformation = field.deformation.as_ref().filter(|_| settings.deform);
             let tracks = field.tracks.as_ref().map(|tracks| tracks.at(time));
-            pose(level, field, deformation, tracks, time, &mut tape.posed);
+            pose(level, field, deformation, tracks, (time, settings.sh_degree), &mut tape.posed);
             deformed = deformation.map_or(0, |deformation| deformation.moving_rows(field.len()).count());
         });
         timed(&mut times.project, || {
@@ -211,9 +211,14 @@ impl Renderer {
                 .into_par_iter()
                 .map(|chunk| {
                     let rows = chunk * CHUNK..n.min((chunk + 1) * CHUNK);
-                    dispatch!(level, _simd => rows
-                        .filter_map(|row| project(&view, &posed.at(row), row as u32))
-                        .collect())
+                    let mut splats = Vec::with_capacity(rows.len());
+                    // No `filter_map`: its closure would not be compiled for the instructions.
+                    dispatch!(level, _simd => for row in rows {
+                        if let Some(splat) = project(&view, &posed.at(row), row as u32) {
+                            splats.push(splat);
+                        }
+                    });
+                    splats
                 })
                 .collect();
             tape.splats.clear();

@@ -8,6 +8,9 @@ use super::super::deform::{DeformationAtTime, begin};
 use super::super::project::Posed;
 use super::Renderer;
 
+/// Highest degree of the spherical harmonics that Gaussians have.
+const ALL_DEGREES: u8 = 3;
+
 impl Renderer {
     /// The canonical Gaussians moved to a time: every array in raw form, deltas added (methods reference 2.3),
     /// then moved by their tracks.
@@ -23,19 +26,19 @@ impl Renderer {
 
     fn posed_gaussians(&mut self, field: &Field, tracks: Option<TracksAtTime<'_>>, time: f64) -> Gaussians {
         let mut posed = Gaussians::default();
-        pose(self.level, field, field.deformation.as_ref(), tracks, time, &mut posed);
+        pose(self.level, field, field.deformation.as_ref(), tracks, (time, ALL_DEGREES), &mut posed);
         posed.or(&field.gaussians)
     }
 }
 
-/// The one place where Gaussians are moved to a time: learned deltas, then tracks. Arrays that nothing moves
-/// are left empty.
+/// The one place where Gaussians are moved to a time: learned deltas, then tracks. Arrays that nothing moves, of
+/// colours up to the degree of spherical harmonics that is drawn, are left empty.
 pub(super) fn pose(
     level: Level,
     field: &Field,
     deformation: Option<&Deformation>,
     tracks: Option<TracksAtTime<'_>>,
-    time: f64,
+    (time, sh_degree): (f64, u8),
     posed: &mut Gaussians,
 ) {
     let canonical = &field.gaussians;
@@ -48,7 +51,7 @@ pub(super) fn pose(
         begin(canonical, false, posed);
     }
     posed.occupancy_logits.clone_from(&canonical.occupancy_logits);
-    if posed.sh_coefficients.is_empty() && tracks.changes_sh() {
+    if posed.sh_coefficients.is_empty() && tracks.changes_colors(sh_degree) {
         posed.sh_coefficients.clone_from(&canonical.sh_coefficients);
     }
     tracks.apply(canonical, posed.rows_mut());

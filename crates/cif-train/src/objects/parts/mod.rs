@@ -62,8 +62,9 @@ const GAIN: f64 = 0.75;
 /// Error on pixels left out beyond which nothing is explained.
 const MOST_ERROR: f64 = 0.1;
 
-/// Loss of the best fit, of that of the static body, from which nothing is looked for.
-const PROMISE: f64 = 0.85;
+/// Loss of the best fit, of that of the static body, from which nothing is looked for: at first, and where values were
+/// searched for again.
+const PROMISES: [f64; 2] = [0.92, 0.85];
 
 /// Looks for a part on a joint of an object that rests otherwise.
 ///
@@ -116,12 +117,16 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         .collect();
     keep_kinds(&mut begun, AGAIN);
     stop.check()?;
+    let uncut = rough.mean_loss(&search.train, level);
+    let promises = |fits: &[Fit<'_>], most: f64| fits.first().is_some_and(|best| best.loss < most * uncut);
+    if !promises(&begun, PROMISES[0]) {
+        return Ok(None);
+    }
     let mut fitted: Vec<Fit<'_>> =
         begun.into_par_iter().map(|begun| search.finely_valued(begun, FIT.1, level)).collect();
     keep_kinds(&mut fitted, FINE);
     stop.check()?;
-    let promises = |fit: &Fit<'_>| fit.loss < PROMISE * rough.mean_loss(&search.train, level);
-    if !fitted.first().is_some_and(promises) {
+    if !promises(&fitted, PROMISES[1]) {
         return Ok(None);
     }
     let (rigid, mut fine) = rayon::join(
