@@ -62,8 +62,9 @@ fn some_rows_have_the_values_that_all_have_and_gradients_need_no_kept_layers() {
         assert_eq!(code, expected, "row {row}");
     }
     // Gradients in some of the rows, so that others are passed over.
-    let v_values: Vec<f32> =
-        (0..300 * CODE).map(|k| if k / CODE % 6 == 0 { (k % 7) as f32 - 3.0 } else { 0.0 }).collect();
+    let v_values: Vec<f32> = (0..300 * CODE)
+        .map(|k| if (k / CODE).is_multiple_of(6) { (k % 7) as f32 - 3.0 } else { 0.0 })
+        .collect();
     let mut gradients = [true, false].map(|keeps| {
         some.layers.1.iter_mut().for_each(|layers| layers.truncate(if keeps { usize::MAX } else { 1 }));
         tensors.reset();
