@@ -88,7 +88,7 @@ pub use curve::{Curve, CurveFrames, CurvePoint};
 pub use error::TrainError;
 pub use events::{Control, Outcome, TrainEvent};
 pub use guard::{Fault, Hint};
-pub use heads::{Head, HeadLoss, HeadTensors, HeadView, Pass, ValueHead};
+pub use heads::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, ValueHead};
 pub use plan::{EffectChoice, EffectPlan};
 pub use stage::Stage;
 pub use stop::{Start, Stop};

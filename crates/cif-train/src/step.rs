@@ -14,7 +14,6 @@ use crate::heads::{Head, HeadLoss, HeadStep, HeadTensors, HeadView, ValueHead, v
 use crate::optimiser::StepRates;
 use crate::random::{Purpose, derive};
 use crate::stage::Stage;
-use crate::state::State;
 
 /// A view of a step.
 #[derive(Clone)]
@@ -124,17 +123,24 @@ impl StepPlan {
         derive(config.seed, Purpose::HeadSteps, u64::from(self.iteration) << 16 | target as u64)
     }
 
-    /// Adds the gradients of the regulariser of a head.
-    pub(crate) fn regularise(&self, head: &dyn ValueHead, state: &mut State) {
-        let time = self.head_targets.first().map_or(0.0, |target| target.time);
-        let step = HeadStep {
-            field: &state.field,
-            time,
+    /// Pairs of Gaussians that the regulariser of a head compares by the values of a target: those of the first, of which
+    /// `positions` gives the centres.
+    pub(crate) fn compared(
+        &self,
+        head: &dyn ValueHead,
+        config: &TrainConfig,
+        target: usize,
+        positions: &dyn Fn() -> Vec<[f32; 3]>,
+    ) -> Vec<[u32; 2]> {
+        if target > 0 {
+            return Vec::new();
+        }
+        head.compared(&HeadStep {
+            positions,
             step: self.iteration,
-            steps: state.config.stages.instance,
-            seed: self.head_seed(&state.config, self.head_targets.len()),
-        };
-        head.regularise(&mut state.head_tensors, &step);
+            steps: config.stages.instance,
+            seed: self.head_seed(config, self.head_targets.len()),
+        })
     }
 
     /// Share of the labelled pixels of the step that a view has (A4).

@@ -95,6 +95,23 @@ fn a_comparison_has_the_scores_of_its_scenes_and_goes_on_where_it_stopped() {
     let told = cif(path, &line.replace("--iterations 8", "--iterations 9")).succeeds().stderr;
     assert_eq!(told.matches(": kept, ").count(), 0, "{told}");
 
+    // Held-out frames have masks in the folder alone that scores are taken on.
+    fs::create_dir(path.join("table/masks_rough")).unwrap();
+    for frame in (0..8).filter(|frame| frame % 4 != 2) {
+        let name = format!("{frame:06}.png");
+        fs::copy(path.join("table/masks").join(&name), path.join("table/masks_rough").join(&name)).unwrap();
+    }
+    let line = format!(
+        "bench compare table -o rough --heads dr-splat --seeds 1 --masks masks_rough {SMALL_MODEL} {SHORT}"
+    );
+    cif(path, &line).fails(1, &["held-out frames have none"]);
+    cif(path, &format!("{line} --score-masks masks")).succeeds();
+    cif(path, "eval rough/runs/table.seed0.dr-splat.cif table --json rough.json").succeeds();
+    let (row, scores) = (json_file(&path.join("rough/panoptic.json")), json_file(&path.join("rough.json")));
+    assert!(row[0]["miou"].is_number() && row[0]["miou"] == scores["miou"], "{row:#}");
+    let page = fs::read_to_string(path.join("rough/compare.html")).unwrap();
+    assert!(page.contains("--masks masks_rough --score-masks masks"));
+
     cif(path, "bench compare table -o table").fails(1, &["not empty"]);
     cif(path, "bench compare table table -o other").fails(1, &["two captures are called table"]);
     cif(path, "bench compare table -o other --iterations some").fails(2, &["published"]);

@@ -28,6 +28,8 @@ pub struct Subject<'a> {
     pub capture: &'a str,
     /// The capture.
     pub dataset: &'a Dataset,
+    /// The capture with the masks that scores are taken on.
+    pub scored: &'a Dataset,
     /// Settings of the reconstruction; their seed is the seed.
     pub config: &'a TrainConfig,
 }
@@ -65,7 +67,9 @@ impl Subject<'_> {
     ) -> Result<Option<Checkpoint>, Error> {
         let path = runs.file(&format!("{}.cif", self.id()));
         let known = runs.file(&format!("{}.settings.json", self.id()));
-        let settings = json!({ "settings": self.config, "capture": self.dataset.root }).to_string();
+        let masks = self.dataset.frames.iter().find_map(|frame| frame.mask.as_ref());
+        let settings =
+            json!({ "settings": self.config, "capture": self.dataset.root, "masks": masks }).to_string();
         if path.is_file() && std::fs::read_to_string(&known).is_ok_and(|kept| kept == settings) {
             return Checkpoint::load(&path).map(Some).map_err(Error::plain);
         }
@@ -117,7 +121,7 @@ impl Subject<'_> {
         let options = EvaluationOptions { decoder: decoder.as_ref(), ..EvaluationOptions::held_out(field) };
         let shown = shown_frame(self.dataset).map(|index| self.dataset.frames[index].name.clone());
         let mut pictures = Vec::new();
-        let evaluation = evaluate::<Failure>(field, self.dataset, &options, |view| {
+        let evaluation = evaluate::<Failure>(field, self.scored, &options, |view| {
             if Some(&view.frame.name) != shown.as_ref() {
                 return Ok(());
             }

@@ -1,8 +1,9 @@
-//! Products of the small matrices of the deformation network: many rows by a few dozen columns, the right
-//! side small enough for the first-level cache, so that nothing needs packing.
+//! Products of the matrices of small networks: many rows by some columns. Where the right side is too large for the
+//! first-level cache, as that of layers of a few hundred, its columns are packed panel by panel.
 //!
 //! All matrices are row-major. Vectors run over the columns of a product; columns beyond a multiple of
-//! [`COLUMNS`] go one by one, so callers pad what is small.
+//! [`COLUMNS`] go one by one, so callers pad what is small. Every entry is summed in the order of the inner side,
+//! whatever the tiles.
 
 use fearless_simd::prelude::*;
 use fearless_simd::{Level, dispatch, f32x8, f32x16};
@@ -11,11 +12,15 @@ use fearless_simd_macros::simd;
 /// Columns are padded to a multiple of this.
 pub(super) const COLUMNS: usize = 8;
 
-/// Rows that one tile of the product keeps in registers.
+/// Rows that one tile of the product keeps in registers, and in twice as many registers.
 const TILE_ROWS: usize = 6;
+const LARGE_TILE_ROWS: usize = 8;
 
 /// Columns of a wide tile.
 const WIDE: usize = 16;
+
+/// Entries of a right side from which on it is packed.
+const PACKED: usize = 8_192;
 
 /// The left side of a product.
 #[derive(Clone, Copy)]
@@ -78,50 +83,56 @@ fn multiply_tiles<S: Simd>(
     out: &mut [f32],
 ) {
     let Shape { rows, columns, .. } = shape;
-    let whole_rows = rows / TILE_ROWS * TILE_ROWS;
-    let wide = columns / WIDE * WIDE;
-    // Two vectors beside each other share what is read of the left side, where registers hold their sums.
-    let paired = if has_many_registers(simd) { columns / (2 * WIDE) * (2 * WIDE) } else { 0 };
-    for column in (0..paired).step_by(2 * WIDE) {
-        for row in (0..whole_rows).step_by(TILE_ROWS) {
-            wide_tile::<S, TILE_ROWS, 2>(simd, shape, left, right, start, rectify, out, (row, column));
-        }
-        for row in whole_rows..rows {
-            wide_tile::<S, 1, 2>(simd, shape, left, right, start, rectify, out, (row, column));
+    let mut packed = Vec::new();
+    let mut column = 0;
+    // Processors with vectors of 16 have 32 registers of them.
+    if S::f32s::LEN >= WIDE {
+        while column + 2 * WIDE <= columns {
+            let right = panel::<{ 2 * WIDE }>(shape, right, column, &mut packed);
+            wide_panel::<S, LARGE_TILE_ROWS, 2>(simd, shape, left, right, start, rectify, out, column);
+            column += 2 * WIDE;
         }
     }
-    for column in (paired..wide).step_by(WIDE) {
-        for row in (0..whole_rows).step_by(TILE_ROWS) {
-            wide_tile::<S, TILE_ROWS, 1>(simd, shape, left, right, start, rectify, out, (row, column));
-        }
-        for row in whole_rows..rows {
-            wide_tile::<S, 1, 1>(simd, shape, left, right, start, rectify, out, (row, column));
-        }
+    while column + WIDE <= columns {
+        let right = panel::<WIDE>(shape, right, column, &mut packed);
+        wide_panel::<S, TILE_ROWS, 1>(simd, shape, left, right, start, rectify, out, column);
+        column += WIDE;
     }
-    let narrow = columns / COLUMNS * COLUMNS;
-    if wide < narrow {
-        for row in (0..whole_rows).step_by(TILE_ROWS) {
-            narrow_tile::<S, TILE_ROWS, 1>(simd, shape, left, right, start, rectify, out, (row, wide));
-        }
-        for row in whole_rows..rows {
-            narrow_tile::<S, 1, 1>(simd, shape, left, right, start, rectify, out, (row, wide));
-        }
+    if column + COLUMNS <= columns {
+        let right = panel::<COLUMNS>(shape, right, column, &mut packed);
+        narrow_panel::<S, TILE_ROWS, 1>(simd, shape, left, right, start, rectify, out, column);
+        column += COLUMNS;
     }
-    for column in narrow..columns {
+    for column in column..columns {
         for row in 0..rows {
             single(shape, left, right, start, rectify, out, (row, column));
         }
     }
 }
 
-/// True with vectors of 16 and 32 registers for them.
+/// Some columns of the right side: those at the start of every `stride` values.
+#[derive(Clone, Copy)]
+struct Panel<'a> {
+    values: &'a [f32],
+    stride: usize,
+}
+
+/// `WIDTH` columns of the right side, packed where it is large.
 #[inline(always)]
-fn has_many_registers<S: Simd>(simd: S) -> bool {
-    match simd.level() {
-        #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
-        Level::Avx512(_) => true,
-        _ => false,
+fn panel<'a, const WIDTH: usize>(
+    Shape { rows, inner, columns }: Shape,
+    right: &'a [f32],
+    column: usize,
+    packed: &'a mut Vec<f32>,
+) -> Panel<'a> {
+    if inner * columns < PACKED || rows <= LARGE_TILE_ROWS {
+        return Panel { values: &right[column.min(right.len())..], stride: columns };
     }
+    packed.clear();
+    for row in right.chunks_exact(columns) {
+        packed.extend_from_slice(&row[column..column + WIDTH]);
+    }
+    Panel { values: packed, stride: WIDTH }
 }
 
 /// One entry of a product.
@@ -150,64 +161,85 @@ fn single(
     out[at] = if rectify { sum.max(0.0) } else { sum };
 }
 
-/// One tile of `R` rows by `C` vectors of columns; the two widths differ in the vector type alone.
-macro_rules! tile {
-    ($name:ident, $vector:ident, $width:expr) => {
+/// Tiles of `R` rows by `W` vectors of columns, and all rows of such columns; the two widths differ in the vector type
+/// alone.
+macro_rules! tiles {
+    ($panel:ident, $tile:ident, $vector:ident, $width:expr) => {
         #[inline(always)]
-        fn $name<S: Simd, const R: usize, const C: usize>(
+        fn $panel<S: Simd, const R: usize, const W: usize>(
             simd: S,
             shape: Shape,
             left: Left<'_>,
-            right: &[f32],
+            right: Panel<'_>,
+            start: Start<'_>,
+            rectify: bool,
+            out: &mut [f32],
+            column: usize,
+        ) {
+            let whole_rows = shape.rows / R * R;
+            for row in (0..whole_rows).step_by(R) {
+                $tile::<S, R, W>(simd, shape, left, right, start, rectify, out, (row, column));
+            }
+            for row in whole_rows..shape.rows {
+                $tile::<S, 1, W>(simd, shape, left, right, start, rectify, out, (row, column));
+            }
+        }
+
+        #[inline(always)]
+        fn $tile<S: Simd, const R: usize, const W: usize>(
+            simd: S,
+            shape: Shape,
+            left: Left<'_>,
+            right: Panel<'_>,
             start: Start<'_>,
             rectify: bool,
             out: &mut [f32],
             (row, column): (usize, usize),
         ) {
             let Shape { rows, inner, columns } = shape;
-            let zero = $vector::splat(simd, 0.0);
-            let mut sums = [[zero; C]; R];
-            for r in 0..R {
-                let (from, at) = match start {
-                    Start::Bias(bias) => (bias, column),
-                    Start::Out => (&*out, (row + r) * columns + column),
-                };
-                for c in 0..C {
-                    sums[r][c] = $vector::from_slice(simd, &from[at + c * $width..at + (c + 1) * $width]);
-                }
-            }
-            let right = right.chunks_exact(columns);
+            let vector =
+                |values: &[f32], w: usize| $vector::from_slice(simd, &values[w * $width..(w + 1) * $width]);
+            let mut sums: [[$vector<S>; W]; R] = match start {
+                Start::Bias(bias) => [std::array::from_fn(|w| vector(&bias[column..], w)); R],
+                Start::Out => std::array::from_fn(|r| {
+                    let at = (row + r) * columns + column;
+                    std::array::from_fn(|w| vector(&out[at..], w))
+                }),
+            };
+            // The last row of columns that are not packed ends with the right side.
+            let right = right.values.chunks(right.stride).take(inner);
             match left {
                 Left::Rows(values) => {
                     let values: [&[f32]; R] =
                         std::array::from_fn(|r| &values[(row + r) * inner..(row + r + 1) * inner]);
-                    for (k, right) in right.take(inner).enumerate() {
-                        let right = &right[column..column + C * $width];
-                        for c in 0..C {
-                            let b = $vector::from_slice(simd, &right[c * $width..(c + 1) * $width]);
-                            for r in 0..R {
-                                sums[r][c] = b.mul_add($vector::splat(simd, values[r][k]), sums[r][c]);
+                    for (k, b) in right.enumerate() {
+                        let b: [$vector<S>; W] = std::array::from_fn(|w| vector(b, w));
+                        for r in 0..R {
+                            let value = $vector::splat(simd, values[r][k]);
+                            for w in 0..W {
+                                sums[r][w] = b[w].mul_add(value, sums[r][w]);
                             }
                         }
                     }
                 }
                 Left::Columns(values) => {
-                    for (values, right) in values.chunks_exact(rows).zip(right) {
+                    for (values, b) in values.chunks_exact(rows).zip(right) {
                         let values: &[f32; R] = values[row..row + R].try_into().expect("a slice of R values");
-                        let right = &right[column..column + C * $width];
-                        for c in 0..C {
-                            let b = $vector::from_slice(simd, &right[c * $width..(c + 1) * $width]);
-                            for r in 0..R {
-                                sums[r][c] = b.mul_add($vector::splat(simd, values[r]), sums[r][c]);
+                        let b: [$vector<S>; W] = std::array::from_fn(|w| vector(b, w));
+                        for r in 0..R {
+                            let value = $vector::splat(simd, values[r]);
+                            for w in 0..W {
+                                sums[r][w] = b[w].mul_add(value, sums[r][w]);
                             }
                         }
                     }
                 }
             }
-            for r in 0..R {
-                for c in 0..C {
-                    let at = (row + r) * columns + column + c * $width;
-                    let sum = if rectify { sums[r][c].max(zero) } else { sums[r][c] };
+            let zero = $vector::splat(simd, 0.0);
+            for (r, sums) in sums.into_iter().enumerate() {
+                for (w, sum) in sums.into_iter().enumerate() {
+                    let at = (row + r) * columns + column + w * $width;
+                    let sum = if rectify { sum.max(zero) } else { sum };
                     sum.store_slice(&mut out[at..at + $width]);
                 }
             }
@@ -215,8 +247,8 @@ macro_rules! tile {
     };
 }
 
-tile!(wide_tile, f32x16, WIDE);
-tile!(narrow_tile, f32x8, COLUMNS);
+tiles!(wide_panel, wide_tile, f32x16, WIDE);
+tiles!(narrow_panel, narrow_tile, f32x8, COLUMNS);
 
 /// The transpose of `[rows, columns]`, each of its rows padded with zeros to `padded` entries.
 pub(super) fn transpose(values: &[f32], rows: usize, columns: usize, padded: usize) -> Vec<f32> {
@@ -248,7 +280,7 @@ mod tests {
     fn products_equal_plain_sums_on_every_level() {
         for level in [Level::new(), Level::baseline()] {
             for (rows, inner, columns) in
-                [(1, 1, 8), (7, 5, 24), (13, 64, 64), (6, 3, 16), (64, 19, 8), (9, 4, 29)]
+                [(1, 1, 8), (7, 5, 24), (13, 64, 64), (6, 3, 16), (64, 19, 8), (9, 4, 29), (19, 130, 88)]
             {
                 let (a, b, bias) =
                     (numbers(rows * inner, 1), numbers(inner * columns, 2), numbers(columns, 3));

@@ -341,6 +341,13 @@ fn check_fast_path(
             renderer.prepare(field, &expected.scene.camera, expected.scene.time, &settings);
             let blended = renderer.blend(&request);
             expected.compare_image(&blended.values, 2e-5, &mut mismatches);
+            let mut listed = vec![f32::NAN; values.len()];
+            for row in renderer.listed_rows() {
+                let of_row = row as usize * channels..(row as usize + 1) * channels;
+                listed[of_row.clone()].copy_from_slice(&values[of_row]);
+            }
+            let of_listed = renderer.blend(&head.request(&listed));
+            assert_eq!(of_listed.values, blended.values, "others are not drawn");
             let mut frozen = vec![0.0; values.len()];
             renderer.blend_backward(&request, &v_blended, &mut frozen, None);
             expected.compare_values(&frozen, 1e-4, &mut mismatches);

@@ -61,8 +61,7 @@ impl Processor {
         }
         state.times.add_render(&self.renderer.times());
         let head = Arc::clone(&state.head);
-        if let Some(head) = plan.head(&head, &state.config) {
-            plan.regularise(head, state);
+        if plan.trains_head {
             fault = fault.or_else(|| state.head_tensors.fault());
         }
         fault = fault
@@ -198,16 +197,25 @@ impl Processor {
         let target = &plan.head_targets[position];
         let head = Arc::clone(&state.head);
         let head = plan.head(&head, &state.config)?;
-        let State { head_tensors: tensors, field, gradients, .. } = state;
+        let State { head_tensors: tensors, field, gradients, config, .. } = state;
         self.renderer.prepare(field, &target.camera, target.time, &plan.settings);
-        let values = head.values(tensors, field, target.time);
+        let positions = || match self.renderer.posed_means() {
+            [] => field.gaussians.means.clone(),
+            posed => posed.to_vec(),
+        };
+        let pairs = plan.compared(head, config, position, &positions);
+        let mut rows = self.renderer.listed_rows();
+        rows.extend(pairs.as_flattened());
+        rows.sort_unstable();
+        rows.dedup();
+        let values = head.values_of(tensors, field, target.time, &rows);
         let (channels, blending) = (head.channels(field), head.blending());
-        let request = BlendRequest { values: &values[..], channels, blending };
+        let request = BlendRequest { values: &values.values[..], channels, blending };
         let blended = self.renderer.blend(&request);
         let mut v_blended = vec![0.0; blended.values.len()];
-        let of_target = (&blended, plan.head_seed(&state.config, position));
+        let of_target = (&blended, plan.head_seed(config, position));
         let loss = target.loss(head, tensors, of_target, plan.view_weight(), &mut v_blended);
-        let mut v_values = vec![0.0; values.len()];
+        let mut v_values = vec![0.0; values.values.len()];
         let weights = head.own_opacity().map(|_| BlendWeightGradients {
             field,
             blended: &blended,
@@ -215,7 +223,8 @@ impl Processor {
             gradients,
         });
         self.renderer.blend_backward(&request, &v_blended, &mut v_values, weights);
-        head.values_backward(tensors, field, target.time, &v_values);
+        head.regularise(tensors, &pairs, &values.values, &mut v_values);
+        head.values_backward(tensors, field, &values, &v_values);
         reports.push(ViewReport::of_head(loss));
         let fault = self.renderer.take_not_finite().map(Fault::from);
         fault.or_else(|| loss_fault("instance loss", loss.loss))

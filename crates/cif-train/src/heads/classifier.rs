@@ -181,63 +181,69 @@ impl Classifier {
         tensors.add_gradients(&self.biases, &sums.biases);
     }
 
-    /// The neighbour term: divergence of the classes of 1 000 random Gaussians from those of their nearest neighbours
-    /// at the time of the step, a mean over pairs, divided by the number of classes, times 2. Its value, and the
-    /// gradient by the codes of some rows, `[rows, width]`, which `codes_of` gives; positions get none.
+    /// The neighbour term on pairs of [`neighbours`]: divergence of the classes of the first of each from those of the
+    /// second, a mean over pairs, divided by the number of classes, times 2. Its value; its gradients by the codes of all
+    /// Gaussians, `[N, width]`, and by weights and biases are added.
     pub(super) fn neighbour_term(
         &self,
         tensors: &mut HeadTensors,
-        step: &HeadStep<'_>,
-        codes_of: impl FnOnce(&HeadTensors, &[u32]) -> Vec<f32>,
-    ) -> (f64, Vec<u32>, Vec<f32>) {
-        let positions = step.field.deformed(step.time).means;
-        let (n, classes, width) = (positions.len(), self.classes(step.field), self.width());
-        let index = NearestNeighbours::new(&positions);
-        let mut random = stream(step.seed, Purpose::HeadSamples, 0);
-        let samples: Vec<usize> = sample(&mut random, n, SAMPLES.min(n)).into_vec();
-        let pairs: Vec<(u32, u32)> = samples
-            .par_iter()
-            .flat_map_iter(|row| {
-                let near = index.nearest(positions[*row].map(f64::from), NEIGHBOURS);
-                near.into_iter().map(move |found| (*row as u32, found.row))
-            })
-            .collect();
-        let mut rows: Vec<u32> = pairs.iter().flat_map(|(a, b)| [*a, *b]).collect();
+        pairs: &[[u32; 2]],
+        codes: &[f32],
+        v_codes: &mut [f32],
+    ) -> f64 {
+        let (classes, width) = (tensors.values(&self.biases).len(), self.width());
+        let mut rows: Vec<u32> = pairs.as_flattened().to_vec();
         rows.sort_unstable();
         rows.dedup();
-        let codes = codes_of(tensors, &rows);
+        let code = |row: &u32| *row as usize * width..(*row as usize + 1) * width;
         let mut probabilities = vec![0.0_f32; rows.len() * classes];
-        for (scores, code) in probabilities.chunks_exact_mut(classes).zip(codes.chunks_exact(width)) {
-            self.logits(tensors, code, scores);
+        for (scores, row) in probabilities.chunks_exact_mut(classes).zip(&rows) {
+            self.logits(tensors, &codes[code(row)], scores);
             softmax(scores);
         }
+        let logarithms: Vec<f64> = probabilities.iter().map(|p| (f64::from(*p) + TINY).ln()).collect();
         let share = NEIGHBOUR_WEIGHT / (classes as f64 * pairs.len().max(1) as f64);
         let mut v_probabilities = vec![0.0_f64; probabilities.len()];
         let mut divergence = 0.0;
-        let place = |row: &u32| rows.binary_search(row).map_or(0, |at| at * classes);
-        for (a, b) in &pairs {
-            let (a, b) = (place(a), place(b));
+        let place = |row: u32| rows.binary_search(&row).map_or(0, |at| at * classes);
+        for pair in pairs {
+            let [a, b] = pair.map(place);
             for k in 0..classes {
                 let (p, q) = (f64::from(probabilities[a + k]), f64::from(probabilities[b + k]));
-                let difference = (p + TINY).ln() - (q + TINY).ln();
+                let difference = logarithms[a + k] - logarithms[b + k];
                 divergence += p * difference;
                 v_probabilities[a + k] += share * (difference + p / (p + TINY));
                 v_probabilities[b + k] -= share * p / (q + TINY);
             }
         }
-        let (mut sums, mut v_codes) = (Sums::zeros(classes, width), vec![0.0; codes.len()]);
+        let mut sums = Sums::zeros(classes, width);
         let mut v_logits = vec![0.0; classes];
-        for (row, v_code) in v_codes.chunks_exact_mut(width).enumerate() {
-            let range = row * classes..(row + 1) * classes;
-            let (p, v) = (&probabilities[range.clone()], &v_probabilities[range]);
+        let of_rows = probabilities.chunks_exact(classes).zip(v_probabilities.chunks_exact(classes));
+        for (row, (p, v)) in rows.iter().zip(of_rows) {
             let mean: f64 = p.iter().zip(v).map(|(p, v)| f64::from(*p) * v).sum();
             for k in 0..classes {
                 v_logits[k] = (f64::from(p[k]) * (v[k] - mean)) as f32;
             }
-            let code = &codes[row * width..(row + 1) * width];
-            sums.add(&v_logits, code, tensors.values(&self.weights), v_code);
+            let weights = tensors.values(&self.weights);
+            sums.add(&v_logits, &codes[code(row)], weights, &mut v_codes[code(row)]);
         }
         self.add(tensors, &sums);
-        (share * divergence, rows, v_codes)
+        share * divergence
     }
+}
+
+/// Pairs of the neighbour term: 1 000 random Gaussians, each with those that are nearest to it at the time of the step.
+pub(super) fn neighbours(step: &HeadStep<'_>) -> Vec<[u32; 2]> {
+    let positions = (step.positions)();
+    let n = positions.len();
+    let index = NearestNeighbours::new(&positions);
+    let mut random = stream(step.seed, Purpose::HeadSamples, 0);
+    let samples: Vec<usize> = sample(&mut random, n, SAMPLES.min(n)).into_vec();
+    samples
+        .par_iter()
+        .flat_map_iter(|row| {
+            let near = index.nearest(positions[*row].map(f64::from), NEIGHBOURS);
+            near.into_iter().map(move |found| [*row as u32, found.row])
+        })
+        .collect()
 }

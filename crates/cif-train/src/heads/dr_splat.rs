@@ -16,7 +16,7 @@ use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
 use cif_render::Blending;
 use cif_render::cpu::{ContributorMass, ContributorRule};
 
-use super::{Head, HeadLoss, HeadTensors, HeadView, Pass, TrainingViews, ValueHead, largest};
+use super::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, TrainingViews, ValueHead, largest};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 
@@ -98,7 +98,7 @@ impl ValueHead for DrSplat {
         values
     }
 
-    fn values_backward(&self, _: &mut HeadTensors, _field: &Field, _time: f64, _v_values: &[f32]) {}
+    fn values_backward(&self, _: &mut HeadTensors, _: &Field, _: &HeadValues, _v_values: &[f32]) {}
 
     fn loss(
         &self,

@@ -19,9 +19,9 @@ use cif_geometry::spherical_harmonics::BAND_0;
 use cif_render::Blending;
 use rand::RngExt;
 
-use super::classifier::{Classifier, biases, weights};
+use super::classifier::{Classifier, biases, neighbours, weights};
 use super::tensors::per_gaussian;
-use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadView, Pass, ValueHead};
+use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadValues, HeadView, Pass, ValueHead};
 use crate::adam::EPSILON;
 use crate::config::TrainConfig;
 use crate::random::{Purpose, stream};
@@ -96,7 +96,7 @@ impl ValueHead for GaussianGrouping {
         tensors.values(&CODES).to_vec()
     }
 
-    fn values_backward(&self, tensors: &mut HeadTensors, _field: &Field, _time: f64, v_values: &[f32]) {
+    fn values_backward(&self, tensors: &mut HeadTensors, _: &Field, _: &HeadValues, v_values: &[f32]) {
         tensors.add_gradients(&CODES, v_values);
     }
 
@@ -110,19 +110,18 @@ impl ValueHead for GaussianGrouping {
         CLASSIFIER.loss(tensors, view, weight, v_blended)
     }
 
-    fn regularise(&self, tensors: &mut HeadTensors, step: &HeadStep<'_>) -> f64 {
-        if !step.step.is_multiple_of(NEIGHBOURS_EVERY) {
-            return 0.0;
-        }
-        let row = |row: &u32| *row as usize * CODE..(*row as usize + 1) * CODE;
-        let (value, rows, v_codes) = CLASSIFIER.neighbour_term(tensors, step, |tensors, rows| {
-            rows.iter().flat_map(|at| &tensors.values(&CODES)[row(at)]).copied().collect()
-        });
-        let (_, gradients) = tensors.values_and_gradients(&CODES);
-        for (at, v_code) in rows.iter().zip(v_codes.chunks_exact(CODE)) {
-            gradients[row(at)].iter_mut().zip(v_code).for_each(|(sum, v)| *sum += v);
-        }
-        value
+    fn compared(&self, step: &HeadStep<'_>) -> Vec<[u32; 2]> {
+        if step.step.is_multiple_of(NEIGHBOURS_EVERY) { neighbours(step) } else { Vec::new() }
+    }
+
+    fn regularise(
+        &self,
+        tensors: &mut HeadTensors,
+        pairs: &[[u32; 2]],
+        values: &[f32],
+        v_values: &mut [f32],
+    ) -> f64 {
+        CLASSIFIER.neighbour_term(tensors, pairs, values, v_values)
     }
 
     fn decode(&self, tensors: &HeadTensors, blended: &[f32]) -> (u16, f32) {

@@ -121,10 +121,8 @@ pub struct HeadView<'a> {
 /// A step of the stage.
 #[derive(Clone, Copy)]
 pub struct HeadStep<'a> {
-    /// The scene.
-    pub field: &'a Field,
-    /// Normalised time of its first view.
-    pub time: f64,
+    /// Gives the centres of the Gaussians at the time of its first view, world metres.
+    pub positions: &'a dyn Fn() -> Vec<[f32; 3]>,
     /// Step of the stage, from 1.
     pub step: u32,
     /// Steps of the stage.
@@ -159,6 +157,21 @@ pub struct CameraBlending {
     pub weight: f32,
     /// Limits of the place of such a camera on the way from the first view to the second, in [0, 1].
     pub ratio: [f32; 2],
+}
+
+/// Values of a head at a time.
+#[derive(Clone, Debug, Default)]
+pub struct HeadValues {
+    /// `[N, C]`; 0 in rows that were not asked for, where a head leaves them out.
+    pub values: Vec<f32>,
+    /// Rows that a network evaluated, and its layers there, for the way back.
+    layers: (Vec<u32>, Vec<sa4d::Layers>),
+}
+
+impl From<Vec<f32>> for HeadValues {
+    fn from(values: Vec<f32>) -> Self {
+        Self { values, layers: Default::default() }
+    }
 }
 
 /// A head that blends values of its own. Gradients reach its tensors, and its own opacities where it has such.
@@ -211,8 +224,20 @@ pub trait ValueHead: Send + Sync {
     /// The values at a time, `[N, C]`.
     fn values(&self, tensors: &HeadTensors, field: &Field, time: f64) -> Vec<f32>;
 
-    /// Adds the gradients of its tensors by those of the values, `[N, C]`.
-    fn values_backward(&self, tensors: &mut HeadTensors, field: &Field, time: f64, v_values: &[f32]);
+    /// The values of some rows, ascending, at a time, and what the way back needs of them. Heads whose values cost
+    /// nothing give those of all rows.
+    fn values_of(&self, tensors: &HeadTensors, field: &Field, time: f64, _rows: &[u32]) -> HeadValues {
+        self.values(tensors, field, time).into()
+    }
+
+    /// Adds the gradients of its tensors by those of the values of [`Self::values_of`], `[N, C]`.
+    fn values_backward(
+        &self,
+        tensors: &mut HeadTensors,
+        field: &Field,
+        values: &HeadValues,
+        v_values: &[f32],
+    );
 
     /// Loss of a view. Its gradient times `weight` by the blended values is added to `v_blended`, `[height, width,
     /// C]`; gradients by tensors that the loss itself uses are added too.
@@ -224,8 +249,20 @@ pub trait ValueHead: Send + Sync {
         v_blended: &mut [f32],
     ) -> HeadLoss;
 
-    /// A regulariser of a step, whose gradients are added; its value.
-    fn regularise(&self, _tensors: &mut HeadTensors, _step: &HeadStep<'_>) -> f64 {
+    /// Pairs of Gaussians that the regulariser of a step compares.
+    fn compared(&self, _step: &HeadStep<'_>) -> Vec<[u32; 2]> {
+        Vec::new()
+    }
+
+    /// The regulariser of a step on pairs; its value. Its gradients by the values, `[N, C]`, and by tensors that it uses
+    /// itself are added.
+    fn regularise(
+        &self,
+        _tensors: &mut HeadTensors,
+        _pairs: &[[u32; 2]],
+        _values: &[f32],
+        _v_values: &mut [f32],
+    ) -> f64 {
         0.0
     }
 

@@ -6,7 +6,7 @@ use cif_geometry::PixelGrid;
 use cif_render::BlendedImage;
 use cif_render::synthetic::{SyntheticConfig, generate};
 
-use super::{HeadStep, HeadTensors, HeadView, ValueHead};
+use super::{HeadStep, HeadTensors, HeadValues, HeadView, ValueHead};
 
 /// A moving field of so many Gaussians.
 pub(crate) fn field(gaussians: usize) -> Field {
@@ -38,23 +38,41 @@ pub(crate) fn tensors(head: &dyn ValueHead, field: &Field) -> HeadTensors {
 pub(crate) const TIME: f64 = 0.4;
 pub(crate) const SEED: u64 = 11;
 
-/// A step of which regularisers take note.
-pub(crate) fn step(field: &Field) -> HeadStep<'_> {
-    HeadStep { field, time: TIME, step: 10, steps: 100, seed: SEED }
-}
-
 /// Loss of a view of the values, and the gradients of the tensors that it leaves.
 pub(crate) fn loss(head: &dyn ValueHead, tensors: &mut HeadTensors, field: &Field) -> f64 {
     tensors.reset();
-    let values = head.values(tensors, field, TIME);
+    let values = every_value(head, tensors, field);
     let channels = head.channels(field);
-    let blended = BlendedImage { width: field.len() as u32, height: 1, channels, values };
+    let blended =
+        BlendedImage { width: field.len() as u32, height: 1, channels, values: values.values.clone() };
     let labels = labels(field);
     let mut v_values = vec![0.0; blended.values.len()];
     let view = HeadView { blended: &blended, labels: &labels, features: Some(&features(field)), seed: SEED };
     let loss = head.loss(tensors, &view, 1.0, &mut v_values);
-    head.values_backward(tensors, field, TIME, &v_values);
+    head.values_backward(tensors, field, &values, &v_values);
     loss.loss
+}
+
+fn every_value(head: &dyn ValueHead, tensors: &HeadTensors, field: &Field) -> HeadValues {
+    let rows: Vec<u32> = (0..field.len() as u32).collect();
+    head.values_of(tensors, field, TIME, &rows)
+}
+
+/// Value of the regulariser of a step, and the gradients of the tensors that it leaves.
+pub(crate) fn regulariser(
+    head: &dyn ValueHead,
+    tensors: &mut HeadTensors,
+    field: &Field,
+    (step, positions): (u32, &[[f32; 3]]),
+) -> f64 {
+    tensors.reset();
+    let values = every_value(head, tensors, field);
+    let mut v_values = vec![0.0; values.values.len()];
+    let positions = &|| positions.to_vec();
+    let pairs = head.compared(&HeadStep { positions, step, steps: 100, seed: SEED });
+    let value = head.regularise(tensors, &pairs, &values.values, &mut v_values);
+    head.values_backward(tensors, field, &values, &v_values);
+    value
 }
 
 /// Holds gradients of some tensors to central differences of an `oracle` in double precision, which takes the values

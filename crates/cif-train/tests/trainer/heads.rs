@@ -7,8 +7,8 @@ use cif_field::parameters::{Activation, OnCopy, Parameter, Rows};
 use cif_field::{Checkpoint, Field};
 use cif_render::Blending;
 use cif_train::{
-    Control, Head, HeadLoss, HeadTensors, HeadView, Outcome, Pass, TrainConfig, TrainEvent, Trainer,
-    ValueHead,
+    Control, Head, HeadLoss, HeadTensors, HeadValues, HeadView, Outcome, Pass, TrainConfig, TrainEvent,
+    Trainer, ValueHead,
 };
 
 /// Instances of the capture, and the rest.
@@ -75,7 +75,7 @@ impl ValueHead for Scored {
         tensors.values(&SCORES).to_vec()
     }
 
-    fn values_backward(&self, tensors: &mut HeadTensors, _field: &Field, _time: f64, v_values: &[f32]) {
+    fn values_backward(&self, tensors: &mut HeadTensors, _: &Field, _: &HeadValues, v_values: &[f32]) {
         let (_, gradients) = tensors.values_and_gradients(&SCORES);
         gradients.iter_mut().zip(v_values).for_each(|(sum, v)| *sum += v);
     }

@@ -39,6 +39,16 @@ impl Renderer {
         self.bin(TileRegion::whole(camera.width, camera.height), true);
     }
 
+    /// Gaussians with a pixel of the view that was prepared last in their reach, ascending: no other is drawn.
+    #[must_use]
+    pub fn listed_rows(&self) -> Vec<u32> {
+        let (splats, lists) = (&self.tape.splats, &self.tape.lists);
+        let listed = splats.iter().enumerate().filter(|(rank, _)| !lists.pairs_of(*rank).is_empty());
+        let mut rows: Vec<u32> = listed.map(|(_, splat)| splat.gaussian).collect();
+        rows.sort_unstable();
+        rows
+    }
+
     /// Blends values over the view that was rendered or prepared last.
     ///
     /// # Panics

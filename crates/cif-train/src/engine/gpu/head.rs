@@ -48,9 +48,11 @@ impl GpuEngine {
             let Self { gpu, rasterizer, resident, .. } = &mut *self;
             let Some(resident) = resident else { break };
             let (channels, blending) = (head.channels(field), head.blending());
-            let values =
-                GpuVec::from_slice(gpu, "values of the head", &head.values(tensors, field, target.time))?;
-            let request = BlendRequest { values: &values, channels, blending };
+            let pairs = plan.compared(head, config, position, &|| field.deformed(target.time).means);
+            let every: Vec<u32> = (0..field.len() as u32).collect();
+            let values = head.values_of(tensors, field, target.time, &every);
+            let on_device = GpuVec::from_slice(gpu, "values of the head", &values.values)?;
+            let request = BlendRequest { values: &on_device, channels, blending };
             let input = ViewInput { camera: &target.camera, settings: &plan.settings, labels: None };
             let identities = match &field.identities {
                 Some(rows) if plan.settings.instances.is_some() => {
@@ -78,7 +80,7 @@ impl GpuEngine {
             let loss = target.loss(head, tensors, of_target, plan.view_weight(), &mut v_blended);
             reports.push(ViewReport::of_head(loss));
             let v_blended = GpuVec::from_slice(gpu, "gradients of blended values", &v_blended)?;
-            let v_values = GpuVec::zeros(gpu, "gradients of values", values.len())?;
+            let v_values = GpuVec::zeros(gpu, "gradients of values", values.values.len())?;
             let mut commands = Commands::new(gpu, None);
             let weights = head.own_opacity().map(|_| BlendWeightGradients {
                 gaussians: posed,
@@ -87,13 +89,14 @@ impl GpuEngine {
             });
             rasterizer.blend_backward(gpu, &mut commands, &request, &v_blended, &v_values, weights)?;
             commands.submit();
-            head.values_backward(tensors, field, target.time, &v_values.read(gpu)?);
+            let mut v_values = v_values.read(gpu)?;
+            head.regularise(tensors, &pairs, &values.values, &mut v_values);
+            head.values_backward(tensors, field, &values, &v_values);
             if !v_opacity.is_empty() {
                 let of_view = rasterizer.gradients().gaussians.download(gpu)?.occupancy_logits;
                 v_opacity.iter_mut().zip(of_view).for_each(|(sum, v)| *sum += v);
             }
         }
-        plan.regularise(head, state);
         let loss = reports.iter().map(|report| report.instance_loss).sum();
         let fault = loss_fault("instance loss", loss).or_else(|| state.head_tensors.fault());
         if let Some(fault) = fault {

@@ -1,6 +1,6 @@
 use super::*;
 use crate::heads::testing::{
-    SEED, check_gradients, cross_entropy, field, labels, loss, neighbour_term, step, tensors,
+    SEED, TIME, check_gradients, cross_entropy, field, labels, loss, neighbour_term, regulariser, tensors,
 };
 
 #[test]
@@ -17,15 +17,13 @@ fn gradients_are_those_of_double_precision() {
     assert!((value / oracle(&start) - 1.0).abs() < 1e-5);
 
     // Fewer Gaussians than are sampled: all of them are.
-    let step = step(&field);
-    let positions = field.deformed(step.time).means;
-    tensors.reset();
-    let value = GaussianGrouping.regularise(&mut tensors, &step);
+    let positions = field.deformed(TIME).means;
+    let value = regulariser(&GaussianGrouping, &mut tensors, &field, (10, &positions));
     let oracle = |values: &[Vec<f64>]| neighbour_term(&values[0], &values[1], &values[2], &positions);
     assert!((value / oracle(&start) - 1.0).abs() < 1e-4, "{value}");
     check_gradients(&GaussianGrouping, &mut tensors, 7, &oracle);
-    tensors.reset();
-    assert_eq!(GaussianGrouping.regularise(&mut tensors, &HeadStep { step: 11, ..step }), 0.0, "every fifth");
+    let between = regulariser(&GaussianGrouping, &mut tensors, &field, (11, &positions));
+    assert_eq!(between, 0.0, "every fifth");
 }
 
 #[test]

@@ -24,7 +24,7 @@ use cif_field::parameters::Parameter;
 use cif_render::Blending;
 
 use super::tensors::per_gaussian;
-use super::{Head, HeadLoss, HeadTensors, HeadView, Pass, Target, ValueHead};
+use super::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, Target, ValueHead};
 use crate::config::TrainConfig;
 
 /// Channels of a code.
@@ -82,7 +82,7 @@ impl ValueHead for LangSplat {
         tensors.values(&CODES).to_vec()
     }
 
-    fn values_backward(&self, tensors: &mut HeadTensors, _field: &Field, _time: f64, v_values: &[f32]) {
+    fn values_backward(&self, tensors: &mut HeadTensors, _: &Field, _: &HeadValues, v_values: &[f32]) {
         tensors.add_gradients(&CODES, v_values);
     }
 

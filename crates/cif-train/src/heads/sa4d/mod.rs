@@ -20,10 +20,11 @@ use cif_field::Field;
 use cif_field::parameters::Parameter;
 use cif_render::Blending;
 
+pub(super) use self::network::Layers;
 use self::network::{CODE, Network};
-use super::classifier::{Classifier, biases, weights};
+use super::classifier::{Classifier, biases, neighbours, weights};
 use super::tensors::shared;
-use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadView, Pass, ValueHead, largest};
+use super::{Head, HeadLoss, HeadStep, HeadTensors, HeadValues, HeadView, Pass, ValueHead, largest};
 use crate::config::TrainConfig;
 
 /// Rate of network and classifier.
@@ -99,9 +100,30 @@ impl ValueHead for Sa4d {
         self.network.codes(tensors.values(&NETWORK), &field.gaussians.means, time)
     }
 
-    fn values_backward(&self, tensors: &mut HeadTensors, field: &Field, time: f64, v_values: &[f32]) {
+    fn values_of(&self, tensors: &HeadTensors, field: &Field, time: f64, rows: &[u32]) -> HeadValues {
+        let places: Vec<[f32; 3]> = rows.iter().map(|row| field.gaussians.means[*row as usize]).collect();
+        let (codes, layers) = self.network.codes_and_layers(tensors.values(&NETWORK), &places, time);
+        let mut values = vec![0.0; field.len() * CODE];
+        for (row, code) in rows.iter().zip(codes.chunks_exact(CODE)) {
+            values[*row as usize * CODE..][..CODE].copy_from_slice(code);
+        }
+        HeadValues { values, layers: (rows.to_vec(), layers) }
+    }
+
+    fn values_backward(
+        &self,
+        tensors: &mut HeadTensors,
+        _: &Field,
+        HeadValues { layers: (rows, layers), .. }: &HeadValues,
+        v_values: &[f32],
+    ) {
+        // Most that is drawn lies behind what is seen, and has no gradient.
+        let v_code = |place: &usize| &v_values[rows[*place] as usize * CODE..][..CODE];
+        let places: Vec<usize> =
+            (0..rows.len()).filter(|place| v_code(place).iter().any(|v| *v != 0.0)).collect();
+        let v_codes: Vec<f32> = places.iter().flat_map(v_code).copied().collect();
         let (network, gradients) = tensors.values_and_gradients(&NETWORK);
-        self.network.backward(network, &field.gaussians.means, time, v_values, gradients);
+        self.network.backward(network, layers, (&places, &v_codes), gradients);
     }
 
     fn loss(
@@ -114,16 +136,18 @@ impl ValueHead for Sa4d {
         CLASSIFIER.loss(tensors, view, weight, v_blended)
     }
 
-    fn regularise(&self, tensors: &mut HeadTensors, step: &HeadStep<'_>) -> f64 {
-        let means = &step.field.gaussians.means;
-        let places =
-            |rows: &[u32]| -> Vec<[f32; 3]> { rows.iter().map(|row| means[*row as usize]).collect() };
-        let (value, rows, v_codes) = CLASSIFIER.neighbour_term(tensors, step, |tensors, rows| {
-            self.network.codes(tensors.values(&NETWORK), &places(rows), step.time)
-        });
-        let (network, gradients) = tensors.values_and_gradients(&NETWORK);
-        self.network.backward(network, &places(&rows), step.time, &v_codes, gradients);
-        value
+    fn compared(&self, step: &HeadStep<'_>) -> Vec<[u32; 2]> {
+        neighbours(step)
+    }
+
+    fn regularise(
+        &self,
+        tensors: &mut HeadTensors,
+        pairs: &[[u32; 2]],
+        values: &[f32],
+        v_values: &mut [f32],
+    ) -> f64 {
+        CLASSIFIER.neighbour_term(tensors, pairs, values, v_values)
     }
 
     fn decode(&self, tensors: &HeadTensors, blended: &[f32]) -> (u16, f32) {

@@ -25,6 +25,12 @@ const LAYERS: usize = WIDTHS.len() - 1;
 /// Places that are evaluated together.
 const CHUNK: usize = 128;
 
+/// Most places whose layers are kept for the way back, which takes 840 values each.
+const KEPT: usize = 1 << 16;
+
+/// Values of layers, `[places, width]` each, the inputs first.
+pub(in super::super) type Layers = Vec<Vec<f32>>;
+
 /// Most tasks of a backward pass, each with gradients of its own; fixed, so that sums do not depend on threads.
 const TASKS: usize = 16;
 
@@ -82,13 +88,14 @@ impl Network {
         network
     }
 
-    /// Values of all layers at some places, the inputs first and the codes last.
-    fn evaluate(&self, network: &[f32], places: &[[f32; 3]], time: f64) -> Vec<Vec<f32>> {
-        let mut values = vec![inputs(places, time)];
+    /// Values of all layers by those of the first, the codes last.
+    fn evaluate(&self, network: &[f32], inputs: Vec<f32>) -> Layers {
+        let rows = inputs.len() / INPUTS;
+        let mut values = vec![inputs];
         for k in 0..LAYERS {
             let (weights, biases) = layer(network, k);
-            let mut out = vec![0.0; places.len() * WIDTHS[k + 1]];
-            let shape = [places.len(), WIDTHS[k], WIDTHS[k + 1]];
+            let mut out = vec![0.0; rows * WIDTHS[k + 1]];
+            let shape = [rows, WIDTHS[k], WIDTHS[k + 1]];
             self.products.layer(shape, (&values[k], weights, biases), k + 1 < LAYERS, &mut out);
             values.push(out);
         }
@@ -97,18 +104,36 @@ impl Network {
 
     /// Codes of some places at a time, `[places, CODE]`.
     pub(super) fn codes(&self, network: &[f32], places: &[[f32; 3]], time: f64) -> Vec<f32> {
-        let codes = |places: &[[f32; 3]]| self.evaluate(network, places, time).pop().unwrap_or_default();
+        let codes =
+            |places: &[[f32; 3]]| self.evaluate(network, inputs(places, time)).pop().unwrap_or_default();
         let chunks: Vec<Vec<f32>> = places.par_chunks(CHUNK).map(codes).collect();
         chunks.concat()
     }
 
-    /// Adds the gradients of weights and biases by those of the codes.
-    pub(super) fn backward(
+    /// The same, and what [`Self::backward`] needs of them: the layers of every chunk, of which many places keep the
+    /// inputs alone.
+    pub(super) fn codes_and_layers(
         &self,
         network: &[f32],
         places: &[[f32; 3]],
         time: f64,
-        v_codes: &[f32],
+    ) -> (Vec<f32>, Vec<Layers>) {
+        let chunks = places.par_chunks(CHUNK).map(|of_chunk| {
+            let mut layers = self.evaluate(network, inputs(of_chunk, time));
+            let codes = layers.pop().unwrap_or_default();
+            layers.truncate(if places.len() <= KEPT { LAYERS } else { 1 });
+            (codes, layers)
+        });
+        let (codes, layers): (Vec<Vec<f32>>, Vec<Layers>) = chunks.unzip();
+        (codes.concat(), layers)
+    }
+
+    /// Adds the gradients of weights and biases by those of the codes of some of the places that `layers` are of.
+    pub(super) fn backward(
+        &self,
+        network: &[f32],
+        layers: &[Layers],
+        (places, v_codes): (&[usize], &[f32]),
         gradients: &mut [f32],
     ) {
         let transposed: Vec<Vec<f32>> = (0..LAYERS)
@@ -118,14 +143,15 @@ impl Network {
                 (0..outputs * inputs).map(|at| weights[at % inputs * outputs + at / inputs]).collect()
             })
             .collect();
-        let of_task = places.len().div_ceil(TASKS).max(CHUNK);
+        let of_task = places.len().div_ceil(TASKS).next_multiple_of(CHUNK);
         let sums: Vec<Vec<f32>> = places
-            .par_chunks(of_task)
-            .zip(v_codes.par_chunks(of_task * CODE))
+            .par_chunks(of_task.max(CHUNK))
+            .zip(v_codes.par_chunks(of_task.max(CHUNK) * CODE))
             .map(|(places, v_codes)| {
                 let mut sums = vec![0.0; network.len()];
                 for (places, v_codes) in places.chunks(CHUNK).zip(v_codes.chunks(CHUNK * CODE)) {
-                    self.backward_chunk((network, &transposed), (places, time), v_codes, &mut sums);
+                    let layers = self.gather(network, layers, places);
+                    self.backward_chunk(&transposed, &layers, v_codes, &mut sums);
                 }
                 sums
             })
@@ -135,33 +161,43 @@ impl Network {
         }
     }
 
+    /// Values of the layers at some places, but for the codes.
+    fn gather(&self, network: &[f32], layers: &[Layers], places: &[usize]) -> Layers {
+        let of_layer = |k: usize| {
+            let mut values = Vec::with_capacity(places.len() * WIDTHS[k]);
+            for place in places {
+                let first = place % CHUNK * WIDTHS[k];
+                values.extend_from_slice(&layers[place / CHUNK][k][first..first + WIDTHS[k]]);
+            }
+            values
+        };
+        match layers.first() {
+            Some(kept) if kept.len() == LAYERS => (0..LAYERS).map(of_layer).collect(),
+            _ => self.evaluate(network, of_layer(0)),
+        }
+    }
+
     fn backward_chunk(
         &self,
-        (network, transposed): (&[f32], &[Vec<f32>]),
-        (places, time): (&[[f32; 3]], f64),
+        transposed: &[Vec<f32>],
+        values: &[Vec<f32>],
         v_codes: &[f32],
         gradients: &mut [f32],
     ) {
-        // What no pixel shows has no gradient.
-        if v_codes.iter().all(|v| *v == 0.0) {
-            return;
-        }
-        let values = self.evaluate(network, places, time);
+        let rows = v_codes.len() / CODE;
         let mut v_out = v_codes.to_vec();
         for k in (0..LAYERS).rev() {
             let (inputs, outputs) = (WIDTHS[k], WIDTHS[k + 1]);
             let (v_weights, v_biases) = layer_mut(gradients, k);
-            let shape = [inputs, places.len(), outputs];
-            self.products.add(shape, Side::Columns(&values[k]), &v_out, v_weights);
+            self.products.add([inputs, rows, outputs], Side::Columns(&values[k]), &v_out, v_weights);
             for row in v_out.chunks_exact(outputs) {
                 v_biases.iter_mut().zip(row).for_each(|(total, v)| *total += v);
             }
             if k == 0 {
                 break;
             }
-            let mut v_in = vec![0.0; places.len() * inputs];
-            let shape = [places.len(), outputs, inputs];
-            self.products.add(shape, Side::Rows(&v_out), &transposed[k], &mut v_in);
+            let mut v_in = vec![0.0; rows * inputs];
+            self.products.add([rows, outputs, inputs], Side::Rows(&v_out), &transposed[k], &mut v_in);
             for (v, value) in v_in.iter_mut().zip(&values[k]) {
                 if *value <= 0.0 {
                     *v = 0.0;

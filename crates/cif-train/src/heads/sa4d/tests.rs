@@ -1,7 +1,7 @@
 use super::network::{WIDTHS, encode};
 use super::*;
 use crate::heads::testing::{
-    TIME, check_gradients, cross_entropy, field, labels, loss, neighbour_term, step, tensors,
+    TIME, check_gradients, cross_entropy, field, labels, loss, neighbour_term, regulariser, tensors,
 };
 
 /// Codes in double precision, by the definition.
@@ -42,13 +42,43 @@ fn gradients_are_those_of_double_precision() {
         |values: &[Vec<f64>]| cross_entropy(&codes(&values[0], &means), &values[1], &values[2], &classes);
     check_gradients(&head, &mut tensors, 1_511, &oracle);
 
-    let step = step(&field);
-    let positions = field.deformed(step.time).means;
-    tensors.reset();
-    assert!(head.regularise(&mut tensors, &HeadStep { step: 11, ..step }) > 0.0, "at every step");
+    let positions = field.deformed(TIME).means;
+    assert!(regulariser(&head, &mut tensors, &field, (11, &positions)) > 0.0, "at every step");
     let oracle =
         |values: &[Vec<f64>]| neighbour_term(&codes(&values[0], &means), &values[1], &values[2], &positions);
     check_gradients(&head, &mut tensors, 1_511, &oracle);
+}
+
+#[test]
+fn some_rows_have_the_values_that_all_have_and_gradients_need_no_kept_layers() {
+    let field = field(300);
+    let head = Sa4d::default();
+    let mut tensors = tensors(&head, &field);
+    let all = head.values(&tensors, &field, TIME);
+    let rows: Vec<u32> = (0..300).filter(|row| row % 3 != 1).collect();
+    let mut some = head.values_of(&tensors, &field, TIME, &rows);
+    for (row, (code, expected)) in some.values.chunks_exact(CODE).zip(all.chunks_exact(CODE)).enumerate() {
+        let expected = if row % 3 == 1 { &[0.0; CODE] } else { expected };
+        assert_eq!(code, expected, "row {row}");
+    }
+    // Gradients in some of the rows, so that others are passed over.
+    let v_values: Vec<f32> = (0..300 * CODE)
+        .map(|k| if (k / CODE).is_multiple_of(6) { (k % 7) as f32 - 3.0 } else { 0.0 })
+        .collect();
+    let mut gradients = [true, false].map(|keeps| {
+        some.layers.1.iter_mut().for_each(|layers| layers.truncate(if keeps { usize::MAX } else { 1 }));
+        tensors.reset();
+        head.values_backward(&mut tensors, &field, &some, &v_values);
+        tensors.values_and_gradients(&NETWORK).1.to_vec()
+    });
+    assert_eq!(gradients[0], gradients[1]);
+    tensors.reset();
+    let every: Vec<u32> = (0..300).collect();
+    let some = head.values_of(&tensors, &field, TIME, &every);
+    head.values_backward(&mut tensors, &field, &some, &v_values);
+    let of_all = tensors.values_and_gradients(&NETWORK).1;
+    gradients[0].iter_mut().zip(of_all).for_each(|(a, b)| *a -= *b);
+    assert!(gradients[0].iter().all(|v| *v == 0.0), "only rows with a gradient count");
 }
 
 #[test]

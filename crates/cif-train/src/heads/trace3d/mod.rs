@@ -24,20 +24,18 @@ use cif_field::Field;
 use cif_field::parameters::Parameter;
 use cif_render::Blending;
 use cif_render::cpu::{ContributorMass, ContributorRule};
+use fearless_simd::Level;
 use rand::seq::index::sample;
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64;
 
-use self::contrast::contrast;
+use self::contrast::{CODE, contrast};
 use super::tensors::{per_gaussian, shared};
-use super::{Head, HeadLoss, HeadTensors, HeadView, Pass, Phase, TrainingViews, ValueHead};
+use super::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, Phase, TrainingViews, ValueHead};
 use crate::config::{HeadName, TrainConfig};
 use crate::densify::{Rearrangement, keep, with_copies};
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
-
-/// Width of a code.
-const CODE: usize = 16;
 
 /// Rate of codes.
 const RATE: f32 = 5e-3;
@@ -180,7 +178,7 @@ impl ValueHead for Trace3d {
         tensors.values(&CODES).to_vec()
     }
 
-    fn values_backward(&self, tensors: &mut HeadTensors, _field: &Field, _time: f64, v_values: &[f32]) {
+    fn values_backward(&self, tensors: &mut HeadTensors, _: &Field, _: &HeadValues, v_values: &[f32]) {
         tensors.add_gradients(&CODES, v_values);
     }
 
@@ -198,11 +196,11 @@ impl ValueHead for Trace3d {
             .into_iter()
             .map(|k| labelled[k])
             .collect();
-        let code = |pixel: &usize| &view.blended.values[pixel * CODE..(pixel + 1) * CODE];
-        let codes: Vec<f32> = chosen.iter().flat_map(code).copied().collect();
+        let (of_pixels, _) = view.blended.values.as_chunks::<CODE>();
+        let codes: Vec<[f32; CODE]> = chosen.iter().map(|pixel| of_pixels[*pixel]).collect();
         let of: Vec<u16> = chosen.iter().map(|pixel| labels[*pixel]).collect();
-        let (loss, v_codes) = contrast(&codes, &of, CODE);
-        for (pixel, v_code) in chosen.iter().zip(v_codes.chunks_exact(CODE)) {
+        let (loss, v_codes) = contrast(Level::new(), &codes, &of);
+        for (pixel, v_code) in chosen.iter().zip(v_codes) {
             let v = &mut v_blended[pixel * CODE..(pixel + 1) * CODE];
             v.iter_mut().zip(v_code).for_each(|(total, v)| *total += weight * v);
         }

@@ -26,7 +26,7 @@ use rand_distr::{Distribution, StandardNormal};
 use self::attention::{LANGUAGE, TOKENS};
 use super::classifier::{Classifier, biases, weights};
 use super::tensors::{per_gaussian, shared};
-use super::{CameraBlending, Head, HeadLoss, HeadTensors, HeadView, OwnOpacity, Pass, ValueHead};
+use super::{CameraBlending, Head, HeadLoss, HeadTensors, HeadValues, HeadView, OwnOpacity, Pass, ValueHead};
 use crate::config::TrainConfig;
 use crate::random::{Purpose, stream};
 
@@ -122,7 +122,7 @@ impl ValueHead for Vlgs {
         attention::fuse(tensors.values(&ATTENTION), field.len(), |row| channels(field, codes, row))
     }
 
-    fn values_backward(&self, tensors: &mut HeadTensors, field: &Field, _time: f64, v_values: &[f32]) {
+    fn values_backward(&self, tensors: &mut HeadTensors, field: &Field, _: &HeadValues, v_values: &[f32]) {
         let codes = tensors.values(&CODES);
         let of = |row: usize| channels(field, codes, row);
         let (v_codes, v_attention) = attention::backward(tensors.values(&ATTENTION), of, v_values);

@@ -157,7 +157,7 @@ impl Asked<'_> {
             self.questions.iter().map(|question| named(field, &question.text)).collect();
         let mut frames: Vec<Vec<FrameAgreement>> = vec![Vec::new(); self.questions.len()];
         let options = EvaluationOptions { decoder, ..EvaluationOptions::held_out(field) };
-        evaluate::<Error>(field, &self.capture.dataset, &options, |view| {
+        evaluate::<Error>(field, self.capture.scored(), &options, |view| {
             interrupt::go_on()?;
             // A pixel that is mostly background is nobody's: all pixels are counted.
             let labels = view.rendered.instances.as_ref().map(InstanceImage::foreground_label);
@@ -182,7 +182,7 @@ impl Asked<'_> {
         let Checkpoint { field, head, .. } = Checkpoint::load(scene).map_err(Error::plain)?;
         let head = head.ok_or_else(|| Error::plain(format!("{} has no head", scene.display())))?;
         let decoder = Decoder::of_scene(&field, &head).map_err(Error::plain)?;
-        let (settings, dataset) = (scene::render_settings(&field), &self.capture.dataset);
+        let (settings, dataset) = (scene::render_settings(&field), self.capture.scored());
         let mut renderer = Renderer::new(SimdLevel::Auto);
         let mut frames: Vec<Vec<FrameAgreement>> = vec![Vec::new(); self.questions.len()];
         for index in dataset.val_frames() {
@@ -207,7 +207,7 @@ impl Asked<'_> {
         question: &Question,
         mut render: impl FnMut(usize) -> cif_geometry::PixelGrid<bool>,
     ) -> Result<Agreement, Error> {
-        let dataset = &self.capture.dataset;
+        let dataset = self.capture.scored();
         let mut frames = Vec::new();
         for index in dataset.val_frames() {
             interrupt::go_on()?;

@@ -55,6 +55,16 @@ pub(super) fn describe(
     if let Some(preset) = &command.preset {
         line += &format!(" --preset {preset}");
     }
+    if !command.heads.is_empty() {
+        let names: Vec<&str> = command.heads.iter().map(|argument| argument.head().name()).collect();
+        line += &format!(" --heads {}", names.join(","));
+    }
+    let options = [("masks", &command.capture_options.masks), ("score-masks", &command.score_masks)];
+    for (name, value) in options {
+        if let Some(value) = value {
+            line += &format!(" --{name} {}", folder(value));
+        }
+    }
     if command.ablations {
         line += " --ablations";
     }

@@ -29,7 +29,9 @@ use crate::{interrupt, output};
 const HELP: &str = "\
 Every capture is reconstructed once per seed; every head then trains on that reconstruction, sees the same masks and is
 scored on the held-out frames as `cif eval` scores its scene. All train what their settings have, as `cif train
---effects all` does.
+--effects all` does. What is trained on the masks of one folder may be scored on those of another:
+
+  cif bench compare captures/table -o compare --masks masks_tracker --score-masks masks
 
   cif bench compare captures/table -o compare --preset draft
   cif bench compare captures/table captures/kitchen -o compare --heads cif,sa4d --seeds 1 --ablations
@@ -99,6 +101,10 @@ pub(super) struct BenchCompare {
     /// and the same command goes on
     #[arg(long, value_name = "DURATION", value_parser = humantime::parse_duration)]
     budget: Option<Duration>,
+    /// Mask folder that scores are taken on: a name inside every capture, such as `masks` beside --masks masks_tracker
+    /// [default: that of --masks]
+    #[arg(long, value_name = "NAME")]
+    score_masks: Option<PathBuf>,
     /// Write a video per capture, shown in the page: colours, then the labels of every run of the first seed, side by
     /// side, along the held-out frames. Needs ffmpeg with libx264
     #[arg(long)]
@@ -143,7 +149,16 @@ impl Iterations {
 struct Capture {
     name: String,
     dataset: Dataset,
+    /// The capture with the masks that scores are taken on, where these are others.
+    scored: Option<Dataset>,
     config: TrainConfig,
+}
+
+impl Capture {
+    /// The capture with the masks that scores are taken on.
+    fn scored(&self) -> &Dataset {
+        self.scored.as_ref().unwrap_or(&self.dataset)
+    }
 }
 
 pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
@@ -187,7 +202,12 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
         for seed in 0..u64::from(command.seeds) {
             let mut config = capture.config.clone();
             config.seed += seed;
-            let subject = Subject { capture: &capture.name, dataset: &capture.dataset, config: &config };
+            let subject = Subject {
+                capture: &capture.name,
+                dataset: &capture.dataset,
+                scored: capture.scored(),
+                config: &config,
+            };
             bench.compare(&subject, &contenders)?;
         }
     }
@@ -270,8 +290,12 @@ fn open(command: &BenchCompare, path: &Path) -> Result<Capture, Error> {
             "hold frames out in the split lists of the capture",
         );
     }
-    let is_masked = |split| dataset.frames.iter().any(|frame| frame.split == split && frame.mask.is_some());
-    if !is_masked(Split::Train) || !is_masked(Split::Val) {
+    let scored = command.score_masks.as_ref().map(|folder| dataset.with_masks(folder)).transpose()?;
+    scored.iter().for_each(print_warnings);
+    let is_masked = |dataset: &Dataset, split| {
+        dataset.frames.iter().any(|frame| frame.split == split && frame.mask.is_some())
+    };
+    if !is_masked(&dataset, Split::Train) || !is_masked(scored.as_ref().unwrap_or(&dataset), Split::Val) {
         return refused(
             "heads are compared by masks, and its training or held-out frames have none",
             "give a capture with masks, or their folder with --masks",
@@ -280,7 +304,7 @@ fn open(command: &BenchCompare, path: &Path) -> Result<Capture, Error> {
     let mut config = base_config(command, dataset.layout)?;
     config.downscale = options.downscale;
     let name = dataset.root.file_name().map_or_else(|| "capture".into(), |name| name.to_string_lossy());
-    Ok(Capture { name: name.into_owned(), config, dataset })
+    Ok(Capture { name: name.into_owned(), config, scored, dataset })
 }
 
 /// Settings of the reconstruction: those of the run of the method itself.

@@ -230,7 +230,7 @@ impl File {
         for capture in captures {
             let Some(of) = self.content.capture.iter().find(|of| of.name == capture.name) else { continue };
             let questions = of.question.iter().map(|question| {
-                let answer = ids(&question.answer, &capture.dataset.instances).map_err(|problem| {
+                let answer = ids(&question.answer, &capture.scored().instances).map_err(|problem| {
                     self.refused(
                         format!("question '{}' of capture {}: {problem}", question.text, capture.name),
                         "name ids, labels or classes of instances; cif info CAPTURE lists them",

@@ -10,6 +10,7 @@ use cif_bench::comparison::record::Record;
 use cif_bench::comparison::run::{Subject, settings};
 use cif_bench::comparison::tables::Missing;
 use cif_bench::records::Records;
+use cif_dataset::Dataset;
 use cif_geometry::PixelGrid;
 use cif_train::metrics::FrameView;
 use cif_train::{HeadName, Stop, TrainConfig};
@@ -72,10 +73,12 @@ impl Bench {
         for contender in contenders {
             let Some(config) = self.settings(subject, *contender) else { continue };
             let id = id(subject.capture, config.seed, contender.name());
+            let masks = |of: &Dataset| of.frames.iter().find_map(|frame| frame.mask.clone());
             let fingerprint = json!({
                 "version": env!("CARGO_PKG_VERSION"),
                 "capture": subject.dataset.root,
-                "masks": subject.dataset.frames.iter().filter_map(|frame| frame.mask.as_ref()).next(),
+                "masks": masks(subject.dataset),
+                "scored": masks(subject.scored),
                 "base": subject.config,
                 "settings": config,
             });
