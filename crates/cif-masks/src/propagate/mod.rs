@@ -261,6 +261,8 @@ impl<'a> Run<'a> {
         }
         let forest = self.forest(key..=key);
         let mut belief = self.start(key);
+        // No other way tells of what the keyframe does not show.
+        belief.shown.fill(true);
         let mut at = key;
         for some in frames.chunks(self.window_frames() - 1) {
             let end = some[some.len() - 1];
