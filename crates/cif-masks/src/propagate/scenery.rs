@@ -24,6 +24,9 @@ const TRUSTED: f32 = 0.9;
 /// [`Picture::lab`]: crate::picture::Picture::lab
 const RECOLORED: f32 = 30.0;
 
+/// Square of the share of it from which it counts.
+const NOTED: f32 = 0.01;
+
 /// Least factor.
 const FLOOR: f32 = 0.1;
 
@@ -44,9 +47,13 @@ pub(super) fn factors(ways: &[[Way; 2]], lab: &[&[Plane; 3]]) -> Vec<Vec<f32>> {
             if ways[frame - 1][0].trust[pixel].min(ways[frame][1].trust[pixel]) > TRUSTED {
                 return 1.0;
             }
-            let was = change(&back, lab[frame], lab[frame - before], pixel);
-            let will_be = change(&ahead, lab[frame], lab[frame + after], pixel);
-            let square = was.min(will_be) / (RECOLORED * RECOLORED);
+            let mut square = change(&back, lab[frame], lab[frame - before], pixel);
+            if square > NOTED {
+                square = square.min(change(&ahead, lab[frame], lab[frame + after], pixel));
+            }
+            if square <= NOTED {
+                return 1.0;
+            }
             FLOOR + (1.0 - FLOOR) * (-0.5 * square).exp()
         };
         (0..pixels).map(factor).collect()
@@ -54,7 +61,8 @@ pub(super) fn factors(ways: &[[Way; 2]], lab: &[&[Plane; 3]]) -> Vec<Vec<f32>> {
     (0..lab.len()).into_par_iter().map(of_frame).collect()
 }
 
-/// Square of the least difference of colour between a pixel and those about where motion leads; 0 beyond the image.
+/// Square of the least difference of colour between a pixel and those about where motion leads, in units of
+/// [`RECOLORED`]; 0 beyond the image.
 fn change(motion: &[&Flow], own: &[Plane; 3], other: &[Plane; 3], pixel: usize) -> f32 {
     let (width, height) = (own[0].width, own[0].height);
     let (mut x, mut y) = ((pixel % width) as f32, (pixel / width) as f32);
@@ -71,7 +79,7 @@ fn change(motion: &[&Flow], own: &[Plane; 3], other: &[Plane; 3], pixel: usize) 
         let square = |(own, other): (&Plane, &Plane)| (own.data[pixel] - tap.of(&other.data)).powi(2);
         least = least.min(own.iter().zip(other).map(square).sum());
     }
-    least
+    least / (RECOLORED * RECOLORED)
 }
 
 /// A flow that is filled in from around where it is not trusted: means of ever larger blocks, each weighed by the square
