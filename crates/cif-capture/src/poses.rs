@@ -18,6 +18,20 @@ pub struct Lens {
     pub distortion: LensDistortion,
 }
 
+impl Lens {
+    /// The lens for images of another size: poses of other tools may be of larger ones.
+    #[must_use]
+    pub fn scaled(&self, size: (u32, u32)) -> Self {
+        let [x, y] = [f64::from(size.0) / f64::from(self.size.0), f64::from(size.1) / f64::from(self.size.1)];
+        Self {
+            size,
+            focal_px: [self.focal_px[0] * x, self.focal_px[1] * y],
+            principal_px: [self.principal_px[0] * x, self.principal_px[1] * y],
+            distortion: self.distortion,
+        }
+    }
+}
+
 #[cfg(test)]
 impl Lens {
     /// A lens of small pictures.

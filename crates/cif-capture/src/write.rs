@@ -75,7 +75,7 @@ pub(crate) fn write_cameras(capture: &Capture<'_>, folder: &Path) -> Result<(), 
             frame.insert("mask_path".to_owned(), json!(format!("masks/{}", mask_name(&shot.name))));
         }
         if !one_lens {
-            insert_lens(&mut frame, &scaled(&capture.poses.lenses[pose.lens], shot.size));
+            insert_lens(&mut frame, &capture.poses.lenses[pose.lens].scaled(shot.size));
         }
         frame.insert("transform_matrix".to_owned(), matrix(pose));
         frames.push(Value::Object(frame));
@@ -83,7 +83,7 @@ pub(crate) fn write_cameras(capture: &Capture<'_>, folder: &Path) -> Result<(), 
     let mut file = Map::new();
     file.insert("camera_model".to_owned(), json!("OPENCV"));
     if let (true, Some(shot)) = (one_lens, capture.shots.first()) {
-        insert_lens(&mut file, &scaled(&capture.poses.lenses[0], shot.size));
+        insert_lens(&mut file, &capture.poses.lenses[0].scaled(shot.size));
     }
     if let Some(rate) = frames_per_second(capture.shots).filter(|_| timed) {
         file.insert("fps".to_owned(), json!(rate));
@@ -151,17 +151,6 @@ fn insert_lens(object: &mut Map<String, Value>, lens: &Lens) {
     object.insert("w".to_owned(), json!(lens.size.0));
     object.insert("h".to_owned(), json!(lens.size.1));
     object.extend(values.map(|(name, value)| (name.to_owned(), json!(value))));
-}
-
-/// A lens for images of another size: poses of other tools may be of larger ones.
-fn scaled(lens: &Lens, size: (u32, u32)) -> Lens {
-    let [x, y] = [f64::from(size.0) / f64::from(lens.size.0), f64::from(size.1) / f64::from(lens.size.1)];
-    Lens {
-        size,
-        focal_px: [lens.focal_px[0] * x, lens.focal_px[1] * y],
-        principal_px: [lens.principal_px[0] * x, lens.principal_px[1] * y],
-        distortion: lens.distortion,
-    }
 }
 
 /// Frames per second of the images of a camera, by their median distance; `None` for fewer than two.

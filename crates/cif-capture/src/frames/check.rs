@@ -51,6 +51,8 @@ fn stands_still(shots: &[&Shot]) -> bool {
 pub fn check(shots: &[Shot], fixed: bool, notes: &mut Notes) -> Result<(), Error> {
     let cameras = by_camera(shots);
     let names: Vec<&str> = cameras.keys().copied().collect();
+    // Of two or less nothing is known of whether the camera moves.
+    let fixed = fixed && shots.len() >= FEWEST;
     if fixed && cameras.len() == 1 {
         return Err(Error::refused(
             format!("{}: the camera stands still, and one still camera sees no depth", names[0]),
@@ -152,6 +154,9 @@ mod tests {
     #[test]
     fn few_and_mixed_images_are_refused() {
         let error = check(&moving(2), false, &mut Notes::new()).unwrap_err().to_string();
+        assert!(error.contains("2 usable images are too few"), "{error}");
+        let twice = [shot("a", "0.png", (64, 48), 50, 0), shot("a", "1.png", (64, 48), 50, 0)];
+        let error = check(&twice, true, &mut Notes::new()).unwrap_err().to_string();
         assert!(error.contains("2 usable images are too few"), "{error}");
         let mut mixed = moving(5);
         mixed[2].size = (48, 64);

@@ -1,5 +1,7 @@
 //! Which frames of a video are taken.
 
+use std::collections::BTreeMap;
+
 use crate::picture::Impression;
 
 /// Frames that are taken of a video where nothing else is asked for.
@@ -21,12 +23,15 @@ pub struct Choice {
     /// True takes the sharpest frame of every window, false the one nearest to its middle. Cameras that record
     /// together need the latter, and have it where this is `None`.
     pub sharpest: Option<bool>,
+    /// Seconds by which cameras began to record after the others, by their names; 0 for those that are not there.
+    /// Seconds of the capture are those of their streams plus these.
+    pub offsets_s: BTreeMap<String, f64>,
 }
 
 /// A frame of a video as it was looked at.
 #[derive(Clone, Debug)]
 pub struct Seen {
-    /// Seconds in the stream.
+    /// Seconds in the stream, with the offset of the camera.
     pub time: f64,
     /// Its looks.
     pub impression: Impression,

@@ -23,7 +23,7 @@ pub struct Shot {
     pub name: String,
     /// Where the image lies.
     pub file: PathBuf,
-    /// Seconds since its camera's first frame; `None` for photographs without times.
+    /// Seconds since its camera's first frame, plus the offset of the camera; `None` for photographs without times.
     pub time: Option<f64>,
     /// Width and height, pixels.
     pub size: (u32, u32),
@@ -34,7 +34,7 @@ pub struct Shot {
 /// Collects the images of all cameras; frames of videos are written below `folder`.
 ///
 /// # Errors
-/// When a video or photograph cannot be read, or ffmpeg is needed and missing.
+/// When a video or photograph cannot be read, ffmpeg is needed and missing, or an offset is of no camera.
 pub fn collect(
     sources: &[Source],
     choice: &Choice,
@@ -42,6 +42,19 @@ pub fn collect(
     hooks: &Hooks<'_>,
     notes: &mut Notes,
 ) -> Result<Vec<Shot>, Error> {
+    let is_video = |name: &str| sources.iter().any(|s| s.camera == name && s.photographs.is_none());
+    if let Some(name) = choice.offsets_s.keys().find(|name| !is_video(name)) {
+        let known: Vec<&str> = sources.iter().map(|source| source.camera.as_str()).collect();
+        return Err(Error::refused(
+            format!("an offset is given for {name}, which is no video"),
+            format!("name one of the cameras: {}", known.join(", ")),
+        ));
+    }
+    // Frames are counted from the moment at which all cameras record, so that they show the same moments.
+    let of = |source: &Source| choice.offsets_s.get(&source.camera).copied().unwrap_or(0.0);
+    let all_record = sources.iter().map(of).fold(f64::NEG_INFINITY, f64::max);
+    let from_s = choice.from_s.or((!choice.offsets_s.is_empty()).then_some(all_record));
+    let choice = &Choice { from_s, ..choice.clone() };
     let mut shots = Vec::new();
     for source in sources {
         // Images of one camera lie in one folder, without a folder of its own.

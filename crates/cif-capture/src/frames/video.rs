@@ -38,7 +38,10 @@ fn read_with(
     let shown = source.path.display();
     cif_input::check(&source.path).map_err(Error::io("read", &source.path))?;
     hooks.tell(&format!("looking at {}", source.camera));
-    let seen = look(ffmpeg, source, hooks)?;
+    let mut seen = look(ffmpeg, source, hooks)?;
+    let start = seen[0].time;
+    let offset = choice.offsets_s.get(&source.camera).copied().unwrap_or(0.0);
+    seen.iter_mut().for_each(|frame| frame.time += offset);
     if let Some(varies) = spread_of_distances(&seen).filter(|spread| *spread > VARIES) {
         notes.push(format!(
             "{shown}: the distance between frames varies by {:.0} %; times are those of the stream",
@@ -65,7 +68,6 @@ fn read_with(
     let into = folder.join(&source.camera);
     std::fs::create_dir_all(&into).map_err(Error::io("create", &into))?;
     write(ffmpeg, source, &taken, choice.max_side, &into, hooks)?;
-    let start = seen[0].time;
     let mut shots = Vec::with_capacity(taken.len());
     for (number, k) in taken.iter().enumerate() {
         let written = into.join(format!("taken{number:06}.png"));
@@ -262,6 +264,29 @@ mod tests {
         // The pixels are those of the frames asked for: the clock of the test picture has gone on.
         let pixels = |k: usize| std::fs::read(&shots[k].file).unwrap();
         assert_ne!(pixels(0), pixels(3));
+    }
+
+    #[test]
+    fn cameras_that_began_at_other_times_show_the_same_moments() {
+        let folder = tempfile::tempdir().unwrap();
+        let filter = "testsrc=duration=2:size=96x64:rate=10";
+        let Some(path) = video(folder.path(), filter, "walk.mkv") else { return };
+        let sources = ["a", "b"].map(|name| Source { camera: name.to_owned(), ..source(&path) });
+        // b began half a second before a, so that its frame 5 shows the moment of the first of a.
+        let offsets_s = [("b".to_owned(), -0.5)].into();
+        let choice = Choice { rate: Some(2.0), offsets_s, ..Choice::default() };
+        let hooks = Hooks::silent();
+        let shots =
+            crate::frames::collect(&sources, &choice, folder.path(), &hooks, &mut Notes::new()).unwrap();
+        let of = |camera: &str| -> Vec<(String, i64)> {
+            let shots = shots.iter().filter(|shot| shot.camera == camera);
+            shots.map(|s| (s.name.clone(), (s.time.unwrap() * 1e3).round() as i64)).collect()
+        };
+        let frames = |camera: &str, first: usize, count: usize| -> Vec<(String, i64)> {
+            (0..count).map(|k| (format!("{camera}/{:06}.png", first + 5 * k), 500 * k as i64)).collect()
+        };
+        assert_eq!(of("a"), frames("a", 0, 4));
+        assert_eq!(of("b"), frames("b", 5, 3));
     }
 
     #[test]

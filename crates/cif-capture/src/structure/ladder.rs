@@ -20,7 +20,7 @@ use crate::{Error, Hooks};
 const PEAKS: [Option<f64>; 3] = [None, Some(0.002), Some(0.001)];
 
 /// Lenses of COLMAP that are fitted.
-pub(super) const LENS_MODEL: &str = "SIMPLE_RADIAL";
+const LENS_MODEL: &str = "SIMPLE_RADIAL";
 
 /// Images have, in the median, fewer features than this where they are blurred or show nothing but plain
 /// surfaces.
@@ -217,7 +217,7 @@ fn reason(verdict: &Verdict) -> String {
 }
 
 /// Images that share a lens.
-pub(super) fn groups(request: &Request<'_>) -> Vec<Group> {
+fn groups(request: &Request<'_>) -> Vec<Group> {
     let mut groups: BTreeMap<(&str, (u32, u32)), Vec<usize>> = BTreeMap::new();
     for (index, shot) in request.shots.iter().enumerate() {
         let camera = match request.lenses {
@@ -227,7 +227,7 @@ pub(super) fn groups(request: &Request<'_>) -> Vec<Group> {
         groups.entry((camera, shot.size)).or_default().push(index);
     }
     let params = |(width, height): (u32, u32)| {
-        request.focal_px.map(|focal| [focal, 0.5 * f64::from(width), 0.5 * f64::from(height), 0.0])
+        request.focal_px.map(|focal| vec![focal, 0.5 * f64::from(width), 0.5 * f64::from(height), 0.0])
     };
     let group = |((_, size), images)| Group { images, params: params(size), size };
     groups.into_iter().map(group).collect()

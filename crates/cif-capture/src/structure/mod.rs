@@ -9,6 +9,6 @@ mod verdict;
 
 pub use ladder::{Found, Lenses, Request, find};
 pub use pairs::Order;
-pub use points::points_of_rig;
+pub use points::{points_of_images, points_of_rig};
 pub use python::{pythons, set_python};
 pub use verdict::{Check, Verdict, judge};

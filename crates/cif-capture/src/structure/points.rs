@@ -1,17 +1,21 @@
-//! Points that the cameras of a rig see. One moment of few cameras gives few of them: most are seen by two
-//! cameras alone, which mappers leave out because they have no poses yet to check them by. With poses, two
-//! views tell a place as well as more, and other moments show what people or things hid.
+//! Points that images with known poses see. One moment of a rig gives few: most are seen by two cameras alone,
+//! which mappers leave out because they have no poses yet to check them by. With poses, two views tell a place as
+//! well as more, and other moments show what people or things hid. Poses of other tools may come without any.
 
 use std::collections::BTreeMap;
 
-use super::ladder::{LENS_MODEL, Request, groups, stage};
-use super::python::{Job, KnownPose, run};
+use super::ladder::{Request, stage};
+use super::pairs::pairs;
+use super::python::{Group, Job, KnownPose, run};
 use crate::frames::Shot;
 use crate::poses::{Point, Poses};
 use crate::{Error, Hooks};
 
 /// Moments of the rig that are looked at; each adds about as many points, and takes as long, as the first.
 const MOMENTS: usize = 4;
+
+/// Lens of COLMAP that holds those of other tools: focal lengths, principal point, k1, k2, p1, p2.
+const KNOWN_LENS: &str = "OPENCV";
 
 /// Points of images of a rig, by poses that are known and stay as they are; `request.order` and `request.masks`
 /// do not count, because the images of a moment are matched each with each and what moves stands still in them.
@@ -20,35 +24,68 @@ const MOMENTS: usize = 4;
 /// When pycolmap is missing or fails, or the caller stops.
 pub fn points_of_rig(request: &Request<'_>, poses: &Poses, hooks: &Hooks<'_>) -> Result<Vec<Point>, Error> {
     let (shots, pairs) = moments(request.shots, poses);
+    points(&Request { shots: &shots, masks: None, ..*request }, poses, &pairs, hooks)
+}
+
+/// Points of images that follow each other as `request.order` tells, by poses that are known and stay as they are.
+/// Lenses are those of the poses.
+///
+/// # Errors
+/// When pycolmap is missing or fails, or the caller stops.
+pub fn points_of_images(
+    request: &Request<'_>,
+    poses: &Poses,
+    hooks: &Hooks<'_>,
+) -> Result<Vec<Point>, Error> {
+    let mut shots = request.shots.to_vec();
+    shots.retain(|shot| poses.images.contains_key(&shot.name));
+    let cameras: Vec<&str> = shots.iter().map(|shot| shot.camera.as_str()).collect();
+    let pairs = pairs(&cameras, request.order);
+    points(&Request { shots: &shots, ..*request }, poses, &pairs, hooks)
+}
+
+/// Points of images that are matched in pairs; all have a pose.
+fn points(
+    request: &Request<'_>,
+    poses: &Poses,
+    pairs: &[(usize, usize)],
+    hooks: &Hooks<'_>,
+) -> Result<Vec<Point>, Error> {
     let work = request.work.join("points");
-    let request = Request { shots: &shots, masks: None, work: &work, ..*request };
-    let images = work.join("images");
-    let names = stage(&request, &images, &work.join("masks"))?;
-    let mut lenses = groups(&request);
-    for group in &mut lenses {
-        let of_group = group.images.iter().find_map(|image| poses.images.get(&shots[*image].name));
-        group.params = of_group.map(|pose| {
-            let lens = &poses.lenses[pose.lens];
-            [lens.focal_px[0], lens.principal_px[0], lens.principal_px[1], lens.distortion.radial[0]]
-        });
-    }
+    let (images, masks) = (work.join("images"), work.join("masks"));
+    let names = stage(&Request { work: &work, ..*request }, &images, &masks)?;
     let known = |(name, shot): (&String, &Shot)| {
         (name.clone(), KnownPose::of(&poses.images[&shot.name].world_from_camera))
     };
     let job = Job {
         work: &work,
         images: &images,
-        masks: None,
+        masks: request.masks.map(|_| masks.as_path()),
         names: &names,
-        pairs: &pairs,
-        cameras: &lenses,
-        model: LENS_MODEL,
+        pairs,
+        cameras: &lenses(request.shots, poses),
+        model: KNOWN_LENS,
         peak: None,
         runs: &[],
-        poses: Some(names.iter().zip(&shots).map(known).collect()),
+        poses: Some(names.iter().zip(request.shots).map(known).collect()),
         threads: request.threads,
     };
     Ok(run(&job, hooks)?.points)
+}
+
+/// Images by their lens and size.
+fn lenses(shots: &[Shot], poses: &Poses) -> Vec<Group> {
+    let mut groups: BTreeMap<(usize, (u32, u32)), Vec<usize>> = BTreeMap::new();
+    for (index, shot) in shots.iter().enumerate() {
+        groups.entry((poses.images[&shot.name].lens, shot.size)).or_default().push(index);
+    }
+    let group = |((lens, size), images): ((usize, (u32, u32)), Vec<usize>)| {
+        let lens = poses.lenses[lens].scaled(size);
+        let ([fx, fy], [cx, cy]) = (lens.focal_px, lens.principal_px);
+        let ([k1, k2, ..], [p1, p2]) = (lens.distortion.radial, lens.distortion.tangential);
+        Group { images, params: Some(vec![fx, fy, cx, cy, k1, k2, p1, p2]), size }
+    };
+    groups.into_iter().map(group).collect()
 }
 
 /// Images of some moments, spread evenly over the frames of the first camera, with a pose; and the pairs of

@@ -84,8 +84,8 @@ impl KnownPose {
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Group {
     pub(super) images: Vec<usize>,
-    /// Of the lens to start from: focal length, principal point, distortion.
-    pub(super) params: Option<[f64; 4]>,
+    /// Of the lens to start from, as its model has them: focal lengths, principal point, distortion.
+    pub(super) params: Option<Vec<f64>>,
     pub(super) size: (u32, u32),
 }
 

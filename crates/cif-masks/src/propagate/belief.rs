@@ -11,18 +11,22 @@ pub(crate) struct Belief {
     pub(crate) shares: Vec<f32>,
     /// `[pixels]`, 0 to 1: product over the steps since the keyframe of how well forward and backward flow agree.
     pub(crate) reliability: Vec<f32>,
+    /// `[classes]`: the way can tell where the class is, as the keyframe that it comes from shows it.
+    pub(crate) shown: Vec<bool>,
 }
 
 impl Belief {
     /// Belief in one class per pixel, as much as told; the rest is shared by all classes.
     pub(crate) fn in_classes(classes: usize, of_pixel: &[u16], reliability: Vec<f32>) -> Self {
         let mut shares = Vec::with_capacity(of_pixel.len() * classes);
+        let mut shown = vec![false; classes];
         for (class, sure) in of_pixel.iter().zip(&reliability) {
+            shown[usize::from(*class)] = true;
             let start = shares.len();
             shares.extend(std::iter::repeat_n((1.0 - sure) / classes as f32, classes));
             shares[start + usize::from(*class)] += sure;
         }
-        Self { classes, shares, reliability }
+        Self { classes, shares, reliability, shown }
     }
 }
 
@@ -31,7 +35,7 @@ const KEPT: usize = 3;
 
 /// A belief in few bytes: the most probable classes of every pixel.
 pub(crate) struct Stored {
-    classes: usize,
+    shown: Vec<bool>,
     pixels: Vec<StoredPixel>,
 }
 
@@ -58,19 +62,20 @@ impl Stored {
             }
             kept
         };
-        Self { classes: belief.classes, pixels: pixels.map(store).collect() }
+        Self { shown: belief.shown.clone(), pixels: pixels.map(store).collect() }
     }
 
     pub(crate) fn restored(&self) -> Belief {
-        let mut shares = vec![0.0_f32; self.pixels.len() * self.classes];
-        shares.par_chunks_mut(self.classes).zip(&self.pixels).for_each(|(shares, stored)| {
+        let classes = self.shown.len();
+        let mut shares = vec![0.0_f32; self.pixels.len() * classes];
+        shares.par_chunks_mut(classes).zip(&self.pixels).for_each(|(shares, stored)| {
             let sum: f32 = stored.share.iter().map(|share| f32::from(*share)).sum();
             for (class, share) in stored.class.iter().zip(stored.share) {
                 shares[usize::from(*class)] += f32::from(share) / sum.max(1.0);
             }
         });
         let reliability = self.pixels.iter().map(|pixel| f32::from(pixel.reliability) / 255.0).collect();
-        Belief { classes: self.classes, shares, reliability }
+        Belief { classes, shares, reliability, shown: self.shown.clone() }
     }
 }
 
@@ -88,6 +93,7 @@ mod tests {
             classes: 5,
             shares: vec![0.1, 0.4, 0.05, 0.2, 0.25, 0.0, 0.0, 1.0, 0.0, 0.0],
             reliability: vec![0.5, 1.0],
+            shown: vec![true, true, true, true, false],
         };
         let restored = Stored::new(&belief).restored();
         let expected = [0.0, 0.4 / 0.85, 0.0, 0.2 / 0.85, 0.25 / 0.85, 0.0, 0.0, 1.0, 0.0, 0.0];

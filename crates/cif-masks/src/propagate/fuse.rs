@@ -25,11 +25,11 @@ pub(super) fn mask(
     let mut shares = vec![0.0_f32; width * height * classes];
     shares.par_chunks_mut(classes).enumerate().for_each(|(pixel, shares)| {
         let mut sum = 0.0;
-        for (share, belief) in ways {
+        for (k, (share, belief)) in ways.iter().enumerate() {
             let weight = (share + FLOOR) * (belief.reliability[pixel] + FLOOR);
             sum += weight;
-            let theirs = &belief.shares[pixel * classes..(pixel + 1) * classes];
-            shares.iter_mut().zip(theirs).for_each(|(share, other)| *share += weight * other);
+            let other = ways.get(1 - k).map_or(*belief, |(_, other)| *other);
+            add_told(shares, weight, belief, other, pixel);
         }
         shares.iter_mut().for_each(|share| *share /= sum);
     });
@@ -68,6 +68,20 @@ pub(super) fn mask(
     }
 }
 
+/// Adds a belief about a pixel to weighted sums of shares. A way from a keyframe that does not show an object cannot tell
+/// where that object is: as far as the way is not reliable, it takes the word of the `other` one on it.
+fn add_told(sums: &mut [f32], weight: f32, belief: &Belief, other: &Belief, pixel: usize) {
+    let row = pixel * belief.classes..(pixel + 1) * belief.classes;
+    let (own, other) = (&belief.shares[row.clone()], &other.shares[row]);
+    let open = 1.0 - belief.reliability[pixel];
+    let unknown: f32 =
+        belief.shown.iter().zip(other).map(|(shown, share)| if *shown { 0.0 } else { *share }).sum();
+    for (((sum, own), other), shown) in sums.iter_mut().zip(own).zip(other).zip(&belief.shown) {
+        let taken = if *shown { 0.0 } else { open * other };
+        *sum += weight * ((1.0 - open * unknown) * own + taken);
+    }
+}
+
 /// The class with the largest share, of equal ones the first.
 fn most_probable(shares: &[f32]) -> usize {
     let mut best = 0;
@@ -77,4 +91,34 @@ fn most_probable(shares: &[f32]) -> usize {
         }
     }
     best
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_keyframe_without_an_object_does_not_deny_it_where_its_way_is_unreliable() {
+        // The first way has never seen class 2, of which the second is fairly sure.
+        let belief = |shares: [f32; 3], reliability: f32, sees: bool| Belief {
+            classes: 3,
+            shares: shares.to_vec(),
+            reliability: vec![reliability],
+            shown: vec![true, true, sees],
+        };
+        let fused = |reliability: f32| {
+            let first = belief([0.8, 0.2, 0.0], reliability, false);
+            let second = belief([0.4, 0.0, 0.6], 0.0, true);
+            let mut sums = [0.0; 3];
+            add_told(&mut sums, 0.9, &first, &second, 0);
+            add_told(&mut sums, 0.1, &second, &first, 0);
+            sums
+        };
+        let close = |found: [f32; 3], expected: [f32; 3]| {
+            assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}");
+        };
+        close(fused(0.0), [0.9 * 0.32 + 0.1 * 0.4, 0.9 * 0.08, 0.6]);
+        // Where its way is reliable, it is not there.
+        close(fused(1.0), [0.9 * 0.8 + 0.1 * 0.4, 0.9 * 0.2, 0.1 * 0.6]);
+    }
 }

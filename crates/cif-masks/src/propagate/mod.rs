@@ -7,6 +7,7 @@
 //! | module | answers |
 //! |---|---|
 //! | [`window`] | flows and looks of some frames in a row |
+//! | [`scenery`] | pixels that cannot be of what stands around them |
 //! | [`belief`] | probabilities of classes per pixel |
 //! | [`step`] | from one frame to the next |
 //! | [`agree`] | pixels that follow their neighbours of the same colour |
@@ -15,6 +16,7 @@
 mod agree;
 pub(crate) mod belief;
 mod fuse;
+mod scenery;
 mod step;
 mod window;
 
@@ -261,6 +263,8 @@ impl<'a> Run<'a> {
         }
         let forest = self.forest(key..=key);
         let mut belief = self.start(key);
+        // No other way tells of what the keyframe does not show.
+        belief.shown.fill(true);
         let mut at = key;
         for some in frames.chunks(self.window_frames() - 1) {
             let end = some[some.len() - 1];

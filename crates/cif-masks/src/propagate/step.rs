@@ -37,7 +37,8 @@ pub(super) struct Step<'a> {
 
 impl Step<'_> {
     /// The belief about the frame that is stepped to: the known one brought along by flow, times what pixels look like,
-    /// where classes may only be near where motion brought them. Where motion is not to be trusted (occlusion, or no
+    /// where classes may only be near where motion brought them; those that the keyframe shows may come back elsewhere
+    /// if looks say so. Where motion is not to be trusted (occlusion, or no
     /// structure to follow), looks alone speak, and the belief becomes less reliable. At last, pixels follow their
     /// neighbours of the same colour.
     pub(super) fn take(&self, known: &Belief) -> Belief {
@@ -56,6 +57,7 @@ impl Step<'_> {
                 }
             },
         );
+        let anywhere: Vec<f32> = known.shown.iter().map(|shown| if *shown { FLOOR } else { 0.0 }).collect();
         let support = Support::new(&moved, width, self.height, classes);
         moved.par_chunks_mut(width * classes).enumerate().for_each(|(y, row)| {
             let mut near = vec![0.0_f32; classes];
@@ -67,8 +69,8 @@ impl Step<'_> {
                 near[0] = 1.0;
                 let seen = &self.seen.looks[at * classes..(at + 1) * classes];
                 let mut sum = 0.0;
-                for ((look, seen), near) in looks.iter_mut().zip(seen).zip(&near) {
-                    *look = f32::from(*seen) * (near + FLOOR);
+                for (((look, seen), near), anywhere) in looks.iter_mut().zip(seen).zip(&near).zip(&anywhere) {
+                    *look = f32::from(*seen) * (near + anywhere);
                     sum += *look;
                 }
                 let scale = 1.0 / sum.max(LEAST_LOOKS);
@@ -78,7 +80,7 @@ impl Step<'_> {
         for _ in 0..ROUNDS {
             moved = agreed(&moved, classes, &self.seen.lab);
         }
-        Belief { classes, shares: moved, reliability }
+        Belief { classes, shares: moved, reliability, shown: known.shown.clone() }
     }
 }
 

@@ -4,7 +4,7 @@ use std::ops::RangeInclusive;
 
 use rayon::prelude::*;
 
-use super::Clip;
+use super::{Clip, scenery};
 use crate::Error;
 use crate::appearance::{Features, Forest};
 use crate::flow::{Flow, Pyramid, flow};
@@ -65,7 +65,7 @@ pub(super) struct Window {
 
 /// Facts about one frame.
 pub(super) struct Seen {
-    /// Which class its pixels look like, `[pixels][classes]`, 1 / 255.
+    /// Which class its pixels look like, `[pixels][classes]`, 1 / 255; unlabelled by less where [`scenery`] says so.
     pub(super) looks: Vec<u8>,
     /// L*a*b* of its pixels, blurred a little.
     pub(super) lab: [Plane; 3],
@@ -83,7 +83,7 @@ impl Window {
         forest: &Forest,
     ) -> Result<Self, Error> {
         let first = *frames.start();
-        let prepared: Vec<Prepared> = frames
+        let mut prepared: Vec<Prepared> = frames
             .into_par_iter()
             .map(|frame| {
                 if (clip.stop)() {
@@ -107,7 +107,14 @@ impl Window {
                 let to_later = Way::new(back.clone(), &there, &b.lab, &a.lab);
                 Ok([to_later, Way::new(there, &back, &a.lab, &b.lab)])
             })
-            .collect::<Result<_, Error>>()?;
+            .collect::<Result<Vec<[Way; 2]>, Error>>()?;
+        let factors = scenery::factors(&ways, &prepared.iter().map(|frame| &frame.lab).collect::<Vec<_>>());
+        for (frame, factors) in prepared.iter_mut().zip(&factors) {
+            let classes = frame.looks.len() / factors.len();
+            for (looks, factor) in frame.looks.chunks_exact_mut(classes).zip(factors) {
+                looks[0] = (f32::from(looks[0]) * factor) as u8;
+            }
+        }
         let frames = prepared.into_iter().map(|Prepared { lab, looks, .. }| Seen { looks, lab }).collect();
         Ok(Self { first, ways, frames })
     }

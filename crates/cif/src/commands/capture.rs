@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use cif_capture::frames::{self, Choice, Notes, Shot};
 use cif_capture::import::{self, Imported};
 use cif_capture::masks::{self, Masks};
-use cif_capture::poses::Poses;
+use cif_capture::poses::{Point, Poses};
 use cif_capture::source::sources;
 use cif_capture::structure::{self, Found, Lenses, Order, Request, Verdict};
 use cif_capture::write::{self, Capture as Written};
@@ -100,8 +100,11 @@ fn make(
     let known = scale::Known::of(command, masks.as_ref())?;
     let mut posed = match &command.poses {
         Some(path) => {
-            let Imported { poses, tool, metres_known, up_known, .. } =
+            let Imported { mut poses, tool, metres_known, up_known, .. } =
                 import::read(path, shots)?.matched(path, shots)?;
+            if poses.points.is_empty() {
+                poses.points = points(command, shots, masks.as_ref(), &poses, scratch, hooks, notes)?;
+            }
             let from = format!("{tool} ({})", path.display());
             Posed { poses, from, verdict: None, metres_known, up_known }
         }
@@ -139,6 +142,7 @@ fn choice(command: &Capture) -> Choice {
         from_s: command.from,
         to_s: command.to,
         max_side: command.max_side,
+        offsets_s: command.offset.iter().cloned().collect(),
         sharpest: command.nearest.then_some(false).or(command.sharpest.then_some(true)),
     }
 }
@@ -164,25 +168,10 @@ fn find(
             "the first frame of each (--moving finds a pose for every frame)"
         ));
     }
-    let black = scratch.join("masks");
-    if let Some(masks) = masks {
-        let moving = command.moving_ids.as_ref().map(|ids| ids.iter().copied().collect());
-        masks::leave_out(masks, &solved, moving.as_ref(), &black, hooks)?;
-    }
+    let black = left_out(command, &solved, masks, scratch, hooks)?;
     let work = scratch.join("work");
     std::fs::create_dir_all(&work).map_err(Error::io("create", &work))?;
-    let request = Request {
-        shots: &solved,
-        masks: masks.map(|_| black.as_path()),
-        order: order(command, &solved, fixed),
-        lenses: match command.lenses {
-            LensesName::One => Lenses::PerSize,
-            LensesName::Each => Lenses::PerCamera,
-        },
-        focal_px: command.focal,
-        work: &work,
-        threads: rayon::current_num_threads(),
-    };
+    let request = request(command, &solved, black.as_deref(), fixed, &work);
     let Found { mut poses, verdict, setting, tried } = structure::find(&request, hooks)?;
     notes.extend(tried.into_iter().map(|tried| format!("not believed: {tried}")));
     if fixed {
@@ -204,6 +193,71 @@ fn find(
         metres_known: false,
         up_known: false,
     })
+}
+
+/// Points for poses that come without. Where none can be found, training starts from random ones, which is told.
+fn points(
+    command: &Capture,
+    shots: &[Shot],
+    masks: Option<&Masks>,
+    poses: &Poses,
+    scratch: &Path,
+    hooks: &Hooks<'_>,
+    notes: &mut Notes,
+) -> Result<Vec<Point>, Error> {
+    let fixed = is_fixed(command, shots);
+    let black = left_out(command, shots, masks, scratch, hooks)?;
+    let work = scratch.join("work");
+    let request = request(command, shots, black.as_deref(), fixed, &work);
+    let find = if fixed { structure::points_of_rig } else { structure::points_of_images };
+    let problem = match find(&request, poses, hooks) {
+        Ok(points) if !points.is_empty() => return Ok(points),
+        Ok(_) => "the images show none that fit the poses".to_owned(),
+        Err(cif_capture::Error::Stopped) => return Err(cif_capture::Error::Stopped.into()),
+        Err(error) => error.to_string(),
+    };
+    notes.push(format!(
+        "the poses come without points, and none were found: {problem}; training starts from random points, which \
+         shows less (pip install 'cif[capture]' brings pycolmap, which finds points)"
+    ));
+    Ok(Vec::new())
+}
+
+/// Pictures in which what moves is black, where there are masks.
+fn left_out(
+    command: &Capture,
+    shots: &[Shot],
+    masks: Option<&Masks>,
+    scratch: &Path,
+    hooks: &Hooks<'_>,
+) -> Result<Option<PathBuf>, Error> {
+    let Some(masks) = masks else { return Ok(None) };
+    let black = scratch.join("masks");
+    let moving = command.moving_ids.as_ref().map(|ids| ids.iter().copied().collect());
+    masks::leave_out(masks, shots, moving.as_ref(), &black, hooks)?;
+    Ok(Some(black))
+}
+
+/// Work on images, as the command line has it.
+fn request<'a>(
+    command: &Capture,
+    shots: &'a [Shot],
+    masks: Option<&'a Path>,
+    fixed: bool,
+    work: &'a Path,
+) -> Request<'a> {
+    Request {
+        shots,
+        masks,
+        order: order(command, shots, fixed),
+        lenses: match command.lenses {
+            LensesName::One => Lenses::PerSize,
+            LensesName::Each => Lenses::PerCamera,
+        },
+        focal_px: command.focal,
+        work,
+        threads: rayon::current_num_threads(),
+    }
 }
 
 /// True where the cameras stand still, as told or seen.

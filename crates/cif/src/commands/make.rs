@@ -66,7 +66,7 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
     let (flag, name) = STAGE;
     let stage = command.output.join(name);
     if !is_made(&stage, &[&scene])? {
-        step(vec!["export".into(), scene.into(), flag.into(), stage.clone().into(), "--check".into()])?;
+        step(vec!["export".into(), scene.into(), flag.into(), stage.clone().into(), "--check".into()], None)?;
     }
     let stage = stage.display().to_string();
     println!("made: {stage}");
@@ -88,7 +88,7 @@ impl Make {
             let mut words = vec!["capture".into()];
             words.extend(self.inputs.iter().cloned());
             words.extend(["-o".into(), place.clone().into()]);
-            step(self.quietly(words))?;
+            step(self.quietly(words), STEP)?;
         }
         Ok(place)
     }
@@ -118,7 +118,7 @@ impl Make {
                 "-o".into(),
                 place.clone().into(),
             ]);
-            step(self.quietly(words.collect()))?;
+            step(self.quietly(words.collect()), STEP)?;
         }
         std::path::absolute(&place).map(Some).map_err(Error::io("find", &place))
     }
@@ -144,7 +144,7 @@ impl Make {
             let config = of("--config", self.config.as_ref().map(OsString::from));
             words.extend(preset.into_iter().chain(config).flatten());
         }
-        step(self.quietly(words))?;
+        step(self.quietly(words), None)?;
         Ok(scene)
     }
 
@@ -170,11 +170,14 @@ fn is_made(result: &Path, of: &[&Path]) -> Result<bool, Error> {
     })
 }
 
-/// Runs a command line of cif, and shows it.
-fn step(words: Vec<OsString>) -> Result<(), Error> {
+/// Tells a command not to say what comes next, which is told here.
+const STEP: Option<&str> = Some("--step");
+
+/// Runs a command line of cif, and shows it without what is `untold`.
+fn step(words: Vec<OsString>, untold: Option<&str>) -> Result<(), Error> {
     let told: Vec<String> = words.iter().map(|word| word.to_string_lossy().into_owned()).collect();
     eprintln!("$ {}", command_line(&told));
-    let line = std::iter::once(OsString::from("cif")).chain(words);
+    let line = std::iter::once(OsString::from("cif")).chain(words).chain(untold.map(OsString::from));
     dispatch(Arguments::try_parse_from(line).map_err(Error::plain)?.command)
 }
 

@@ -14,6 +14,7 @@ on the PATH; poses need pycolmap, which `pip install cif[capture]` brings.
   cif capture walk.mp4 -o captures/table --rate 5 --max-side 960
   cif capture photos/ -o captures/garden                          photographs keep their names
   cif capture left=a.mp4 right=b.mp4 top=c.mp4 -o captures/rig --rate 10
+  cif capture left=a.mp4 right=b.mp4 -o captures/rig --rate 10 --offset right=-0.12    right began 0.12 s earlier
   cif capture walk.mp4 -o captures/table2 --masks painted --moving-ids 1,4     what moves is left out of the poses
   cif capture walk.mp4 -o captures/table --masks masks --length 'red mug' 0.09
   cif capture photos/ -o captures/garden --poses colmap/sparse/0
@@ -55,6 +56,9 @@ pub(in crate::commands) struct Capture {
     /// Take the frame nearest to the middle of every window, as is the default for several videos
     #[arg(long, help_heading = "Frames")]
     pub(super) nearest: bool,
+    /// Seconds by which a camera began to record after the others, below 0 before them; may be given several times
+    #[arg(long, value_name = "CAMERA=SECONDS", value_parser = offset, allow_hyphen_values = true, help_heading = "Frames")]
+    pub(super) offset: Vec<(String, f64)>,
     /// Table of times: image name, comma, seconds
     #[arg(long, value_name = "FILE", help_heading = "Frames")]
     pub(super) times: Option<PathBuf>,
@@ -83,7 +87,7 @@ pub(in crate::commands) struct Capture {
     #[arg(long, help_heading = "Poses")]
     pub(super) moving: bool,
     /// Take poses of another tool: a COLMAP model, a nerfstudio transforms.json, a Polycam export, a
-    /// RealityCapture registration (.csv), or cameras of Metashape (.xml)
+    /// RealityCapture registration (.csv), or cameras of Metashape (.xml); where it has no points, pycolmap finds them
     #[arg(long, value_name = "FROM", conflicts_with_all = ["focal", "fixed", "moving"], help_heading = "Poses")]
     pub(super) poses: Option<PathBuf>,
     /// Write the capture even where the verdict says no
@@ -107,6 +111,9 @@ pub(in crate::commands) struct Capture {
     /// Show no progress
     #[arg(short, long)]
     pub(super) quiet: bool,
+    /// A step of `cif make`, which tells what comes next
+    #[arg(long, hide = true)]
+    pub(super) step: bool,
 }
 
 /// Which images share a lens.
@@ -168,4 +175,25 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
 fn seconds(text: &str) -> Result<f64, String> {
     let value = text.parse().ok().filter(|value: &f64| value.is_finite() && *value >= 0.0);
     value.ok_or_else(|| "seconds from 0 on are expected".to_owned())
+}
+
+/// A camera and seconds.
+fn offset(text: &str) -> Result<(String, f64), String> {
+    let parsed = text.rsplit_once('=').and_then(|(name, seconds)| Some((name, seconds.parse().ok()?)));
+    let found = parsed.filter(|(name, seconds): &(&str, f64)| !name.is_empty() && seconds.is_finite());
+    let (name, seconds) = found.ok_or_else(|| "CAMERA=SECONDS is expected, as right=-0.12".to_owned())?;
+    Ok((name.to_owned(), seconds))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn offsets_name_a_camera() {
+        assert_eq!(offset("cam=2=-0.12"), Ok(("cam=2".to_owned(), -0.12)));
+        for text in ["0.1", "=0.1", "cam2=", "cam2=soon", "cam2=inf"] {
+            assert!(offset(text).is_err(), "{text}");
+        }
+    }
 }

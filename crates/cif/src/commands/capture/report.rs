@@ -46,6 +46,9 @@ pub(super) fn print(
     let masked = masks
         .map_or(0, |masks| posed.poses.images.keys().filter(|name| masks.files.contains_key(*name)).count());
     println!("masks: {masked} of {with_pose} images");
+    if command.step {
+        return;
+    }
     println!("next:");
     let scene = scene_name(&command.output).display().to_string();
     if masked == with_pose {

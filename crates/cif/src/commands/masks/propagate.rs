@@ -67,6 +67,9 @@ pub(super) struct Propagate {
     /// Show no progress
     #[arg(short, long)]
     quiet: bool,
+    /// A step of `cif make`, which tells what comes next
+    #[arg(long, hide = true)]
+    step: bool,
 }
 
 impl From<cif_masks::Error> for Error {
@@ -320,6 +323,9 @@ impl Work<'_> {
                 dataset.frames[frame].name,
                 100.0 * doubts[frame]
             );
+        }
+        if command.step {
+            return Ok(());
         }
         let words = [
             "train".to_owned(),
