@@ -16,9 +16,9 @@ use super::search::search;
 /// Gaussians of base and part, and steps, of fine fits.
 pub(super) const FINELY: ([usize; 2], usize) = ([500, 250], 500);
 
-/// Places of a hinge that are tried about that of a fit, in two rounds: steps to each side of the best so far, of the
-/// size.
-const PLACES: [f64; 2] = [0.39, 0.13];
+/// Places of a hinge that are tried about that of a fit: steps to each side of it, and a step, of the size.
+const PLACES: i32 = 3;
+const PLACE: f64 = 0.13;
 
 /// Opacity, as a logit, that the base starts with where the part is.
 const FAINT: f32 = -2.0;
@@ -86,20 +86,14 @@ impl<'a> Search<'a> {
         }
         let times = self.times(LOOKS);
         let (first, second) = hinge.axis.any_orthonormal_pair();
-        let mut tried = |hinge: Hinge| {
-            body.hinge = Some(hinge);
+        let mut best = (hinge, BTreeMap::new(), f64::INFINITY);
+        for (i, j) in (-PLACES..=PLACES).flat_map(|i| (-PLACES..=PLACES).map(move |j| (i, j))) {
+            let aside = PLACE * self.size * (f64::from(i) * first + f64::from(j) * second);
+            let moved = Hinge { point: hinge.point + aside, ..hinge };
+            body.hinge = Some(moved);
             let (values, loss) = search(&body, &times, (&guess.values, false), level);
-            (hinge, values, loss)
-        };
-        let mut best = tried(hinge);
-        for step in PLACES {
-            let middle = best.0;
-            for (i, j) in (-1..=1).flat_map(|i| (-1..=1).map(move |j| (i, j))).filter(|at| *at != (0, 0)) {
-                let aside = step * self.size * (f64::from(i) * first + f64::from(j) * second);
-                let moved = tried(Hinge { point: middle.point + aside, ..middle });
-                if moved.2 < best.2 {
-                    best = moved;
-                }
+            if loss < best.2 {
+                best = (moved, values, loss);
             }
         }
         let (placed, values, _) = best;

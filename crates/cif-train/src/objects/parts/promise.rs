@@ -30,10 +30,6 @@ const TURNS: [f64; 2] = [30.0, 60.0];
 /// Least and largest share of the Gaussians that a part may have.
 const PART: [f64; 2] = [0.03, 0.7];
 
-/// At first a guess is searched at every so many of its values, on reduced views; so many of a box that do best are then
-/// searched at all.
-const COARSELY: (usize, usize) = (3, 20);
-
 /// Loss of the best guess, of that of the static body, from which nothing is looked for.
 const PROMISE: f64 = 0.99;
 
@@ -48,30 +44,18 @@ impl<'a> Search<'a> {
         let up = self.up.unwrap_or(DVec3::Z);
         let sides = Sides::around(inside, up);
         let (times, level) = (self.times(LOOKS), self.level());
-        let cut = |guess: &Guess| {
+        let try_one = |guess: Guess| {
             let members: Vec<bool> = places.iter().map(|place| guess.has(*place, 0.0)).collect();
             let share = members.iter().filter(|member| **member).count() as f64 / members.len() as f64;
-            (PART[0]..=PART[1])
-                .contains(&share)
-                .then(|| self.body(rough.shape.copied(), Some((guess.hinge, members, BTreeMap::new()))))
-        };
-        let coarsely = |guess: Guess| {
-            let body = cut(&guess)?;
-            let values: Vec<f64> = guess.values.iter().copied().step_by(COARSELY.0).collect();
-            let (_, loss) = search(&body, &times, (&values, guess.is_round), level + 1);
-            Some((guess, loss))
-        };
-        let finely = |(guess, _): (Guess, f64)| {
-            let (values, loss) = search(&cut(&guess)?, &times, (&guess.values, guess.is_round), level);
+            if !(PART[0]..=PART[1]).contains(&share) {
+                return None;
+            }
+            let body = self.body(rough.shape.copied(), Some((guess.hinge, members, BTreeMap::new())));
+            let (values, loss) = search(&body, &times, (&guess.values, guess.is_round), level);
             Some((guess, values, loss))
         };
-        let try_all = |sides: &Sides| -> Vec<_> {
-            let mut promising: Vec<(Guess, f64)> =
-                guesses(sides, plane).into_par_iter().filter_map(coarsely).collect();
-            promising.sort_by(|a, b| a.1.total_cmp(&b.1));
-            promising.truncate(COARSELY.1);
-            promising.into_par_iter().filter_map(finely).collect()
-        };
+        let try_all =
+            |sides: &Sides| -> Vec<_> { guesses(sides, plane).into_par_iter().filter_map(try_one).collect() };
         let mut tried = try_all(&sides);
         let (_, still) = search(rough, &times, (&[0.0], false), level);
         let best = tried.iter().map(|(.., loss)| *loss).fold(f64::INFINITY, f64::min);
