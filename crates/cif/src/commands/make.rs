@@ -106,7 +106,7 @@ impl Make {
         let masks = dataset.frames.iter().map(|frame| keyframes.join(format!("{}.png", frame.name)));
         let painted: Vec<PathBuf> = masks.filter(|file| file.is_file()).collect();
         if painted.is_empty() {
-            return Err(to_paint(&dataset, &keyframes));
+            return Err(to_paint(&dataset, &keyframes, capture));
         }
         let place = self.output.join("masks");
         if !is_made(&place, &painted.iter().map(PathBuf::as_path).collect::<Vec<_>>())? {
@@ -182,7 +182,7 @@ fn step(words: Vec<OsString>, untold: Option<&str>) -> Result<(), Error> {
 }
 
 /// The stop at which a person is needed.
-fn to_paint(dataset: &Dataset, keyframes: &Path) -> Error {
+fn to_paint(dataset: &Dataset, keyframes: &Path, capture: &Path) -> Error {
     let camera = dataset.frames.first().map(|frame| &frame.camera_name);
     let frames: Vec<_> = dataset.frames.iter().filter(|frame| Some(&frame.camera_name) == camera).collect();
     let count = PROPOSED.min(frames.len());
@@ -198,8 +198,11 @@ fn to_paint(dataset: &Dataset, keyframes: &Path) -> Error {
     let lines: Vec<String> = (0..count).map(line).collect();
     Error::failed(
         format!("{} frames have to be painted:\n{}", lines.len(), lines.join("\n")),
-        "paint each object in the value of its id, 1 to 255, on 0 in an 8-bit grey or palette PNG of the same size (any \
-         paint program, or a tracker's first answer); name the ids in instances.json beside them, \
-         [{\"id\": 1, \"label\": \"red mug\"}]; then run the same command again",
+        format!(
+            "paint each object in the value of its id, 1 to 255, on 0 in an 8-bit grey or palette PNG of the same size \
+             (any paint program, or a tracker's first answer); name the ids in instances.json beside them, \
+             [{{\"id\": 1, \"label\": \"red mug\"}}]; then run the same command again; without objects: {}",
+            command_line(&["train", &capture.display().to_string(), "-o", "scene.cif"])
+        ),
     )
 }
