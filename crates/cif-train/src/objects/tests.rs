@@ -259,11 +259,8 @@ fn one_camera_follows_an_object_from_where_it_stood_to_its_other_side() {
     assert!(turn < 10.0 && shift < 0.015, "{turn} deg, {shift} m");
 }
 
-/// A bar that rolls about its long axis, and its motion.
-fn rolling_bar(
-    color: impl Fn(DVec3) -> [f32; 3],
-    cameras: Cameras,
-) -> (Vec<ObjectView>, Vec<(DQuat, DVec3)>) {
+#[test]
+fn a_bar_that_rolls_about_its_long_axis_is_found_by_its_texture() {
     let mut rng = stream(0, Purpose::Objects, 14);
     let places: Vec<DVec3> = (0..2500)
         .map(|_| {
@@ -277,26 +274,10 @@ fn rolling_bar(
             (DQuat::from_rotation_y(way / 0.03), DVec3::new(-0.1 + way, 0.0, 0.03))
         })
         .collect();
-    (views(solid(&places, color, 0.005), &truth, cameras), truth)
-}
-
-#[test]
-fn a_bar_that_rolls_about_its_long_axis_is_found_by_its_texture() {
-    let (views, truth) = rolling_bar(patches, moving);
-    let fitted = fit(&views);
+    let fitted = fit(&views(solid(&places, patches, 0.005), &truth, moving));
     let (turn, shift) = errors(&fitted.poses, &truth);
     assert!(fitted.way.starts_with("rolls"), "{}", fitted.way);
     assert!(turn < 15.0 && shift < 0.006, "{turn} deg, {shift} m");
-}
-
-#[test]
-fn a_plain_bar_that_goes_across_its_long_axis_is_assumed_to_roll() {
-    let (views, truth) = rolling_bar(|_| [0.8, 0.6, 0.4], rig);
-    let fitted = fit(&views);
-    let (turn, shift) = errors(&fitted.poses, &truth);
-    assert_eq!(fitted.rotation, RotationEvidence::Assumed);
-    assert!(fitted.way.starts_with("rolls about"), "{}", fitted.way);
-    assert!(turn < 60.0 && shift < 0.006, "{turn} deg, {shift} m");
 }
 
 #[test]

@@ -11,7 +11,6 @@ use super::fit::{Fit, Turns, fresh_moments};
 use super::follow::follow;
 use super::outline::{self, Outline};
 use super::path::smooth;
-use super::shape::Pose;
 use super::start::{Object, Started};
 use super::texture;
 use super::view::ObjectView;
@@ -49,9 +48,7 @@ const FOLLOW_GAIN: [f64; 2] = [0.98, 0.94];
 /// no turn.
 const TEXTURE_GAIN: f64 = 1.3;
 
-/// Turn, radians, from which a bar that goes across its long axis rolls, and the largest error of that, relative to the
-/// best simple way: light, which stays where it is, prefers no turn.
-const LONG_ROLL: f64 = 1.5;
+/// The same of the turn of a bar about its long axis, which light, staying where it is, argues against.
 const LONG_GAIN: f64 = 1.6;
 
 /// Largest error of rolling, relative to that of sliding, at which rolling is preferred: of most objects, and of round
@@ -116,7 +113,6 @@ pub(super) fn best_way<'a>(
             reference,
             followed: None,
             textured: None,
-            rolls_long: None,
         },
         train,
         left_out,
@@ -125,9 +121,7 @@ pub(super) fn best_way<'a>(
     let simple_errors = [Way::Rest, Way::Slide(0)].map(|way| error_of(&simple, way));
     let stays = rests(&simple, Way::Slide(0), REST_GAIN[0]);
     let is_unexplained = contest.is_unexplained(&simple);
-    contest.paths.rolls_long = contest.long_rolls(&simple);
-    let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
-    let mut trials = if let Some(textured) = contest.textured(&simple, reliable, least)? {
+    let trials = if let Some(textured) = contest.textured(&simple, reliable)? {
         vec![textured]
     } else if object.is_told {
         contest.along_the_path(simple)?
@@ -143,12 +137,7 @@ pub(super) fn best_way<'a>(
     };
     let moves =
         decide(&trials, outline).filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
-    let Some((mut way, mut rotation)) = moves else { return Ok(None) };
-    if !matches!(way, Way::Roll(_) | Way::Textured)
-        && let Some(rolls) = contest.rolls_long(least)?
-    {
-        (way, rotation, trials) = (Way::RollsLong, RotationEvidence::Assumed, vec![rolls]);
-    }
+    let Some((way, rotation)) = moves else { return Ok(None) };
     // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
     let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
     let kept = if rolls_unseen { Way::Slide(0) } else { way };
@@ -190,12 +179,12 @@ impl<'a> Contest<'a> {
         &mut self,
         simple: &[Trial<'_>],
         reliable: &[usize],
-        least: f64,
     ) -> Result<Option<Trial<'a>>, TrainError> {
         let seen = reliable.iter().map(|view| &self.object.views[*view]);
         let (outline, up, reference) = (self.object.outline, self.paths.up, self.paths.reference);
-        let bar = self.bar(simple);
-        let is_bar = bar.is_some();
+        let slides = simple.iter().find(|trial| trial.way == Way::Slide(0)).map(|trial| &trial.fit);
+        let bar = slides.and_then(|fit| Bar::of(fit.shape.gaussians(), &fit.poses, up));
+        let most = if bar.is_some() { LONG_GAIN } else { TEXTURE_GAIN };
         self.paths.textured = if let Some(bar) = bar {
             let rolled = bar.rolled(up, outline.height, reference);
             let turns = texture::rolls(seen, &bar.poses, (bar.axis, up), &rolled, outline);
@@ -212,38 +201,11 @@ impl<'a> Contest<'a> {
         if self.paths.textured.is_none() {
             return Ok(None);
         }
-        self.alone(Way::Textured, least * if is_bar { LONG_GAIN } else { TEXTURE_GAIN })
-    }
-
-    /// The bar that an object is, as sliding without a turn finds it.
-    fn bar(&self, simple: &[Trial<'_>]) -> Option<Bar> {
-        let slides = simple.iter().find(|trial| trial.way == Way::Slide(0)).map(|trial| &trial.fit)?;
-        Bar::of(slides.shape.gaussians(), &slides.poses, self.paths.up)
-    }
-
-    /// Poses of rolling about its long axis, of a bar that lies and goes across it.
-    fn long_rolls(&self, simple: &[Trial<'_>]) -> Option<BTreeMap<usize, Pose>> {
-        let Object { outline, place, .. } = self.object;
-        let stays = self.paths.stands && outline.air.is_empty() && place == 0;
-        let bar = self.bar(simple).filter(|bar| stays && bar.is_round)?;
-        let rolled = bar.rolled(self.paths.up, outline.height, self.paths.reference);
-        let low = rolled.values().copied().fold(0.0, f64::min);
-        let high = rolled.values().copied().fold(0.0, f64::max);
-        (high - low >= LONG_ROLL).then(|| bar.turned(&rolled))
-    }
-
-    /// The same as it looks: taken where neither texture nor outline tell how it turns, for what lies across its way
-    /// rolls.
-    fn rolls_long(&self, least: f64) -> Result<Option<Trial<'a>>, TrainError> {
-        if self.paths.rolls_long.is_none() { Ok(None) } else { self.alone(Way::RollsLong, LONG_GAIN * least) }
-    }
-
-    /// A way that is not held against others, where its error is at most so large.
-    fn alone(&self, way: Way, most: f64) -> Result<Option<Trial<'a>>, TrainError> {
-        let mut trials = self.begin(&[way], GAUSSIANS);
+        let mut trials = self.begin(&[Way::Textured], GAUSSIANS);
         self.advance(&mut trials, (0, STEPS[1]), false)?;
         self.judge(&mut trials, false);
-        Ok(trials.pop().filter(|trial| trial.losses[1] <= most))
+        let least = simple.iter().map(|trial| trial.losses[1]).fold(f64::INFINITY, f64::min);
+        Ok(trials.pop().filter(|trial| trial.losses[1] <= most * least))
     }
 
     /// True where views of all sides show how it turns from time to time, or it is lifted from where it stood, so that
@@ -313,7 +275,6 @@ impl<'a> Contest<'a> {
                 Way::Rest => (Turns::Given, None),
                 Way::Slide(_) | Way::Spin(_) => (Turns::Upright, None),
                 Way::Roll(factor) => (Turns::Free, Some(self.paths.outline.height / factor)),
-                Way::RollsLong => (Turns::Given, None),
                 Way::Followed | Way::Textured => (Turns::Free, None),
             };
             if *way == Way::Followed {

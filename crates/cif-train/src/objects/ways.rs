@@ -26,9 +26,6 @@ const OTHER_ROLLS: [f64; 12] = [0.64, 0.68, 0.72, 0.76, 0.8, 0.84, 0.88, 0.92, 0
 /// Length of a bar in its widths, and the cosine between its long axis and the normal up to which it lies.
 const BAR: (f64, f64) = (2.0, 0.3);
 
-/// Variance across the long axis, the least of the largest, from which a bar is about as thick both ways.
-const EVEN: f64 = 0.6;
-
 /// Roundness of masks from which an object may roll as a ball.
 const ROUND: f64 = 0.93;
 
@@ -54,8 +51,6 @@ pub(super) enum Way {
     Followed,
     /// Along the path, turning about the normal, or its own long axis, as its texture tells.
     Textured,
-    /// Along the path, rolling about its long axis without slip.
-    RollsLong,
 }
 
 impl Way {
@@ -68,7 +63,6 @@ impl Way {
             Self::Roll(factor) => format!("rolls with {factor:.2} of its height"),
             Self::Followed => "followed from time to time".to_owned(),
             Self::Textured => "turns as its texture tells".to_owned(),
-            Self::RollsLong => "rolls about its long axis".to_owned(),
         }
     }
 
@@ -98,8 +92,6 @@ pub(super) struct Paths<'a> {
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
     /// Poses with turns that its texture tells, where it does.
     pub(super) textured: Option<BTreeMap<usize, Pose>>,
-    /// Poses with turns of rolling about its long axis, where it may.
-    pub(super) rolls_long: Option<BTreeMap<usize, Pose>>,
 }
 
 /// True where masks are round enough for a ball.
@@ -193,12 +185,8 @@ impl Paths<'_> {
                 let back = rotations[origin].inverse();
                 rotations.into_iter().map(|rotation| rotation * back).collect()
             }
-            Way::Followed | Way::Textured | Way::RollsLong => {
-                let found = match way {
-                    Way::Followed => &self.followed,
-                    Way::Textured => &self.textured,
-                    _ => &self.rolls_long,
-                };
+            Way::Followed | Way::Textured => {
+                let found = if way == Way::Followed { &self.followed } else { &self.textured };
                 return found
                     .iter()
                     .flatten()
@@ -218,15 +206,12 @@ impl Paths<'_> {
 pub(super) struct Bar {
     pub(super) poses: BTreeMap<usize, Pose>,
     pub(super) axis: DVec3,
-    /// True where it is about as thick both ways, so that it may roll.
-    pub(super) is_round: bool,
 }
 
 impl Bar {
     /// The bar that Gaussians in poses are, if they are long and lie.
     pub(super) fn of(gaussians: &Gaussians, poses: &BTreeMap<usize, Pose>, up: DVec3) -> Option<Self> {
-        let (axis, is_round) = long_axis(gaussians, up)?;
-        Some(Self { axis, is_round, poses: poses.clone() })
+        Some(Self { axis: long_axis(gaussians, up)?, poses: poses.clone() })
     }
 
     /// Turns about its long axis by time, radians, as far as it goes across it; from zero at `reference`.
@@ -257,8 +242,8 @@ impl Bar {
     }
 }
 
-/// Long axis of Gaussians, as of a bar that lies in a plane, and whether it is about as thick both ways.
-fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<(DVec3, bool)> {
+/// Long axis of Gaussians, as of a bar that lies in a plane.
+fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<DVec3> {
     let weight = |row: usize| 1.0 / (1.0 + f64::from(-gaussians.opacity_logits[row]).exp());
     let place = |row: usize| DVec3::from_array(gaussians.means[row].map(f64::from));
     let rows = || 0..gaussians.len();
@@ -275,8 +260,7 @@ fn long_axis(gaussians: &Gaussians, up: DVec3) -> Option<(DVec3, bool)> {
     let axis = eigen.eigenvectors.column(order[0]);
     let axis = DVec3::new(axis[0], axis[1], axis[2]);
     let is_long = eigen.eigenvalues[order[0]] > BAR.0 * BAR.0 * eigen.eigenvalues[order[1]];
-    let is_round = eigen.eigenvalues[order[2]] > EVEN * eigen.eigenvalues[order[1]];
-    (is_long && axis.dot(up).abs() < BAR.1).then_some((axis, is_round))
+    (is_long && axis.dot(up).abs() < BAR.1).then_some(axis)
 }
 
 /// Turns of a ball that rolls without slip from place to place.
