@@ -3,7 +3,8 @@
 //! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, though
 //! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections
 //! and things without a mask do move. The two leave as nodes of their own: one constant, and one with a path for
-//! every splat, so that a few moving splats neither freeze nor make thousands of others move. Splats of an instance at
+//! every splat, or of a few bodies where a format holds no such paths, so that a few moving splats neither freeze nor
+//! make thousands of others move. Splats of an instance at
 //! rest that travel farther than they are large show something else that passes over it, its shadow mostly: they leave
 //! with what moves of the background.
 

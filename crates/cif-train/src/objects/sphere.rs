@@ -67,7 +67,7 @@ impl Side {
         Self { time, samples: views.iter().flat_map(|view| samples(view, centre, radius)).collect() }
     }
 
-    /// The side by every so manyth of its places.
+    /// The side by one of every `step` of its places.
     pub(super) fn few(&self, step: usize) -> Self {
         Self { time: self.time, samples: self.samples.iter().step_by(step).copied().collect() }
     }
