@@ -113,11 +113,9 @@ pub(crate) fn find_part(
 ) -> Result<Option<Jointed>, TrainError> {
     let views = views_of(label, dataset, frames, surroundings)?;
     let outlines = outline::outlines(&views, surroundings.plane, surroundings.times);
-    let objects = Object::by_outlines(label, &views, &outlines, false, surroundings);
-    // What opens looks larger, as if it came nearer: its size is then that of other times.
-    let found = objects.into_iter().take(2).map(parts::find);
-    let found: Vec<_> = found.collect::<Result<_, TrainError>>()?;
-    Ok(found.into_iter().flatten().min_by(|a, b| a.errors[0].total_cmp(&b.errors[0])))
+    // It rests: as standing, which is the first of its outlines.
+    let object = Object::by_outlines(label, &views, &outlines, false, surroundings).into_iter().next();
+    object.map_or(Ok(None), parts::find)
 }
 
 /// The object in all training frames that show it, in the order of times.

@@ -52,6 +52,9 @@ const BAR: (f64, f64) = (2.2, 0.15);
 const LOWEST: usize = 8;
 const STANDS: (f64, f64) = (0.4, 1.5);
 
+/// Height above that at which it stands, of that of its outline, from which an object is off its support.
+const RAISED: f64 = 0.2;
+
 /// Room that an object has around its height and radius, of them.
 const ROOM: f64 = 1.1;
 
@@ -162,7 +165,11 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
     if found.is_empty() || leaves.is_some() {
         let crossing = Some(path::crossing(views, times)).filter(|path| !path.is_empty());
         found.extend(leaves);
-        found.extend(crossing.map(|path| surrounded(views, (None, None), (path, path::CROSSING))));
+        found.extend(crossing.map(|path| {
+            let mut outline = surrounded(views, (None, None), (path, path::CROSSING));
+            outline.air = plane.map_or_else(Vec::new, |plane| raised(&outline, plane));
+            outline
+        }));
     }
     found.extend(on_plane(Stance::Topples));
     found
@@ -201,6 +208,14 @@ fn surrounded(
     outline.air.clear();
     outline.path.extend(met);
     outline
+}
+
+/// Times at which an object on a known path is not as low as it stands; all, where it may never stand.
+fn raised(outline: &Outline, plane: &Plane) -> Vec<usize> {
+    let stands = standing_height(&outline.path, plane, outline.height);
+    let is_raised =
+        |centre: DVec3| stands.is_none_or(|stands| plane.height(centre) > stands + RAISED * outline.height);
+    outline.path.iter().filter(|(_, centre)| is_raised(**centre)).map(|(time, _)| *time).collect()
 }
 
 /// Height above the plane at which an object stands whose centres are known: that of its lowest times. `None` where these
@@ -453,7 +468,7 @@ mod tests {
     use glam::DQuat;
     use rand::RngExt;
 
-    use super::super::testing::{FLOOR, TIMES, moving, rig, solid, sphere_places, views};
+    use super::super::testing::{FLOOR, TIMES, jumping, moving, rig, solid, sphere_places, views};
     use super::*;
     use crate::random::{Purpose, stream};
 
@@ -497,6 +512,27 @@ mod tests {
         let found = outlines(&views, Some(&FLOOR), TIMES);
         let [found] = &found[..] else { panic!("{} outlines", found.len()) };
         assert!((found.height / found.radius - 1.0).abs() < 0.06, "{} and {}", found.height, found.radius);
+    }
+
+    #[test]
+    fn what_rays_show_above_where_it_stands_is_off_the_plane() {
+        let place = |time: usize| {
+            let height = if (10..20).contains(&time) {
+                0.03 * time.min(29 - time).saturating_sub(9) as f64
+            } else {
+                0.0
+            };
+            DVec3::new(0.005 * time as f64 - 0.07, 0.0, RADIUS + height)
+        };
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+        let views = views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &truth, jumping);
+        let found = outlines(&views, Some(&FLOOR), TIMES);
+        let crossing = found.iter().find(|outline| outline.is_surrounded).unwrap();
+        assert!((11..19).all(|time| crossing.air.contains(&time)), "{:?}", crossing.air);
+        assert!(crossing.air.len() < 16, "{:?}", crossing.air);
+        // Without a plane nothing tells.
+        let found = outlines(&views, None, TIMES);
+        assert!(found[0].is_surrounded && found[0].air.is_empty());
     }
 
     #[test]

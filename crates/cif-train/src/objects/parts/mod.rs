@@ -1,9 +1,10 @@
 //! Parts of objects that turn on a hinge or slide: a door, a lid, a drawer, an arm.
 //!
-//! An object is first made of Gaussians that do not move in its frame. Where that leaves residuals, joints are guessed
-//! by the box around it, and the values of each are searched for at some times with the static Gaussians cut in two.
-//! The best of these get Gaussians for base and part, and are moved together with values and axis against the
-//! pictures. What wins must explain pixels that were left out better than the static Gaussians do.
+//! An object is first made of Gaussians that do not move in its frame: as it looks at all times, and as it looks at the
+//! times in a row that are most alike, say while its lid is closed. Where the first leave residuals that the second do
+//! not, joints are guessed by the box around the second, and the values of each are searched for at some times with
+//! these Gaussians cut in two. The best of the joints get Gaussians for base and part, and are moved together with values
+//! and axis against the pictures. What wins must explain pixels that were left out better than the static Gaussians do.
 //!
 //! | file | answers |
 //! |---|---|
@@ -51,13 +52,16 @@ const FIT: ([usize; 2], usize) = ([200, 150], 250);
 
 /// Of these, those whose values are searched for again, and those that are fitted finely.
 const AGAIN: usize = 8;
-const FINE: usize = 3;
+const FINE: usize = 4;
+
+/// Loss of static Gaussians at all times, of that of others at the times that are most alike, up to which nothing moves.
+const ALIKE: f64 = 1.5;
 
 /// Error of a slide, of that of the best joint, up to which it is preferred.
 const SIMPLE: f64 = 1.12;
 
 /// Error on pixels left out, of that of the static body, up to which a joint is taken.
-const GAIN: f64 = 0.75;
+const GAIN: f64 = 0.55;
 
 /// Error on pixels left out beyond which nothing is explained.
 const MOST_ERROR: f64 = 0.1;
@@ -102,14 +106,19 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         up,
         one_camera: reliable.len() == times.len(),
     };
-    let Some(rough) = search.rigid(ROUGH.0, ROUGH.1, search.level()) else { return Ok(None) };
+    let level = search.level();
+    let Some(rough) = search.rigid(&search.train, ROUGH, level) else { return Ok(None) };
+    let uncut = rough.mean_loss(&search.train, level);
     stop.check()?;
-    let tried = search.tried(&rough);
+    let Some((closed, still)) = search.closed(ROUGH, level) else { return Ok(None) };
+    if uncut <= ALIKE * closed.mean_loss(&still, level) {
+        return Ok(None);
+    }
+    let tried = search.tried(&closed, &still);
     if tried.is_empty() {
         return Ok(None);
     }
     stop.check()?;
-    let level = search.level();
     let mut begun: Vec<Fit<'_>> = tried
         .into_par_iter()
         .take(FITTED)
@@ -117,7 +126,6 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
         .collect();
     keep_kinds(&mut begun, AGAIN);
     stop.check()?;
-    let uncut = rough.mean_loss(&search.train, level);
     let promises = |fits: &[Fit<'_>], most: f64| fits.first().is_some_and(|best| best.loss < most * uncut);
     if !promises(&begun, PROMISES[0]) {
         return Ok(None);
@@ -132,7 +140,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let (rigid, mut fine) = rayon::join(
         || {
             let ([base, part], steps) = FINELY;
-            search.rigid(base + part, 2 * steps, 0)
+            search.rigid(&search.train, (base + part, 2 * steps), 0)
         },
         || {
             let finely = |Fit { guess, body, .. }: Fit<'_>| {

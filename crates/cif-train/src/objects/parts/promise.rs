@@ -1,4 +1,4 @@
-//! Guesses that promise something: their values searched for at some times, with the static Gaussians cut in two.
+//! Guesses that promise something: their values searched for at some times, with static Gaussians cut in two.
 
 use std::collections::BTreeMap;
 
@@ -34,11 +34,16 @@ const PART: [f64; 2] = [0.03, 0.7];
 const PROMISE: f64 = 0.99;
 
 impl<'a> Search<'a> {
-    /// Guesses with their values, best first; none where none promises anything.
-    pub(super) fn tried(&self, rough: &Body<'a>) -> Vec<(Guess, BTreeMap<usize, f64>, f64)> {
-        let means = &rough.shape.gaussians().means;
+    /// Guesses about static Gaussians with their values, best first; none where none promises anything. The views are those
+    /// that the Gaussians were made from.
+    pub(super) fn tried(
+        &self,
+        closed: &Body<'a>,
+        still: &[usize],
+    ) -> Vec<(Guess, BTreeMap<usize, f64>, f64)> {
+        let means = &closed.shape.gaussians().means;
         let places: Vec<DVec3> = means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))).collect();
-        let carved = self.carved();
+        let carved = self.carved(still);
         let inside = if carved.len() < FEWEST_INSIDE { &places } else { &carved };
         let plane = self.object.surroundings.plane;
         let up = self.up.unwrap_or(DVec3::Z);
@@ -50,16 +55,16 @@ impl<'a> Search<'a> {
             if !(PART[0]..=PART[1]).contains(&share) {
                 return None;
             }
-            let body = self.body(rough.shape.copied(), Some((guess.hinge, members, BTreeMap::new())));
+            let body = self.body(closed.shape.copied(), Some((guess.hinge, members, BTreeMap::new())));
             let (values, loss) = search(&body, &times, (&guess.values, guess.is_round), level);
             Some((guess, values, loss))
         };
         let try_all =
             |sides: &Sides| -> Vec<_> { guesses(sides, plane).into_par_iter().filter_map(try_one).collect() };
         let mut tried = try_all(&sides);
-        let (_, still) = search(rough, &times, (&[0.0], false), level);
+        let (_, uncut) = search(closed, &times, (&[0.0], false), level);
         let best = tried.iter().map(|(.., loss)| *loss).fold(f64::INFINITY, f64::min);
-        if best > PROMISE * still {
+        if best > PROMISE * uncut {
             return Vec::new();
         }
         if self.one_camera {
@@ -79,8 +84,8 @@ impl<'a> Search<'a> {
         distinct
     }
 
-    /// Places that all views which show the object well have inside its mask, above what it stands on.
-    fn carved(&self) -> Vec<DVec3> {
+    /// Places that some views which show the object well have inside its mask, above what it stands on.
+    fn carved(&self, views: &[usize]) -> Vec<DVec3> {
         let mut rng = self.object.rng();
         let reach = 1.6 * self.size;
         let mut inside = Vec::new();
@@ -90,7 +95,7 @@ impl<'a> Search<'a> {
                 continue;
             }
             let (mut own, mut beside) = (0_u32, 0_u32);
-            for view in &self.train {
+            for view in views {
                 let view = &self.object.views[*view];
                 let Some(pose) = self.base.get(&view.time_index) else { continue };
                 match view.at(pose.rotation * place + pose.translation) {
@@ -98,7 +103,7 @@ impl<'a> Search<'a> {
                     Seen::Nothing => beside += 1,
                     Seen::Other | Seen::Outside => {}
                 }
-                if f64::from(beside) > BESIDE * self.train.len() as f64 {
+                if f64::from(beside) > BESIDE * views.len() as f64 {
                     break;
                 }
             }

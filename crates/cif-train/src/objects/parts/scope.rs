@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use glam::DVec3;
+use rayon::prelude::*;
 
 use super::super::fit::hull;
 use super::super::shape::{Pose, Shape};
@@ -15,6 +16,12 @@ const VIEWS: usize = 2;
 
 /// Reach of an object that one camera sees, of the radius of its outline.
 const ACROSS: f64 = 1.1;
+
+/// Rows of times of which one is that at which the object looks most alike, their part of all times, and the fewest
+/// times of one.
+const ROWS: usize = 7;
+const ROW: usize = 4;
+const FEWEST_IN_ROW: usize = 4;
 
 /// Shared facts of a search.
 pub(super) struct Search<'a> {
@@ -63,11 +70,38 @@ impl<'a> Search<'a> {
         Body::new((self.object.views, self.base), shape, part, (self.size, self.up), self.object.rng())
     }
 
-    /// The object without parts.
-    pub(super) fn rigid(&self, gaussians: usize, steps: usize, level: usize) -> Option<Body<'a>> {
-        let mut body = self.body(self.hull(self.base, None, gaussians)?, None);
-        body.steps(&self.train, steps, level, |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0));
+    /// The object without parts, as some views show it: with a number of Gaussians, after some steps.
+    pub(super) fn rigid(
+        &self,
+        views: &[usize],
+        (gaussians, steps): (usize, usize),
+        level: usize,
+    ) -> Option<Body<'a>> {
+        let times = views.iter().map(|view| self.object.views[*view].time_index);
+        let poses = times.filter_map(|time| Some((time, *self.base.get(&time)?))).collect();
+        let mut body = self.body(self.hull(&poses, None, gaussians)?, None);
+        body.steps(views, steps, level, |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0));
         Some(body)
+    }
+
+    /// The object without parts as it looks in the row of times that are most alike, with the views of these.
+    pub(super) fn closed(&self, sizes: (usize, usize), level: usize) -> Option<(Body<'a>, Vec<usize>)> {
+        let time_of = |view: usize| self.object.views[view].time_index;
+        let mut times: Vec<usize> = self.train.iter().map(|view| time_of(*view)).collect();
+        times.dedup();
+        let length = (times.len() / ROW).max(FEWEST_IN_ROW).min(times.len());
+        let of_row = |row: usize| {
+            let first = row * (times.len() - length) / (ROWS - 1);
+            let range = times[first]..=times[first + length - 1];
+            let views: Vec<usize> =
+                self.train.iter().copied().filter(|view| range.contains(&time_of(*view))).collect();
+            let body = self.rigid(&views, sizes, level)?;
+            Some((body.mean_loss(&views, level), body, views))
+        };
+        let rows: Vec<_> = (0..ROWS).into_par_iter().filter_map(of_row).collect();
+        let (_, mut body, views) = rows.into_iter().min_by(|a, b| a.0.total_cmp(&b.0))?;
+        body.steps(&views, sizes.1, level, |_| (0.5, 0.0));
+        Some((body, views))
     }
 
     /// Views of some times, one each, or of all times, a few each.

@@ -43,15 +43,25 @@ fn seen(
     pose: impl Fn(f64) -> (DQuat, DVec3),
     cameras: Cameras,
 ) -> Vec<ObjectView> {
+    let mut views = seen_always(base, part, pose, cameras);
+    // Half of the times tell enough.
+    views.retain(|view| view.time_index.is_multiple_of(2));
+    views
+}
+
+/// The same at all times.
+fn seen_always(
+    base: &[DVec3],
+    part: &[DVec3],
+    pose: impl Fn(f64) -> (DQuat, DVec3),
+    cameras: Cameras,
+) -> Vec<ObjectView> {
     let mut all = solid(base, patches, 0.006);
     all.append(&solid(part, |p| patches(p + DVec3::splat(0.31)), 0.006));
     let group_of = (0..all.len()).map(|row| u32::from(row >= base.len())).collect();
     let still = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
     let poses = (0..TIMES).map(|time| pose(share(time))).collect();
-    let mut views = views_of_groups(all, group_of, &[still, poses], cameras);
-    // Half of the times tell enough.
-    views.retain(|view| view.time_index.is_multiple_of(2));
-    views
+    views_of_groups(all, group_of, &[still, poses], cameras)
 }
 
 /// Largest error of the values, from the first on.
@@ -64,20 +74,25 @@ fn the_lid_of_a_box_turns_on_its_hinge() {
     let base = faces(DVec3::new(-0.07, -0.05, 0.0), DVec3::new(0.07, 0.05, 0.06), 1200, 20);
     let lid = faces(DVec3::new(-0.07, -0.05, 0.065), DVec3::new(0.07, 0.05, 0.08), 700, 21);
     let hinge = DVec3::new(0.0, 0.05, 0.065);
-    // It opens away from the cameras.
     let pose = |share: f64| {
-        let turn = DQuat::from_rotation_x(1.6 * share);
+        let turn = DQuat::from_rotation_x(-1.6 * share);
         (turn, hinge - turn * hinge)
     };
-    let pose = |share: f64| pose(-share);
-    let found = find(&seen(&base, &lid, pose, rig)).unwrap();
-    assert_eq!(found.hinge.kind, JointKind::Revolute);
-    let angle = found.hinge.axis.dot(DVec3::X).abs().min(1.0).acos() * 180.0 / PI;
-    let off = found.hinge.point - hinge;
-    let error = value_error(&found, |share| 1.6 * share).to_degrees();
-    assert!(angle < 3.0 && error < 5.0, "axis {angle} deg, values {error} deg");
-    assert!((off - off.x * DVec3::X).length() < 0.01, "{off}");
-    assert!(found.errors[0] < 0.75 * found.errors[1]);
+    let check = |views: &[ObjectView], most: [f64; 3]| {
+        let found = find(views).unwrap();
+        assert_eq!(found.hinge.kind, JointKind::Revolute);
+        let angle = found.hinge.axis.dot(DVec3::X).abs().min(1.0).acos() * 180.0 / PI;
+        let off = found.hinge.point - hinge;
+        let off = (off - off.x * DVec3::X).length();
+        let error = value_error(&found, |share| 1.6 * share).to_degrees();
+        eprintln!("axis {angle} deg, values {error} deg, {off} m");
+        assert!(angle < most[0] && error < most[1], "axis {angle} deg, values {error} deg");
+        assert!(off < most[2], "{off} m");
+        assert!(found.errors[0] < 0.5 * found.errors[1]);
+    };
+    check(&seen(&base, &lid, pose, rig), [3.0, 5.0, 0.01]);
+    // One camera sees at no time how deep it is: the closed box tells where the lid may turn.
+    check(&seen_always(&base, &lid, pose, moving), [4.0, 12.0, 0.02]);
 }
 
 #[test]
