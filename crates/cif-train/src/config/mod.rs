@@ -74,7 +74,8 @@ pub struct TrainConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StagesConfig {
-    /// Coarse steps: one static set for all times, default 300. A capture with one time has no coarse stage:
+    /// Coarse steps: one static set for all times, default 300, and 2000 in the layout D-NeRF, which has no points:
+    /// what objects stand on is looked for in what they reconstruct. A capture with one time has no coarse stage:
     /// its steps are added to the fine stage, which then has no deformation.
     pub coarse: u32,
     /// Fine steps: deformation and regularisers on, default 7000.

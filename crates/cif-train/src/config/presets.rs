@@ -11,14 +11,27 @@ use super::{
 };
 
 impl TrainConfig {
-    /// The settings of a preset; `paper` differs by the layout of the capture.
+    /// The settings of a preset, which differ by the layout of the capture.
     #[must_use]
     pub fn preset(preset: Preset, layout: Layout) -> Self {
-        match preset {
+        let mut config = match preset {
             Preset::Standard => Self::default(),
             Preset::Draft => draft(),
             Preset::Paper => paper(layout),
+        };
+        if let (Layout::DNerf, Some(coarse)) = (layout, without_points(preset)) {
+            config.stages.coarse = coarse;
         }
+        config
+    }
+}
+
+/// Coarse steps of captures that have no points: what objects stand on is then looked for in what these reconstruct.
+fn without_points(preset: Preset) -> Option<u32> {
+    match preset {
+        Preset::Standard => Some(2_000),
+        Preset::Draft => Some(1_000),
+        Preset::Paper => None,
     }
 }
 

@@ -39,6 +39,15 @@ fn the_paper_preset_follows_the_dataset_type() {
 }
 
 #[test]
+fn captures_without_points_are_reconstructed_longer_before_objects_are_looked_for() {
+    let coarse = |preset: Preset, layout: Layout| TrainConfig::preset(preset, layout).stages.coarse;
+    for preset in [Preset::Draft, Preset::Standard] {
+        assert!(coarse(preset, Layout::DNerf) > 3 * coarse(preset, Layout::HyperNerf));
+    }
+    assert_eq!(coarse(Preset::Paper, Layout::DNerf), coarse(Preset::Paper, Layout::HyperNerf));
+}
+
+#[test]
 fn absent_keys_take_defaults_and_unknown_keys_are_refused() {
     let partial: TrainConfig = serde_json::from_str(r#"{"stages": {"fine": 7}}"#).unwrap();
     assert_eq!(partial.stages, StagesConfig { fine: 7, ..StagesConfig::default() });

@@ -74,6 +74,9 @@ pub(super) struct Outline {
     pub(super) stiffness: f64,
     /// True where views of several sides, of one time or of few, tell where it is.
     pub(super) is_surrounded: bool,
+    /// True of what is tried only where no other outline explains what is seen: a plane tells depths better than few
+    /// rays.
+    pub(super) is_resort: bool,
 }
 
 impl Outline {
@@ -150,8 +153,8 @@ enum Stance {
 
 /// Outlines that the views of an object may have; none where nothing tells where it is. Several cameras at a time tell
 /// one. One camera leaves open whether what looks larger comes nearer or shows a broader side, and whether what looks
-/// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross tell its
-/// path too. `times` are those of the sequence.
+/// lower fell over: pictures decide. Where it sees the object from other sides soon after, rays that cross tell the path
+/// of what leaves the plane. `times` are those of the sequence.
 pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize) -> Vec<Outline> {
     let on_plane = |stance: Stance| plane.and_then(|plane| on_plane(views, plane, stance));
     let met = meetings(views);
@@ -161,15 +164,14 @@ pub(super) fn outlines(views: &[ObjectView], plane: Option<&Plane>, times: usize
     }
     let mut found: Vec<Outline> = on_plane(Stance::Stays).into_iter().collect();
     let leaves = on_plane(Stance::MayLeave).filter(|outline| !outline.air.is_empty());
-    // A plane tells depths better than few rays.
-    if found.is_empty() || leaves.is_some() {
-        let crossing = Some(path::crossing(views, times)).filter(|path| !path.is_empty());
+    let crossing = path::crossing(views, times);
+    if crossing.is_empty() {
         found.extend(leaves);
-        found.extend(crossing.map(|path| {
-            let mut outline = surrounded(views, (None, None), (path, path::CROSSING));
-            outline.air = plane.map_or_else(Vec::new, |plane| raised(&outline, plane));
-            outline
-        }));
+    } else {
+        let is_resort = !found.is_empty() && leaves.is_none();
+        let mut outline = surrounded(views, (None, None), (crossing, path::CROSSING));
+        outline.air = plane.map_or_else(Vec::new, |plane| raised(&outline, plane));
+        found.push(Outline { is_resort, ..outline });
     }
     found.extend(on_plane(Stance::Topples));
     found
@@ -198,6 +200,7 @@ fn surrounded(
         air: Vec::new(),
         stiffness,
         is_surrounded: true,
+        is_resort: false,
     });
     if stiffness == path::MEETING
         && let Some(height) = plane.and_then(|plane| standing_height(&met, plane, outline.height))
@@ -305,6 +308,7 @@ fn on_plane(views: &[ObjectView], plane: &Plane, stance: Stance) -> Option<Outli
         path: sums.into_iter().map(|(time, (sum, weight, _))| (time, sum / weight)).collect(),
         stiffness: path::CUT_BY_PLANE,
         is_surrounded: false,
+        is_resort: false,
     })
 }
 

@@ -17,13 +17,13 @@ const LEAST_SHARE: f64 = 0.3;
 /// `normal . X = offset`, the normal towards the cameras.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Plane {
-    pub(super) normal: DVec3,
+    pub(crate) normal: DVec3,
     pub(super) offset: f64,
 }
 
 impl Plane {
     /// Height of a point above it.
-    pub(super) fn height(&self, point: DVec3) -> f64 {
+    pub(crate) fn height(&self, point: DVec3) -> f64 {
         self.normal.dot(point) - self.offset
     }
 

@@ -36,6 +36,9 @@ const TOGETHER: usize = 7;
 /// Step from time to time, of the size, up to which an object that leaves its support stands still on it.
 pub(super) const STANDS: f64 = 0.03;
 
+/// Error from which an outline does not explain what is seen.
+const STRANGE: f64 = 0.15;
+
 /// Gaussians of an object that is followed.
 const FOLLOWED: usize = 300;
 
@@ -122,8 +125,17 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     let begin = |object: &Object<'a>| -> Result<Option<(Object<'a>, Started<'a>)>, TrainError> {
         Ok(object.begun()?.map(|started| (*object, started)))
     };
-    let begun: Vec<_> = objects.par_iter().map(begin).collect::<Result<_, TrainError>>()?;
-    let best = begun.into_iter().flatten().min_by(|a, b| a.1.error.total_cmp(&b.1.error));
+    let all = |objects: &[Object<'a>]| -> Result<Vec<_>, TrainError> {
+        let begun: Vec<_> = objects.par_iter().map(begin).collect::<Result<_, TrainError>>()?;
+        Ok(begun.into_iter().flatten().collect())
+    };
+    let (resorts, others): (Vec<Object<'a>>, Vec<Object<'a>>) =
+        objects.iter().partition(|object| object.outline.is_resort);
+    let mut begun: Vec<(Object<'a>, Started<'a>)> = all(&others)?;
+    if begun.iter().all(|(_, started)| started.error > STRANGE) {
+        begun.extend(all(&resorts)?);
+    }
+    let best = begun.into_iter().min_by(|a, b| a.1.error.total_cmp(&b.1.error));
     let Some((object, Started { mut fit, path, way, rotation, error, unturned, reference })) = best else {
         return Ok(None);
     };

@@ -115,7 +115,9 @@ impl Paths<'_> {
     pub(super) fn ways(&self) -> Vec<Way> {
         let mut ways = Vec::new();
         ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
-        if self.stands && self.reach() >= ROLLS_FROM * self.outline.size() {
+        // What its rays show off the support flies.
+        let flies = self.outline.is_surrounded && !self.outline.air.is_empty();
+        if self.stands && !flies && self.reach() >= ROLLS_FROM * self.outline.size() {
             let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
             ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
         }

@@ -4,7 +4,9 @@
 use cif_dataset::PointSource;
 use cif_field::Gaussians;
 use cif_field::tracks::{NO_GROUP, RotationEvidence, TrackGroup, TrackPose, Tracks};
-use glam::DVec3;
+use cif_render::cpu::Renderer;
+use cif_render::{Channels, RenderSettings};
+use glam::{DVec2, DVec3};
 use rayon::prelude::*;
 
 use super::Trainer;
@@ -25,6 +27,11 @@ const MOST_OF_BALL: f64 = 0.24;
 /// Error, of that without a turn, up to which an object is rigid all the same: rough masks leave errors, but no turn
 /// explains what deforms.
 const TURN_EXPLAINS: f64 = 0.5;
+
+/// Views whose depths show surfaces, pixels from one of these to the next, and coverage from which they are solid.
+const LOOKS: usize = 30;
+const APART: usize = 3;
+const OPAQUE: f32 = 0.9;
 
 /// Rates of poses at the start and the end of the fine stage, shares of the size of the object.
 const RATES: [f32; 2] = [0.004, 2e-4];
@@ -88,14 +95,40 @@ impl Trainer {
     }
 
     /// The plane that objects stand on: in the points of the capture or, where it has none, in what is reconstructed so far.
-    pub(super) fn support(&self) -> Option<Plane> {
+    ///
+    /// # Errors
+    /// When a frame cannot be read, or the run is to stop.
+    pub(super) fn support(&self) -> Result<Option<Plane>, TrainError> {
         let (state, seed) = (&self.state, self.state.config.seed);
         if state.dataset.points.source != PointSource::Random {
-            return objects::support(&state.dataset, &state.dataset.points.positions, seed);
+            return Ok(objects::support(&state.dataset, &state.dataset.points.positions, seed));
         }
-        let g = &state.field.gaussians;
-        let solid = g.means.iter().zip(&g.opacity_logits).filter(|(_, logit)| **logit > 0.0);
-        objects::support(&state.dataset, &solid.map(|(mean, _)| *mean).collect::<Vec<_>>(), seed)
+        Ok(objects::support(&state.dataset, &self.seen_surfaces()?, seed))
+    }
+
+    /// Points of the surfaces that training views see of what is reconstructed so far.
+    fn seen_surfaces(&self) -> Result<Vec<[f32; 3]>, TrainError> {
+        let state = &self.state;
+        let settings = RenderSettings { deform: false, ..state.color_settings() };
+        let mut renderer = Renderer::new(self.simd);
+        let mut points = Vec::new();
+        for view in (0..state.frames.len()).step_by(state.frames.len().div_ceil(LOOKS)) {
+            state.stop.check()?;
+            let frame = &state.dataset.frames[state.frames.index(view)];
+            let channels = Channels { depth: true, instances: false };
+            let seen = renderer.render(&state.field, &frame.camera, frame.time, &settings, channels);
+            let Some(depths) = &seen.depth else { continue };
+            let origin = frame.camera.centre();
+            for y in (0..depths.height).step_by(APART) {
+                for x in (0..depths.width).step_by(APART) {
+                    if *seen.alpha.at(x, y) > OPAQUE {
+                        let ray = frame.camera.ray(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5));
+                        points.push((origin + f64::from(*depths.at(x, y)) * ray).as_vec3().to_array());
+                    }
+                }
+            }
+        }
+        Ok(points)
     }
 
     /// Facts that fits of objects need.
@@ -120,7 +153,7 @@ impl Trainer {
             return Ok(Vec::new());
         }
         let state = &self.state;
-        let plane = self.support();
+        let plane = self.support()?;
         let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
         let surroundings = self.surroundings(plane.as_ref(), &order);
         let most = MOST_ERROR[usize::from(state.dataset.points.source == PointSource::Random)];
@@ -243,5 +276,41 @@ impl Trainer {
             _ => 0.0,
         };
         f64::from(rate)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::guard_tests::support::{Scene, capture, small_config};
+    use super::*;
+
+    #[test]
+    fn without_points_what_is_seen_of_the_reconstruction_tells_the_support() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut dataset = capture(folder.path(), Scene::default());
+        dataset.points.source = PointSource::Random;
+        let mut trainer = Trainer::new(dataset, small_config()).unwrap();
+        // A slab before the cameras, which see one side of it.
+        let (side, reach) = (40, 0.6 * trainer.state.dataset.extent());
+        let centres: Vec<DVec3> = trainer.state.dataset.frames.iter().map(|f| f.camera.centre()).collect();
+        let normal = centres.iter().sum::<DVec3>().normalize();
+        let (first, second) = normal.any_orthonormal_pair();
+        let place = |k: usize| {
+            let at = |k: usize| reach * (2.0 * k as f64 / (side - 1) as f64 - 1.0);
+            let layer = (k / (side * side)) as f64;
+            (at(k % side) * first + at(k / side % side) * second - 0.1 * layer * reach * normal)
+                .as_vec3()
+                .to_array()
+        };
+        let places: Vec<[f32; 3]> = (0..3 * side * side).map(place).collect();
+        let mut slab = Gaussians::from_points(&places, &vec![[0.5; 3]; places.len()]).unwrap();
+        slab.log_scales.fill([(0.5 * reach / side as f64).ln() as f32; 3]);
+        slab.opacity_logits.fill(4.0);
+        trainer.state.field.gaussians = slab;
+        let plane = trainer.support().unwrap().unwrap();
+        let height = plane.height(DVec3::ZERO);
+        assert!(plane.normal.dot(normal) > 0.999 && height.abs() < 0.01 * reach, "{plane:?}, {height}");
+        trainer.state.field.gaussians.opacity_logits.fill(-4.0);
+        assert_eq!(trainer.support().unwrap(), None);
     }
 }

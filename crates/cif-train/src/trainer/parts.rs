@@ -18,7 +18,7 @@ impl Trainer {
         }
         let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();
         let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
-        let plane = self.support();
+        let plane = self.support()?;
         let state = &self.state;
         let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
         let surroundings = self.surroundings(plane.as_ref(), &order);
