@@ -277,8 +277,8 @@ struct NodeRows {
     moves: Vec<bool>,
     /// True of an instance some of whose splats go farther than they are large, by the network.
     is_passed: bool,
-    /// True where they may move as one body or as a few: an instance, and what moves of the background where not every
-    /// splat may have a path of its own.
+    /// True where they may move as bodies: an instance, and what moves of the background where not every splat may have
+    /// a path of its own.
     is_body: bool,
 }
 
@@ -372,6 +372,7 @@ fn moving_groups(
         let moving: f64 =
             group.weights.iter().zip(moves).filter(|(_, moves)| *moves).map(|(weight, _)| weight).sum();
         group.is_passed = is_passed;
+        group.is_loose = owner.is_none() && is_body;
         group.stands_still = moving <= trim * group.weights.iter().sum::<f64>();
         group_owners.push(owner);
         groups.push(group);

@@ -3,8 +3,8 @@
 //! A network trembles a little where nothing moves. An instance whose splats do no more than that is at rest, though
 //! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections
 //! and things without a mask do move. The two leave as nodes of their own: one constant, and one with a path for
-//! every splat, or of a few bodies where a format holds no such paths, so that a few moving splats neither freeze nor
-//! make thousands of others move. Splats of an instance at
+//! every splat, so that a few moving splats neither freeze nor make thousands of others move. Where a format holds
+//! bodies alone, the splats that travel farthest are a body each, and the others one together. Splats of an instance at
 //! rest that travel farther than they are large show something else that passes over it, its shadow mostly: they leave
 //! with what moves of the background.
 
@@ -12,8 +12,9 @@ use cif_geometry::quaternion;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::build::frames::Frames;
-use crate::motion::{dot, vector};
+use crate::build::frames::{Frame, Frames};
+use crate::motion::parts::Partition;
+use crate::motion::{MovingGroup, dot, vector};
 
 /// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the
 /// middle one of the three: flat splats are seen from their broad side), of its size in logarithms, and of its
@@ -23,6 +24,9 @@ const LEAST_CHANGE: f64 = 0.3;
 
 /// Distance from which a splat travels, in units of its own largest standard deviation.
 const TRAVELS: f64 = 2.0;
+
+/// Most splats that are a body each.
+const ALONE: usize = 200;
 
 /// Ranges of place and size of one splat over time, and its largest turn since the first.
 #[derive(Clone, Copy, Default)]
@@ -62,6 +66,22 @@ pub(crate) fn changes(frames: &mut Frames<'_>, rows: &[u32]) -> Vec<Change> {
         });
     }
     changes
+}
+
+/// The splats of a group that travel farthest as a part each, behind the others together; `own` are its splats at the
+/// sampled times.
+pub(crate) fn alone(group: &MovingGroup, own: &[Frame]) -> Partition {
+    let count = group.rows.len();
+    let travelled = |k: usize| {
+        let still = group.pivot + group.static_shape.means[k];
+        own.iter().map(|frame| vector(frame.means[k]).distance(still)).fold(0.0, f64::max)
+    };
+    let mut order: Vec<(usize, f64)> = (0..count).map(|k| (k, travelled(k))).collect();
+    order.sort_by(|a, b| b.1.total_cmp(&a.1));
+    let mut labels = vec![0; count];
+    let alone = ALONE.min(count.saturating_sub(1));
+    order[..alone].iter().enumerate().for_each(|(part, (k, _))| labels[*k] = part + 1);
+    Partition { labels, count: alone + 1, decisive: 0.0 }
 }
 
 impl Change {

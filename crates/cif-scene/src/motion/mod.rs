@@ -48,6 +48,8 @@ pub struct MovingGroup {
     pub stands_still: bool,
     /// True where some splats travel that may show what passes over it ([`crate::motion::loose`]).
     pub is_passed: bool,
+    /// True where every splat moves on its own way, though the format holds bodies alone ([`crate::motion::loose`]).
+    pub is_loose: bool,
     /// Share of the weight that may be outliers.
     pub trim: f64,
     /// Largest decisive residual allowed, world units.
@@ -251,6 +253,7 @@ impl MovingGroup {
             is_body,
             stands_still: false,
             is_passed: false,
+            is_loose: false,
             trim,
             tolerance,
             static_shape: MeanShape::default(),
