@@ -23,7 +23,7 @@ use crate::motion::{MovingGroup, dot, vector};
 const LEAST_CHANGE: f64 = 0.3;
 
 /// Distance from which a splat travels, in units of its own largest standard deviation.
-const TRAVELS: f64 = 2.0;
+const TRAVELS: f64 = 1.0;
 
 /// Most splats that are a body each.
 const ALONE: usize = 200;

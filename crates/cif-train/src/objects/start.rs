@@ -37,7 +37,7 @@ const TOGETHER: usize = 7;
 pub(super) const STANDS: f64 = 0.03;
 
 /// Error from which an outline does not explain what is seen.
-const STRANGE: f64 = 0.15;
+const STRANGE: f64 = 0.11;
 
 /// Gaussians of an object that is followed.
 const FOLLOWED: usize = 300;
