@@ -61,7 +61,7 @@ const ALIKE: f64 = 1.5;
 const SIMPLE: f64 = 1.12;
 
 /// Error on pixels left out, of that of the static body, up to which a joint is taken.
-const GAIN: f64 = 0.55;
+const GAIN: f64 = 0.62;
 
 /// Error on pixels left out beyond which nothing is explained.
 const MOST_ERROR: f64 = 0.1;
