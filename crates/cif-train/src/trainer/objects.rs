@@ -33,6 +33,9 @@ const LOOKS: usize = 30;
 const APART: usize = 3;
 const OPAQUE: f32 = 0.9;
 
+/// Largest distance between cameras, of the middle depth, from which views tell depths.
+const PARALLAX: f64 = 0.1;
+
 /// Rates of poses at the start and the end of the fine stage, shares of the size of the object.
 const RATES: [f32; 2] = [0.004, 2e-4];
 
@@ -106,12 +109,13 @@ impl Trainer {
         Ok(objects::support(&state.dataset, &self.seen_surfaces()?, seed))
     }
 
-    /// Points of the surfaces that training views see of what is reconstructed so far.
+    /// Points of the surfaces that training views see of what is reconstructed so far; none where all see it from about one
+    /// place, so that its depths are guesses.
     fn seen_surfaces(&self) -> Result<Vec<[f32; 3]>, TrainError> {
         let state = &self.state;
         let settings = RenderSettings { deform: false, ..state.color_settings() };
         let mut renderer = Renderer::new(self.simd);
-        let mut points = Vec::new();
+        let (mut points, mut depths_seen, mut centres) = (Vec::new(), Vec::new(), Vec::new());
         for view in (0..state.frames.len()).step_by(state.frames.len().div_ceil(LOOKS)) {
             state.stop.check()?;
             let frame = &state.dataset.frames[state.frames.index(view)];
@@ -119,16 +123,23 @@ impl Trainer {
             let seen = renderer.render(&state.field, &frame.camera, frame.time, &settings, channels);
             let Some(depths) = &seen.depth else { continue };
             let origin = frame.camera.centre();
+            centres.push(origin);
             for y in (0..depths.height).step_by(APART) {
                 for x in (0..depths.width).step_by(APART) {
                     if *seen.alpha.at(x, y) > OPAQUE {
                         let ray = frame.camera.ray(DVec2::new(f64::from(x) + 0.5, f64::from(y) + 0.5));
-                        points.push((origin + f64::from(*depths.at(x, y)) * ray).as_vec3().to_array());
+                        let depth = f64::from(*depths.at(x, y));
+                        depths_seen.push(depth);
+                        points.push((origin + depth * ray).as_vec3().to_array());
                     }
                 }
             }
         }
-        Ok(points)
+        let far = |centre: &DVec3| centres.iter().map(|other| other.distance(*centre)).fold(0.0, f64::max);
+        let apart = centres.iter().map(far).fold(0.0, f64::max);
+        depths_seen.sort_by(f64::total_cmp);
+        let is_told = depths_seen.get(depths_seen.len() / 2).is_some_and(|middle| apart > PARALLAX * middle);
+        Ok(if is_told { points } else { Vec::new() })
     }
 
     /// Facts that fits of objects need.
