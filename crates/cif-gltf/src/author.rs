@@ -15,7 +15,7 @@ use crate::arrays::Array;
 use crate::document::{self, Document};
 use crate::extras::{self, Cif, Extras};
 use crate::rotation_keys::{self, Inserted, SamplerExtras};
-use crate::{EXTENSION, GENERATOR, GltfError, conventions};
+use crate::{EXTENSION, GENERATOR, GltfError, conventions, loose};
 
 /// A document and the arrays that follow each other in its only buffer.
 pub(crate) struct Authored<'a> {
@@ -25,15 +25,18 @@ pub(crate) struct Authored<'a> {
     pub(crate) bytes: u64,
 }
 
-/// Builds the document of a graph. The buffer has no URI yet.
+/// Builds the document of a graph, whose loose splats are given in frames of their own. The buffer has no URI yet.
 ///
 /// # Errors
-/// When a node moves splat by splat, arrays do not fit together, or values are not finite.
-pub(crate) fn author(graph: &SceneGraph) -> Result<Authored<'_>, GltfError> {
+/// When arrays do not fit together, or values are not finite.
+pub(crate) fn author<'a>(
+    graph: &'a SceneGraph,
+    loose: &'a BTreeMap<usize, Splats>,
+) -> Result<Authored<'a>, GltfError> {
     let mut author = Author::new(graph)?;
     let mut children = Vec::new();
-    for node in &graph.nodes {
-        children.push(author.node(node)?);
+    for (position, node) in graph.nodes.iter().enumerate() {
+        children.push(author.node(node, loose.get(&position))?);
     }
     let cameras: Vec<usize> =
         graph.cameras.iter().map(|track| author.camera(track)).collect::<Result<_, _>>()?;
@@ -98,7 +101,7 @@ impl<'a> Author<'a> {
         self.document.nodes.len() - 1
     }
 
-    fn node(&mut self, node: &'a Node) -> Result<usize, GltfError> {
+    fn node(&mut self, node: &'a Node, loose: Option<&'a Splats>) -> Result<usize, GltfError> {
         check_splats(node)?;
         let name = self.unique(&node.name);
         let track = node.track();
@@ -121,36 +124,62 @@ impl<'a> Author<'a> {
             }
             Motion::Parts(motion) => {
                 for (position, part) in motion.parts.iter().enumerate() {
-                    let name = self.unique(&format!("{name}_{}", part.name));
                     let rest =
                         PoseSample { time_code: 0.0, translation: part.pivot, rotation: DQuat::IDENTITY };
                     let first = part.track.first().unwrap_or(&rest);
-                    let mesh = self.mesh(&name, &node.splats, part.splats.clone());
-                    let child = self.push(document::Node {
-                        name,
-                        mesh,
-                        translation: Some(single(first.translation)),
-                        rotation: Some(conventions::gltf_quaternion(first.rotation)),
-                        extras: Some(Extras {
-                            cif: Cif::Part(extras::Part {
-                                name: part.name.clone(),
-                                part: position,
-                                pivot: part.pivot.to_array(),
-                                joint: part.joint,
-                                range: motion.joint_range(position),
-                            }),
-                        }),
-                        ..document::Node::default()
-                    });
-                    self.document.nodes[index].children.push(child);
+                    let told = extras::Part {
+                        name: part.name.clone(),
+                        part: position,
+                        pivot: part.pivot.to_array(),
+                        joint: part.joint,
+                        range: motion.joint_range(position),
+                    };
+                    let child = self.part((index, &name), (&node.splats, part.splats.clone()), first, told);
                     self.pose_channels(child, &part.track, &node.name, error)?;
                 }
             }
-            Motion::Dense(_) => return Err(GltfError::Dense { node: node.name.clone() }),
+            Motion::Dense(motion) => {
+                let own = loose.ok_or_else(|| GltfError::Dense { node: node.name.clone() })?;
+                for splat in all {
+                    let (track, sizes) = loose::path(motion, splat, own);
+                    let told = extras::Part {
+                        name: format!("splat_{splat:03}"),
+                        part: splat,
+                        pivot: track[0].translation.to_array(),
+                        joint: None,
+                        range: None,
+                    };
+                    let child = self.part((index, &name), (own, splat..splat + 1), &track[0], told);
+                    self.pose_channels(child, &track, &node.name, error)?;
+                    self.size_channel(child, &track, sizes, &node.name)?;
+                }
+            }
         }
         self.pose_channels(index, track, &node.name, error)?;
         self.visibility_channel(index, &node.visibility, &node.name)?;
         Ok(index)
+    }
+
+    /// A node below that of an object, with a range of splats.
+    fn part(
+        &mut self,
+        (parent, of): (usize, &str),
+        (splats, range): (&'a Splats, Range<usize>),
+        first: &PoseSample,
+        told: extras::Part,
+    ) -> usize {
+        let name = self.unique(&format!("{of}_{}", told.name));
+        let mesh = self.mesh(&name, splats, range);
+        let child = self.push(document::Node {
+            name,
+            mesh,
+            translation: Some(single(first.translation)),
+            rotation: Some(conventions::gltf_quaternion(first.rotation)),
+            extras: Some(Extras { cif: Cif::Part(told) }),
+            ..document::Node::default()
+        });
+        self.document.nodes[parent].children.push(child);
+        child
     }
 
     /// One mesh of one splat primitive; `None` for no splats, as primitives must not be empty.
@@ -310,6 +339,29 @@ impl<'a> Author<'a> {
         Ok(())
     }
 
+    /// LINEAR scale at the samples of a track, of at least two; nothing where no size is given.
+    fn size_channel(
+        &mut self,
+        node: usize,
+        track: &[PoseSample],
+        sizes: Vec<[f32; 3]>,
+        name: &str,
+    ) -> Result<(), GltfError> {
+        if sizes.len() < 2 {
+            return Ok(());
+        }
+        if !sizes.as_flattened().iter().all(|size| size.is_finite() && *size > 0.0) {
+            let what = "a size of its splats is not finite".to_owned();
+            return Err(GltfError::Inconsistent { node: name.to_owned(), what });
+        }
+        let times = self.key_times(track.iter().map(|pose| pose.time_code), name)?;
+        let input = self.input(times);
+        let count = sizes.len();
+        let output = self.accessor(Array::Keys(sizes.into_flattened()), document::FLOAT, "VEC3", count);
+        self.channel(node, "scale", input, output, "LINEAR");
+        Ok(())
+    }
+
     /// A stepped scale that hides the node.
     fn visibility_channel(
         &mut self,
@@ -463,13 +515,14 @@ fn single(translation: DVec3) -> document::Translation {
 /// The earliest time code of anything: it is at 0 seconds.
 fn first_time_code(graph: &SceneGraph) -> f64 {
     let nodes = graph.nodes.iter().flat_map(|node| {
-        let parts = match &node.motion {
-            Motion::Parts(motion) => motion.parts.as_slice(),
-            _ => &[],
+        let (parts, samples) = match &node.motion {
+            Motion::Parts(motion) => (motion.parts.as_slice(), [].as_slice()),
+            Motion::Dense(motion) => ([].as_slice(), motion.samples.as_slice()),
+            _ => ([].as_slice(), [].as_slice()),
         };
         let poses = node.track().first().into_iter().chain(parts.iter().filter_map(|p| p.track.first()));
         let visibility = node.visibility.first().map(|sample| sample.time_code);
-        poses.map(|pose| pose.time_code).chain(visibility)
+        poses.map(|pose| pose.time_code).chain(visibility).chain(samples.first().map(|s| s.time_code))
     });
     let cameras = graph.cameras.iter().filter_map(|track| track.samples.first()).map(|s| s.time_code);
     nodes.chain(cameras).fold(graph.time_codes.start(), f64::min)

@@ -25,7 +25,8 @@ pub enum GltfError {
     },
     /// Motion that glTF cannot hold.
     #[error(
-        "{node} moves splat by splat, which glTF cannot hold; build the scene with parts or rigid as the most expensive motion"
+        "{node} moves splat by splat, which glTF holds of {most} splats at most; build the scene with parts or rigid as the most expensive motion",
+        most = cif_scene::LOOSE_SPLATS
     )]
     Dense {
         /// Name of the node.

@@ -6,7 +6,7 @@
 use std::collections::BTreeMap;
 
 use cif_field::SortMetric;
-use cif_scene::{CaptureFrame, MotionReport, PartJoint, SceneOptions, UpAxis};
+use cif_scene::{CaptureFrame, MotionModel, MotionReport, PartJoint, SceneOptions, UpAxis};
 use serde::{Deserialize, Serialize};
 
 /// Version of what stands here.
@@ -55,6 +55,18 @@ pub(crate) struct World {
     pub(crate) field_fingerprint: Option<String>,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub(crate) options: Option<SceneOptions>,
+}
+
+impl Cif {
+    /// True of an object each of whose splats has a path of its own.
+    pub(crate) fn moves_by_splat(&self) -> bool {
+        let object = match self {
+            Self::Instance(instance) => &instance.object,
+            Self::Background(object) => object.as_ref(),
+            Self::World(_) | Self::Part(_) | Self::Camera(_) => return false,
+        };
+        object.motion.model == MotionModel::Dense
+    }
 }
 
 /// An instance.

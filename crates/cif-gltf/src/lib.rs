@@ -5,6 +5,7 @@
 //! | [`conventions`] | how axes, quaternions, times and cameras differ from ours |
 //! | `extras` | what stands in `extras.cif`, because glTF has no place for it |
 //! | `document` | the objects of glTF that are written |
+//! | `loose` | bodies of splats that move one by one |
 //! | `author` | which nodes, meshes, cameras and tracks a scene becomes |
 //! | `rotation_keys` | keys between those of a track, for viewers that do not slerp |
 //! | `arrays` | what the buffer holds |
@@ -13,7 +14,8 @@
 //!
 //! Layout of a file: the node `World` brings our axes and units to those of glTF; below it stand one node per
 //! instance, one for the background, and `Cameras`. A rigid instance is a mesh of one point primitive with
-//! splats; one that moves in parts has a child node per part. One animation holds all motion. Splats carry the
+//! splats; one that moves in parts has a child node per part, and one of few splats with paths of their own a child node
+//! per splat. One animation holds all motion. Splats carry the
 //! attributes [`ROW`], [`OCCUPANCY`], [`IDENTITY`], [`INSTANCE_IDS`] and [`INSTANCE_SHARES`] besides those of the
 //! extension, so that an edited file can be traced home.
 //!
@@ -29,6 +31,7 @@ mod document;
 mod extras;
 #[cfg(test)]
 mod foreign_tests;
+mod loose;
 mod read;
 mod relabel;
 mod rotation_keys;
@@ -50,7 +53,8 @@ pub use write::{check_target, export};
 
 /// The extension that holds the splats.
 pub const EXTENSION: &str = "KHR_gaussian_splatting";
-/// Most expensive motion that a file can hold: build graphs for glTF with no more than this.
+/// Most expensive motion that a file can hold: build graphs for glTF with no more than this. Some splats
+/// ([`cif_scene::LOOSE_SPLATS`]) may have paths of their own nevertheless.
 pub const MOST_EXPENSIVE_MOTION: MotionModel = MotionModel::Parts;
 /// Attribute with the row of every splat in the field: two unsigned shorts, the low one first.
 pub const ROW: &str = "_CIF_ROW";

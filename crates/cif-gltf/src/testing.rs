@@ -4,9 +4,9 @@ use cif_field::RotationEvidence;
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_geometry::{Bounds, PinholeCamera, RigidTransform};
 use cif_scene::{
-    CameraSample, CameraTrack, CaptureFrame, IdentityShare, Motion, MotionModel, MotionReport, Node,
-    NodeKind, Origin, Part, PartsMotion, PoseSample, ResidualStatistics, SceneGraph, SceneOptions, Splats,
-    TimeCodes, UpAxis, VisibilitySample, extent,
+    CameraSample, CameraTrack, CaptureFrame, DenseMotion, DenseSample, IdentityShare, Motion, MotionModel,
+    MotionReport, Node, NodeKind, Origin, Part, PartsMotion, PoseSample, ResidualStatistics, SceneGraph,
+    SceneOptions, Splats, TimeCodes, UpAxis, VisibilitySample, extent,
 };
 use glam::{DMat3, DQuat, DVec2, DVec3};
 use proptest::prelude::*;
@@ -67,6 +67,30 @@ impl Numbers {
             splats.rows.push(first_row + 70_000 * k as u32);
         }
         splats
+    }
+
+    /// Splats that move and, where `changes`, grow and shrink on their own; as they are at first.
+    pub(crate) fn dense(&mut self, splats: &mut Splats, codes: &[f64], changes: bool) -> DenseMotion {
+        let mut samples: Vec<DenseSample> = Vec::new();
+        for &time_code in codes {
+            let mut shape = self.splats(splats.len(), 0, 0);
+            if let Some(before) = samples.last() {
+                for (q, before) in shape.orientations.iter_mut().zip(&before.orientations) {
+                    if q.iter().zip(before).map(|(a, b)| a * b).sum::<f32>() < 0.0 {
+                        *q = q.map(|value| -value);
+                    }
+                }
+            }
+            let scales = changes.then_some(shape.scales);
+            let Splats { means, orientations, .. } = shape;
+            samples.push(DenseSample { time_code, means, orientations, scales, extent: Bounds::EMPTY });
+        }
+        splats.means.clone_from(&samples[0].means);
+        splats.orientations.clone_from(&samples[0].orientations);
+        if let Some(scales) = &samples[0].scales {
+            splats.scales.clone_from(scales);
+        }
+        DenseMotion { track: Vec::new(), samples }
     }
 
     pub(crate) fn track(&mut self, codes: &[f64]) -> Vec<PoseSample> {

@@ -13,7 +13,7 @@ use cif_scene::files::{FileError, existing_folder, target_of};
 use serde::Deserialize;
 
 use crate::author::{Authored, author};
-use crate::{ExportOptions, ExportSummary, GENERATOR_PREFIX, GltfError};
+use crate::{ExportOptions, ExportSummary, GENERATOR_PREFIX, GltfError, loose};
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
@@ -109,10 +109,11 @@ fn is_ours(path: &Path) -> bool {
 ///
 /// # Errors
 /// Unknown ending, missing folder, a file there that is not ours (without [`ExportOptions::force`]), a node with
-/// dense motion, values that are not finite, disk full. Nothing existing is touched then.
+/// dense motion of more than [`cif_scene::LOOSE_SPLATS`] splats, values that are not finite, disk full. Nothing existing is touched then.
 pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result<ExportSummary, GltfError> {
     let (kind, target) = checked_kind(path, options)?;
-    let mut authored = author(graph)?;
+    let loose = loose::in_own_frames(graph)?;
+    let mut authored = author(graph, &loose)?;
     let failed = |source: io::Error| FileError::Write { path: path.to_owned(), source };
     let mut paths = vec![path.to_owned()];
     let bytes = match kind {

@@ -45,7 +45,8 @@ pub trait SceneFormat: Sync {
         graph: &SceneGraph,
         options: &SceneOptions,
     ) -> Result<Option<SceneGraph>, SceneError> {
-        let too_much = |most| graph.nodes.iter().any(|node| node.model() > most);
+        let too_much =
+            |most| options.most_expensive_motion > most && graph.nodes.iter().any(|node| node.model() > most);
         if !self.about().most_expensive_motion.is_some_and(too_much) {
             return Ok(None);
         }

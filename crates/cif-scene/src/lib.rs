@@ -77,6 +77,7 @@ pub use graph::{
     PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
 pub use joint::PartJoint;
+pub use motion::loose::LOOSE_SPLATS;
 pub use motion::placement::PlacedSplats;
 pub use motion::velocity::Velocity;
 pub use motion_scores::{InstanceMotion, MotionErrors, MotionScores, motion_scores};

@@ -1,11 +1,11 @@
 //! Nodes with splats to objects of the scene: ours by what `extras.cif` says, others by their names.
 
-use cif_scene::assemble::{Identity, Piece, Placement, Prim, PrimName, Track, uniform};
+use cif_scene::assemble::{Identity, Piece, Placement, Prim, PrimName, Shape, Track, uniform};
 use cif_scene::{MotionModel, Splats, naming};
 use glam::{DAffine3, DMat3, DVec3};
 
 use super::hierarchy::Placed;
-use super::motion::{Movement, Stage};
+use super::motion::{Chain, Movement, Stage};
 use crate::GltfError;
 use crate::extras::{Cif, Object};
 
@@ -77,9 +77,12 @@ impl Reader<'_> {
         };
         self.warn_of_stretch(placed.index, &movement);
         let splats = self.own_splats(placed.index)?;
-        let mut pieces = match found.parts.is_empty() {
-            true => vec![piece(String::new(), splats, Track::still(), movement.stretch, None)],
-            false => self.parts(found, splats, &movement)?,
+        let is_loose = splats.is_empty() && placed.cif.as_ref().is_some_and(Cif::moves_by_splat);
+        let codes = if is_loose { self.shape_codes(found) } else { Vec::new() };
+        let mut pieces = match (found.parts.is_empty(), codes.is_empty()) {
+            (true, _) => vec![piece(String::new(), splats, Track::still(), movement.stretch, None)],
+            (false, true) => self.parts(found, splats, &movement)?,
+            (false, false) => self.loose(found, &movement, &codes)?,
         };
         if pieces.iter().all(|piece| piece.splats.is_empty()) {
             self.warnings.push(format!("{place}: it has no splats left; taken as deleted"));
@@ -89,7 +92,9 @@ impl Reader<'_> {
             self.fill_rows(&mut piece.splats);
         }
         let foreign = Prim {
-            in_parts: !found.parts.is_empty(),
+            in_parts: !found.parts.is_empty() && codes.is_empty(),
+            shape_codes: codes,
+            scales_change: is_loose,
             track: movement.track,
             pieces,
             visibility: movement.visibility,
@@ -177,8 +182,7 @@ impl Reader<'_> {
         let mut ordered = found.parts.clone();
         ordered.sort_by_key(position);
         for placed in ordered {
-            let at = placed.chain.iter().position(|&node| node == found.placed.index).map_or(0, |at| at + 1);
-            let chain = self.stage.chain(None, &placed.chain[at..], true);
+            let chain = self.part_chain(found, placed);
             let Some(movement) = self.stage.movement(&chain) else { continue };
             self.warn_of_stretch(placed.index, &movement);
             let splats = self.own_splats(placed.index)?;
@@ -201,6 +205,60 @@ impl Reader<'_> {
         {
             // Joints count parts that are not where they were.
             pieces.iter_mut().for_each(|piece| piece.joint = None);
+        }
+        Ok(pieces)
+    }
+
+    /// Chain of a part below its object.
+    fn part_chain(&self, found: &Found<'_>, part: &Placed) -> Chain {
+        let at = part.chain.iter().position(|&node| node == found.placed.index).map_or(0, |at| at + 1);
+        self.stage.chain(None, &part.chain[at..], true)
+    }
+
+    /// Time codes at which any part has a key.
+    fn shape_codes(&self, found: &Found<'_>) -> Vec<f64> {
+        let keys = |part: &&Placed| self.stage.movement(&self.part_chain(found, part));
+        let poses = found.parts.iter().filter_map(keys).flat_map(|movement| movement.track.samples);
+        let mut codes: Vec<f64> = poses.map(|pose| pose.time_code).collect();
+        codes.sort_by(f64::total_cmp);
+        codes.dedup();
+        codes
+    }
+
+    /// The parts as splats that deform: where each is and how it is stretched at every time code.
+    fn loose(
+        &mut self,
+        found: &Found<'_>,
+        object: &Movement,
+        codes: &[f64],
+    ) -> Result<Vec<Piece>, GltfError> {
+        let stretch = DAffine3::from_mat3(object.stretch);
+        let mut pieces = Vec::with_capacity(found.parts.len());
+        for &part in &found.parts {
+            let splats = self.own_splats(part.index)?;
+            let chain = self.part_chain(found, part);
+            let map = |code: f64| {
+                let decomposed = self.stage.at(&chain, self.stage.clock.seconds(code))?;
+                let turned = DMat3::from_quat(decomposed.rotation) * decomposed.stretch;
+                Some((code, stretch * DAffine3::from_mat3_translation(turned, decomposed.translation)))
+            };
+            let Some(maps) = codes.iter().map(|&code| map(code)).collect::<Option<Vec<_>>>() else {
+                self.warnings.push(format!(
+                    "{}: its scale is 0, so that nothing of it can be seen; left out",
+                    self.stage.source.node_name(part.index)
+                ));
+                continue;
+            };
+            let shape = Shape {
+                means: splats.means.clone(),
+                orientations: splats.orientations.clone(),
+                scales: splats.scales.clone(),
+            };
+            pieces.push(Piece {
+                placement: Placement::Sampled(maps),
+                shapes: vec![shape; codes.len()],
+                ..piece(String::new(), splats, Track::still(), DMat3::IDENTITY, None)
+            });
         }
         Ok(pieces)
     }

@@ -277,15 +277,15 @@ struct NodeRows {
     moves: Vec<bool>,
     /// True of an instance some of whose splats go farther than they are large, by the network.
     is_passed: bool,
-    /// True where they may move as bodies: an instance, and what moves of the background where not every splat may have
-    /// a path of its own.
-    is_body: bool,
+    /// True of splats each of which may have a path of its own, whatever motion is allowed.
+    is_loose: bool,
 }
 
 impl NodeRows {
-    fn of(owner: Option<usize>, rows: Vec<(u32, Change)>, [is_passed, is_body]: [bool; 2]) -> Self {
+    fn of(owner: Option<usize>, rows: Vec<(u32, Change)>) -> Self {
         let (rows, changes): (_, Vec<Change>) = rows.into_iter().unzip();
-        Self { owner, rows, moves: changes.iter().map(Change::shows).collect(), is_passed, is_body }
+        let moves = changes.iter().map(Change::shows).collect();
+        Self { owner, rows, moves, is_passed: false, is_loose: false }
     }
 }
 
@@ -319,18 +319,23 @@ fn rows_of_nodes(
             background.extend(passing.into_iter().map(|(row, _)| row));
             own = rest;
         }
-        nodes.push(NodeRows::of(Some(index), own, [is_passed, true]));
+        nodes.push(NodeRows { is_passed, ..NodeRows::of(Some(index), own) });
     }
     background.sort_unstable();
     let changes = loose::changes(frames, &background);
     let background: Vec<(u32, Change)> = background.into_iter().zip(changes).collect();
     if options.most_expensive_motion >= MotionModel::Parts {
-        let (moving, still) = background.into_iter().partition(|(_, change)| change.shows());
-        let by_parts = options.most_expensive_motion == MotionModel::Parts;
-        nodes.push(NodeRows::of(None, still, [false; 2]));
-        nodes.push(NodeRows::of(None, moving, [false, by_parts]));
+        let (mut moving, mut still): (Vec<_>, Vec<_>) =
+            background.into_iter().partition(|(_, change)| change.shows());
+        let is_loose = options.most_expensive_motion == MotionModel::Parts;
+        if is_loose {
+            still.extend(loose::leave_farthest(&mut moving));
+            still.sort_unstable_by_key(|(row, _)| *row);
+        }
+        nodes.push(NodeRows::of(None, still));
+        nodes.push(NodeRows { is_loose, ..NodeRows::of(None, moving) });
     } else {
-        nodes.push(NodeRows::of(None, background, [false; 2]));
+        nodes.push(NodeRows::of(None, background));
     }
     nodes.retain(|node| !node.rows.is_empty());
     nodes
@@ -345,7 +350,8 @@ fn moving_groups(
 ) -> (Vec<Option<usize>>, Vec<MovingGroup>) {
     let mut largest_instance: f64 = 0.0;
     let (mut group_owners, mut groups) = (Vec::new(), Vec::new());
-    for NodeRows { owner, rows, moves, is_passed, is_body } in nodes {
+    for NodeRows { owner, rows, moves, is_passed, is_loose } in nodes {
+        let is_body = owner.is_some();
         let weights: Vec<f64> = rows
             .iter()
             .map(|&row| {
@@ -366,13 +372,13 @@ fn moving_groups(
             None => size,
         };
         let pivot = if is_body { (low + high) / 2.0 } else { DVec3::ZERO };
-        let trim = if owner.is_some() { INSTANCE_TRIM } else { BACKGROUND_TRIM };
+        let trim = if is_body { INSTANCE_TRIM } else { BACKGROUND_TRIM };
         let tolerance = options.tolerance.in_world_units(yardstick);
         let mut group = MovingGroup::new(rows, weights, pivot, is_body, trim, tolerance, &reference.means);
         let moving: f64 =
             group.weights.iter().zip(moves).filter(|(_, moves)| *moves).map(|(weight, _)| weight).sum();
         group.is_passed = is_passed;
-        group.is_loose = owner.is_none() && is_body;
+        group.is_loose = is_loose;
         group.stands_still = moving <= trim * group.weights.iter().sum::<f64>();
         group_owners.push(owner);
         groups.push(group);

@@ -11,7 +11,6 @@ use crate::build::frames::{Frame, Frames};
 use crate::graph::{DenseSample, PoseSample, pose_at};
 use crate::motion::dense;
 use crate::motion::keys::{self, Moments};
-use crate::motion::loose;
 use crate::motion::parts::{self, Partition};
 use crate::motion::{MovingGroup, ResidualSum, trimmed_box};
 use crate::{MotionModel, SceneOptions};
@@ -153,9 +152,6 @@ fn fit_parts(group: &MovingGroup, own: &[Frame], options: &SceneOptions) -> Opti
         let partition = Partition { labels: told.labels.clone(), count: told.parts.len() + 1, decisive: 0.0 };
         return Some(fit_partition(group, own, &partition));
     }
-    if group.is_loose {
-        return Some(fit_partition(group, own, &loose::alone(group, own)));
-    }
     let partitions = parts::partitions(own, &group.weights, group.tolerance, group.trim, options.max_parts);
     let promising = partitions.iter().filter(|partition| partition.decisive <= PROMISING * group.tolerance);
     let mut best: Option<FittedParts> = None;
@@ -219,12 +215,13 @@ fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptio
         return MotionModel::Static;
     }
     if !group.is_body {
-        return if limit == MotionModel::Dense { MotionModel::Dense } else { MotionModel::Static };
+        let is_dense = group.is_loose || limit == MotionModel::Dense;
+        return if is_dense { MotionModel::Dense } else { MotionModel::Static };
     }
     if inside(group, &group.rigid_residual) || limit == MotionModel::Rigid {
         return MotionModel::Rigid;
     }
-    if (group.told.is_some() || group.is_loose) && parts.is_some() {
+    if group.told.is_some() && parts.is_some() {
         return MotionModel::Parts;
     }
     let cheaper_than_dense =

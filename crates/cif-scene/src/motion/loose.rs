@@ -4,17 +4,16 @@
 //! the tolerance of motion be tighter by some factor. Most of a background stands still too; but shadows, reflections
 //! and things without a mask do move. The two leave as nodes of their own: one constant, and one with a path for
 //! every splat, so that a few moving splats neither freeze nor make thousands of others move. Where a format holds
-//! bodies alone, the splats that travel farthest are a body each, and the others one together. Splats of an instance at
-//! rest that travel farther than they are large show something else that passes over it, its shadow mostly: they leave
-//! with what moves of the background.
+//! bodies alone, a splat can be one: those that travel farthest have a path each, and the others stand still. Splats of
+//! an instance at rest that travel farther than they are large show something else that passes over it, its shadow
+//! mostly: they leave with what moves of the background.
 
 use cif_geometry::quaternion;
 use glam::DVec3;
 use rayon::prelude::*;
 
-use crate::build::frames::{Frame, Frames};
-use crate::motion::parts::Partition;
-use crate::motion::{MovingGroup, dot, vector};
+use crate::build::frames::Frames;
+use crate::motion::{dot, vector};
 
 /// Change below which a splat stands still in a picture: of its place in units of its own standard deviation (the
 /// middle one of the three: flat splats are seen from their broad side), of its size in logarithms, and of its
@@ -25,8 +24,8 @@ const LEAST_CHANGE: f64 = 0.3;
 /// Distance from which a splat travels, in units of its own largest standard deviation.
 const TRAVELS: f64 = 1.0;
 
-/// Most splats that are a body each.
-const ALONE: usize = 200;
+/// Most splats with a path of their own where formats hold bodies alone: each of them is one.
+pub const LOOSE_SPLATS: usize = 200;
 
 /// Ranges of place and size of one splat over time, and its largest turn since the first.
 #[derive(Clone, Copy, Default)]
@@ -68,20 +67,12 @@ pub(crate) fn changes(frames: &mut Frames<'_>, rows: &[u32]) -> Vec<Change> {
     changes
 }
 
-/// The splats of a group that travel farthest as a part each, behind the others together; `own` are its splats at the
-/// sampled times.
-pub(crate) fn alone(group: &MovingGroup, own: &[Frame]) -> Partition {
-    let count = group.rows.len();
-    let travelled = |k: usize| {
-        let still = group.pivot + group.static_shape.means[k];
-        own.iter().map(|frame| vector(frame.means[k]).distance(still)).fold(0.0, f64::max)
-    };
-    let mut order: Vec<(usize, f64)> = (0..count).map(|k| (k, travelled(k))).collect();
-    order.sort_by(|a, b| b.1.total_cmp(&a.1));
-    let mut labels = vec![0; count];
-    let alone = ALONE.min(count.saturating_sub(1));
-    order[..alone].iter().enumerate().for_each(|(part, (k, _))| labels[*k] = part + 1);
-    Partition { labels, count: alone + 1, decisive: 0.0 }
+/// Leaves the splats that travel farthest, at most [`LOOSE_SPLATS`], in the order of their rows, and gives the others.
+pub(crate) fn leave_farthest(moving: &mut Vec<(u32, Change)>) -> Vec<(u32, Change)> {
+    moving.sort_by(|(a, x), (b, y)| y.travelled().total_cmp(&x.travelled()).then(a.cmp(b)));
+    let others = moving.split_off(moving.len().min(LOOSE_SPLATS));
+    moving.sort_unstable_by_key(|(row, _)| *row);
+    others
 }
 
 impl Change {
@@ -90,7 +81,7 @@ impl Change {
         let mut scales = ((self.low_scale + self.high_scale) / 2.0).exp().to_array();
         scales.sort_by(f64::total_cmp);
         let [least, middle, most] = scales;
-        (self.high - self.low).length() > LEAST_CHANGE * middle
+        self.travelled() > LEAST_CHANGE * middle
             || (self.high_scale - self.low_scale).max_element() > LEAST_CHANGE
             || self.turn * (1.0 - least / most) > LEAST_CHANGE
     }
@@ -98,6 +89,28 @@ impl Change {
     /// True where it goes farther than it is large.
     pub(crate) fn travels(&self) -> bool {
         let largest = ((self.low_scale + self.high_scale) / 2.0).exp().max_element();
-        (self.high - self.low).length() > TRAVELS * largest
+        self.travelled() > TRAVELS * largest
+    }
+
+    /// Diagonal of the box of its centres.
+    fn travelled(&self) -> f64 {
+        (self.high - self.low).length()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_farthest_are_left_and_no_splat_is_lost() {
+        let travelled = |row: u32| Change { high: DVec3::X * f64::from(row % 7), ..Change::default() };
+        let mut moving: Vec<(u32, Change)> =
+            (0..LOOSE_SPLATS as u32 + 30).map(|row| (row, travelled(row))).collect();
+        let others = leave_farthest(&mut moving);
+        assert_eq!((moving.len(), others.len()), (LOOSE_SPLATS, 30));
+        assert!(moving.is_sorted_by_key(|(row, _)| *row));
+        assert!(others.iter().all(|(row, _)| row % 7 == 0), "of those that travel least");
+        assert!(leave_farthest(&mut moving).is_empty());
     }
 }

@@ -10,7 +10,7 @@
 pub(crate) mod choose;
 pub(crate) mod dense;
 pub mod keys;
-pub(crate) mod loose;
+pub mod loose;
 pub mod parts;
 pub mod placement;
 pub mod procrustes;
@@ -48,7 +48,7 @@ pub struct MovingGroup {
     pub stands_still: bool,
     /// True where some splats travel that may show what passes over it ([`crate::motion::loose`]).
     pub is_passed: bool,
-    /// True where every splat moves on its own way, though the format holds bodies alone ([`crate::motion::loose`]).
+    /// True where every splat may have a path of its own, whatever motion is allowed ([`crate::motion::loose`]).
     pub is_loose: bool,
     /// Share of the weight that may be outliers.
     pub trim: f64,

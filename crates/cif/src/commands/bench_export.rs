@@ -20,7 +20,7 @@ use crate::output::{self, Outputs};
 The scene is built once per tolerance. Residuals are distances in world units: decisive is what the
 tolerance is held against (worst time, without the outermost 5 % of an object's weight). KB are the
 sampled values; write times and file sizes come with every format that this build can write, into a
-temporary folder. glTF holds no motion splat by splat: what is dense leaves as rigid parts there, and
+temporary folder. glTF holds few splats with paths of their own: what else is dense leaves as rigid parts there, and
 the lines of glTF tell what that misses (worst: largest decisive residual as a share of what is allowed).
 
   cif bench export table.cif

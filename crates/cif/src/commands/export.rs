@@ -160,7 +160,10 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     } else {
         print_motion(&graph);
         for (format, graph) in &rebuilt {
-            println!("motion in the {}, which holds no motion splat by splat:", format.about().name);
+            println!(
+                "motion in the {}, which holds splats with paths of their own only where these are few:",
+                format.about().name
+            );
             print_motion(graph);
         }
         if let Some(errors) = &errors {
