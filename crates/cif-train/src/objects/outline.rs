@@ -213,9 +213,11 @@ fn surrounded(
     outline
 }
 
-/// Times at which an object on a known path is not as low as it stands; all, where it may never stand.
+/// Times at which an object on a known path is not as low as it stands; all, where it may never stand: as the height of
+/// its outline is its reach, its middle is no higher then.
 fn raised(outline: &Outline, plane: &Plane) -> Vec<usize> {
-    let stands = standing_height(&outline.path, plane, outline.height);
+    let reaches = |stands: &f64| *stands < ROOM * outline.height;
+    let stands = standing_height(&outline.path, plane, outline.height).filter(reaches);
     let is_raised =
         |centre: DVec3| stands.is_none_or(|stands| plane.height(centre) > stands + RAISED * outline.height);
     outline.path.iter().filter(|(_, centre)| is_raised(**centre)).map(|(time, _)| *time).collect()
@@ -520,20 +522,24 @@ mod tests {
 
     #[test]
     fn what_rays_show_above_where_it_stands_is_off_the_plane() {
-        let place = |time: usize| {
-            let height = if (10..20).contains(&time) {
-                0.03 * time.min(29 - time).saturating_sub(9) as f64
-            } else {
-                0.0
-            };
-            DVec3::new(0.005 * time as f64 - 0.07, 0.0, RADIUS + height)
+        let lifted = |time: usize| match time {
+            10..20 => 0.03 * time.min(29 - time).saturating_sub(9) as f64,
+            _ => 0.0,
         };
-        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
-        let views = views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &truth, jumping);
+        let seen = |lowest: f64| {
+            let place = |time: usize| DVec3::new(0.005 * time as f64 - 0.07, 0.0, lowest + lifted(time));
+            let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+            views(solid(&sphere_places(RADIUS), |_| [0.8, 0.5, 0.2], 0.006), &truth, jumping)
+        };
+        let views = seen(RADIUS);
         let found = outlines(&views, Some(&FLOOR), TIMES);
         let crossing = found.iter().find(|outline| outline.is_surrounded).unwrap();
         assert!((11..19).all(|time| crossing.air.contains(&time)), "{:?}", crossing.air);
         assert!(crossing.air.len() < 16, "{:?}", crossing.air);
+        // Nothing stands higher than it reaches.
+        let found = outlines(&seen(1.5 * RADIUS), Some(&FLOOR), TIMES);
+        let crossing = found.iter().find(|outline| outline.is_surrounded).unwrap();
+        assert_eq!(crossing.air.len(), crossing.path.len());
         // Without a plane nothing tells.
         let found = outlines(&views, None, TIMES);
         assert!(found[0].is_surrounded && found[0].air.is_empty());

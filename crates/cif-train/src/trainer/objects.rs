@@ -59,11 +59,12 @@ impl Trainer {
     pub(super) fn find_other_movers(&mut self) -> Result<(), TrainError> {
         let travelling = &self.state.guidance.travelling;
         let others: Vec<u16> = (1..travelling.len()).filter(|k| !travelling[*k]).map(|k| k as u16).collect();
-        for (label, fitted) in self.fit_objects(&others)? {
+        let plane = self.support()?;
+        for (label, fitted) in self.fit_objects(&others, plane.as_ref())? {
             self.state.guidance.travelling[usize::from(label)] = true;
             self.fits.insert(label, fitted);
         }
-        self.find_parts(&others)
+        self.find_parts(&others, plane.as_ref())
     }
 
     /// Fits the travelling objects that were not fitted yet.
@@ -73,7 +74,8 @@ impl Trainer {
             .map(|(label, _)| label as u16)
             .filter(|label| !self.fits.contains_key(label) && !self.jointed.contains_key(label))
             .collect();
-        let fits = self.fit_objects(&rest)?;
+        let plane = self.support()?;
+        let fits = self.fit_objects(&rest, plane.as_ref())?;
         self.fits.extend(fits);
         Ok(())
     }
@@ -159,14 +161,17 @@ impl Trainer {
 
     /// Rigid motions of objects (labels: dense index + 1), without those that rest, are not rigid, or whose masks do
     /// not tell enough.
-    fn fit_objects(&mut self, labels: &[u16]) -> Result<Vec<(u16, Fitted)>, TrainError> {
+    fn fit_objects(
+        &mut self,
+        labels: &[u16],
+        plane: Option<&Plane>,
+    ) -> Result<Vec<(u16, Fitted)>, TrainError> {
         if !self.state.config.motion.rigid {
             return Ok(Vec::new());
         }
         let state = &self.state;
-        let plane = self.support()?;
         let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
-        let surroundings = self.surroundings(plane.as_ref(), &order);
+        let surroundings = self.surroundings(plane, &order);
         let most = MOST_ERROR[usize::from(state.dataset.points.source == PointSource::Random)];
         let wanted: Vec<(u16, Option<ObjectMotion>)> =
             labels.iter().map(|label| (*label, self.told(*label))).collect();

@@ -6,22 +6,21 @@ use rayon::prelude::*;
 
 use super::Trainer;
 use crate::error::TrainError;
-use crate::objects::{self, Jointed, Order};
+use crate::objects::{self, Jointed, Order, Plane};
 
 impl Trainer {
     /// Looks for parts of objects (labels: dense index + 1) that do not travel, nor move as a whole, and of which nothing
     /// is told: among all that moves, a joint far away does what travelling does.
-    pub(super) fn find_parts(&mut self, labels: &[u16]) -> Result<(), TrainError> {
+    pub(super) fn find_parts(&mut self, labels: &[u16], plane: Option<&Plane>) -> Result<(), TrainError> {
         let motion = &self.state.config.motion;
         if !motion.rigid || !motion.parts {
             return Ok(());
         }
         let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();
         let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
-        let plane = self.support()?;
         let state = &self.state;
         let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
-        let surroundings = self.surroundings(plane.as_ref(), &order);
+        let surroundings = self.surroundings(plane, &order);
         let find = |label: &u16| {
             let found = objects::find_part(*label, &state.dataset, &state.frames, surroundings)?;
             Ok(found.map(|found| (*label, found)))
