@@ -16,6 +16,7 @@ use cif_render::UNLABELLED;
 use rayon::prelude::*;
 
 use crate::error::TrainError;
+use crate::mask_edges::{self, Doubt};
 use crate::stop::Stop;
 use crate::switches::{Seen, put_right, switches};
 use crate::tracks::{misfits, observe};
@@ -50,11 +51,16 @@ struct Decoding {
     maps: BTreeMap<usize, PathBuf>,
     /// New labels of masks that show other objects, by index in the capture.
     switched: BTreeMap<usize, BTreeMap<u16, u16>>,
+    /// True where outlines of masks are moved to where colours change.
+    moves_edges: bool,
 }
 
 /// Pixels of masks with less confidence than this, in units of 1 / 255, are taken as unlabelled: their ids are wrong
 /// nearly as often as right (measured on propagated masks).
 const LEAST_CONFIDENCE: u8 = 192;
+
+/// Frames that tell whether masks are rough.
+const LOOKED: usize = 32;
 
 /// Frames decoded together before the budget is looked at again.
 const BATCH: usize = 32;
@@ -74,7 +80,8 @@ impl FrameStore {
         }
         let training = dataset.frames.iter().enumerate().filter(|(_, f)| f.split == Split::Train);
         let frames = training.map(|(index, _)| (index, None)).collect();
-        let decoding = Arc::new(Decoding { label_of_id, background, maps, switched: BTreeMap::new() });
+        let switched = BTreeMap::new();
+        let decoding = Arc::new(Decoding { label_of_id, background, maps, switched, moves_edges: false });
         let mut store = Self { frames, decoding, ahead: None };
         if store.frames.is_empty() {
             return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
@@ -193,6 +200,32 @@ impl FrameStore {
         Ok(&self.decoding.switched)
     }
 
+    /// Moves the outlines of masks to where colours change if they are rough (see [`crate::mask_edges`]); true where
+    /// they are. Masks that tell how sure they are, pixel by pixel, stay.
+    pub(crate) fn put_edges_right(&mut self, dataset: &Dataset, stop: &Stop) -> Result<bool, TrainError> {
+        let is_plain = |k: &usize| dataset.frames[self.index(*k)].confidence.is_none();
+        let plain: Vec<usize> = (0..self.len()).filter(is_plain).collect();
+        let doubt = |k: &usize| {
+            stop.check()?;
+            let frame = self.get(dataset, *k)?;
+            Ok(frame.labels.as_ref().map(|labels| Doubt::of(&frame.image, labels)))
+        };
+        let looked: Vec<usize> = plain.iter().step_by(plain.len().div_ceil(LOOKED).max(1)).copied().collect();
+        let doubts: Vec<Option<Doubt>> = looked.par_iter().map(doubt).collect::<Result<_, TrainError>>()?;
+        if !Doubt::sum(doubts.into_iter().flatten()).is_rough() {
+            return Ok(false);
+        }
+        let kept =
+            self.frames.par_iter_mut().filter(|(index, _)| dataset.frames[*index].confidence.is_none());
+        kept.filter_map(|(_, frame)| frame.as_mut()).for_each(|frame| {
+            let labels = frame.labels.as_ref().map(|labels| mask_edges::moved(&frame.image, labels));
+            *frame = Arc::new(TrainFrame::new(frame.image.clone(), labels, frame.features.clone()));
+        });
+        Arc::make_mut(&mut self.decoding).moves_edges = true;
+        self.ahead.iter().for_each(Ahead::give_up);
+        Ok(true)
+    }
+
     /// Renames dense labels, in frames kept and in those decoded later.
     pub(crate) fn relabel(&mut self, new_label: impl Fn(u16) -> u16) {
         let rename = |label: &u16| if *label == UNLABELLED { UNLABELLED } else { new_label(label - 1) + 1 };
@@ -224,6 +257,9 @@ impl Decoding {
         let mut labels = data.mask.map(|mask| mask.map(|id| self.label_of_id[usize::from(*id)]));
         if let Some(renamed) = self.switched.get(&index) {
             labels = labels.map(|labels| put_right(&labels, renamed));
+        }
+        if self.moves_edges && data.confidence.is_none() {
+            labels = labels.map(|labels| mask_edges::moved(&data.image, &labels));
         }
         if let (Some(labels), Some(confidence)) = (&mut labels, &data.confidence) {
             for (label, confidence) in labels.pixels.iter_mut().zip(&confidence.pixels) {
@@ -320,6 +356,45 @@ mod tests {
             store.relabel(|label| 1 - label.min(1));
         }
         assert!(same(&renamed, &read, 0));
+    }
+
+    #[test]
+    fn rough_outlines_are_moved_in_frames_kept_and_in_those_read_later() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene { times: 2, views: 3, ..Scene::default() });
+        let open =
+            |budget| FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Stop::default()).unwrap();
+        let labels = |store: &FrameStore, k| store.get(&dataset, k).unwrap().labels.clone().unwrap();
+        // Plain balls, and masks that are larger than these by two pixels.
+        let mut grown_masks = Vec::new();
+        for frame in &dataset.frames {
+            let path = frame.mask.as_ref().unwrap();
+            let ids = image::open(path).unwrap().into_luma8();
+            let color = |id: u8| image::Rgb([20 * id, 90, 250 - 20 * id]);
+            let plain = |x, y| color(ids.get_pixel(x, y).0[0]);
+            image::RgbImage::from_fn(ids.width(), ids.height(), plain).save(&frame.image).unwrap();
+            let grown = image::GrayImage::from_fn(ids.width(), ids.height(), |x, y| {
+                let near = |at: u32, end: u32| at.saturating_sub(2)..(at + 3).min(end);
+                let around = near(y, ids.height()).flat_map(|y| near(x, ids.width()).map(move |x| (x, y)));
+                image::Luma([around.map(|(x, y)| ids.get_pixel(x, y).0[0]).max().unwrap_or(0)])
+            });
+            grown_masks.push((path, grown));
+        }
+        let mut exact = open(u64::MAX);
+        let before = labels(&exact, 0);
+        assert!(!exact.put_edges_right(&dataset, &Stop::default()).unwrap());
+        assert_eq!(labels(&exact, 0), before);
+        grown_masks.into_iter().for_each(|(path, grown)| grown.save(path).unwrap());
+        let (mut kept, mut read) = (open(u64::MAX), open(0));
+        let off = |labels: &PixelGrid<u16>| {
+            labels.pixels.iter().zip(&before.pixels).filter(|(a, b)| a != b).count()
+        };
+        let grown = off(&labels(&kept, 0));
+        for store in [&mut kept, &mut read] {
+            assert!(store.put_edges_right(&dataset, &Stop::default()).unwrap());
+            assert!(4 * off(&labels(store, 0)) < grown, "{} of {grown}", off(&labels(store, 0)));
+        }
+        assert_eq!(labels(&kept, 3), labels(&read, 3));
     }
 
     #[test]

@@ -21,6 +21,7 @@
 //! | `objects` | how rigid objects get poses, before the scene is trained |
 //! | [`heads`] | what the instance stage learns, and how pixels tell it |
 //! | `switches` | which masks show another object than theirs |
+//! | `mask_edges` | where the outlines of rough masks belong |
 //! | [`tracks`] | where objects travel, from masks alone |
 //! | [`metrics`] | how good a field is |
 //! | `wgpu` | losses and optimiser on the GPU, behind the feature of that name |
@@ -60,6 +61,7 @@ mod guard;
 mod guidance;
 pub mod heads;
 pub mod losses;
+mod mask_edges;
 #[cfg(test)]
 mod measured;
 pub mod metrics;

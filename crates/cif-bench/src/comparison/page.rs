@@ -248,6 +248,10 @@ fn pictures(
         }
     }
     page.push_str("<section id=\"pictures\">\n<h2>One held-out frame</h2>\n");
+    page.push_str(
+        "<p class=\"how\">Labels are drawn where a pixel is an object's rather than the background's by at least a \
+         half. The scores above take the most probable label of every pixel, and count pixels with a true label.</p>\n",
+    );
     for (capture, seed) in captures {
         let of_capture: Vec<&Record> = records
             .iter()

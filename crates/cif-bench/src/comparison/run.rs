@@ -125,7 +125,7 @@ impl Subject<'_> {
             if Some(&view.frame.name) != shown.as_ref() {
                 return Ok(());
             }
-            for (suffix, picture) in draw(&view) {
+            for (suffix, picture) in draw(field, &view) {
                 let name = format!("{id}{suffix}.png");
                 save(&runs.file(&name), &picture).map_err(Failure)?;
                 pictures.push(name);

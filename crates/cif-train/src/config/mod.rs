@@ -211,6 +211,9 @@ pub struct MotionConfig {
     /// True where masks that show another object, by their colours and by their places in the frames before and after,
     /// are put right: exchanged where two show each other, else taken away. Default true; false in `paper`.
     pub switches: bool,
+    /// True where outlines of masks are moved to where the colours change, if many of them are clearly beside it, as
+    /// those of trackers are. Default true; false in `paper`.
+    pub edges: bool,
 }
 
 /// Cloning, splitting and pruning (methods reference 1.5). Steps count from the start of each stage.

@@ -97,6 +97,7 @@ fn paper(layout: Layout) -> TrainConfig {
         stillness: 0.0,
         misfit: 0.0,
         switches: false,
+        edges: false,
         parts: false,
         ..config.motion
     };
@@ -238,6 +239,7 @@ impl Default for MotionConfig {
             gaussians: 300,
             misfit: 20.0,
             switches: true,
+            edges: true,
         }
     }
 }

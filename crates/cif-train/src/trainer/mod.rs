@@ -232,6 +232,11 @@ impl Trainer {
             let switched = frames.put_switches_right(&dataset, &stop)?;
             warnings.extend(switch_warning(&dataset, switched));
         }
+        if has_instances && config.motion.edges && frames.put_edges_right(&dataset, &stop)? {
+            let what = "outlines of masks are rough, and were moved to where the colours change (motion.edges = false \
+                        keeps them)";
+            warnings.push(what.to_owned());
+        }
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
         Ok(Self {

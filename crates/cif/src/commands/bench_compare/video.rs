@@ -136,7 +136,7 @@ fn picture(renderer: &mut Renderer, shown: &[Shown], (camera, time): (&PinholeCa
             parts.push(rgb_picture(&rendered.color));
         }
         if let Some(instances) = &rendered.instances {
-            parts.push(labels(&mask_ids(field, &instances.label)));
+            parts.push(labels(&mask_ids(field, &instances.foreground_label())));
         }
     }
     side_by_side(&parts)
