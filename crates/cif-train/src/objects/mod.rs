@@ -5,7 +5,7 @@
 //! |---|---|
 //! | `order` | what cannot hide an object |
 //! | `view` | what a frame shows of an object |
-//! | `plane` | which plane objects stand on |
+//! | `plane`, `below` | which plane objects stand on, and which points may lie on it |
 //! | `outline`, `path` | how large an object is, and where it goes |
 //! | `shape` | its Gaussians alone, against crops |
 //! | `fit` | its poses and Gaussians, moved together |
@@ -18,6 +18,7 @@
 //! | `parts` | which part of it turns on a hinge or slides |
 
 mod ball;
+mod below;
 mod fit;
 mod follow;
 mod order;
@@ -50,6 +51,7 @@ use self::view::ObjectView;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
 use crate::random::{Purpose, stream};
+use crate::stop::Stop;
 
 /// Distance from a plane within which a point is on it, of the extent of the cameras.
 const ON_PLANE: f64 = 0.005;
@@ -61,6 +63,26 @@ pub(crate) fn support(dataset: &Dataset, points: &[[f32; 3]], seed: u64) -> Opti
     let cameras: Vec<DVec3> = training.map(|frame| frame.camera.centre()).collect();
     let rng = stream(seed, Purpose::Objects, 0);
     plane::support(&points, &cameras, ON_PLANE * dataset.extent(), rng)
+}
+
+/// The same among the points that lie just below objects in the images, which scatter where they come from structure
+/// from motion.
+///
+/// # Errors
+/// When a frame cannot be read, or the run is to stop.
+pub(crate) fn support_below(
+    dataset: &Dataset,
+    frames: &FrameStore,
+    seed: u64,
+    stop: &Stop,
+) -> Result<Option<Plane>, TrainError> {
+    let points: Vec<DVec3> =
+        dataset.points.positions.iter().map(|p| DVec3::from_array(p.map(f64::from))).collect();
+    let below = below::below(&points, dataset, frames, stop)?;
+    let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
+    let cameras: Vec<DVec3> = training.map(|frame| frame.camera.centre()).collect();
+    let rng = stream(seed, Purpose::Objects, 0);
+    Ok(plane::rough_support(&below, (&cameras, up(dataset)), rng))
 }
 
 /// Mean direction upwards in the training images of a capture.

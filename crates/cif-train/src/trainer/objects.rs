@@ -99,14 +99,18 @@ impl Trainer {
         }
     }
 
-    /// The plane that objects stand on: in the points of the capture or, where it has none, in what is reconstructed so far.
+    /// The plane that objects stand on: in the points of the capture, in those of them that lie below objects or, where
+    /// it has none, in what is reconstructed so far.
     ///
     /// # Errors
     /// When a frame cannot be read, or the run is to stop.
     pub(super) fn support(&self) -> Result<Option<Plane>, TrainError> {
         let (state, seed) = (&self.state, self.state.config.seed);
         if state.dataset.points.source != PointSource::Random {
-            return Ok(objects::support(&state.dataset, &state.dataset.points.positions, seed));
+            return match objects::support(&state.dataset, &state.dataset.points.positions, seed) {
+                Some(plane) => Ok(Some(plane)),
+                None => objects::support_below(&state.dataset, &state.frames, seed, &state.stop),
+            };
         }
         Ok(objects::support(&state.dataset, &self.seen_surfaces()?, seed))
     }
