@@ -81,7 +81,12 @@ impl Numbers {
                     }
                 }
             }
-            let scales = changes.then_some(shape.scales);
+            // As glTF holds them: the same along all axes, from those of the splats on.
+            let mut grown = |scale: &[f32; 3]| {
+                let size = self.between(0.5, 2.0) as f32;
+                scale.map(|scale| size * scale)
+            };
+            let scales = changes.then(|| splats.scales.iter().map(&mut grown).collect());
             let Splats { means, orientations, .. } = shape;
             samples.push(DenseSample { time_code, means, orientations, scales, extent: Bounds::EMPTY });
         }

@@ -83,14 +83,6 @@ fn quaternion_of(orthogonal: DMat3) -> DQuat {
     DQuat::from_mat3(&(orthogonal * orthogonal.determinant().signum())).normalize()
 }
 
-/// Turn and lengths of axes that are still at right angles: their order stays then, and so does what is between two
-/// times.
-fn orthogonal_axes(axes: &DMat3) -> Option<(DQuat, DVec3)> {
-    let lengths = DVec3::new(axes.x_axis.length(), axes.y_axis.length(), axes.z_axis.length());
-    let directions = *axes * DMat3::from_diagonal(lengths.recip());
-    is_identity(&(directions.transpose() * directions)).then(|| (quaternion_of(directions), lengths))
-}
-
 /// A map that is applied to splats: means, covariances, and spherical harmonics turned by the nearest orthogonal
 /// matrix. Light that left in a direction leaves in the same direction after a stretch, as engines draw it.
 pub struct Bake {
@@ -150,14 +142,8 @@ impl Bake {
                 continue;
             }
             let rotation = DMat3::from_quat(DQuat::from_xyzw(q[1], q[2], q[3], q[0]).normalize());
-            let turned = self.map.matrix3 * rotation;
-            if let Some((turned, factors)) = orthogonal_axes(&turned) {
-                *orientation = [turned.w, turned.x, turned.y, turned.z].map(|value| value as f32);
-                *scale = [0, 1, 2]
-                    .map(|axis| ((f64::from(scale[axis]) * factors[axis]) as f32).max(f32::MIN_POSITIVE));
-                continue;
-            }
-            let axes = turned * DMat3::from_diagonal(DVec3::from_array(scale.map(f64::from)));
+            let axes =
+                self.map.matrix3 * rotation * DMat3::from_diagonal(DVec3::from_array(scale.map(f64::from)));
             let svd = to_nalgebra(&axes).svd(true, false);
             let Some(u) = svd.u else { continue };
             // Axes have no sign; a turn has.
