@@ -515,14 +515,17 @@ fn single(translation: DVec3) -> document::Translation {
 /// The earliest time code of anything: it is at 0 seconds.
 fn first_time_code(graph: &SceneGraph) -> f64 {
     let nodes = graph.nodes.iter().flat_map(|node| {
-        let (parts, samples) = match &node.motion {
-            Motion::Parts(motion) => (motion.parts.as_slice(), [].as_slice()),
-            Motion::Dense(motion) => ([].as_slice(), motion.samples.as_slice()),
-            _ => ([].as_slice(), [].as_slice()),
+        let parts = match &node.motion {
+            Motion::Parts(motion) => motion.parts.as_slice(),
+            _ => &[],
+        };
+        let shape = match &node.motion {
+            Motion::Dense(motion) => motion.samples.first().map(|sample| sample.time_code),
+            _ => None,
         };
         let poses = node.track().first().into_iter().chain(parts.iter().filter_map(|p| p.track.first()));
         let visibility = node.visibility.first().map(|sample| sample.time_code);
-        poses.map(|pose| pose.time_code).chain(visibility).chain(samples.first().map(|s| s.time_code))
+        poses.map(|pose| pose.time_code).chain(visibility).chain(shape)
     });
     let cameras = graph.cameras.iter().filter_map(|track| track.samples.first()).map(|s| s.time_code);
     nodes.chain(cameras).fold(graph.time_codes.start(), f64::min)

@@ -120,7 +120,8 @@ pub struct SceneOptions {
     /// spherical-harmonics coefficients; 0 keeps them at every sampled frame. Default 0.01.
     pub appearance_tolerance: f64,
     /// The most expensive motion model that may be chosen; what is lost is only reported then. `rigid` keeps
-    /// every instance a rigid body; `parts` is for formats that hold no dense motion. Default dense.
+    /// every instance a rigid body; `parts` is for formats that hold no dense motion but that of a few splats of the
+    /// background ([`crate::LOOSE_SPLATS`]). Default dense.
     pub most_expensive_motion: MotionModel,
     /// Gaussians below this opacity are left out. Default 1/255: the blending rule never draws fainter ones.
     pub min_opacity: f32,

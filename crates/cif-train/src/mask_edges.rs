@@ -31,8 +31,8 @@ const ROUNDS: usize = 2;
 /// Share of the votes of two labels, and votes at the smallest distance, from which a pixel is clearly wrong.
 const CLEAR: (f32, f32) = (0.8, 3.0);
 
-/// Clearly wrong pixels, of those beside an outline, from which masks are rough. Exact masks have about 0.01 of them,
-/// those of trackers with an overlap of 0.9 some 0.07.
+/// Clearly wrong pixels, of those beside an outline, from which masks are rough. Exact masks of five
+/// captures have 0.003 to 0.010 of them, those of a tracker with its errors 0.041 to 0.060.
 const ROUGH: f64 = 0.03;
 
 /// Pixels that are clearly wrong, and those beside outlines, of some masks.

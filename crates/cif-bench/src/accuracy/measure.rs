@@ -44,7 +44,7 @@ pub struct Training<'a> {
 type Picture = PixelGrid<[u8; 3]>;
 
 /// Draws a view as pictures, each with what is put behind the identifier of the rung to name it.
-pub type Draw<'a> = &'a dyn Fn(&Field, &FrameView<'_>) -> Vec<(&'static str, Picture)>;
+pub type Draw<'a> = &'a dyn Fn(&FrameView<'_>) -> Vec<(&'static str, Picture)>;
 
 /// Trains a rung, going on where it was interrupted. The scene and its time; none when `stop` says so.
 ///
@@ -98,7 +98,7 @@ pub fn score(
         if Some(&view.frame.name) != shown.as_ref() {
             return Ok(());
         }
-        for (suffix, picture) in draw(field, &view) {
+        for (suffix, picture) in draw(&view) {
             let name = format!("{id}{suffix}.png");
             save(&folder.file(&name), &picture).map_err(Failure)?;
             record.pictures.push(name);

@@ -249,8 +249,9 @@ fn pictures(
     }
     page.push_str("<section id=\"pictures\">\n<h2>One held-out frame</h2>\n");
     page.push_str(
-        "<p class=\"how\">Labels are drawn where a pixel is an object's rather than the background's by at least a \
-         half. The scores above take the most probable label of every pixel, and count pixels with a true label.</p>\n",
+        "<p class=\"how\">CIF draws no label where a pixel is mostly background, nor do heads with a class for unlabelled \
+         pixels (Gaussian Grouping, SA4D); VLGS, Dr. Splat and Trace3D give the background to instances too. The scores \
+         above count only pixels with a true label, and take the most probable label there.</p>\n",
     );
     for (capture, seed) in captures {
         let of_capture: Vec<&Record> = records

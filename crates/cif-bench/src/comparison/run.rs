@@ -2,7 +2,7 @@
 
 use cif_dataset::Dataset;
 use cif_field::Checkpoint;
-use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
+use cif_train::metrics::{EvaluationError, EvaluationOptions, FrameView, evaluate, mask_ids};
 use cif_train::{HeadName, Stage, Start, Stop, TrainConfig, Trainer};
 use serde_json::json;
 
@@ -125,7 +125,11 @@ impl Subject<'_> {
             if Some(&view.frame.name) != shown.as_ref() {
                 return Ok(());
             }
-            for (suffix, picture) in draw(field, &view) {
+            // Pixels that are mostly background have no label in pictures; what decodes pixels tells that itself.
+            let rendered = view.rendered.instances.as_ref().filter(|_| decoder.is_none());
+            let shown = rendered.map(|instances| mask_ids(field, &instances.foreground_label()));
+            let view = FrameView { predicted: shown.as_ref().or(view.predicted), ..view };
+            for (suffix, picture) in draw(&view) {
                 let name = format!("{id}{suffix}.png");
                 save(&runs.file(&name), &picture).map_err(Failure)?;
                 pictures.push(name);

@@ -58,11 +58,8 @@ const ON_PLANE: f64 = 0.005;
 
 /// The plane that objects of a capture stand on, among points of what rests; `None` where no plane has enough of them.
 pub(crate) fn support(dataset: &Dataset, points: &[[f32; 3]], seed: u64) -> Option<Plane> {
-    let points: Vec<DVec3> = points.iter().map(|p| DVec3::from_array(p.map(f64::from))).collect();
-    let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
-    let cameras: Vec<DVec3> = training.map(|frame| frame.camera.centre()).collect();
     let rng = stream(seed, Purpose::Objects, 0);
-    plane::support(&points, &cameras, ON_PLANE * dataset.extent(), rng)
+    plane::support(&doubles(points), &cameras(dataset), ON_PLANE * dataset.extent(), rng)
 }
 
 /// The same among the points that lie just below objects in the images, which scatter where they come from structure
@@ -76,13 +73,19 @@ pub(crate) fn support_below(
     seed: u64,
     stop: &Stop,
 ) -> Result<Option<Plane>, TrainError> {
-    let points: Vec<DVec3> =
-        dataset.points.positions.iter().map(|p| DVec3::from_array(p.map(f64::from))).collect();
-    let below = below::below(&points, dataset, frames, stop)?;
-    let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
-    let cameras: Vec<DVec3> = training.map(|frame| frame.camera.centre()).collect();
+    let below = below::below(&doubles(&dataset.points.positions), dataset, frames, stop)?;
     let rng = stream(seed, Purpose::Objects, 0);
-    Ok(plane::rough_support(&below, (&cameras, up(dataset)), rng))
+    Ok(plane::rough_support(&below, (&cameras(dataset), up(dataset)), rng))
+}
+
+fn doubles(points: &[[f32; 3]]) -> Vec<DVec3> {
+    points.iter().map(|point| DVec3::from_array(point.map(f64::from))).collect()
+}
+
+/// Places of the training cameras.
+fn cameras(dataset: &Dataset) -> Vec<DVec3> {
+    let training = dataset.frames.iter().filter(|frame| frame.split == Split::Train);
+    training.map(|frame| frame.camera.centre()).collect()
 }
 
 /// Mean direction upwards in the training images of a capture.

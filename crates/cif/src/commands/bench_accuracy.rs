@@ -587,7 +587,7 @@ fn exact<'a>(
 }
 
 /// Pictures of a view for the report.
-fn draw(_: &Field, view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
+fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
     let mut pictures = vec![("", rgb_picture(&view.rendered.color))];
     if let (Some(ids), Some(layers)) = (view.predicted, &view.rendered.instances) {
         pictures.push((".instances", instance_picture(ids, &layers.foreground)));

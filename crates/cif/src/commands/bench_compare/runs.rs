@@ -11,10 +11,8 @@ use cif_bench::comparison::run::{Subject, settings};
 use cif_bench::comparison::tables::Missing;
 use cif_bench::records::Records;
 use cif_dataset::Dataset;
-use cif_field::Field;
 use cif_geometry::PixelGrid;
-use cif_render::InstanceImage;
-use cif_train::metrics::{FrameView, mask_ids};
+use cif_train::metrics::FrameView;
 use cif_train::{HeadName, Stop, TrainConfig};
 use serde_json::json;
 
@@ -179,12 +177,11 @@ pub(super) fn labels(ids: &PixelGrid<u16>) -> Picture {
     instance_picture(ids, &PixelGrid::filled(ids.width, ids.height, 1.0))
 }
 
-/// Pictures of a view for the page; pixels that are mostly background have no label there.
-fn draw(field: &Field, view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
+/// Pictures of a view for the page.
+fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
     let mut pictures = vec![("", rgb_picture(&view.rendered.color)), (".truth", view.truth.image.clone())];
     pictures.extend(view.truth.mask.as_ref().map(|mask| (".mask", labels(mask))));
-    let instances = view.rendered.instances.as_ref().map(InstanceImage::foreground_label);
-    pictures.extend(instances.map(|own| (".instances", labels(&mask_ids(field, &own)))));
+    pictures.extend(view.predicted.map(|ids| (".instances", labels(ids))));
     pictures
 }
 

@@ -136,7 +136,10 @@ fn picture(renderer: &mut Renderer, shown: &[Shown], (camera, time): (&PinholeCa
             parts.push(rgb_picture(&rendered.color));
         }
         if let Some(instances) = &rendered.instances {
-            parts.push(labels(&mask_ids(field, &instances.foreground_label())));
+            // As in the pictures of the page.
+            let shown =
+                if decoder.is_none() { instances.foreground_label() } else { instances.label.clone() };
+            parts.push(labels(&mask_ids(field, &shown)));
         }
     }
     side_by_side(&parts)
