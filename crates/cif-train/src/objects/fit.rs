@@ -54,7 +54,7 @@ pub(super) struct Fit<'a> {
     pub(super) touches: bool,
     /// Times at which it may be off the plane.
     pub(super) air: Vec<usize>,
-    moments: BTreeMap<usize, PoseMoments>,
+    pub(super) moments: BTreeMap<usize, PoseMoments>,
 }
 
 /// Moments of turns and translations.
@@ -324,24 +324,27 @@ impl<'a> Fit<'a> {
                 }
                 pose
             }
-            (Some(a), None) => self.onward(a, self.neighbours(a)[0], time),
-            (None, Some(a)) => self.onward(a, self.neighbours(a)[1], time),
+            (Some(a), None) => self.beyond(a, self.neighbours(a)[0], time),
+            (None, Some(a)) => self.beyond(a, self.neighbours(a)[1], time),
             (None, None) => return None,
         })
     }
 
-    /// Goes on at the speed between two times, for a few steps at most.
-    fn onward(&self, near: usize, far: Option<usize>, time: usize) -> Pose {
+    /// Pose at a time beyond the outermost one, beside another.
+    fn beyond(&self, near: usize, far: Option<usize>, time: usize) -> Pose {
         let last = self.poses[&near];
-        let Some(far) = far else { return last };
-        let steps = (time as f64 - near as f64) / (near as f64 - far as f64);
-        let steps = steps.clamp(-6.0, 6.0);
-        let before = self.poses[&far];
-        let turn = log(last.rotation * before.rotation.inverse());
-        Pose {
-            rotation: (DQuat::from_scaled_axis(steps * turn) * last.rotation).normalize(),
-            translation: last.translation + steps * (last.translation - before.translation),
-        }
+        far.map_or(last, |far| onward((near, last), (far, self.poses[&far]), time))
+    }
+}
+
+/// Pose at a time where the speed between a far and a near one leads, for a few steps at most.
+pub(super) fn onward((near, last): (usize, Pose), (far, before): (usize, Pose), time: usize) -> Pose {
+    let steps = (time as f64 - near as f64) / (near as f64 - far as f64);
+    let steps = steps.clamp(-6.0, 6.0);
+    let turn = log(last.rotation * before.rotation.inverse());
+    Pose {
+        rotation: (DQuat::from_scaled_axis(steps * turn) * last.rotation).normalize(),
+        translation: last.translation + steps * (last.translation - before.translation),
     }
 }
 

@@ -13,6 +13,7 @@
 //! | `texture`, `ball`, `sphere` | how it turns, where its outline does not tell |
 //! | `ways` | which ways of moving are tried |
 //! | `follow` | how it moves from time to time |
+//! | `mend` | which of its poses jump, and where they belong |
 //! | `trials` | which way is kept |
 //! | `start` | everything in order |
 //! | `parts` | which part of it turns on a hinge or slides |
@@ -21,6 +22,7 @@ mod ball;
 mod below;
 mod fit;
 mod follow;
+mod mend;
 mod order;
 mod outline;
 mod parts;

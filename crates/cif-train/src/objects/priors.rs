@@ -79,6 +79,11 @@ impl Fit<'_> {
         2.0 * DEPTH * ray.dot(pose.translation - *place) / (size * size) * ray
     }
 
+    /// True where it is held to its support, as nothing else tells its distance.
+    pub(super) fn is_held(&self) -> bool {
+        self.plane.is_some() && self.touches && self.one_camera
+    }
+
     /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane, or no deeper at times off
     /// the plane; `None` where nothing needs to move, and where several cameras tell the distance.
     pub(super) fn contact(
@@ -87,7 +92,7 @@ impl Fit<'_> {
         time: usize,
         pose: &Pose,
     ) -> Option<(PoseGradient, Vec<DVec3>)> {
-        let plane = self.plane.filter(|_| self.touches && self.one_camera)?;
+        let plane = self.plane.filter(|_| self.is_held())?;
         let size = self.size();
         let g = shape.gaussians();
         let normal = pose.rotation.inverse() * plane.normal;

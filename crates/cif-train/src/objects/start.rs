@@ -11,6 +11,7 @@ use rayon::prelude::*;
 
 use super::fit::{Fit, Turns, between, hull};
 use super::follow::follow;
+use super::mend::mend;
 use super::order::Order;
 use super::outline::{Outline, meeting_point};
 use super::path::smooth;
@@ -141,6 +142,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     };
     let (outline, stop) = (object.outline, object.surroundings.stop);
     grow(&mut fit, &path);
+    mend(&mut fit, stop)?;
     stop.check()?;
     let all: Vec<usize> = object.views_at(&fit.poses).collect();
     let levels = fit.levels();
@@ -340,6 +342,15 @@ fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
     let known: Vec<usize> = fit.poses.keys().copied().collect();
     let mut rest: Vec<usize> = path.keys().copied().filter(|time| !fit.poses.contains_key(time)).collect();
     rest.sort_by_key(|time| known.iter().map(|known| known.abs_diff(*time)).min());
+    // Between times at which it may be off its support, it may.
+    let is_off = |time: Option<&usize>| time.is_none_or(|time| fit.air.contains(time));
+    let beside = |time: usize| {
+        let after = known.partition_point(|known| *known < time);
+        is_off(known[..after].last()) && is_off(known.get(after))
+    };
+    let off: Vec<usize> =
+        rest.iter().copied().filter(|time| !fit.air.contains(time) && beside(*time)).collect();
+    fit.air.extend(off);
     for time in rest {
         let views: Vec<usize> =
             (0..fit.views.len()).filter(|view| fit.views[*view].time_index == time).collect();

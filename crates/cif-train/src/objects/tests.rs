@@ -6,14 +6,17 @@ use cif_field::tracks::RotationEvidence;
 use glam::{DQuat, DVec3};
 use rand::RngExt;
 
+use super::mend::mend;
 use super::outline;
 use super::plane::{self, Plane};
+use super::shape::Pose;
 use super::start::{Fitted, fit_object};
 use super::testing::{
     Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views, with_objects,
 };
 use super::view::ObjectView;
 use crate::random::{Purpose, stream};
+use crate::stop::Stop;
 
 fn fit(views: &[ObjectView]) -> Fitted {
     fit_on(Some(&FLOOR), views).unwrap()
@@ -260,6 +263,30 @@ fn one_camera_follows_an_object_from_where_it_stood_to_its_other_side() {
 }
 
 #[test]
+fn what_is_lifted_and_tilted_is_off_its_support_where_it_is_hardly_seen_too() {
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+        .map(|k| {
+            let share = ((k as f64 - 8.0) / 14.0).clamp(0.0, 1.0);
+            let up = (std::f64::consts::PI * share).sin();
+            let turn = DQuat::from_rotation_y(0.9 * up);
+            (turn, DVec3::new(-0.05 + 0.1 * share, 0.0, 0.045 + 0.1 * up))
+        })
+        .collect();
+    // Flat, so that it looks no larger.
+    let flat = sides(DVec3::new(0.06, 0.06, 0.03));
+    let mut views = views(solid(&flat, patches, 0.006), &truth, moving);
+    for view in views.iter_mut().filter(|view| (14..17).contains(&view.time_index)) {
+        view.visible = 0.4;
+    }
+    let fitted = fit(&views);
+    let (turn, shift) = errors(&fitted.poses, &truth);
+    assert!(fitted.way.starts_with("followed"), "{}", fitted.way);
+    assert!(turn < 12.0 && shift < 0.02, "{turn} deg, {shift} m");
+    let worst = (14..17).map(|time| (fitted.poses[&time].1 - truth[time].1).length()).fold(0.0, f64::max);
+    assert!(worst < 0.05, "{worst} m");
+}
+
+#[test]
 fn a_bar_that_rolls_about_its_long_axis_is_found_by_its_texture() {
     let mut rng = stream(0, Purpose::Objects, 14);
     let places: Vec<DVec3> = (0..2500)
@@ -278,6 +305,32 @@ fn a_bar_that_rolls_about_its_long_axis_is_found_by_its_texture() {
     let (turn, shift) = errors(&fitted.poses, &truth);
     assert!(fitted.way.starts_with("rolls"), "{}", fitted.way);
     assert!(turn < 15.0 && shift < 0.006, "{turn} deg, {shift} m");
+}
+
+#[test]
+fn poses_that_jump_are_mended_from_both_sides() {
+    let place = |k: usize| DVec3::new(0.006 * k as f64 - 0.09, 0.0, 0.05);
+    let truth: Vec<(DQuat, DVec3)> =
+        (0..TIMES).map(|k| (DQuat::from_rotation_z(0.04 * k as f64), place(k))).collect();
+    let views = views(solid(&box_places(), patches, 0.006), &truth, moving);
+    with_objects(Some(&FLOOR), &views, |objects| {
+        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
+        let poses: BTreeMap<usize, Pose> = (0..TIMES).map(|time| (time, pose(time))).collect();
+        let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
+        let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+        let all: Vec<usize> = (0..views.len()).collect();
+        fit.steps(&all, 600, |_| (1.0, 0.0, 0));
+        let jumped = 12..17;
+        for time in jumped.clone() {
+            let pose = fit.poses.get_mut(&time).unwrap();
+            *pose = Pose { rotation: DQuat::from_rotation_y(1.0) * pose.rotation, ..*pose };
+        }
+        mend(&mut fit, &Stop::default()).unwrap();
+        let turns =
+            (0..TIMES).map(|time| fit.poses[&time].rotation.angle_between(truth[time].0).to_degrees());
+        let turns: Vec<f64> = turns.collect();
+        assert!(turns.iter().all(|turn| *turn < 8.0), "{turns:.0?}");
+    });
 }
 
 #[test]

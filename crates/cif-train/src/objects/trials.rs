@@ -44,6 +44,11 @@ const MOST_IN_PLACE: f64 = 0.1;
 /// objects, and of round ones.
 const FOLLOW_GAIN: [f64; 2] = [0.98, 0.94];
 
+/// Error of an object on its support where it moves, relative to that where it rests, from which it may be off it, and
+/// the largest error of it off its support, relative to that on it, at which it is.
+const STRAINED: f64 = 1.3;
+const OFF_GAIN: f64 = 0.85;
+
 /// Largest error of turning as texture tells, relative to the best other way: a few Gaussians without texture prefer
 /// no turn.
 const TEXTURE_GAIN: f64 = 1.3;
@@ -112,6 +117,7 @@ pub(super) fn best_way<'a>(
             stands: surroundings.plane.is_some(),
             reference,
             followed: None,
+            off: Vec::new(),
             textured: None,
         },
         train,
@@ -220,6 +226,31 @@ impl<'a> Contest<'a> {
         self.object.outline.is_surrounded && simple.iter().all(|trial| trial.losses[1] > UNEXPLAINED)
     }
 
+    /// The object followed over known times: on its support where its path is, and off it if that explains more where
+    /// it does not rest, as of what is lifted and tilted, so that its size does not tell.
+    fn follow(&self, known: &[usize]) -> Result<Option<Fit<'a>>, TrainError> {
+        let (object, along) = (self.object, &self.paths.along);
+        let followed = |air: Option<Vec<usize>>| -> Result<Option<Fit<'a>>, TrainError> {
+            let Some((reference, mut fit)) = object.first(along, known) else { return Ok(None) };
+            fit.air = air.unwrap_or(fit.air);
+            follow(&mut fit, reference, along, &self.train, object.surroundings.stop)?;
+            Ok(Some(fit))
+        };
+        let Some(mut on) = followed(None)? else { return Ok(None) };
+        let rests: Vec<usize> = object.rests(along).into_iter().flatten().collect();
+        let (resting, moving): (Vec<usize>, Vec<usize>) =
+            self.train.iter().partition(|view| rests.contains(&object.views[**view].time_index));
+        let level = on.trial_level();
+        let is_explained = on.mean_loss(&moving, level) < STRAINED * on.mean_loss(&resting, level);
+        if is_explained || resting.is_empty() || !on.air.is_empty() || !on.is_held() {
+            return Ok(Some(on));
+        }
+        let moves = along.keys().copied().filter(|time| !rests.contains(time));
+        let Some(mut off) = followed(Some(moves.collect()))? else { return Ok(Some(on)) };
+        let gains = off.mean_loss(&moving, level) < OFF_GAIN * on.mean_loss(&moving, level);
+        Ok(Some(if gains { off } else { on }))
+    }
+
     /// All other ways along the path, beside the simple ones.
     fn along_the_path(&mut self, simple: Vec<Trial<'a>>) -> Result<Vec<Trial<'a>>, TrainError> {
         let mut trials = simple;
@@ -227,9 +258,8 @@ impl<'a> Contest<'a> {
             let mut known: Vec<usize> =
                 self.train.iter().map(|view| self.object.views[*view].time_index).collect();
             known.dedup();
-            if let Some((reference, mut fit)) = self.object.first(&self.paths.along, &known) {
-                follow(&mut fit, reference, &self.paths.along, &self.train, self.object.surroundings.stop)?;
-                self.paths.followed = Some(fit.poses);
+            if let Some(fit) = self.follow(&known)? {
+                (self.paths.followed, self.paths.off) = (Some(fit.poses), fit.air);
             }
         }
         let ways = if self.object.place > 0 && self.paths.followed.is_some() {
@@ -278,7 +308,7 @@ impl<'a> Contest<'a> {
                 Way::Followed | Way::Textured => (Turns::Free, None),
             };
             if *way == Way::Followed {
-                fit.air = self.object.may_be_off(&self.paths.along);
+                fit.air.clone_from(&self.paths.off);
             }
             fit.touches = !matches!(way, Way::Rest | Way::Spin(_));
             Some(Trial { way: *way, fit, losses: [0.0; 2] })

@@ -32,6 +32,9 @@ const ROUND: f64 = 0.93;
 /// Pixels of a mask from which its texture may show a turn.
 const TEXTURED: f64 = 400.0;
 
+/// Height of the centre, in radii, up to which an object may roll: what is taller stands.
+const ROLLS_UP_TO: f64 = 2.0;
+
 /// Reach of a path, in sizes, from which an object moves as a whole, and from which it may roll.
 const SHIFTS: f64 = 0.6;
 const ROLLS_FROM: f64 = 1.2;
@@ -88,8 +91,9 @@ pub(super) struct Paths<'a> {
     pub(super) stands: bool,
     /// Time at which all ways have the same pose.
     pub(super) reference: usize,
-    /// Poses that following found, where it did.
+    /// Poses that following found, where it did, and the times at which it may be off its support there.
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
+    pub(super) off: Vec<usize>,
     /// Poses with turns that its texture tells, where it does.
     pub(super) textured: Option<BTreeMap<usize, Pose>>,
 }
@@ -117,7 +121,8 @@ impl Paths<'_> {
         ways.extend((-180 / SLIDE..=180 / SLIDE).filter(|k| *k != 0).map(|k| Way::Slide(k * SLIDE)));
         // What its rays show off the support flies.
         let flies = self.outline.is_surrounded && !self.outline.air.is_empty();
-        if self.stands && !flies && self.reach() >= ROLLS_FROM * self.outline.size() {
+        let is_low = self.outline.height <= ROLLS_UP_TO * self.outline.radius;
+        if self.stands && !flies && is_low && self.reach() >= ROLLS_FROM * self.outline.size() {
             let radii: &[f64] = if is_round(self.outline) { &ROLLS } else { &OTHER_ROLLS };
             ways.extend(radii.iter().map(|radius| Way::Roll(*radius)));
         }
@@ -274,4 +279,40 @@ pub(super) fn rolled(places: &[DVec3], normal: DVec3, radius: f64) -> Vec<DQuat>
         rotations.push((DQuat::from_scaled_axis(turn) * last).normalize());
     }
     rotations
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_tall_slides_and_what_is_low_may_roll() {
+        let along: BTreeMap<usize, DVec3> = (0..20).map(|k| (k, DVec3::X * (0.02 * k as f64))).collect();
+        let rolls = |height: f64, radius: f64| {
+            let outline = Outline {
+                height,
+                radius,
+                roundness: 0.85,
+                path: along.clone(),
+                air: Vec::new(),
+                stiffness: 1.0,
+                is_surrounded: false,
+                is_resort: false,
+            };
+            let paths = Paths {
+                along: along.clone(),
+                place: DVec3::ZERO,
+                outline: &outline,
+                up: DVec3::Z,
+                stands: true,
+                reference: 0,
+                followed: None,
+                off: Vec::new(),
+                textured: None,
+            };
+            paths.ways().iter().any(|way| matches!(way, Way::Roll(_)))
+        };
+        assert!(rolls(0.03, 0.1) && rolls(0.05, 0.04));
+        assert!(!rolls(0.09, 0.03));
+    }
 }

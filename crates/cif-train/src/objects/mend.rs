@@ -1,0 +1,126 @@
+//! Mending of poses that jump: following a few times may end on a wrong side of what they show, from which following
+//! the times behind them comes back.
+
+use super::fit::{Fit, fresh_moments, log, onward};
+use super::shape::Pose;
+use crate::error::TrainError;
+use crate::stop::Stop;
+
+/// Turn per time, degrees, and shift, of the size, from which poses may jump, and how much more than the usual ones
+/// around them.
+const JUMP: (f64, f64, f64) = (8.0, 0.1, 2.5);
+
+/// Steps from one time to the next, before and after, among which one is usual.
+const AROUND: usize = 5;
+
+/// Steps of a pose from where the times before it lead.
+const SETTLE: usize = 60;
+
+/// Loss, of that of the present pose, up to which a pose explains more; up to which poses that close a jump are kept, as
+/// they move more evenly; and beyond which following ends.
+const GAIN: f64 = 0.98;
+const EVEN: f64 = 1.03;
+const MOST: f64 = 1.1;
+
+/// Turn, degrees, and distance, of the size, from the present pose up to which a jump is closed.
+const CLOSED: (f64, f64) = (8.0, 0.1);
+
+/// Visible share below which a view does not tell one pose from another.
+const TOLD: f64 = 0.2;
+
+/// Follows the object anew across jumps, from either side, as far as that explains more than the poses it has.
+///
+/// # Errors
+/// [`TrainError::Stopped`] when the run is to stop.
+pub(super) fn mend(fit: &mut Fit<'_>, stop: &Stop) -> Result<(), TrainError> {
+    let times: Vec<usize> = fit.poses.keys().copied().collect();
+    for after in jumps(fit, &times) {
+        stop.check()?;
+        march(fit, times[..after].iter().rev().copied(), &times[after..]);
+        march(fit, times[after..].iter().copied(), &times[..after].iter().rev().copied().collect::<Vec<_>>());
+    }
+    Ok(())
+}
+
+/// Places of times before which poses jump.
+fn jumps(fit: &Fit<'_>, times: &[usize]) -> Vec<usize> {
+    let speed = |pair: &[usize]| {
+        let [a, b] = [fit.poses[&pair[0]], fit.poses[&pair[1]]];
+        let steps = (pair[1] - pair[0]) as f64;
+        let turn = log(b.rotation * a.rotation.inverse()).length().to_degrees();
+        (turn / steps, (b.translation - a.translation).length() / fit.size() / steps)
+    };
+    let speeds: Vec<(f64, f64)> = times.windows(2).map(speed).collect();
+    let usual = |k: usize, of: fn(&(f64, f64)) -> f64| {
+        let near = k.saturating_sub(AROUND)..(k + AROUND + 1).min(speeds.len());
+        super::view::median(&mut speeds[near].iter().map(of).collect::<Vec<_>>())
+    };
+    let (turn, shift, more) = JUMP;
+    let is_jump = |k: &usize| {
+        let (turns, shifts) = speeds[*k];
+        (turns > turn && turns > more * usual(*k, |speed| speed.0))
+            || (shifts > shift && shifts > more * usual(*k, |speed| speed.1))
+    };
+    (0..speeds.len()).filter(is_jump).map(|k| k + 1).collect()
+}
+
+/// Follows times outward from those on the other side of a jump, nearest first: until it meets the poses that they have,
+/// or as long as it explains them better.
+fn march(fit: &mut Fit<'_>, times: impl Iterator<Item = usize>, known: &[usize]) {
+    let mut run: Vec<(usize, Pose)> =
+        known.iter().take(2).rev().map(|time| (*time, fit.poses[time])).collect();
+    let (begin, mut better) = (run.len(), run.len());
+    let (mut before, mut after) = (0.0, 0.0);
+    for time in times {
+        let Some((present, found, pose)) = settled(fit, time, &run) else { break };
+        if found > MOST * present {
+            break;
+        }
+        (before, after) = (before + present, after + found);
+        if better == run.len() && found < GAIN * present {
+            better += 1;
+        }
+        run.push((time, pose));
+        let old = fit.poses[&time];
+        let turn = log(pose.rotation * old.rotation.inverse()).length().to_degrees();
+        let shift = (pose.translation - old.translation).length() / fit.size();
+        if turn < CLOSED.0 && shift < CLOSED.1 {
+            if after < EVEN * before {
+                better = run.len();
+            }
+            break;
+        }
+    }
+    for (time, pose) in run.drain(..better).skip(begin) {
+        fit.poses.insert(time, pose);
+        fit.moments.remove(&time);
+    }
+}
+
+/// Losses of a time in its present pose, and in that where the last ones of a run lead, and that pose; `None` where the
+/// time does not tell.
+fn settled(fit: &Fit<'_>, time: usize, run: &[(usize, Pose)]) -> Option<(f64, f64, Pose)> {
+    let level = fit.trial_level();
+    let is_told = |view: &usize| fit.views[*view].time_index == time && fit.views[*view].visible >= TOLD;
+    let views: Vec<usize> = (0..fit.views.len()).filter(is_told).collect();
+    let near = run.last().filter(|_| !views.is_empty())?;
+    let mut guesses = vec![near.1];
+    if let Some(far) = run.len().checked_sub(2).map(|k| run[k]) {
+        guesses.push(onward(*near, far, time));
+    }
+    let mut shape = fit.shape.copied();
+    let loss = |shape: &mut _, pose: &Pose| -> f64 {
+        views.iter().map(|view| fit.loss_with(shape, *view, level, pose)).sum()
+    };
+    let present = loss(&mut shape, fit.poses.get(&time)?);
+    let found = guesses.into_iter().map(|mut pose| {
+        let mut moments = fresh_moments();
+        for step in 0..SETTLE {
+            let rate = if step < SETTLE / 2 { 1.0 } else { 0.3 };
+            fit.pose_step(&mut shape, views[step % views.len()], level, (&mut pose, &mut moments), rate);
+        }
+        (loss(&mut shape, &pose), pose)
+    });
+    let (found, pose) = found.min_by(|a, b| a.0.total_cmp(&b.0))?;
+    Some((present, found, pose))
+}
