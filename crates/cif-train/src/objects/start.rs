@@ -142,7 +142,9 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     };
     let (outline, stop) = (object.outline, object.surroundings.stop);
     grow(&mut fit, &path);
-    mend(&mut fit, stop)?;
+    if way == Way::Followed {
+        mend(&mut fit, stop)?;
+    }
     stop.check()?;
     let all: Vec<usize> = object.views_at(&fit.poses).collect();
     let levels = fit.levels();
