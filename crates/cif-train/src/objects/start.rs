@@ -206,7 +206,7 @@ impl<'a> Object<'a> {
 
     /// The object in the best way of moving along the path of its outline; `None` where it rests, or its masks do not
     /// tell enough.
-    fn begun(self) -> Result<Option<Started<'a>>, TrainError> {
+    pub(super) fn begun(self) -> Result<Option<Started<'a>>, TrainError> {
         let Object { views, outline, .. } = self;
         let path = smooth(&outline.path, views, self.surroundings.times, outline);
         let reliable: Vec<usize> = self.views_at(&path).filter(|view| views[*view].is_reliable()).collect();
@@ -340,7 +340,7 @@ fn roll_along(fit: &mut Fit<'_>, plane: &Plane, radius: f64) {
 }
 
 /// Adds the times that are seen, but not reliable, nearest first.
-fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
+pub(super) fn grow(fit: &mut Fit<'_>, path: &BTreeMap<usize, DVec3>) {
     let known: Vec<usize> = fit.poses.keys().copied().collect();
     let mut rest: Vec<usize> = path.keys().copied().filter(|time| !fit.poses.contains_key(time)).collect();
     rest.sort_by_key(|time| known.iter().map(|known| known.abs_diff(*time)).min());
