@@ -218,6 +218,23 @@ impl<'a> Fit<'a> {
         *pose = self.moved(view, pose, &gradient, moments, rate);
     }
 
+    /// A pose moved onto views in so many steps, the shape as it is.
+    pub(super) fn settled(
+        &self,
+        shape: &mut Shape,
+        views: &[usize],
+        level: usize,
+        mut pose: Pose,
+        steps: usize,
+    ) -> Pose {
+        let mut moments = fresh_moments();
+        for step in 0..steps {
+            let rate = if step < steps / 2 { 1.0 } else { 0.3 };
+            self.pose_step(shape, views[step % views.len()], level, (&mut pose, &mut moments), rate);
+        }
+        pose
+    }
+
     /// Mean loss over views, by their visible shares.
     pub(super) fn mean_loss(&mut self, views: &[usize], level: usize) -> f64 {
         let weights: f64 = views.iter().map(|view| self.views[*view].visible).sum();

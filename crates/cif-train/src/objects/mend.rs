@@ -1,8 +1,9 @@
 //! Mending of poses that jump: following a few times may end on a wrong side of what they show, from which following
 //! the times behind them comes back.
 
-use super::fit::{Fit, fresh_moments, log, onward};
+use super::fit::{Fit, log, onward};
 use super::shape::Pose;
+use super::view::median;
 use crate::error::TrainError;
 use crate::stop::Stop;
 
@@ -36,8 +37,9 @@ pub(super) fn mend(fit: &mut Fit<'_>, stop: &Stop) -> Result<(), TrainError> {
     let times: Vec<usize> = fit.poses.keys().copied().collect();
     for after in jumps(fit, &times) {
         stop.check()?;
-        march(fit, times[..after].iter().rev().copied(), &times[after..]);
-        march(fit, times[after..].iter().copied(), &times[..after].iter().rev().copied().collect::<Vec<_>>());
+        let earlier: Vec<usize> = times[..after].iter().rev().copied().collect();
+        march(fit, &earlier, &times[after..]);
+        march(fit, &times[after..], &earlier);
     }
     Ok(())
 }
@@ -45,15 +47,14 @@ pub(super) fn mend(fit: &mut Fit<'_>, stop: &Stop) -> Result<(), TrainError> {
 /// Places of times before which poses jump.
 fn jumps(fit: &Fit<'_>, times: &[usize]) -> Vec<usize> {
     let speed = |pair: &[usize]| {
-        let [a, b] = [fit.poses[&pair[0]], fit.poses[&pair[1]]];
+        let (turn, shift) = apart(&fit.poses[&pair[0]], &fit.poses[&pair[1]], fit.size());
         let steps = (pair[1] - pair[0]) as f64;
-        let turn = log(b.rotation * a.rotation.inverse()).length().to_degrees();
-        (turn / steps, (b.translation - a.translation).length() / fit.size() / steps)
+        (turn / steps, shift / steps)
     };
     let speeds: Vec<(f64, f64)> = times.windows(2).map(speed).collect();
     let usual = |k: usize, of: fn(&(f64, f64)) -> f64| {
         let near = k.saturating_sub(AROUND)..(k + AROUND + 1).min(speeds.len());
-        super::view::median(&mut speeds[near].iter().map(of).collect::<Vec<_>>())
+        median(&mut speeds[near].iter().map(of).collect::<Vec<_>>())
     };
     let (turn, shift, more) = JUMP;
     let is_jump = |k: &usize| {
@@ -64,14 +65,20 @@ fn jumps(fit: &Fit<'_>, times: &[usize]) -> Vec<usize> {
     (0..speeds.len()).filter(is_jump).map(|k| k + 1).collect()
 }
 
+/// Turn from one pose to another, degrees, and shift, of the size.
+fn apart(a: &Pose, b: &Pose, size: f64) -> (f64, f64) {
+    let turn = log(b.rotation * a.rotation.inverse()).length().to_degrees();
+    (turn, (b.translation - a.translation).length() / size)
+}
+
 /// Follows times outward from those on the other side of a jump, nearest first: until it meets the poses that they have,
 /// or as long as it explains them better.
-fn march(fit: &mut Fit<'_>, times: impl Iterator<Item = usize>, known: &[usize]) {
+fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
     let mut run: Vec<(usize, Pose)> =
         known.iter().take(2).rev().map(|time| (*time, fit.poses[time])).collect();
     let (begin, mut better) = (run.len(), run.len());
     let (mut before, mut after) = (0.0, 0.0);
-    for time in times {
+    for time in times.iter().copied() {
         let Some((present, found, pose)) = settled(fit, time, &run) else { break };
         if found > MOST * present {
             break;
@@ -81,9 +88,7 @@ fn march(fit: &mut Fit<'_>, times: impl Iterator<Item = usize>, known: &[usize])
             better += 1;
         }
         run.push((time, pose));
-        let old = fit.poses[&time];
-        let turn = log(pose.rotation * old.rotation.inverse()).length().to_degrees();
-        let shift = (pose.translation - old.translation).length() / fit.size();
+        let (turn, shift) = apart(&fit.poses[&time], &pose, fit.size());
         if turn < CLOSED.0 && shift < CLOSED.1 {
             if after < EVEN * before {
                 better = run.len();
@@ -113,12 +118,8 @@ fn settled(fit: &Fit<'_>, time: usize, run: &[(usize, Pose)]) -> Option<(f64, f6
         views.iter().map(|view| fit.loss_with(shape, *view, level, pose)).sum()
     };
     let present = loss(&mut shape, fit.poses.get(&time)?);
-    let found = guesses.into_iter().map(|mut pose| {
-        let mut moments = fresh_moments();
-        for step in 0..SETTLE {
-            let rate = if step < SETTLE / 2 { 1.0 } else { 0.3 };
-            fit.pose_step(&mut shape, views[step % views.len()], level, (&mut pose, &mut moments), rate);
-        }
+    let found = guesses.into_iter().map(|guess| {
+        let pose = fit.settled(&mut shape, &views, level, guess, SETTLE);
         (loss(&mut shape, &pose), pose)
     });
     let (found, pose) = found.min_by(|a, b| a.0.total_cmp(&b.0))?;

@@ -7,7 +7,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::ball;
-use super::fit::{Fit, Turns, fresh_moments};
+use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::outline::{self, Outline};
 use super::path::smooth;
@@ -240,14 +240,17 @@ impl<'a> Contest<'a> {
         let rests: Vec<usize> = object.rests(along).into_iter().flatten().collect();
         let (resting, moving): (Vec<usize>, Vec<usize>) =
             self.train.iter().partition(|view| rests.contains(&object.views[**view].time_index));
+        if resting.is_empty() || !on.air.is_empty() || !on.is_held() {
+            return Ok(Some(on));
+        }
         let level = on.trial_level();
-        let is_explained = on.mean_loss(&moving, level) < STRAINED * on.mean_loss(&resting, level);
-        if is_explained || resting.is_empty() || !on.air.is_empty() || !on.is_held() {
+        let error = on.mean_loss(&moving, level);
+        if error < STRAINED * on.mean_loss(&resting, level) {
             return Ok(Some(on));
         }
         let moves = along.keys().copied().filter(|time| !rests.contains(time));
         let Some(mut off) = followed(Some(moves.collect()))? else { return Ok(Some(on)) };
-        let gains = off.mean_loss(&moving, level) < OFF_GAIN * on.mean_loss(&moving, level);
+        let gains = off.mean_loss(&moving, level) < OFF_GAIN * error;
         Ok(Some(if gains { off } else { on }))
     }
 
@@ -343,12 +346,8 @@ impl<'a> Contest<'a> {
         let mut shape = fit.shape.copied();
         for view in self.left_out.iter().filter(|view| self.between.contains(&fit.views[**view].time_index)) {
             let time = fit.views[*view].time_index;
-            let Some(mut pose) = fit.poses.get(&time).copied() else { continue };
-            let mut moments = fresh_moments();
-            for step in 0..SETTLE {
-                let rate = if step < SETTLE / 2 { 1.0 } else { 0.3 };
-                fit.pose_step(&mut shape, *view, level, (&mut pose, &mut moments), rate);
-            }
+            let Some(pose) = fit.poses.get(&time).copied() else { continue };
+            let pose = fit.settled(&mut shape, &[*view], level, pose, SETTLE);
             fit.poses.insert(time, pose);
         }
     }

@@ -91,8 +91,9 @@ pub(super) struct Paths<'a> {
     pub(super) stands: bool,
     /// Time at which all ways have the same pose.
     pub(super) reference: usize,
-    /// Poses that following found, where it did, and the times at which it may be off its support there.
+    /// Poses that following found, where it did.
     pub(super) followed: Option<BTreeMap<usize, Pose>>,
+    /// Times at which it may be off its support in these.
     pub(super) off: Vec<usize>,
     /// Poses with turns that its texture tells, where it does.
     pub(super) textured: Option<BTreeMap<usize, Pose>>,
