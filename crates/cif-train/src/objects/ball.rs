@@ -4,6 +4,7 @@
 //! most of the ball at a time, so that each time is turned by itself, however fast it turns.
 
 use std::collections::BTreeMap;
+use std::f64::consts::PI;
 
 use glam::{DQuat, DVec3};
 use rayon::prelude::*;
@@ -20,8 +21,11 @@ use super::view::{ObjectView, are_discs, median};
 const ANY_APART: f64 = 0.2;
 const FEW: usize = 4;
 
-/// Cost in agreement, per radian of change, of such turns: of several that agree, the most even is taken.
-const FAST_COST: f64 = 0.06;
+/// Rotations of a time that are kept of these.
+const KEPT: usize = 32;
+
+/// Cost in agreement, per radian of change from time to time, of such turns.
+const FAST_COST: f64 = 0.15;
 
 /// Agreement of the times from which such turns are told: among so many some agree by chance.
 const TOLD_OF_ANY: f64 = 0.45;
@@ -69,6 +73,9 @@ const FEWEST_PIXELS: f64 = 150.0;
 /// Root mean square of the logarithms of the texture below which it may be light.
 const FAINT: f64 = 0.15;
 
+/// Weight of what several cameras show of a time, of that of the middle one, up to which it says nothing of its turn.
+const HIDDEN: f64 = 0.3;
+
 /// Agreement with the others, of the middle one, from which a time is turned well.
 const WELL: f64 = 0.7;
 
@@ -93,6 +100,11 @@ pub(super) fn turns(
     let side =
         |(time, views): (&usize, &Vec<&ObjectView>)| Side::of(*time, views, path[time], outline.size());
     let mut sides: Vec<Side> = at.iter().map(side).collect();
+    if are_surrounded {
+        let mut weights: Vec<f64> = sides.iter().map(Side::weight).collect();
+        let least = HIDDEN * median(&mut weights);
+        sides.retain(|side| side.weight() > least);
+    }
     let moves = |time: usize| {
         let next = path.range(time + 1..).next().or_else(|| path.range(..time).next_back());
         next.is_some_and(|(other, place)| {
@@ -131,43 +143,109 @@ fn followed_turns(sides: &[Side]) -> Option<Vec<DQuat>> {
 }
 
 /// The same of sides each of which shows most of the ball: outward from the one that shows most, each is turned as it
-/// agrees best with those before, whatever the turn between them.
+/// agrees best with those before, whatever the turn between them; then again with the texture of all others. Balls
+/// often look nearly the same from several sides, so that of all turns that agree those are taken which together are
+/// the most even.
 fn turns_by_themselves(sides: &[Side]) -> Option<Vec<DQuat>> {
     let first = (0..sides.len()).max_by(|a, b| sides[*a].weight().total_cmp(&sides[*b].weight()))?;
-    let mut order: Vec<usize> = (0..sides.len()).collect();
+    let mut order: Vec<usize> = (0..sides.len()).filter(|k| *k != first).collect();
     order.sort_by_key(|k| k.abs_diff(first));
-    let all = grid(std::f64::consts::PI, ANY_APART);
+    let all = grid(PI, ANY_APART);
     let mut turns = vec![DQuat::IDENTITY; sides.len()];
     let mut texture = Texture::of(&sides[first], DQuat::IDENTITY);
-    let found = |texture: &Texture, turns: &[DQuat], k: usize| {
-        let beside = if k < first { k + 1 } else { k - 1 };
-        let from = turns[beside];
-        // The turn between the two before leads on.
-        let before = if k < first { beside + 1 } else { beside.wrapping_sub(1) };
-        let is_known = if k < first { before <= first } else { beside > first };
-        let rate = if is_known { log(from * turns[before].inverse()) } else { DVec3::ZERO };
-        let rotation = |turn: DVec3| (DQuat::from_scaled_axis(turn) * from).normalize();
-        let cost = |turn: DVec3| FAST_COST * (turn - rate).length().min(std::f64::consts::PI);
-        let few = sides[k].few(FEW);
-        let rough = |turn: DVec3| texture.agreement(&few, rotation(turn)).share() - cost(turn);
-        let scores: Vec<f64> = all.par_iter().map(|turn| rough(*turn)).collect();
-        let best = (0..all.len()).max_by(|a, b| scores[*a].total_cmp(&scores[*b])).map_or(rate, |k| all[k]);
-        let score = |turn: DVec3| texture.agreement(&sides[k], rotation(turn)).share() - cost(turn);
-        let coarse = best_around((score(rate), rate), (best, &grid(ANY_APART, APART)), score);
-        rotation(refined(coarse, score).1)
-    };
-    for k in order.iter().copied().filter(|k| *k != first) {
-        turns[k] = found(&texture, &turns, k);
+    for k in order {
+        let best = agreeing(&sides[k], &texture, &all).into_iter();
+        turns[k] = best.max_by(|a, b| a.agreement.total_cmp(&b.agreement))?.rotation;
         texture.add(&Texture::of(&sides[k], turns[k]));
     }
     for _ in 0..AGAIN {
-        for k in order.iter().copied().filter(|k| *k != first) {
-            texture.subtract(&Texture::of(&sides[k], turns[k]));
-            turns[k] = found(&texture, &turns, k);
-            texture.add(&Texture::of(&sides[k], turns[k]));
-        }
+        let others = |k: usize| {
+            let mut others = texture.clone();
+            others.subtract(&Texture::of(&sides[k], turns[k]));
+            agreeing(&sides[k], &others, &all)
+        };
+        let agreeing: Vec<Vec<Agreeing>> = (0..sides.len()).map(others).collect();
+        turns = evenest(sides, &agreeing);
+        texture = Texture::empty();
+        sides.iter().zip(&turns).for_each(|(side, turn)| texture.add(&Texture::of(side, *turn)));
     }
     Some(turns)
+}
+
+/// A rotation in which a side agrees with a texture better than in those around.
+struct Agreeing {
+    rotation: DQuat,
+    agreement: f64,
+}
+
+/// The best of such rotations, among `all` that are tried.
+fn agreeing(side: &Side, texture: &Texture, all: &[DVec3]) -> Vec<Agreeing> {
+    let few = side.few(FEW);
+    let scores: Vec<f64> =
+        all.par_iter().map(|turn| texture.agreement(&few, DQuat::from_scaled_axis(*turn)).share()).collect();
+    let mut order: Vec<usize> = (0..all.len()).collect();
+    order.sort_by(|a, b| scores[*b].total_cmp(&scores[*a]));
+    let mut kept: Vec<DQuat> = Vec::with_capacity(KEPT);
+    for k in order {
+        let rotation = DQuat::from_scaled_axis(all[k]);
+        if kept.iter().all(|kept| rotation.angle_between(*kept) > 2.0 * ANY_APART) {
+            kept.push(rotation);
+        }
+        if kept.len() == KEPT {
+            break;
+        }
+    }
+    let changes = grid(ANY_APART, APART);
+    let best = |middle: DQuat| {
+        let rotation = |turn: DVec3| (DQuat::from_scaled_axis(turn) * middle).normalize();
+        let score = |turn: DVec3| texture.agreement(side, rotation(turn)).share();
+        let coarse = best_around((score(DVec3::ZERO), DVec3::ZERO), (DVec3::ZERO, &changes), score);
+        let (agreement, turn) = refined(coarse, score);
+        Agreeing { rotation: rotation(turn), agreement }
+    };
+    kept.into_par_iter().map(best).collect()
+}
+
+/// One of the rotations of every side, so that they agree most and the turns between them change least.
+fn evenest(sides: &[Side], of: &[Vec<Agreeing>]) -> Vec<DQuat> {
+    let turn = |k: usize, from: usize, to: usize| {
+        let steps = (sides[k].time - sides[k - 1].time) as f64;
+        log(of[k][to].rotation * of[k - 1][from].rotation.inverse()) / steps
+    };
+    // Of every pair of rotations of neighbouring sides, the best sum that ends with it, and the rotation before.
+    let mut sums: Vec<Vec<(f64, usize)>> = Vec::with_capacity(sides.len());
+    for k in 1..sides.len() {
+        let pairs = (0..of[k - 1].len()).flat_map(|from| (0..of[k].len()).map(move |to| (from, to)));
+        let best = |(from, to): (usize, usize)| {
+            let agreement = of[k][to].agreement;
+            let Some(before) = sums.last() else { return (of[0][from].agreement + agreement, 0) };
+            let next = turn(k, from, to);
+            let sum = |earlier: usize| {
+                let change = (next - turn(k - 1, earlier, from)).length().min(PI);
+                before[earlier * of[k - 1].len() + from].0 - FAST_COST * change
+            };
+            let sums = (0..of[k - 2].len()).map(|earlier| (sum(earlier), earlier));
+            let (sum, earlier) = sums.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0));
+            (sum + agreement, earlier)
+        };
+        let found = pairs.map(best).collect();
+        sums.push(found);
+    }
+    let mut chosen = vec![0; sides.len()];
+    for k in (1..sides.len()).rev() {
+        let found = &sums[k - 1];
+        let width = of[k].len();
+        let pair = if k + 1 == sides.len() {
+            (0..found.len()).max_by(|a, b| found[*a].0.total_cmp(&found[*b].0)).unwrap_or(0)
+        } else {
+            chosen[k - 1] * width + chosen[k]
+        };
+        (chosen[k - 1], chosen[k]) = (pair / width, pair % width);
+        if k > 1 {
+            chosen[k - 2] = found[pair].1;
+        }
+    }
+    chosen.iter().zip(of).map(|(chosen, of)| of[*chosen].rotation).collect()
 }
 
 /// Texture without sides that agree least with the others, which may be turned wrongly.

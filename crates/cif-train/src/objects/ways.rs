@@ -152,13 +152,22 @@ impl Paths<'_> {
         std::iter::once(Way::Rest).chain(SPINS.map(Way::Spin)).collect()
     }
 
-    /// Poses along the path with turns, from none at the reference.
+    /// Poses along the path with turns, from none at the reference; between times that have one it turns evenly.
     pub(super) fn turned(&self, turns: &BTreeMap<usize, DQuat>) -> BTreeMap<usize, Pose> {
-        let back = turns.get(&self.reference).copied().unwrap_or_default().inverse();
-        let mut rotation = DQuat::IDENTITY;
+        let turn = |time: usize| {
+            let before = turns.range(..=time).next_back();
+            let after = turns.range(time..).next();
+            match (before, after) {
+                (Some((a, from)), Some((b, to))) if a < b => {
+                    from.slerp(*to, (time - a) as f64 / (b - a) as f64)
+                }
+                (Some((_, turn)), _) | (None, Some((_, turn))) => *turn,
+                (None, None) => DQuat::IDENTITY,
+            }
+        };
+        let back = turn(self.reference).inverse();
         let pose = |(time, place): (&usize, &DVec3)| {
-            rotation = turns.get(time).map_or(rotation, |turn| *turn * back);
-            (*time, Pose { rotation, translation: *place })
+            (*time, Pose { rotation: turn(*time) * back, translation: *place })
         };
         self.along.iter().map(pose).collect()
     }
