@@ -505,6 +505,26 @@ mod tests {
     }
 
     #[test]
+    fn of_rotations_that_agree_the_most_even_are_taken() {
+        let even = |time: usize| DQuat::from_scaled_axis(0.3 * time as f64 * DVec3::Y);
+        let sides: Vec<Side> = (0..10).map(|time| Side::of(time, &[], DVec3::ZERO, 1.0)).collect();
+        // At some times a ball that looks nearly the same from elsewhere agrees better there.
+        let agreeing: Vec<Vec<Agreeing>> = (0..10)
+            .map(|time| {
+                let other = even(time) * DQuat::from_scaled_axis(2.0 * DVec3::X);
+                let agreement = if time % 3 == 1 { 0.62 } else { 0.58 };
+                vec![
+                    Agreeing { rotation: other, agreement },
+                    Agreeing { rotation: even(time), agreement: 0.6 },
+                ]
+            })
+            .collect();
+        for (time, rotation) in evenest(&sides, &agreeing).into_iter().enumerate() {
+            assert!(rotation.angle_between(even(time)) < 1e-6, "{time}");
+        }
+    }
+
+    #[test]
     fn a_plain_ball_does_not_show_its_turns() {
         assert!(thrown(|_| [0.8, 0.5, 0.2], even, jumping).is_none());
         assert!(thrown(|_| [0.8, 0.5, 0.2], even, rig).is_none());

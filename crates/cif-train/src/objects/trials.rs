@@ -14,7 +14,7 @@ use super::path::smooth;
 use super::start::{Object, Started};
 use super::texture;
 use super::view::ObjectView;
-use super::ways::{Bar, Paths, Way, is_round};
+use super::ways::{Bar, Paths, SMALLEST_SPIN, Way, is_round};
 use crate::error::TrainError;
 
 /// Gaussians of a trial.
@@ -32,6 +32,10 @@ pub(super) const REST_GAIN: [f64; 2] = [1.5, 1.15];
 
 /// Steps of poses of times that were left out.
 const SETTLE: usize = 40;
+
+/// Error of the smallest turn in place, relative to that of one whose angle the pictures do not tell, from which it turns
+/// at all: what deforms is explained by any of them.
+const SPIN_GAIN: f64 = 1.12;
 
 /// Error from which neither resting nor sliding explains what is seen, and that of a way that does, of it.
 const UNEXPLAINED: f64 = 0.1;
@@ -144,6 +148,9 @@ pub(super) fn best_way<'a>(
     let moves =
         decide(&trials, outline).filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
     let Some((way, rotation)) = moves else { return Ok(None) };
+    if rotation == RotationEvidence::Assumed && !object.is_told && !turns(|way| error_of(&trials, way), way) {
+        return Ok(None);
+    }
     // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
     let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
     let kept = if rolls_unseen { Way::Slide(0) } else { way };
@@ -419,6 +426,15 @@ fn error_of(trials: &[Trial<'_>], way: Way) -> Option<f64> {
     trials.iter().find(|trial| trial.way == way).map(|trial| trial.losses[1])
 }
 
+/// True of ways whose pictures tell that it turns, if not how far: the smallest turn in place explains less.
+fn turns(error_of: impl Fn(Way) -> Option<f64>, way: Way) -> bool {
+    let Way::Spin(degrees) = way else { return true };
+    let smallest = Way::Spin(SMALLEST_SPIN * degrees.signum());
+    // What was given up explains less.
+    let least = error_of(smallest).filter(|_| smallest != way);
+    least.zip(error_of(way)).is_none_or(|(least, error)| least > SPIN_GAIN * error)
+}
+
 /// True where the error of resting is at most `gain` times that of a way of moving.
 fn rests(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
     error_of(trials, Way::Rest).zip(error_of(trials, way)).is_some_and(|(rest, moves)| rest <= gain * moves)
@@ -463,4 +479,21 @@ fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvide
         return Some((turning, RotationEvidence::Assumed));
     }
     Some((turning, RotationEvidence::Observed))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_any_turn_in_place_explains_does_not_turn() {
+        let with = |smallest: Option<f64>| {
+            move |way: Way| if way == Way::Spin(SMALLEST_SPIN) { smallest } else { Some(0.04) }
+        };
+        assert!(!turns(with(Some(0.042)), Way::Spin(160)));
+        assert!(turns(with(Some(0.05)), Way::Spin(160)));
+        assert!(turns(with(None), Way::Spin(160)), "given up");
+        assert!(turns(with(Some(0.042)), Way::Spin(SMALLEST_SPIN)));
+        assert!(turns(with(Some(0.042)), Way::Slide(0)));
+    }
 }

@@ -14,8 +14,9 @@ use super::view::{ObjectView, median};
 /// Turns of slides, degrees apart.
 const SLIDE: i32 = 30;
 
-/// Turns in place, degrees.
+/// Turns in place, degrees, and the smallest of them.
 const SPINS: [i32; 12] = [-240, -200, -160, -120, -80, -40, 40, 80, 120, 160, 200, 240];
+pub(super) const SMALLEST_SPIN: i32 = 40;
 
 /// Rolling radii tried of balls, of the height.
 const ROLLS: [f64; 9] = [0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08];
