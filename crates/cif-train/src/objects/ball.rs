@@ -208,10 +208,13 @@ fn agreeing(side: &Side, texture: &Texture, all: &[DVec3]) -> Vec<Agreeing> {
 
 /// One of the rotations of every side, so that they agree most and the turns between them change least.
 fn evenest(sides: &[Side], of: &[Vec<Agreeing>]) -> Vec<DQuat> {
-    let turn = |k: usize, from: usize, to: usize| {
+    // Turns from every rotation of the side before one to every rotation of it.
+    let turns_to = |k: usize| -> Vec<DVec3> {
         let steps = (sides[k].time - sides[k - 1].time) as f64;
-        log(of[k][to].rotation * of[k - 1][from].rotation.inverse()) / steps
+        let turn = |from: &Agreeing, to: &Agreeing| log(to.rotation * from.rotation.inverse()) / steps;
+        of[k - 1].iter().flat_map(|from| of[k].iter().map(move |to| turn(from, to))).collect()
     };
+    let turns: Vec<Vec<DVec3>> = (1..sides.len()).map(turns_to).collect();
     // Of every pair of rotations of neighbouring sides, the best sum that ends with it, and the rotation before.
     let mut sums: Vec<Vec<(f64, usize)>> = Vec::with_capacity(sides.len());
     for k in 1..sides.len() {
@@ -219,10 +222,11 @@ fn evenest(sides: &[Side], of: &[Vec<Agreeing>]) -> Vec<DQuat> {
         let best = |(from, to): (usize, usize)| {
             let agreement = of[k][to].agreement;
             let Some(before) = sums.last() else { return (of[0][from].agreement + agreement, 0) };
-            let next = turn(k, from, to);
+            let next = turns[k - 1][from * of[k].len() + to];
             let sum = |earlier: usize| {
-                let change = (next - turn(k - 1, earlier, from)).length().min(PI);
-                before[earlier * of[k - 1].len() + from].0 - FAST_COST * change
+                let pair = earlier * of[k - 1].len() + from;
+                let change = (next - turns[k - 2][pair]).length().min(PI);
+                before[pair].0 - FAST_COST * change
             };
             let sums = (0..of[k - 2].len()).map(|earlier| (sum(earlier), earlier));
             let (sum, earlier) = sums.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, 0));
