@@ -50,8 +50,8 @@ pub(super) struct Fit<'a> {
     /// True with one camera per time, so that distances are not observed.
     pub(super) one_camera: bool,
     pub(super) rng: Pcg64,
-    /// True where it stands on the plane at times that are not in the air.
-    pub(super) touches: bool,
+    /// True where it is taken to stay in one place, whatever its path and its support say.
+    pub(super) stays: bool,
     /// Times at which it may be off the plane.
     pub(super) air: Vec<usize>,
     pub(super) moments: BTreeMap<usize, PoseMoments>,
@@ -153,7 +153,7 @@ impl<'a> Fit<'a> {
             near,
             one_camera,
             rng,
-            touches: true,
+            stays: false,
             air: outline.air.clone(),
             moments: BTreeMap::new(),
         }
@@ -334,6 +334,7 @@ impl<'a> Fit<'a> {
                 let mut pose = between(&self.poses[&a], &self.poses[&b], share);
                 let path = |time: usize| self.outline.path.get(&time).copied();
                 if self.outline.is_surrounded
+                    && !self.stays
                     && let (Some(from), Some(to), Some(place)) = (path(a), path(b), path(time))
                 {
                     // Beside the path as its neighbours are.

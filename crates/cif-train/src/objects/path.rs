@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use nalgebra::{DMatrix, DVector};
 
 use super::outline::Outline;
-use super::view::{ObjectView, are_discs, median};
+use super::view::{ObjectView, WITHIN, are_discs, median};
 use crate::tracks::across;
 
 /// Weights of squared second differences, in steps of a 60th of the sequence: of paths that a plane cuts from rays,
@@ -28,6 +28,9 @@ const ASIDE_SHARE: f64 = 0.2;
 /// Times on either side among which rays cross, and the angle from which they do, radians.
 const BESIDE: usize = 2;
 const CROSSES: f64 = 0.7;
+
+/// Times on either side of one that tell where it belongs.
+const LED_BY: usize = 6;
 
 /// Rounds of reweighting of rays, by their distances from the path.
 const ROUNDS: usize = 5;
@@ -53,7 +56,7 @@ pub(super) fn smooth(
     if keys.len() < 3 {
         return raw.clone();
     }
-    let aside = if outline.air.is_empty() { aside(raw, outline.size()) } else { BTreeSet::new() };
+    let aside = if outline.air.is_empty() { places_aside(raw, outline.size()) } else { BTreeSet::new() };
     let near = |time: &usize| {
         let of = || views.iter().filter(|view| view.time_index == *time);
         let seen = of().map(|view| view.visible).fold(0.0, f64::max);
@@ -65,33 +68,41 @@ pub(super) fn smooth(
     even(&keys, &near, &vec![outline.stiffness; keys.len()], times).unwrap_or_else(|| raw.clone())
 }
 
-/// Times at which a path of an object of this size jumps aside, and back.
-fn aside(raw: &BTreeMap<usize, DVec3>, size: f64) -> BTreeSet<usize> {
-    let mut kept: Vec<usize> = raw.keys().copied().collect();
-    let mut found = BTreeSet::new();
+/// Parts of a path that lie far from where those beside them lead, which `missed` tells of one of those that are left: by
+/// what distance, and the size of the object; `None` where nothing leads.
+fn aside<T>(mut kept: Vec<T>, missed: impl Fn(&[T], usize) -> Option<(f64, f64)>) -> Vec<T> {
     let most = (ASIDE_SHARE * kept.len() as f64) as usize;
+    let mut found = Vec::new();
     while found.len() < most && kept.len() > 3 {
-        // From between those beside it; at the ends from where the next two lead.
-        let jump = |k: usize| {
-            let last = kept.len() - 1;
-            let [a, b] = if k == 0 {
-                [1, 2]
-            } else if k == last {
-                [last - 1, last - 2]
-            } else {
-                [k - 1, k + 1]
-            };
-            let [time, a, b] = [k, a, b].map(|k| kept[k]);
-            let share = (time as f64 - a as f64) / (b as f64 - a as f64);
-            (raw[&time] - raw[&a].lerp(raw[&b], share)).length()
-        };
-        let jumps: Vec<f64> = (0..kept.len()).map(jump).collect();
-        let far = (ASIDE * size).max(OF_USUAL * median(&mut jumps.clone()));
-        let largest = (0..jumps.len()).max_by(|a, b| jumps[*a].total_cmp(&jumps[*b]));
-        let Some(k) = largest.filter(|k| jumps[*k] > far) else { break };
-        found.insert(kept.remove(k));
+        let missed: Vec<Option<(f64, f64)>> = (0..kept.len()).map(|k| missed(&kept, k)).collect();
+        let middle =
+            |of: fn(&(f64, f64)) -> f64| median(&mut missed.iter().flatten().map(of).collect::<Vec<_>>());
+        let far = (ASIDE * middle(|missed| missed.1)).max(OF_USUAL * middle(|missed| missed.0));
+        let distance = |k: &usize| missed[*k].map_or(0.0, |(distance, _)| distance);
+        let largest = (0..kept.len()).max_by(|a, b| distance(a).total_cmp(&distance(b)));
+        let Some(k) = largest.filter(|k| distance(k) > far) else { break };
+        found.push(kept.remove(k));
     }
     found
+}
+
+/// Times at which a path of an object of this size jumps aside, and back.
+fn places_aside(raw: &BTreeMap<usize, DVec3>, size: f64) -> BTreeSet<usize> {
+    // From between those beside it; at the ends from where the next two lead.
+    let jump = |kept: &[usize], k: usize| {
+        let last = kept.len() - 1;
+        let [a, b] = if k == 0 {
+            [1, 2]
+        } else if k == last {
+            [last - 1, last - 2]
+        } else {
+            [k - 1, k + 1]
+        };
+        let [time, a, b] = [k, a, b].map(|k| kept[k]);
+        let share = (time as f64 - a as f64) / (b as f64 - a as f64);
+        Some(((raw[&time] - raw[&a].lerp(raw[&b], share)).length(), size))
+    };
+    aside(raw.keys().copied().collect(), jump).into_iter().collect()
 }
 
 /// The path that passes near the rays of one view per time and bends little; nothing where neighbouring rays hardly
@@ -105,15 +116,22 @@ pub(super) fn crossing(views: &[ObjectView], times: usize) -> BTreeMap<usize, DV
 /// The same, where it is known whether it bounces: the middle of its masks is then sure, so that a path that bends
 /// somewhere is found before rays are told to be off it. Nothing else tells where its ends are.
 fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usize, DVec3> {
-    let views: Vec<&ObjectView> = views.iter().filter(|view| !view.cut).collect();
+    let mut views: Vec<&ObjectView> = views.iter().filter(|view| !view.cut).collect();
     let rays: Vec<DVec3> = views.iter().map(|view| view.camera.ray(view.centroid).normalize()).collect();
-    let keys: Vec<usize> = views.iter().map(|view| view.time_index).collect();
     let widest = |k: usize| {
         let beside = k.saturating_sub(BESIDE)..=(k + BESIDE).min(rays.len() - 1);
         beside.map(|other| rays[k].angle_between(rays[other])).fold(0.0, f64::max)
     };
     let mut angles: Vec<f64> = (0..rays.len()).map(widest).collect();
-    if keys.len() < 3 || keys.windows(2).any(|pair| pair[0] == pair[1]) || median(&mut angles) < CROSSES {
+    let is_one_camera = views.windows(2).all(|pair| pair[0].time_index != pair[1].time_index);
+    if !is_one_camera || median(&mut angles) < CROSSES {
+        return BTreeMap::new();
+    }
+    // Masks that show something else as well, or something else.
+    let wrong = aside(views.clone(), |kept, k| missed(kept, k, times));
+    views.retain(|view| !wrong.iter().any(|wrong| wrong.time_index == view.time_index));
+    let keys: Vec<usize> = views.iter().map(|view| view.time_index).collect();
+    if keys.len() < 3 {
         return BTreeMap::new();
     }
     let mut weights: Vec<f64> = views.iter().map(|view| view.visible.powi(2) + 1e-4).collect();
@@ -148,6 +166,28 @@ fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usi
         path = found;
     }
     path
+}
+
+/// Distance of the ray of a view from the path of those around it, and the reach of its mask there; `None` at the ends,
+/// and where these do not tell.
+fn missed(views: &[&ObjectView], at: usize, times: usize) -> Option<(f64, f64)> {
+    let near = at.checked_sub(1)?.saturating_sub(LED_BY)..(at + LED_BY + 1).min(views.len());
+    if at + 1 >= near.end {
+        return None;
+    }
+    let keys: Vec<usize> = views[near.clone()].iter().map(|view| view.time_index).collect();
+    let ray = |k: usize| {
+        let view = views[k];
+        let weight = if k == at { 0.0 } else { view.visible.powi(2) + 1e-4 };
+        let across = weight * across(&view.camera, view.centroid);
+        (across, across * view.camera.centre())
+    };
+    let rays: Vec<(DMat3, DVec3)> = near.map(ray).collect();
+    let place = even(&keys, &rays, &vec![CROSSING; keys.len()], times)?[&views[at].time_index];
+    let camera = &views[at].camera;
+    let distance = (across(camera, views[at].centroid) * (place - camera.centre())).length();
+    let depth = camera.project(place)?.1;
+    Some((distance, views[at].reach(WITHIN) * depth / camera.focal_px.x))
 }
 
 /// The path of least bending near some places: minimises `(c - c0) . A (c - c0)`, given as `A` and `A c0` for every
@@ -199,7 +239,7 @@ fn bend(keys: &[usize], path: &BTreeMap<usize, DVec3>, k: usize) -> DVec3 {
 
 #[cfg(test)]
 mod tests {
-    use glam::DQuat;
+    use glam::{DQuat, DVec2};
 
     use super::super::testing::{TIMES, jumping, solid, sphere_places, views};
     use super::*;
@@ -210,24 +250,44 @@ mod tests {
         let bends = |time: usize| (time, DVec3::new((0.3 * time as f64).sin(), 0.1, 0.0));
         for wrong in [0, 7, 19] {
             let mut path: BTreeMap<usize, DVec3> = (0..20).map(straight).collect();
-            assert!(aside(&path, 0.05).is_empty());
+            assert!(places_aside(&path, 0.05).is_empty());
             path.insert(wrong, DVec3::new(0.02 * wrong as f64, -0.2, 0.0));
-            assert_eq!(aside(&path, 0.05), BTreeSet::from([wrong]));
+            assert_eq!(places_aside(&path, 0.05), BTreeSet::from([wrong]));
         }
         // Fast, but not aside.
-        assert!(aside(&(0..20).map(bends).collect(), 0.05).is_empty());
+        assert!(places_aside(&(0..20).map(bends).collect(), 0.05).is_empty());
+    }
+
+    /// Place of a ball that bounces.
+    fn place(time: usize) -> DVec3 {
+        let share = (time % 15) as f64 / 15.0;
+        DVec3::new(0.01 * time as f64 - 0.15, 0.0, 0.05 + 0.6 * share * (1.0 - share))
+    }
+
+    fn bouncing() -> Vec<ObjectView> {
+        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (DQuat::IDENTITY, place(time))).collect();
+        views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth, jumping)
+    }
+
+    #[test]
+    fn masks_that_show_something_else_do_not_bend_a_path() {
+        let mut views = bouncing();
+        let error = |path: &BTreeMap<usize, DVec3>| {
+            path.iter().map(|(time, found)| (*found - place(*time)).length()).fold(0.0, f64::max)
+        };
+        let clean = crossing(&views, TIMES);
+        assert_eq!(clean.len(), TIMES, "bounces are not aside");
+        for (time, shift) in [(4, [30.0, 5.0]), (5, [24.0, -20.0]), (21, [-25.0, 15.0])] {
+            views[time].centroid += DVec2::from(shift);
+        }
+        let found = crossing(&views, TIMES);
+        assert!([4, 5, 21].iter().all(|time| !found.contains_key(time)) && found.len() == TIMES - 3);
+        assert!(error(&found) < 1.2 * error(&clean), "{} m, {} m without", error(&found), error(&clean));
     }
 
     #[test]
     fn a_path_that_bounces_is_nearer_where_it_does() {
-        let height = |time: usize| {
-            let share = (time % 15) as f64 / 15.0;
-            0.05 + 0.6 * share * (1.0 - share)
-        };
-        let place = |time: usize| DVec3::new(0.01 * time as f64 - 0.15, 0.0, height(time));
-        let still = DQuat::IDENTITY;
-        let truth: Vec<(DQuat, DVec3)> = (0..TIMES).map(|time| (still, place(time))).collect();
-        let views = views(solid(&sphere_places(0.05), |_| [0.8, 0.5, 0.2], 0.006), &truth, jumping);
+        let views = bouncing();
         let error = |path: &BTreeMap<usize, DVec3>| (path[&15] - place(15)).length();
         let [found, smooth] =
             [crossing(&views, TIMES), along_rays(&views, TIMES, false)].map(|path| error(&path));

@@ -317,7 +317,7 @@ impl<'a> Object<'a> {
         let shape = self.hull(&poses, FOLLOWED, &mut self.rng())?;
         let mut fit = self.fit(poses, shape, self.rng());
         fit.turns = Turns::Given;
-        fit.touches = false;
+        fit.stays = true;
         fit.steps(views, STEPS[1], |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, 0));
         Some(fit.mean_loss(views, 0))
     }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
 use cif_field::{Field, Gaussians};
-use cif_geometry::{PinholeCamera, RigidTransform};
+use cif_geometry::{PinholeCamera, PixelGrid, RigidTransform};
 use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{Channels, RenderSettings, synthetic};
 use glam::{DMat3, DQuat, DVec2, DVec3};
@@ -78,6 +78,16 @@ pub(super) fn views_of_groups(
     poses: &[Vec<(DQuat, DVec3)>],
     cameras: Cameras,
 ) -> Vec<ObjectView> {
+    views_in_masks((gaussians, group_of), poses, cameras, |labels| labels)
+}
+
+/// The same in masks that are not exact.
+pub(super) fn views_in_masks(
+    (gaussians, group_of): (Gaussians, Vec<u32>),
+    poses: &[Vec<(DQuat, DVec3)>],
+    cameras: Cameras,
+    mut masks: impl FnMut(PixelGrid<u16>) -> PixelGrid<u16>,
+) -> Vec<ObjectView> {
     let time = |k: usize| k as f64 / (TIMES - 1) as f64;
     let group = |poses: &Vec<(DQuat, DVec3)>| {
         let poses = poses.iter().enumerate().map(|(k, (rotation, translation))| TrackPose {
@@ -103,7 +113,7 @@ pub(super) fn views_of_groups(
     for (k, camera) in (0..TIMES).flat_map(|k| cameras(k).into_iter().map(move |camera| (k, camera))) {
         let channels = Channels { depth: false, instances: false };
         let image = renderer.render(&field, &camera, time(k), &settings, channels);
-        let labels = image.alpha.map(|alpha| u16::from(*alpha > 0.5));
+        let labels = masks(image.alpha.map(|alpha| u16::from(*alpha > 0.5)));
         let bytes = image.color.map(|c| c.map(|c| (255.0 * c.clamp(0.0, 1.0)).round() as u8));
         let frame = Arc::new(TrainFrame { image: bytes, labels: Some(labels), labelled: 0, features: None });
         views.extend(ObjectView::new((1, &behind), k, &camera, &frame));

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_field::tracks::RotationEvidence;
+use cif_geometry::PixelGrid;
 use glam::{DQuat, DVec3};
 use rand::RngExt;
 
@@ -12,7 +13,8 @@ use super::plane::{self, Plane};
 use super::shape::Pose;
 use super::start::{Fitted, fit_object, grow};
 use super::testing::{
-    Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views, with_objects,
+    Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
+    views_in_masks, with_objects,
 };
 use super::view::ObjectView;
 use crate::random::{Purpose, stream};
@@ -103,6 +105,26 @@ fn a_textured_ball_is_found_to_roll_and_a_plain_one_is_assumed_to() {
 fn what_rests_is_left_alone() {
     let rests = vec![(DQuat::from_rotation_z(0.4), DVec3::new(0.05, 0.02, 0.05)); TIMES];
     assert!(fit_on(Some(&FLOOR), &views(solid(&box_places(), patches, 0.006), &rests, moving)).is_none());
+}
+
+#[test]
+fn what_rests_in_rough_masks_is_left_alone() {
+    let mut rng = stream(0, Purpose::Objects, 4);
+    // Masks beside their object, on another side of it every time.
+    let masks = |labels: PixelGrid<u16>| {
+        let [right, down] = std::array::from_fn(|_| rng.random_range(0..=4));
+        let mut moved = labels.map(|_| 0);
+        let width = labels.width as usize;
+        moved.pixels[down * width + right..]
+            .copy_from_slice(&labels.pixels[..labels.pixels.len() - down * width - right]);
+        moved
+    };
+    let rests = vec![(DQuat::from_rotation_z(0.4), DVec3::new(0.05, 0.02, 0.05)); TIMES];
+    let solid = solid(&box_places(), patches, 0.006);
+    let groups = vec![0; solid.len()];
+    let views = views_in_masks((solid, groups), &[rests], jumping, masks);
+    let found = fit_on(Some(&FLOOR), &views);
+    assert!(found.is_none(), "{}", found.unwrap().way);
 }
 
 #[test]

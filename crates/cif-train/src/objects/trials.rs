@@ -320,7 +320,7 @@ impl<'a> Contest<'a> {
             if *way == Way::Followed {
                 fit.air.clone_from(&self.paths.off);
             }
-            fit.touches = !matches!(way, Way::Rest | Way::Spin(_));
+            fit.stays = matches!(way, Way::Rest | Way::Spin(_));
             Some(Trial { way: *way, fit, losses: [0.0; 2] })
         };
         ways.par_iter().filter_map(begin).collect()
