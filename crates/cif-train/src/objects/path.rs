@@ -29,6 +29,9 @@ const ASIDE_SHARE: f64 = 0.2;
 const BESIDE: usize = 2;
 const CROSSES: f64 = 0.7;
 
+/// Distance of a ray from the path, in reaches of its mask, from which this shows something else.
+const ELSEWHERE: f64 = 2.0;
+
 /// Times on either side of one that tell where it belongs.
 const LED_BY: usize = 6;
 
@@ -69,7 +72,7 @@ pub(super) fn smooth(
 }
 
 /// Parts of a path that lie far from where those beside them lead, which `missed` tells of one of those that are left: by
-/// what distance, and the size of the object; `None` where nothing leads.
+/// what distance, and what is far; `None` where nothing leads.
 fn aside<T>(mut kept: Vec<T>, missed: impl Fn(&[T], usize) -> Option<(f64, f64)>) -> Vec<T> {
     let most = (ASIDE_SHARE * kept.len() as f64) as usize;
     let mut found = Vec::new();
@@ -77,7 +80,7 @@ fn aside<T>(mut kept: Vec<T>, missed: impl Fn(&[T], usize) -> Option<(f64, f64)>
         let missed: Vec<Option<(f64, f64)>> = (0..kept.len()).map(|k| missed(&kept, k)).collect();
         let middle =
             |of: fn(&(f64, f64)) -> f64| median(&mut missed.iter().flatten().map(of).collect::<Vec<_>>());
-        let far = (ASIDE * middle(|missed| missed.1)).max(OF_USUAL * middle(|missed| missed.0));
+        let far = middle(|missed| missed.1).max(OF_USUAL * middle(|missed| missed.0));
         let distance = |k: &usize| missed[*k].map_or(0.0, |(distance, _)| distance);
         let largest = (0..kept.len()).max_by(|a, b| distance(a).total_cmp(&distance(b)));
         let Some(k) = largest.filter(|k| distance(k) > far) else { break };
@@ -100,7 +103,7 @@ fn places_aside(raw: &BTreeMap<usize, DVec3>, size: f64) -> BTreeSet<usize> {
         };
         let [time, a, b] = [k, a, b].map(|k| kept[k]);
         let share = (time as f64 - a as f64) / (b as f64 - a as f64);
-        Some(((raw[&time] - raw[&a].lerp(raw[&b], share)).length(), size))
+        Some(((raw[&time] - raw[&a].lerp(raw[&b], share)).length(), ASIDE * size))
     };
     aside(raw.keys().copied().collect(), jump).into_iter().collect()
 }
@@ -168,13 +171,16 @@ fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usi
     path
 }
 
-/// Distance of the ray of a view from the path of those around it, and the reach of its mask there; `None` at the ends,
-/// and where these do not tell.
+/// Distance of the ray of a view from the path of those around it, of those that usual gaps between them leave open, and
+/// that at which its mask shows something else; `None` near the ends, and where these do not tell.
 fn missed(views: &[&ObjectView], at: usize, times: usize) -> Option<(f64, f64)> {
-    let near = at.checked_sub(1)?.saturating_sub(LED_BY)..(at + LED_BY + 1).min(views.len());
-    if at + 1 >= near.end {
+    if at < BESIDE || at + BESIDE >= views.len() {
         return None;
     }
+    let near = at.saturating_sub(LED_BY)..(at + LED_BY + 1).min(views.len());
+    let time = |k: usize| views[k].time_index as f64;
+    let usual = (time(views.len() - 1) - time(0)) / (views.len() - 1) as f64;
+    let gap = ((time(at + 1) - time(at - 1)) / (2.0 * usual)).max(1.0);
     let keys: Vec<usize> = views[near.clone()].iter().map(|view| view.time_index).collect();
     let ray = |k: usize| {
         let view = views[k];
@@ -187,7 +193,7 @@ fn missed(views: &[&ObjectView], at: usize, times: usize) -> Option<(f64, f64)> 
     let camera = &views[at].camera;
     let distance = (across(camera, views[at].centroid) * (place - camera.centre())).length();
     let depth = camera.project(place)?.1;
-    Some((distance, views[at].reach(WITHIN) * depth / camera.focal_px.x))
+    Some((distance / gap.powi(2), ELSEWHERE * views[at].reach(WITHIN) * depth / camera.focal_px.x))
 }
 
 /// The path of least bending near some places: minimises `(c - c0) . A (c - c0)`, given as `A` and `A c0` for every
@@ -277,7 +283,7 @@ mod tests {
         };
         let clean = crossing(&views, TIMES);
         assert_eq!(clean.len(), TIMES, "bounces are not aside");
-        for (time, shift) in [(4, [30.0, 5.0]), (5, [24.0, -20.0]), (21, [-25.0, 15.0])] {
+        for (time, shift) in [(4, [70.0, 5.0]), (5, [55.0, -50.0]), (21, [-40.0, 15.0])] {
             views[time].centroid += DVec2::from(shift);
         }
         let found = crossing(&views, TIMES);
