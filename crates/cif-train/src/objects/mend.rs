@@ -21,7 +21,7 @@ const SETTLE: usize = 60;
 /// they move more evenly; and beyond which following ends.
 const GAIN: f64 = 0.98;
 const EVEN: f64 = 1.03;
-const MOST: f64 = 1.1;
+const MOST: [f64; 2] = [1.1, 1.5];
 
 /// Turn, degrees, and distance, of the size, from the present pose up to which a jump is closed.
 const CLOSED: (f64, f64) = (8.0, 0.1);
@@ -72,29 +72,39 @@ fn apart(a: &Pose, b: &Pose, size: f64) -> (f64, f64) {
 }
 
 /// Follows times outward from those on the other side of a jump, nearest first: until it meets the poses that they have,
-/// or as long as it explains them better.
+/// or as long as it explains them better. What looks the same from two sides never meets them, and explains all of them
+/// as well.
 fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
     let mut run: Vec<(usize, Pose)> =
         known.iter().take(2).rev().map(|time| (*time, fit.poses[time])).collect();
     let (begin, mut better) = (run.len(), run.len());
     let (mut before, mut after) = (0.0, 0.0);
+    let mut is_even = false;
     for time in times.iter().copied() {
-        let Some((present, found, pose)) = settled(fit, time, &run) else { break };
-        if found > MOST * present {
+        let guesses = led(time, &run);
+        let Some((present, found, pose)) = settled(fit, time, &guesses) else {
+            // It does not tell: onward to those that do.
+            run.extend(guesses.last().map(|pose| (time, *pose)));
+            continue;
+        };
+        (before, after) = (before + present, after + found);
+        is_even = after < EVEN * before;
+        if after > MOST[0] * before || found > MOST[1] * present {
+            is_even = false;
             break;
         }
-        (before, after) = (before + present, after + found);
         if better == run.len() && found < GAIN * present {
             better += 1;
         }
         run.push((time, pose));
         let (turn, shift) = apart(&fit.poses[&time], &pose, fit.size());
         if turn < CLOSED.0 && shift < CLOSED.1 {
-            if after < EVEN * before {
-                better = run.len();
-            }
             break;
         }
+    }
+    // It met the poses that they have, or the last of them.
+    if is_even {
+        better = run.len();
     }
     for (time, pose) in run.drain(..better).skip(begin) {
         fit.poses.insert(time, pose);
@@ -102,24 +112,29 @@ fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
     }
 }
 
-/// Losses of a time in its present pose, and in that where the last ones of a run lead, and that pose; `None` where the
+/// Poses in which a time may be where the last ones of a run lead: as the last one, and as far on as its speed leads.
+fn led(time: usize, run: &[(usize, Pose)]) -> Vec<Pose> {
+    let Some(near) = run.last() else { return Vec::new() };
+    let far = run.len().checked_sub(2).map(|k| run[k]);
+    std::iter::once(near.1).chain(far.map(|far| onward(*near, far, time))).collect()
+}
+
+/// Losses of a time in its present pose, and in the best of those that guesses lead to, and that pose; `None` where the
 /// time does not tell.
-fn settled(fit: &Fit<'_>, time: usize, run: &[(usize, Pose)]) -> Option<(f64, f64, Pose)> {
+fn settled(fit: &Fit<'_>, time: usize, guesses: &[Pose]) -> Option<(f64, f64, Pose)> {
     let level = fit.trial_level();
     let is_told = |view: &usize| fit.views[*view].time_index == time && fit.views[*view].visible >= TOLD;
     let views: Vec<usize> = (0..fit.views.len()).filter(is_told).collect();
-    let near = run.last().filter(|_| !views.is_empty())?;
-    let mut guesses = vec![near.1];
-    if let Some(far) = run.len().checked_sub(2).map(|k| run[k]) {
-        guesses.push(onward(*near, far, time));
+    if views.is_empty() {
+        return None;
     }
     let mut shape = fit.shape.copied();
     let loss = |shape: &mut _, pose: &Pose| -> f64 {
         views.iter().map(|view| fit.loss_with(shape, *view, level, pose)).sum()
     };
     let present = loss(&mut shape, fit.poses.get(&time)?);
-    let found = guesses.into_iter().map(|guess| {
-        let pose = fit.settled(&mut shape, &views, level, guess, SETTLE);
+    let found = guesses.iter().map(|guess| {
+        let pose = fit.settled(&mut shape, &views, level, *guess, SETTLE);
         (loss(&mut shape, &pose), pose)
     });
     let (found, pose) = found.min_by(|a, b| a.0.total_cmp(&b.0))?;

@@ -81,7 +81,7 @@ impl Fit<'_> {
 
     /// True where it is held to its support, as nothing else tells its distance.
     pub(super) fn is_held(&self) -> bool {
-        self.plane.is_some() && !self.stays && self.one_camera
+        self.plane.is_some() && !self.stays && self.one_camera && !self.outline.is_surrounded
     }
 
     /// Gradients, by the pose and by the centres, that put the lowest Gaussians onto the plane, or no deeper at times off
