@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_field::tracks::RotationEvidence;
-use glam::DVec3;
+use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::ball;
@@ -145,8 +145,8 @@ pub(super) fn best_way<'a>(
     } else {
         return Ok(None);
     };
-    let moves =
-        decide(&trials, outline).filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
+    let moves = decide(&errors(&trials), outline)
+        .filter(|(way, _)| object.is_told || !rests(&trials, *way, REST_GAIN[1]));
     let Some((way, rotation)) = moves else { return Ok(None) };
     if rotation == RotationEvidence::Assumed && !object.is_told && !turns(|way| error_of(&trials, way), way) {
         return Ok(None);
@@ -165,6 +165,9 @@ pub(super) fn best_way<'a>(
     };
     if losses[1] > most && !object.is_told {
         return Ok(None);
+    }
+    if rotation == RotationEvidence::Assumed && kept == Way::Slide(0) && is_round(outline) {
+        fit.poses.values_mut().for_each(|pose| pose.rotation = DQuat::IDENTITY);
     }
     (fit.turns, fit.rolls) = match (rotation, way) {
         (RotationEvidence::Assumed, Way::Roll(_)) => (Turns::Free, None),
@@ -402,11 +405,11 @@ pub(super) fn split(views: &[ObjectView], reliable: &[usize], good: &[usize]) ->
 
 /// Ways that are near the best: paths, rolls, and what following found.
 fn rivals(trials: &[Trial<'_>]) -> Vec<Way> {
-    let mut best: Vec<(f64, Way)> = trials.iter().map(|trial| (trial.losses[1], trial.way)).collect();
-    best.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let is_near = |factor: f64, error: f64| error < factor * best[0].0;
+    let mut best = errors(trials);
+    best.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let is_near = |factor: f64, error: f64| error < factor * best[0].1;
     let (mut paths, mut rolls, mut rivals) = (0, 0, Vec::new());
-    for (error, way) in &best {
+    for (way, error) in &best {
         // What turns about a long axis shows it by its texture alone.
         let (count, most, factor) = match way {
             Way::Roll(_) => (&mut rolls, RIVALS, FAR),
@@ -440,12 +443,16 @@ fn rests(trials: &[Trial<'_>], way: Way, gain: f64) -> bool {
     error_of(trials, Way::Rest).zip(error_of(trials, way)).is_some_and(|(rest, moves)| rest <= gain * moves)
 }
 
-/// The best way of moving, and whether the pictures tell its turns.
-fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvidence)> {
+/// Ways that were tried with their errors on the views that were left out.
+fn errors(trials: &[Trial<'_>]) -> Vec<(Way, f64)> {
+    trials.iter().map(|trial| (trial.way, trial.losses[1])).collect()
+}
+
+/// The best way of moving, by the errors of those that were tried, and whether the pictures tell its turns.
+fn decide(tried: &[(Way, f64)], outline: &Outline) -> Option<(Way, RotationEvidence)> {
     let (is_round, in_contact) = (is_round(outline), outline.air.is_empty());
     let best = |wanted: &dyn Fn(&Way) -> bool| {
-        let of = trials.iter().filter(|trial| wanted(&trial.way));
-        of.min_by(|a, b| a.losses[1].total_cmp(&b.losses[1])).map(|trial| (trial.way, trial.losses[1]))
+        tried.iter().filter(|(way, _)| wanted(way)).min_by(|a, b| a.1.total_cmp(&b.1)).copied()
     };
     let (moving, moving_error) = best(&|way| *way != Way::Rest)?;
     let roll = best(&|way| matches!(way, Way::Roll(_)));
@@ -468,12 +475,18 @@ fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvide
     let rival = best(&|way| way.degrees().is_some_and(apart));
     let same = if is_round { SAME } else { 0.0 };
     let least = (RIVAL.0[usize::from(is_round)] * turning_error).max(turning_error + same);
-    if rival.is_some_and(|(_, error)| error < least) {
-        let has = |wanted: &Way| trials.iter().any(|trial| trial.way == *wanted);
-        if is_round && in_contact && has(&Way::Roll(1.0)) {
+    let has = |wanted: Way| tried.iter().any(|(way, _)| *way == wanted);
+    // Where no turn of something round was tried, none is known.
+    let is_untried = is_round && tried.iter().filter(|(way, _)| way.degrees().is_some()).count() < 2;
+    if is_untried || rival.is_some_and(|(_, error)| error < least) {
+        if is_round && in_contact && has(Way::Roll(1.0)) {
             return Some((Way::Roll(1.0), RotationEvidence::Assumed));
         }
-        if has(&Way::Slide(0)) {
+        // What may roll without a change of its outline is made to.
+        if let Some((way, _)) = roll.filter(|(_, error)| in_contact && *error <= turning_error) {
+            return Some((way, RotationEvidence::Assumed));
+        }
+        if has(Way::Slide(0)) {
             return Some((Way::Slide(0), RotationEvidence::Assumed));
         }
         return Some((turning, RotationEvidence::Assumed));
@@ -484,6 +497,34 @@ fn decide(trials: &[Trial<'_>], outline: &Outline) -> Option<(Way, RotationEvide
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn turns_that_nothing_tells_are_assumed() {
+        let outline = |roundness: f64, air: Vec<usize>| Outline {
+            height: 0.05,
+            radius: 0.05,
+            roundness,
+            path: BTreeMap::new(),
+            air,
+            stiffness: 1.0,
+            is_surrounded: false,
+            is_resort: false,
+        };
+        let slides = [(Way::Slide(0), 0.1), (Way::Slide(90), 0.101)];
+        let with = |more: &[(Way, f64)]| [&slides[..], more].concat();
+        let (edgy, round) = (outline(0.7, Vec::new()), outline(1.0, vec![3]));
+        let assumed = |way: Way| Some((way, RotationEvidence::Assumed));
+        // What may roll does, where it explains no less than sliding, and touches its support.
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.099)]), &edgy), assumed(Way::Roll(0.8)));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.102)]), &edgy), assumed(Way::Slide(0)));
+        assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.099)]), &outline(0.7, vec![3])), assumed(Way::Slide(0)));
+        // Of a ball in the air no turn was tried but those that following found.
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &round), assumed(Way::Slide(0)));
+        let followed = Some((Way::Followed, RotationEvidence::Observed));
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.05)], &round), followed);
+        let observed = Some((Way::Slide(0), RotationEvidence::Observed));
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &edgy), observed);
+    }
 
     #[test]
     fn what_any_turn_in_place_explains_does_not_turn() {
