@@ -19,6 +19,10 @@ const POSE_RATE: f64 = 0.02;
 /// Rate of the distance from the camera of what leaves its support, relative to that of other shifts.
 const DEPTH_RATE: f64 = 3.0;
 
+/// Turn, radians, from which the shortest one need not be it, and the largest difference from where it leads.
+const LONG: f64 = 2.0;
+const LEADS: f64 = 1.2;
+
 /// Background that losses are compared on.
 const GREY: [f32; 3] = [0.5; 3];
 
@@ -332,6 +336,12 @@ impl<'a> Fit<'a> {
             (Some(a), Some(b)) => {
                 let share = (time - a) as f64 / (b - a) as f64;
                 let mut pose = between(&self.poses[&a], &self.poses[&b], share);
+                if let Some(turn) = self.long_turn(a, b) {
+                    let (first, last) = (self.poses[&a].rotation, self.poses[&b].rotation);
+                    let rest = log(last * (DQuat::from_scaled_axis(turn) * first).inverse());
+                    let part = |turn: DVec3| DQuat::from_scaled_axis(share * turn);
+                    pose.rotation = (part(rest) * part(turn) * first).normalize();
+                }
                 let path = |time: usize| self.outline.path.get(&time).copied();
                 if self.outline.is_surrounded
                     && !self.stays
@@ -346,6 +356,35 @@ impl<'a> Fit<'a> {
             (None, Some(a)) => self.beyond(a, self.neighbours(a)[1], time),
             (None, None) => return None,
         })
+    }
+
+    /// Turn from one time to the next that has a pose, which may be a whole one and more, as its rolling or its speed on
+    /// either side leads; `None` where that is short, so that the shortest turn is it, or leads elsewhere.
+    fn long_turn(&self, a: usize, b: usize) -> Option<DVec3> {
+        let (first, last) = (self.poses[&a], self.poses[&b]);
+        let steps = (b - a) as f64;
+        let speed = |from: usize, to: usize| {
+            log(self.poses[&to].rotation * self.poses[&from].rotation.inverse()) / (to - from) as f64
+        };
+        let turn = match (self.rolls, &self.plane) {
+            (Some(radius), Some(plane)) => plane.normal.cross(last.translation - first.translation) / radius,
+            _ => {
+                let before = self.neighbours(a)[0].map(|before| speed(before, a));
+                let after = self.neighbours(b)[1].map(|after| speed(b, after));
+                0.5 * steps * (before? + after?)
+            }
+        };
+        let rest = log(last.rotation * (DQuat::from_scaled_axis(turn) * first.rotation).inverse());
+        (turn.length() > LONG && rest.length() < LEADS).then_some(turn)
+    }
+
+    /// Fills the gaps between times that have poses.
+    pub(super) fn fill(&mut self) {
+        let ends = self.poses.keys().next().zip(self.poses.keys().next_back());
+        let Some((first, last)) = ends.map(|(first, last)| (*first, *last)) else { return };
+        let gaps = (first..last).filter(|time| !self.poses.contains_key(time));
+        let filled: Vec<(usize, Pose)> = gaps.filter_map(|time| Some((time, self.pose_at(time)?))).collect();
+        self.poses.extend(filled);
     }
 
     /// Pose at a time beyond the outermost one, beside another.

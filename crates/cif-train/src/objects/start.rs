@@ -170,6 +170,10 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         fit.steps(&all, STEPS[1], |share| (0.6 * 0.05_f64.powf(share), 0.1, 0));
     }
     stop.check()?;
+    if let Way::Roll(factor) = way {
+        fit.rolls = Some(outline.height / factor);
+    }
+    fit.fill();
     let at_rest = (DQuat::IDENTITY, DVec3::ZERO);
     Ok(Some(Fitted {
         poses: fit.poses.iter().map(|(time, pose)| (*time, (pose.rotation, pose.translation))).collect(),

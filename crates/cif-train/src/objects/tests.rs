@@ -432,6 +432,31 @@ fn how_a_plain_ball_turns_in_the_air_is_assumed() {
 }
 
 #[test]
+fn turns_at_times_that_hide_it_go_the_way_of_those_around_them() {
+    let truth = rolling(0.057);
+    let mut views = views(solid(&sphere_places(0.05), patches, 0.006), &truth, moving);
+    // The shortest turn across the gap is the other way round.
+    views.retain(|view| !(8..22).contains(&view.time_index));
+    with_objects(Some(&FLOOR), &views, |objects| {
+        let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
+        let gaps = |rolls: Option<f64>| {
+            let poses = views.iter().map(|view| (view.time_index, pose(view.time_index))).collect();
+            let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
+            let mut fit = objects[0].fit(poses, shape, objects[0].rng());
+            fit.rolls = rolls;
+            fit.fill();
+            let error =
+                |(time, pose): (&usize, &Pose)| pose.rotation.angle_between(truth[*time].0).to_degrees();
+            assert_eq!(fit.poses.len(), TIMES);
+            fit.poses.iter().map(error).fold(0.0, f64::max)
+        };
+        assert!(truth[7].0.angle_between(truth[22].0) < 2.8, "{}", truth[7].0.angle_between(truth[22].0));
+        assert!(gaps(Some(0.055)) < 10.0, "as it rolls");
+        assert!(gaps(None) < 1.0, "as fast as before and after");
+    });
+}
+
+#[test]
 fn one_camera_without_a_support_says_nothing_of_distances() {
     let truth = vec![(DQuat::IDENTITY, DVec3::ZERO); TIMES];
     let views = views(solid(&box_places(), patches, 0.006), &truth, moving);

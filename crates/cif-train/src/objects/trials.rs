@@ -37,8 +37,9 @@ const SETTLE: usize = 40;
 /// at all: what deforms is explained by any of them.
 const SPIN_GAIN: f64 = 1.12;
 
-/// Error from which neither resting nor sliding explains what is seen, and that of a way that does, of it.
-const UNEXPLAINED: f64 = 0.1;
+/// Error from which neither resting nor sliding explains what is seen, where one camera sees it from about one side and
+/// where it is seen from several, and that of a way that does, of it.
+const UNEXPLAINED: [f64; 2] = [0.3, 0.1];
 const EXPLAINED: f64 = 0.5;
 
 /// Largest error of turning in place.
@@ -233,7 +234,8 @@ impl<'a> Contest<'a> {
 
     /// True where following may find what neither resting nor sliding explains.
     fn is_unexplained(&self, simple: &[Trial<'_>]) -> bool {
-        self.object.outline.is_surrounded && simple.iter().all(|trial| trial.losses[1] > UNEXPLAINED)
+        let least = UNEXPLAINED[usize::from(self.object.outline.is_surrounded)];
+        simple.iter().all(|trial| trial.losses[1] > least)
     }
 
     /// The object followed over known times: on its support where its path is, and off it if that explains more where
