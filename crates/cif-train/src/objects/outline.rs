@@ -223,12 +223,14 @@ fn raised(outline: &Outline, plane: &Plane) -> Vec<usize> {
     outline.path.iter().filter(|(_, centre)| is_raised(**centre)).map(|(time, _)| *time).collect()
 }
 
-/// Height above the plane at which an object stands whose centres are known: that of its lowest times. `None` where these
-/// are few, or far from what its outlines tell, so that it may never stand.
+/// Height above the plane at which an object stands whose centres are known: the middle one of times that are about as low
+/// as its lowest ones. `None` where these are few, or far from what its outlines tell, so that it may never stand.
 fn standing_height(met: &BTreeMap<usize, DVec3>, plane: &Plane, told: f64) -> Option<f64> {
     let mut heights: Vec<f64> = met.values().map(|centre| plane.height(*centre)).collect();
     heights.sort_by(f64::total_cmp);
-    let height = *heights.get(heights.len() / LOWEST).filter(|_| heights.len() >= LOWEST)?;
+    let low = *heights.get(heights.len() / LOWEST).filter(|_| heights.len() >= LOWEST)?;
+    heights.retain(|height| *height < ROOM * low);
+    let height = median(&mut heights);
     (STANDS.0 * told..STANDS.1 * told).contains(&height).then_some(height)
 }
 
@@ -550,6 +552,11 @@ mod tests {
         let lifted = |time: usize| (time, DVec3::new(0.1, 0.0, 0.05 + 0.02 * time.saturating_sub(6) as f64));
         let met: BTreeMap<usize, DVec3> = (0..TIMES).map(lifted).collect();
         assert_eq!(standing_height(&met, &FLOOR, 0.07), Some(0.05));
+        // Rough masks put it too low as often as too high.
+        let rough =
+            |time: usize| (time, DVec3::new(0.1, 0.0, 0.05 + 0.001 * ((7 * time) % 5) as f64 - 0.002));
+        let found = standing_height(&(0..TIMES).map(rough).collect(), &FLOOR, 0.05).unwrap();
+        assert!((found - 0.05).abs() < 5e-4, "{found}");
         // Too high to stand, by its outlines; too few times.
         assert_eq!(standing_height(&met, &FLOOR, 0.02), None);
         assert_eq!(standing_height(&(0..5).map(lifted).collect(), &FLOOR, 0.07), None);
