@@ -30,6 +30,9 @@ const FEWEST_TIMES: usize = 8;
 /// Times at which an object must be seen to be followed.
 const FEWEST_SEEN: usize = 5;
 
+/// Views at the beginning and the end of which all must show an object elsewhere than where it rests, if it is.
+const AT_ENDS: usize = 2;
+
 /// Times that one camera shows from so many sides that they are begun together, as if the object did not turn between
 /// them.
 const TOGETHER: usize = 7;
@@ -218,10 +221,27 @@ impl<'a> Object<'a> {
         let mut good: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
         good.dedup();
         if good.len() < FEWEST_TIMES {
-            self.followed(path)
-        } else {
-            trials::best_way(self, path, (&reliable, &good))
+            return self.followed(path);
         }
+        let found = trials::best_way(self, path.clone(), (&reliable, &good))?;
+        if found.is_none() && self.comes_or_goes(&path, &reliable) {
+            return self.followed(path);
+        }
+        Ok(found)
+    }
+
+    /// True of what rests while it is seen well, but is elsewhere when it is seen first, or last.
+    fn comes_or_goes(&self, path: &BTreeMap<usize, DVec3>, reliable: &[usize]) -> bool {
+        let Some(place) = self.resting_place(reliable) else { return false };
+        let seen: Vec<&ObjectView> = self.views_at(path).map(|view| &self.views[view]).collect();
+        let is_away = |view: &&ObjectView| {
+            view.camera.project(place).is_some_and(|(pixel, depth)| {
+                let size = self.outline.size() * view.camera.focal_px.x / depth;
+                (pixel - view.centroid).length() > size
+            })
+        };
+        seen.len() > AT_ENDS
+            && (seen.iter().take(AT_ENDS).all(is_away) || seen.iter().rev().take(AT_ENDS).all(is_away))
     }
 
     /// Random numbers of the object, from their start.
@@ -314,10 +334,14 @@ impl<'a> Object<'a> {
         Ok(Some(Started { fit, path, way, rotation, error, unturned: None, reference }))
     }
 
+    /// The place where views see it together.
+    fn resting_place(&self, views: &[usize]) -> Option<DVec3> {
+        meeting_point(views.iter().map(|k| (&self.views[*k], self.views[*k].visible.powi(2))))
+    }
+
     /// Error of the object in one place, on the views that it is fitted to.
     fn at_rest(&self, views: &[usize]) -> Option<f64> {
-        let place = meeting_point(views.iter().map(|k| (&self.views[*k], self.views[*k].visible.powi(2))))?;
-        let rests = Pose { rotation: DQuat::IDENTITY, translation: place };
+        let rests = Pose { rotation: DQuat::IDENTITY, translation: self.resting_place(views)? };
         let poses = views.iter().map(|k| (self.views[*k].time_index, rests)).collect();
         let shape = self.hull(&poses, FOLLOWED, &mut self.rng())?;
         let mut fit = self.fit(poses, shape, self.rng());

@@ -141,6 +141,24 @@ fn what_rests_and_is_cut_at_all_times_is_left_alone() {
 }
 
 #[test]
+fn what_comes_to_rest_as_soon_as_it_is_seen_is_followed_to_the_border() {
+    let right = DVec3::new(0.5_f64.cos(), 0.5_f64.sin(), 0.0);
+    let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
+        .map(|k| {
+            let way = [0.35, 0.31, 0.25].get(k).copied().unwrap_or(0.2);
+            (DQuat::IDENTITY, way * right + 0.05 * DVec3::Z)
+        })
+        .collect();
+    let views = views(solid(&box_places(), patches, 0.006), &truth, moving);
+    assert!(views.iter().all(|view| view.cut == (view.time_index < 3)));
+    let fitted = fit(&views);
+    let early = fitted.poses.range(..3).map(|(time, pose)| (time, pose.1 - fitted.reference.1));
+    let errors: Vec<f64> =
+        early.map(|(time, shift)| (shift - (truth[*time].1 - truth[TIMES - 1].1)).length()).collect();
+    assert!(errors.len() == 3 && errors.iter().all(|error| *error < 0.02), "{errors:?}");
+}
+
+#[test]
 fn what_shows_a_broader_side_is_not_lifted() {
     let truth: Vec<(DQuat, DVec3)> = (0..TIMES)
         .map(|k| {
