@@ -378,11 +378,12 @@ impl<'a> Fit<'a> {
         (turn.length() > LONG && rest.length() < LEADS).then_some(turn)
     }
 
-    /// Fills the gaps between times that have poses.
-    pub(super) fn fill(&mut self) {
-        let ends = self.poses.keys().next().zip(self.poses.keys().next_back());
-        let Some((first, last)) = ends.map(|(first, last)| (*first, *last)) else { return };
-        let gaps = (first..last).filter(|time| !self.poses.contains_key(time));
+    /// Fills the gaps across which it turns far. Across others the poses that are trained on either side tell what lies
+    /// between.
+    pub(super) fn fill_long_turns(&mut self) {
+        let times: Vec<usize> = self.poses.keys().copied().collect();
+        let far = times.windows(2).filter(|pair| self.long_turn(pair[0], pair[1]).is_some());
+        let gaps = far.flat_map(|pair| pair[0] + 1..pair[1]);
         let filled: Vec<(usize, Pose)> = gaps.filter_map(|time| Some((time, self.pose_at(time)?))).collect();
         self.poses.extend(filled);
     }

@@ -176,7 +176,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     if let Way::Roll(factor) = way {
         fit.rolls = Some(outline.height / factor);
     }
-    fit.fill();
+    fit.fill_long_turns();
     let at_rest = (DQuat::IDENTITY, DVec3::ZERO);
     Ok(Some(Fitted {
         poses: fit.poses.iter().map(|(time, pose)| (*time, (pose.rotation, pose.translation))).collect(),

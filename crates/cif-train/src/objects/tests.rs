@@ -453,8 +453,8 @@ fn how_a_plain_ball_turns_in_the_air_is_assumed() {
 fn turns_at_times_that_hide_it_go_the_way_of_those_around_them() {
     let truth = rolling(0.057);
     let mut views = views(solid(&sphere_places(0.05), patches, 0.006), &truth, moving);
-    // The shortest turn across the gap is the other way round.
-    views.retain(|view| !(8..22).contains(&view.time_index));
+    // The shortest turn across the gap is the other way round; between 3 and 5 the poses there tell.
+    views.retain(|view| view.time_index != 4 && !(8..22).contains(&view.time_index));
     with_objects(Some(&FLOOR), &views, |objects| {
         let pose = |time: usize| Pose { rotation: truth[time].0, translation: truth[time].1 };
         let gaps = |rolls: Option<f64>| {
@@ -462,10 +462,10 @@ fn turns_at_times_that_hide_it_go_the_way_of_those_around_them() {
             let shape = objects[0].hull(&poses, 300, &mut objects[0].rng()).unwrap();
             let mut fit = objects[0].fit(poses, shape, objects[0].rng());
             fit.rolls = rolls;
-            fit.fill();
+            fit.fill_long_turns();
             let error =
                 |(time, pose): (&usize, &Pose)| pose.rotation.angle_between(truth[*time].0).to_degrees();
-            assert_eq!(fit.poses.len(), TIMES);
+            assert!(fit.poses.len() == TIMES - 1 && !fit.poses.contains_key(&4));
             fit.poses.iter().map(error).fold(0.0, f64::max)
         };
         assert!(truth[7].0.angle_between(truth[22].0) < 2.8, "{}", truth[7].0.angle_between(truth[22].0));
