@@ -18,7 +18,7 @@ const AROUND: usize = 5;
 const SETTLE: usize = 60;
 
 /// Loss, of that of the present pose, up to which a pose explains more; up to which poses that close a jump are kept, as
-/// they move more evenly; and beyond which following ends.
+/// they move more evenly; and beyond which following ends, of all poses so far and of one.
 const GAIN: f64 = 0.98;
 const EVEN: f64 = 1.03;
 const MOST: [f64; 2] = [1.1, 1.5];
@@ -88,9 +88,9 @@ fn march(fit: &mut Fit<'_>, times: &[usize], known: &[usize]) {
             continue;
         };
         (before, after) = (before + present, after + found);
-        is_even = after < EVEN * before;
-        if after > MOST[0] * before || found > MOST[1] * present {
-            is_even = false;
+        let ends = after > MOST[0] * before || found > MOST[1] * present;
+        is_even = !ends && after < EVEN * before;
+        if ends {
             break;
         }
         if better == run.len() && found < GAIN * present {

@@ -1,5 +1,6 @@
 //! Solids whose motion is known, as cameras see them, for tests.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use cif_field::tracks::{TrackGroup, TrackPose, Tracks};
@@ -142,6 +143,24 @@ pub(super) fn with_objects<T>(
         stop: &stop,
     };
     act(&Object::by_outlines(1, views, &outlines, false, surroundings))
+}
+
+/// The outline of an object of this height and radius, and roundness, which stays on its support along a path.
+pub(super) fn shaped(
+    (height, radius): (f64, f64),
+    roundness: f64,
+    path: BTreeMap<usize, DVec3>,
+) -> outline::Outline {
+    outline::Outline {
+        height,
+        radius,
+        roundness,
+        path,
+        air: Vec::new(),
+        stiffness: 1.0,
+        is_surrounded: false,
+        is_resort: false,
+    }
 }
 
 /// Patches of colour.

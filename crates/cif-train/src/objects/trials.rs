@@ -498,19 +498,14 @@ fn decide(tried: &[(Way, f64)], outline: &Outline) -> Option<(Way, RotationEvide
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::shaped;
     use super::*;
 
     #[test]
     fn turns_that_nothing_tells_are_assumed() {
         let outline = |roundness: f64, air: Vec<usize>| Outline {
-            height: 0.05,
-            radius: 0.05,
-            roundness,
-            path: BTreeMap::new(),
             air,
-            stiffness: 1.0,
-            is_surrounded: false,
-            is_resort: false,
+            ..shaped((0.05, 0.05), roundness, BTreeMap::new())
         };
         let slides = [(Way::Slide(0), 0.1), (Way::Slide(90), 0.101)];
         let with = |more: &[(Way, f64)]| [&slides[..], more].concat();

@@ -294,22 +294,14 @@ pub(super) fn rolled(places: &[DVec3], normal: DVec3, radius: f64) -> Vec<DQuat>
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::shaped;
     use super::*;
 
     #[test]
     fn what_is_tall_slides_and_what_is_low_may_roll() {
         let along: BTreeMap<usize, DVec3> = (0..20).map(|k| (k, DVec3::X * (0.02 * k as f64))).collect();
         let rolls = |height: f64, radius: f64| {
-            let outline = Outline {
-                height,
-                radius,
-                roundness: 0.85,
-                path: along.clone(),
-                air: Vec::new(),
-                stiffness: 1.0,
-                is_surrounded: false,
-                is_resort: false,
-            };
+            let outline = shaped((height, radius), 0.85, along.clone());
             let paths = Paths {
                 along: along.clone(),
                 place: DVec3::ZERO,
