@@ -336,11 +336,9 @@ impl<'a> Fit<'a> {
             (Some(a), Some(b)) => {
                 let share = (time - a) as f64 / (b - a) as f64;
                 let mut pose = between(&self.poses[&a], &self.poses[&b], share);
-                if let Some(turn) = self.long_turn(a, b) {
-                    let (first, last) = (self.poses[&a].rotation, self.poses[&b].rotation);
-                    let rest = log(last * (DQuat::from_scaled_axis(turn) * first).inverse());
+                if let Some([turn, rest]) = self.long_turn(a, b) {
                     let part = |turn: DVec3| DQuat::from_scaled_axis(share * turn);
-                    pose.rotation = (part(rest) * part(turn) * first).normalize();
+                    pose.rotation = (part(rest) * part(turn) * self.poses[&a].rotation).normalize();
                 }
                 let path = |time: usize| self.outline.path.get(&time).copied();
                 if self.outline.is_surrounded
@@ -359,8 +357,9 @@ impl<'a> Fit<'a> {
     }
 
     /// Turn from one time to the next that has a pose, which may be a whole one and more, as its rolling or its speed on
-    /// either side leads; `None` where that is short, so that the shortest turn is it, or leads elsewhere.
-    fn long_turn(&self, a: usize, b: usize) -> Option<DVec3> {
+    /// either side leads, and what is left from there; `None` where that is short, so that the shortest turn is it, or
+    /// leads elsewhere.
+    fn long_turn(&self, a: usize, b: usize) -> Option<[DVec3; 2]> {
         let (first, last) = (self.poses[&a], self.poses[&b]);
         let steps = (b - a) as f64;
         let speed = |from: usize, to: usize| {
@@ -375,7 +374,7 @@ impl<'a> Fit<'a> {
             }
         };
         let rest = log(last.rotation * (DQuat::from_scaled_axis(turn) * first.rotation).inverse());
-        (turn.length() > LONG && rest.length() < LEADS).then_some(turn)
+        (turn.length() > LONG && rest.length() < LEADS).then_some([turn, rest])
     }
 
     /// Fills the gaps across which it turns far. Across others the poses that are trained on either side tell what lies

@@ -7,7 +7,7 @@ use glam::{DMat2, DVec2, DVec3};
 use super::path;
 use super::plane::Plane;
 use super::view::{ObjectView, WITHIN, are_discs, is_one_camera, median};
-use crate::tracks::{across, nearest_to_rays};
+use crate::tracks::nearest_to_rays;
 
 /// Largest apparent size of a mask, relative to that on the plane, at which its object is taken to touch the plane.
 const AIR: f64 = 1.1;
@@ -122,12 +122,8 @@ pub(super) fn meeting_point<'a>(views: impl Iterator<Item = (&'a ObjectView, f64
     if views.len() < FEWEST_RAYS {
         return nearest(&all);
     }
-    let distances = |point: DVec3| -> Vec<f64> {
-        let distance = |(view, _): &(&ObjectView, f64)| {
-            (across(&view.camera, view.centroid) * (point - view.camera.centre())).length()
-        };
-        views.iter().map(distance).collect()
-    };
+    let distances =
+        |point: DVec3| -> Vec<f64> { views.iter().map(|(view, _)| view.distance(point)).collect() };
     // Of the points where two rays meet, and that where all do, the one that is nearest to the middle ray.
     let paired: Vec<usize> = (0..views.len()).step_by(views.len().div_ceil(MOST_PAIRED)).collect();
     let pairs = (0..paired.len()).flat_map(|a| (0..a).map(move |b| (a, b)));

@@ -137,27 +137,19 @@ fn along_rays(views: &[ObjectView], times: usize, bounces: bool) -> BTreeMap<usi
     if keys.len() < 3 {
         return BTreeMap::new();
     }
-    let mut weights: Vec<f64> = views.iter().map(|view| view.visible.powi(2) + 1e-4).collect();
+    let mut weights: Vec<f64> = views.iter().map(|view| weight(view)).collect();
     let mut stiffness = vec![CROSSING; keys.len()];
     let (rounds, sure, ends) = if bounces { BOUNCING } else { (ROUNDS, 0, 0) };
     let inner = ends..keys.len().saturating_sub(ends);
     let mut path = BTreeMap::new();
     for round in 0..rounds {
-        let near = |(view, weight): (&&ObjectView, &f64)| {
-            let across = *weight * across(&view.camera, view.centroid);
-            (across, across * view.camera.centre())
-        };
-        let near: Vec<(DMat3, DVec3)> = views.iter().zip(&weights).map(near).collect();
+        let near: Vec<(DMat3, DVec3)> =
+            views.iter().zip(&weights).map(|(view, weight)| ray(view, *weight)).collect();
         let Some(found) = even(&keys, &near, &stiffness, times) else { return BTreeMap::new() };
-        let distance = |view: &&ObjectView| {
-            let offset = found[&view.time_index] - view.camera.centre();
-            (across(&view.camera, view.centroid) * offset).length()
-        };
-        let distances: Vec<f64> = views.iter().map(distance).collect();
+        let distances: Vec<f64> = views.iter().map(|view| view.distance(found[&view.time_index])).collect();
         let large = 2.0 * median(&mut distances.clone());
         for k in inner.clone().filter(|_| round >= sure) {
-            let seen = views[k].visible.powi(2) + 1e-4;
-            weights[k] = seen / (1.0 + (distances[k] / large.max(1e-12)).powi(2));
+            weights[k] = weight(views[k]) / (1.0 + (distances[k] / large.max(1e-12)).powi(2));
         }
         if bounces {
             let bends: Vec<f64> = (0..keys.len()).map(|k| bend(&keys, &found, k).length()).collect();
@@ -182,18 +174,23 @@ fn missed(views: &[&ObjectView], at: usize, times: usize) -> Option<(f64, f64)> 
     let usual = (time(views.len() - 1) - time(0)) / (views.len() - 1) as f64;
     let gap = ((time(at + 1) - time(at - 1)) / (2.0 * usual)).max(1.0);
     let keys: Vec<usize> = views[near.clone()].iter().map(|view| view.time_index).collect();
-    let ray = |k: usize| {
-        let view = views[k];
-        let weight = if k == at { 0.0 } else { view.visible.powi(2) + 1e-4 };
-        let across = weight * across(&view.camera, view.centroid);
-        (across, across * view.camera.centre())
-    };
-    let rays: Vec<(DMat3, DVec3)> = near.map(ray).collect();
+    let of = |k: usize| ray(views[k], if k == at { 0.0 } else { weight(views[k]) });
+    let rays: Vec<(DMat3, DVec3)> = near.map(of).collect();
     let place = even(&keys, &rays, &vec![CROSSING; keys.len()], times)?[&views[at].time_index];
-    let camera = &views[at].camera;
-    let distance = (across(camera, views[at].centroid) * (place - camera.centre())).length();
+    let (view, camera) = (views[at], &views[at].camera);
     let depth = camera.project(place)?.1;
-    Some((distance / gap.powi(2), ELSEWHERE * views[at].reach(WITHIN) * depth / camera.focal_px.x))
+    Some((view.distance(place) / gap.powi(2), ELSEWHERE * view.reach(WITHIN) * depth / camera.focal_px.x))
+}
+
+/// The ray of a view with a weight, as [`even`] takes what is near.
+fn ray(view: &ObjectView, weight: f64) -> (DMat3, DVec3) {
+    let across = weight * across(&view.camera, view.centroid);
+    (across, across * view.camera.centre())
+}
+
+/// Weight of a ray by the visible share of its view.
+fn weight(view: &ObjectView) -> f64 {
+    view.visible.powi(2) + 1e-4
 }
 
 /// The path of least bending near some places: minimises `(c - c0) . A (c - c0)`, given as `A` and `A c0` for every

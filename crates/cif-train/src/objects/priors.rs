@@ -79,7 +79,8 @@ impl Fit<'_> {
         2.0 * DEPTH * ray.dot(pose.translation - *place) / (size * size) * ray
     }
 
-    /// True where it is held to its support, as nothing else tells its distance.
+    /// True where it is held to its support, as nothing else tells its distance: neither several cameras nor rays of one
+    /// that cross.
     pub(super) fn is_held(&self) -> bool {
         self.plane.is_some() && !self.stays && self.one_camera && !self.outline.is_surrounded
     }

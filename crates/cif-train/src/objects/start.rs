@@ -335,7 +335,7 @@ impl<'a> Object<'a> {
     }
 
     /// The place where views see it together.
-    fn resting_place(&self, views: &[usize]) -> Option<DVec3> {
+    pub(super) fn resting_place(&self, views: &[usize]) -> Option<DVec3> {
         meeting_point(views.iter().map(|k| (&self.views[*k], self.views[*k].visible.powi(2))))
     }
 

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::ball;
 use super::fit::{Fit, Turns};
 use super::follow::follow;
-use super::outline::{self, Outline};
+use super::outline::Outline;
 use super::path::smooth;
 use super::start::{Object, Started};
 use super::texture;
@@ -110,12 +110,11 @@ pub(super) fn best_way<'a>(
     let (train, left_out) = split(views, reliable, good);
     let is_trained = |time: usize| train.iter().any(|view| views[*view].time_index == time);
     let between = left_out.iter().map(|view| views[*view].time_index).filter(|time| !is_trained(*time));
-    let rays = reliable.iter().map(|view| (&views[*view], views[*view].visible.powi(2)));
     let mut contest = Contest {
         object,
         between: between.collect(),
         paths: Paths {
-            place: outline::meeting_point(rays).unwrap_or(along[&reference]),
+            place: object.resting_place(reliable).unwrap_or(along[&reference]),
             along,
             outline,
             up: surroundings.plane.map_or(surroundings.up, |plane| plane.normal),

@@ -9,6 +9,7 @@ use cif_render::{RenderSettings, UNLABELLED};
 use glam::DVec2;
 
 use crate::frames::TrainFrame;
+use crate::tracks::across;
 
 /// Pixels around the mask that belong to its crop.
 const MARGIN: u32 = 5;
@@ -142,6 +143,11 @@ impl ObjectView {
         let mut distances: Vec<f64> = self.pixels.iter().map(from).collect();
         distances.sort_by(f64::total_cmp);
         distances[((distances.len() - 1) as f64 * share) as usize]
+    }
+
+    /// Distance of a point of the world from the ray through the middle of the mask, metres.
+    pub(super) fn distance(&self, point: glam::DVec3) -> f64 {
+        (across(&self.camera, self.centroid) * (point - self.camera.centre())).length()
     }
 
     /// True where the outline is the object's own.
