@@ -3,7 +3,8 @@
 //!
 //! Colour: with `Q = v_C . C_out` (background included), the gradient of a blending weight is
 //! `v_alpha_i = T_i e_i - (Q - E_i) / (1 - alpha_i)`, where `e_i = v_C . c_i` and `E_i` is the running sum of
-//! `T alpha e` through i; `Q - E_i` is kept as one running remainder.
+//! `T alpha e` through i; `Q - E_i` is kept as one running remainder. Coverage is one more channel, in which every
+//! Gaussian is 1 and the background 0.
 //!
 //! Instances: `r_i = W_i p_i / M`, remainder `1 - c_i`, `q_i = r_i - b_i (1 - c_i) / (1 - b_i)`. Behind the last
 //! Gaussian that supports a pixel's label both are 0: there the instance pass of a group ends.
@@ -28,8 +29,26 @@ const FROM_BINARY: f32 = 2.0 * std::f32::consts::LN_2;
 pub(super) struct TileCotangents {
     /// dL/dcolour.
     pub(super) color: [TilePixels; 3],
-    /// `v_C . C_out`, background included.
+    /// dL/dalpha, where there is one.
+    pub(super) alpha: Option<Box<TilePixels>>,
+    /// `v_C . C_out`, background included, and `v_A A`.
     pub(super) remainder: TilePixels,
+}
+
+impl TileCotangents {
+    /// Adds gradients by the coverage of the pixels, given what light they still let through.
+    pub(super) fn add_alpha(&mut self, place: &TilePlace, v_alpha: &[f32], transmittance: &TilePixels) {
+        let mut alpha = Box::new([[0.0; LANES]; GROUPS]);
+        for group in 0..GROUPS {
+            for lane in 0..LANES {
+                if let Some(pixel) = place.pixel(group, lane) {
+                    alpha[group][lane] = v_alpha[pixel];
+                    self.remainder[group][lane] += v_alpha[pixel] * (1.0 - transmittance[group][lane]);
+                }
+            }
+        }
+        self.alpha = Some(alpha);
+    }
 }
 
 /// Instance inputs of a tile.
@@ -146,7 +165,10 @@ impl<S: Simd> Seen<S> {
         let blended = self.blending.step(simd, unclamped, &mut transmittance[group]);
         let [red, green, blue] = &cotangents.color;
         let v_c = [load(simd, &red[group]), load(simd, &green[group]), load(simd, &blue[group])];
-        let e = v_c[0].mul_add(self.color[0], v_c[1].mul_add(self.color[1], v_c[2] * self.color[2]));
+        let mut e = v_c[0].mul_add(self.color[0], v_c[1].mul_add(self.color[1], v_c[2] * self.color[2]));
+        if let Some(alpha) = &cotangents.alpha {
+            e += load(simd, &alpha[group]);
+        }
         for channel in 0..3 {
             sums.color[channel] = blended.weight.mul_add(v_c[channel], sums.color[channel]);
         }

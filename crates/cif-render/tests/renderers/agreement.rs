@@ -17,7 +17,7 @@ use cif_render::{
     OccupancySource, RenderSettings, RenderedImage,
 };
 
-use crate::renderers::{Path, Seen, everywhere, fast_gradient, forward_and_backward};
+use crate::renderers::{Path, Seen, everywhere, fast_gradient, forward_and_backward, on_processor};
 use crate::support::{Cotangents, Mismatches, Worst, pixel_discontinuity, render};
 
 /// Relative width of the boundary band: above the rounding of a weight in single precision.
@@ -334,6 +334,38 @@ fn colour_only() {
     let settings = RenderSettings { instances: None, ..settings() };
     check("colour only", &SyntheticConfig { instances: 0, ..config() }, &settings, |_| {});
     check("colour only, identities unused", &config(), &settings, |_| {});
+}
+
+#[test]
+fn coverage_and_its_gradients() {
+    let settings = RenderSettings { instances: None, ..settings() };
+    let mut expected = Expected::of("coverage", &config(), &settings, |_| {});
+    let mut cotangents = Cotangents::random(4, config().width, config().height);
+    (cotangents.color, cotangents.depth) = (expected.cotangents.color.clone(), None);
+    cotangents.instance_weight = 0.0;
+    let alpha = cotangents.alpha.as_mut().unwrap();
+    for (v, near) in alpha.pixels.iter_mut().zip(&expected.band) {
+        *v *= f64::from(u8::from(!near));
+    }
+    let scene = Scene::<f64>::from_field(&expected.synthetic.field);
+    expected.gradients = cotangents.backward(&scene, &expected.forward);
+    for actual in on_processor(&expected.synthetic, &settings, &cotangents) {
+        let (mut mismatches, mut worst) = (Mismatches::default(), Worst::default());
+        expected.compare(&actual, Tolerances::of(actual.path), &mut mismatches, &mut worst);
+        mismatches.finish(&format!("coverage, {:?}", actual.path));
+    }
+    for simd in levels() {
+        let mut renderer = Renderer::new(simd);
+        let SyntheticScene { field, camera, time, .. } = &expected.synthetic;
+        renderer.forward(field, camera, *time, &settings, None);
+        let mut mismatches = Mismatches::default();
+        for (position, alpha) in renderer.alpha().pixels.into_iter().enumerate() {
+            let e = expected.forward.alpha.pixels[position];
+            let tolerance = if expected.band[position] { ONE_DECISION } else { 2e-5 };
+            mismatches.compare("coverage", position, e, f64::from(alpha), 0.0, tolerance);
+        }
+        mismatches.finish("coverage");
+    }
 }
 
 #[test]

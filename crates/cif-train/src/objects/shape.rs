@@ -3,8 +3,8 @@
 use cif_field::tracks::TrackPose;
 use cif_field::{Field, Gaussians, Record, SortMetric, Timeline, Tracks};
 use cif_geometry::{PinholeCamera, PixelGrid, RigidTransform};
-use cif_render::cpu::{BlendWeightGradients, Renderer, SimdLevel};
-use cif_render::{BlendRequest, Blending, GeometryPath, Gradients, PoseGradient, RenderSettings};
+use cif_render::cpu::{Renderer, SimdLevel};
+use cif_render::{Gradients, PoseGradient, RenderSettings};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::view::Crop;
@@ -198,12 +198,10 @@ impl Shape {
         };
         let settings = RenderSettings { background, low_pass: crop.low_pass, ..self.settings };
         let color = self.renderer.forward(&self.field, &camera, 0.0, &settings, None).color;
-        let ones = vec![1.0; self.len()];
-        let request = BlendRequest { values: &ones[..], channels: 1, blending: Blending::Color };
-        let blended = self.renderer.blend(&request);
+        let alpha = self.renderer.alpha();
         let mut value = 0.0_f64;
         let mut v_color = PixelGrid::filled(camera.width, camera.height, [0.0_f32; 3]);
-        let mut v_alpha = vec![0.0_f32; crop.mask.len()];
+        let mut v_alpha = PixelGrid::filled(camera.width, camera.height, 0.0_f32);
         let scale = weight / crop.pixels;
         for (pixel, found) in color.pixels.iter().enumerate() {
             let of_color = crop.color_weight(pixel) * scale / 3.0;
@@ -217,24 +215,16 @@ impl Shape {
             }
             let of_mask = COVERAGE * crop.known[pixel] * scale;
             if of_mask > 0.0 {
-                let d = blended.values[pixel] - crop.mask[pixel];
+                let d = alpha.pixels[pixel] - crop.mask[pixel];
                 let h = (d * d + SOFT[1] * SOFT[1]).sqrt();
                 value += f64::from(of_mask * (h - SOFT[1]));
-                v_alpha[pixel] = of_mask * d / h;
+                v_alpha.pixels[pixel] = of_mask * d / h;
             }
         }
         let mut sum = PoseGradient::default();
         if differentiates {
             self.gradients.reset();
-            self.renderer.backward(&self.field, &v_color, 0.0, &mut self.gradients);
-            let mut v_ones = vec![0.0; ones.len()];
-            let weights = BlendWeightGradients {
-                field: &self.field,
-                blended: &blended,
-                geometry: GeometryPath::Full,
-                gradients: &mut self.gradients,
-            };
-            self.renderer.blend_backward(&request, &v_alpha, &mut v_ones, Some(weights));
+            self.renderer.backward_with_alpha(&self.field, &v_color, &v_alpha, &mut self.gradients);
             let (g, v) = (&self.field.gaussians, &self.gradients.gaussians);
             for row in 0..self.len() {
                 let at = (g.means[row], g.quaternions[row], &g.sh_coefficients[row]);

@@ -45,6 +45,20 @@ impl Renderer {
         self.backward_displaced(field, v_color, instance_weight, &[], gradients);
     }
 
+    /// [`Self::backward`] of colours and of `v_alpha`, dL/dalpha per pixel; see [`Self::alpha`].
+    ///
+    /// # Panics
+    /// As [`Self::backward`].
+    pub fn backward_with_alpha(
+        &mut self,
+        field: &Field,
+        v_color: &PixelGrid<[f32; 3]>,
+        v_alpha: &PixelGrid<f32>,
+        gradients: &mut Gradients,
+    ) {
+        self.view_backward(field, (v_color, Some(v_alpha)), 0.0, &[], gradients);
+    }
+
     /// [`Self::backward`] with gradients of its own by what the deformation adds to the centres, `[N, 3]`, or
     /// empty: they train the deformation, and leave the canonical centres to the image.
     ///
@@ -58,11 +72,25 @@ impl Renderer {
         v_displacements: &[[f32; 3]],
         gradients: &mut Gradients,
     ) {
+        self.view_backward(field, (v_color, None), instance_weight, v_displacements, gradients);
+    }
+
+    fn view_backward(
+        &mut self,
+        field: &Field,
+        (v_color, v_alpha): (&PixelGrid<[f32; 3]>, Option<&PixelGrid<f32>>),
+        instance_weight: f32,
+        v_displacements: &[[f32; 3]],
+        gradients: &mut Gradients,
+    ) {
         let (view, settings, _) = self.tape.view.expect("backward follows a forward pass");
         assert_eq!((v_color.width, v_color.height), (view.width, view.height), "cotangent size");
+        if let Some(v_alpha) = v_alpha {
+            assert_eq!((v_alpha.width, v_alpha.height), (view.width, view.height), "cotangent size");
+        }
         let mut times = self.times;
         let (pairs, label_mass) = timed(&mut times.rasterize_backward, || {
-            self.rasterize_backward(field, v_color, instance_weight, &settings)
+            self.rasterize_backward(field, (v_color, v_alpha), instance_weight, &settings)
         });
         self.inspect_pairs(&pairs, &label_mass.values);
         timed(&mut times.project_backward, || self.calibration_backward(field, &label_mass, gradients));
@@ -149,7 +177,7 @@ impl Renderer {
     fn rasterize_backward(
         &self,
         field: &Field,
-        v_color: &PixelGrid<[f32; 3]>,
+        (v_color, v_alpha): (&PixelGrid<[f32; 3]>, Option<&PixelGrid<f32>>),
         instance_weight: f32,
         settings: &RenderSettings,
     ) -> (Vec<SplatGradient>, LabelMass) {
@@ -186,6 +214,9 @@ impl Renderer {
             let place = self.place(tile);
             let entries = lists.tile(tile);
             let mut cotangents = tile_cotangents(&place, &v_color.pixels, &tape.color);
+            if let Some(v_alpha) = v_alpha {
+                cotangents.add_alpha(&place, &v_alpha.pixels, &tape.tiles[tile].transmittance);
+            }
             let instances = instances(tile).map(|(labels, rows)| {
                 let (inverse_probability, coverage_ratio) =
                     instance_cotangents(labels, &tape.tiles[tile], settings);
@@ -344,7 +375,7 @@ fn has_posed_sh(field: &Field, row: usize) -> bool {
 /// Gradients of the colour loss by the colours of a tile's pixels.
 fn tile_cotangents(place: &TilePlace, v_color: &[[f32; 3]], color: &[[f32; 3]]) -> TileCotangents {
     let zero = [[0.0; LANES]; GROUPS];
-    let mut cotangents = TileCotangents { color: [zero; 3], remainder: zero };
+    let mut cotangents = TileCotangents { color: [zero; 3], alpha: None, remainder: zero };
     for group in 0..GROUPS {
         for lane in 0..LANES {
             if let Some(pixel) = place.pixel(group, lane) {

@@ -158,9 +158,7 @@ impl Renderer {
         let (lists, tiles) = (&self.tape.lists, &self.tape.tiles);
         let width = band.image.color.width;
         self.gather_color(&mut band.image.color.pixels);
-        gather_tiles(lists, width, &mut band.image.alpha.pixels, |tile, group, lane| {
-            1.0 - tiles[tile].transmittance[group][lane]
-        });
+        self.gather_alpha(width, &mut band.image.alpha.pixels);
         if let Some(depth) = &mut band.image.depth {
             gather_tiles(lists, width, &mut depth.pixels, |tile, group, lane| {
                 let tile = &tiles[tile];

@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 
 use cif_field::{Field, Identities};
-use cif_geometry::PinholeCamera;
+use cif_geometry::{PinholeCamera, PixelGrid};
 use fearless_simd::dispatch;
 use rayon::prelude::*;
 
@@ -53,6 +53,26 @@ impl Renderer {
             Ok::<(), Infallible>(())
         });
         image.expect("a view has a band")
+    }
+
+    /// Coverage of the pixels in the last forward pass, 1 minus what light they still let through.
+    ///
+    /// # Panics
+    /// Without a forward pass.
+    #[must_use]
+    pub fn alpha(&self) -> PixelGrid<f32> {
+        let (view, ..) = self.tape.view.expect("a view was rendered");
+        let mut alpha = PixelGrid::filled(view.width, view.height, 0.0);
+        self.gather_alpha(view.width, &mut alpha.pixels);
+        alpha
+    }
+
+    /// Writes the coverage of the tiles that were blended last to rows of pixels.
+    pub(super) fn gather_alpha(&self, width: u32, rows: &mut [f32]) {
+        let tiles = &self.tape.tiles;
+        gather_tiles(&self.tape.lists, width, rows, |tile, group, lane| {
+            1.0 - tiles[tile].transmittance[group][lane]
+        });
     }
 
     /// Blended identities of every tile, and so many of the most probable instances per pixel.
