@@ -36,8 +36,13 @@ const OPAQUE: f32 = 0.9;
 /// Largest distance between cameras, of the middle depth, from which views tell depths.
 const PARALLAX: f64 = 0.1;
 
-/// Rates of poses at the start and the end of the fine stage, shares of the size of the object.
-const RATES: [f32; 2] = [0.004, 2e-4];
+/// Way that a pose can go in the fine stage, of the size of its object. Fits are closer than that, and what would pull
+/// poses farther is light and shadow, which stay where they are.
+const TRAVEL: f64 = 0.04;
+
+/// Largest rate of poses, of the size of the object, and rate at the end of the fine stage, of that at its start.
+const FASTEST: f64 = 0.004;
+const LAST: f32 = 0.05;
 
 /// Steps of the fine stage in which poses stay, while everything settles around them.
 const FROZEN: u32 = 300;
@@ -289,13 +294,19 @@ impl Trainer {
 
     /// Rate of the poses at a step of a stage; 0 where they stay.
     pub(super) fn pose_rate(&self, stage: Stage, iteration: u32) -> f64 {
-        let steps = self.state.config.fine_iterations().max(1);
-        let rate = match stage {
-            Stage::Fine if iteration > FROZEN.min(steps / 4) => log_linear(RATES, iteration, steps),
-            Stage::Instance => RATES[1],
+        let config = &self.state.config;
+        let steps = config.fine_iterations().max(1);
+        let visits =
+            f64::from(steps) * f64::from(config.stages.batch) / self.state.dataset.times.len() as f64;
+        // Mean of rates that fall log-linearly, of the first.
+        let mean = f64::from((LAST - 1.0) / LAST.ln());
+        let rate = (TRAVEL / (mean * visits)).min(FASTEST);
+        let share = match stage {
+            Stage::Fine if iteration > FROZEN.min(steps / 4) => log_linear([1.0, LAST], iteration, steps),
+            Stage::Instance => LAST,
             _ => 0.0,
         };
-        f64::from(rate)
+        rate * f64::from(share)
     }
 }
 
@@ -303,6 +314,27 @@ impl Trainer {
 mod tests {
     use super::super::guard_tests::support::{Scene, capture, small_config};
     use super::*;
+
+    #[test]
+    fn poses_go_as_far_in_long_stages_as_in_short_ones() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = capture(folder.path(), Scene::default());
+        let times = dataset.times.len() as f64;
+        let mut trainer = Trainer::new(dataset, small_config()).unwrap();
+        let mut way = |steps: u32| -> f64 {
+            trainer.state.config.stages.fine = steps;
+            let rates = (1..=steps).map(|step| trainer.pose_rate(Stage::Fine, step));
+            rates.sum::<f64>() / times
+        };
+        // All but what the steps in which poses stay would add.
+        for steps in [4_000, 40_000] {
+            let share = way(steps) / TRAVEL;
+            assert!((0.75..=1.0).contains(&share), "{share} in {steps} steps");
+        }
+        assert!(way(100) < 0.5 * TRAVEL, "no step is too large");
+        assert_eq!(trainer.pose_rate(Stage::Coarse, 1), 0.0);
+        assert!(trainer.pose_rate(Stage::Instance, 1) > 0.0);
+    }
 
     #[test]
     fn without_points_what_is_seen_of_the_reconstruction_tells_the_support() {
