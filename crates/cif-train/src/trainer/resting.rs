@@ -2,6 +2,8 @@
 //! They are taken out of it as a whole where the held-out pixels hardly miss it, so that they leave as one thing that
 //! stands still; likewise what stays behind of an object that has poses.
 
+use glam::DVec3;
+
 use super::Trainer;
 use super::judged::{JudgedErrors, gain};
 use super::motions::{Motion, put_to_rest};
@@ -11,6 +13,12 @@ use crate::error::TrainError;
 /// Loss on held-out pixels, dB, up to which instances are taken to rest: each on its own pixels, and together on all.
 const OWN_LOSS: f64 = 1.0;
 const LOSS: f64 = 0.05;
+
+/// Displacement of the Gaussians of an instance, root mean square, of their spread, up to which it trembles, as where the
+/// network draws reflections by shifting them, and the loss on its own pixels, dB, up to which it rests all the same: its
+/// colours are still trained.
+const TREMBLES: f64 = 0.06;
+const TREMBLING_LOSS: f64 = 5.0;
 
 /// Share of its image on labelled pixels from which a Gaussian may leave with its instance.
 const LABELLED_SHARE: f32 = 0.2;
@@ -24,6 +32,7 @@ impl Trainer {
         if !resting.contains(&true) {
             return Ok(0);
         }
+        let trembling = self.trembling(motions, &instance_of);
         let settings = self.state.color_settings();
         let before = self.judged_errors(None, &settings)?;
         while resting.contains(&true) {
@@ -33,7 +42,7 @@ impl Trainer {
             };
             let count = put_to_rest(&mut trial, motions, rests);
             let after = self.judged_errors(Some(&trial), &settings)?;
-            let missed = missed(&before, &after, &resting);
+            let missed = missed(&before, &after, &resting, &trembling);
             if missed.is_empty() {
                 self.state.field = trial;
                 return Ok(count);
@@ -41,6 +50,21 @@ impl Trainer {
             missed.into_iter().for_each(|instance| resting[instance] = false);
         }
         Ok(0)
+    }
+
+    /// True for instances that the network shifts little beside their size.
+    fn trembling(&self, motions: &[Motion], instance_of: &[Option<usize>]) -> Vec<bool> {
+        let field = &self.state.field;
+        let is_still = |row: usize| field.deformation.as_ref().is_none_or(|network| network.is_still(row));
+        let mut shifts = vec![Shift::default(); field.instances.len()];
+        for (row, instance) in instance_of.iter().enumerate() {
+            if let Some(instance) = instance.filter(|_| !self.is_mover(row)) {
+                let displacement = if is_still(row) { 0.0 } else { f64::from(motions[row].displacement) };
+                let place = DVec3::from_array(field.gaussians.means[row].map(f64::from));
+                shifts[instance].add(f64::from(field.gaussians.opacity(row)), place, displacement);
+            }
+        }
+        shifts.iter().map(Shift::trembles).collect()
     }
 
     /// The instance of every row that may leave with it.
@@ -78,17 +102,46 @@ impl Trainer {
     }
 }
 
-/// Instances that must not rest: those whose own pixels miss the network or, where all pixels together do, the one that
-/// costs most.
-fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool]) -> Vec<usize> {
-    let loss =
-        |instance: usize| gain(after.of_labels[instance + 1].mean(), before.of_labels[instance + 1].mean());
+/// Sums over the Gaussians of an instance, by their opacities.
+#[derive(Clone, Debug, Default)]
+struct Shift {
+    weight: f64,
+    places: DVec3,
+    squared_places: f64,
+    squared_displacements: f64,
+}
+
+impl Shift {
+    fn add(&mut self, weight: f64, place: DVec3, displacement: f64) {
+        self.weight += weight;
+        self.places += weight * place;
+        self.squared_places += weight * place.length_squared();
+        self.squared_displacements += weight * displacement * displacement;
+    }
+
+    /// True of displacements that are small beside the spread of the places.
+    fn trembles(&self) -> bool {
+        let spread = self.squared_places / self.weight - (self.places / self.weight).length_squared();
+        self.squared_displacements / self.weight <= TREMBLES * TREMBLES * spread
+    }
+}
+
+/// Instances that must not rest: those whose own pixels miss the network or, where all pixels together do, but for those
+/// of instances that tremble, the one that costs most.
+fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool], trembling: &[bool]) -> Vec<usize> {
+    let own = |errors: &JudgedErrors, instance: usize| errors.of_labels[instance + 1].sum();
     let tried = || (0..resting.len()).filter(|instance| resting[*instance]);
-    let missed: Vec<usize> = tried().filter(|instance| loss(*instance) > OWN_LOSS).collect();
-    if !missed.is_empty() || gain(after.all.mean(), before.all.mean()) <= LOSS {
+    let limit = |instance: usize| if trembling[instance] { TREMBLING_LOSS } else { OWN_LOSS };
+    let misses = |instance: &usize| gain(own(after, *instance), own(before, *instance)) > limit(*instance);
+    let missed: Vec<usize> = tried().filter(misses).collect();
+    let all = |errors: &JudgedErrors| {
+        let excused = tried().filter(|instance| trembling[*instance]).map(|instance| own(errors, instance));
+        errors.all.sum() - excused.sum::<f64>()
+    };
+    if !missed.is_empty() || gain(all(after), all(before)) <= LOSS {
         return missed;
     }
-    let cost = |instance: usize| after.of_labels[instance + 1].sum() - before.of_labels[instance + 1].sum();
+    let cost = |instance: usize| own(after, instance) - own(before, instance);
     tried().max_by(|a, b| cost(*a).total_cmp(&cost(*b))).into_iter().collect()
 }
 
@@ -147,11 +200,35 @@ mod tests {
             errors
         };
         let before = errors([0.1; 4]);
-        let missed = |after: [f64; 4], resting: [bool; 3]| missed(&before, &errors(after), &resting);
+        let of = |after: [f64; 4], resting: [bool; 3], trembling: [bool; 3]| {
+            missed(&before, &errors(after), &resting, &trembling)
+        };
+        let missed = |after: [f64; 4], resting: [bool; 3]| of(after, resting, [false; 3]);
         assert!(missed([0.1, 0.1005, 0.1, 0.1], [true; 3]).is_empty());
         assert_eq!(missed([0.1, 0.1, 0.2, 0.1], [true; 3]), [1]);
         assert_eq!(missed([0.1, 0.11, 0.105, 0.1], [true; 3]), [0], "all pixels together miss it");
         assert_eq!(missed([0.2, 0.1, 0.1, 0.1], [true; 3]).len(), 1, "so they do for what has no label");
         assert!(missed([0.1, 0.1, 0.2, 0.1], [true, false, true]) != [1], "it was not tried");
+        // What trembles may lose more of its own pixels, but not of those around it.
+        let trembling = [false, true, false];
+        assert!(of([0.1, 0.1, 0.15, 0.1], [true; 3], trembling).is_empty());
+        assert_eq!(of([0.1, 0.1, 0.2, 0.1], [true; 3], trembling), [1]);
+        assert_eq!(of([0.12, 0.1, 0.15, 0.1], [true; 3], trembling), [1]);
+    }
+
+    #[test]
+    fn what_shifts_little_beside_its_size_trembles() {
+        let shift = |displacement: f64, moving: i32| {
+            let mut shift = Shift::default();
+            for k in 0..20 {
+                let place = DVec3::new(0.01 * f64::from(k), 2.0, 0.0);
+                shift.add(0.8, place, if k < moving { displacement } else { 0.0 });
+            }
+            shift
+        };
+        assert!(shift(0.003, 10).trembles() && shift(0.0, 0).trembles());
+        assert!(!shift(0.008, 10).trembles());
+        // A few that go far are no trembling.
+        assert!(!shift(0.03, 1).trembles());
     }
 }
