@@ -12,7 +12,7 @@ use super::mend::mend;
 use super::outline;
 use super::plane::{self, Plane};
 use super::shape::Pose;
-use super::start::{Fitted, fit_object, grow};
+use super::start::{Fitted, Object, fit_object, grow};
 use super::testing::{
     Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
     views_in_masks, with_objects,
@@ -317,6 +317,29 @@ fn lifted_and_tilted() -> (Vec<ObjectView>, Vec<(DQuat, DVec3)>) {
         .collect();
     let flat = sides(DVec3::new(0.06, 0.06, 0.03));
     (views(solid(&flat, patches, 0.006), &truth, moving), truth)
+}
+
+#[test]
+fn supports_hold_objects_whose_distance_nothing_else_tells() {
+    let truth: Vec<(DQuat, DVec3)> =
+        (0..TIMES).map(|k| (DQuat::IDENTITY, DVec3::new(0.1 - 0.006 * k as f64, 0.0, 0.045))).collect();
+    // Of every outline that it may have: rays of several cameras or sides tell it, and it is held.
+    let held = |cameras: Cameras| -> Vec<(bool, bool)> {
+        let views = views(solid(&sphere_places(0.045), patches, 0.006), &truth, cameras);
+        with_objects(Some(&FLOOR), &views, |objects| {
+            let of = |object: &Object<'_>| {
+                let path = &object.outline.path;
+                let times: Vec<usize> = path.keys().copied().collect();
+                let (_, fit) = object.first(path, &times).unwrap();
+                (object.outline.is_surrounded, fit.is_held())
+            };
+            objects.iter().map(of).collect()
+        })
+    };
+    assert!(held(moving).contains(&(false, true)));
+    assert!(held(rig).iter().all(|(_, held)| !held));
+    let jumping = held(jumping);
+    assert!(jumping.contains(&(true, false)) && !jumping.contains(&(true, true)), "{jumping:?}");
 }
 
 #[test]

@@ -18,7 +18,7 @@ const LOSS: f64 = 0.05;
 /// network draws reflections by shifting them, and the loss on its own pixels, dB, up to which it rests all the same: its
 /// colours are still trained.
 const TREMBLES: f64 = 0.06;
-const TREMBLING_LOSS: f64 = 5.0;
+const TREMBLING_LOSS: f64 = 8.0;
 
 /// Share of its image on labelled pixels from which a Gaussian may leave with its instance.
 const LABELLED_SHARE: f32 = 0.2;
@@ -212,7 +212,7 @@ mod tests {
         // What trembles may lose more of its own pixels, but not of those around it.
         let trembling = [false, true, false];
         assert!(of([0.1, 0.1, 0.15, 0.1], [true; 3], trembling).is_empty());
-        assert_eq!(of([0.1, 0.1, 0.2, 0.1], [true; 3], trembling), [1]);
+        assert_eq!(of([0.1, 0.1, 0.3, 0.1], [true; 3], trembling), [1]);
         assert_eq!(of([0.12, 0.1, 0.15, 0.1], [true; 3], trembling), [1]);
     }
 
