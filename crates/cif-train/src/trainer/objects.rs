@@ -36,9 +36,9 @@ const OPAQUE: f32 = 0.9;
 /// Largest distance between cameras, of the middle depth, from which views tell depths.
 const PARALLAX: f64 = 0.1;
 
-/// Way that a pose can go in the fine stage, of the size of its object. Fits are closer than that, and what would pull
-/// poses farther is light and shadow, which stay where they are.
-const TRAVEL: f64 = 0.04;
+/// Way that a pose can go in the fine stage, of the size of its object: as far as times that no mask shows may be off.
+/// What would pull the poses of many views farther is light and shadow, which stay where they are.
+const TRAVEL: f64 = 0.15;
 
 /// Largest rate of poses, of the size of the object, and rate at the end of the fine stage, of that at its start.
 const FASTEST: f64 = 0.004;
