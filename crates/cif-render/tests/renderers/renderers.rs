@@ -105,7 +105,7 @@ fn fast(simd: SimdLevel, scene: &SyntheticScene, settings: &RenderSettings, cota
     }
 }
 
-/// A view of the fast path, which adds to `gradients`; without instances where coverage has cotangents.
+/// A view of the fast path, which adds to `gradients`; those of coverage without instances alone.
 pub(crate) fn forward_and_backward(
     simd: SimdLevel,
     scene: &SyntheticScene,
@@ -116,7 +116,7 @@ pub(crate) fn forward_and_backward(
     let mut renderer = Renderer::new(simd);
     let forward = renderer.forward(&scene.field, &scene.camera, scene.time, settings, Some(&scene.labels));
     let v_color = cotangents.color.map(|color| color.map(|v| v as f32));
-    match &cotangents.alpha {
+    match cotangents.alpha.as_ref().filter(|_| settings.instances.is_none()) {
         None => renderer.backward(&scene.field, &v_color, cotangents.instance_weight as f32, gradients),
         Some(alpha) => {
             let v_alpha = alpha.map(|v| *v as f32);
