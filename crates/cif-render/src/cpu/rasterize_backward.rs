@@ -35,22 +35,6 @@ pub(super) struct TileCotangents {
     pub(super) remainder: TilePixels,
 }
 
-impl TileCotangents {
-    /// Adds gradients by the coverage of the pixels, given what light they still let through.
-    pub(super) fn add_alpha(&mut self, place: &TilePlace, v_alpha: &[f32], transmittance: &TilePixels) {
-        let mut alpha = Box::new([[0.0; LANES]; GROUPS]);
-        for group in 0..GROUPS {
-            for lane in 0..LANES {
-                if let Some(pixel) = place.pixel(group, lane) {
-                    alpha[group][lane] = v_alpha[pixel];
-                    self.remainder[group][lane] += v_alpha[pixel] * (1.0 - transmittance[group][lane]);
-                }
-            }
-        }
-        self.alpha = Some(alpha);
-    }
-}
-
 /// Instance inputs of a tile.
 pub(super) struct TileInstances<'a> {
     pub(super) labels: &'a TileLabels,

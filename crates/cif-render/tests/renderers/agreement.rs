@@ -361,7 +361,8 @@ fn coverage_and_its_gradients() {
         let mut mismatches = Mismatches::default();
         for (position, alpha) in renderer.alpha().pixels.into_iter().enumerate() {
             let e = expected.forward.alpha.pixels[position];
-            let tolerance = if expected.band[position] { ONE_DECISION } else { 2e-5 };
+            let tolerance =
+                if expected.band[position] { ONE_DECISION } else { Tolerances::of(Path::Fast(simd)).color };
             mismatches.compare("coverage", position, e, f64::from(alpha), 0.0, tolerance);
         }
         mismatches.finish("coverage");

@@ -215,7 +215,7 @@ impl Renderer {
             let entries = lists.tile(tile);
             let mut cotangents = tile_cotangents(&place, &v_color.pixels, &tape.color);
             if let Some(v_alpha) = v_alpha {
-                cotangents.add_alpha(&place, &v_alpha.pixels, &tape.tiles[tile].transmittance);
+                add_alpha(&mut cotangents, &place, &v_alpha.pixels, &tape.tiles[tile].transmittance);
             }
             let instances = instances(tile).map(|(labels, rows)| {
                 let (inverse_probability, coverage_ratio) =
@@ -388,6 +388,25 @@ fn tile_cotangents(place: &TilePlace, v_color: &[[f32; 3]], color: &[[f32; 3]]) 
         }
     }
     cotangents
+}
+
+/// Adds gradients by the coverage of a tile's pixels, given what light they still let through.
+fn add_alpha(
+    cotangents: &mut TileCotangents,
+    place: &TilePlace,
+    v_alpha: &[f32],
+    transmittance: &TilePixels,
+) {
+    let mut alpha = Box::new([[0.0; LANES]; GROUPS]);
+    for group in 0..GROUPS {
+        for lane in 0..LANES {
+            if let Some(pixel) = place.pixel(group, lane) {
+                alpha[group][lane] = v_alpha[pixel];
+                cotangents.remainder[group][lane] += v_alpha[pixel] * (1.0 - transmittance[group][lane]);
+            }
+        }
+    }
+    cotangents.alpha = Some(alpha);
 }
 
 /// 1 / M_y where it carries a gradient, and `S_end / A` under coverage normalisation.
