@@ -22,6 +22,7 @@
 //! | [`heads`] | what the instance stage learns, and how pixels tell it |
 //! | `switches` | which masks show another object than theirs |
 //! | `mask_edges` | where the outlines of rough masks belong |
+//! | `sightings` | where masks show objects, and which appear or vanish |
 //! | [`tracks`] | where objects travel, from masks alone |
 //! | [`metrics`] | how good a field is |
 //! | `wgpu` | losses and optimiser on the GPU, behind the feature of that name |
@@ -73,6 +74,7 @@ mod progress;
 mod random;
 pub mod resample;
 pub mod schedule;
+mod sightings;
 pub mod stage;
 mod state;
 mod step;

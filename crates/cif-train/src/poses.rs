@@ -33,17 +33,29 @@ pub(crate) struct PoseMoments {
     pub first: Vec<[f64; WIDTH]>,
     pub second: Vec<[f64; WIDTH]>,
     pub steps: Vec<u32>,
+    /// Rates of the poses, of the common one.
+    pub shares: Vec<f64>,
 }
 
 impl PoseMoments {
     /// Zero moments of the poses of some tracks.
     pub(crate) fn zeros(tracks: Option<&Tracks>) -> Self {
-        let poses = tracks.map_or(0, Tracks::poses);
-        Self { first: vec![[0.0; WIDTH]; poses], second: vec![[0.0; WIDTH]; poses], steps: vec![0; poses] }
+        let mut moments = Self::default();
+        moments.extend(&vec![1.0; tracks.map_or(0, Tracks::poses)]);
+        moments
     }
 
-    /// Moves the poses that views were drawn of: translations at `rate` of the `sizes` of the groups, metres, turns, where
-    /// they are not assumed, at [`TURN_RATE`] of as many radians.
+    /// Adds zero moments of poses that follow, with their shares of the common rate.
+    pub(crate) fn extend(&mut self, shares: &[f64]) {
+        let poses = self.shares.len() + shares.len();
+        self.first.resize(poses, [0.0; WIDTH]);
+        self.second.resize(poses, [0.0; WIDTH]);
+        self.steps.resize(poses, 0);
+        self.shares.extend(shares);
+    }
+
+    /// Moves the poses that views were drawn of, each at its share of `rate`: translations at that of the `sizes` of the
+    /// groups, metres, turns, where they are not assumed, at [`TURN_RATE`] of as many radians.
     pub(crate) fn step(
         &mut self,
         tracks: &mut Tracks,
@@ -73,6 +85,7 @@ impl PoseMoments {
                     *second = DECAY[1] * *second + (1.0 - DECAY[1]) * g * g;
                     taken[k] = (*first / bias[0]) / ((*second / bias[1]).sqrt() + EPSILON);
                 }
+                let rate = rate * self.shares[place];
                 if turns {
                     let turn = -TURN_RATE * rate * DVec3::from_slice(&taken[..3]);
                     pose.rotation = (pose.rotation * DQuat::from_scaled_axis(turn)).normalize();
@@ -91,6 +104,7 @@ impl PoseMoments {
             ("poses.first", StateTensor::F64(self.first.as_flattened().to_vec())),
             ("poses.second", StateTensor::F64(self.second.as_flattened().to_vec())),
             ("poses.steps", StateTensor::U32(self.steps.clone())),
+            ("poses.shares", StateTensor::F64(self.shares.clone())),
         ]
     }
 
@@ -99,18 +113,20 @@ impl PoseMoments {
     pub(crate) fn restore(&mut self, saved: &mut BTreeMap<String, StateTensor>) -> Option<()> {
         let Some(steps) = saved.remove("poses.steps") else { return Some(()) };
         let (first, second) = (saved.remove("poses.first")?, saved.remove("poses.second")?);
+        let StateTensor::F64(shares) = saved.remove("poses.shares")? else { return None };
         let (StateTensor::F64(first), StateTensor::F64(second), StateTensor::U32(steps)) =
             (first, second, steps)
         else {
             return None;
         };
         let poses = self.steps.len();
-        let fits = steps.len() == poses && first.len() == WIDTH * poses && second.len() == WIDTH * poses;
-        let is_finite = first.iter().chain(&second).all(|value| value.is_finite());
+        let fits =
+            [first.len(), second.len()] == [WIDTH * poses; 2] && [steps.len(), shares.len()] == [poses; 2];
+        let is_finite = first.iter().chain(&second).chain(&shares).all(|value| value.is_finite());
         (fits && is_finite).then(|| {
             self.first = first.as_chunks().0.to_vec();
             self.second = second.as_chunks().0.to_vec();
-            self.steps = steps;
+            (self.steps, self.shares) = (steps, shares);
         })
     }
 }

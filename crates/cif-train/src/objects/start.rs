@@ -18,7 +18,7 @@ use super::path::smooth;
 use super::plane::Plane;
 use super::shape::{Pose, Shape};
 use super::trials::{self, GAUSSIANS, STEPS};
-use super::view::{ObjectView, is_one_camera};
+use super::view::{ObjectView, is_one_camera, median};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
@@ -49,6 +49,9 @@ const FOLLOWED: usize = 300;
 /// Steps of the joint fit.
 const JOINT: usize = 2500;
 
+/// Share of the way that training may move the pose of a time which shows an object whole.
+const LEAST_SHARE: f64 = 0.1;
+
 /// Pose-only steps of a time that is added.
 const ADDED: usize = 30;
 
@@ -57,6 +60,8 @@ const ADDED: usize = 30;
 pub(crate) struct Fitted {
     /// World from object, by time.
     pub(crate) poses: BTreeMap<usize, (DQuat, DVec3)>,
+    /// How far training may move each of these poses: 1 where its time shows nothing that the fit explains.
+    pub(crate) shares: BTreeMap<usize, f64>,
     /// In the frame of the object.
     pub(crate) gaussians: Gaussians,
     /// Pose at the time that shows most of it.
@@ -177,8 +182,10 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         fit.rolls = Some(outline.height / factor);
     }
     fit.fill_long_turns();
+    let shares = shares(&mut fit);
     let at_rest = (DQuat::IDENTITY, DVec3::ZERO);
     Ok(Some(Fitted {
+        shares,
         poses: fit.poses.iter().map(|(time, pose)| (*time, (pose.rotation, pose.translation))).collect(),
         gaussians: fit.shape.gaussians().clone(),
         reference: fit.poses.get(&reference).map_or(at_rest, |p| (p.rotation, p.translation)),
@@ -350,6 +357,25 @@ impl<'a> Object<'a> {
         fit.steps(views, STEPS[1], |share| (if share < 0.5 { 1.0 } else { 0.5 }, 0.0, 0));
         Some(fit.mean_loss(views, 0))
     }
+}
+
+/// Share of the way that training may move poses, of each time: little where an object is seen whole and explained as well
+/// as usually, all where it is not seen, or something else than at other times.
+fn shares(fit: &mut Fit<'_>) -> BTreeMap<usize, f64> {
+    let mut seen: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
+    for view in 0..fit.views.len() {
+        let (time, visible) = (fit.views[view].time_index, fit.views[view].visible);
+        let loss = fit.loss(view, 0);
+        let (most, worst) = seen.entry(time).or_default();
+        (*most, *worst) = (most.max(visible), worst.max(loss));
+    }
+    let usual = median(&mut seen.values().map(|(_, loss)| *loss).collect::<Vec<_>>());
+    let share = |time: &usize| {
+        let explained =
+            seen.get(time).map_or(0.0, |(visible, loss)| visible * (usual / loss).min(1.0).powi(2));
+        1.0 - (1.0 - LEAST_SHARE) * explained
+    };
+    fit.poses.keys().map(|time| (*time, share(time))).collect()
 }
 
 /// Turns an object as it rolls without slip along its path, about its middle.

@@ -8,6 +8,7 @@ use rayon::prelude::*;
 
 use crate::config::MotionConfig;
 use crate::error::TrainError;
+use crate::sightings::Sightings;
 use crate::switches::{Seen, put_right, switches};
 use crate::tracks::{Observation, misfits, observe, travels};
 
@@ -25,9 +26,6 @@ const CHANGE: u8 = 24;
 
 /// Initial points that distances are measured with.
 const POINTS: usize = 500;
-
-/// Share of its usual area from which an instance counts as seen whole.
-const WHOLE: f64 = 0.5;
 
 /// Points, cameras, and images of each that brightness is compared with.
 const COLORED_POINTS: usize = 4_000;
@@ -94,7 +92,7 @@ impl Evidence {
         };
         let masked: Vec<(usize, &Frame)> =
             training.iter().filter(|(_, frame)| frame.mask.is_some()).copied().collect();
-        let sightings = Sightings::of(dataset, &masked)?;
+        let sightings = sightings(dataset, &masked)?;
         Ok(Self {
             times: dataset.times.len(),
             frames: training.len(),
@@ -103,8 +101,8 @@ impl Evidence {
             change,
             masked: masked.len(),
             instances: dataset.instances.len(),
-            travelling: sightings.travelling(dataset),
-            appearing: sightings.appearing(dataset),
+            travelling: labels(dataset, |id| travels(&sightings.of(id))),
+            appearing: labels(dataset, |id| sightings.appears(id) || sightings.vanishes(id)),
             exposures: exposures(dataset, &cameras)?,
             footprint_ratio: footprint_ratio(dataset, &training),
             view_angle: view_angle(dataset, &training),
@@ -145,100 +143,47 @@ fn largest_change(dataset: &Dataset, cameras: &[&Vec<(usize, &Frame)>]) -> Resul
     Ok(largest)
 }
 
-/// Where masks show instances, in a sample of the frames; empty for a single time.
-struct Sightings<'a> {
-    /// Frames looked at, by camera, in the order of time.
-    times: BTreeMap<&'a str, Vec<usize>>,
-    /// Per instance id, camera by camera.
-    of: BTreeMap<u16, BTreeMap<&'a str, Vec<Observation>>>,
+/// Where masks show instances, in a sample of the frames; nothing for a single time.
+fn sightings<'a>(dataset: &Dataset, masked: &[(usize, &'a Frame)]) -> Result<Sightings<'a>, TrainError> {
+    let mut found = Sightings::default();
+    if dataset.times.len() < 2 {
+        return Ok(found);
+    }
+    let mut masked = masked.to_vec();
+    masked.sort_by_key(|(_, frame)| frame.time_index);
+    let load = |(index, frame): (usize, &'a Frame)| {
+        let Some(mask) = dataset.load_mask(index)? else { return Ok(None) };
+        let image = dataset.load_image(index, [1.0; 3])?;
+        let seen = Seen::of(&image, Some(&mask), &frame.camera_name, frame.time_index);
+        Ok(Some((frame, mask, seen)))
+    };
+    let loaded: Vec<_> =
+        spread(&masked, MASKS).into_par_iter().map(load).collect::<Result<_, TrainError>>()?;
+    let (mut frames, mut masks, mut seen) = (Vec::new(), Vec::new(), Vec::new());
+    for (frame, mask, of) in loaded.into_iter().flatten() {
+        frames.push(frame);
+        masks.push(mask);
+        seen.push(of);
+    }
+    // As training puts them right.
+    let seen = masks.iter().zip(switches(&seen)).map(|(mask, renamed)| put_right(mask, &renamed));
+    let mut seen: Vec<BTreeMap<u16, Observation>> =
+        seen.zip(&frames).map(|(mask, frame)| observe(&mask, &frame.camera, frame.time_index)).collect();
+    // A wrong camera shows everything somewhere else, as if it travelled.
+    for wrong in misfits(&seen, f64::from(MotionConfig::default().misfit)).into_iter().rev() {
+        frames.remove(wrong);
+        seen.remove(wrong);
+    }
+    for (frame, seen) in frames.into_iter().zip(seen) {
+        found.add(&frame.camera_name, frame.time_index, seen);
+    }
+    Ok(found)
 }
 
-impl<'a> Sightings<'a> {
-    fn of(dataset: &Dataset, masked: &[(usize, &'a Frame)]) -> Result<Self, TrainError> {
-        let mut found = Self { times: BTreeMap::new(), of: BTreeMap::new() };
-        if dataset.times.len() < 2 {
-            return Ok(found);
-        }
-        let mut masked = masked.to_vec();
-        masked.sort_by_key(|(_, frame)| frame.time_index);
-        let load = |(index, frame): (usize, &'a Frame)| {
-            let Some(mask) = dataset.load_mask(index)? else { return Ok(None) };
-            let image = dataset.load_image(index, [1.0; 3])?;
-            let seen = Seen::of(&image, Some(&mask), &frame.camera_name, frame.time_index);
-            Ok(Some((frame, mask, seen)))
-        };
-        let loaded: Vec<_> =
-            spread(&masked, MASKS).into_par_iter().map(load).collect::<Result<_, TrainError>>()?;
-        let (mut frames, mut masks, mut seen) = (Vec::new(), Vec::new(), Vec::new());
-        for (frame, mask, of) in loaded.into_iter().flatten() {
-            frames.push(frame);
-            masks.push(mask);
-            seen.push(of);
-        }
-        // As training puts them right.
-        let seen = masks.iter().zip(switches(&seen)).map(|(mask, renamed)| put_right(mask, &renamed));
-        let mut seen: Vec<BTreeMap<u16, Observation>> =
-            seen.zip(&frames).map(|(mask, frame)| observe(&mask, &frame.camera, frame.time_index)).collect();
-        // A wrong camera shows everything somewhere else, as if it travelled.
-        for wrong in misfits(&seen, f64::from(MotionConfig::default().misfit)).into_iter().rev() {
-            frames.remove(wrong);
-            seen.remove(wrong);
-        }
-        for (frame, seen) in frames.into_iter().zip(seen) {
-            let camera = frame.camera_name.as_str();
-            found.times.entry(camera).or_default().push(frame.time_index);
-            for (id, observation) in seen {
-                found.of.entry(id).or_default().entry(camera).or_default().push(observation);
-            }
-        }
-        Ok(found)
-    }
-
-    fn labels(
-        &self,
-        dataset: &Dataset,
-        wanted: impl Fn(&BTreeMap<&str, Vec<Observation>>) -> bool,
-    ) -> Vec<String> {
-        let instances = dataset.instances.iter();
-        instances
-            .filter(|instance| self.of.get(&instance.id).is_some_and(&wanted))
-            .map(|instance| instance.label.clone())
-            .collect()
-    }
-
-    /// Labels of the instances that travel, by the centres of their masks.
-    fn travelling(&self, dataset: &Dataset) -> Vec<String> {
-        self.labels(dataset, |cameras| {
-            let mut all: Vec<Observation> = cameras.values().flatten().copied().collect();
-            all.sort_by_key(|observation| observation.time_index);
-            travels(&all)
-        })
-    }
-
-    /// Labels of the instances that every camera which sees them sees appear, or vanish, inside its image and at
-    /// full size: what comes in from the side is cut first, what comes from behind something starts small.
-    fn appearing(&self, dataset: &Dataset) -> Vec<String> {
-        self.labels(dataset, |cameras| {
-            let all = |pops: &dyn Fn(&[usize], &[Observation]) -> bool| {
-                cameras.iter().all(|(camera, seen)| pops(&self.times[camera], seen))
-            };
-            all(&|times, seen| {
-                let (Some(first), Some(start)) = (seen.first(), times.first()) else { return false };
-                first.time_index > *start && is_whole(first, &seen[1..])
-            }) || all(&|times, seen| {
-                let (Some(last), Some(end)) = (seen.last(), times.last()) else { return false };
-                last.time_index < *end && is_whole(last, &seen[..seen.len() - 1])
-            })
-        })
-    }
-}
-
-/// True when an instance is seen as large as in the other frames, away from the border.
-fn is_whole(observation: &Observation, others: &[Observation]) -> bool {
-    let mut areas: Vec<f64> = others.iter().map(|other| other.area_px).collect();
-    areas.sort_by(f64::total_cmp);
-    let Some(median) = areas.get(areas.len() / 2) else { return false };
-    !observation.cut && observation.area_px >= WHOLE * median
+/// Labels of the instances of which something is true, by their ids.
+fn labels(dataset: &Dataset, wanted: impl Fn(u16) -> bool) -> Vec<String> {
+    let instances = dataset.instances.iter().filter(|instance| wanted(instance.id));
+    instances.map(|instance| instance.label.clone()).collect()
 }
 
 /// Number of training cameras that could be compared, and the largest factor between two of them in how bright they

@@ -14,7 +14,6 @@ use super::plan_step::plane_weights;
 use crate::error::TrainError;
 use crate::guidance::Guide;
 use crate::optimiser::{Optimiser, StepRates};
-use crate::poses::PoseMoments;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
 use crate::state::State;
@@ -114,21 +113,22 @@ impl Trainer {
         if self.state.guidance.travelling.contains(&true) {
             let observations = self.observe(true)?;
             self.fit_travelling()?;
+            let mut posed = Vec::new();
             for (of, observations) in observations.iter().enumerate() {
                 if self.state.guidance.travelling[of + 1]
-                    && !self.add_object(of as u16 + 1)
+                    && !self.add_object(of as u16 + 1, &mut posed)
                     && let Some(track) = fit(observations)
                 {
                     self.inject(of as u16 + 1, track, observations)?;
                 }
             }
+            self.hide_absent(&posed)?;
         }
         let n = self.state.field.len();
         self.state.guidance.guide_of.resize(n, 0);
         if let Some(tracks) = &mut self.state.field.tracks {
             tracks.group_of.resize(n, cif_field::tracks::NO_GROUP);
         }
-        self.state.pose_moments = PoseMoments::zeros(self.state.field.tracks.as_ref());
         self.rehearse()
     }
 

@@ -1,12 +1,13 @@
 //! Objects with poses beside objects on paths.
 
 use std::collections::BTreeMap;
+use std::f64::consts::PI;
 
 use cif_field::{Gaussians, RotationEvidence};
 use glam::{DQuat, DVec3};
 
 use super::Trainer;
-use super::guard_tests::support::{Scene, capture, small_config};
+use super::guard_tests::support::{Scene, capture, small_config, stopped_after};
 use super::objects::is_rigid;
 use crate::objects::Fitted;
 use crate::stage::Stage;
@@ -15,6 +16,7 @@ use crate::stage::Stage;
 fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
     let fitted = |(error, unturned), rotation, is_ball| Fitted {
         poses: BTreeMap::new(),
+        shares: BTreeMap::new(),
         gaussians: Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap(),
         reference: (DQuat::IDENTITY, DVec3::ZERO),
         rotation,
@@ -48,6 +50,7 @@ fn paths_hold_no_object_that_has_poses() {
     let pose = (DQuat::IDENTITY, DVec3::new(0.5, 0.1, 0.3));
     let fitted = Fitted {
         poses: BTreeMap::from([(0, pose), (4, pose)]),
+        shares: BTreeMap::from([(0, 1.0), (4, 0.1)]),
         gaussians: Gaussians::from_points(&[[0.0; 3], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], &[[0.5; 3]; 3])
             .unwrap(),
         reference: pose,
@@ -68,4 +71,61 @@ fn paths_hold_no_object_that_has_poses() {
     let tracks = trainer.state.field.tracks.as_ref().unwrap();
     let posed = (0..trainer.state.field.len()).filter(|row| tracks.group(*row).is_some());
     assert!(posed.map(|row| guidance.guide_of[row]).eq([0; 3]));
+    assert_eq!(trainer.state.pose_moments.shares, [1.0, 0.1]);
+}
+
+/// Changes of visibility that the third ball, which has poses where masks show it, is given.
+fn hidden(scene: Scene, keeps_masks: bool) -> Vec<(f64, bool)> {
+    let folder = tempfile::tempdir().unwrap();
+    let mut dataset = capture(folder.path(), scene);
+    // Its points would stay for many steps.
+    dataset.points.positions.drain(300..450);
+    dataset.points.colors.drain(300..450);
+    let early = |frame: &cif_dataset::Frame| frame.time < 0.5;
+    for frame in dataset.frames.iter().filter(|frame| early(frame) && !keeps_masks) {
+        let mask = frame.mask.as_ref().unwrap();
+        let mut ids = image::open(mask).unwrap().into_luma8();
+        ids.pixels_mut().filter(|id| id.0 == [9]).for_each(|id| id.0 = [0]);
+        ids.save(mask).unwrap();
+    }
+    let mut config = small_config();
+    (config.motion.guidance, config.motion.rehearsal, config.motion.rigid) = (10.0, 1, false);
+    let mut trainer = stopped_after(&dataset, &config, config.stages.coarse.into());
+    trainer.state.guidance.travelling = vec![false, false, false, true];
+    let when = |time: f64| if scene.frozen { 0.0 } else { time };
+    let pose = |time: f64| (DQuat::IDENTITY, DVec3::new((PI * when(time)).sin() - 0.5, 0.25, -0.75));
+    let places: Vec<[f32; 3]> =
+        (0..27).map(|k| [k % 3, k / 3 % 3, k / 9].map(|step| 0.12 * (step as f32 - 1.0))).collect();
+    let mut gaussians = Gaussians::from_points(&places, &[[0.2, 0.3, 0.85]; 27]).unwrap();
+    gaussians.log_scales.fill([-3.0; 3]);
+    gaussians.opacity_logits.fill(4.0);
+    let late = dataset.times.iter().enumerate().filter(|(_, time)| **time >= 0.5);
+    let poses: BTreeMap<usize, (DQuat, DVec3)> = late.map(|(index, time)| (index, pose(*time))).collect();
+    let fitted = Fitted {
+        shares: poses.keys().map(|time| (*time, 1.0)).collect(),
+        poses,
+        gaussians,
+        reference: pose(1.0),
+        rotation: RotationEvidence::Observed,
+        error: 0.0,
+        unturned: None,
+        is_ball: false,
+        is_settled: false,
+        way: "told".to_owned(),
+    };
+    trainer.fits.insert(3, fitted);
+    trainer.enter(Stage::Fine).unwrap();
+    trainer.state.field.validate().unwrap();
+    let group = &trainer.state.field.tracks.as_ref().unwrap().groups[0];
+    group.visibility.iter().map(|step| (step.time, step.visible)).collect()
+}
+
+#[test]
+fn what_is_not_there_is_hidden_where_the_images_agree_with_the_masks() {
+    let appears = Scene { times: 6, appears: true, rolls: Some(1.0), ..Scene::default() };
+    assert_eq!(hidden(appears, true), [(0.0, false), (0.6, true)]);
+    // A tracker that found it late.
+    let there = Scene { times: 6, frozen: true, rolls: Some(1.0), ..Scene::default() };
+    assert_eq!(hidden(there, false), []);
+    assert_eq!(hidden(there, true), []);
 }

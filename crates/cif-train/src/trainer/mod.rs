@@ -52,6 +52,7 @@ mod objects;
 mod pacing;
 mod parts;
 mod plan_step;
+mod presence;
 mod provenance;
 mod resting;
 mod resume;

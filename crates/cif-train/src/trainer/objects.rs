@@ -210,8 +210,9 @@ impl Trainer {
         Ok(fits)
     }
 
-    /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not.
-    pub(super) fn add_object(&mut self, label: u16) -> bool {
+    /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not. What
+    /// moves as a whole joins `posed`, with its group.
+    pub(super) fn add_object(&mut self, label: u16, posed: &mut Vec<(u16, u32)>) -> bool {
         let name = self.state.field.instances[usize::from(label) - 1].label.clone();
         let Some(fitted) = self.fits.remove(&label) else {
             if let Some(found) = self.jointed.remove(&label) {
@@ -237,12 +238,13 @@ impl Trainer {
             "{name} moves as a whole: {}{how} (error {:.3} on pixels left out)",
             fitted.way, fitted.error
         ));
-        self.join(name, &fitted);
+        posed.push((label, self.join(name, &fitted)));
         true
     }
 
-    /// Adds the Gaussians of an object to the field, where the best of its poses puts them, in a group of their own.
-    fn join(&mut self, name: String, fitted: &Fitted) {
+    /// Adds the Gaussians of an object to the field, where the best of its poses puts them, in a group of their own, of
+    /// which it returns the place.
+    fn join(&mut self, name: String, fitted: &Fitted) -> u32 {
         let (rotation, place) = fitted.reference;
         let mut rows = fitted.gaussians.clone();
         for (mean, quaternion) in rows.means.iter_mut().zip(&mut rows.quaternions) {
@@ -270,11 +272,14 @@ impl Trainer {
         }
         let rotation = Some(fitted.rotation);
         let group = TrackGroup { deformed: false, poses, rotation, ..TrackGroup::still(name, place) };
-        self.add_group(rows, group);
+        let shares: Vec<f64> = fitted.shares.values().copied().collect();
+        self.add_group(rows, group, &shares)
     }
 
-    /// Adds Gaussians to the field, in a group of their own that skips the network; returns its place.
-    pub(super) fn add_group(&mut self, mut rows: Gaussians, group: TrackGroup) -> u32 {
+    /// Adds Gaussians to the field, in a group of their own that skips the network; returns its place. Its poses are
+    /// trained at `shares` of the common rate.
+    pub(super) fn add_group(&mut self, mut rows: Gaussians, group: TrackGroup, shares: &[f64]) -> u32 {
+        self.state.pose_moments.extend(shares);
         let occupancy = cif_geometry::scalar::logit(self.state.config.instance.occupancy);
         rows.occupancy_logits.fill(occupancy);
         let field = &mut self.state.field;

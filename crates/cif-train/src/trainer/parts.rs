@@ -42,13 +42,14 @@ impl Trainer {
             found.told()
         ));
         let base = TrackGroup { deformed: false, ..TrackGroup::still(name.clone(), found.hinge.point) };
-        let base = self.add_group(found.base.clone(), base);
+        let base = self.add_group(found.base.clone(), base, &[]);
         let times = &self.state.dataset.times;
         let values: Vec<(f64, f64)> =
             found.values.iter().map(|(time, value)| (times[*time], *value)).collect();
         let joint = Joint { base, kind: found.hinge.kind, axis: found.hinge.axis };
         let groups = self.state.field.tracks.as_ref().map_or(&[][..], |tracks| &tracks.groups);
         let part = TrackGroup::jointed(name, found.hinge.point, joint, &values, groups);
-        self.add_group(found.part.clone(), part);
+        let shares = vec![1.0; part.poses.len()];
+        self.add_group(found.part.clone(), part, &shares);
     }
 }

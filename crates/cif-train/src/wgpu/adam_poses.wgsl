@@ -1,4 +1,4 @@
-// The optimiser's step of the poses that views were drawn of, and their limits: translations by shares of
+// The optimiser's step of the poses that views were drawn of, each at its share of the rate: translations by that of
 // the size of the group, half of the largest extent of its Gaussians, turns by a part of as many radians, unless they
 // are assumed. Gradients
 // become zero. A workgroup per group.
@@ -66,7 +66,8 @@ fn move_pose(at: u32, size: f32, turns: bool) {
     let second_turn = POSE_DECAY_2 * state.second_turn.xyz + POSE_SHARE_2 * turn * turn;
     let second_translation = POSE_DECAY_2 * state.second_translation.xyz + POSE_SHARE_2 * translation * translation;
     state.first_turn = vec4f(first_turn, steps);
-    state.first_translation = vec4f(first_translation, 0.0);
+    let share = state.first_translation.w;
+    state.first_translation = vec4f(first_translation, share);
     state.second_turn = vec4f(second_turn, 0.0);
     state.second_translation = vec4f(second_translation, 0.0);
     moments[at] = state;
@@ -75,10 +76,11 @@ fn move_pose(at: u32, size: f32, turns: bool) {
     let bias_2 = 1.0 - power(POSE_DECAY_2, counted);
     let by_turn = (first_turn / bias_1) / (sqrt(second_turn / bias_2) + POSE_EPSILON);
     let by_translation = (first_translation / bias_1) / (sqrt(second_translation / bias_2) + POSE_EPSILON);
+    let rate = share * rates.rate;
     if turns {
-        poses[at].rotation = normalize(product(poses[at].rotation, small_turn(-POSE_TURN_RATE * rates.rate * by_turn)));
+        poses[at].rotation = normalize(product(poses[at].rotation, small_turn(-POSE_TURN_RATE * rate * by_turn)));
     }
-    poses[at].offset -= vec4f(rates.rate * size * by_translation, 0.0);
+    poses[at].offset -= vec4f(rate * size * by_translation, 0.0);
 }
 
 @compute @workgroup_size(256)

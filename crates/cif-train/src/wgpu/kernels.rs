@@ -165,7 +165,7 @@ cif_render::shared_struct! {
     pub struct PoseState {
         /// Decaying mean of the gradient by the turn, and steps done.
         pub first_turn: [f32; 4],
-        /// Of the gradient by the translation; one more float.
+        /// Of the gradient by the translation, and the share of the rate.
         pub first_translation: [f32; 4],
         /// Decaying mean of the squares; one more float.
         pub second_turn: [f32; 4],

@@ -42,6 +42,7 @@ impl GpuPoseOptimiser {
             first: rows.iter().map(|row| six(row.first_turn, row.first_translation)).collect(),
             second: rows.iter().map(|row| six(row.second_turn, row.second_translation)).collect(),
             steps: rows.iter().map(|row| row.first_turn[3] as u32).collect(),
+            shares: rows.iter().map(|row| f64::from(row.first_translation[3])).collect(),
         })
     }
 
@@ -82,13 +83,12 @@ fn rows(moments: &PoseMoments) -> Vec<PoseState> {
         let [a, b, c, d, e, f] = six.map(|value| value as f32);
         ([a, b, c, 0.0], [d, e, f, 0.0])
     };
-    let PoseMoments { first, second, steps } = moments;
-    let rows = first.iter().zip(second).zip(steps);
-    rows.map(|((first, second), steps)| {
-        let ((first_turn, first_translation), (second_turn, second_translation)) =
+    let PoseMoments { first, second, steps, shares } = moments;
+    let rows = first.iter().zip(second).zip(steps.iter().zip(shares));
+    rows.map(|((first, second), (steps, share))| {
+        let ((mut first_turn, mut first_translation), (second_turn, second_translation)) =
             (halves(first), halves(second));
-        let [a, b, c, _] = first_turn;
-        let first_turn = [a, b, c, *steps as f32];
+        (first_turn[3], first_translation[3]) = (*steps as f32, *share as f32);
         PoseState { first_turn, first_translation, second_turn, second_translation }
     })
     .collect()

@@ -1,0 +1,142 @@
+//! Objects with poses that appear or vanish: they are hidden while masks and images show that they are not there.
+
+use cif_field::Field;
+use cif_field::tracks::VisibilityStep;
+use cif_render::cpu::Renderer;
+use cif_render::{Channels, RenderSettings};
+
+use super::Trainer;
+use crate::error::TrainError;
+use crate::sightings::Sightings;
+use crate::tracks::observe;
+
+/// Most views that tell whether an object is there while no mask shows it.
+const LOOKS: usize = 12;
+
+/// Difference of a channel from which a pixel shows whether an object is there, and fewest such pixels.
+const SHOWS: f32 = 0.04;
+const FEWEST_PIXELS: usize = 30;
+
+/// Largest squared error without the object, of that with it, at which it is not there: what its masks miss is
+/// reconstructed with its surroundings, so that both are about the same.
+const ABSENT: f64 = 0.5;
+
+impl Trainer {
+    /// Hides objects (labels: dense index + 1, with the group of each) before they appear and after they vanish inside
+    /// the view, by their masks, where the images are explained better without them.
+    pub(super) fn hide_absent(&mut self, groups: &[(u16, u32)]) -> Result<(), TrainError> {
+        if groups.is_empty() {
+            return Ok(());
+        }
+        let mut found = Vec::new();
+        let sightings = self.sightings()?;
+        for (label, group) in groups {
+            let seen = sightings.of(*label);
+            let Some([first, last]) =
+                seen.first().zip(seen.last()).map(|(a, b)| [a, b].map(|o| o.time_index))
+            else {
+                continue;
+            };
+            let mut steps = Vec::new();
+            let times = &self.state.dataset.times;
+            if sightings.appears(*label) && self.is_absent(*group, |time| time < first)? {
+                let before = self.last_time_before(first);
+                let appears = times[(before + first).div_ceil(2)];
+                steps.extend([(times[0], false), (appears, true)]);
+            }
+            if sightings.vanishes(*label) && self.is_absent(*group, |time| time > last)? {
+                let after = self.first_time_after(last);
+                if steps.is_empty() {
+                    steps.push((times[0], true));
+                }
+                steps.push((times[(last + after).div_ceil(2)], false));
+            }
+            found.push((*label, *group, steps));
+        }
+        for (label, group, steps) in found.into_iter().filter(|(.., steps)| !steps.is_empty()) {
+            let state = &mut self.state;
+            let Some(tracks) = &mut state.field.tracks else { continue };
+            let name = &state.field.instances[usize::from(label) - 1].label;
+            self.warnings.push(format!(
+                "{name} is not there all the time, by its masks and by what is seen in its place: hidden meanwhile"
+            ));
+            tracks.groups[group as usize].visibility =
+                steps.into_iter().map(|(time, visible)| VisibilityStep { time, visible }).collect();
+        }
+        Ok(())
+    }
+
+    /// Where the masks of training views show objects, by label.
+    fn sightings(&self) -> Result<Sightings<'_>, TrainError> {
+        let state = &self.state;
+        let mut views: Vec<usize> = (0..state.frames.len()).collect();
+        views.sort_by_key(|view| state.dataset.frames[state.frames.index(*view)].time_index);
+        let mut sightings = Sightings::default();
+        for view in views {
+            state.stop.check()?;
+            let frame = &state.dataset.frames[state.frames.index(view)];
+            let data = state.frames.get(&state.dataset, view)?;
+            if let Some(labels) = &data.labels {
+                let seen = observe(labels, &frame.camera, frame.time_index);
+                sightings.add(&frame.camera_name, frame.time_index, seen);
+            }
+        }
+        Ok(sightings)
+    }
+
+    /// The last time of training views before one, and the first after one.
+    fn last_time_before(&self, time: usize) -> usize {
+        self.training_times().filter(|other| *other < time).max().unwrap_or(time)
+    }
+
+    fn first_time_after(&self, time: usize) -> usize {
+        self.training_times().filter(|other| *other > time).min().unwrap_or(time)
+    }
+
+    fn training_times(&self) -> impl Iterator<Item = usize> {
+        let state = &self.state;
+        (0..state.frames.len()).map(|view| state.dataset.frames[state.frames.index(view)].time_index)
+    }
+
+    /// True where training views at some times are explained far better without the Gaussians of a group, which are in the
+    /// nearest of their poses.
+    fn is_absent(&self, group: u32, at: impl Fn(usize) -> bool) -> Result<bool, TrainError> {
+        let state = &self.state;
+        let time_of = |view: &usize| state.dataset.frames[state.frames.index(*view)].time_index;
+        let views: Vec<usize> = (0..state.frames.len()).filter(|view| at(time_of(view))).collect();
+        let without = hidden(&state.field, group);
+        let settings = RenderSettings { deform: false, ..state.color_settings() };
+        let channels = Channels { depth: false, instances: false };
+        let mut renderer = Renderer::new(self.simd);
+        let (mut errors, mut pixels) = ([0.0_f64; 2], 0);
+        for view in views.iter().step_by(views.len().div_ceil(LOOKS).max(1)) {
+            state.stop.check()?;
+            let frame = &state.dataset.frames[state.frames.index(*view)];
+            let truth = state.frames.get(&state.dataset, *view)?;
+            let [with, without] = [&state.field, &without]
+                .map(|field| renderer.render(field, &frame.camera, frame.time, &settings, channels).color);
+            for ((with, without), truth) in with.pixels.iter().zip(&without.pixels).zip(&truth.image.pixels) {
+                let differs = (0..3).any(|channel| (with[channel] - without[channel]).abs() > SHOWS);
+                if !differs {
+                    continue;
+                }
+                pixels += 1;
+                for (error, color) in errors.iter_mut().zip([with, without]) {
+                    let squares = (0..3).map(|c| f64::from(color[c] - f32::from(truth[c]) / 255.0).powi(2));
+                    *error += squares.sum::<f64>();
+                }
+            }
+        }
+        Ok(pixels >= FEWEST_PIXELS && errors[1] < ABSENT * errors[0])
+    }
+}
+
+/// The field without the Gaussians of a group.
+fn hidden(field: &Field, group: u32) -> Field {
+    let mut field = field.clone();
+    if let Some(tracks) = &mut field.tracks {
+        let never = VisibilityStep { time: 0.0, visible: false };
+        tracks.groups[group as usize].visibility = vec![never];
+    }
+    field
+}
