@@ -24,7 +24,7 @@ const LONG: f64 = 2.0;
 const LEADS: f64 = 1.2;
 
 /// Background that losses are compared on.
-const GREY: [f32; 3] = [0.5; 3];
+pub(super) const GREY: [f32; 3] = [0.5; 3];
 
 /// Turns that poses may take.
 #[derive(Clone, Copy, Debug, PartialEq)]

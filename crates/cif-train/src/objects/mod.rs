@@ -15,11 +15,13 @@
 //! | `follow` | how it moves from time to time |
 //! | `mend` | which of its poses jump, and where they belong |
 //! | `trials` | which way is kept |
+//! | `bend` | whether it rather deforms |
 //! | `start` | everything in order |
 //! | `parts` | which part of it turns on a hinge or slides |
 
 mod ball;
 mod below;
+mod bend;
 mod fit;
 mod follow;
 mod mend;

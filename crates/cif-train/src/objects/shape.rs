@@ -235,6 +235,22 @@ impl Shape {
         Loss { value, pose: sum }
     }
 
+    /// Centres, in the object's frame.
+    pub(super) fn centres(&self) -> Vec<DVec3> {
+        self.field.gaussians.means.iter().map(|mean| DVec3::from_array(mean.map(f64::from))).collect()
+    }
+
+    pub(super) fn set_centres(&mut self, centres: &[DVec3]) {
+        for (mean, centre) in self.field.gaussians.means.iter_mut().zip(centres) {
+            *mean = centre.to_array().map(|value| value as f32);
+        }
+    }
+
+    /// Gradients of the last loss by the centres.
+    pub(super) fn centre_gradients(&self) -> Vec<DVec3> {
+        self.gradients.gaussians.means.iter().map(|v| DVec3::from_array(v.map(f64::from))).collect()
+    }
+
     /// Adds a gradient by the centres, in the object's frame.
     pub(super) fn add_to_centres(&mut self, v: &[DVec3]) {
         for (sum, v) in self.gradients.gaussians.means.iter_mut().zip(v) {

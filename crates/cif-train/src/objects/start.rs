@@ -71,6 +71,8 @@ pub(crate) struct Fitted {
     pub(crate) error: f64,
     /// The same, had it not turned.
     pub(crate) unturned: Option<f64>,
+    /// The same, might it bend, of that if it may not; `None` where nobody doubts that it does not.
+    pub(crate) bent: Option<f64>,
     /// True of a ball.
     pub(crate) is_ball: bool,
     /// True where the poses of what was left out were moved onto it before, so that errors are smaller.
@@ -122,6 +124,8 @@ pub(super) struct Started<'a> {
     pub(super) error: f64,
     /// Error of moving without a turn.
     pub(super) unturned: Option<f64>,
+    /// Error of bending, of that of a rigid object; `None` where it was not asked for.
+    pub(super) bent: Option<f64>,
     /// Time that shows most of it.
     pub(super) reference: usize,
 }
@@ -145,7 +149,8 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         begun.extend(all(&resorts)?);
     }
     let best = begun.into_iter().min_by(|a, b| a.1.error.total_cmp(&b.1.error));
-    let Some((object, Started { mut fit, path, way, rotation, error, unturned, reference })) = best else {
+    let Some((object, Started { mut fit, path, way, rotation, error, unturned, bent, reference })) = best
+    else {
         return Ok(None);
     };
     let (outline, stop) = (object.outline, object.surroundings.stop);
@@ -192,6 +197,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         rotation,
         error,
         unturned,
+        bent,
         is_ball: outline.roundness >= 1.0,
         is_settled: outline.is_surrounded && fit.one_camera,
         way: way.told(),
@@ -338,7 +344,7 @@ impl<'a> Object<'a> {
             return Ok(None);
         }
         let (way, rotation) = (Way::Followed, RotationEvidence::Observed);
-        Ok(Some(Started { fit, path, way, rotation, error, unturned: None, reference }))
+        Ok(Some(Started { fit, path, way, rotation, error, unturned: None, bent: None, reference }))
     }
 
     /// The place where views see it together.

@@ -8,6 +8,7 @@ use cif_geometry::PixelGrid;
 use glam::{DQuat, DVec3};
 use rand::RngExt;
 
+use super::bend;
 use super::mend::mend;
 use super::outline;
 use super::plane::{self, Plane};
@@ -15,7 +16,7 @@ use super::shape::Pose;
 use super::start::{Fitted, Object, fit_object, grow};
 use super::testing::{
     Cameras, FLOOR, TIMES, camera, jumping, moving, patches, rig, solid, sphere_places, views,
-    views_in_masks, with_objects,
+    views_in_masks, views_of_groups, with_objects,
 };
 use super::view::ObjectView;
 use crate::random::{Purpose, stream};
@@ -521,4 +522,34 @@ fn the_support_is_found_among_other_points() {
     assert!(below.normal.dot(DVec3::Z) < -0.999, "the normal looks at the cameras");
     let loose: Vec<DVec3> = points.iter().copied().skip(1).step_by(2).collect();
     assert!(plane::support(&loose, &above, 0.005, rng()).is_none());
+}
+
+#[test]
+fn what_folds_on_its_way_is_explained_by_bending_and_a_solid_is_not() {
+    let bar = sides(DVec3::new(0.09, 0.02, 0.02));
+    let group_of: Vec<u32> = bar.iter().map(|place| u32::from(place.x > 0.0)).collect();
+    let gaussians = || solid(&bar, patches, 0.006);
+    let way = |k: usize| k as f64 / (TIMES - 1) as f64;
+    let at = |k: usize| DVec3::new(-0.2 + 0.4 * way(k), 0.1 * way(k), 0.05);
+    let side = |sign: f64, fold: f64| -> Vec<(DQuat, DVec3)> {
+        (0..TIMES).map(|k| (DQuat::from_rotation_z(sign * fold * (2.0 * way(k) - 1.0)), at(k))).collect()
+    };
+    let bent = |fold: f64| {
+        let views = views_of_groups(gaussians(), group_of.clone(), &[side(-1.0, fold), side(1.0, fold)], rig);
+        with_objects(Some(&FLOOR), &views, |objects| {
+            let poses: BTreeMap<usize, Pose> =
+                (0..TIMES).map(|k| (k, Pose { rotation: DQuat::IDENTITY, translation: at(k) })).collect();
+            let mut rng = objects[0].rng();
+            let shape = objects[0].hull(&poses, 150, &mut rng).unwrap();
+            let mut fit = objects[0].fit(poses, shape, rng);
+            let all: Vec<usize> = (0..views.len()).collect();
+            let (judged, train): (Vec<usize>, Vec<usize>) = all.iter().partition(|view| *view % 5 == 2);
+            let level = fit.trial_level();
+            fit.steps(&train, 300, |_| (1.0, 0.0, level));
+            bend::bent(&fit, (&train, &judged), level)
+        })
+    };
+    let (folds, stays) = (bent(0.7), bent(0.0));
+    assert!(folds < 0.85, "{folds}");
+    assert!(stays > 0.95, "{stays}");
 }

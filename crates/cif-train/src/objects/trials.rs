@@ -7,6 +7,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::ball;
+use super::bend::bent;
 use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::outline::Outline;
@@ -41,6 +42,9 @@ const SPIN_GAIN: f64 = 1.12;
 /// where it is seen from several, and that of a way that does, of it.
 const UNEXPLAINED: [f64; 2] = [0.3, 0.1];
 const EXPLAINED: f64 = 0.5;
+
+/// Error from which an object may be one that bends.
+const DOUBTED: f64 = 0.1;
 
 /// Largest error of turning in place.
 const MOST_IN_PLACE: f64 = 0.1;
@@ -181,7 +185,11 @@ pub(super) fn best_way<'a>(
         _ => (Turns::Free, None),
     };
     let unturned = simple_errors[1];
-    Ok(Some(Started { fit, path, way, rotation, error: losses[1], unturned, reference }))
+    let bent = (losses[1] > DOUBTED && !object.is_told).then(|| {
+        let judged = if contest.left_out.is_empty() { &contest.train } else { &contest.left_out };
+        bent(&fit, (&contest.train, judged), fit.trial_level())
+    });
+    Ok(Some(Started { fit, path, way, rotation, error: losses[1], unturned, bent, reference }))
 }
 
 impl<'a> Contest<'a> {

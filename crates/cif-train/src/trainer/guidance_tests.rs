@@ -22,6 +22,7 @@ fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
         rotation,
         error,
         unturned: Some(unturned),
+        bent: None,
         is_ball,
         is_settled: true,
         way: "told".to_owned(),
@@ -35,6 +36,14 @@ fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
     assert!(!kept((0.12, 0.3), assumed, false));
     assert!(kept((0.2, 0.2), assumed, true));
     assert!(!kept((0.3, 0.5), observed, true));
+    let bends = |error: f64, bent: f64, is_settled: bool| {
+        let fitted = fitted((error, error), observed, false);
+        is_rigid(&Fitted { bent: Some(bent), is_settled, ..fitted }, 0.22)
+    };
+    assert!(bends(0.3, 1.0, false) && !bends(0.3, 0.95, false) && !bends(0.4, 1.0, false));
+    assert!(bends(0.15, 0.9, false) && !bends(0.15, 0.7, false));
+    // Of what is seen from other sides all the time, bending is not told.
+    assert!(!bends(0.15, 1.0, true));
 }
 
 #[test]
@@ -57,6 +66,7 @@ fn paths_hold_no_object_that_has_poses() {
         rotation: RotationEvidence::Observed,
         error: 0.0,
         unturned: None,
+        bent: None,
         is_ball: false,
         is_settled: false,
         way: "told".to_owned(),
@@ -109,6 +119,7 @@ fn hidden(scene: Scene, keeps_masks: bool) -> Vec<(f64, bool)> {
         rotation: RotationEvidence::Observed,
         error: 0.0,
         unturned: None,
+        bent: None,
         is_ball: false,
         is_settled: false,
         way: "told".to_owned(),

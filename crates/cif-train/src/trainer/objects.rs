@@ -28,6 +28,12 @@ const MOST_OF_BALL: f64 = 0.24;
 /// explains what deforms.
 const TURN_EXPLAINS: f64 = 0.5;
 
+/// Error of bending, of that of a rigid object, up to which an object deforms, whatever its error, and from which it does
+/// not, where what else is left is so much larger than usual: rough masks of small things leave much.
+const DEFORMS: f64 = 0.85;
+const BENDS_NO_BETTER: f64 = 0.98;
+const ROUGH: f64 = 1.5;
+
 /// Views whose depths show surfaces, pixels from one of these to the next, and coverage from which they are solid.
 const LOOKS: usize = 30;
 const APART: usize = 3;
@@ -56,7 +62,12 @@ pub(super) fn is_rigid(fitted: &Fitted, most: f64) -> bool {
     };
     let turns = fitted.rotation == RotationEvidence::Observed;
     let explains = |unturned: f64| turns && fitted.error <= TURN_EXPLAINS * unturned;
-    fitted.error <= most || fitted.unturned.is_some_and(explains)
+    let bends_no_better = |bent: f64| bent >= BENDS_NO_BETTER && fitted.error <= ROUGH * most;
+    let deforms = !fitted.is_ball && fitted.bent.is_some_and(|bent| bent <= DEFORMS);
+    let is_explained = fitted.error <= most
+        || fitted.unturned.is_some_and(explains)
+        || (!fitted.is_settled && fitted.bent.is_some_and(bends_no_better));
+    is_explained && !deforms
 }
 
 impl Trainer {

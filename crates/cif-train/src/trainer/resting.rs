@@ -18,7 +18,7 @@ const LOSS: f64 = 0.05;
 /// network draws reflections by shifting them, and the losses, dB, up to which it rests all the same, as its colours are
 /// still trained: on its own pixels, and together on all, which shadows on large things are worth more.
 const TREMBLES: f64 = 0.06;
-const TREMBLING_LOSSES: [f64; 2] = [5.0, 0.3];
+const TREMBLING_LOSSES: [f64; 2] = [8.0, 0.3];
 
 /// Share of its image on labelled pixels from which a Gaussian may leave with its instance.
 const LABELLED_SHARE: f32 = 0.2;

@@ -1,0 +1,132 @@
+//! An object that bends, held against one that does not: a smooth field over its frame, which changes with time, shifts
+//! its Gaussians. What deforms is explained far better by it, what is merely seen badly is not.
+
+use glam::DVec3;
+use rand::seq::SliceRandom;
+
+use super::fit::{Fit, GREY};
+use super::shape::{Adam, Shape};
+
+/// Captured times from one knot of the field to the next.
+const KNOT: usize = 3;
+
+/// Functions of the place: 1, its coordinates, and products of two of these.
+const TERMS: usize = 10;
+
+/// Steps, the share of the first rates that the last have, and first rates of the coefficients, of the size, and of the
+/// Gaussians.
+const STEPS: usize = 900;
+const LAST: f64 = 0.05;
+const RATE: f64 = 0.002;
+const SHAPE_RATE: f64 = 0.5;
+
+/// Shifts that are quadratic in the place and linear in time between knots.
+struct Bend {
+    /// Time of the first knot.
+    first: usize,
+    size: f64,
+    /// Coefficients by knot, metres.
+    knots: Vec<[DVec3; TERMS]>,
+    moments: Vec<Adam>,
+}
+
+impl Bend {
+    /// No shifts, at the times of the poses of a fit.
+    fn none(fit: &Fit<'_>) -> Self {
+        let first = fit.poses.first_key_value().map_or(0, |(time, _)| *time);
+        let last = fit.poses.last_key_value().map_or(0, |(time, _)| *time);
+        let knots = (last - first) / KNOT + 2;
+        Self {
+            first,
+            size: fit.size(),
+            knots: vec![[DVec3::ZERO; TERMS]; knots],
+            moments: vec![Adam::new(3 * TERMS); knots],
+        }
+    }
+
+    fn terms(&self, place: DVec3) -> [f64; TERMS] {
+        let DVec3 { x, y, z } = place / self.size;
+        [1.0, x, y, z, x * x, y * y, z * z, x * y, y * z, z * x]
+    }
+
+    /// Knots beside a time, with their weights.
+    fn beside(&self, time: usize) -> [(usize, f64); 2] {
+        let (before, rest) = ((time - self.first) / KNOT, (time - self.first) % KNOT);
+        let share = rest as f64 / KNOT as f64;
+        [(before, 1.0 - share), (before + 1, share)]
+    }
+
+    fn shifted(&self, time: usize, places: &[DVec3]) -> Vec<DVec3> {
+        let beside = self.beside(time);
+        let coefficients: [DVec3; TERMS] =
+            std::array::from_fn(|k| beside.iter().map(|(knot, weight)| *weight * self.knots[*knot][k]).sum());
+        let shift = |place: &DVec3| -> DVec3 {
+            self.terms(*place).iter().zip(coefficients).map(|(term, coefficient)| *term * coefficient).sum()
+        };
+        places.iter().map(|place| *place + shift(place)).collect()
+    }
+
+    /// A step against the gradients by the shifted places of a time.
+    fn step(&mut self, time: usize, places: &[DVec3], gradients: &[DVec3], rate: f64) {
+        let mut sums = [DVec3::ZERO; TERMS];
+        for (place, gradient) in places.iter().zip(gradients) {
+            for (sum, term) in sums.iter_mut().zip(self.terms(*place)) {
+                *sum += term * *gradient;
+            }
+        }
+        for (knot, weight) in self.beside(time) {
+            let values = sums.iter().flat_map(|sum| (weight * *sum).to_array());
+            let coefficients = &mut self.knots[knot];
+            self.moments[knot].step(values, rate * self.size, |k, step| coefficients[k / 3][k % 3] -= step);
+        }
+    }
+}
+
+/// Loss of a view with the Gaussians shifted; their gradients stay in the shape.
+fn loss(fit: &Fit<'_>, shape: &mut Shape, bend: Option<&Bend>, (view, level): (usize, usize)) -> f64 {
+    let view = &fit.views[view];
+    let Some(pose) = fit.poses.get(&view.time_index) else { return 0.0 };
+    let places = shape.centres();
+    if let Some(bend) = bend {
+        shape.set_centres(&bend.shifted(view.time_index, &places));
+    }
+    let value = shape.loss(&view.crops[level], pose, GREY, 1.0, true).value;
+    shape.set_centres(&places);
+    value
+}
+
+/// Mean loss over views that were left out, after a fit to others in the poses that there are.
+fn refitted(
+    fit: &Fit<'_>,
+    mut bend: Option<Bend>,
+    (train, judged): (&[usize], &[usize]),
+    level: usize,
+) -> f64 {
+    let (mut shape, mut rng, mut order) = (fit.shape.copied(), fit.rng.clone(), train.to_vec());
+    for step in 0..if train.is_empty() { 0 } else { STEPS } {
+        let place = step % order.len();
+        if place == 0 {
+            order.shuffle(&mut rng);
+        }
+        let (view, rate) = (order[place], LAST.powf(step as f64 / STEPS as f64));
+        let places = shape.centres();
+        loss(fit, &mut shape, bend.as_ref(), (view, level));
+        if let Some(bend) = &mut bend {
+            bend.step(fit.views[view].time_index, &places, &shape.centre_gradients(), RATE * rate);
+        }
+        shape.step(SHAPE_RATE * rate);
+    }
+    let weight = |view: &usize| fit.views[*view].visible;
+    let sum: f64 =
+        judged.iter().map(|view| weight(view) * loss(fit, &mut shape, bend.as_ref(), (*view, level))).sum();
+    sum / judged.iter().map(weight).sum::<f64>().max(1e-12)
+}
+
+/// Error of an object that may bend, of that of one that may not, on views that were left out.
+pub(super) fn bent(fit: &Fit<'_>, views: (&[usize], &[usize]), level: usize) -> f64 {
+    let (rigid, bent) = rayon::join(
+        || refitted(fit, None, views, level),
+        || refitted(fit, Some(Bend::none(fit)), views, level),
+    );
+    bent / rigid.max(1e-12)
+}
