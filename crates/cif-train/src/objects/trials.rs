@@ -76,6 +76,9 @@ const RIVAL: ([f64; 2], i32) = ([1.02, 1.06], 60);
 /// Largest error of rolling, relative to that of sliding, at which it is assumed where no turn is told.
 const ROLLS_AS_WELL: f64 = 1.015;
 
+/// The same of sliding with a turn of [`RIVAL`] degrees or more, which few things do.
+const ROLLS_RATHER: f64 = 1.03;
+
 /// Difference of errors up to which turns of round things are the same.
 const SAME: f64 = 0.002;
 
@@ -160,7 +163,8 @@ pub(super) fn best_way<'a>(
     }
     // The path of a ball whose turn does not show is best where none is looked for; its rolling is put on afterwards.
     let rolls_unseen = rotation == RotationEvidence::Assumed && matches!(way, Way::Roll(_));
-    let kept = if rolls_unseen { Way::Slide(0) } else { way };
+    let slides = error_of(&trials, Way::Slide(0)).is_some();
+    let kept = if rolls_unseen && slides { Way::Slide(0) } else { way };
     let Some(Trial { mut fit, losses, .. }) = trials.into_iter().find(|trial| trial.way == kept) else {
         return Ok(None);
     };
@@ -480,6 +484,14 @@ fn decide(tried: &[(Way, f64)], outline: &Outline) -> Option<(Way, RotationEvide
     {
         return Some((way, RotationEvidence::Observed));
     }
+    let turns_far = turning.degrees().is_some_and(|degrees| degrees.abs() >= RIVAL.1);
+    if let Some((way, error)) = roll
+        && in_contact
+        && turns_far
+        && error <= ROLLS_RATHER * turning_error
+    {
+        return Some((way, RotationEvidence::Assumed));
+    }
     let apart = |other: i32| {
         let difference = (other - turning.degrees().unwrap_or(0)).rem_euclid(360);
         difference.min(360 - difference) >= RIVAL.1
@@ -526,13 +538,18 @@ mod tests {
         assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.101)]), &edgy), assumed(Way::Roll(0.8)));
         assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.102)]), &edgy), assumed(Way::Slide(0)));
         assert_eq!(decide(&with(&[(Way::Roll(0.8), 0.099)]), &outline(0.7, vec![3])), assumed(Way::Slide(0)));
+        // What would have to turn far while it slides rolls, even a little worse.
+        let turning = [(Way::Slide(-120), 0.1), (Way::Roll(1.08), 0.102)];
+        assert_eq!(decide(&turning, &edgy), assumed(Way::Roll(1.08)));
+        let observed = |way: Way| Some((way, RotationEvidence::Observed));
+        assert_eq!(decide(&[(Way::Slide(-30), 0.1), turning[1]], &edgy), observed(Way::Slide(-30)));
+        assert_eq!(decide(&[turning[0], (Way::Roll(1.08), 0.104)], &edgy), observed(Way::Slide(-120)));
         // Of a ball in the air no turn was tried but those that following found.
         assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &round), assumed(Way::Slide(0)));
         let followed = Some((Way::Followed, RotationEvidence::Observed));
         assert_eq!(decide(&[slides[0], (Way::Followed, 0.05)], &round), followed);
         assert_eq!(decide(&[slides[0], (Way::Followed, 0.09)], &round), assumed(Way::Slide(0)));
-        let observed = Some((Way::Slide(0), RotationEvidence::Observed));
-        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &edgy), observed);
+        assert_eq!(decide(&[slides[0], (Way::Followed, 0.2)], &edgy), observed(Way::Slide(0)));
     }
 
     #[test]

@@ -32,7 +32,7 @@ const TURN_EXPLAINS: f64 = 0.5;
 /// not, where what else is left is so much larger than usual: rough masks of small things leave much.
 const DEFORMS: f64 = 0.85;
 const BENDS_NO_BETTER: f64 = 0.98;
-const ROUGH: f64 = 1.5;
+const ROUGH: f64 = 2.0;
 
 /// Views whose depths show surfaces, pixels from one of these to the next, and coverage from which they are solid.
 const LOOKS: usize = 30;
