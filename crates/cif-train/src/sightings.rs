@@ -33,26 +33,29 @@ impl<'a> Sightings<'a> {
         all
     }
 
-    /// True of an instance that every camera which sees it sees appear inside its image at full size: what comes in
-    /// from the side is cut first, what comes from behind something starts small.
+    /// True of an instance that no camera sees from the start, and most of those which see it see appear inside their
+    /// images at full size: what comes in from the side is cut first, what comes from behind something starts small.
     pub(crate) fn appears(&self, instance: u16) -> bool {
-        self.all_cameras(instance, |times, seen| {
-            let (Some(first), Some(start)) = (seen.first(), times.first()) else { return false };
-            first.time_index > *start && is_whole(first, &seen[1..])
+        self.most_see(instance, |times, seen| {
+            let first = seen.first().filter(|first| first.time_index > times[0])?;
+            Some(is_whole(first, &seen[1..]))
         })
     }
 
-    /// True of an instance that every camera which sees it sees vanish likewise.
+    /// True of an instance that no camera sees to the end, and most of those which see it see vanish likewise.
     pub(crate) fn vanishes(&self, instance: u16) -> bool {
-        self.all_cameras(instance, |times, seen| {
-            let (Some(last), Some(end)) = (seen.last(), times.last()) else { return false };
-            last.time_index < *end && is_whole(last, &seen[..seen.len() - 1])
+        self.most_see(instance, |times, seen| {
+            let last = seen.last().filter(|last| last.time_index < times[times.len() - 1])?;
+            Some(is_whole(last, &seen[..seen.len() - 1]))
         })
     }
 
-    fn all_cameras(&self, instance: u16, shows: impl Fn(&[usize], &[Observation]) -> bool) -> bool {
-        let cameras = self.of.get(&instance);
-        cameras.is_some_and(|cameras| cameras.iter().all(|(camera, seen)| shows(&self.times[camera], seen)))
+    /// True where most cameras that see an instance show something, and none contradicts.
+    fn most_see(&self, instance: u16, shows: impl Fn(&[usize], &[Observation]) -> Option<bool>) -> bool {
+        let Some(cameras) = self.of.get(&instance) else { return false };
+        let shown = cameras.iter().map(|(camera, seen)| shows(&self.times[camera], seen));
+        let shown: Option<Vec<bool>> = shown.collect();
+        shown.is_some_and(|shown| 2 * shown.iter().filter(|shows| **shows).count() > shown.len())
     }
 }
 
@@ -62,4 +65,44 @@ fn is_whole(observation: &Observation, others: &[Observation]) -> bool {
     areas.sort_by(f64::total_cmp);
     let Some(median) = areas.get(areas.len() / 2) else { return false };
     !observation.cut && observation.area_px >= WHOLE * median
+}
+
+#[cfg(test)]
+mod tests {
+    use cif_render::synthetic;
+    use glam::DVec2;
+
+    use super::*;
+
+    /// An instance of so many pixels at every time, 0 where it is not seen, by camera.
+    fn seen(areas: &[&[u32]]) -> [bool; 2] {
+        let names: Vec<String> = (0..areas.len()).map(|camera| camera.to_string()).collect();
+        let mut sightings = Sightings::default();
+        for time in 0..areas[0].len() {
+            for (camera, areas) in areas.iter().enumerate() {
+                let observation = Observation {
+                    time_index: time,
+                    camera: synthetic::generate(&synthetic::SyntheticConfig::default()).camera,
+                    centroid_px: DVec2::splat(10.0),
+                    area_px: f64::from(areas[time]),
+                    cut: false,
+                    contact_depth: None,
+                };
+                let seen = (areas[time] > 0).then_some((1, observation));
+                sightings.add(&names[camera], time, seen.into_iter().collect());
+            }
+        }
+        [sightings.appears(1), sightings.vanishes(1)]
+    }
+
+    #[test]
+    fn what_most_cameras_lose_at_full_size_vanishes() {
+        let (whole, hides, stays) = ([80, 80, 80, 0, 0], [80, 80, 20, 0, 0], [80, 80, 80, 80, 80]);
+        assert_eq!(seen(&[&whole]), [false, true]);
+        assert_eq!(seen(&[&whole, &hides, &whole]), [false, true]);
+        assert_eq!(seen(&[&whole, &hides]), [false, false]);
+        assert_eq!(seen(&[&whole, &whole, &stays]), [false, false]);
+        assert_eq!(seen(&[&[0, 0, 80, 80, 80], &[0, 70, 80, 80, 0]]), [true, false]);
+        assert_eq!(seen(&[&[0, 0, 80, 80, 0]]), [true, true]);
+    }
 }
