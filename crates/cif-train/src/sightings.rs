@@ -7,6 +7,9 @@ use crate::tracks::Observation;
 /// Share of its usual area from which an instance counts as seen whole.
 const WHOLE: f64 = 0.5;
 
+/// Pixels below which masks come and go with the tracker.
+const FEWEST_PIXELS: f64 = 40.0;
+
 /// Observations of instances in the frames that were looked at.
 #[derive(Debug, Default)]
 pub(crate) struct Sightings<'a> {
@@ -64,7 +67,7 @@ fn is_whole(observation: &Observation, others: &[Observation]) -> bool {
     let mut areas: Vec<f64> = others.iter().map(|other| other.area_px).collect();
     areas.sort_by(f64::total_cmp);
     let Some(median) = areas.get(areas.len() / 2) else { return false };
-    !observation.cut && observation.area_px >= WHOLE * median
+    !observation.cut && observation.area_px >= FEWEST_PIXELS.max(WHOLE * median)
 }
 
 #[cfg(test)]
@@ -104,5 +107,6 @@ mod tests {
         assert_eq!(seen(&[&whole, &whole, &stays]), [false, false]);
         assert_eq!(seen(&[&[0, 0, 80, 80, 80], &[0, 70, 80, 80, 0]]), [true, false]);
         assert_eq!(seen(&[&[0, 0, 80, 80, 0]]), [true, true]);
+        assert_eq!(seen(&[&[0, 0, 20, 20, 0]]), [false, false], "too few pixels");
     }
 }

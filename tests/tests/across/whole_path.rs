@@ -7,7 +7,7 @@ use std::thread::sleep;
 use std::time::Duration;
 
 use cif_dataset::CaptureFrame;
-use cif_field::tracks::{DenseTrack, RotationEvidence, TrackGroup, TrackPose, Tracks};
+use cif_field::tracks::{DenseTrack, RotationEvidence, TrackGroup, TrackPose, Tracks, VisibilityStep};
 use cif_field::{Checkpoint, Field, Gaussians, Identities, Instance, SortMetric, Timeline};
 use cif_test::capture::{self, ROLLING, STANDING};
 use cif_test::command::{Run, run};
@@ -483,6 +483,8 @@ fn objects_tell_how_they_move() {
         pose.rotation = DQuat::from_rotation_y(0.25 * k as f64);
     }
     groups[0].rotation = Some(RotationEvidence::Assumed);
+    groups[0].visibility =
+        vec![VisibilityStep { time: 0.0, visible: false }, VisibilityStep { time: 0.4, visible: true }];
     groups[1].poses.clear();
     field.save(path.join("scene.cif")).unwrap();
     let facts = json(&cif(path, "info scene.cif --json").succeeds().stdout);
@@ -490,14 +492,14 @@ fn objects_tell_how_they_move() {
     assert_eq!(rolling["gaussians"], 100);
     let motion = &rolling["motion"];
     assert_eq!((&motion["model"], &motion["poses"]), (&"rigid".into(), &8.into()), "{facts:#}");
-    assert_eq!(motion["rotation"], "assumed");
+    assert_eq!((&motion["rotation"], &motion["hidden"]), (&"assumed".into(), &true.into()));
     let travel = capture::centre(ROLLING, 1.0).distance(capture::centre(ROLLING, 0.0));
     assert!((motion["moves"].as_f64().unwrap() - travel).abs() < 1e-9, "{motion}");
     assert!((motion["turns_deg"].as_f64().unwrap() - 1.75_f64.to_degrees()).abs() < 1e-3, "{motion}");
     assert_eq!(standing["motion"], serde_json::json!({ "model": "static" }));
     let text = cif(path, "info scene.cif").succeeds().stdout;
     assert!(
-        text.contains("100 Gaussians  rigid, 8 poses, moves 0.500, turns 100.3 deg, rotation assumed"),
+        text.contains("100 Gaussians  rigid, 8 poses, moves 0.500, turns 100.3 deg, rotation assumed, hidden at some times"),
         "{text}"
     );
     assert!(text.contains("100 Gaussians  static"), "{text}");

@@ -22,6 +22,9 @@ pub(super) enum ObjectMotion {
         turns_deg: f64,
         /// `None` where nobody told.
         rotation: Option<RotationEvidence>,
+        /// True where it is hidden at some times.
+        #[serde(default)]
+        hidden: bool,
     },
     /// A base, and parts that joints tie to it.
     Parts { joints: Vec<JointMotion> },
@@ -76,9 +79,10 @@ impl std::fmt::Display for ObjectMotion {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         match self {
             Self::Static => f.write_str("static"),
-            Self::Rigid { poses, moves, turns_deg, rotation } => {
+            Self::Rigid { poses, moves, turns_deg, rotation, hidden } => {
                 write!(f, "rigid, {poses} poses, moves {moves:.3}, turns {turns_deg:.1} deg")?;
-                rotation.map_or(Ok(()), |rotation| write!(f, ", rotation {rotation}"))
+                rotation.map_or(Ok(()), |rotation| write!(f, ", rotation {rotation}"))?;
+                f.write_str(if *hidden { ", hidden at some times" } else { "" })
             }
             Self::Parts { joints } => {
                 write!(f, "{} parts", joints.len() + 1)?;
@@ -137,5 +141,6 @@ fn rigid(group: &TrackGroup, world_per_unit: f64) -> ObjectMotion {
         moves: largest(&|k| group.poses[k].translation.distance(first.translation)) * world_per_unit,
         turns_deg: largest(&|k| group.poses[k].rotation.angle_between(first.rotation)).to_degrees(),
         rotation: group.rotation,
+        hidden: group.visibility.iter().any(|step| !step.visible),
     }
 }
