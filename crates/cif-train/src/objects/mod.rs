@@ -51,6 +51,7 @@ pub(crate) use self::parts::Jointed;
 pub(crate) use self::plane::Plane;
 use self::start::Object;
 pub(crate) use self::start::{Fitted, Surroundings};
+pub(crate) use self::trials::BENDS_NO_BETTER;
 use self::view::ObjectView;
 use crate::error::TrainError;
 use crate::frames::FrameStore;

@@ -7,7 +7,7 @@ use glam::{DQuat, DVec3};
 use rayon::prelude::*;
 
 use super::ball;
-use super::bend::bent;
+use super::bend;
 use super::fit::{Fit, Turns};
 use super::follow::follow;
 use super::outline::Outline;
@@ -45,6 +45,9 @@ const EXPLAINED: f64 = 0.5;
 
 /// Error from which an object may be one that bends.
 const DOUBTED: f64 = 0.1;
+
+/// Error of bending, of that of a rigid object, from which it explains no better.
+pub(crate) const BENDS_NO_BETTER: f64 = 0.98;
 
 /// Largest error of turning in place.
 const MOST_IN_PLACE: f64 = 0.1;
@@ -168,13 +171,21 @@ pub(super) fn best_way<'a>(
     let Some(Trial { mut fit, losses, .. }) = trials.into_iter().find(|trial| trial.way == kept) else {
         return Ok(None);
     };
-    // What stays in place and looks otherwise in every turn deforms, or opens.
+    let bent = (losses[1] > DOUBTED && !object.is_told).then(|| {
+        let judged = if contest.left_out.is_empty() { &contest.train } else { &contest.left_out };
+        bend::bent(&fit, (&contest.train, judged), fit.trial_level())
+    });
+    // What stays in place and looks otherwise in every turn deforms, or opens. Of thin things the outline, which is never
+    // exact, is most of what is seen: they are solid where bending explains no more.
     let most = match simple_errors[0] {
         _ if matches!(way, Way::Spin(_)) => MOST_IN_PLACE,
         Some(rests) if stays && is_unexplained => EXPLAINED * rests,
         _ => f64::INFINITY,
     };
-    if losses[1] > most && !object.is_told {
+    let may_be_solid = !outline.is_surrounded
+        && !matches!(way, Way::Spin(_))
+        && bent.is_some_and(|bent| bent >= BENDS_NO_BETTER);
+    if losses[1] > most && !object.is_told && !may_be_solid {
         return Ok(None);
     }
     if rotation == RotationEvidence::Assumed && kept == Way::Slide(0) && is_round(outline) {
@@ -189,10 +200,6 @@ pub(super) fn best_way<'a>(
         _ => (Turns::Free, None),
     };
     let unturned = simple_errors[1];
-    let bent = (losses[1] > DOUBTED && !object.is_told).then(|| {
-        let judged = if contest.left_out.is_empty() { &contest.train } else { &contest.left_out };
-        bent(&fit, (&contest.train, judged), fit.trial_level())
-    });
     Ok(Some(Started { fit, path, way, rotation, error: losses[1], unturned, bent, reference }))
 }
 

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use super::Trainer;
 use crate::config::ObjectMotion;
 use crate::error::TrainError;
-use crate::objects::{self, Fitted, Found, Order, Plane, Surroundings};
+use crate::objects::{self, BENDS_NO_BETTER, Fitted, Found, Order, Plane, Surroundings};
 use crate::schedule::log_linear;
 use crate::stage::Stage;
 
@@ -28,10 +28,9 @@ const MOST_OF_BALL: f64 = 0.24;
 /// explains what deforms.
 const TURN_EXPLAINS: f64 = 0.5;
 
-/// Error of bending, of that of a rigid object, up to which an object deforms, whatever its error, and from which it does
-/// not, where what else is left is so much larger than usual: rough masks of small things leave much.
+/// Error of bending, of that of a rigid object, up to which an object deforms, whatever its error, and how much larger than
+/// usual what is left may be where bending explains no better: rough masks of small things leave much.
 const DEFORMS: f64 = 0.85;
-const BENDS_NO_BETTER: f64 = 0.98;
 const ROUGH: f64 = 2.0;
 
 /// Views whose depths show surfaces, pixels from one of these to the next, and coverage from which they are solid.
