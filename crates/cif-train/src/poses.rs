@@ -186,4 +186,29 @@ mod tests {
         assert_eq!(turned.collect::<Vec<_>>(), [false, true, true]);
         assert!(tracks.groups.iter().all(|group| group.poses[0].translation.y < 0.0));
     }
+
+    #[test]
+    fn poses_move_at_their_shares_of_the_rate_and_these_are_saved() {
+        let pose = |time: f64| TrackPose { time, translation: DVec3::ZERO, rotation: DQuat::IDENTITY };
+        let poses = vec![pose(0.0), pose(0.5), pose(1.0)];
+        let group = TrackGroup { deformed: false, poses, ..TrackGroup::still("box", DVec3::ZERO) };
+        let mut tracks = Tracks { groups: vec![group], ..Tracks::default() };
+        let mut moments = PoseMoments::default();
+        moments.extend(&[1.0]);
+        moments.extend(&[0.1, 0.0]);
+        let gradients = [PoseGradient { turn: DVec3::X, translation: DVec3::Y }; 3];
+        moments.step(&mut tracks, &[0.1], &gradients, &[1; 3], 0.01);
+        let moved: Vec<f64> = tracks.groups[0].poses.iter().map(|pose| -pose.translation.y / 0.001).collect();
+        let turned: Vec<f64> =
+            tracks.groups[0].poses.iter().map(|pose| -2.0 * pose.rotation.x / (TURN_RATE * 0.01)).collect();
+        for found in [moved, turned] {
+            assert!(found.iter().zip([1.0, 0.1, 0.0]).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?}");
+        }
+        let arrays = || moments.saved().into_iter().map(|(name, array)| (name.to_owned(), array));
+        let mut restored = PoseMoments::zeros(Some(&tracks));
+        assert!(restored.restore(&mut arrays().collect()).is_some());
+        assert_eq!(restored, moments);
+        let without = arrays().filter(|(name, _)| name != "poses.shares");
+        assert!(restored.restore(&mut without.collect()).is_none());
+    }
 }

@@ -50,7 +50,9 @@ fn trainer(gpu: Option<&Gpu>) -> (Trainer, TempDir) {
     }
     let group_of = (0..n).map(|row| [0, NO_GROUP, 1, 2, NO_GROUP, 3][row as usize % 6]).collect();
     let tracks = Tracks { group_of, groups };
-    trainer.state.pose_moments = PoseMoments::zeros(Some(&tracks));
+    trainer.state.pose_moments = PoseMoments::default();
+    let shares: Vec<f64> = (0..tracks.poses()).map(|pose| [1.0, 0.25, 0.5][pose % 3]).collect();
+    trainer.state.pose_moments.extend(&shares);
     trainer.state.field.tracks = Some(tracks);
     trainer.state.field.validate().unwrap();
     trainer.state.gradients = Gradients::zeros(&trainer.state.field);
@@ -97,7 +99,7 @@ fn poses_move_as_on_the_processor() {
             trainer.fetch().unwrap();
         }
         let ((found, moments), (expected, of_processor)) = (poses(&on_gpu), poses(&expected));
-        assert_eq!(moments.steps, of_processor.steps);
+        assert_eq!((&moments.steps, &moments.shares), (&of_processor.steps, &of_processor.shares));
         assert!(moments.steps.contains(&steps), "{:?}", moments.steps);
         let errors = [
             worst(&moments.first, &of_processor.first),
