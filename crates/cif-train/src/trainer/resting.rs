@@ -127,7 +127,8 @@ impl Shift {
 }
 
 /// Instances that must not rest: those whose own pixels miss the network or, where all pixels together do, the one that
-/// costs most. Pixels of instances that tremble may lose more.
+/// costs most. Pixels of instances that tremble may lose more; where those of the others lose too much, it is one of the
+/// others, if one costs anything.
 fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool], trembling: &[bool]) -> Vec<usize> {
     let own = |errors: &JudgedErrors, instance: usize| errors.of_labels[instance + 1].sum();
     let tried = || (0..resting.len()).filter(|instance| resting[*instance]);
@@ -138,13 +139,17 @@ fn missed(before: &JudgedErrors, after: &JudgedErrors, resting: &[bool], trembli
         let excused = tried().filter(|instance| trembling[*instance]).map(|instance| own(errors, instance));
         errors.all.sum() - excused.sum::<f64>()
     };
-    let fits = gain(others(after), others(before)) <= LOSS
-        && gain(after.all.sum(), before.all.sum()) <= TREMBLING_LOSSES[1];
-    if !missed.is_empty() || fits {
+    let others_fit = gain(others(after), others(before)) <= LOSS;
+    let all_fit = gain(after.all.sum(), before.all.sum()) <= TREMBLING_LOSSES[1];
+    if !missed.is_empty() || (others_fit && all_fit) {
         return missed;
     }
     let cost = |instance: usize| own(after, instance) - own(before, instance);
-    tried().max_by(|a, b| cost(*a).total_cmp(&cost(*b))).into_iter().collect()
+    let dearest = |among: &dyn Fn(usize) -> bool| {
+        tried().filter(|instance| among(*instance)).max_by(|a, b| cost(*a).total_cmp(&cost(*b)))
+    };
+    let of_others = dearest(&|instance| !others_fit && !trembling[instance] && cost(instance) > 0.0);
+    of_others.or_else(|| dearest(&|_| true)).into_iter().collect()
 }
 
 #[cfg(test)]
@@ -213,8 +218,10 @@ mod tests {
         let few = errors([0.3, 0.3, 0.05, 0.3]);
         let of = |after: [f64; 4]| super::missed(&few, &errors(after), &[true; 3], &[false, true, false]);
         assert!(of([0.3, 0.3, 0.08, 0.3]).is_empty());
-        assert_eq!(of([0.3, 0.3, 0.1, 0.3]), [1]);
+        assert_eq!(of([0.3, 0.3, 0.13, 0.3]), [1]);
         assert_eq!(of([0.31, 0.3, 0.06, 0.3]), [1]);
+        // What costs the others is not what trembles.
+        assert_eq!(of([0.3, 0.3, 0.08, 0.31]), [2]);
         let large = errors([0.1, 0.1, 0.3, 0.1]);
         let of = |after: [f64; 4]| super::missed(&large, &errors(after), &[true; 3], &[false, true, false]);
         assert!(of([0.1, 0.1, 0.305, 0.1]).is_empty());
