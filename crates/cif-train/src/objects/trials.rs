@@ -171,10 +171,8 @@ pub(super) fn best_way<'a>(
     let Some(Trial { mut fit, losses, .. }) = trials.into_iter().find(|trial| trial.way == kept) else {
         return Ok(None);
     };
-    let bent = (losses[1] > DOUBTED && !object.is_told).then(|| {
-        let judged = if contest.left_out.is_empty() { &contest.train } else { &contest.left_out };
-        bend::bent(&fit, (&contest.train, judged), fit.trial_level())
-    });
+    let bent = (losses[1] > DOUBTED && !object.is_told)
+        .then(|| bend::bent(&fit, (&contest.train, contest.judged()), fit.trial_level()));
     // What stays in place and looks otherwise in every turn deforms, or opens. Of thin things the outline, which is never
     // exact, is most of what is seen: they are solid where bending explains no more.
     let most = match simple_errors[0] {
@@ -385,6 +383,11 @@ impl<'a> Contest<'a> {
         }
     }
 
+    /// Views that were left out, or all where none were.
+    fn judged(&self) -> &[usize] {
+        if self.left_out.is_empty() { &self.train } else { &self.left_out }
+    }
+
     /// Losses on the views that were left out.
     fn judge(&self, trials: &mut [Trial<'a>], finely: bool) {
         trials.par_iter_mut().for_each(|trial| {
@@ -397,8 +400,7 @@ impl<'a> Contest<'a> {
             if self.may_be_followed() && trial.way != Way::Rest {
                 self.settle(&mut trial.fit, level);
             }
-            let judged = if self.left_out.is_empty() { &self.train } else { &self.left_out };
-            trial.losses[1] = trial.fit.mean_loss(judged, level);
+            trial.losses[1] = trial.fit.mean_loss(self.judged(), level);
         });
     }
 }
