@@ -82,15 +82,21 @@ impl Bend {
     }
 }
 
-/// Loss of a view with the Gaussians shifted; their gradients stay in the shape.
-fn loss(fit: &Fit<'_>, shape: &mut Shape, bend: Option<&Bend>, (view, level): (usize, usize)) -> f64 {
+/// Loss of a view with the Gaussians shifted; their gradients stay in the shape, unless only the value is asked for.
+fn loss(
+    fit: &Fit<'_>,
+    shape: &mut Shape,
+    bend: Option<&Bend>,
+    (view, level): (usize, usize),
+    differentiates: bool,
+) -> f64 {
     let view = &fit.views[view];
     let Some(pose) = fit.poses.get(&view.time_index) else { return 0.0 };
     let places = shape.centres();
     if let Some(bend) = bend {
         shape.set_centres(&bend.shifted(view.time_index, &places));
     }
-    let value = shape.loss(&view.crops[level], pose, GREY, 1.0, true).value;
+    let value = shape.loss(&view.crops[level], pose, GREY, 1.0, differentiates).value;
     shape.set_centres(&places);
     value
 }
@@ -110,15 +116,15 @@ fn refitted(
         }
         let (view, rate) = (order[place], LAST.powf(step as f64 / STEPS as f64));
         let places = shape.centres();
-        loss(fit, &mut shape, bend.as_ref(), (view, level));
+        loss(fit, &mut shape, bend.as_ref(), (view, level), true);
         if let Some(bend) = &mut bend {
             bend.step(fit.views[view].time_index, &places, &shape.centre_gradients(), RATE * rate);
         }
         shape.step(SHAPE_RATE * rate);
     }
     let weight = |view: &usize| fit.views[*view].visible;
-    let sum: f64 =
-        judged.iter().map(|view| weight(view) * loss(fit, &mut shape, bend.as_ref(), (*view, level))).sum();
+    let mut judge = |view: &usize| weight(view) * loss(fit, &mut shape, bend.as_ref(), (*view, level), false);
+    let sum: f64 = judged.iter().map(&mut judge).sum();
     sum / judged.iter().map(weight).sum::<f64>().max(1e-12)
 }
 

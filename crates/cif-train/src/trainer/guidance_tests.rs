@@ -12,20 +12,32 @@ use super::objects::is_rigid;
 use crate::objects::Fitted;
 use crate::stage::Stage;
 
+/// An object without poses yet, which is explained in full.
+fn told(gaussians: Gaussians) -> Fitted {
+    Fitted {
+        poses: BTreeMap::new(),
+        shares: BTreeMap::new(),
+        gaussians,
+        reference: (DQuat::IDENTITY, DVec3::ZERO),
+        rotation: RotationEvidence::Observed,
+        error: 0.0,
+        unturned: None,
+        bent: None,
+        is_ball: false,
+        is_settled: false,
+        way: "told".to_owned(),
+    }
+}
+
 #[test]
 fn poses_are_kept_of_balls_with_rough_masks_and_of_what_turns() {
     let fitted = |(error, unturned), rotation, is_ball| Fitted {
-        poses: BTreeMap::new(),
-        shares: BTreeMap::new(),
-        gaussians: Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap(),
-        reference: (DQuat::IDENTITY, DVec3::ZERO),
         rotation,
         error,
         unturned: Some(unturned),
-        bent: None,
         is_ball,
         is_settled: true,
-        way: "told".to_owned(),
+        ..told(Gaussians::from_points(&[[0.0; 3]], &[[0.5; 3]]).unwrap())
     };
     let (observed, assumed) = (RotationEvidence::Observed, RotationEvidence::Assumed);
     let kept = |errors, rotation, is_ball| is_rigid(&fitted(errors, rotation, is_ball), 0.22);
@@ -57,19 +69,13 @@ fn paths_hold_no_object_that_has_poses() {
     trainer.state.guidance.travelling = vec![false, true, true, true];
     // The one in between is fitted.
     let pose = (DQuat::IDENTITY, DVec3::new(0.5, 0.1, 0.3));
+    let gaussians =
+        Gaussians::from_points(&[[0.0; 3], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], &[[0.5; 3]; 3]).unwrap();
     let fitted = Fitted {
         poses: BTreeMap::from([(0, pose), (4, pose)]),
         shares: BTreeMap::from([(0, 1.0), (4, 0.1)]),
-        gaussians: Gaussians::from_points(&[[0.0; 3], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]], &[[0.5; 3]; 3])
-            .unwrap(),
         reference: pose,
-        rotation: RotationEvidence::Observed,
-        error: 0.0,
-        unturned: None,
-        bent: None,
-        is_ball: false,
-        is_settled: false,
-        way: "told".to_owned(),
+        ..told(gaussians)
     };
     trainer.fits.insert(2, fitted);
     trainer.enter(Stage::Fine).unwrap();
@@ -114,15 +120,8 @@ fn hidden(scene: Scene, keeps_masks: bool) -> Vec<(f64, bool)> {
     let fitted = Fitted {
         shares: poses.keys().map(|time| (*time, 1.0)).collect(),
         poses,
-        gaussians,
         reference: pose(1.0),
-        rotation: RotationEvidence::Observed,
-        error: 0.0,
-        unturned: None,
-        bent: None,
-        is_ball: false,
-        is_settled: false,
-        way: "told".to_owned(),
+        ..told(gaussians)
     };
     trainer.fits.insert(3, fitted);
     trainer.enter(Stage::Fine).unwrap();

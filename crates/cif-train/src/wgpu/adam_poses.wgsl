@@ -1,7 +1,6 @@
 // The optimiser's step of the poses that views were drawn of, each at its share of the rate: translations by that of
 // the size of the group, half of the largest extent of its Gaussians, turns by a part of as many radians, unless they
-// are assumed. Gradients
-// become zero. A workgroup per group.
+// are assumed. Gradients become zero. A workgroup per group.
 // Rust twin: poses.rs, `PoseMoments::step` and `object_sizes`. Source: methods reference of motion, 2.1.
 
 #import constants
