@@ -16,8 +16,12 @@ use crate::cryptomatte::ObjectIds;
 pub enum Layout {
     /// `dataset.json`, `metadata.json`, `scene.json`, `camera/`, `rgb/`.
     HyperNerf,
+    /// `train_meta.json` and `test_meta.json` with a camera per image and time, `ims/`, `seg/`.
+    DynamicGaussians,
     /// `poses_bounds.npy` with `camXX/images` or `camXX.mp4`.
     Neu3d,
+    /// `poses_bounds.npy` with `images/`: the images of one moving camera in order.
+    Llff,
     /// `transforms_train.json` and its siblings.
     DNerf,
     /// One `transforms.json`.
@@ -39,7 +43,8 @@ pub enum Split {
 /// Options for opening a capture.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct OpenOptions {
-    /// Mask folder: a name inside the capture (`masks_tracker`) or a path; `None` takes `masks` where present.
+    /// Mask folder: a name inside the capture (`masks_tracker`) or a path; `None` takes `masks` where present, in the
+    /// layout of Dynamic 3D Gaussians else `seg`.
     pub masks: Option<PathBuf>,
     /// Ignore masks altogether.
     pub without_masks: bool,
@@ -144,6 +149,8 @@ pub struct Dataset {
     pub has_alpha: bool,
     /// Oddities met while reading, one sentence each, naming the file.
     pub warnings: Vec<String>,
+    /// What was found and decided, one sentence each: nothing in it needs to be put right.
+    pub notes: Vec<String>,
     /// A sentence on what the capture does not know of its world, its unit or its up axis; a warning too.
     pub unknown: Option<String>,
     /// Where cameras and points lie in the coordinates of the capture; the identity for ordinary captures.

@@ -23,9 +23,9 @@ pub enum Error {
     },
     /// Nothing in the folder marks a layout.
     #[error(
-        "{}: no capture layout fits; looked for dataset.json (HyperNeRF), poses_bounds.npy (Neu3D), \
-         transforms_train.json or transforms_test.json (D-NeRF), transforms.json (nerfstudio) and sparse/0 \
-         (COLMAP){hint}",
+        "{}: no capture layout fits; looked for dataset.json (HyperNeRF), train_meta.json (Dynamic 3D Gaussians), \
+         poses_bounds.npy (Neu3D, LLFF), transforms_train.json or transforms_test.json (D-NeRF), transforms.json \
+         (nerfstudio) and sparse/0 (COLMAP){hint}",
         root.display()
     )]
     NoLayout {

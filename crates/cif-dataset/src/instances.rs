@@ -1,4 +1,4 @@
-//! Labels of instances: `instances.json`, completed from the masks.
+//! Labels of instances: `instances.json` or `class_mapping.json`, completed from the masks.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -26,13 +26,19 @@ struct Entry {
     taxonomies: BTreeMap<String, String>,
 }
 
+/// A map of ids to names, `{"1": "red mug"}`, as generators of synthetic captures write it beside their masks.
+const CLASS_MAPPING: &str = "class_mapping.json";
+
 /// Labels named by a file, ascending id.
 ///
 /// # Errors
 /// When the file does not parse, an id is outside 1 to 65 535 (0 is left out with a warning), or twice.
 pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u16, InstanceLabel>, Error> {
     // Syntax first: the message of an untagged enum has no line.
-    let value: serde_json::Value = json::read(path)?;
+    let mut value: serde_json::Value = json::read(path)?;
+    if path.ends_with(CLASS_MAPPING) {
+        value = as_list(path, &value)?;
+    }
     let file: InstancesFile = serde_json::from_value(value).map_err(|_| {
         Error::invalid(
             path,
@@ -86,17 +92,49 @@ pub(crate) fn read(path: &Path, warnings: &mut Vec<String>) -> Result<BTreeMap<u
     Ok(labels)
 }
 
+/// The entries of a class mapping as those of `instances.json`; 0 is the background and not an instance.
+fn as_list(path: &Path, value: &serde_json::Value) -> Result<serde_json::Value, Error> {
+    let entry = |(id, label): (&String, &serde_json::Value)| {
+        let entry = (id.trim().parse::<i64>().ok()?, label.as_str()?);
+        Some((entry.0 != 0).then(|| serde_json::json!({ "id": entry.0, "label": entry.1 })))
+    };
+    let entries: Option<Vec<Option<serde_json::Value>>> =
+        value.as_object().and_then(|classes| classes.iter().map(entry).collect());
+    let entries = entries.ok_or_else(|| {
+        Error::invalid(
+            path,
+            "a name per id is expected: {\"1\": \"red mug\", \"2\": \"blue ball\"}; correct it, or give \
+             instances.json beside it, which goes first",
+        )
+    })?;
+    Ok(entries.into_iter().flatten().collect())
+}
+
 /// Name of an instance that nobody named.
 pub(crate) fn default_label(id: u16) -> String {
     format!("instance_{id}")
 }
 
-/// Labels for a capture's masks: the file in the mask folder, else the one of the capture.
+/// Value of masks that only say where something is.
+pub(crate) const WHITE: u16 = 255;
+
+/// The instance of masks whose only values are 0 and 255.
+pub(crate) fn foreground() -> InstanceLabel {
+    let label = "foreground".to_owned();
+    InstanceLabel { id: WHITE, category: label.clone(), label, taxonomies: BTreeMap::new() }
+}
+
+/// The file of labels for a capture's masks: in the mask folder, else in the nearest folder of the capture above it.
 pub(crate) fn file_for(root: &Path, mask_folder: Option<&Path>) -> Option<PathBuf> {
+    let above = |folder: &Path| {
+        let inside = folder.strip_prefix(root).map(Path::components).map_or(0, Iterator::count);
+        folder.ancestors().take(inside.max(1)).map(Path::to_owned).collect::<Vec<_>>()
+    };
     mask_folder
         .into_iter()
-        .chain([root])
-        .map(|folder| folder.join("instances.json"))
+        .flat_map(above)
+        .chain([root.to_owned()])
+        .flat_map(|folder| ["instances.json", CLASS_MAPPING].map(|name| folder.join(name)))
         .find(|path| listing::is_there(path))
 }
 

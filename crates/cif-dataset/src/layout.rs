@@ -4,19 +4,28 @@ use std::fmt;
 use std::path::Path;
 
 use crate::files::listing;
-use crate::formats::colmap_sparse_folder;
-use crate::{Error, Layout};
+use crate::{Error, Layout, formats};
 
 impl Layout {
     /// Every layout that can be read.
-    pub const ALL: [Self; 5] = [Self::HyperNerf, Self::Neu3d, Self::DNerf, Self::Nerfstudio, Self::Colmap];
+    pub const ALL: [Self; 7] = [
+        Self::HyperNerf,
+        Self::DynamicGaussians,
+        Self::Neu3d,
+        Self::Llff,
+        Self::DNerf,
+        Self::Nerfstudio,
+        Self::Colmap,
+    ];
 
     /// Name as the command line spells it.
     #[must_use]
     pub fn name(self) -> &'static str {
         match self {
             Self::HyperNerf => "hyper-nerf",
+            Self::DynamicGaussians => "dynamic-gaussians",
             Self::Neu3d => "neu3d",
+            Self::Llff => "llff",
             Self::DNerf => "d-nerf",
             Self::Nerfstudio => "nerfstudio",
             Self::Colmap => "colmap",
@@ -28,7 +37,9 @@ impl Layout {
     pub fn marker(self) -> &'static str {
         match self {
             Self::HyperNerf => "dataset.json",
+            Self::DynamicGaussians => "train_meta.json",
             Self::Neu3d => "poses_bounds.npy",
+            Self::Llff => "poses_bounds.npy beside images",
             Self::DNerf => "transforms_train.json or transforms_test.json",
             Self::Nerfstudio => "transforms.json",
             Self::Colmap => "sparse/0",
@@ -36,12 +47,28 @@ impl Layout {
     }
 
     fn fits(self, root: &Path) -> bool {
+        let has = |name: &str| listing::is_there(&root.join(name));
         match self {
-            Self::HyperNerf | Self::Neu3d | Self::Nerfstudio => listing::is_there(&root.join(self.marker())),
-            Self::DNerf => ["transforms_train.json", "transforms_test.json"]
-                .iter()
-                .any(|name| listing::is_there(&root.join(name))),
-            Self::Colmap => colmap_sparse_folder(root).is_some(),
+            Self::HyperNerf | Self::DynamicGaussians | Self::Nerfstudio => has(self.marker()),
+            Self::Neu3d => has("poses_bounds.npy") && !Self::Llff.fits(root),
+            Self::Llff => {
+                has("poses_bounds.npy") && !formats::has_rig(root) && formats::has_image_folder(root)
+            }
+            Self::DNerf => has("transforms_train.json") || has("transforms_test.json"),
+            Self::Colmap => formats::colmap_sparse_folder(root).is_some(),
+        }
+    }
+
+    /// True when a folder that fits holds more of the layout than the file that marks it.
+    fn is_complete(self, root: &Path) -> bool {
+        let has = |name: &str| root.join(name).exists();
+        match self {
+            Self::HyperNerf => has("metadata.json") && has("camera") && has("rgb"),
+            Self::DynamicGaussians => has("ims"),
+            Self::Neu3d => formats::has_rig(root),
+            Self::DNerf => has("transforms_train.json"),
+            Self::Colmap => has("images"),
+            Self::Llff | Self::Nerfstudio => true,
         }
     }
 }
@@ -54,15 +81,15 @@ impl fmt::Display for Layout {
 
 /// Recognises the layout of a folder.
 ///
-/// A COLMAP reconstruction beside another layout is what that layout was made from: the other one wins, with a
-/// warning. Any other two are an error.
+/// A COLMAP reconstruction beside another layout is what that layout was made from, and a file that marks a layout
+/// without the rest of it is left over: the other layout wins, with a note. Any other two are an error.
 ///
 /// # Errors
 /// When the folder is missing, nothing fits, two layouts fit, or the forced one does not.
 pub(crate) fn recognise(
     root: &Path,
     forced: Option<Layout>,
-    warnings: &mut Vec<String>,
+    notes: &mut Vec<String>,
 ) -> Result<Layout, Error> {
     if !root.exists() {
         return Err(Error::MissingFolder { path: root.to_owned() });
@@ -80,16 +107,24 @@ pub(crate) fn recognise(
         });
     }
     let mut fitting: Vec<Layout> = Layout::ALL.into_iter().filter(|layout| layout.fits(root)).collect();
+    let mut beside = Vec::new();
+    if fitting.iter().any(|layout| layout.is_complete(root)) {
+        let (complete, rest): (Vec<_>, Vec<_>) =
+            fitting.into_iter().partition(|layout| layout.is_complete(root));
+        beside.extend(rest.iter().map(|layout| format!("of {layout} there is only {}", layout.marker())));
+        fitting = complete;
+    }
     if fitting.len() > 1 && fitting.last() == Some(&Layout::Colmap) {
         fitting.pop();
-        if fitting.len() == 1 {
-            warnings.push(format!(
-                "{}: read as {} ({}); the COLMAP reconstruction beside it is not used (--layout colmap reads it)",
-                root.display(),
-                fitting[0],
-                fitting[0].marker()
-            ));
-        }
+        beside.push("--layout colmap reads the COLMAP reconstruction beside it, without times".to_owned());
+    }
+    if let (&[layout], false) = (&fitting[..], beside.is_empty()) {
+        notes.push(format!(
+            "{}: read as {layout} ({}); {}",
+            root.display(),
+            layout.marker(),
+            beside.join("; ")
+        ));
     }
     match fitting[..] {
         [] => Err(Error::NoLayout { root: root.to_owned(), hint: hint(root) }),

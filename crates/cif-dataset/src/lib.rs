@@ -2,15 +2,18 @@
 //!
 //! | layout | marked by | held out |
 //! |---|---|---|
-//! | HyperNeRF, Nerfies | `dataset.json` | `val_ids`, else every fourth frame from the third on |
-//! | Neu3D, DyNeRF | `poses_bounds.npy` | `cam00` |
+//! | HyperNeRF, Nerfies, DyCheck | `dataset.json` | `splits/val.json`, `val_ids`, else every fourth frame from the third on |
+//! | Dynamic 3D Gaussians (CMU Panoptic) | `train_meta.json` | `test_meta.json` |
+//! | Neu3D, DyNeRF | `poses_bounds.npy` with `cam00`, ... | `cam00` |
+//! | LLFF sequences (NSFF, NVIDIA, NR-NeRF, EndoNeRF) | `poses_bounds.npy` with `images` | `mv_images`, else every eighth image from the second on |
 //! | D-NeRF, Blender | `transforms_train.json` | `transforms_test.json` |
 //! | nerfstudio, instant-ngp | `transforms.json` | its lists, else every eighth frame |
 //! | COLMAP | `sparse/0` | every eighth image |
 //!
-//! Masks are PNG files of instance ids, 0 for unlabelled, or EXR files with a [`cryptomatte`]; labels come from
-//! `instances.json`, which may also lie in the mask folder and may name `taxonomies` per instance, or from the
-//! Cryptomatte. [`masks::Import`] makes such a folder of what other tools write. A mask folder may hold
+//! Masks are PNG files of instance ids, 0 for unlabelled, or EXR files with a [`cryptomatte`]; they lie in `masks`, in a
+//! folder of that name beside the images, or in `seg` (Dynamic 3D Gaussians). Labels come from `instances.json`, which
+//! may also lie in the mask folder and may name `taxonomies` per instance, from `class_mapping.json`
+//! (`{"1": "sphere_1"}`), or from the Cryptomatte. Points that a program drew at random count as none. [`masks::Import`] makes such a folder of what other tools write. A mask folder may hold
 //! `confidence/<frame>.png`: 8-bit grey, the probability that the id of a pixel is right in units of 1 / 255. Named groups of held-out frames
 //! come from `splits.json`, known motion from `motion.json` and `tracks.npz` (see [`motion_truth`]). All cameras are
 //! ideal pinholes in this project's axes once a frame is loaded; times are normalised to [0, 1].

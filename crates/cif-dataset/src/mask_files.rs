@@ -14,6 +14,17 @@ use crate::{Error, Frame, Layout};
 /// Mask folder that is taken where none is asked for.
 pub(crate) const DEFAULT_FOLDER: &str = "masks";
 
+/// The mask folder of Dynamic 3D Gaussians: 255 where something moves, else 0.
+const SEGMENTS: &str = "seg";
+
+/// The mask folder of a capture that nobody named.
+pub(crate) fn default_folder(root: &Path, layout: Layout) -> &'static Path {
+    let segments = layout == Layout::DynamicGaussians
+        && !root.join(DEFAULT_FOLDER).is_dir()
+        && root.join(SEGMENTS).is_dir();
+    Path::new(if segments { SEGMENTS } else { DEFAULT_FOLDER })
+}
+
 /// Folder of confidences inside a mask folder.
 pub(crate) const CONFIDENCE_FOLDER: &str = "confidence";
 
@@ -71,19 +82,21 @@ pub(crate) struct MaskListing {
     pub(crate) paths: Vec<Option<PathBuf>>,
     /// Confidences of these masks, `[frames]`.
     pub(crate) confidences: Vec<Option<PathBuf>>,
-    /// Folder that holds `instances.json` for these masks, if it has one of its own.
+    /// Folder of these masks, which may hold labels of its own; the first of several.
     pub(crate) folder: Option<PathBuf>,
-    /// PNG and EXR files in the folder that belong to no frame.
+    /// PNG and EXR files in the folders that belong to no frame.
     pub(crate) strangers: usize,
-    /// True when files are numbered in the order of the frames instead of named as them.
+    /// True when files belong to frames by their numbers instead of their names.
     pub(crate) numbered: bool,
 }
 
 /// Finds the masks of a folder: a name inside the capture, or a path.
 ///
 /// Looked for, in this order: `<camera>/<folder>/<stem>.png` (Neu3D), `<folder>/<frame>.png`,
-/// `<folder>/<frame>.<image extension>.png` and, where stems are unique, `<folder>/<stem>.png`; each also with
-/// `.exr`. Where none fits, EXR files that are bare numbers count the frames from 0, as renderers number them.
+/// `<folder>/<frame>.<image extension>.png`, where stems are unique `<folder>/<stem>.png`, and the folder beside the
+/// image (`train/<folder>/<stem>.png`); each also with `.exr`. Where none fits, EXR files that are bare numbers count
+/// the frames from 0, as renderers number them, and masks of an LLFF sequence belong to the images of their numbers
+/// (`frame-000012.mask.png` to `000012.png`).
 pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Path) -> MaskListing {
     let inside = root.join(folder);
     // A path relative to the working folder, where the capture has no such folder.
@@ -108,6 +121,9 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
             if occurrences[stem.as_str()] == 1 {
                 candidates.push(base.join(stem));
             }
+            if let (true, Some(beside)) = (folder.is_relative(), frame.image.parent()) {
+                candidates.push(beside.join(folder).join(stem));
+            }
             candidates.iter().find_map(|candidate| {
                 EXTENSIONS.iter().find_map(|extension| {
                     let mut name = candidate.clone().into_os_string();
@@ -118,17 +134,56 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
             })
         })
         .collect();
-    let numbered = paths.iter().all(Option::is_none) && number(&base, &mut paths);
-    let strangers =
-        count_files(&base).saturating_sub(paths.iter().flatten().filter(|p| p.starts_with(&base)).count());
-    let folder_of_confidences = base.join(CONFIDENCE_FOLDER);
-    let strangers = strangers.saturating_sub(count_files(&folder_of_confidences));
+    let numbered = paths.iter().all(Option::is_none)
+        && (number(&base, &mut paths) || layout == Layout::Llff && by_number(&base, &stems, &mut paths));
+    let found: BTreeSet<&Path> = paths.iter().flatten().map(PathBuf::as_path).collect();
+    // Masks of a folder may lie in subfolders, those of cameras and splits in folders of their own.
+    let mut folders: BTreeSet<&Path> =
+        found.iter().filter(|path| !path.starts_with(&base)).filter_map(|path| path.parent()).collect();
+    let folder_of_masks =
+        if base.is_dir() { Some(base.clone()) } else { folders.first().map(|p| p.to_path_buf()) };
+    folders.insert(&base);
+    let confidences = |folder: &Path| folder.join(CONFIDENCE_FOLDER);
+    let files: usize = folders
+        .iter()
+        .map(|folder| count_files(folder).saturating_sub(count_files(&confidences(folder))))
+        .sum();
+    let strangers = files.saturating_sub(found.len());
+    let folder_of_confidences = confidences(&base);
     let confidence = |(frame, mask): (&Frame, &Option<PathBuf>)| {
         let path = folder_of_confidences.join(format!("{}.png", frame.name));
         mask.as_ref().map(|_| path).filter(|path| listing::is_there(path))
     };
     let confidences = frames.iter().zip(&paths).map(confidence).collect();
-    MaskListing { paths, confidences, folder: base.is_dir().then_some(base), strangers, numbered }
+    MaskListing { paths, confidences, folder: folder_of_masks, strangers, numbered }
+}
+
+/// The number in a name that has one.
+fn only_number(name: &str) -> Option<u64> {
+    let mut numbers = name.split(|c: char| !c.is_ascii_digit()).filter(|digits| !digits.is_empty());
+    let number = numbers.next()?.parse().ok();
+    number.filter(|_| numbers.next().is_none())
+}
+
+/// Gives PNG files to the frames whose names hold the same number, where no two files or frames share one; whether
+/// there are any.
+fn by_number(folder: &Path, stems: &[String], paths: &mut [Option<PathBuf>]) -> bool {
+    let mut files: BTreeMap<u64, Option<PathBuf>> = BTreeMap::new();
+    let entries = if folder.is_dir() { listing::entries(folder).unwrap_or_default() } else { Vec::new() };
+    for path in entries.into_iter().filter(|path| listing::has_extension(path, &["png"])) {
+        if let Some(number) = only_number(&listing::stem(&path)) {
+            files.entry(number).and_modify(|file| *file = None).or_insert(Some(path));
+        }
+    }
+    let numbers: Vec<Option<u64>> = stems.iter().map(|stem| only_number(stem)).collect();
+    let distinct: BTreeSet<u64> = numbers.iter().copied().flatten().collect();
+    if distinct.len() < numbers.len() {
+        return false;
+    }
+    for (path, number) in paths.iter_mut().zip(numbers) {
+        *path = number.and_then(|number| files.get(&number).cloned().flatten());
+    }
+    paths.iter().any(Option::is_some)
 }
 
 /// Gives numbered EXR files to the frames they count; whether there are any.

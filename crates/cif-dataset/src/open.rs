@@ -34,11 +34,11 @@ impl Dataset {
     /// When the folder is no capture, or something in it is missing or wrong; the message names file and fix.
     pub fn open(root: impl AsRef<Path>, options: &OpenOptions) -> Result<Self, Error> {
         let root = root.as_ref();
-        let mut warnings = Vec::new();
+        let (mut warnings, mut notes) = (Vec::new(), Vec::new());
         if options.downscale == Some(0) {
             return Err(Error::invalid(root, "images cannot be reduced by 0; give 1, 2, 4, ..."));
         }
-        let layout = layout::recognise(root, options.layout, &mut warnings)?;
+        let layout = layout::recognise(root, options.layout, &mut notes)?;
         let mut draft = formats::read(layout, &Source { root, options })?;
         draft.leave_out(root, &options.without_cameras)?;
         warnings.extend(draft.warnings.iter().cloned());
@@ -59,6 +59,7 @@ impl Dataset {
             points: PointCloud { positions: Vec::new(), colors: Vec::new(), source: PointSource::Random },
             has_alpha,
             warnings,
+            notes,
             unknown: draft.unknown.clone(),
             frame: CaptureFrame::default(),
         };
@@ -70,12 +71,16 @@ impl Dataset {
         }
         dataset.read_groups()?;
         dataset.note_poor_coverage();
+        let mut unused = draft.unused;
         if options.without_masks {
             for frame in &mut dataset.frames {
                 frame.mask = None;
             }
         } else {
-            dataset.attach_masks(options.masks.as_deref(), &stored_sizes)?;
+            dataset.attach_masks(options.masks.as_deref(), &stored_sizes, &mut unused)?;
+        }
+        if !unused.is_empty() {
+            dataset.notes.push(format!("{}: not used: {}", root.display(), unused.join("; ")));
         }
         dataset.points = dataset.initial_points(draft.points, draft.random_box)?;
         dataset.warnings.extend(points::unseen_warning(&dataset));
@@ -91,12 +96,13 @@ impl Dataset {
     pub fn with_masks(&self, folder: &Path) -> Result<Self, Error> {
         let mut dataset = self.clone();
         dataset.warnings.clear();
+        dataset.notes.clear();
         let sizes = dataset
             .frames
             .iter()
             .map(|frame| image::probe(&frame.image).map(|header| (header.width, header.height)))
             .collect::<Result<Vec<_>, _>>()?;
-        dataset.attach_masks(Some(folder), &sizes)?;
+        dataset.attach_masks(Some(folder), &sizes, &mut Vec::new())?;
         Ok(dataset)
     }
 
@@ -204,8 +210,14 @@ impl Dataset {
         }
     }
 
-    fn attach_masks(&mut self, folder: Option<&Path>, stored_sizes: &[(u32, u32)]) -> Result<(), Error> {
-        let name = folder.unwrap_or(Path::new(mask_files::DEFAULT_FOLDER));
+    /// Gives frames their masks and finds the instances in them; files that belong to no frame go to `unused`.
+    fn attach_masks(
+        &mut self,
+        folder: Option<&Path>,
+        stored_sizes: &[(u32, u32)],
+        unused: &mut Vec<String>,
+    ) -> Result<(), Error> {
+        let name = folder.unwrap_or_else(|| mask_files::default_folder(&self.root, self.layout));
         let listing = mask_files::locate(&self.root, self.layout, &self.frames, name);
         if folder.is_some() {
             self.mask_paths(name)?;
@@ -244,19 +256,26 @@ impl Dataset {
             ));
             return Ok(());
         }
-        if masked < self.frames.len() {
-            self.warnings.push(format!(
-                "{}: {masked} of {} frames have a mask",
-                self.root.join(name).display(),
-                self.frames.len()
+        let masked_of = |split: Split| {
+            let frames = self.split_frames(split);
+            (frames.iter().filter(|index| self.frames[**index].mask.is_some()).count(), frames.len())
+        };
+        let ((train, all_train), (val, all_val)) = (masked_of(Split::Train), masked_of(Split::Val));
+        let place = match self.root.join(name) {
+            folder if folder.is_dir() => folder.display().to_string(),
+            _ if name.is_dir() => name.display().to_string(),
+            _ => format!("{}: {}/ beside its images", self.root.display(), name.display()),
+        };
+        if train < all_train {
+            self.warnings.push(format!("{place}: {masked} of {} frames have a mask", self.frames.len()));
+        } else if val < all_val {
+            self.notes.push(format!(
+                "{place}: {val} of {all_val} held-out frames have a mask; instances are scored {}",
+                if val == 0 { "on none" } else { "on these" }
             ));
         }
-        if listing.strangers > 0 && masked > 0 {
-            self.warnings.push(format!(
-                "{}: {} mask files belong to no frame",
-                self.root.join(name).display(),
-                listing.strangers
-            ));
+        if listing.strangers > 0 {
+            unused.push(format!("{} mask files in {place} that belong to no frame", listing.strangers));
         }
         if listing.numbered {
             let numbered: Vec<String> = self
@@ -267,9 +286,8 @@ impl Dataset {
                     Some(format!("{} for {}", mask.file_name()?.to_string_lossy(), frame.name))
                 })
                 .collect();
-            self.warnings.push(format!(
-                "{}: the files are numbered, so they are taken in the order of the frames: {}",
-                self.root.join(name).display(),
+            self.notes.push(format!(
+                "{place}: the files belong to frames by their numbers: {}",
                 some_of(numbered.iter().map(String::as_str))
             ));
         }
@@ -306,20 +324,24 @@ impl Dataset {
                 "{}: the masks hold no labelled pixel; only colour can be trained",
                 self.root.join(name).display()
             ));
-        } else if found.iter().eq([255_u16].iter()) {
-            self.warnings.push(format!(
-                "{}: every labelled pixel is 255: the files look like masks of valid pixels, not of instances",
-                self.root.join(name).display()
-            ));
+        } else if found.iter().eq([instances::WHITE].iter()) && !named.contains_key(&instances::WHITE) {
+            let what = format!(
+                "{place}: the masks hold 0 and 255 alone: what is 255 is taken as one instance, foreground"
+            );
+            match self.layout {
+                Layout::DynamicGaussians => self.notes.push(what),
+                _ => self.warnings.push(format!(
+                    "{what}; masks of valid pixels or of what to ignore are no instances (--no-masks)"
+                )),
+            }
+            named.insert(instances::WHITE, instances::foreground());
         }
         let labelled_train = self.frames.iter().zip(&counts).any(|(frame, counts)| {
             frame.split == Split::Train && counts.as_ref().is_some_and(|c| !c.0.is_empty())
         });
         if !found.is_empty() && !labelled_train {
-            self.warnings.push(format!(
-                "{}: no training frame has a labelled pixel; only colour can be trained",
-                self.root.join(name).display()
-            ));
+            self.warnings
+                .push(format!("{place}: no training frame has a labelled pixel; only colour can be trained"));
         }
         if file.is_none() && named.is_empty() && !found.is_empty() {
             self.warnings.push(format!(
@@ -346,6 +368,13 @@ impl Dataset {
             }
             if raw.positions.is_empty() {
                 self.warnings.push(format!("{}: it holds no point; random ones are taken", path.display()));
+            } else if points::are_made_up(&raw) {
+                self.notes.push(format!(
+                    "{}: its {} points were drawn at random (they fill a box evenly, and colours do not depend on places), \
+                     not measured; they count as none",
+                    path.display(),
+                    raw.positions.len()
+                ));
             } else {
                 let colors = match raw.colors {
                     Some(colors) => colors,

@@ -58,6 +58,8 @@ pub struct CaptureSummary {
     pub extent: f64,
     /// Oddities, one sentence each.
     pub warnings: Vec<String>,
+    /// What was found and decided, one sentence each.
+    pub notes: Vec<String>,
 }
 
 /// One camera.
@@ -172,6 +174,7 @@ impl Dataset {
             camera_bounds: Bounds::around(self.frames.iter().map(|frame| frame.camera.centre())),
             extent: self.extent(),
             warnings: self.warnings.clone(),
+            notes: self.notes.clone(),
         })
     }
 
@@ -290,6 +293,7 @@ impl CaptureSummary {
                 ));
             }
         }
+        lines.extend(self.notes.iter().map(|note| format!("note: {note}")));
         lines.extend(self.warnings.iter().map(|warning| format!("warning: {warning}")));
         lines
     }

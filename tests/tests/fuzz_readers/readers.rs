@@ -57,6 +57,12 @@ pub(crate) fn all() -> Vec<Reader> {
         capture("capture-cryptomatte", "masks/000000.exr", Form::Binary, cryptomatte),
         capture("capture-cryptomatte-objects", "masks/objects.json", Form::Json, cryptomatte),
         capture("neu3d-poses", "poses_bounds.npy", Form::Binary, neu3d),
+        capture("llff-poses", "poses_bounds.npy", Form::Binary, llff),
+        capture("dynamic-gaussians-cameras", "train_meta.json", Form::Json, dynamic_gaussians),
+        capture("dynamic-gaussians-points", "init_pt_cld.npz", Form::Binary, dynamic_gaussians),
+        capture("dycheck-splits", "splits/val.json", Form::Json, dycheck),
+        capture("dycheck-extra", "extra.json", Form::Json, dycheck),
+        capture("capture-classes", "class_mapping.json", Form::Json, classes),
         capture("dnerf-transforms", "transforms_train.json", Form::Json, dnerf),
         capture("nerfstudio-transforms", "transforms.json", Form::Json, nerfstudio),
         capture("capture-points-ply", "sfm.ply", Form::Text, nerfstudio),
@@ -314,6 +320,34 @@ fn confidence(folder: &Path) {
 
 fn neu3d(folder: &Path) {
     adopt(captures::neu3d(2, 2).path(), folder);
+}
+
+fn llff(folder: &Path) {
+    adopt(captures::llff(3).path(), folder);
+}
+
+fn dynamic_gaussians(folder: &Path) {
+    adopt(captures::dynamic_gaussians(3, 2).path(), folder);
+    let rows: Vec<f64> = (0..35).map(|k| f64::from(k) * 0.01).collect();
+    fs::write(folder.join("init_pt_cld.npz"), captures::npz("data", "(5, 7)", &rows)).unwrap();
+}
+
+fn dycheck(folder: &Path) {
+    hypernerf(folder);
+    fs::create_dir(folder.join("splits")).unwrap();
+    for (name, list) in [("train", r#"["000000", "000002"]"#), ("val", r#"["000001"]"#)] {
+        let list = format!(r#"{{ "frame_names": {list}, "time_ids": [0], "camera_ids": [0] }}"#);
+        fs::write(folder.join(format!("splits/{name}.json")), list).unwrap();
+    }
+    fs::write(folder.join("extra.json"), r#"{ "fps": 30.0, "factor": 2 }"#).unwrap();
+}
+
+/// A capture whose instances a map of classes names.
+fn classes(folder: &Path) {
+    hypernerf(folder);
+    fs::remove_file(folder.join("instances.json")).unwrap();
+    fs::write(folder.join("class_mapping.json"), r#"{ "0": "background", "1": "sphere_1", "2": "cube" }"#)
+        .unwrap();
 }
 
 fn dnerf(folder: &Path) {

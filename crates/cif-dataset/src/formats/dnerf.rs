@@ -19,13 +19,10 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     if !listing::is_there(&train) {
         return Err(Error::MissingFile { path: train, fix: "it lists the frames to train on".to_owned() });
     }
-    let mut warnings = Vec::new();
+    let (mut warnings, mut unused) = (Vec::new(), Vec::new());
     let held_out = if listing::is_there(&test) {
         if listing::is_there(&val) {
-            warnings.push(format!(
-                "{}: not used; the frames of transforms_test.json are the held-out ones",
-                val.display()
-            ));
+            unused.push("transforms_val.json (held out are the frames of transforms_test.json)".to_owned());
         }
         Some(test)
     } else if listing::is_there(&val) {
@@ -73,8 +70,8 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         points: customary_points(root)?,
         random_box: Some(BOX),
         frames_per_second,
-        left_out: Vec::new(),
         warnings,
-        unknown: None,
+        unused,
+        ..Draft::default()
     })
 }

@@ -1,6 +1,8 @@
-//! HyperNeRF and Nerfies captures. Source: methods reference 2.1 (time) and 10.2 (cameras, splits).
+//! HyperNeRF and Nerfies captures, and DyCheck's of an iPhone in the same layout. Source: methods reference 2.1 (time)
+//! and 10.2 (cameras, splits); `datasets/iphone.py` of KAIR-BAIR/dycheck (`splits/`, `extra.json`).
 //!
-//! `scale` and `center` of `scene.json` are not applied: cameras and points share the raw frame.
+//! DyCheck's lists `splits/train.json` and `splits/val.json` go before those of `dataset.json`; its `depth/`,
+//! `covisible/` (where a held-out view shows what training views see) and `keypoint/` are not read. `scale` and `center` of `scene.json` are not applied: cameras and points share the raw frame.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -20,6 +22,18 @@ struct DatasetFile {
     train_ids: Vec<String>,
     #[serde(default)]
     val_ids: Vec<String>,
+}
+
+/// A list of DyCheck's.
+#[derive(Deserialize)]
+struct SplitFile {
+    frame_names: Vec<String>,
+}
+
+/// `extra.json` of DyCheck.
+#[derive(Deserialize)]
+struct Extra {
+    fps: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -53,7 +67,7 @@ fn one() -> f64 {
 pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let root = source.root;
     let list_path = root.join("dataset.json");
-    let list: DatasetFile = json::read(&list_path)?;
+    let mut list: DatasetFile = json::read(&list_path)?;
     let metadata_path = root.join("metadata.json");
     if !listing::is_there(&metadata_path) {
         return Err(Error::MissingFile {
@@ -63,9 +77,23 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     }
     let metadata: BTreeMap<String, Metadata> = json::read(&metadata_path)?;
     let (images, reduction) = image_folder(root, source.options.downscale.unwrap_or(1))?;
-    let mut warnings = Vec::new();
+    let (mut warnings, mut unused) = (Vec::new(), Vec::new());
 
-    let splits = splits(&list, &list_path, &mut warnings)?;
+    let of_dycheck = [root.join("splits/train.json"), root.join("splits/val.json")];
+    let splits = if of_dycheck.iter().all(|path| listing::is_there(path)) {
+        let [train, val] = of_dycheck;
+        list.train_ids = json::read::<SplitFile>(&train)?.frame_names;
+        list.val_ids = json::read::<SplitFile>(&val)?.frame_names;
+        listed(&list, &root.join("splits"), &mut warnings, &mut unused)?
+    } else if list.val_ids.is_empty() {
+        unused.push("every second frame, as there are no lists of what to hold out".to_owned());
+        every_fourth(&list, &list_path)?
+    } else {
+        listed(&list, &list_path, &mut warnings, &mut unused)?
+    };
+    let extra_path = root.join("extra.json");
+    let frames_per_second =
+        if listing::is_there(&extra_path) { json::read::<Extra>(&extra_path)?.fps } else { None };
     let mut frames = Vec::with_capacity(splits.len());
     let mut last_warp = 0;
     let mut without_image = Vec::new();
@@ -122,29 +150,24 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     }
     let unlisted = listing::images(&images)?.len().saturating_sub(list.ids.len() - without_image.len());
     if unlisted > 0 {
-        warnings.push(format!(
-            "{}: {unlisted} images are not listed in dataset.json and are not used",
-            images.display()
-        ));
+        unused.push(format!("{unlisted} images in {} that dataset.json does not list", images.display()));
     }
     Ok(Draft {
         frames,
         stored_reduction: reduction,
         points: customary_points(root)?,
+        frames_per_second,
         warnings,
+        unused,
         ..Draft::default()
     })
 }
 
-/// Frames that are used with their split, in the order of `ids`.
+/// The ids of a capture, each once.
 ///
-/// Without validation ids, every fourth frame is trained on and the one two later held out, as in the base
-/// code (which also leaves out the last held-out frame, only to stay inside the list).
-fn splits(
-    list: &DatasetFile,
-    path: &Path,
-    warnings: &mut Vec<String>,
-) -> Result<Vec<(String, Split)>, Error> {
+/// # Errors
+/// When there is none, or one is there twice.
+fn ids<'a>(list: &'a DatasetFile, path: &Path) -> Result<BTreeSet<&'a str>, Error> {
     if list.ids.is_empty() {
         return Err(Error::invalid(path, "`ids` is empty; list the frames there"));
     }
@@ -154,18 +177,29 @@ fn splits(
             return Err(Error::DuplicateFrame { path: path.to_owned(), frame: id.clone() });
         }
     }
-    if list.val_ids.is_empty() {
-        return Ok(list
-            .ids
-            .iter()
-            .enumerate()
-            .filter_map(|(index, id)| match index % 4 {
-                0 => Some((id.clone(), Split::Train)),
-                2 => Some((id.clone(), Split::Val)),
-                _ => None,
-            })
-            .collect());
-    }
+    Ok(seen)
+}
+
+/// Frames of a capture without lists: every fourth one is trained on and the one two later held out, as in the base
+/// code (which also leaves out the last held-out frame, only to stay inside the list).
+fn every_fourth(list: &DatasetFile, path: &Path) -> Result<Vec<(String, Split)>, Error> {
+    ids(list, path)?;
+    let split = |(index, id): (usize, &String)| match index % 4 {
+        0 => Some((id.clone(), Split::Train)),
+        2 => Some((id.clone(), Split::Val)),
+        _ => None,
+    };
+    Ok(list.ids.iter().enumerate().filter_map(split).collect())
+}
+
+/// Frames that the lists use with their split, in the order of `ids`. `path` is where the lists are.
+fn listed(
+    list: &DatasetFile,
+    path: &Path,
+    warnings: &mut Vec<String>,
+    unused: &mut Vec<String>,
+) -> Result<Vec<(String, Split)>, Error> {
+    let seen = ids(list, path)?;
     let val: BTreeSet<&str> = list.val_ids.iter().map(String::as_str).collect();
     let train: BTreeSet<&str> = if list.train_ids.is_empty() {
         seen.difference(&val).copied().collect()
@@ -177,7 +211,7 @@ fn splits(
         return Err(Error::invalid(
             path,
             format!(
-                "train_ids or val_ids name {}, not in ids; correct the lists",
+                "its lists to train on or hold out name {}, not in `ids` of dataset.json; correct the lists",
                 some_of(unknown.into_iter())
             ),
         ));
@@ -185,18 +219,15 @@ fn splits(
     let both: Vec<&str> = train.intersection(&val).copied().collect();
     if !both.is_empty() {
         warnings.push(format!(
-            "{}: in train_ids and val_ids, taken as held out: {}",
+            "{}: in both lists, taken as held out: {}",
             path.display(),
             some_of(both.into_iter())
         ));
     }
-    let unused =
+    let in_none =
         list.ids.iter().filter(|id| !train.contains(id.as_str()) && !val.contains(id.as_str())).count();
-    if unused > 0 {
-        warnings.push(format!(
-            "{}: {unused} ids are neither in train_ids nor in val_ids and are not used",
-            path.display()
-        ));
+    if in_none > 0 {
+        unused.push(format!("{in_none} frames that no list of {} has", path.display()));
     }
     Ok(list
         .ids

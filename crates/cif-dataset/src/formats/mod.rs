@@ -8,12 +8,17 @@
 
 mod colmap;
 mod dnerf;
+mod dynamic_gaussians;
 mod hypernerf;
+mod llff;
 mod nerfstudio;
 mod neu3d;
+mod poses_bounds;
 mod transforms;
 
 pub(crate) use colmap::{named_cameras as colmap_cameras, sparse_folder as colmap_sparse_folder};
+pub(crate) use llff::has_image_folder;
+pub(crate) use neu3d::has_rig;
 pub(crate) use transforms::named_cameras as transforms_cameras;
 
 use std::collections::BTreeSet;
@@ -46,6 +51,8 @@ pub(crate) struct Draft {
     /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
     pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
+    /// What is left out, such as "12 images that dataset.json does not list".
+    pub(crate) unused: Vec<String>,
     /// Facts of its world that the capture does not know.
     pub(crate) unknown: Option<String>,
 }
@@ -110,7 +117,9 @@ pub(crate) enum DraftFocal {
 pub(crate) fn read(layout: Layout, source: &Source<'_>) -> Result<Draft, Error> {
     match layout {
         Layout::HyperNerf => hypernerf::read(source),
+        Layout::DynamicGaussians => dynamic_gaussians::read(source),
         Layout::Neu3d => neu3d::read(source),
+        Layout::Llff => llff::read(source),
         Layout::DNerf => dnerf::read(source),
         Layout::Nerfstudio => nerfstudio::read(source),
         Layout::Colmap => colmap::read(source),

@@ -15,7 +15,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let root = source.root;
     let path = root.join("transforms.json");
     let file = transforms::read(&path)?;
-    let mut warnings = Vec::new();
+    let mut unused = Vec::new();
     let file_paths: Vec<&Path> = file.frames.iter().map(|entry| entry.file_path.as_path()).collect();
     let inner = transforms::inside(root, &file_paths);
     let folder = transforms::common_folder(inner.iter().map(PathBuf::as_path));
@@ -38,19 +38,15 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let listed = lists(&file, &path)?;
     if let Some(splits) = listed {
         let mut kept = Vec::with_capacity(frames.len());
-        let mut unused = 0;
+        let mut unlisted = 0;
         for (frame, entry) in frames.into_iter().zip(&file.frames) {
             match splits.get(&transforms::clean(&entry.file_path)) {
                 Some(split) => kept.push(DraftFrame { split: *split, ..frame }),
-                None => unused += 1,
+                None => unlisted += 1,
             }
         }
-        if unused > 0 {
-            warnings.push(format!(
-                "{}: {unused} frames are in none of train_filenames, val_filenames and test_filenames, and are \
-                 not used",
-                path.display()
-            ));
+        if unlisted > 0 {
+            unused.push(format!("{unlisted} frames that no list of transforms.json has"));
         }
         frames = kept;
     } else {
@@ -60,10 +56,10 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     }
     let unlisted = listing::count_images_below(&root.join(&folder))?;
     if !folder.as_os_str().is_empty() && unlisted > file.frames.len() {
-        warnings.push(format!(
-            "{}: {} images have no camera in transforms.json and are not used",
-            root.join(&folder).display(),
-            unlisted - file.frames.len()
+        unused.push(format!(
+            "{} images in {} that have no camera in transforms.json",
+            unlisted - file.frames.len(),
+            root.join(&folder).display()
         ));
     }
     let points = match &file.ply_file_path {
@@ -85,7 +81,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         stored_reduction: 1,
         points,
         frames_per_second: file.fps,
-        warnings,
+        unused,
         unknown: file.cif.and_then(unknown),
         ..Draft::default()
     })

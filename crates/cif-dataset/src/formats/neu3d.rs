@@ -3,13 +3,12 @@
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use cif_geometry::LensDistortion;
-use glam::{DMat3, DVec2, DVec3};
+use glam::DVec2;
 
-use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, customary_points, some_of, world_to_camera};
+use super::{Draft, DraftCamera, DraftFrame, Source, customary_points, poses_bounds, some_of};
 use crate::dataset::DEFAULT_VIDEO_FRAMES;
+use crate::files::listing;
 use crate::files::video::{self, Extraction};
-use crate::files::{image, listing, npy};
 use crate::load::reduced_size;
 use crate::{Error, Split};
 
@@ -22,33 +21,20 @@ struct View {
 
 pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let root = source.root;
-    let poses_path = root.join("poses_bounds.npy");
-    let poses = npy::read_matrix(&poses_path)?;
-    if poses.columns < 15 {
-        return Err(Error::invalid(
-            &poses_path,
-            format!(
-                "{} values per camera; 17 are expected: a 3 x 5 pose (down, right, back, position, (H, W, f)) and \
-                 two depths",
-                poses.columns
-            ),
-        ));
-    }
-    let (names, left_out) = cameras(root, &poses_path, poses.rows, &source.options.without_cameras)?;
-    let row = |row: usize| &poses.values[row * poses.columns..][..15];
+    let poses = poses_bounds::read(root)?;
+    let (names, left_out) = cameras(root, &poses.path, poses.cameras.len(), &source.options.without_cameras)?;
     let mut views = Vec::new();
-    for (at, name) in names.into_iter().enumerate() {
+    for (name, camera) in names.into_iter().zip(poses.cameras) {
         if left_out.contains(&name) {
             continue;
         }
-        let camera = camera(&poses_path, row(at));
         let images = images(source, &name, camera.size)?;
         views.push(View { name, images, camera });
     }
     let Some(first) = views.first() else {
         return Err(Error::invalid(root, "every camera is left out; keep one to train on"));
     };
-    let stored_reduction = stored_reduction(first)?;
+    let stored_reduction = poses_bounds::stored_reduction(&first.camera, &first.images[0])?;
 
     // Frames of different cameras belong together by name; a step that some camera lacks still counts.
     let steps: BTreeSet<String> =
@@ -97,6 +83,22 @@ fn is_camera(name: &str) -> bool {
     name.strip_prefix("cam").is_some_and(|rest| !rest.is_empty() && rest.chars().all(|c| c.is_ascii_digit()))
 }
 
+/// Names of the cameras that a folder holds images or a video of.
+fn rig(root: &Path) -> Result<BTreeSet<String>, Error> {
+    let names = listing::entries(root)?
+        .iter()
+        .filter(|path| path.is_dir() || listing::has_extension(path, &["mp4"]))
+        .map(|path| listing::stem(path))
+        .filter(|name| is_camera(name))
+        .collect();
+    Ok(names)
+}
+
+/// True when a folder holds images or videos of several fixed cameras.
+pub(crate) fn has_rig(root: &Path) -> bool {
+    rig(root).is_ok_and(|names| !names.is_empty())
+}
+
 /// Names of the cameras in the order of the rows of poses, and those of them that are left out. A camera that is left
 /// out keeps its row, whether its files are there or not.
 fn cameras(
@@ -105,17 +107,12 @@ fn cameras(
     rows: usize,
     unwanted: &[String],
 ) -> Result<(Vec<String>, Vec<String>), Error> {
-    let there: BTreeSet<String> = listing::entries(root)?
-        .iter()
-        .filter(|path| path.is_dir() || listing::has_extension(path, &["mp4"]))
-        .map(|path| listing::stem(path))
-        .filter(|name| is_camera(name))
-        .collect();
+    let there = rig(root)?;
     if there.is_empty() {
         return Err(Error::MissingFile {
             path: root.join("cam00"),
-            fix: "poses_bounds.npy needs camXX/images or camXX.mp4 beside it; for a static capture of one image \
-                  per camera use the COLMAP or nerfstudio layout"
+            fix: "poses_bounds.npy needs camXX/images or camXX.mp4 beside it for fixed cameras, or images/ for one \
+                  camera that moves"
                 .to_owned(),
         });
     }
@@ -167,32 +164,4 @@ fn images(source: &Source<'_>, name: &str, captured: Option<DVec2>) -> Result<Ve
         return Err(Error::DuplicateFrame { path: folder, frame: listing::stem(&pair[0]) });
     }
     Ok(images)
-}
-
-/// Reduction of the images relative to the size that poses are of, as preprocessing by others leaves them; 1 where it
-/// is no whole number, or differs between width and height by more than rounding.
-fn stored_reduction(view: &View) -> Result<u32, Error> {
-    let Some(captured) = view.camera.size else { return Ok(1) };
-    let header = image::probe(&view.images[0])?;
-    let factor = (captured.x / f64::from(header.width)).round();
-    if !(1.0..=64.0).contains(&factor) {
-        return Ok(1);
-    }
-    let rounded = |captured: f64, stored: u32| (captured / factor - f64::from(stored)).abs() <= 1.0;
-    let fits = rounded(captured.x, header.width) && rounded(captured.y, header.height);
-    Ok(if fits { factor as u32 } else { 1 })
-}
-
-/// A 3 x 5 pose, row by row: columns down, right, back, position, (H, W, f).
-fn camera(path: &Path, pose: &[f64]) -> DraftCamera {
-    let column = |c: usize| DVec3::new(pose[c], pose[5 + c], pose[10 + c]);
-    let [down, right, back, centre, size] = [0, 1, 2, 3, 4].map(column);
-    DraftCamera {
-        source: path.to_owned(),
-        size: Some(DVec2::new(size.y, size.x)),
-        focal: DraftFocal::Pixels(DVec2::splat(size.z)),
-        principal_px: None,
-        lens: LensDistortion::default(),
-        camera_from_world: world_to_camera(DMat3::from_cols(right, down, -back), centre),
-    }
 }

@@ -1,6 +1,7 @@
 //! Initial points: read, thinned, coloured, or drawn where the cameras look.
 
 mod color;
+mod made_up;
 mod random;
 mod sight;
 
@@ -11,6 +12,7 @@ use cif_geometry::Bounds;
 use glam::DVec3;
 
 pub(crate) use color::sample_colors;
+pub(crate) use made_up::are_made_up;
 pub(crate) use random::draw;
 pub(crate) use sight::unseen_warning;
 

@@ -91,6 +91,7 @@ mod tests {
             },
             has_alpha: false,
             warnings: Vec::new(),
+            notes: Vec::new(),
             unknown: None,
             frame: CaptureFrame::default(),
         }

@@ -39,6 +39,11 @@ pub fn warns(dataset: &Dataset, words: &[&str]) -> bool {
     dataset.warnings.iter().any(|warning| words.iter().all(|word| warning.contains(word)))
 }
 
+/// True when some note holds all the words.
+pub fn notes(dataset: &Dataset, words: &[&str]) -> bool {
+    dataset.notes.iter().any(|note| words.iter().all(|word| note.contains(word)))
+}
+
 /// Asserts that a message holds all the words.
 #[track_caller]
 pub fn holds(message: &str, words: &[&str]) {
@@ -109,6 +114,16 @@ pub fn npy_of(shape: &str, values: &[f64]) -> Vec<u8> {
     bytes.extend(header.as_bytes());
     bytes.extend(values.iter().flat_map(|value| value.to_le_bytes()));
     bytes
+}
+
+/// A NumPy archive with one array of doubles, stored.
+pub fn npz(name: &str, shape: &str, values: &[f64]) -> Vec<u8> {
+    use std::io::{Cursor, Write};
+    let mut archive = zip::ZipWriter::new(Cursor::new(Vec::new()));
+    let options = zip::write::SimpleFileOptions::default();
+    archive.start_file(format!("{name}.npy"), options).unwrap();
+    archive.write_all(&npy_of(shape, values)).unwrap();
+    archive.finish().unwrap().into_inner()
 }
 
 /// Camera `k` of a ring around the origin: axes right, down, forward as columns, and the centre.
@@ -183,19 +198,9 @@ pub fn hypernerf(count: usize) -> TempDir {
 pub fn neu3d(cameras: usize, steps: usize) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    let mut poses = Vec::new();
+    // At twice the size of the images.
+    let poses = llff_poses(cameras, [2 * WIDTH, 2 * HEIGHT], 2.0 * FOCAL);
     for camera in 0..cameras {
-        let (axes, centre) = ring_camera(camera);
-        // Columns down, right, back, position, (H, W, f), at twice the size of the images.
-        let columns = [
-            axes.y_axis,
-            axes.x_axis,
-            -axes.z_axis,
-            centre,
-            DVec3::new(2.0 * f64::from(HEIGHT), 2.0 * f64::from(WIDTH), 2.0 * FOCAL),
-        ];
-        poses.extend((0..3).flat_map(|row| columns.map(|column| column[row])));
-        poses.extend([0.1, 10.0]);
         for step in 0..steps {
             let name = format!("{step:04}.png");
             let place = root.join(format!("cam{camera:02}"));
@@ -204,6 +209,72 @@ pub fn neu3d(cameras: usize, steps: usize) -> TempDir {
         }
     }
     write(&root.join("poses_bounds.npy"), npy(cameras, 17, &poses));
+    folder
+}
+
+/// A capture of Dynamic 3D Gaussians of frames 10, 20, ...; camera 0 is held out and has no masks.
+pub fn dynamic_gaussians(cameras: usize, steps: usize) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    let list = |cameras: std::ops::Range<usize>| {
+        let mut meta = json!({"w": WIDTH, "h": HEIGHT, "k": [], "w2c": [], "fn": [], "cam_id": []});
+        for step in 0..steps {
+            let of = |entry: &dyn Fn(usize) -> Value| cameras.clone().map(entry).collect::<Vec<Value>>();
+            // Row by row, world to camera, as OpenCV has it.
+            let pose = |camera: usize| {
+                let (axes, centre) = ring_camera(camera);
+                let rotation = axes.transpose();
+                let translation = -(rotation * centre);
+                let row = |r: usize| {
+                    json!([rotation.x_axis[r], rotation.y_axis[r], rotation.z_axis[r], translation[r]])
+                };
+                json!([row(0), row(1), row(2), [0.0, 0.0, 0.0, 1.0]])
+            };
+            let push = |meta: &mut Value, key: &str, entries: Vec<Value>| {
+                meta[key].as_array_mut().unwrap().push(json!(entries));
+            };
+            push(&mut meta, "k", of(&|_| json!([[FOCAL, 0.0, 16.5], [0.0, FOCAL, 11.0], [0.0, 0.0, 1.0]])));
+            push(&mut meta, "w2c", of(&pose));
+            push(&mut meta, "fn", of(&|camera| json!(format!("{camera}/{:06}.jpg", 10 * (step + 1)))));
+            push(&mut meta, "cam_id", of(&|camera| json!(camera)));
+        }
+        meta
+    };
+    write_json(&root.join("train_meta.json"), &list(1..cameras));
+    write_json(&root.join("test_meta.json"), &list(0..1));
+    for camera in 0..cameras {
+        for step in 0..steps {
+            let name = format!("{camera}/{:06}", 10 * (step + 1));
+            write_rgb(&root.join(format!("ims/{name}.jpg")), WIDTH, HEIGHT, shade(step));
+            if camera > 0 {
+                write_mask(&root.join(format!("seg/{name}.png")), WIDTH, HEIGHT, |x, _| 255 * (x / 16) as u8);
+            }
+        }
+    }
+    folder
+}
+
+/// Rows of `poses_bounds.npy`: columns down, right, back, position, (H, W, f), and two depths.
+pub fn llff_poses(count: usize, size: [u32; 2], focal: f64) -> Vec<f64> {
+    let mut poses = Vec::new();
+    for k in 0..count {
+        let (axes, centre) = ring_camera(k);
+        let size = DVec3::new(f64::from(size[1]), f64::from(size[0]), focal);
+        let columns = [axes.y_axis, axes.x_axis, -axes.z_axis, centre, size];
+        poses.extend((0..3).flat_map(|row| columns.map(|column| column[row])));
+        poses.extend([0.1, 10.0]);
+    }
+    poses
+}
+
+/// A sequence of one moving camera with LLFF's poses, without masks or points.
+pub fn llff(count: usize) -> TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    let root = folder.path();
+    for k in 0..count {
+        write_rgb(&root.join(format!("images/{k:05}.png")), WIDTH, HEIGHT, shade(k));
+    }
+    write(&root.join("poses_bounds.npy"), npy(count, 17, &llff_poses(count, [WIDTH, HEIGHT], FOCAL)));
     folder
 }
 

@@ -108,8 +108,9 @@ fn paper(layout: Layout) -> TrainConfig {
             config.rates.mlp[1] = 1.6e-6;
             config.densify.prune_every = 8_000;
         }
-        Layout::HyperNerf => {
-            config.downscale = Some(2);
+        // The publication has no LLFF sequences; they are of one moving camera, too.
+        Layout::HyperNerf | Layout::Llff => {
+            config.downscale = (layout == Layout::HyperNerf).then_some(2);
             config.stages.batch = 2;
             config.model.time_resolution = 150;
             config.model.multipliers = vec![1, 2, 4];
@@ -120,8 +121,9 @@ fn paper(layout: Layout) -> TrainConfig {
             config.densify.until = 10_000;
             config.densify.opacity_reset_every = 300_000;
         }
-        Layout::Neu3d => {
-            config.downscale = Some(2);
+        // Nor captures of Dynamic 3D Gaussians, which are of fixed cameras, too.
+        Layout::Neu3d | Layout::DynamicGaussians => {
+            config.downscale = (layout == Layout::Neu3d).then_some(2);
             config.stages.batch = 4;
             config.model.time_resolution = 150;
             config.model.multipliers = vec![1, 2];

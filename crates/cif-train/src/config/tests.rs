@@ -2,13 +2,10 @@ use cif_dataset::Layout;
 
 use super::*;
 
-const LAYOUTS: [Layout; 5] =
-    [Layout::HyperNerf, Layout::Neu3d, Layout::DNerf, Layout::Nerfstudio, Layout::Colmap];
-
 #[test]
 fn every_preset_is_valid_and_survives_a_round_trip() {
     for preset in [Preset::Draft, Preset::Standard, Preset::Paper] {
-        for layout in LAYOUTS {
+        for layout in Layout::ALL {
             let config = TrainConfig::preset(preset, layout);
             assert_eq!(config.preset, preset);
             config.validate().unwrap();
@@ -29,8 +26,10 @@ fn the_paper_preset_follows_the_dataset_type() {
     assert_eq!((neu.loss.lambda_instance, neu.resample.rate), (0.005, 0.05));
     assert_eq!(hyper.resample.rate, 0.01);
     assert_eq!((hyper.resample.weak_share, hyper.resample.excess), (1.0, Excess::Share));
-    let reductions = LAYOUTS.map(|layout| TrainConfig::preset(Preset::Paper, layout).downscale);
-    assert_eq!(reductions, [Some(2), Some(2), None, None, None]);
+    let reductions = Layout::ALL.map(|layout| TrainConfig::preset(Preset::Paper, layout).downscale);
+    assert_eq!(reductions, [Some(2), None, Some(2), None, None, None, None]);
+    let sequence = TrainConfig::preset(Preset::Paper, Layout::Llff);
+    assert_eq!(TrainConfig { downscale: Some(2), ..sequence }, hyper);
     let dnerf = TrainConfig::preset(Preset::Paper, Layout::DNerf);
     assert_eq!(dnerf.rates.mlp, [1.6e-4, 1.6e-6]);
     assert_eq!(dnerf.densify.prune_every, 8_000);

@@ -246,6 +246,7 @@ mod tests {
             points: PointCloud { positions: Vec::new(), colors: Vec::new(), source: PointSource::Random },
             has_alpha: false,
             warnings: Vec::new(),
+            notes: Vec::new(),
             unknown: None,
             frame: CaptureFrame::default(),
         }

@@ -233,6 +233,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
         points: PointCloud { positions, colors, source: PointSource::Random },
         has_alpha: false,
         warnings: Vec::new(),
+        notes: Vec::new(),
         unknown: None,
         frame: Default::default(),
     }

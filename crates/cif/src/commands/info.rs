@@ -106,6 +106,7 @@ fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
         ("points_box".to_owned(), corners(&points)),
         ("camera_box".to_owned(), corners(&centres)),
         ("frame".to_owned(), json!((!dataset.frame.is_identity()).then_some(dataset.frame))),
+        ("notes".to_owned(), json!(dataset.notes)),
         ("warnings".to_owned(), json!(dataset.warnings)),
     ])
 }

@@ -76,8 +76,9 @@ A short tour:
   cif label table.usda --instance 3 'blue mug'           give it another name
   cif check table.cif                                    is it numerically sound?
 
-A capture is a folder in the layout of HyperNeRF, Neu3D, D-NeRF, nerfstudio or COLMAP, with
-instance masks (PNG, value = instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/.
+A capture is a folder in the layout of HyperNeRF, DyCheck, Neu3D, D-NeRF, Dynamic 3D Gaussians (CMU
+Panoptic), LLFF sequences (NSFF, EndoNeRF), nerfstudio or COLMAP, with instance masks (PNG, value =
+instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/ or beside its images.
 `cif masks` makes them out of those of other tools, a few painted frames, or with a video tracker.
 Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 `cif COMMAND --help` explains one command.";
@@ -237,7 +238,9 @@ struct FrameOptions {
 #[derive(Clone, Copy, Debug, ValueEnum)]
 enum LayoutName {
     HyperNerf,
+    DynamicGaussians,
     Neu3d,
+    Llff,
     DNerf,
     Nerfstudio,
     Colmap,
@@ -247,7 +250,9 @@ impl From<LayoutName> for cif_dataset::Layout {
     fn from(name: LayoutName) -> Self {
         match name {
             LayoutName::HyperNerf => Self::HyperNerf,
+            LayoutName::DynamicGaussians => Self::DynamicGaussians,
             LayoutName::Neu3d => Self::Neu3d,
+            LayoutName::Llff => Self::Llff,
             LayoutName::DNerf => Self::DNerf,
             LayoutName::Nerfstudio => Self::Nerfstudio,
             LayoutName::Colmap => Self::Colmap,
@@ -302,8 +307,11 @@ impl CaptureOptions {
     }
 }
 
-/// Prints the oddities of a capture.
+/// Prints what was decided about a capture, and its oddities.
 fn print_warnings(dataset: &cif_dataset::Dataset) {
+    for note in &dataset.notes {
+        eprintln!("note: {note}");
+    }
     for warning in &dataset.warnings {
         eprintln!("warning: {warning}");
     }

@@ -10,7 +10,7 @@ mod text;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use cif_geometry::RigidTransform;
+use cif_geometry::{Bounds, RigidTransform};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::{Draft, DraftCamera, DraftFrame, Source, hold_out_every_eighth, transforms};
@@ -92,11 +92,11 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     }
     frames.sort_by(|a, b| a.name.cmp(&b.name));
     hold_out_every_eighth(&mut frames);
-    let mut warnings = Vec::new();
+    let mut unused = Vec::new();
     let unlisted = listing::count_images_below(&image_folder)?.saturating_sub(frames.len());
     if unlisted > 0 {
-        warnings.push(format!(
-            "{}: {unlisted} images have no camera in {} and are not used",
+        unused.push(format!(
+            "{unlisted} images in {} that have no camera in {}",
             image_folder.display(),
             images_path.display()
         ));
@@ -106,7 +106,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         frames,
         stored_reduction: 1,
         points: (!points.positions.is_empty()).then_some((points, points_path)),
-        warnings,
+        unused,
         ..Draft::default()
     })
 }
@@ -143,6 +143,40 @@ pub(crate) fn named_cameras(folder: &Path) -> Result<(Vec<(String, DraftCamera)>
         camera(&reconstruction, image, &name).map(|camera| (name, camera))
     });
     Ok((cameras.collect::<Result<_, _>>()?, reconstruction.points))
+}
+
+/// Largest distance of camera centres that are one, in sizes of what all centres span.
+const SAME_PLACE: f64 = 1e-3;
+
+/// Points of the reconstruction of a capture, where its cameras stand where those of the frames do: then its points
+/// and the frames share their coordinates. Images belong to frames by the stems of their names.
+///
+/// # Errors
+/// As the files of the reconstruction are damaged.
+pub(super) fn points_among(
+    root: &Path,
+    frames: &[DraftFrame],
+) -> Result<Option<(RawPoints, PathBuf)>, Error> {
+    let found = sparse_folder(root).map(|folder| reconstruction(&folder)).transpose()?;
+    let Some(found) = found.filter(|found| !found.points.positions.is_empty()) else { return Ok(None) };
+    let centre = |pose: &RigidTransform| -(pose.rotation.transpose() * pose.translation);
+    let of_images: BTreeMap<String, DVec3> = found
+        .images
+        .iter()
+        .filter_map(|image| Some((listing::stem(Path::new(&image.name)), centre(&pose(image)?))))
+        .collect();
+    let pairs: Vec<[DVec3; 2]> = frames
+        .iter()
+        .filter_map(|frame| {
+            let theirs = of_images.get(&listing::stem(&frame.image))?;
+            Some([*theirs, centre(&frame.camera.camera_from_world)])
+        })
+        .collect();
+    let size = Bounds::around(pairs.iter().map(|[_, ours]| *ours)).size().length();
+    let is_one = |[theirs, ours]: &[DVec3; 2]| theirs.distance(*ours) <= SAME_PLACE * size;
+    // One camera has no size to measure distances in.
+    let same = pairs.len() > 1 && pairs.iter().all(is_one);
+    Ok(same.then_some((found.points, found.points_path)))
 }
 
 /// The camera of an image.
