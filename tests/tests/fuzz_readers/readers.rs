@@ -333,13 +333,7 @@ fn dynamic_gaussians(folder: &Path) {
 }
 
 fn dycheck(folder: &Path) {
-    hypernerf(folder);
-    fs::create_dir(folder.join("splits")).unwrap();
-    for (name, list) in [("train", r#"["000000", "000002"]"#), ("val", r#"["000001"]"#)] {
-        let list = format!(r#"{{ "frame_names": {list}, "time_ids": [0], "camera_ids": [0] }}"#);
-        fs::write(folder.join(format!("splits/{name}.json")), list).unwrap();
-    }
-    fs::write(folder.join("extra.json"), r#"{ "fps": 30.0, "factor": 2 }"#).unwrap();
+    adopt(captures::dycheck().path(), folder);
 }
 
 /// A capture whose instances a map of classes names.

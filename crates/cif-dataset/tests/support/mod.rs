@@ -194,6 +194,43 @@ pub fn hypernerf(count: usize) -> TempDir {
     folder
 }
 
+/// DyCheck's capture of a phone that moves and one that stands: `hypernerf` with two cameras, lists and much beside.
+pub fn dycheck() -> TempDir {
+    let folder = hypernerf(1);
+    let root = folder.path();
+    for name in ["masks", "camera", "rgb"] {
+        fs::remove_dir_all(root.join(name)).unwrap();
+    }
+    let ids: Vec<String> =
+        (0..2).flat_map(|camera| (0..6).map(move |time| format!("{camera}_{time:05}"))).collect();
+    let mut metadata = json!({});
+    for (k, id) in ids.iter().enumerate() {
+        metadata[id] = json!({"warp_id": k % 6, "appearance_id": k % 6, "camera_id": k / 6});
+        write_json(&root.join(format!("camera/{id}.json")), &nerfies_camera(if k < 6 { k } else { 9 }));
+        for (factor, divisor) in [("1x", 1), ("2x", 2)] {
+            write_rgb(
+                &root.join(format!("rgb/{factor}/{id}.png")),
+                WIDTH / divisor,
+                HEIGHT / divisor,
+                shade(k),
+            );
+        }
+        write(&root.join(format!("depth/1x/{id}.npy")), npy(1, 1, &[1.0]));
+        write_mask(&root.join(format!("covisible/2x/val/{id}.png")), WIDTH / 2, HEIGHT / 2, |_, _| 255);
+    }
+    let (train, val) = ids.split_at(6);
+    write_json(&root.join("metadata.json"), &metadata);
+    write_json(&root.join("dataset.json"), &json!({"ids": ids, "train_ids": ids, "val_ids": []}));
+    for (name, frames, camera) in [("train", train, 0), ("val", &val[1..], 1)] {
+        let (times, cameras) = (vec![0; frames.len()], vec![camera; frames.len()]);
+        let list = json!({"frame_names": frames, "time_ids": times, "camera_ids": cameras});
+        write_json(&root.join(format!("splits/{name}.json")), &list);
+    }
+    write_json(&root.join("extra.json"), &json!({"factor": 2, "fps": 30.0, "up": [0.0, 1.0, 0.0]}));
+    fs::remove_file(root.join("instances.json")).unwrap();
+    folder
+}
+
 /// A Neu3D capture with masks inside the camera folders.
 pub fn neu3d(cameras: usize, steps: usize) -> TempDir {
     let folder = tempfile::tempdir().unwrap();
