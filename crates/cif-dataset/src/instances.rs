@@ -118,10 +118,10 @@ pub(crate) fn default_label(id: u16) -> String {
 /// Value of masks that only say where something is.
 pub(crate) const WHITE: u16 = 255;
 
-/// The instance of masks whose only values are 0 and 255.
-pub(crate) fn foreground() -> InstanceLabel {
+/// The instance of masks that have one value apart from 0.
+pub(crate) fn foreground(id: u16) -> InstanceLabel {
     let label = "foreground".to_owned();
-    InstanceLabel { id: WHITE, category: label.clone(), label, taxonomies: BTreeMap::new() }
+    InstanceLabel { id, category: label.clone(), label, taxonomies: BTreeMap::new() }
 }
 
 /// The file of labels for a capture's masks: in the mask folder, else in the nearest folder of the capture above it.

@@ -14,8 +14,8 @@ use crate::{Error, Frame, Layout};
 /// Mask folder that is taken where none is asked for.
 pub(crate) const DEFAULT_FOLDER: &str = "masks";
 
-/// The mask folder of Dynamic 3D Gaussians: 255 where something moves, else 0.
-const SEGMENTS: &str = "seg";
+/// The mask folder of Dynamic 3D Gaussians: white where the foreground is, mostly of one bit per pixel.
+pub(crate) const SEGMENTS: &str = "seg";
 
 /// The mask folder of a capture that nobody named.
 pub(crate) fn default_folder(root: &Path, layout: Layout) -> &'static Path {

@@ -264,7 +264,7 @@ impl Dataset {
         let place = match self.root.join(name) {
             folder if folder.is_dir() => folder.display().to_string(),
             _ if name.is_dir() => name.display().to_string(),
-            _ => format!("{}: {}/ beside its images", self.root.display(), name.display()),
+            _ => format!("{}: {}/ beside the images", self.root.display(), name.display()),
         };
         if train < all_train {
             self.warnings.push(format!("{place}: {masked} of {} frames have a mask", self.frames.len()));
@@ -275,7 +275,11 @@ impl Dataset {
             ));
         }
         if listing.strangers > 0 {
-            unused.push(format!("{} mask files in {place} that belong to no frame", listing.strangers));
+            unused.push(format!(
+                "{} mask files in {} that belong to no frame",
+                listing.strangers,
+                name.display()
+            ));
         }
         if listing.numbered {
             let numbered: Vec<String> = self
@@ -324,17 +328,19 @@ impl Dataset {
                 "{}: the masks hold no labelled pixel; only colour can be trained",
                 self.root.join(name).display()
             ));
-        } else if found.iter().eq([instances::WHITE].iter()) && !named.contains_key(&instances::WHITE) {
-            let what = format!(
-                "{place}: the masks hold 0 and 255 alone: what is 255 is taken as one instance, foreground"
-            );
-            match self.layout {
-                Layout::DynamicGaussians => self.notes.push(what),
-                _ => self.warnings.push(format!(
+        } else if let (1, Some(&id)) = (found.len(), found.first())
+            && (id == instances::WHITE || name == Path::new(mask_files::SEGMENTS))
+            && !named.contains_key(&id)
+        {
+            named.insert(id, instances::foreground(id));
+            let what = format!("{place}: one value apart from 0 ({id}): taken as one instance, foreground");
+            if name == Path::new(mask_files::SEGMENTS) {
+                self.notes.push(what);
+            } else {
+                self.warnings.push(format!(
                     "{what}; masks of valid pixels or of what to ignore are no instances (--no-masks)"
-                )),
+                ));
             }
-            named.insert(instances::WHITE, instances::foreground());
         }
         let labelled_train = self.frames.iter().zip(&counts).any(|(frame, counts)| {
             frame.split == Split::Train && counts.as_ref().is_some_and(|c| !c.0.is_empty())

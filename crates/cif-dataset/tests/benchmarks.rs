@@ -50,13 +50,23 @@ fn dynamic_gaussians_have_cameras_times_a_split_and_a_foreground() {
     assert_eq!(frame.camera.focal_px.to_array(), [50.0, 60.0]);
     assert_eq!((frame.camera.principal_px.to_array(), frame.lens.skew_px), ([15.0, 10.0], 0.5));
     assert!(frame.mask.as_ref().unwrap().ends_with("seg/1/000020.png"));
-    // 0 and 255 are one thing and the rest; held-out views without masks are no oddity.
+    // Two values are one thing and the rest; held-out views without masks are no oddity.
     let instances: Vec<(u16, &str)> =
         dataset.instances.iter().map(|instance| (instance.id, instance.label.as_str())).collect();
     assert_eq!(instances, [(255, "foreground")]);
     assert!(dataset.warnings.is_empty(), "{:?}", dataset.warnings);
     assert!(notes(&dataset, &["seg", "0 of 3 held-out frames", "scored on none"]), "{:?}", dataset.notes);
-    assert!(notes(&dataset, &["0 and 255", "foreground"]));
+    assert!(notes(&dataset, &["seg", "255", "foreground"]));
+    // As published: one bit per pixel.
+    for camera in 1..4 {
+        for step in 1..4 {
+            let path = folder.path().join(format!("seg/{camera}/{:06}.png", 10 * step));
+            write_bits(&path, WIDTH, HEIGHT, |x, _| x > 15);
+        }
+    }
+    let dataset = open(&folder);
+    assert_eq!((dataset.instances[0].id, dataset.instances[0].label.as_str()), (1, "foreground"));
+    assert!(dataset.warnings.is_empty(), "{:?}", dataset.warnings);
     assert_eq!(dataset.points.source, PointSource::Random);
 }
 
@@ -219,7 +229,7 @@ fn endoscopes_that_stand_still_are_upright_and_their_masks_belong_by_number() {
     assert!(notes(&dataset, &["by their numbers", "frame-000000.mask.png for 00000"]), "{:?}", dataset.notes);
     // EndoNeRF leaves out what is 255, the instruments; nobody can know that from the files.
     assert_eq!(dataset.instances[0].label, "foreground");
-    assert!(warns(&dataset, &["0 and 255", "--no-masks"]), "{:?}", dataset.warnings);
+    assert!(warns(&dataset, &["apart from 0 (255)", "--no-masks"]), "{:?}", dataset.warnings);
     // Two files of one number belong to nobody.
     write_mask(&folder.path().join("masks/7.png"), WIDTH, HEIGHT, |_, _| 1);
     assert!(open(&folder).frames[7].mask.is_none());

@@ -150,7 +150,8 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     }
     let unlisted = listing::images(&images)?.len().saturating_sub(list.ids.len() - without_image.len());
     if unlisted > 0 {
-        unused.push(format!("{unlisted} images in {} that dataset.json does not list", images.display()));
+        let folder = images.strip_prefix(root).unwrap_or(&images);
+        unused.push(format!("{unlisted} images in {} that dataset.json does not list", folder.display()));
     }
     Ok(Draft {
         frames,
@@ -227,7 +228,8 @@ fn listed(
     let in_none =
         list.ids.iter().filter(|id| !train.contains(id.as_str()) && !val.contains(id.as_str())).count();
     if in_none > 0 {
-        unused.push(format!("{in_none} frames that no list of {} has", path.display()));
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        unused.push(format!("{in_none} frames that no list of {name} has"));
     }
     Ok(list
         .ids

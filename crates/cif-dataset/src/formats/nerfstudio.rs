@@ -59,7 +59,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         unused.push(format!(
             "{} images in {} that have no camera in transforms.json",
             unlisted - file.frames.len(),
-            root.join(&folder).display()
+            folder.display()
         ));
     }
     let points = match &file.ply_file_path {

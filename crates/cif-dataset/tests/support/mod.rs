@@ -89,6 +89,20 @@ pub fn write_mask(path: &Path, width: u32, height: u32, id: impl Fn(u32, u32) ->
     encoder.write_header().unwrap().write_image_data(&ids).unwrap();
 }
 
+/// A grey mask of one bit per pixel; widths of whole bytes.
+pub fn write_bits(path: &Path, width: u32, height: u32, is_white: impl Fn(u32, u32) -> bool) {
+    fs::create_dir_all(path.parent().unwrap()).unwrap();
+    let mut encoder = png::Encoder::new(fs::File::create(path).unwrap(), width, height);
+    encoder.set_color(png::ColorType::Grayscale);
+    encoder.set_depth(png::BitDepth::One);
+    let byte = |x: u32, y: u32| (0..8).fold(0, |byte, bit| byte << 1 | u8::from(is_white(x + bit, y)));
+    let bytes: Vec<u8> = (0..height)
+        .flat_map(|y| (0..width).step_by(8).map(move |x| (x, y)))
+        .map(|(x, y)| byte(x, y))
+        .collect();
+    encoder.write_header().unwrap().write_image_data(&bytes).unwrap();
+}
+
 /// A grey mask, 16 bit.
 pub fn write_wide_mask(path: &Path, width: u32, height: u32, id: impl Fn(u32, u32) -> u16) {
     fs::create_dir_all(path.parent().unwrap()).unwrap();

@@ -176,9 +176,9 @@ fn print(facts: &Facts) {
                     println!("{:>28}  {}", "", named(item));
                 }
             }
-            Value::Array(items) if name == "warnings" => {
+            Value::Array(items) if ["notes", "warnings"].contains(&name.as_str()) => {
                 for item in items {
-                    println!("{:>28}  {}", "warning", one_line(item));
+                    println!("{:>28}  {}", &name[..name.len() - 1], one_line(item));
                 }
             }
             Value::Object(items) if items.is_empty() => println!("{name:>28}  none"),

@@ -95,11 +95,8 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let mut unused = Vec::new();
     let unlisted = listing::count_images_below(&image_folder)?.saturating_sub(frames.len());
     if unlisted > 0 {
-        unused.push(format!(
-            "{unlisted} images in {} that have no camera in {}",
-            image_folder.display(),
-            images_path.display()
-        ));
+        let list = images_path.file_name().unwrap_or_default().to_string_lossy();
+        unused.push(format!("{unlisted} images in images that have no camera in {list}"));
     }
     let Reconstruction { points, points_path, .. } = reconstruction;
     Ok(Draft {
