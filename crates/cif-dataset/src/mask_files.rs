@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::cryptomatte::{self, ObjectIds};
 use crate::files::{confidence, listing, mask};
 use crate::load::same_aspect;
-use crate::{Error, Frame, Layout};
+use crate::{Error, Frame, Layout, Split};
 
 /// Mask folder that is taken where none is asked for.
 pub(crate) const DEFAULT_FOLDER: &str = "masks";
@@ -82,7 +82,7 @@ pub(crate) struct MaskListing {
     pub(crate) paths: Vec<Option<PathBuf>>,
     /// Confidences of these masks, `[frames]`.
     pub(crate) confidences: Vec<Option<PathBuf>>,
-    /// Folder of these masks, which may hold labels of its own; the first of several.
+    /// Folder of these masks, which may hold labels of its own; of several, the one of the first training frame.
     pub(crate) folder: Option<PathBuf>,
     /// PNG and EXR files in the folders that belong to no frame.
     pub(crate) strangers: usize,
@@ -140,8 +140,11 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
     // Masks of a folder may lie in subfolders, those of cameras and splits in folders of their own.
     let mut folders: BTreeSet<&Path> =
         found.iter().filter(|path| !path.starts_with(&base)).filter_map(|path| path.parent()).collect();
-    let folder_of_masks =
-        if base.is_dir() { Some(base.clone()) } else { folders.first().map(|p| p.to_path_buf()) };
+    let of_training = || {
+        let trained = frames.iter().zip(&paths).filter(|(frame, _)| frame.split == Split::Train);
+        trained.filter_map(|(_, path)| path.as_deref()?.parent()).next().map(Path::to_owned)
+    };
+    let folder_of_masks = if base.is_dir() { Some(base.clone()) } else { of_training() };
     folders.insert(&base);
     let confidences = |folder: &Path| folder.join(CONFIDENCE_FOLDER);
     let files: usize = folders

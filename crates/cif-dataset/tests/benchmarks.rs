@@ -182,9 +182,9 @@ fn reduced_images_of_sequences_are_read_where_they_fit() {
     assert_eq!(loaded(Some(3)).0, "images");
     // As DynamicNeRF is published: the reduced ones alone.
     fs::remove_dir_all(folder.path().join("images")).unwrap();
-    assert_eq!(loaded(None), ("images_2".to_owned(), WIDTH / 2, FOCAL / 2.0));
-    fs::remove_dir_all(folder.path().join("images_2")).unwrap();
     assert_eq!(loaded(None), ("images_20x15".to_owned(), 20, FOCAL * 20.0 / f64::from(WIDTH)));
+    fs::remove_dir_all(folder.path().join("images_20x15")).unwrap();
+    assert_eq!(loaded(None), ("images_2".to_owned(), WIDTH / 2, FOCAL / 2.0));
 }
 
 #[test]

@@ -185,7 +185,10 @@ fn neu3d_masks_may_lie_beside_the_cameras_and_a_step_may_be_missing() {
     assert_eq!((frame.time, frame.time_index), (0.5, 2));
     assert!(frame.mask.as_ref().unwrap().ends_with("tracked/cam01/0002.png"));
     assert_eq!(dataset.instances.iter().map(|i| i.id).collect::<Vec<_>>(), [9]);
-    assert!(dataset.frames[0].mask.is_none() && warns(&dataset, &["3 of 7 frames have a mask"]));
+    assert!(dataset.frames[0].mask.is_none() && notes(&dataset, &["0 of 4 held-out frames have a mask"]));
+    std::fs::remove_file(folder.path().join("tracked/cam01/0002.png")).unwrap();
+    let dataset = Dataset::open(folder.path(), &options).unwrap();
+    assert!(warns(&dataset, &["2 of 7 frames have a mask"]));
 }
 
 #[test]
