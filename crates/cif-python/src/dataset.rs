@@ -68,6 +68,12 @@ impl Dataset {
         self.inner.warnings.clone()
     }
 
+    /// What was found and decided while reading, such as what is left out; one sentence each.
+    #[getter]
+    fn notes(&self) -> Vec<String> {
+        self.inner.notes.clone()
+    }
+
     #[getter]
     fn frames<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         let frames = PyList::empty(py);

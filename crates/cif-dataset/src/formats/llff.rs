@@ -10,7 +10,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Draft, DraftFrame, Source, colmap, customary_points, poses_bounds, some_of};
+use super::{Draft, DraftCamera, DraftFrame, Source, colmap, customary_points, poses_bounds, some_of};
 use crate::files::{image, listing};
 use crate::{Error, Split};
 
@@ -81,7 +81,8 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let stems: Vec<String> = images.iter().map(|image| listing::stem(image)).collect();
     let ranks = ranks(&stems);
     let last = images.len() - 1;
-    let seen_by_others = seen_by_others(root, &poses.cameras, last)?;
+    let mut unused = Vec::new();
+    let seen_by_others = seen_by_others(root, &poses.cameras, last, &mut unused)?;
     let held_out = |rank: usize| seen_by_others.is_empty() && rank % HOLD_OUT == 1 && rank < last;
     let mut frames: Vec<DraftFrame> = images
         .into_iter()
@@ -107,7 +108,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         }),
     };
     frames.extend(seen_by_others);
-    Ok(Draft { frames, stored_reduction, points, warnings, ..Draft::default() })
+    Ok(Draft { frames, stored_reduction, points, warnings, unused, ..Draft::default() })
 }
 
 /// Place of every image in the sequence: numbers that outgrow their leading zeros come last.
@@ -125,8 +126,9 @@ fn ranks(stems: &[String]) -> Vec<usize> {
 /// has the pose of the k-th image.
 fn seen_by_others(
     root: &Path,
-    cameras: &[super::DraftCamera],
+    cameras: &[DraftCamera],
     last: usize,
+    unused: &mut Vec<String>,
 ) -> Result<Vec<DraftFrame>, Error> {
     let folder = root.join("mv_images");
     if !folder.is_dir() || cameras.len() < RIG {
@@ -159,13 +161,9 @@ fn seen_by_others(
         }
     }
     if !strangers.is_empty() {
-        return Err(Error::invalid(
-            &folder,
-            format!(
-                "images are expected as 00007/cam03.jpg, of a time of the sequence (0 to {last}) and a camera (1 to \
-                 {RIG}); others are {}",
-                some_of(strangers.iter().map(String::as_str))
-            ),
+        unused.push(format!(
+            "images in mv_images of no time of the sequence or no camera from cam01 to cam{RIG}: {}",
+            some_of(strangers.iter().map(String::as_str))
         ));
     }
     Ok(frames)
