@@ -149,7 +149,7 @@ pub struct Dataset {
     pub has_alpha: bool,
     /// Oddities met while reading, one sentence each, naming the file.
     pub warnings: Vec<String>,
-    /// What was found and decided, one sentence each: nothing in it needs to be put right.
+    /// Findings and decisions of reading, one sentence each; nothing in them needs to be put right.
     pub notes: Vec<String>,
     /// A sentence on what the capture does not know of its world, its unit or its up axis; a warning too.
     pub unknown: Option<String>,

@@ -58,7 +58,7 @@ pub struct CaptureSummary {
     pub extent: f64,
     /// Oddities, one sentence each.
     pub warnings: Vec<String>,
-    /// What was found and decided, one sentence each.
+    /// Findings and decisions of reading, one sentence each.
     pub notes: Vec<String>,
 }
 

@@ -68,7 +68,7 @@ impl Dataset {
         self.inner.warnings.clone()
     }
 
-    /// What was found and decided while reading, such as what is left out; one sentence each.
+    /// Findings and decisions of reading, such as what is left out, one sentence each.
     #[getter]
     fn notes(&self) -> Vec<String> {
         self.inner.notes.clone()

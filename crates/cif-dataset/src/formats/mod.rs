@@ -51,7 +51,7 @@ pub(crate) struct Draft {
     /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
     pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
-    /// What is left out, such as "12 images that dataset.json does not list".
+    /// Parts of the capture that are left out, such as "12 images that dataset.json does not list".
     pub(crate) unused: Vec<String>,
     /// Facts of its world that the capture does not know.
     pub(crate) unknown: Option<String>,

@@ -14,13 +14,13 @@
 
 use super::RawPoints;
 
-/// Points looked at, spread evenly over the cloud; more tell nothing new.
+/// Points looked at, spread evenly over the cloud; more add nothing.
 const MOST: usize = 20_000;
 
 /// Points per cell on average, from which on counts are nearly normal.
 const PER_CELL: usize = 8;
 
-/// Fewest cells along a side that tell a surface from a volume.
+/// Fewest cells along a side that distinguish a surface from a volume.
 const FEWEST_CELLS: usize = 4;
 
 /// `x` of the distance's bound, for a chance of 1e-6: `sqrt(ln(2 / 1e-6) / 2)`.

@@ -58,7 +58,7 @@ class Dataset:
     def warnings(self) -> list[str]: ...
     @property
     def notes(self) -> list[str]:
-        """What was found and decided while reading, such as what is left out; one sentence each."""
+        """Findings and decisions of reading, such as what is left out, one sentence each."""
     @property
     def frames(self) -> list[dict[str, Any]]:
         """name, camera_name, time, time_index, split, group, image and mask of every frame."""

@@ -307,7 +307,7 @@ impl CaptureOptions {
     }
 }
 
-/// Prints what was decided about a capture, and its oddities.
+/// Prints the notes of a capture, and its oddities.
 fn print_warnings(dataset: &cif_dataset::Dataset) {
     for note in &dataset.notes {
         eprintln!("note: {note}");
