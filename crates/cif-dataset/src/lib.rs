@@ -36,6 +36,7 @@ mod feature_maps;
 mod files;
 pub mod foreign;
 mod formats;
+mod frame_source;
 mod instances;
 mod layout;
 mod lens_removal;
@@ -56,5 +57,6 @@ pub use dataset::{
 };
 pub use error::Error;
 pub use feature_maps::feature_maps;
+pub use frame_source::{FrameSource, VideoFrame};
 pub use motion_truth::{MotionTruth, TrueMotion};
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

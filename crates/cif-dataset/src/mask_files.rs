@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use crate::cryptomatte::{self, ObjectIds};
 use crate::files::{confidence, listing, mask};
 use crate::load::same_aspect;
+use crate::masks::files_of_video;
 use crate::{Error, Frame, Layout};
 
 /// Mask folder that is taken where none is asked for.
@@ -83,7 +84,8 @@ pub(crate) struct MaskListing {
 ///
 /// Looked for, in this order: `<camera>/<folder>/<stem>.png` (Neu3D), `<folder>/<frame>.png`,
 /// `<folder>/<frame>.<image extension>.png` and, where stems are unique, `<folder>/<stem>.png`; each also with
-/// `.exr`. Where none fits, EXR files that are bare numbers count the frames from 0, as renderers number them.
+/// `.exr`. Files that are numbered as the frames of the video that the capture was made of, one for each, are those of its
+/// frames. Where none fits, EXR files that are bare numbers count the frames from 0, as renderers number them.
 pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Path) -> MaskListing {
     let inside = root.join(folder);
     // A path relative to the working folder, where the capture has no such folder.
@@ -118,9 +120,10 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
             })
         })
         .collect();
+    let of_videos = of_videos(&base, frames, &mut paths);
     let numbered = paths.iter().all(Option::is_none) && number(&base, &mut paths);
-    let strangers =
-        count_files(&base).saturating_sub(paths.iter().flatten().filter(|p| p.starts_with(&base)).count());
+    let known = paths.iter().flatten().filter(|p| p.starts_with(&base)).count();
+    let strangers = count_files(&base).saturating_sub(known + of_videos);
     let folder_of_confidences = base.join(CONFIDENCE_FOLDER);
     let strangers = strangers.saturating_sub(count_files(&folder_of_confidences));
     let confidence = |(frame, mask): (&Frame, &Option<PathBuf>)| {
@@ -129,6 +132,32 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
     };
     let confidences = frames.iter().zip(&paths).map(confidence).collect();
     MaskListing { paths, confidences, folder: base.is_dir().then_some(base), strangers, numbered }
+}
+
+/// Gives the masks of whole videos to the frames that were made of these: files of bare numbers, in the folder where there
+/// is one camera, else in folders of their names. Returns how many are of frames that the capture does not have.
+fn of_videos(base: &Path, frames: &[Frame], paths: &mut [Option<PathBuf>]) -> usize {
+    let mut cameras: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
+    for (index, frame) in frames.iter().enumerate() {
+        cameras.entry(&frame.camera_name).or_default().push(index);
+    }
+    let mut others = 0;
+    for (camera, indices) in &cameras {
+        let places: Option<Vec<_>> =
+            indices.iter().map(|index| frames[*index].source.as_ref()?.video).collect();
+        let Some(places) = places else { continue };
+        let of = places[0].of;
+        let folder = if cameras.len() == 1 { base.to_owned() } else { base.join(camera) };
+        if !folder.is_dir() || places.iter().any(|place| place.of != of) {
+            continue;
+        }
+        let Some(mut files) = files_of_video(&folder, &EXTENSIONS, of) else { continue };
+        for (index, place) in indices.iter().zip(&places) {
+            paths[*index] = files.remove(&place.frame);
+        }
+        others += files.len();
+    }
+    others
 }
 
 /// Gives numbered EXR files to the frames they count; whether there are any.
@@ -224,7 +253,9 @@ pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Re
             });
         }
         result.largest_id = result.largest_id.max(header.largest_id);
-        if size != *stored && size != (frame.camera.width, frame.camera.height) {
+        // Masks of the size of the recording are as they should be.
+        let recorded = frame.source.as_ref().is_some_and(|source| source.size == [size.0, size.1]);
+        if size != *stored && size != (frame.camera.width, frame.camera.height) && !recorded {
             match &mut result.resized {
                 Some(resized) => resized.count += 1,
                 None => {

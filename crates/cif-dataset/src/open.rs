@@ -75,7 +75,7 @@ impl Dataset {
                 frame.mask = None;
             }
         } else {
-            dataset.attach_masks(options.masks.as_deref(), &stored_sizes)?;
+            dataset.attach_masks(options.masks.as_deref(), options.keyframes, &stored_sizes)?;
         }
         dataset.points = dataset.initial_points(draft.points, draft.random_box)?;
         dataset.warnings.extend(points::unseen_warning(&dataset));
@@ -96,7 +96,7 @@ impl Dataset {
             .iter()
             .map(|frame| image::probe(&frame.image).map(|header| (header.width, header.height)))
             .collect::<Result<Vec<_>, _>>()?;
-        dataset.attach_masks(Some(folder), &sizes)?;
+        dataset.attach_masks(Some(folder), false, &sizes)?;
         Ok(dataset)
     }
 
@@ -204,7 +204,12 @@ impl Dataset {
         }
     }
 
-    fn attach_masks(&mut self, folder: Option<&Path>, stored_sizes: &[(u32, u32)]) -> Result<(), Error> {
+    fn attach_masks(
+        &mut self,
+        folder: Option<&Path>,
+        keyframes: bool,
+        stored_sizes: &[(u32, u32)],
+    ) -> Result<(), Error> {
         let name = folder.unwrap_or(Path::new(mask_files::DEFAULT_FOLDER));
         let listing = mask_files::locate(&self.root, self.layout, &self.frames, name);
         if folder.is_some() {
@@ -244,7 +249,7 @@ impl Dataset {
             ));
             return Ok(());
         }
-        if masked < self.frames.len() {
+        if masked < self.frames.len() && !keyframes {
             self.warnings.push(format!(
                 "{}: {masked} of {} frames have a mask",
                 self.root.join(name).display(),
@@ -315,7 +320,7 @@ impl Dataset {
         let labelled_train = self.frames.iter().zip(&counts).any(|(frame, counts)| {
             frame.split == Split::Train && counts.as_ref().is_some_and(|c| !c.0.is_empty())
         });
-        if !found.is_empty() && !labelled_train {
+        if !found.is_empty() && !labelled_train && !keyframes {
             self.warnings.push(format!(
                 "{}: no training frame has a labelled pixel; only colour can be trained",
                 self.root.join(name).display()
@@ -439,6 +444,7 @@ fn frames(
                 split: frame.split,
                 group: None,
                 image: frame.image.clone(),
+                source: draft.sources.get(&frame.name).cloned(),
                 mask: frame.mask.clone(),
                 confidence: None,
             },

@@ -73,8 +73,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         points: customary_points(root)?,
         random_box: Some(BOX),
         frames_per_second,
-        left_out: Vec::new(),
         warnings,
-        unknown: None,
+        ..Draft::default()
     })
 }

@@ -16,7 +16,7 @@ mod transforms;
 pub(crate) use colmap::{named_cameras as colmap_cameras, sparse_folder as colmap_sparse_folder};
 pub(crate) use transforms::named_cameras as transforms_cameras;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use cif_geometry::{LensDistortion, RigidTransform};
@@ -24,7 +24,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use crate::files::listing;
 use crate::points::RawPoints;
-use crate::{Error, Layout, OpenOptions, Split};
+use crate::{Error, FrameSource, Layout, OpenOptions, Split};
 
 /// Input of a reader: the folder of the capture, and options.
 pub(crate) struct Source<'a> {
@@ -46,6 +46,8 @@ pub(crate) struct Draft {
     /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
     pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
+    /// Recordings that frames were made of, by the name of the frame, where they are known.
+    pub(crate) sources: BTreeMap<String, FrameSource>,
     /// Facts of its world that the capture does not know.
     pub(crate) unknown: Option<String>,
 }
