@@ -104,8 +104,16 @@ struct Found {
     pixels: u64,
     labelled: u64,
     disputed: u64,
-    /// Masks of another size than their image: how many, the first size, and that of the image.
-    resized: Option<(usize, (u32, u32), (u32, u32))>,
+    resized: Option<Resized>,
+}
+
+/// Masks of another size than their images.
+struct Resized {
+    count: usize,
+    /// Width and height of the first of them, pixels.
+    from: (u32, u32),
+    /// Those of its image.
+    to: (u32, u32),
 }
 
 pub(super) fn run(command: &Import) -> Result<(), Error> {
@@ -135,7 +143,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         found.disputed += drawn.disputed;
         let size = (drawn.ids.width, drawn.ids.height);
         if drawn.size != size {
-            found.resized.get_or_insert((0, drawn.size, size)).0 += 1;
+            found.resized.get_or_insert(Resized { count: 0, from: drawn.size, to: size }).count += 1;
         }
         found.count(&drawn.ids.pixels);
     }
@@ -176,7 +184,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     for note in &source.notes {
         eprintln!("note: {note}");
     }
-    if let Some((count, from, to)) = found.resized {
+    if let Some(Resized { count, from, to }) = found.resized {
         eprintln!(
             "note: {count} masks of {} x {} pixels were brought to {} x {} by nearest neighbour",
             from.0, from.1, to.0, to.1
