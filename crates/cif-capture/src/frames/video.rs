@@ -368,12 +368,12 @@ mod tests {
 
     /// A video of 20 s whose frames show their numbers: two patches with its digits to the base of 16.
     const COUNTED: &str = "color=gray:size=48x32:rate=15:duration=20,format=gray,\
-        geq=lum='if(lt(X,16),40+12*mod(N,16),if(lt(X,32),40+12*floor(N/16),60+100*mod(floor(Y/4),2)))'";
+        geq=lum='if(lt(X,16),40+11*mod(N,16),if(lt(X,32),40+11*floor(N/16),60+100*mod(floor(Y/4),2)))'";
 
     fn number_in(path: &Path) -> usize {
         let picture = image::open(path).unwrap().into_luma8();
-        // Neighbouring digits are 12 apart, whatever range the values are in.
-        let digit = |x: u32| ((f64::from(picture.get_pixel(x, 16).0[0]) - 40.0) / 12.0).round() as usize;
+        // Neighbouring digits are 11 apart, whatever range the values are in.
+        let digit = |x: u32| ((f64::from(picture.get_pixel(x, 16).0[0]) - 40.0) / 11.0).round() as usize;
         digit(8) + 16 * digit(24)
     }
 
