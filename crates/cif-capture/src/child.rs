@@ -13,9 +13,9 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 const KEPT_LINES: usize = 12;
 
 /// Answer of a program.
-pub(crate) struct Answer {
-    /// Everything it wrote to standard output.
-    pub(crate) output: Vec<u8>,
+pub(crate) struct Answer<T = Vec<u8>> {
+    /// Everything it wrote to standard output, or what a reader made of it.
+    pub(crate) output: T,
     /// True where it ended with exit code 0.
     pub(crate) succeeded: bool,
     /// Its last lines on standard error.
@@ -32,8 +32,26 @@ pub(crate) fn run(
     command: &mut Command,
     input: &[u8],
     should_stop: &dyn Fn() -> bool,
-    mut line: impl FnMut(&str) + Send,
+    line: impl FnMut(&str) + Send,
 ) -> Result<Option<Answer>, Error> {
+    run_reading(command, input, should_stop, line, |stdout| {
+        let mut bytes = Vec::new();
+        stdout.read_to_end(&mut bytes).map(|_| bytes)
+    })
+}
+
+/// Runs a program as [`run`] does, whose standard output goes to `read` while it works. A reader that has enough returns
+/// before the end: what the program writes after that is lost.
+///
+/// # Errors
+/// As [`run`], and when `read` fails.
+pub(crate) fn run_reading<T: Send>(
+    command: &mut Command,
+    input: &[u8],
+    should_stop: &dyn Fn() -> bool,
+    mut line: impl FnMut(&str) + Send,
+    read: impl FnOnce(&mut dyn Read) -> io::Result<T> + Send,
+) -> Result<Option<Answer<T>>, Error> {
     let name = command.get_program().to_string_lossy().into_owned();
     let lost = |error: io::Error| Error::refused(format!("{name} was lost: {error}"), "try again");
     let started = command.stdin(Stdio::piped()).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn();
@@ -48,9 +66,9 @@ pub(crate) fn run(
             // A program that ends before it has read everything tells why by itself.
             let _ = stdin.map(|mut stdin| stdin.write_all(input));
         });
-        let output = scope.spawn(move || {
-            let mut bytes = Vec::new();
-            stdout.map(|mut stdout| stdout.read_to_end(&mut bytes)).transpose().map(|_| bytes)
+        let output = scope.spawn(move || match stdout {
+            Some(mut stdout) => read(&mut stdout),
+            None => read(&mut io::empty()),
         });
         let words = scope.spawn(move || {
             let mut kept: Vec<String> = Vec::new();
@@ -104,6 +122,18 @@ mod tests {
         assert!(!answer.succeeded);
         assert_eq!(answer.last_words, "one\ntwo");
         assert_eq!(lines, ["one", "two"]);
+    }
+
+    #[test]
+    fn a_reader_may_have_enough_before_the_end() {
+        let mut endless = Command::new("sh");
+        endless.args(["-c", "while :; do echo line; done"]);
+        let first = |stdout: &mut dyn Read| {
+            let mut bytes = [0; 4];
+            stdout.read_exact(&mut bytes).map(|()| bytes)
+        };
+        let answer = run_reading(&mut endless, b"", &|| false, |_| (), first).unwrap().unwrap();
+        assert_eq!((&answer.output, answer.succeeded), (b"line", false));
     }
 
     #[test]

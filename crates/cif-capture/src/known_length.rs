@@ -47,7 +47,7 @@ pub fn measure(
     let mut seen = Vec::new();
     for shot in masked.iter().step_by(masked.len().div_ceil(VIEWS).max(1)) {
         hooks.go_on()?;
-        let ids = cif_dataset::masks::read_ids(&masks.files[&shot.name])?;
+        let Some(ids) = masks.ids(shot)? else { continue };
         let pose = &poses.images[&shot.name];
         let lens = &poses.lenses[pose.lens];
         let pixels: Vec<DVec2> = (0..ids.pixels.len())
@@ -156,6 +156,7 @@ mod tests {
                 time: None,
                 size: (640, 480),
                 impression: Impression::of(&board(50, 0)),
+                source: None,
             });
         }
         poses.transform(&somewhere());

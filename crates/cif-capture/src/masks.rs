@@ -3,6 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
+use cif_dataset::VideoFrame;
+use cif_dataset::masks::files_of_video;
 use cif_geometry::PixelGrid;
 use image::GrayImage;
 
@@ -25,6 +27,15 @@ pub struct Masks {
 }
 
 impl Masks {
+    /// The ids of an image at its size, where it has a mask.
+    ///
+    /// # Errors
+    /// When the mask cannot be read or has another aspect than its image.
+    pub fn ids(&self, shot: &Shot) -> Result<Option<PixelGrid<u16>>, Error> {
+        let Some(path) = self.files.get(&shot.name) else { return Ok(None) };
+        Ok(Some(cif_dataset::masks::read_ids_at(path, &shot.file, shot.size)?))
+    }
+
     /// The file of labels: in the folder of masks, else beside it, as captures have it.
     #[must_use]
     pub fn labels(&self) -> Option<PathBuf> {
@@ -34,13 +45,16 @@ impl Masks {
 }
 
 /// Finds the masks of images: `NAME.png` with or without the ending of the image, below the folder or, of one
-/// camera, in it.
+/// camera, in it; or PNG files that are numbered as the frames of the video, one for each of them.
 ///
 /// # Errors
 /// When there is no such folder, or it holds no mask of any image.
 pub fn find(folder: &Path, shots: &[Shot]) -> Result<Masks, Error> {
-    let mut files = BTreeMap::new();
-    for shot in shots {
+    let mut files = of_videos(folder, shots);
+    let known: BTreeSet<&str> =
+        shots.iter().filter(|shot| files.contains_key(&shot.name)).map(|shot| shot.camera.as_str()).collect();
+    let others: Vec<&Shot> = shots.iter().filter(|shot| !known.contains(shot.camera.as_str())).collect();
+    for shot in others {
         let stem = shot.name.rsplit_once('.').map_or(shot.name.as_str(), |(stem, _)| stem);
         // Alone, a camera has no folder; its masks may have one all the same.
         let candidates =
@@ -66,10 +80,33 @@ pub fn find(folder: &Path, shots: &[Shot]) -> Result<Masks, Error> {
     Ok(Masks { folder: folder.to_owned(), files })
 }
 
+/// Masks of whole videos, in the folder where there is one camera, else in folders of their names.
+fn of_videos(folder: &Path, shots: &[Shot]) -> BTreeMap<String, PathBuf> {
+    let cameras: BTreeSet<&str> = shots.iter().map(|shot| shot.camera.as_str()).collect();
+    let mut files = BTreeMap::new();
+    for camera in &cameras {
+        let below = folder.join(camera);
+        let folder = if cameras.len() == 1 && !below.is_dir() { folder } else { &below };
+        let taken: Vec<(&Shot, VideoFrame)> = shots
+            .iter()
+            .filter(|shot| shot.camera == *camera)
+            .filter_map(|shot| Some((shot, shot.source.as_ref()?.video?)))
+            .collect();
+        let Some((_, first)) = taken.first() else { continue };
+        let Some(of_video) = files_of_video(folder, &["png"], first.of) else { continue };
+        files.extend(
+            taken
+                .iter()
+                .filter_map(|(shot, place)| Some((shot.name.clone(), of_video.get(&place.frame)?.clone()))),
+        );
+    }
+    files
+}
+
 /// Writes what pycolmap leaves out: black where a moving object is, of `moving` ids or of all but 0.
 ///
 /// # Errors
-/// When a mask cannot be read or has another size than its image, or little is left of most images.
+/// When a mask cannot be read or has another aspect than its image, or little is left of most images.
 pub fn leave_out(
     masks: &Masks,
     shots: &[Shot],
@@ -80,21 +117,7 @@ pub fn leave_out(
     let mut covered = 0;
     for shot in shots {
         hooks.go_on()?;
-        let Some(path) = masks.files.get(&shot.name) else { continue };
-        let ids = cif_dataset::masks::read_ids(path)?;
-        if (ids.width, ids.height) != shot.size {
-            return Err(Error::refused(
-                format!(
-                    "{}: {} x {} pixels, but its image has {} x {}",
-                    path.display(),
-                    ids.width,
-                    ids.height,
-                    shot.size.0,
-                    shot.size.1
-                ),
-                "paint masks on the images of the capture, at their size",
-            ));
-        }
+        let Some(ids) = masks.ids(shot)? else { continue };
         let left = left_over(&ids, moving);
         let black = left.pixels().filter(|pixel| pixel.0[0] == 0).count();
         covered += usize::from(black as f64 > MOST * ids.pixels.len() as f64);
@@ -137,7 +160,62 @@ fn left_over(ids: &PixelGrid<u16>, moving: Option<&BTreeSet<u16>>) -> GrayImage 
 
 #[cfg(test)]
 mod tests {
+    use cif_dataset::FrameSource;
+
     use super::*;
+    use crate::picture::Impression;
+    use crate::picture::tests::board;
+
+    /// Every other frame of a video of ten, at half its size.
+    fn every_other() -> Vec<Shot> {
+        (0..5_u64)
+            .map(|k| Shot {
+                camera: "walk".to_owned(),
+                name: format!("{:06}.png", 2 * k),
+                file: "none.png".into(),
+                time: Some(k as f64),
+                size: (32, 24),
+                impression: Impression::of(&board(50, 0)),
+                source: Some(FrameSource {
+                    file: "walk.mp4".to_owned(),
+                    size: [64, 48],
+                    video: Some(VideoFrame { frame: 2 * k, of: 10, time: k as f64 }),
+                }),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn masks_of_the_whole_video_are_those_of_its_frames() {
+        let folder = tempfile::tempdir().unwrap();
+        let shots = every_other();
+        // Six digits as the frames have, but counted from 1: names alone would be those of neighbours.
+        for k in 1..=10_u8 {
+            let mask = image::GrayImage::from_fn(64, 48, |x, _| image::Luma([if x < 32 { k } else { 0 }]));
+            mask.save(folder.path().join(format!("{k:06}.png"))).unwrap();
+        }
+        let masks = find(folder.path(), &shots).unwrap();
+        for (k, shot) in shots.iter().enumerate() {
+            let ids = masks.ids(shot).unwrap().unwrap();
+            assert_eq!((ids.width, ids.height), (32, 24));
+            let id = 2 * k as u16 + 1;
+            assert!((0..32).all(|x| ids.pixels[x] == if x < 16 { id } else { 0 }), "{}", shot.name);
+        }
+        // Without one of them it is not known which frames they are, and names count.
+        std::fs::remove_file(folder.path().join("000010.png")).unwrap();
+        let masks = find(folder.path(), &shots).unwrap();
+        assert_eq!(masks.ids(&shots[1]).unwrap().unwrap().pixels[0], 2);
+    }
+
+    #[test]
+    fn masks_of_another_aspect_are_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        image::GrayImage::new(24, 32).save(folder.path().join("000002.png")).unwrap();
+        let shots = every_other();
+        let masks = find(folder.path(), &shots).unwrap();
+        let told = masks.ids(&shots[1]).unwrap_err().to_string();
+        assert!(told.contains("24 x 32") && told.contains("32 x 24"), "{told}");
+    }
 
     #[test]
     fn what_moves_is_left_out_and_widened() {

@@ -1,7 +1,11 @@
-//! An image from afar: how bright and sharp it is, and what changed since another one.
+//! Image files, and images from afar: how bright and sharp one is, and what changed since another one.
 
-use std::io::BufReader;
+use std::io::{self, BufReader, BufWriter};
 use std::path::Path;
+
+use image::codecs::jpeg::JpegEncoder;
+use image::codecs::png::PngEncoder;
+use image::{DynamicImage, ImageDecoder, ImageEncoder, ImageFormat};
 
 use crate::Error;
 
@@ -11,6 +15,75 @@ pub(crate) const WIDTH: usize = 320;
 pub(crate) const HEIGHT: usize = 240;
 /// Side of the blocks that are compared, pixels of the reduced image.
 const BLOCK: usize = 20;
+
+/// Quality of reduced JPEG files, of 100: above it files grow faster than what is lost shrinks.
+const JPEG_QUALITY: u8 = 95;
+
+/// An image file, decoded.
+pub(crate) struct Photograph {
+    pub(crate) image: DynamicImage,
+    format: ImageFormat,
+    exif: Option<Vec<u8>>,
+    color_profile: Option<Vec<u8>>,
+}
+
+impl Photograph {
+    /// Decodes a file.
+    ///
+    /// # Errors
+    /// When it is no image.
+    pub(crate) fn read(path: &Path) -> Result<Self, Error> {
+        let refused = |error: image::ImageError| {
+            Error::refused(
+                format!("{}: this is no image that can be read: {error}", path.display()),
+                "give PNG or JPEG files, or leave it out",
+            )
+        };
+        let file = cif_input::open(path).map_err(Error::io("read", path))?;
+        let reader = image::ImageReader::new(BufReader::new(file))
+            .with_guessed_format()
+            .map_err(Error::io("read", path))?;
+        let format = reader.format().unwrap_or(ImageFormat::Png);
+        let mut decoder = reader.into_decoder().map_err(refused)?;
+        let mut limits = image::Limits::default();
+        limits.reserve(decoder.total_bytes()).map_err(refused)?;
+        decoder.set_limits(limits).map_err(refused)?;
+        let exif = decoder.exif_metadata().ok().flatten();
+        let color_profile = decoder.icc_profile().ok().flatten();
+        let image = DynamicImage::from_decoder(decoder).map_err(refused)?;
+        Ok(Self { image, format, exif, color_profile })
+    }
+
+    /// Reduces the image by area averages so that its larger side has `side` pixels.
+    pub(crate) fn reduce(&mut self, side: u32) {
+        let (width, height) = (self.image.width(), self.image.height());
+        let share = f64::from(side) / f64::from(width.max(height));
+        let of = |length: u32| ((f64::from(length) * share).round() as u32).max(1);
+        self.image = self.image.thumbnail_exact(of(width), of(height));
+    }
+
+    /// Writes the image in the format that it was read in, with the facts about camera and colours that it came with.
+    ///
+    /// # Errors
+    /// When the file system refuses.
+    pub(crate) fn write(&self, path: &Path) -> Result<(), Error> {
+        let failed = |error: image::ImageError| Error::io("write", path)(io::Error::other(error));
+        let file = BufWriter::new(std::fs::File::create(path).map_err(Error::io("write", path))?);
+        if self.format == ImageFormat::Jpeg {
+            let encoder = self.with_facts(JpegEncoder::new_with_quality(file, JPEG_QUALITY));
+            self.image.write_with_encoder(encoder).map_err(failed)
+        } else {
+            self.image.write_with_encoder(self.with_facts(PngEncoder::new(file))).map_err(failed)
+        }
+    }
+
+    fn with_facts<E: ImageEncoder>(&self, mut encoder: E) -> E {
+        // An encoder that cannot keep them leaves them out.
+        let _ = self.exif.clone().map(|exif| encoder.set_exif_metadata(exif));
+        let _ = self.color_profile.clone().map(|profile| encoder.set_icc_profile(profile));
+        encoder
+    }
+}
 
 /// A reduced image.
 #[derive(Clone, Debug, PartialEq)]
@@ -49,27 +122,11 @@ impl Impression {
         Self { brightness, sharpness, blocks }
     }
 
-    /// Judges an image file, and tells its size, with its alpha left out.
-    ///
-    /// # Errors
-    /// When it is no image.
-    pub(crate) fn of_file(path: &Path) -> Result<(Self, (u32, u32)), Error> {
-        let file = cif_input::open(path).map_err(Error::io("read", path))?;
-        let image = image::ImageReader::new(BufReader::new(file))
-            .with_guessed_format()
-            .map_err(Error::io("read", path))?
-            .decode()
-            .map_err(|error| {
-                Error::refused(
-                    format!("{}: this is no image that can be read: {error}", path.display()),
-                    "give PNG or JPEG files, or leave it out",
-                )
-            })?;
-        let size = (image.width(), image.height());
-        let grey = image.to_luma8();
+    /// Judges an image, with its alpha left out.
+    pub(crate) fn of_image(image: &DynamicImage) -> Self {
         let filter = image::imageops::FilterType::Triangle;
-        let small = image::imageops::resize(&grey, WIDTH as u32, HEIGHT as u32, filter);
-        Ok((Self::of(small.as_raw()), size))
+        let small = image::imageops::resize(&image.to_luma8(), WIDTH as u32, HEIGHT as u32, filter);
+        Self::of(small.as_raw())
     }
 
     /// True where nothing can be seen: all of it near black, or of one colour.

@@ -22,6 +22,16 @@ pub struct Source {
     pub photographs: Option<Vec<PathBuf>>,
 }
 
+impl Source {
+    /// Name of the video or folder, without those that it lies in.
+    pub(crate) fn file_name(&self) -> String {
+        self.path
+            .file_name()
+            .map(|name| name.to_string_lossy().into_owned())
+            .unwrap_or_else(|| self.camera.clone())
+    }
+}
+
 fn has_ending(path: &Path, endings: &[&str]) -> bool {
     let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
     ending.is_some_and(|ending| endings.contains(&ending.as_str()))

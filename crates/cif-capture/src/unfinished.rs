@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use cif_dataset::masks::NewFolder;
 
 use crate::Error;
-use crate::frames::Shot;
+use crate::frames::{self, Shot};
 use crate::poses::Poses;
 use crate::source::Source;
 use crate::write::{self, Capture};
@@ -53,6 +53,7 @@ pub fn keep(
     for shot in &frames {
         write::copy(&shot.file, &write::inside(folder.path(), "images", &shot.name)?)?;
     }
+    frames::remember(&folder.path().join("images"), &frames)?;
     let timed = shots.iter().all(|shot| shot.time.is_some());
     if timed {
         let mut text = String::new();
@@ -107,7 +108,8 @@ mod tests {
     use crate::picture::Impression;
     use crate::picture::tests::board;
     use crate::poses::{Lens, Pose};
-    use crate::{Hooks, frames, import, source, times};
+    use crate::{Hooks, import, source, times};
+    use cif_dataset::{FrameSource, VideoFrame};
     use cif_geometry::RigidTransform;
     use glam::{DMat3, DVec3};
 
@@ -141,6 +143,11 @@ mod tests {
                     time: Some(f64::from(n) / 3.0),
                     size: (64, 48),
                     impression: Impression::of(&board(50, usize::from(n))),
+                    source: Some(FrameSource {
+                        file: format!("{}.mp4", source.camera),
+                        size: [128, 96],
+                        video: Some(VideoFrame { frame: u64::from(n), of: 3, time: f64::from(n) / 3.0 }),
+                    }),
                 });
             }
         }
@@ -160,7 +167,9 @@ mod tests {
             frames::collect(&again, &Choice::default(), folder.path(), &hooks, &mut notes).unwrap();
         let table = kept.times.unwrap();
         times::apply(&times::read(&table).unwrap(), &table, &mut found).unwrap();
-        let told = |shot: &Shot| (shot.name.clone(), shot.time, std::fs::read(&shot.file).unwrap());
+        let told = |shot: &Shot| {
+            (shot.name.clone(), shot.time, shot.source.clone(), std::fs::read(&shot.file).unwrap())
+        };
         assert_eq!(found.iter().map(told).collect::<Vec<_>>(), shots.iter().map(told).collect::<Vec<_>>());
         let kept = folder.path().join("table-unfinished");
         let read = import::read(&kept, &found).unwrap().matched(&kept, &mut found).unwrap().poses;

@@ -4,7 +4,7 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use cif_dataset::masks::NewFolder;
+use cif_dataset::masks::{NewFolder, read_ids, read_ids_at, write_ids};
 use serde_json::{Map, Value, json};
 
 use crate::frames::Shot;
@@ -43,10 +43,10 @@ pub fn write(capture: &Capture<'_>, place: &Path, hooks: &Hooks<'_>) -> Result<(
         let Some(masks) = capture.masks else { continue };
         let Some(mask) = masks.files.get(&shot.name) else { continue };
         let name = mask_name(&shot.name);
-        copy(mask, &inside(folder.path(), "masks", &name)?)?;
+        write_mask(mask, shot, &inside(folder.path(), "masks", &name)?)?;
         let confidence = masks.folder.join("confidence").join(&name);
         if confidence.is_file() {
-            copy(&confidence, &inside(&folder.path().join("masks"), "confidence", &name)?)?;
+            write_mask(&confidence, shot, &inside(&folder.path().join("masks"), "confidence", &name)?)?;
         }
     }
     if let Some(labels) = capture.masks.and_then(Masks::labels) {
@@ -77,6 +77,9 @@ pub(crate) fn write_cameras(capture: &Capture<'_>, folder: &Path) -> Result<(), 
         if !one_lens {
             insert_lens(&mut frame, &capture.poses.lenses[pose.lens].scaled(shot.size));
         }
+        if let Some(source) = &shot.source {
+            frame.insert("cif".to_owned(), json!(source));
+        }
         frame.insert("transform_matrix".to_owned(), matrix(pose));
         frames.push(Value::Object(frame));
     }
@@ -103,6 +106,15 @@ pub(crate) fn write_cameras(capture: &Capture<'_>, folder: &Path) -> Result<(), 
     let path = folder.join("transforms.json");
     let text = format!("{:#}\n", Value::Object(file));
     fs::write(&path, text).map_err(Error::io("write", &path))
+}
+
+/// Copies a mask, or its confidence, at the size of its image.
+fn write_mask(from: &Path, shot: &Shot, to: &Path) -> Result<(), Error> {
+    let stored = read_ids(from)?;
+    if (stored.width, stored.height) == shot.size {
+        return copy(from, to);
+    }
+    Ok(write_ids(to, &read_ids_at(from, &shot.file, shot.size)?)?)
 }
 
 /// Name of the mask of an image.
@@ -186,7 +198,7 @@ fn ply(points: &[Point]) -> Vec<u8> {
 
 #[cfg(test)]
 mod tests {
-    use cif_dataset::{Dataset, OpenOptions};
+    use cif_dataset::{Dataset, FrameSource, OpenOptions, VideoFrame};
     use glam::DVec3;
 
     use super::*;
@@ -208,6 +220,11 @@ mod tests {
                     time: times.then_some(0.25 + 0.1 * k as f64),
                     size: (64, 48),
                     impression: Impression::of(&board(50, k)),
+                    source: Some(FrameSource {
+                        file: "walk.mp4".to_owned(),
+                        size: [128, 96],
+                        video: Some(VideoFrame { frame: 3 * k as u64, of: 40, time: 0.1 * k as f64 }),
+                    }),
                 }
             })
             .collect()
@@ -253,6 +270,8 @@ mod tests {
         assert_eq!(masked.len(), 2, "{masked:?}");
         for frame in &dataset.frames {
             let name = format!("{}.png", frame.name.rsplit('/').next().unwrap());
+            let shot = shots.iter().find(|shot| shot.name == name).unwrap();
+            assert_eq!(frame.source, shot.source, "the recording is remembered");
             let pose = poses.images[&name].world_from_camera;
             let found = frame.camera.camera_from_world.inverse();
             assert!((found.translation - pose.translation).length() < 1e-9, "{name}");

@@ -7,8 +7,8 @@ use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
-use crate::CaptureFrame;
 use crate::cryptomatte::ObjectIds;
+use crate::{CaptureFrame, FrameSource};
 
 /// The layouts that can be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -48,6 +48,9 @@ pub struct OpenOptions {
     pub masks: Option<PathBuf>,
     /// Ignore masks altogether.
     pub without_masks: bool,
+    /// The masks are painted keyframes, of which those of the other frames are to be made: the warnings do not speak of
+    /// frames without a mask and of what can be trained.
+    pub keyframes: bool,
     /// Image reduction: 1, 2, 4, ...; `None` takes the largest images stored.
     pub downscale: Option<u32>,
     /// Place the principal point in the image centre, as the base code of the method does.
@@ -85,6 +88,8 @@ pub struct Frame {
     pub group: Option<String>,
     /// Image file.
     pub image: PathBuf,
+    /// Image of a recording that it was made of, where the capture says so.
+    pub source: Option<FrameSource>,
     /// Mask file, where this frame has one.
     pub mask: Option<PathBuf>,
     /// Confidence of the mask, where it has one: `confidence/<frame>.png` in the mask folder.

@@ -219,7 +219,7 @@ pub enum Error {
     Ffmpeg {
         /// The video.
         video: PathBuf,
-        /// Last words of ffmpeg.
+        /// First lines of the errors of ffmpeg.
         problem: String,
     },
     /// A file holds something else than it should.

@@ -39,6 +39,7 @@ mod feature_maps;
 mod files;
 pub mod foreign;
 mod formats;
+mod frame_source;
 mod instances;
 mod layout;
 mod lens_removal;
@@ -59,5 +60,6 @@ pub use dataset::{
 };
 pub use error::Error;
 pub use feature_maps::feature_maps;
+pub use frame_source::{FrameSource, VideoFrame};
 pub use motion_truth::{MotionTruth, TrueMotion};
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

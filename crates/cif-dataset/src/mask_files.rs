@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use crate::cryptomatte::{self, ObjectIds};
 use crate::files::{confidence, listing, mask};
 use crate::load::same_aspect;
+use crate::masks::files_of_video;
 use crate::{Error, Frame, Layout, Split};
 
 /// Mask folder that is taken where none is asked for.
@@ -94,7 +95,8 @@ pub(crate) struct MaskListing {
 ///
 /// Looked for, in this order: `<camera>/<folder>/<stem>.png` (Neu3D), `<folder>/<frame>.png`,
 /// `<folder>/<frame>.<image extension>.png`, where stems are unique `<folder>/<stem>.png`, and the folder beside the
-/// image (`train/<folder>/<stem>.png`); each also with `.exr`. Where none fits, EXR files that are bare numbers count
+/// image (`train/<folder>/<stem>.png`); each also with `.exr`. Files that are numbered as the frames of the video that the
+/// capture was made of, one for each, are those of its frames. Where none fits, EXR files that are bare numbers count
 /// the frames from 0, as renderers number them, and masks of an LLFF sequence belong to the images of their numbers
 /// (`frame-000012.mask.png` to `000012.png`).
 pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Path) -> MaskListing {
@@ -134,6 +136,7 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
             })
         })
         .collect();
+    let of_videos = of_videos(&base, frames, &mut paths);
     let numbered = paths.iter().all(Option::is_none)
         && (number(&base, &mut paths) || layout == Layout::Llff && by_number(&base, &stems, &mut paths));
     let found: BTreeSet<&Path> = paths.iter().flatten().map(PathBuf::as_path).collect();
@@ -151,7 +154,7 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
         .iter()
         .map(|folder| count_files(folder).saturating_sub(count_files(&confidences(folder))))
         .sum();
-    let strangers = files.saturating_sub(found.len());
+    let strangers = files.saturating_sub(found.len() + of_videos);
     let folder_of_confidences = confidences(&base);
     let confidence = |(frame, mask): (&Frame, &Option<PathBuf>)| {
         let path = folder_of_confidences.join(format!("{}.png", frame.name));
@@ -187,6 +190,32 @@ fn by_number(folder: &Path, stems: &[String], paths: &mut [Option<PathBuf>]) -> 
         *path = number.and_then(|number| files.get(&number).cloned().flatten());
     }
     paths.iter().any(Option::is_some)
+}
+
+/// Gives the masks of whole videos to the frames that were made of these: files of bare numbers, in the folder where there
+/// is one camera, else in folders of their names. Returns how many are of frames that the capture does not have.
+fn of_videos(base: &Path, frames: &[Frame], paths: &mut [Option<PathBuf>]) -> usize {
+    let mut cameras: BTreeMap<&str, Vec<usize>> = BTreeMap::new();
+    for (index, frame) in frames.iter().enumerate() {
+        cameras.entry(&frame.camera_name).or_default().push(index);
+    }
+    let mut others = 0;
+    for (camera, indices) in &cameras {
+        let places: Option<Vec<_>> =
+            indices.iter().map(|index| frames[*index].source.as_ref()?.video).collect();
+        let Some(places) = places else { continue };
+        let of = places[0].of;
+        let folder = if cameras.len() == 1 { base.to_owned() } else { base.join(camera) };
+        if !folder.is_dir() || places.iter().any(|place| place.of != of) {
+            continue;
+        }
+        let Some(mut files) = files_of_video(&folder, &EXTENSIONS, of) else { continue };
+        for (index, place) in indices.iter().zip(&places) {
+            paths[*index] = files.remove(&place.frame);
+        }
+        others += files.len();
+    }
+    others
 }
 
 /// Gives numbered EXR files to the frames they count; whether there are any.
@@ -282,7 +311,9 @@ pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Re
             });
         }
         result.largest_id = result.largest_id.max(header.largest_id);
-        if size != *stored && size != (frame.camera.width, frame.camera.height) {
+        // Masks of the size of the recording are as they should be.
+        let recorded = frame.source.as_ref().is_some_and(|source| source.size == [size.0, size.1]);
+        if size != *stored && size != (frame.camera.width, frame.camera.height) && !recorded {
             match &mut result.resized {
                 Some(resized) => resized.count += 1,
                 None => {

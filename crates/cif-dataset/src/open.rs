@@ -77,7 +77,8 @@ impl Dataset {
                 frame.mask = None;
             }
         } else {
-            dataset.attach_masks(options.masks.as_deref(), &stored_sizes, &mut unused)?;
+            let folder = options.masks.as_deref();
+            dataset.attach_masks(folder, options.keyframes, &stored_sizes, &mut unused)?;
         }
         if !unused.is_empty() {
             dataset.notes.push(format!("{}: not used: {}", root.display(), unused.join("; ")));
@@ -102,7 +103,7 @@ impl Dataset {
             .iter()
             .map(|frame| image::probe(&frame.image).map(|header| (header.width, header.height)))
             .collect::<Result<Vec<_>, _>>()?;
-        dataset.attach_masks(Some(folder), &sizes, &mut Vec::new())?;
+        dataset.attach_masks(Some(folder), false, &sizes, &mut Vec::new())?;
         Ok(dataset)
     }
 
@@ -214,6 +215,7 @@ impl Dataset {
     fn attach_masks(
         &mut self,
         folder: Option<&Path>,
+        keyframes: bool,
         stored_sizes: &[(u32, u32)],
         unused: &mut Vec<String>,
     ) -> Result<(), Error> {
@@ -266,9 +268,9 @@ impl Dataset {
             _ if name.is_dir() => name.display().to_string(),
             _ => format!("{}: {}/ beside the images", self.root.display(), name.display()),
         };
-        if train < all_train {
+        if train < all_train && !keyframes {
             self.warnings.push(format!("{place}: {masked} of {} frames have a mask", self.frames.len()));
-        } else if val < all_val {
+        } else if val < all_val && !keyframes {
             self.notes.push(format!(
                 "{place}: {val} of {all_val} held-out frames have a mask; instances are scored {}",
                 if val == 0 { "on none" } else { "on these" }
@@ -345,7 +347,7 @@ impl Dataset {
         let labelled_train = self.frames.iter().zip(&counts).any(|(frame, counts)| {
             frame.split == Split::Train && counts.as_ref().is_some_and(|c| !c.0.is_empty())
         });
-        if !found.is_empty() && !labelled_train {
+        if !found.is_empty() && !labelled_train && !keyframes {
             self.warnings
                 .push(format!("{place}: no training frame has a labelled pixel; only colour can be trained"));
         }
@@ -474,6 +476,7 @@ fn frames(
                 split: frame.split,
                 group: None,
                 image: frame.image.clone(),
+                source: draft.sources.get(&frame.name).cloned(),
                 mask: frame.mask.clone(),
                 confidence: None,
             },

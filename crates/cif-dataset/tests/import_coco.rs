@@ -56,7 +56,7 @@ fn damaged_coco_is_refused_by_entry() {
         (|v| v["annotations"][0]["category_id"] = json!(8), &["annotation 1", "category_id 8"]),
         (|v| v["annotations"][0]["image_id"] = json!(99), &["annotation 1", "image_id 99"]),
         (|v| v["annotations"][0]["segmentation"] = json!([]), &["annotation 1", "no segmentation"]),
-        (|v| v["images"][2]["width"] = json!(64), &["000002.jpg", "64 x 24", "32 x 24", "--downscale"]),
+        (|v| v["images"][2]["width"] = json!(64), &["000002.jpg", "64 x 24", "32 x 24", "another aspect"]),
         (
             |v| v["annotations"].as_array_mut().unwrap().iter_mut().for_each(|a| a["track_id"] = json!(null)),
             &["several annotations", "track_id"],

@@ -129,7 +129,7 @@ fn the_smaller_of_two_objects_is_in_front_unless_layers_say_so() {
     let dataset = open(&folder);
     for (front, back, expected) in [(0, 0, [2, 1]), (0, 1, [1, 1])] {
         write(&path, xml(polygon("table", 32, back) + &polygon("cup", 8, front)));
-        let import = Import::open(&path, None, &dataset).unwrap();
+        let import = Import::open(&path, None, None, &dataset).unwrap();
         let drawn = import.draw(&dataset, 0).unwrap().unwrap();
         assert_eq!([3, 12].map(|x| *drawn.ids.at(x, 5)), expected);
         assert_eq!(drawn.disputed, 8 * 24);
@@ -249,8 +249,8 @@ fn mattes_are_channels_or_files_and_cut_at_a_half() {
 fn sizes_and_frames_that_do_not_fit_are_told() {
     let folder = hypernerf(3);
     let source = folder.path().join("tracked");
-    write_mask(&source.join("000001.png"), 2 * WIDTH, 2 * HEIGHT, |_, _| 1);
-    holds(&failure_of(&folder, &source), &["000001.png", "64 x 48", "32 x 24"]);
+    write_mask(&source.join("000001.png"), WIDTH, 2 * HEIGHT, |_, _| 1);
+    holds(&failure_of(&folder, &source), &["000001.png", "32 x 48", "32 x 24", "another aspect"]);
     std::fs::remove_file(source.join("000001.png")).unwrap();
     write_mask(&source.join("frame_000701.png"), WIDTH, HEIGHT, |_, _| 1);
     holds(&failure_of(&folder, &source), &["none of its 1 pictures", "000000"]);
@@ -260,7 +260,7 @@ fn sizes_and_frames_that_do_not_fit_are_told() {
         write_mask(&source.join(format!("clip{name}.png")), WIDTH, HEIGHT, |_, _| id);
     }
     let dataset = open(&folder);
-    let import = Import::open(&source, None, &dataset).unwrap();
+    let import = Import::open(&source, None, None, &dataset).unwrap();
     assert!(import.notes.iter().any(|note| note.contains("from 1")), "{:?}", import.notes);
     assert_eq!(*import.draw(&dataset, 2).unwrap().unwrap().ids.at(0, 0), 7);
     holds(&failure_of(&folder, &folder.path().join("nothing")), &["no such file"]);

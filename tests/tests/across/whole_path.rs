@@ -183,7 +183,13 @@ fn all_steps_are_one_command_that_stops_where_frames_have_to_be_painted() {
         let from = from.iter().find(|file| file.exists()).unwrap();
         fs::copy(from, path.join("out/keyframes").join(name)).unwrap();
     }
-    let made = cif(path, line).succeeds();
+    // Two of the four frames that were asked for: nothing goes on without a word.
+    let missing =
+        ["2 of 4 frames are painted", "out/keyframes/000002.png", "out/keyframes/000004.png", "--as-painted"];
+    cif(path, line).fails(1, &missing);
+    assert!(!path.join("out/masks").exists());
+    let made = cif(path, &format!("{line} --as-painted")).succeeds();
+    assert!(!made.stderr.contains("training frame"), "{}", made.stderr);
     for step in ["$ cif masks propagate table", "$ cif train table", "$ cif export out/scene.cif"] {
         assert!(made.stderr.contains(step), "{step} in {}", made.stderr);
     }

@@ -14,7 +14,7 @@ fn size() -> (u32, u32) {
 pub(crate) fn import(folder: &Path, file: &str) -> Result<(), String> {
     let options = OpenOptions { without_masks: true, ..OpenOptions::default() };
     let dataset = Dataset::open(folder, &options).map_err(|error| error.to_string())?;
-    let import = Import::open(&folder.join(file), None, &dataset).map_err(|error| error.to_string())?;
+    let import = Import::open(&folder.join(file), None, None, &dataset).map_err(|error| error.to_string())?;
     for frame in 0..dataset.frames.len() {
         import.draw(&dataset, frame).map_err(|error| error.to_string())?;
     }

@@ -119,6 +119,7 @@ mod tests {
             time: None,
             size,
             impression: Impression::of(&board(side, shift)),
+            source: None,
         }
     }
 

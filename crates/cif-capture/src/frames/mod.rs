@@ -1,14 +1,19 @@
 //! Frames of a capture: photographs, and chosen frames of videos.
 
+mod bt2100;
 mod check;
 pub mod choose;
+mod ffmpeg;
 mod photographs;
+mod pixmap;
 mod video;
 
 use std::path::{Path, PathBuf};
 
 pub use check::{Notes, check, is_fixed};
 pub use choose::Choice;
+use cif_dataset::FrameSource;
+pub(crate) use photographs::remember;
 
 use crate::picture::Impression;
 use crate::source::Source;
@@ -29,9 +34,11 @@ pub struct Shot {
     pub size: (u32, u32),
     /// Its looks from afar.
     pub impression: Impression,
+    /// Photograph, or frame of a video, that it was made of; `None` where it is not known.
+    pub source: Option<FrameSource>,
 }
 
-/// Collects the images of all cameras; frames of videos are written below `folder`.
+/// Collects the images of all cameras; frames of videos, and photographs that are reduced, are written below `folder`.
 ///
 /// # Errors
 /// When a video or photograph cannot be read, ffmpeg is needed and missing, or an offset is of no camera.
@@ -60,7 +67,7 @@ pub fn collect(
         // Images of one camera lie in one folder, without a folder of its own.
         let prefix = if sources.len() > 1 { format!("{}/", source.camera) } else { String::new() };
         shots.extend(match &source.photographs {
-            Some(files) => photographs::read(source, files, &prefix, choice, hooks, notes)?,
+            Some(files) => photographs::read(source, files, &prefix, choice, folder, hooks, notes)?,
             None => {
                 let choice =
                     Choice { sharpest: choice.sharpest.or(Some(sources.len() == 1)), ..choice.clone() };

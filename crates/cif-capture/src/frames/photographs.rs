@@ -1,27 +1,30 @@
 //! Photographs, which keep their names.
 
-use std::path::PathBuf;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
+use cif_dataset::FrameSource;
 use rayon::prelude::*;
 
 use super::{Choice, Notes, Shot};
-use crate::picture::Impression;
+use crate::picture::{Impression, Photograph};
 use crate::source::Source;
 use crate::{Error, Hooks};
 
-/// The photographs of a camera in name order; such that show nothing are left out.
+/// The photographs of a camera in name order; such that show nothing are left out. Larger ones than wanted are reduced
+/// below `folder`, all others stay where they are.
 pub(super) fn read(
     source: &Source,
     files: &[PathBuf],
     prefix: &str,
     choice: &Choice,
+    folder: &Path,
     hooks: &Hooks<'_>,
     notes: &mut Notes,
 ) -> Result<Vec<Shot>, Error> {
-    if choice.rate.is_some() || choice.from_s.is_some() || choice.to_s.is_some() || choice.max_side.is_some()
-    {
+    if choice.rate.is_some() || choice.from_s.is_some() || choice.to_s.is_some() {
         notes.push(format!(
-            "{}: photographs are taken as they are: a rate, a range of seconds and a size are for videos",
+            "{}: photographs are taken as they are: a rate and a range of seconds are for videos",
             source.path.display()
         ));
     }
@@ -31,21 +34,24 @@ pub(super) fn read(
         Some(count) => (0..count).map(|k| &files[k * files.len() / count]).collect(),
         None => files.iter().collect(),
     };
-    let read: Vec<_> = files.par_iter().map(|file| Impression::of_file(file)).collect();
-    hooks.go_on()?;
+    let mut known = remembered(&source.path)?;
+    let into = folder.join(&source.camera);
+    std::fs::create_dir_all(&into).map_err(Error::io("create", &into))?;
+    let read: Vec<_> = files.par_iter().map(|file| read_one(file, choice.max_side, &into, hooks)).collect();
     let mut shots = Vec::new();
     let mut empty = Vec::new();
-    for (file, read) in files.into_iter().zip(read) {
-        let (impression, size) = read?;
-        let name = file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    for read in read {
+        let Read { name, file, size, stored, impression } = read?;
         if impression.is_empty() {
             empty.push(name);
             continue;
         }
+        let own = |file: &String| FrameSource { file: file.clone(), size: stored, video: None };
         shots.push(Shot {
             camera: source.camera.clone(),
+            source: Some(known.remove(&name).unwrap_or_else(|| own(&name))),
             name: format!("{prefix}{name}"),
-            file: file.clone(),
+            file,
             time: None,
             size,
             impression,
@@ -60,4 +66,111 @@ pub(super) fn read(
         ));
     }
     Ok(shots)
+}
+
+/// File beside frames that were kept of videos: the recordings that they were made of, by file name.
+const SOURCES: &str = "sources.json";
+
+/// Writes the recordings of images beside them, so that [`read`] finds them.
+///
+/// # Errors
+/// When the file system refuses.
+pub(crate) fn remember(images: &Path, shots: &[&Shot]) -> Result<(), Error> {
+    let mut folders: BTreeMap<PathBuf, BTreeMap<&str, &FrameSource>> = BTreeMap::new();
+    for shot in shots {
+        let (folder, file) = shot.name.rsplit_once('/').unwrap_or(("", &shot.name));
+        let of_folder = folders.entry(images.join(folder)).or_default();
+        of_folder.extend(shot.source.as_ref().map(|source| (file, source)));
+    }
+    for (folder, sources) in folders {
+        let path = folder.join(SOURCES);
+        let text = serde_json::to_string_pretty(&sources).unwrap_or_default();
+        std::fs::write(&path, text).map_err(Error::io("write", &path))?;
+    }
+    Ok(())
+}
+
+/// Recordings that [`remember`] wrote into a folder.
+fn remembered(folder: &Path) -> Result<BTreeMap<String, FrameSource>, Error> {
+    let path = folder.join(SOURCES);
+    if !path.is_file() {
+        return Ok(BTreeMap::new());
+    }
+    let bytes = cif_input::read(&path).map_err(Error::io("read", &path))?;
+    // A file of that name that somebody else wrote says nothing.
+    Ok(serde_json::from_slice(&bytes).unwrap_or_default())
+}
+
+/// A photograph as it is taken.
+struct Read {
+    name: String,
+    /// The photograph, or its reduction.
+    file: PathBuf,
+    size: (u32, u32),
+    /// Width and height of the photograph.
+    stored: [u32; 2],
+    impression: Impression,
+}
+
+fn read_one(file: &Path, max_side: Option<u32>, into: &Path, hooks: &Hooks<'_>) -> Result<Read, Error> {
+    hooks.go_on()?;
+    let name = file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    let mut photograph = Photograph::read(file)?;
+    let stored = [photograph.image.width(), photograph.image.height()];
+    let impression = Impression::of_image(&photograph.image);
+    let mut taken = file.to_owned();
+    if let Some(side) = max_side.filter(|side| stored[0].max(stored[1]) > *side) {
+        photograph.reduce(side);
+        taken = into.join(&name);
+        photograph.write(&taken)?;
+    }
+    let size = (photograph.image.width(), photograph.image.height());
+    Ok(Read { name, file: taken, size, stored, impression })
+}
+
+#[cfg(test)]
+mod tests {
+    use image::codecs::jpeg::JpegEncoder;
+    use image::{ImageDecoder, ImageEncoder, ImageReader, Rgb, RgbImage};
+
+    use super::*;
+
+    #[test]
+    fn larger_photographs_are_reduced_and_keep_their_facts() {
+        let folder = tempfile::tempdir().unwrap();
+        let photos = folder.path().join("photos");
+        std::fs::create_dir(&photos).unwrap();
+        let image = |width, height| {
+            RgbImage::from_fn(width, height, |x, y| {
+                Rgb([(x / 4 % 2 * 200) as u8, (y / 4 % 2 * 200) as u8, 90])
+            })
+        };
+        // A focal length of 26 mm of small film, by which the lens is guessed.
+        let exif = b"II*\0\x08\0\0\0\x01\0\x05\xa4\x03\0\x01\0\0\0\x1a\0\0\0\0\0\0\0".to_vec();
+        let large = std::fs::File::create(photos.join("a.jpg")).unwrap();
+        let mut encoder = JpegEncoder::new_with_quality(large, 95);
+        encoder.set_exif_metadata(exif.clone()).unwrap();
+        image(200, 120).write_with_encoder(encoder).unwrap();
+        image(96, 160).save(photos.join("b.png")).unwrap();
+        image(64, 48).save(photos.join("c.png")).unwrap();
+        let source = Source { camera: "walk".into(), path: photos.clone(), photographs: None };
+        let files: Vec<PathBuf> = ["a.jpg", "b.png", "c.png"].map(|name| photos.join(name)).to_vec();
+        let choice = Choice { max_side: Some(80), ..Choice::default() };
+        let mut notes = Notes::new();
+        let into = folder.path().join("frames");
+        let shots = read(&source, &files, "", &choice, &into, &Hooks::silent(), &mut notes).unwrap();
+        assert!(notes.is_empty(), "{notes:?}");
+        let sizes: Vec<_> = shots.iter().map(|shot| shot.size).collect();
+        assert_eq!(sizes, [(80, 48), (48, 80), (64, 48)]);
+        for shot in &shots {
+            assert_eq!(image::image_dimensions(&shot.file).unwrap(), shot.size);
+        }
+        assert_eq!(shots[2].file, files[2], "small ones stay where they are");
+        assert_eq!(shots[0].name, "a.jpg");
+        let told = shots[0].source.as_ref().unwrap();
+        assert_eq!((told.file.as_str(), told.size, told.video), ("a.jpg", [200, 120], None));
+        let mut reduced = ImageReader::open(&shots[0].file).unwrap().into_decoder().unwrap();
+        assert_eq!(reduced.exif_metadata().unwrap(), Some(exif));
+        assert_eq!(image::image_dimensions(&files[0]).unwrap(), (200, 120), "the original is left alone");
+    }
 }

@@ -109,6 +109,7 @@ mod tests {
             time: None,
             size: (1000, 500),
             impression: Impression::of(&board(50, 0)),
+            source: None,
         };
         let found = read(&path, &[shot("cam/a.jpg"), shot("cam/b.jpg")]).unwrap();
         let of = |name: &str| found.poses.images[name];

@@ -17,6 +17,7 @@ fn shot(name: &str) -> Shot {
         time: None,
         size: (64, 48),
         impression: Impression::of(&board(50, 0)),
+        source: None,
     }
 }
 

@@ -145,6 +145,7 @@ mod tests {
                     time: *time,
                     size: (64, 48),
                     impression: Impression::of(&board(50, k)),
+                    source: None,
                 });
             }
         }

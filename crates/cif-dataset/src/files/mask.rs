@@ -149,6 +149,15 @@ pub(crate) fn decode_binary(path: &Path) -> Result<PixelGrid<u16>, Error> {
     Ok(PixelGrid::from_pixels(picture.width(), picture.height(), pixels))
 }
 
+/// Width and height of a PNG file of any kind.
+///
+/// # Errors
+/// When the file is missing or no PNG.
+pub(crate) fn size(path: &Path) -> Result<(u32, u32), Error> {
+    let reader = open_png(path)?;
+    Ok((reader.info().width, reader.info().height))
+}
+
 /// Kind of the pixels of a PNG file.
 ///
 /// # Errors

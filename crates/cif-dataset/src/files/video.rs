@@ -94,7 +94,10 @@ fn frames_with(
     let failed =
         |problem: &str| Error::Ffmpeg { video: video.to_owned(), problem: problem.trim().to_owned() };
     if !output.status.success() {
-        return Err(failed(words.lines().last().unwrap_or("it gave no reason")));
+        // The first lines are the cause, what follows its consequences.
+        let causes: Vec<&str> = words.lines().filter(|line| !line.trim().is_empty()).take(3).collect();
+        let causes = if causes.is_empty() { "it gave no reason".to_owned() } else { causes.join("; ") };
+        return Err(failed(&causes));
     }
     if listing::images(&partial)?.is_empty() {
         return Err(failed("it holds no frame"));
@@ -148,6 +151,23 @@ mod tests {
         .to_string();
         assert!(error.contains("cam00.mp4") && error.contains("install ffmpeg"), "{error}");
         assert!(error.contains("cam00/images") || error.contains("cam00\\images"), "{error}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn the_cause_of_a_failure_is_shown() {
+        use std::os::unix::fs::PermissionsExt;
+
+        let root = tempfile::tempdir().unwrap();
+        let video = root.path().join("cam00.mp4");
+        std::fs::write(&video, b"no video").unwrap();
+        let program = root.path().join("stand-in");
+        let script = "#!/bin/sh\necho 'moov atom not found' >&2\necho 'Invalid data' >&2\nexit 1\n";
+        std::fs::write(&program, script).unwrap();
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let wanted = Extraction { most: 300, size: None };
+        let error = frames_with(program.as_os_str(), root.path(), &video, root.path(), wanted).unwrap_err();
+        assert!(error.to_string().ends_with("moov atom not found; Invalid data"), "{error}");
     }
 
     #[cfg(unix)]

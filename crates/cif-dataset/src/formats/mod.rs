@@ -21,7 +21,7 @@ pub(crate) use llff::has_image_folder;
 pub(crate) use neu3d::has_rig;
 pub(crate) use transforms::named_cameras as transforms_cameras;
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use cif_geometry::{LensDistortion, RigidTransform};
@@ -29,7 +29,7 @@ use glam::{DMat3, DVec2, DVec3};
 
 use crate::files::listing;
 use crate::points::RawPoints;
-use crate::{Error, Layout, OpenOptions, Split};
+use crate::{Error, FrameSource, Layout, OpenOptions, Split};
 
 /// Input of a reader: the folder of the capture, and options.
 pub(crate) struct Source<'a> {
@@ -53,6 +53,8 @@ pub(crate) struct Draft {
     pub(crate) warnings: Vec<String>,
     /// Parts of the capture that are left out, such as "12 images that dataset.json does not list".
     pub(crate) unused: Vec<String>,
+    /// Recordings that frames were made of, by the name of the frame, where they are known.
+    pub(crate) sources: BTreeMap<String, FrameSource>,
     /// Facts of its world that the capture does not know.
     pub(crate) unknown: Option<String>,
 }

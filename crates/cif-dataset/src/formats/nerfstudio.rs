@@ -23,10 +23,20 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let times: Vec<Option<f64>> = file.frames.iter().map(|entry| entry.time).collect();
     let times = transforms::normalised_times(&path, &times)?;
     let mut frames = Vec::with_capacity(file.frames.len());
+    let mut sources = BTreeMap::new();
     for ((entry, inner), time) in file.frames.iter().zip(&inner).zip(times) {
         let inner = inner.strip_prefix(&folder).unwrap_or(inner);
+        let name = transforms::frame_name(inner);
+        if let Some(source) = &entry.cif {
+            if !source.is_sound() {
+                let problem =
+                    format!("frame {name}: `cif` has a number that its video does not have; remove `cif`");
+                return Err(Error::invalid(&path, problem));
+            }
+            sources.insert(name.clone(), source.clone());
+        }
         frames.push(DraftFrame {
-            name: transforms::frame_name(inner),
+            name,
             camera_name: camera_name(inner, folders.len()),
             time,
             split: Split::Train,
@@ -82,6 +92,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         points,
         frames_per_second: file.fps,
         unused,
+        sources,
         unknown: file.cif.and_then(unknown),
         ..Draft::default()
     })

@@ -7,8 +7,8 @@ use glam::DVec2;
 use serde::Deserialize;
 
 use super::{DraftCamera, DraftFocal, from_opengl};
-use crate::Error;
 use crate::files::{json, listing};
+use crate::{Error, FrameSource};
 
 /// A whole file.
 #[derive(Deserialize)]
@@ -45,6 +45,8 @@ pub(super) struct FrameEntry {
     pub(super) transform_matrix: Vec<[f64; 4]>,
     pub(super) time: Option<f64>,
     pub(super) mask_path: Option<PathBuf>,
+    /// Recording that `cif capture` made the image of.
+    pub(super) cif: Option<FrameSource>,
     #[serde(flatten)]
     pub(super) intrinsics: Intrinsics,
 }

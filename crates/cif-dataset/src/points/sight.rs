@@ -71,6 +71,7 @@ mod tests {
             split,
             group: None,
             image: "none.png".into(),
+            source: None,
             mask: None,
             confidence: None,
         };

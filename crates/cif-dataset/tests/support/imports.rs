@@ -22,7 +22,7 @@ pub fn imported(
     source: &Path,
 ) -> (SourceKind, Vec<String>, Vec<Option<[u16; 3]>>) {
     let dataset = open(folder);
-    let import = Import::open(source, None, &dataset).unwrap();
+    let import = Import::open(source, None, None, &dataset).unwrap();
     let out = folder.path().join("imported");
     let writer = MaskWriter::create(&out).unwrap();
     for (index, frame) in dataset.frames.iter().enumerate() {
@@ -43,7 +43,7 @@ pub fn imported(
 
 pub fn failure_of(folder: &tempfile::TempDir, source: &Path) -> String {
     let dataset = open(folder);
-    match Import::open(source, None, &dataset) {
+    match Import::open(source, None, None, &dataset) {
         Err(error) => error.to_string(),
         Ok(import) => {
             let drawn = (0..dataset.frames.len()).map(|index| import.draw(&dataset, index));

@@ -197,6 +197,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
                 split: if held_out { Split::Val } else { Split::Train },
                 group: None,
                 image,
+                source: None,
                 mask,
                 confidence: None,
             });

@@ -45,7 +45,10 @@ pub(super) struct Make {
     /// Painted masks of a few frames, PNG files of ids named as the frames [default: DIR/keyframes]
     #[arg(long, value_name = "DIR", conflicts_with = "masks")]
     keyframes: Option<PathBuf>,
-    /// Masks of all frames, so that none has to be painted
+    /// Go on with the frames that are painted, although they are fewer than asked for
+    #[arg(long, conflicts_with = "masks")]
+    as_painted: bool,
+    /// Masks of all frames, or a file for each frame of the video, so that none has to be painted
     #[arg(long, value_name = "DIR")]
     masks: Option<PathBuf>,
     /// Named settings of the training: draft, standard or paper [default: standard]
@@ -103,18 +106,23 @@ impl Make {
             return Ok(None);
         }
         let keyframes = self.keyframes.clone().unwrap_or_else(|| self.output.join("keyframes"));
-        let masks = dataset.frames.iter().map(|frame| keyframes.join(format!("{}.png", frame.name)));
-        let painted: Vec<PathBuf> = masks.filter(|file| file.is_file()).collect();
-        if painted.is_empty() {
-            return Err(to_paint(&dataset, &keyframes, capture));
-        }
+        let masks: Vec<PathBuf> =
+            dataset.frames.iter().map(|frame| keyframes.join(format!("{}.png", frame.name))).collect();
+        let painted: Vec<&Path> = masks.iter().map(PathBuf::as_path).filter(|file| file.is_file()).collect();
         let place = self.output.join("masks");
-        if !is_made(&place, &painted.iter().map(PathBuf::as_path).collect::<Vec<_>>())? {
+        if !is_made(&place, &painted)? {
+            let asked = proposed(&dataset);
+            let missing: Vec<usize> =
+                asked.iter().copied().filter(|frame| !masks[*frame].is_file()).collect();
+            // Other frames than those asked for will do, if they are as many.
+            if painted.is_empty() || (painted.len() < asked.len() && !self.as_painted) {
+                return Err(to_paint(&dataset, &missing, painted.len(), &keyframes, capture));
+            }
             std::fs::create_dir_all(&self.output).map_err(Error::io("create", &self.output))?;
             let words = ["masks", "propagate"].map(OsString::from).into_iter().chain([
                 capture.into(),
                 "--keyframes".into(),
-                keyframes.into(),
+                keyframes.clone().into(),
                 "-o".into(),
                 place.clone().into(),
             ]);
@@ -181,23 +189,40 @@ fn step(words: Vec<OsString>, untold: Option<&str>) -> Result<(), Error> {
     dispatch(Arguments::try_parse_from(line).map_err(Error::plain)?.command)
 }
 
-/// The stop at which a person is needed.
-fn to_paint(dataset: &Dataset, keyframes: &Path, capture: &Path) -> Error {
+/// Frames of the first camera that are proposed to be painted: the first and the last, and some between.
+fn proposed(dataset: &Dataset) -> Vec<usize> {
     let camera = dataset.frames.first().map(|frame| &frame.camera_name);
-    let frames: Vec<_> = dataset.frames.iter().filter(|frame| Some(&frame.camera_name) == camera).collect();
+    let of_camera = |index: &usize| Some(&dataset.frames[*index].camera_name) == camera;
+    let frames: Vec<usize> = (0..dataset.frames.len()).filter(of_camera).collect();
     let count = PROPOSED.min(frames.len());
-    let line = |k: usize| {
-        // The first and the last, and some between.
-        let frame = frames[k * (frames.len() - 1) / (count - 1).max(1)];
-        format!(
-            "  {}  ->  {}",
-            frame.image.display(),
-            keyframes.join(format!("{}.png", frame.name)).display()
-        )
+    (0..count).map(|k| frames[k * (frames.len() - 1) / (count - 1).max(1)]).collect()
+}
+
+/// The stop at which a person is needed: frames to be painted, beside those that are.
+fn to_paint(dataset: &Dataset, frames: &[usize], painted: usize, keyframes: &Path, capture: &Path) -> Error {
+    let line = |index: &usize| {
+        let frame = &dataset.frames[*index];
+        let mask = keyframes.join(format!("{}.png", frame.name));
+        format!("  {}  ->  {}", frame.image.display(), mask.display())
     };
-    let lines: Vec<String> = (0..count).map(line).collect();
+    let lines = frames.iter().map(line).collect::<Vec<_>>().join("\n");
+    if painted > 0 {
+        return Error::failed(
+            format!(
+                "{painted} of {PROPOSED} frames are painted; masks of the others would be guessed from these. Missing:\n{lines}"
+            ),
+            "paint them too, or as many other frames, and run the same command again; or go on with what is painted: \
+             --as-painted",
+        );
+    }
+    let strangers = std::fs::read_dir(keyframes).into_iter().flatten().flatten().map(|entry| entry.path());
+    let strangers = strangers.filter(|path| path.extension().is_some_and(|ending| ending == "png")).count();
+    let named = match strangers {
+        0 => String::new(),
+        count => format!("\n({} has {count} PNG files, none of them named as a frame)", keyframes.display()),
+    };
     Error::failed(
-        format!("{} frames have to be painted:\n{}", lines.len(), lines.join("\n")),
+        format!("{} frames have to be painted:\n{lines}{named}", frames.len()),
         format!(
             "paint each object in the value of its id, 1 to 255, on 0 in an 8-bit grey or palette PNG of the same size \
              (any paint program, or a tracker's first answer); name the ids in instances.json beside them, \

@@ -282,6 +282,7 @@ impl CaptureOptions {
         cif_dataset::OpenOptions {
             masks: self.masks.clone(),
             without_masks: self.no_masks,
+            keyframes: false,
             downscale: self.downscale,
             centre_principal_point: self.center_principal_point,
             layout: self.layout.map(Into::into),

@@ -7,9 +7,9 @@ use cif_geometry::PixelGrid;
 
 use super::mattes::Matte;
 use super::tracker::Table;
-use super::{Drawn, Picture, Place, check_size, mattes, polygon, runs, tracker};
+use super::{Drawn, Picture, Place, check_aspect, check_size, mattes, polygon, runs, tracker};
 use crate::Error;
-use crate::files::mask;
+use crate::files::{exr_header, mask};
 
 /// What a picture consists of.
 pub(super) enum Content {
@@ -43,28 +43,48 @@ pub(super) enum Shape {
     Matte(Matte),
 }
 
-/// The mask of a picture, at the size of its frame. `ids` are those of the objects.
+/// The mask of a picture, drawn at its own size and brought to that of its frame by nearest neighbour. `ids` are those of
+/// the objects.
 ///
 /// # Errors
-/// When a file is damaged or anything has another size than the frame.
-pub(super) fn draw(picture: &Picture, size: (u32, u32), ids: &[u16]) -> Result<Drawn, Error> {
+/// When a file is damaged, has another aspect than the frame, or parts of the picture differ in size.
+pub(super) fn draw(picture: &Picture, frame: (u32, u32), ids: &[u16]) -> Result<Drawn, Error> {
     if let Some(stated) = picture.size {
-        check_size(&picture.place, stated, size)?;
+        check_aspect(&picture.place, stated, frame)?;
     }
-    match &picture.content {
+    let (drawn, disputed) = match &picture.content {
         Content::Values(path, table) => {
             let objects = tracker::decode(path, table)?;
-            check_size(&picture.place, (objects.width, objects.height), size)?;
-            let ids = objects.map(|object| object.map_or(0, |object| ids[object]));
-            Ok(Drawn { ids, disputed: 0 })
+            (objects.map(|object| object.map_or(0, |object| ids[object])), 0)
         }
         Content::Ids(table, values) => {
             let id = |value: &u16| table[usize::from(*value)].map_or(0, |object| ids[object]);
-            let pixels = values.iter().map(id).collect();
-            Ok(Drawn { ids: PixelGrid::from_pixels(size.0, size.1, pixels), disputed: 0 })
+            let size = picture.size.unwrap_or(frame);
+            (PixelGrid::from_pixels(size.0, size.1, values.iter().map(id).collect()), 0)
         }
-        Content::Pieces(pieces) => draw_pieces(pieces, size, ids),
-    }
+        Content::Pieces(pieces) => {
+            let mut size = picture.size;
+            for piece in pieces {
+                size = size.map_or_else(|| size_of(&piece.shape), |size| Ok(Some(size)))?;
+            }
+            let size = size.unwrap_or(frame);
+            check_aspect(&picture.place, size, frame)?;
+            draw_pieces(pieces, size, ids)?
+        }
+    };
+    let size = (drawn.width, drawn.height);
+    check_aspect(&picture.place, size, frame)?;
+    Ok(Drawn { ids: mask::nearest_resize(&drawn, frame.0, frame.1), disputed, size })
+}
+
+/// Size of the picture that a shape is drawn in, where the shape says it.
+fn size_of(shape: &Shape) -> Result<Option<(u32, u32)>, Error> {
+    Ok(match shape {
+        Shape::Polygons(_) => None,
+        Shape::Runs(_, stated) => *stated,
+        Shape::File(path) => Some(mask::size(path)?),
+        Shape::Matte(matte) => Some(exr_header::read(&matte.path)?.1),
+    })
 }
 
 /// Pixels that a piece covers, as places in the picture row by row, ascending.
@@ -86,7 +106,7 @@ fn covered(piece: &Piece, size: (u32, u32)) -> Result<Vec<u32>, Error> {
     }
 }
 
-fn draw_pieces(pieces: &[Piece], size: (u32, u32), ids: &[u16]) -> Result<Drawn, Error> {
+fn draw_pieces(pieces: &[Piece], size: (u32, u32), ids: &[u16]) -> Result<(PixelGrid<u16>, u64), Error> {
     // Pieces of one object are one thing on their layer: their sizes add up.
     let mut things: Vec<(i64, usize, Vec<u32>)> = Vec::new();
     for piece in pieces {
@@ -112,5 +132,5 @@ fn draw_pieces(pieces: &[Piece], size: (u32, u32), ids: &[u16]) -> Result<Drawn,
         }
     }
     let disputed = disputed.iter().filter(|disputed| **disputed).count() as u64;
-    Ok(Drawn { ids: grid, disputed })
+    Ok((grid, disputed))
 }

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use crate::Dataset;
 use crate::files::listing;
-use crate::masks::flat_name;
+use crate::masks::{first_number, flat_name, number_of};
 
 /// Endings that are left out of names of frames.
 const ENDINGS: [&str; 10] = ["png", "jpg", "jpeg", "exr", "npy", "npz", "tif", "tiff", "webp", "bmp"];
@@ -15,14 +15,28 @@ pub(super) struct FrameNames {
     names: BTreeMap<String, Option<usize>>,
     /// Number at the end of the name of each frame, `[frames]`.
     numbers: Vec<Option<u64>>,
-    one_camera: bool,
+    /// Cameras by name, with their frames.
+    cameras: BTreeMap<String, OfCamera>,
     example: String,
+}
+
+/// Frames of a camera.
+#[derive(Default)]
+struct OfCamera {
+    /// Frames by their numbers in the video, else by those that their names end in.
+    by_number: BTreeMap<u64, usize>,
+    /// How many frames of the capture there are.
+    taken: usize,
+    /// File name and number of frames of the video that all of them are of.
+    video: Option<(String, u64)>,
 }
 
 /// Frames of pictures.
 pub(super) struct Matched {
     /// `[pictures]`.
     pub(super) frames: Vec<Option<usize>>,
+    /// True where pictures without a frame are of other frames of its video.
+    pub(super) of_video: bool,
     /// How they were found, where names did not fit.
     pub(super) note: Option<String>,
 }
@@ -38,11 +52,24 @@ impl FrameNames {
             enter(flat_name(&frame.name), index);
             enter(listing::stem(&frame.image), index);
         }
-        let cameras: BTreeSet<&str> = dataset.frames.iter().map(|frame| frame.camera_name.as_str()).collect();
+        let mut cameras: BTreeMap<String, OfCamera> = BTreeMap::new();
+        for (index, frame) in dataset.frames.iter().enumerate() {
+            let video = frame.source.as_ref().and_then(|source| Some((source.file.clone(), source.video?)));
+            let camera = cameras.entry(frame.camera_name.clone()).or_default();
+            let number = video.as_ref().map(|(_, place)| place.frame).or_else(|| number_of(&frame.name));
+            camera.by_number.extend(number.map(|number| (number, index)));
+            let video = video.map(|(file, place)| (file, place.of));
+            camera.video = if camera.taken == 0 {
+                video
+            } else {
+                camera.video.take().filter(|one| video.as_ref() == Some(one))
+            };
+            camera.taken += 1;
+        }
         Self {
             names,
             numbers: dataset.frames.iter().map(|frame| number_of(&frame.name)).collect(),
-            one_camera: cameras.len() <= 1,
+            cameras,
             example: dataset.frames.first().map(|frame| frame.name.clone()).unwrap_or_default(),
         }
     }
@@ -68,31 +95,116 @@ impl FrameNames {
     pub(super) fn reach(&self, names: &BTreeSet<&str>) -> (usize, usize) {
         let named: BTreeSet<usize> = names.iter().filter_map(|name| self.find(name)).collect();
         let list: Vec<&str> = names.iter().copied().collect();
-        let numbered =
-            self.by_number(&list).or_else(|| self.in_order(&list)).map_or(0, |found| found.frames.len());
+        let numbered = self.of_videos(&list, None).ok().flatten();
+        let numbered = numbered.or_else(|| self.by_number(&list)).or_else(|| self.in_order(&list));
+        let numbered = numbered.map_or(0, |found| found.frames.len());
         (named.len(), numbered)
     }
 
-    /// The frames of pictures. Names count first; where none is a name of a frame, numbers at their ends do: those of
-    /// the frames, whatever zeros they begin with, else places in the order of the capture.
+    /// The frames of pictures. Names count first where all are names of frames, then numbers at their ends: of the frames
+    /// of the video that the capture was made of, then of the frames, whatever zeros they begin with, else places in the
+    /// order of the capture. `first` says that the names end in numbers of frames of the video, and which the first has.
     ///
     /// # Errors
-    /// When nothing fits.
-    pub(super) fn resolve(&self, names: &[&str]) -> Result<Matched, String> {
+    /// When nothing fits, or more than one thing does.
+    pub(super) fn resolve(&self, names: &[&str], first: Option<u64>) -> Result<Matched, String> {
         let normal: Vec<String> = names.iter().map(|name| name.replace('\\', "/")).collect();
-        let frames: Vec<Option<usize>> = normal.iter().map(|name| self.find(name)).collect();
-        if frames.iter().any(Option::is_some) {
-            return Ok(Matched { frames, note: None });
+        let names: Vec<&str> = normal.iter().map(String::as_str).collect();
+        let frames: Vec<Option<usize>> = names.iter().map(|name| self.find(name)).collect();
+        let named = frames.iter().flatten().count();
+        let by_name = Matched { frames, of_video: false, note: None };
+        if first.is_none() && named == names.len() {
+            return Ok(by_name);
         }
-        self.by_number(names).or_else(|| self.in_order(names)).ok_or_else(|| {
-            format!(
-                "none of its {} pictures belongs to a frame: they are named as {}, frames as {}; rename them as the \
-                 frames",
-                names.len(),
-                names.first().copied().unwrap_or_default(),
+        let of_videos = match self.of_videos(&names, first) {
+            Ok(Some(matched)) => return Ok(matched),
+            Ok(None) if named > 0 => return Ok(by_name),
+            Ok(None) => None,
+            Err(problem) => Some(problem),
+        };
+        if first.is_none()
+            && let Some(matched) = self.by_number(&names).or_else(|| self.in_order(&names))
+        {
+            return Ok(matched);
+        }
+        Err(of_videos.unwrap_or_else(|| format!(
+            "none of its {} pictures belongs to a frame: they are named as {}, frames as {}; rename them as the \
+             frames, or, where they are numbered as the frames of the video, say which number its first frame has, as \
+             with --first-number 0",
+            names.len(),
+            names.first().copied().unwrap_or_default(),
+            self.example
+        )))
+    }
+
+    /// Every name by the number that it ends in, as the number of a frame of the video of its camera; `None` where the
+    /// capture does not know its videos, or names have no numbers.
+    ///
+    /// # Errors
+    /// When nothing shows which number the first frame of a video has.
+    fn of_videos(&self, names: &[&str], first: Option<u64>) -> Result<Option<Matched>, String> {
+        let mut numbers: BTreeMap<&str, BTreeSet<u64>> = BTreeMap::new();
+        let mut places = Vec::with_capacity(names.len());
+        for name in names {
+            let stem = without_ending(name);
+            let (Some(camera), Some(number)) = (self.camera_of(stem), number_of(stem)) else {
+                return Ok(None);
+            };
+            let is_new = numbers.entry(camera).or_default().insert(number);
+            if !is_new || (first.is_none() && self.cameras[camera].video.is_none()) {
+                return Ok(None);
+            }
+            places.push((camera, number));
+        }
+        let mut begins = BTreeMap::new();
+        let mut notes = Vec::new();
+        for (camera, numbers) in &numbers {
+            let of = &self.cameras[*camera];
+            let begin = match (first, &of.video) {
+                (Some(first), _) => first,
+                (None, None) => return Ok(None),
+                (None, Some((file, frames))) => first_number(numbers, *frames).map_err(|problem| {
+                    format!(
+                        "{file}: {problem}; say it with --first-number 0 or 1, or rename them as the frames"
+                    )
+                })?,
+            };
+            let known =
+                numbers.iter().filter_map(|number| of.by_number.get(&number.checked_sub(begin)?)).count();
+            let video = of.video.as_ref().map_or("the video", |(file, _)| file);
+            notes.push(format!(
+                "{} masks are those of frames of {video}, numbered from {begin}; {known} of these frames are in the capture",
+                numbers.len()
+            ));
+            begins.insert(*camera, begin);
+        }
+        let frame = |(camera, number): (&str, u64)| {
+            self.cameras[camera].by_number.get(&number.checked_sub(begins[camera])?).copied()
+        };
+        let frames: Vec<Option<usize>> = places.into_iter().map(frame).collect();
+        if frames.iter().all(Option::is_none) {
+            return Err(format!(
+                "{}; the capture has other frames of it, such as {}",
+                notes.join("; "),
                 self.example
-            )
-        })
+            ));
+        }
+        Ok(Some(Matched { frames, of_video: true, note: Some(notes.join("; ")) }))
+    }
+
+    /// The camera that a name is of: the only one, else that of which a folder, or the beginning of the name, is named.
+    fn camera_of(&self, name: &str) -> Option<&str> {
+        let mut known = self.cameras.keys().map(String::as_str);
+        if self.cameras.len() == 1 {
+            return known.next();
+        }
+        let fits = |camera: &&str| {
+            name.match_indices(camera).any(|(at, _)| {
+                let before = name[..at].ends_with('/') || at == 0;
+                before && name[at + camera.len()..].starts_with(['/', '_', '-', '.'])
+            })
+        };
+        known.filter(fits).max_by_key(|camera| camera.len())
     }
 
     /// Every name by the number that it ends in, where each is the number of one frame.
@@ -104,23 +216,25 @@ impl FrameNames {
         let find = |name: &&str| frames.get(&number_of(without_ending(name))?).copied().flatten();
         let found: Vec<Option<usize>> = names.iter().map(find).collect();
         let all = found.iter().all(Option::is_some);
-        all.then(|| Matched { frames: found, note: Some("frames were matched by their numbers".to_owned()) })
+        let note = Some("frames were matched by their numbers".to_owned());
+        all.then_some(Matched { frames: found, of_video: false, note })
     }
 
     /// Every name by its number as a place in the order of the frames, counted from 0, or from 1 where all frames are
-    /// there.
+    /// there. Where the capture knows its video, all have to be there: fewer may be numbers of the video as well.
     fn in_order(&self, names: &[&str]) -> Option<Matched> {
         let numbers: Vec<u64> =
             names.iter().map(|name| number_of(without_ending(name))).collect::<Option<_>>()?;
         let (first, last) = (*numbers.iter().min()?, *numbers.iter().max()?);
         let count = self.numbers.len() as u64;
         let start = u64::from(first == 1 && last == count);
-        if !self.one_camera || last - start >= count {
+        let [camera] = self.cameras.values().collect::<Vec<_>>()[..] else { return None };
+        if last - start >= count || (camera.video.is_some() && names.len() as u64 != count) {
             return None;
         }
         let note = format!("numbers of the source count the frames of the capture in order, from {start}");
         let frames = numbers.iter().map(|number| Some((number - start) as usize)).collect();
-        Some(Matched { frames, note: Some(note) })
+        Some(Matched { frames, of_video: false, note: Some(note) })
     }
 }
 
@@ -129,10 +243,4 @@ fn without_ending(name: &str) -> &str {
         Some((stem, ending)) if ENDINGS.iter().any(|known| ending.eq_ignore_ascii_case(known)) => stem,
         _ => name,
     }
-}
-
-/// The number that a name ends in.
-fn number_of(name: &str) -> Option<u64> {
-    let digits = name.bytes().rev().take_while(u8::is_ascii_digit).count();
-    name[name.len() - digits..].parse().ok()
 }

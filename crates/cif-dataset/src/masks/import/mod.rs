@@ -38,6 +38,7 @@ use self::draw::Content;
 use self::frames::FrameNames;
 pub use self::kind::SourceKind;
 use self::objects::Objects;
+use crate::load::same_aspect;
 use crate::{Dataset, Error, InstanceLabel};
 
 /// A picture of a source: a frame of the capture in the words of another tool.
@@ -103,14 +104,22 @@ pub struct Drawn {
     pub ids: PixelGrid<u16>,
     /// Pixels that several objects claimed.
     pub disputed: u64,
+    /// Width and height of the source, of which the ids are the nearest pixels where the frame has another size.
+    pub size: (u32, u32),
 }
 
 impl Import {
-    /// Lists the masks of a file or folder and matches them with the frames of a capture.
+    /// Lists the masks of a file or folder and matches them with the frames of a capture. `first_number` is the number of
+    /// the first frame of the video, where names end in numbers of its frames and nothing else shows it.
     ///
     /// # Errors
     /// When nothing tells what the source is, it is damaged, no picture belongs to a frame, or two belong to one.
-    pub fn open(source: &Path, kind: Option<SourceKind>, dataset: &Dataset) -> Result<Self, Error> {
+    pub fn open(
+        source: &Path,
+        kind: Option<SourceKind>,
+        first_number: Option<u64>,
+        dataset: &Dataset,
+    ) -> Result<Self, Error> {
         if !source.exists() {
             return Err(Error::invalid(source, "there is no such file or folder; give the masks to import"));
         }
@@ -137,7 +146,8 @@ impl Import {
             ));
         }
         let stated: Vec<&str> = listing.pictures.iter().map(|picture| picture.name.as_str()).collect();
-        let matched = names.resolve(&stated).map_err(|problem| Error::invalid(source, problem))?;
+        let matched =
+            names.resolve(&stated, first_number).map_err(|problem| Error::invalid(source, problem))?;
         listing.notes.extend(matched.note);
         let mut pictures: Vec<Option<Picture>> = dataset.frames.iter().map(|_| None).collect();
         let mut strangers = Vec::new();
@@ -156,7 +166,7 @@ impl Import {
             }
             pictures[frame] = Some(picture);
         }
-        if let Some(first) = strangers.first() {
+        if let Some(first) = strangers.first().filter(|_| !matched.of_video) {
             listing.notes.push(format!("{} masks belong to no frame, the first is {first}", strangers.len()));
         }
         let (ids, instances) = listing.objects.finish().map_err(|problem| Error::invalid(source, problem))?;
@@ -174,7 +184,7 @@ impl Import {
     /// of equal ones the later one.
     ///
     /// # Errors
-    /// When a picture is damaged, or of another size than the frame.
+    /// When a picture is damaged, or of another aspect than the frame.
     ///
     /// # Panics
     /// When there is no frame `frame`, or the capture is another one.
@@ -186,15 +196,26 @@ impl Import {
     }
 }
 
-/// Refuses a size that is not that of the frame.
-fn check_size(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<(), Error> {
-    if size == frame {
+/// Refuses a size of another aspect than that of the frame.
+fn check_aspect(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<(), Error> {
+    if size.0 > 0 && size.1 > 0 && same_aspect(size, frame) {
         return Ok(());
     }
     Err(place.error(format!(
-        "{} x {} pixels, its frame has {} x {}; export the masks at the size of the images, or say with --downscale \
-         that they were made on reduced ones",
+        "{} x {} pixels, its frame has {} x {}: another aspect; export the masks at the size of the images or of their \
+         video",
         size.0, size.1, frame.0, frame.1
+    )))
+}
+
+/// Refuses a part of a picture that has another size.
+fn check_size(place: &Place, size: (u32, u32), picture: (u32, u32)) -> Result<(), Error> {
+    if size == picture {
+        return Ok(());
+    }
+    Err(place.error(format!(
+        "{} x {} pixels, other masks of its frame {} x {}; export them at one size",
+        size.0, size.1, picture.0, picture.1
     )))
 }
 

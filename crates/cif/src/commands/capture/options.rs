@@ -26,8 +26,9 @@ and the commands that go on from there are told. Poses from images know neither 
 the cameras were held, the metre from --length or --measured, and the capture tells what is known.
 
 Cameras of a rig that stand still are told by their pictures; they are solved at one moment, and give the points of four.
-Frames of a video are called by their number in the stream (000123.png), so that masks fit later calls with the same
-frames. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
+Frames of a video are called by their number in the stream (000123.png), and the capture remembers the video, so that
+masks of all its frames, at its size, fit the frames that were taken. HLG and PQ video, as phones record it, becomes the
+display values of sRGB. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
 pub(in crate::commands) struct Capture {
     /// Videos and folders of photographs, one per camera
     #[arg(required = true, value_name = "INPUT")]
@@ -47,7 +48,7 @@ pub(in crate::commands) struct Capture {
     /// Last second of videos to take
     #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Frames")]
     pub(super) to: Option<f64>,
-    /// Reduce frames of videos so that their larger side has at most so many pixels
+    /// Reduce frames of videos and photographs so that their larger side has at most so many pixels
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(16..=16_384), help_heading = "Frames")]
     pub(super) max_side: Option<u32>,
     /// Take the sharpest frame of every window, as is the default for one video

@@ -69,6 +69,9 @@ fn beginning(command: &Capture, kept: &Unfinished) -> Vec<String> {
             words.extend(values);
         }
     };
+    // Of photographs, which stay where they are; what was kept of videos is as it was chosen.
+    add("--max-side", command.max_side.map(|side| side.to_string()).into_iter().collect());
+    add("--count", command.count.map(|count| count.to_string()).into_iter().collect());
     let times = kept.times.as_ref().or(command.times.as_ref());
     add("--times", times.map(|path| path.display().to_string()).into_iter().collect());
     add("--masks", command.masks.as_ref().map(|path| path.display().to_string()).into_iter().collect());

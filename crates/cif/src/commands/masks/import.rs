@@ -32,8 +32,9 @@ Recognised by what they hold, or named with --from:
   cif masks import annotations.xml -o table-masks --capture captures/table
   cif train captures/table --masks table-masks -o table.cif
 
-Frames are found by their names, else by the numbers at the ends of the names. Masks need the size of the images. A mask
-of one object covers a pixel from one half on. Where objects overlap, the higher layer (z_order of CVAT) has the pixel, on
+Frames are found by their names, else by the numbers at the ends of the names: of frames of the video, where the capture
+was made of one (a mask for each frame of it, counted from 0 or 1, or --first-number), else of frames of the capture. Masks
+of another size than the images, such as that of the video, are brought to it by nearest neighbour. A mask of one object covers a pixel from one half on. Where objects overlap, the higher layer (z_order of CVAT) has the pixel, on
 one layer the object with fewer pixels in that frame, of equal ones the later. Numbers from 1 to 65535 that name all
 objects stay their ids; else objects are numbered from 1. Cryptomatte EXR files need no import: cif train CAPTURE
 --masks DIR reads them.")]
@@ -49,6 +50,10 @@ pub(super) struct Import {
     /// Read the source as this [default: what it holds]
     #[arg(long, value_name = "TOOL")]
     from: Option<From>,
+    /// Names of the masks end in numbers of frames of the video, and its first frame has this one [default: what the
+    /// numbers show]
+    #[arg(long, value_name = "NUMBER")]
+    first_number: Option<u64>,
     /// The masks were made on images reduced by 1, 2, 4, ... [default: the largest images stored]
     #[arg(long, value_name = "FACTOR", value_parser = clap::value_parser!(u32).range(1..=64))]
     downscale: Option<u32>,
@@ -99,6 +104,16 @@ struct Found {
     pixels: u64,
     labelled: u64,
     disputed: u64,
+    resized: Option<Resized>,
+}
+
+/// Masks of another size than their images.
+struct Resized {
+    count: usize,
+    /// Width and height of the first of them, pixels.
+    from: (u32, u32),
+    /// Those of its image.
+    to: (u32, u32),
 }
 
 pub(super) fn run(command: &Import) -> Result<(), Error> {
@@ -109,8 +124,8 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         ..OpenOptions::default()
     };
     let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;
-    let source =
-        Source::open(&command.source, command.from.map(From::kind), &dataset).map_err(Error::plain)?;
+    let source = Source::open(&command.source, command.from.map(From::kind), command.first_number, &dataset)
+        .map_err(Error::plain)?;
     println!("read as {}", source.kind.described());
     let writer = MaskWriter::create(&command.output).map_err(Error::plain)?;
     interrupt::watch();
@@ -126,6 +141,10 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         };
         writer.add(&frame.name, &drawn.ids, None).map_err(Error::plain)?;
         found.disputed += drawn.disputed;
+        let size = (drawn.ids.width, drawn.ids.height);
+        if drawn.size != size {
+            found.resized.get_or_insert(Resized { count: 0, from: drawn.size, to: size }).count += 1;
+        }
         found.count(&drawn.ids.pixels);
     }
     drop(progress);
@@ -164,6 +183,12 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     );
     for note in &source.notes {
         eprintln!("note: {note}");
+    }
+    if let Some(Resized { count, from, to }) = found.resized {
+        eprintln!(
+            "note: {count} masks of {} x {} pixels were brought to {} x {} by nearest neighbour",
+            from.0, from.1, to.0, to.1
+        );
     }
     if found.disputed > 0 {
         eprintln!("note: {} pixels were claimed by several objects", found.disputed);

@@ -140,6 +140,7 @@ fn open(command: &Propagate) -> Result<Dataset, Error> {
     let options = OpenOptions {
         // A path from here, also where the capture has a folder of that name.
         masks: Some(std::path::absolute(folder).map_err(Error::io("find", folder))?),
+        keyframes: true,
         downscale: command.downscale,
         layout: command.layout.map(Into::into),
         without_cameras: command.frames.without_camera.clone(),
@@ -147,9 +148,7 @@ fn open(command: &Propagate) -> Result<Dataset, Error> {
         ..OpenOptions::default()
     };
     let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;
-    let without: Vec<_> =
-        dataset.warnings.iter().filter(|text| !text.contains("frames have a mask")).collect();
-    for warning in without {
+    for warning in &dataset.warnings {
         eprintln!("warning: {warning}");
     }
     Ok(dataset)
