@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::clock::Seconds;
 
-pub(crate) use pacer::weights;
+pub(crate) use pacer::{FITS, IDENTITY_STEPS_PER_FRAME, TRIALS, weights};
 pub use pacer::{COARSE, INSTANCE, Pacer, StageShare};
 
 /// Which time a budget counts.

@@ -22,7 +22,7 @@ use super::view::{ObjectView, is_one_camera, median};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
-use crate::stop::Stop;
+use crate::phases::Phases;
 
 /// Reliable times below which ways of moving cannot be told apart.
 const FEWEST_TIMES: usize = 8;
@@ -94,7 +94,7 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) seed: u64,
     /// Gaussians that an object leaves with.
     pub(crate) gaussians: usize,
-    pub(crate) stop: &'a Stop,
+    pub(crate) phases: &'a Phases,
 }
 
 /// An object to be fitted, with what is known of it.
@@ -153,12 +153,12 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     else {
         return Ok(None);
     };
-    let (outline, stop) = (object.outline, object.surroundings.stop);
+    let (outline, phases) = (object.outline, object.surroundings.phases);
     grow(&mut fit, &path);
     if way == Way::Followed {
-        mend(&mut fit, stop)?;
+        mend(&mut fit, phases)?;
     }
-    stop.check()?;
+    phases.check()?;
     let all: Vec<usize> = object.views_at(&fit.poses).collect();
     let levels = fit.levels();
     fit.steps(&all, JOINT, |share| {
@@ -166,7 +166,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         let level = if share < 0.2 && levels.len() > 1 { 1 } else { 0 };
         (0.6 * decay, 1.5 * decay, level)
     });
-    stop.check()?;
+    phases.check()?;
     if let (RotationEvidence::Assumed, Way::Roll(factor), Some(plane)) =
         (rotation, way, object.surroundings.plane)
     {
@@ -182,7 +182,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         fit.shape = shape;
         fit.steps(&all, STEPS[1], |share| (0.6 * 0.05_f64.powf(share), 0.1, 0));
     }
-    stop.check()?;
+    phases.check()?;
     if let Way::Roll(factor) = way {
         fit.rolls = Some(outline.height / factor);
     }
@@ -275,7 +275,8 @@ impl<'a> Object<'a> {
 
     /// Gaussians inside the masks in poses.
     pub(super) fn hull(&self, poses: &BTreeMap<usize, Pose>, count: usize, rng: &mut Pcg64) -> Option<Shape> {
-        hull(self.views, poses, (self.outline.size(), None), count, self.surroundings.near, rng)
+        let Surroundings { near, phases, .. } = self.surroundings;
+        hull(self.views, poses, (self.outline.size(), None), count, (near, phases), rng)
     }
 
     /// Of some times the one that shows most of it: the largest mask, whole if there is one.
@@ -305,8 +306,9 @@ impl<'a> Object<'a> {
             poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
         }
         let upright = self.outline.upright(self.surroundings.plane);
-        let (size, near) = (self.outline.size(), self.surroundings.near);
-        let shape = hull(self.views, &poses, (size, Some(&upright)), FOLLOWED, near, &mut self.rng())?;
+        let Surroundings { near, phases, .. } = self.surroundings;
+        let bounded: (f64, Option<&dyn Fn(DVec3) -> bool>) = (self.outline.size(), Some(&upright));
+        let shape = hull(self.views, &poses, bounded, FOLLOWED, (near, phases), &mut self.rng())?;
         let mut fit = self.fit(poses, shape, self.rng());
         fit.air = self.may_be_off(path);
         Some((reference, fit))
@@ -338,7 +340,7 @@ impl<'a> Object<'a> {
         let first = self.first(&path, &times).filter(|_| path.len() >= FEWEST_SEEN);
         let Some((reference, mut fit)) = first else { return Ok(None) };
         let all: Vec<usize> = self.views_at(&path).collect();
-        follow(&mut fit, reference, &path, &all, self.surroundings.stop)?;
+        follow(&mut fit, reference, &path, &all, self.surroundings.phases)?;
         let error = fit.mean_loss(&all, 0);
         if !self.is_told && self.at_rest(&all).is_some_and(|rests| rests <= trials::REST_GAIN[1] * error) {
             return Ok(None);

@@ -20,7 +20,7 @@ use super::testing::{
 };
 use super::view::ObjectView;
 use crate::random::{Purpose, stream};
-use crate::stop::Stop;
+use crate::phases::Phases;
 
 fn fit(views: &[ObjectView]) -> Fitted {
     fit_on(Some(&FLOOR), views).unwrap()
@@ -417,7 +417,7 @@ fn mended(
         }
         let all: Vec<usize> = (0..views.len()).collect();
         fit.steps(&all, 600, |_| (1.0, 0.0, 0));
-        mend(&mut fit, &Stop::default()).unwrap();
+        mend(&mut fit, &Phases::default()).unwrap();
         fit.poses
     });
     (truth, poses)

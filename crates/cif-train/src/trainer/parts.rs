@@ -5,8 +5,11 @@ use cif_field::tracks::{Joint, TrackGroup};
 use rayon::prelude::*;
 
 use super::Trainer;
+use super::objects::in_time;
 use crate::error::TrainError;
+use crate::events::TrainEvent;
 use crate::objects::{self, Jointed, Order, Plane};
+use crate::phase::Phase;
 
 impl Trainer {
     /// Looks for parts of objects (labels: dense index + 1) that do not travel, nor move as a whole, and of which nothing
@@ -19,28 +22,41 @@ impl Trainer {
         let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();
         let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
         let state = &self.state;
-        let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
+        let phase = state.phases.enter(Phase::Joints, wanted.len());
+        let order = Order::of(&state.dataset, &state.frames, &state.phases)?;
+        phase.until(self.deadline(Phase::Joints));
         let surroundings = self.surroundings(plane, &order);
         let find = |label: &u16| {
-            let found = objects::find_part(*label, &state.dataset, &state.frames, surroundings)?;
-            Ok(found.map(|found| (*label, found)))
+            let found = objects::find_part(*label, &state.dataset, &state.frames, surroundings);
+            let found = in_time(found)?;
+            state.phases.advance();
+            Ok((*label, found))
         };
-        let found: Vec<Option<(u16, Jointed)>> =
+        let found: Vec<(u16, Option<Option<Jointed>>)> =
             wanted.par_iter().map(find).collect::<Result<_, TrainError>>()?;
-        for (label, found) in found.into_iter().flatten() {
-            self.state.guidance.travelling[usize::from(label)] = true;
-            self.jointed.insert(label, found);
+        drop(phase);
+        let mut left_out = Vec::new();
+        for (label, found) in found {
+            match found {
+                Some(Some(found)) => {
+                    self.state.guidance.travelling[usize::from(label)] = true;
+                    self.jointed.insert(label, found);
+                }
+                Some(None) => {}
+                None => left_out.push(label),
+            }
         }
+        self.note_left_out(&left_out, "taken to have no parts on joints");
         Ok(())
     }
 
     /// Gives an object with a part groups for both.
     pub(super) fn add_parts(&mut self, name: String, found: &Jointed) {
         let [with, without] = found.errors;
-        self.warnings.push(format!(
+        self.messages.push(TrainEvent::note(format!(
             "{name} rests, but {} (error {with:.3} on pixels left out, {without:.3} without)",
             found.told()
-        ));
+        )));
         let base = TrackGroup { deformed: false, ..TrackGroup::still(name.clone(), found.hinge.point) };
         let base = self.add_group(found.base.clone(), base, &[]);
         let times = &self.state.dataset.times;

@@ -17,6 +17,7 @@ use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::heads::{Cif, Head, HeadTensors, value_head};
 use crate::optimiser::Optimiser;
+use crate::phase::Phase;
 use crate::progress::Progress;
 use crate::stage::Stage;
 use crate::state::State;
@@ -177,7 +178,7 @@ impl Trainer {
         let state = SavedState {
             version: VERSION,
             config: self.state.config.clone(),
-            progress: self.state.progress.clone(),
+            progress: self.progress(),
             capture: Capture::of(&self.state.dataset),
             head: self.state.head.name().to_owned(),
             adam_steps,
@@ -192,13 +193,14 @@ impl Trainer {
     /// When the checkpoint has no training state, is damaged, or belongs to another capture; when a frame cannot
     /// be read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
     pub fn resume(start: impl Into<Start>, checkpoint: Checkpoint) -> Result<Self, TrainError> {
-        let Start { mut dataset, stop } = start.into();
+        let Start { mut dataset, phases } = start.into();
+        let _run = phases.enter(Phase::Other, 0);
         let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
         let state = SavedState::parse(json)?;
         state.config.validate()?;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &state.config);
         state.capture.check(&Capture::of(&dataset), &dataset)?;
-        let start = Start { dataset, stop };
+        let start = Start { dataset, phases: phases.clone() };
         let mut trainer =
             Self::assemble(start, measured_frames, state.config, checkpoint.field, Some(state.progress))?;
 
@@ -211,9 +213,6 @@ impl Trainer {
         };
         trainer.restore_guidance(&mut tensors)?;
         trainer.restore_poses(&mut tensors)?;
-        if trainer.state.progress.stage == Stage::Coarse {
-            trainer.find_travelling()?;
-        }
         let has_rows = trainer.state.field.identities.is_some();
         let unseen = counters(&mut tensors, "identity.unseen", if has_rows { n } else { 0 })?;
         trainer.state.unseen = unseen.into_iter().map(|flag| flag != 0).collect();

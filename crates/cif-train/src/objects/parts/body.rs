@@ -157,6 +157,9 @@ impl<'a> Body<'a> {
     ) {
         let mut order = views.to_vec();
         for step in 0..if order.is_empty() { 0 } else { count } {
+            if self.shape.phases().is_over() {
+                break;
+            }
             let place = step % order.len();
             if place == 0 {
                 order.shuffle(&mut self.rng);
