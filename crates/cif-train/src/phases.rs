@@ -338,3 +338,103 @@ impl Drop for Entered {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::budget::BudgetClock;
+
+    /// A clock that stands still until time passes on it.
+    #[derive(Default)]
+    struct Manual(Mutex<f64>);
+
+    impl Manual {
+        fn pass(&self, seconds: f64) {
+            *self.0.lock().unwrap() += seconds;
+        }
+    }
+
+    impl Clock for Manual {
+        fn now(&self) -> Seconds {
+            let wall_s = *self.0.lock().unwrap();
+            Seconds { wall_s, cpu_s: 2.0 * wall_s }
+        }
+    }
+
+    fn on_a_clock() -> (Arc<Manual>, Phases) {
+        let clock = Arc::new(Manual::default());
+        (Arc::clone(&clock), Phases::new(clock, Stop::default()))
+    }
+
+    #[test]
+    fn time_belongs_to_the_innermost_phase() {
+        let (clock, phases) = on_a_clock();
+        clock.pass(1.0);
+        assert!(phases.times().is_empty(), "before the first phase nothing is counted");
+        let outer = phases.enter(Phase::Fine, 10);
+        clock.pass(2.0);
+        let inner = phases.enter(Phase::Measure, 3);
+        clock.pass(4.0);
+        assert_eq!(phases.spent(Phase::Measure), Seconds { wall_s: 4.0, cpu_s: 8.0 }, "it goes on");
+        drop(inner);
+        clock.pass(8.0);
+        drop(outer);
+        clock.pass(16.0);
+        let times = phases.times();
+        assert_eq!((times[&Phase::Fine].wall_s, times[&Phase::Measure].wall_s), (10.0, 4.0));
+    }
+
+    #[test]
+    fn events_tell_how_far_a_phase_is_and_what_it_took() {
+        let (clock, phases) = on_a_clock();
+        let events: Arc<Mutex<Vec<TrainEvent>>> = Arc::default();
+        let phases = phases.reported_to({
+            let events = Arc::clone(&events);
+            move |event| {
+                events.lock().unwrap().push(event.clone());
+                Control::Continue
+            }
+        });
+        let outer = phases.enter(Phase::Objects, 4);
+        clock.pass(3.0);
+        assert!(!phases.tick());
+        phases.advance();
+        // What comes between does not change how far it is.
+        let inner = phases.enter(Phase::Save, 0);
+        clock.pass(5.0);
+        drop(inner);
+        clock.pass(1.0);
+        drop(outer);
+        let (phase, total) = (Phase::Objects, 4);
+        let events = events.lock().unwrap();
+        assert_eq!(events[0], TrainEvent::PhaseStarted { phase, total });
+        let progress =
+            TrainEvent::PhaseProgress { phase, done: 0, total, steps: 1, elapsed_s: 3.0, eta_s: None };
+        assert_eq!(events[1], progress);
+        let ended = TrainEvent::PhaseEnded { phase, done: 1, total, steps: 1, wall_s: 4.0, cpu_s: 8.0 };
+        assert_eq!(events.last(), Some(&ended));
+        assert_eq!(events.len(), 5, "the second report comes too soon: {events:?}");
+    }
+
+    #[test]
+    fn work_ends_by_a_stop_or_by_its_deadline() {
+        let (clock, phases) = on_a_clock();
+        let phases = phases.reported_to(|event| match event {
+            TrainEvent::PhaseStarted { phase: Phase::Fine, .. } => Control::Stop,
+            _ => Control::Continue,
+        });
+        let budget = Budget { seconds: 10.0, clock: BudgetClock::Wall, threads: 1, start: phases.now() };
+        let limited = phases.enter(Phase::Search, 2);
+        limited.until(Some(Deadline { budget, at_s: 3.0 }));
+        clock.pass(2.0);
+        assert!(phases.check().is_ok() && !phases.tick());
+        clock.pass(1.0);
+        assert!(matches!(phases.check(), Err(TrainError::OutOfTime)) && phases.tick());
+        drop(limited);
+        assert!(phases.check().is_ok(), "the deadline is that of the phase");
+        let fine = phases.enter(Phase::Fine, 2);
+        assert!(matches!(phases.check(), Err(TrainError::Stopped)) && phases.tick());
+        drop(fine);
+        assert!(phases.is_stopped(), "for good");
+    }
+}

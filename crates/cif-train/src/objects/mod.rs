@@ -45,6 +45,7 @@ mod ways;
 
 use cif_dataset::{Dataset, Split};
 use glam::DVec3;
+use serde::{Deserialize, Serialize};
 
 pub(crate) use self::order::Order;
 pub(crate) use self::parts::Jointed;
@@ -101,6 +102,7 @@ pub(crate) fn up(dataset: &Dataset) -> DVec3 {
 }
 
 /// Finding about one object.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) enum Found {
     /// Its motion as a whole.
     Moves(Box<Fitted>),

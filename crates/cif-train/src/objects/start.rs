@@ -8,6 +8,7 @@ use cif_field::tracks::RotationEvidence;
 use glam::{DQuat, DVec3};
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::fit::{Fit, Turns, between, hull};
 use super::follow::follow;
@@ -56,13 +57,14 @@ const LEAST_SHARE: f64 = 0.1;
 const ADDED: usize = 30;
 
 /// An object with its motion.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Fitted {
     /// World from object, by time.
     pub(crate) poses: BTreeMap<usize, (DQuat, DVec3)>,
     /// How far training may move each of these poses: 1 where its time shows nothing that the fit explains.
     pub(crate) shares: BTreeMap<usize, f64>,
     /// In the frame of the object.
+    #[serde(skip)]
     pub(crate) gaussians: Gaussians,
     /// Pose at the time that shows most of it.
     pub(crate) reference: (DQuat, DVec3),

@@ -11,7 +11,7 @@
 //! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `heads` | what heads of other systems see and change between steps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
-//! | `objects` | which objects move as a whole, and how they join the field |
+//! | `objects`, `known` | which objects move as a whole, how they join the field, and what is kept of fits until then |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `resume` | what is saved, and how a run resumes |
@@ -48,6 +48,7 @@ mod heads;
 mod identity;
 mod initialize;
 mod judged;
+mod known;
 mod measure;
 mod motions;
 mod objects;
@@ -78,6 +79,7 @@ use cif_render::{Gradients, UNLABELLED};
 pub use self::backend::Probe;
 use self::changes::Changes;
 use self::evaluate::MeasuredFrames;
+use self::known::KnownObjects;
 pub(crate) use self::initialize::automatic_time_nodes;
 pub use self::measure::InstancePass;
 use self::pacing::Pacing;
@@ -179,6 +181,8 @@ pub struct Trainer {
     saved_head: Option<SavedHead>,
     /// Loss of the last step that was taken in.
     last_loss: StepLoss,
+    /// Objects that were fitted so far, until the fine stage has taken them over.
+    known: KnownObjects,
     /// Objects that move as a whole, by label, until the fine stage gives them Gaussians.
     fits: BTreeMap<u16, Fitted>,
     /// Labels of objects of which nothing tells how far away they are.
@@ -274,6 +278,7 @@ impl Trainer {
             is_searched: false,
             saved_head: None,
             last_loss: StepLoss::default(),
+            known: KnownObjects::default(),
             fits: BTreeMap::new(),
             nowhere: BTreeSet::new(),
             left_out: BTreeSet::new(),
@@ -387,7 +392,7 @@ impl Trainer {
     /// True once there is something that a run begun anew would have to do again.
     #[must_use]
     pub fn has_begun(&self) -> bool {
-        self.state.progress.total_steps > 0 || self.state.progress.stage > Stage::Coarse
+        self.steps_done() > 0 || self.stage() > Stage::Coarse || !self.known.is_empty()
     }
 
     /// Steps left in all stages.

@@ -221,6 +221,28 @@ impl Trainer {
         if !self.state.config.motion.rigid {
             return Ok((Vec::new(), Vec::new()));
         }
+        let is_known = |label: &&u16| self.known.rigid.contains_key(*label);
+        let unknown: Vec<u16> = labels.iter().filter(|label| !is_known(label)).copied().collect();
+        let left_out = if unknown.is_empty() { Vec::new() } else { self.fit_unknown(phase, &unknown, plane)? };
+        let mut fits = Vec::new();
+        for label in labels {
+            match self.known.rigid.get(label) {
+                Some(Found::Moves(fitted)) => fits.push((*label, (**fitted).clone())),
+                Some(Found::Nowhere) => drop(self.nowhere.insert(*label)),
+                Some(Found::Nothing) | None => {}
+            }
+        }
+        Ok((fits, left_out))
+    }
+
+    /// Fits objects of which nothing is known yet, and keeps what is found, also where the run is stopped meanwhile;
+    /// returns those that a budget left no time for.
+    fn fit_unknown(
+        &mut self,
+        phase: Phase,
+        labels: &[u16],
+        plane: Option<&Plane>,
+    ) -> Result<Vec<u16>, TrainError> {
         let state = &self.state;
         let entered = state.phases.enter(phase, labels.len());
         let order = Order::of(&state.dataset, &state.frames, &state.phases)?;
@@ -237,29 +259,22 @@ impl Trainer {
                 in_time(objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told))?
             };
             state.phases.advance();
-            Ok((
-                *label,
-                match found {
-                    Some(Found::Moves(fitted)) if !is_told && !is_rigid(&fitted, most) => {
-                        Some(Found::Nothing)
-                    }
-                    found => found,
-                },
-            ))
+            Ok(match found {
+                Some(Found::Moves(fitted)) if !is_told && !is_rigid(&fitted, most) => Some(Found::Nothing),
+                found => found,
+            })
         };
-        let found: Vec<(u16, Option<Found>)> =
-            wanted.par_iter().map(fit).collect::<Result<_, TrainError>>()?;
+        let found: Vec<Result<Option<Found>, TrainError>> = wanted.par_iter().map(fit).collect();
         drop(entered);
-        let (mut fits, mut left_out) = (Vec::new(), Vec::new());
-        for (label, found) in found {
+        let (mut left_out, mut failed) = (Vec::new(), None);
+        for (label, found) in labels.iter().zip(found) {
             match found {
-                Some(Found::Moves(fitted)) => fits.push((label, *fitted)),
-                Some(Found::Nowhere) => drop(self.nowhere.insert(label)),
-                Some(Found::Nothing) => {}
-                None => left_out.push(label),
+                Ok(Some(found)) => drop(self.known.rigid.insert(*label, found)),
+                Ok(None) => left_out.push(*label),
+                Err(error) => failed = failed.or(Some(error)),
             }
         }
-        Ok((fits, left_out))
+        failed.map_or(Ok(left_out), Err)
     }
 
     /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not. What

@@ -21,33 +21,45 @@ impl Trainer {
         }
         let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();
         let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
+        let is_known = |label: &&u16| self.known.parts.contains_key(*label);
+        let unknown: Vec<u16> = wanted.iter().filter(|label| !is_known(label)).copied().collect();
+        if !unknown.is_empty() {
+            self.find_unknown_parts(&unknown, plane)?;
+        }
+        for label in wanted {
+            if let Some(Some(found)) = self.known.parts.get(&label) {
+                self.state.guidance.travelling[usize::from(label)] = true;
+                self.jointed.insert(label, found.clone());
+            }
+        }
+        Ok(())
+    }
+
+    /// Looks for parts of objects of which that is not known yet, and keeps what is found, also where the run is stopped
+    /// meanwhile.
+    fn find_unknown_parts(&mut self, labels: &[u16], plane: Option<&Plane>) -> Result<(), TrainError> {
         let state = &self.state;
-        let phase = state.phases.enter(Phase::Joints, wanted.len());
+        let entered = state.phases.enter(Phase::Joints, labels.len());
         let order = Order::of(&state.dataset, &state.frames, &state.phases)?;
-        phase.until(self.deadline(Phase::Joints));
+        entered.until(self.deadline(Phase::Joints));
         let surroundings = self.surroundings(plane, &order);
         let find = |label: &u16| {
-            let found = objects::find_part(*label, &state.dataset, &state.frames, surroundings);
-            let found = in_time(found)?;
+            let found = in_time(objects::find_part(*label, &state.dataset, &state.frames, surroundings))?;
             state.phases.advance();
-            Ok((*label, found))
+            Ok(found)
         };
-        let found: Vec<(u16, Option<Option<Jointed>>)> =
-            wanted.par_iter().map(find).collect::<Result<_, TrainError>>()?;
-        drop(phase);
-        let mut left_out = Vec::new();
-        for (label, found) in found {
+        let found: Vec<Result<Option<Option<Jointed>>, TrainError>> = labels.par_iter().map(find).collect();
+        drop(entered);
+        let (mut left_out, mut failed) = (Vec::new(), None);
+        for (label, found) in labels.iter().zip(found) {
             match found {
-                Some(Some(found)) => {
-                    self.state.guidance.travelling[usize::from(label)] = true;
-                    self.jointed.insert(label, found);
-                }
-                Some(None) => {}
-                None => left_out.push(label),
+                Ok(Some(found)) => drop(self.known.parts.insert(*label, found)),
+                Ok(None) => left_out.push(*label),
+                Err(error) => failed = failed.or(Some(error)),
             }
         }
         self.note_left_out(&left_out, "taken to have no parts on joints");
-        Ok(())
+        failed.map_or(Ok(()), Err)
     }
 
     /// Gives an object with a part groups for both.

@@ -12,6 +12,7 @@ use serde_json::Value;
 
 use super::Trainer;
 use super::evaluate::MeasuredFrames;
+use super::known::KnownObjects;
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
@@ -38,6 +39,9 @@ pub(super) struct SavedState {
     /// Name of the head that the instance stage trains.
     #[serde(default = "name_of_cif", skip_serializing_if = "is_cif")]
     head: String,
+    /// Objects that were fitted, before the fine stage takes them over.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    objects: Option<Value>,
     /// Steps per parameter group.
     pub(super) adam_steps: BTreeMap<String, u32>,
 }
@@ -175,12 +179,15 @@ impl Trainer {
         for (name, tensor) in self.state.pose_moments.saved() {
             tensors.insert(name.to_owned(), tensor);
         }
+        let (objects, of_objects) = self.known.saved();
+        tensors.extend(of_objects);
         let state = SavedState {
             version: VERSION,
             config: self.state.config.clone(),
             progress: self.progress(),
             capture: Capture::of(&self.state.dataset),
             head: self.state.head.name().to_owned(),
+            objects,
             adam_steps,
         };
         let json = serde_json::to_value(state).expect("the state holds only strings, numbers and lists");
@@ -213,6 +220,11 @@ impl Trainer {
         };
         trainer.restore_guidance(&mut tensors)?;
         trainer.restore_poses(&mut tensors)?;
+        if let Some(objects) = state.objects {
+            let counts = (trainer.state.field.instances.len(), trainer.state.dataset.times.len());
+            trainer.known = KnownObjects::restored(objects, &mut tensors, counts)
+                .ok_or_else(|| unusable("the fitted objects do not fit the capture"))?;
+        }
         let has_rows = trainer.state.field.identities.is_some();
         let unseen = counters(&mut tensors, "identity.unseen", if has_rows { n } else { 0 })?;
         trainer.state.unseen = unseen.into_iter().map(|flag| flag != 0).collect();

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use cif_render::Gradients;
 
+use super::known::KnownObjects;
 use super::saving::Saving;
 use super::{Trainer, TrainerView, initialize, provenance};
 use crate::curve::MIN_GAP;
@@ -303,11 +304,13 @@ impl Trainer {
     /// Begins a stage. The run stays at the end of the stage before it when that fails or is stopped.
     pub(super) fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
         if stage == Stage::Fine {
-            let before = self.state.keep();
+            let before = (self.state.keep(), self.fits.clone(), self.jointed.clone());
             if let Err(error) = self.prepare_fine() {
-                self.state.put_back(before);
+                self.state.put_back(before.0);
+                (self.fits, self.jointed) = (before.1, before.2);
                 return Err(error);
             }
+            self.known = KnownObjects::default();
         }
         self.prepare_head(stage)?;
         self.begin(stage);

@@ -117,7 +117,7 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
     let finished = (0..500).find_map(|_| {
         let asked = Arc::new(AtomicU32::new(0));
         let stop = Stop::when(move || asked.fetch_add(1, Ordering::Relaxed) >= limit);
-        let start = Start { dataset: dataset.clone(), stop };
+        let start = Start { dataset: dataset.clone(), phases: stop.into() };
         let begun = match state.clone() {
             None => Trainer::new(start, config.clone()),
             Some(state) => Trainer::resume(start, state),

@@ -7,6 +7,7 @@ use glam::{DQuat, DVec3};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
+use serde::{Deserialize, Serialize};
 
 use super::super::shape::{Adam, Pose, Shape};
 use super::super::view::ObjectView;
@@ -21,7 +22,7 @@ const UPRIGHT: f64 = 0.99;
 const GREY: [f32; 3] = [0.5; 3];
 
 /// A joint in the frame of the object.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Hinge {
     pub(crate) kind: JointKind,
     /// Unit.
