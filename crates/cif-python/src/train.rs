@@ -59,7 +59,11 @@ impl Typed {
     }
 
     /// The settings on a capture, and what it calls for.
-    fn on(&self, dataset: &cif_dataset::Dataset, phases: &Phases) -> Result<(TrainConfig, EffectPlan), Error> {
+    fn on(
+        &self,
+        dataset: &cif_dataset::Dataset,
+        phases: &Phases,
+    ) -> Result<(TrainConfig, EffectPlan), Error> {
         let basis = if self.preset == Preset::Paper { Basis::All } else { Basis::Auto };
         let choice = self.effects.clone().unwrap_or(EffectChoice { basis, ..EffectChoice::default() });
         let config = self.alone(dataset.layout)?;

@@ -346,8 +346,9 @@ mod tests {
     fn frames_read_ahead_are_those_read_when_they_are_needed() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 2, views: 3, ..Scene::default() });
-        let open =
-            |budget| FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Phases::default()).unwrap();
+        let open = |budget| {
+            FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Phases::default()).unwrap()
+        };
         let (kept, mut read) = (open(u64::MAX), open(0));
         let same = |a: &FrameStore, b: &FrameStore, k: usize| {
             let (a, b) = (a.get(&dataset, k).unwrap(), b.get(&dataset, k).unwrap());
@@ -377,8 +378,9 @@ mod tests {
     fn rough_outlines_are_moved_in_frames_kept_and_in_those_read_later() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 2, views: 3, ..Scene::default() });
-        let open =
-            |budget| FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Phases::default()).unwrap();
+        let open = |budget| {
+            FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Phases::default()).unwrap()
+        };
         let labels = |store: &FrameStore, k| store.get(&dataset, k).unwrap().labels.clone().unwrap();
         // Plain balls, and masks that are larger than these by two pixels.
         let mut grown_masks = Vec::new();

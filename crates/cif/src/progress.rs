@@ -170,9 +170,8 @@ impl Progress {
                          back; the scene's record names the last"
                     ));
                 }
-                self.trained = Some(format!(
-                    "{gaussians} Gaussians, PSNR of training views {psnr:.2}{memory}"
-                ));
+                self.trained =
+                    Some(format!("{gaussians} Gaussians, PSNR of training views {psnr:.2}{memory}"));
             }
             TrainEvent::Densified { .. }
             | TrainEvent::Resampled { .. }
@@ -196,13 +195,20 @@ impl Progress {
         self.phases.push((phase, shown));
     }
 
-    fn phase_progress(&mut self, phase: Phase, [done, total, steps]: [u64; 3], elapsed_s: f64, eta_s: Option<f64>) {
+    fn phase_progress(
+        &mut self,
+        phase: Phase,
+        [done, total, steps]: [u64; 3],
+        elapsed_s: f64,
+        eta_s: Option<f64>,
+    ) {
         let steps = if steps > 0 {
             format!("  {steps} steps, {:.0}/s", steps as f64 / elapsed_s.max(1e-9))
         } else {
             String::new()
         };
-        let eta = eta_s.filter(|_| total > 0).map_or(String::new(), |eta_s| format!("  ETA {}", duration(eta_s)));
+        let eta =
+            eta_s.filter(|_| total > 0).map_or(String::new(), |eta_s| format!("  ETA {}", duration(eta_s)));
         let message = format!("{}{steps}{eta}", phase.describe());
         if elapsed_s >= WORTH_SHOWING_S && self.is_line_due() {
             self.last_line = Some(Instant::now());

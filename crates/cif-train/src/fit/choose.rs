@@ -75,7 +75,8 @@ fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, r
 #[must_use]
 pub fn share_of_fits(config: &TrainConfig, work: Workload) -> f64 {
     let motion = &config.motion;
-    let are_fitted = motion.rigid && motion.guidance > 0.0 && config.effects.motion && config.effects.instances;
+    let are_fitted =
+        motion.rigid && motion.guidance > 0.0 && config.effects.motion && config.effects.instances;
     if are_fitted && work.is_dynamic && work.has_instances { FITS } else { 0.0 }
 }
 

@@ -56,8 +56,8 @@ pub(crate) use self::trials::BENDS_NO_BETTER;
 use self::view::ObjectView;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
-use crate::random::{Purpose, stream};
 use crate::phases::Phases;
+use crate::random::{Purpose, stream};
 
 /// Distance from a plane within which a point is on it, of the extent of the cameras.
 const ON_PLANE: f64 = 0.005;

@@ -22,8 +22,8 @@ use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, is_one_camera, median};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
-use crate::random::{Purpose, stream};
 use crate::phases::Phases;
+use crate::random::{Purpose, stream};
 
 /// Reliable times below which ways of moving cannot be told apart.
 const FEWEST_TIMES: usize = 8;

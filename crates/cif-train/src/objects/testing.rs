@@ -17,8 +17,8 @@ use super::plane::Plane;
 use super::start::{Object, Surroundings};
 use super::view::{ObjectView, set_visible};
 use crate::frames::TrainFrame;
-use crate::random::{Purpose, stream};
 use crate::phases::Phases;
+use crate::random::{Purpose, stream};
 
 pub(super) const TIMES: usize = 30;
 pub(super) const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };

@@ -19,8 +19,8 @@ use super::testing::{
     views_in_masks, views_of_groups, with_objects,
 };
 use super::view::ObjectView;
-use crate::random::{Purpose, stream};
 use crate::phases::Phases;
+use crate::random::{Purpose, stream};
 
 fn fit(views: &[ObjectView]) -> Fitted {
     fit_on(Some(&FLOOR), views).unwrap()

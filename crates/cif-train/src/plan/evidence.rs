@@ -92,11 +92,7 @@ impl Evidence {
             training.iter().filter(|(_, frame)| frame.mask.is_some()).copied().collect();
         let looked = if dataset.times.len() > 1 { masked.len().min(MASKS) } else { 0 };
         let _phase = phases.enter(Phase::Plan, looked);
-        let change = if is_compared {
-            Some(largest_change(dataset, &fixed, phases)?)
-        } else {
-            None
-        };
+        let change = if is_compared { Some(largest_change(dataset, &fixed, phases)?) } else { None };
         let sightings = sightings(dataset, &masked, phases)?;
         Ok(Self {
             times: dataset.times.len(),

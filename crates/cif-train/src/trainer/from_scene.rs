@@ -81,8 +81,13 @@ impl Trainer {
         field.instances = initialize::instances(&dataset);
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
         (field.background, field.sort_metric) = (config.background, config.sort_metric);
-        let mut trainer =
-            Self::assemble(Start { dataset, phases: phases.clone() }, measured_frames, config, field, Some(progress))?;
+        let mut trainer = Self::assemble(
+            Start { dataset, phases: phases.clone() },
+            measured_frames,
+            config,
+            field,
+            Some(progress),
+        )?;
         if !trainer.stages.has_instances {
             return Err(TrainError::NoLabels { root: trainer.state.dataset.root });
         }

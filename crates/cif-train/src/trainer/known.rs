@@ -69,10 +69,12 @@ impl KnownObjects {
         let labels = known.rigid.keys().chain(known.parts.keys());
         let are_labels = labels.copied().all(|label| (1..=instances).contains(&usize::from(label)));
         let of_rigid = known.rigid.values().filter_map(|found| match found {
-            Found::Moves(fitted) => Some(fitted.poses.len() == fitted.shares.len() && {
-                let last = fitted.poses.last_key_value();
-                last.is_some_and(|(time, _)| *time < times)
-            }),
+            Found::Moves(fitted) => Some(
+                fitted.poses.len() == fitted.shares.len() && {
+                    let last = fitted.poses.last_key_value();
+                    last.is_some_and(|(time, _)| *time < times)
+                },
+            ),
             _ => None,
         });
         let of_parts = known.parts.values().flatten().map(|found| {
@@ -86,7 +88,8 @@ impl KnownObjects {
             let StateTensor::F32(means) = tensors.get(&format!("{name}.means"))? else { return None };
             *gaussians = Gaussians::zeros(means.len() / 3);
             for (parameter, values) in gaussians.tensors_mut() {
-                let Some(StateTensor::F32(saved)) = tensors.remove(&format!("{name}.{}", parameter.name)) else {
+                let Some(StateTensor::F32(saved)) = tensors.remove(&format!("{name}.{}", parameter.name))
+                else {
                     return None;
                 };
                 if saved.len() != values.len() || !saved.iter().all(|value| value.is_finite()) {

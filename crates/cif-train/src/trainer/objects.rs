@@ -223,7 +223,8 @@ impl Trainer {
         }
         let is_known = |label: &&u16| self.known.rigid.contains_key(*label);
         let unknown: Vec<u16> = labels.iter().filter(|label| !is_known(label)).copied().collect();
-        let left_out = if unknown.is_empty() { Vec::new() } else { self.fit_unknown(phase, &unknown, plane)? };
+        let left_out =
+            if unknown.is_empty() { Vec::new() } else { self.fit_unknown(phase, &unknown, plane)? };
         let mut fits = Vec::new();
         for label in labels {
             match self.known.rigid.get(label) {

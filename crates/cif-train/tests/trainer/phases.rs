@@ -9,7 +9,8 @@ use cif_dataset::{Dataset, PointSource};
 use cif_field::Checkpoint;
 use cif_train::budget::{Budget, BudgetClock};
 use cif_train::{
-    Clock, Control, Outcome, Phase, Phases, Seconds, Start, Stop, TrainConfig, TrainError, TrainEvent, Trainer,
+    Clock, Control, Outcome, Phase, Phases, Seconds, Start, Stop, TrainConfig, TrainError, TrainEvent,
+    Trainer,
 };
 
 /// A clock that moves on by a tenth of a second whenever it is read.
@@ -51,7 +52,10 @@ fn guided() -> TrainConfig {
 type Events = Arc<Mutex<Vec<TrainEvent>>>;
 
 /// Phases whose events are kept, on a clock; stopped when `stops` says so of an event.
-fn kept(clock: Arc<dyn Clock>, stops: impl Fn(&TrainEvent) -> bool + Send + Sync + 'static) -> (Phases, Events) {
+fn kept(
+    clock: Arc<dyn Clock>,
+    stops: impl Fn(&TrainEvent) -> bool + Send + Sync + 'static,
+) -> (Phases, Events) {
     let events = Events::default();
     let phases = Phases::new(clock, Stop::default()).reported_to({
         let events = Arc::clone(&events);
@@ -101,8 +105,12 @@ fn every_phase_is_reported_and_all_of_them_add_up_to_the_time_that_passed() {
         }
     }
     assert!(open.is_empty(), "{open:?}");
-    use Phase::{Coarse, Decode, Evaluate, Fine, Identity, Instance, Masks, Measure, Objects, Paths, Rehearsal};
-    for phase in [Decode, Masks, Paths, Coarse, Objects, Rehearsal, Fine, Identity, Instance, Measure, Evaluate] {
+    use Phase::{
+        Coarse, Decode, Evaluate, Fine, Identity, Instance, Masks, Measure, Objects, Paths, Rehearsal,
+    };
+    for phase in
+        [Decode, Masks, Paths, Coarse, Objects, Rehearsal, Fine, Identity, Instance, Measure, Evaluate]
+    {
         assert!(seen.contains(&phase), "{phase} is missing: {seen:?}");
     }
     let progresses = |phase: Phase| {
@@ -148,10 +156,9 @@ fn a_stop_inside_fits_is_obeyed_at_once_and_the_run_goes_on_to_the_same_end() {
 #[test]
 fn a_stop_while_frames_are_decoded_ends_the_preparation() {
     let folder = tempfile::tempdir().unwrap();
-    let (phases, _) = kept(
-        Arc::new(Ticking::default()),
-        |event| matches!(event, TrainEvent::PhaseProgress { phase: Phase::Decode, .. }),
-    );
+    let (phases, _) = kept(Arc::new(Ticking::default()), |event| {
+        matches!(event, TrainEvent::PhaseProgress { phase: Phase::Decode, .. })
+    });
     let stopped = Trainer::new(Start { dataset: rolling(folder.path()), phases }, guided());
     assert!(matches!(stopped.err(), Some(TrainError::Stopped)));
 }

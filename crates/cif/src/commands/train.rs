@@ -7,8 +7,8 @@ use cif_dataset::{Dataset, Layout};
 use cif_field::Checkpoint;
 use cif_train::plan::Basis;
 use cif_train::{
-    Control, EffectChoice, EffectPlan, HeadName, Outcome, Phase, Phases, Preset, Start, Stop, TrainConfig, TrainError,
-    TrainEvent, Trainer,
+    Control, EffectChoice, EffectPlan, HeadName, Outcome, Phase, Phases, Preset, Start, Stop, TrainConfig,
+    TrainError, TrainEvent, Trainer,
 };
 use clap::{Args, ValueEnum};
 
@@ -53,9 +53,11 @@ As good as it gets in a minute and a half, or only as long as it has to:
   cif train captures/table -o table.cif --budget 90s
   cif train captures/table -o table.cif --target-psnr 28 --target-miou 85 --budget 10m
 
-With --resume, a budget is for the rest. SCENE.train.toml then holds the settings that came of it.
+With --resume, a budget is for the rest. SCENE.train.toml then holds the settings that came of it. A budget counts
+everything from the start of the command on; fits of objects that it has no time for are left out, and noted.
 
-Ctrl-C and SIGTERM save and stop; the same command with --resume goes on as if nothing had happened. It does so
+Ctrl-C and SIGTERM save and stop, inside fits of objects too, which keep the objects that are done; the same command
+with --resume goes on as if nothing had happened. It does so
 after a power cut as well, from the state saved last: there is one every five minutes and at the end of each stage
 (--checkpoint-seconds). While a run lasts, its scene is locked: another one to the same file is refused.")]
 pub(super) struct Train {
@@ -272,8 +274,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
                 let preset = TrainConfig::preset(config.preset, dataset.layout);
                 let (goals, options) = (&command.goals, &command.capture_options);
                 let quiet = command.quiet;
-                dataset =
-                    goals.fit(&mut timing, &mut config, &preset, dataset, options, &phases, quiet)?;
+                dataset = goals.fit(&mut timing, &mut config, &preset, dataset, options, &phases, quiet)?;
             }
             destination.check_settings(&config)?;
             let start = Start { dataset, phases: phases.clone() };

@@ -58,8 +58,7 @@ impl<'a> Search<'a> {
             |place: DVec3| (!bounded || self.is_within(place)) && bound.is_none_or(|bound| bound(place));
         let bound: Option<&dyn Fn(DVec3) -> bool> = Some(&inside);
         let mut rng = self.object.rng();
-        let mut shape =
-            hull(self.object.views, poses, (reach, bound), count, (near, phases), &mut rng)?;
+        let mut shape = hull(self.object.views, poses, (reach, bound), count, (near, phases), &mut rng)?;
         shape.fade(0.0, |_| true);
         Some(shape)
     }
