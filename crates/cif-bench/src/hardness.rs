@@ -105,7 +105,7 @@ fn train_and_score(
     config: &TrainConfig,
     stop: &Stop,
 ) -> Result<(), String> {
-    let start = Start { dataset: dataset.clone(), stop: stop.clone() };
+    let start = Start { dataset: dataset.clone(), phases: stop.clone().into() };
     let mut trainer = Trainer::new(start, config.clone()).map_err(|error| error.to_string())?;
     let mut notes = Vec::new();
     let outcome = trainer.run(&mut |event, _| {

@@ -34,7 +34,7 @@ impl Run<'_> {
             true => Checkpoint::load(self.partial).ok(),
             false => None,
         };
-        let start = || Start { dataset: self.dataset.clone(), stop: stop.clone() };
+        let start = || Start { dataset: self.dataset.clone(), phases: stop.clone().into() };
         let resumed = begun.and_then(|checkpoint| Trainer::resume(start(), checkpoint).ok());
         let mut trainer = match resumed {
             // Settings may have changed since.

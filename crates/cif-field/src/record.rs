@@ -69,11 +69,12 @@ pub struct Run {
     pub seed: Option<u64>,
     /// Steps over all stages.
     pub iterations: Option<u64>,
-    /// Time of the steps on the clock, seconds.
+    /// Time of the run on the clock, seconds; of the steps alone in scenes of older versions.
     pub wall_s: Option<f64>,
-    /// The same per stage.
-    pub wall_s_by_stage: BTreeMap<String, f64>,
-    /// Time of the steps over all threads, seconds.
+    /// The same per phase.
+    #[serde(alias = "wall_s_by_stage")]
+    pub wall_s_by_phase: BTreeMap<String, f64>,
+    /// Processor time of the run, all threads together, seconds.
     pub cpu_s: Option<f64>,
     /// Largest resident memory, MB; `None` where the system did not tell.
     pub peak_rss_mb: Option<f64>,
@@ -251,7 +252,7 @@ mod tests {
         assert_eq!(exposures["left"].gain, [1.25, 1.0, 1.0]);
         let run = record.run.as_ref().unwrap();
         assert_eq!((run.iterations, run.wall_s, run.peak_rss_mb), (Some(720), Some(61.5), None));
-        assert_eq!(run.wall_s_by_stage["fine"], 40.0);
+        assert_eq!(run.wall_s_by_phase["fine"], 40.0, "as scenes of older versions have it");
         assert_eq!(run.notes["simd"], "avx2");
         assert_eq!(record.edits.len(), 1);
         assert_eq!(record.notes["dataset"]["layout"], "nerfstudio");

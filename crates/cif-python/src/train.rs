@@ -11,7 +11,9 @@ use cif::settings::Layers;
 use cif_dataset::{Layout, OpenOptions};
 use cif_field::Checkpoint;
 use cif_train::plan::Basis;
-use cif_train::{Control, EffectChoice, EffectPlan, Preset, Start, Stop, TrainConfig, TrainEvent, Trainer};
+use cif_train::{
+    Control, EffectChoice, EffectPlan, Phase, Phases, Preset, Start, Stop, TrainConfig, TrainEvent, Trainer,
+};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyBool, PyDict};
@@ -57,10 +59,15 @@ impl Typed {
     }
 
     /// The settings on a capture, and what it calls for.
-    fn on(&self, dataset: &cif_dataset::Dataset) -> Result<(TrainConfig, EffectPlan), Error> {
+    fn on(
+        &self,
+        dataset: &cif_dataset::Dataset,
+        phases: &Phases,
+    ) -> Result<(TrainConfig, EffectPlan), Error> {
         let basis = if self.preset == Preset::Paper { Basis::All } else { Basis::Auto };
         let choice = self.effects.clone().unwrap_or(EffectChoice { basis, ..EffectChoice::default() });
-        let plan = EffectPlan::new(dataset, &self.alone(dataset.layout)?, &choice).map_err(Error::plain)?;
+        let config = self.alone(dataset.layout)?;
+        let plan = EffectPlan::watched(dataset, &config, &choice, phases).map_err(Error::plain)?;
         let mut base = TrainConfig::preset(self.preset, dataset.layout);
         plan.apply(&mut base);
         Ok((self.over(base)?, plan))
@@ -115,11 +122,15 @@ struct Run {
     backend: Backend,
     resume: bool,
     force: bool,
-    stop: Stop,
 }
 
 impl Run {
-    fn run(self, observe: &mut dyn FnMut(&TrainEvent) -> Control) -> Result<cif_field::Field, Error> {
+    fn run(
+        self,
+        phases: &Phases,
+        observe: &mut dyn FnMut(&TrainEvent) -> Control,
+    ) -> Result<cif_field::Field, Error> {
+        let _run = phases.enter(Phase::Other, 0);
         let existing = if self.force || self.resume { Existing::Replace } else { Existing::Keep };
         let mut destination =
             self.output.as_deref().map(|path| Destination::open(path, existing)).transpose()?;
@@ -142,26 +153,26 @@ impl Run {
                     }
                 };
                 let options = OpenOptions { downscale, ..OpenOptions::default() };
+                let _phase = phases.enter(Phase::Open, 0);
                 (cif_dataset::Dataset::open(&folder, &options).map_err(Error::plain)?, downscale)
             }
         };
+        let begun = |dataset| Start { dataset, phases: phases.clone() };
         let mut trainer = match state {
             Some(state) => {
-                let trainer =
-                    Trainer::resume(Start { dataset, stop: self.stop }, state).map_err(Error::plain)?;
+                let trainer = Trainer::resume(begun(dataset), state).map_err(Error::plain)?;
                 if let Some(destination) = &mut destination {
                     destination.resumes(trainer.config());
                 }
                 trainer
             }
             None => {
-                let (mut config, plan) = self.typed.on(&dataset)?;
+                let (mut config, plan) = self.typed.on(&dataset, phases)?;
                 config.downscale = downscale;
                 if let Some(destination) = &destination {
                     destination.check_settings(&config)?;
                 }
-                let mut trainer =
-                    Trainer::new(Start { dataset, stop: self.stop }, config).map_err(Error::plain)?;
+                let mut trainer = Trainer::new(begun(dataset), config).map_err(Error::plain)?;
                 trainer.record_effects(serde_json::json!(plan));
                 trainer
             }
@@ -185,7 +196,8 @@ impl Run {
 ///
 /// callback is called in this thread with a dictionary for each event of the run; its "event" is "stage_started",
 /// "step" (every report.step_every steps: stage, iteration, iterations, loss, psnr, gaussians, eta_s), "evaluated",
-/// "warning", "finished" and more. When it returns False the run stops and the field as it is then is returned. An
+/// "note", "warning", "finished" and more. Work without steps is reported as "phase_started", "phase_progress" (phase,
+/// done, total, elapsed_s, eta_s) and "phase_ended" (phase, wall_s, cpu_s), from the opening of the capture on. When it returns False the run stops and the field as it is then is returned. An
 /// exception in it stops the run and is raised, as is KeyboardInterrupt on Ctrl-C. In all three cases the run is
 /// saved to output first, and resume=True goes on with it, with the settings of the file.
 ///
@@ -242,11 +254,11 @@ pub(crate) fn train(
         backend: backend_named(backend)?,
         resume,
         force,
-        stop: Stop::when({
-            let requested = Arc::clone(&requested);
-            move || requested.load(Ordering::Relaxed)
-        }),
     };
+    let stop = Stop::when({
+        let requested = Arc::clone(&requested);
+        move || requested.load(Ordering::Relaxed)
+    });
     let answer = |event: TrainEvent| -> PyResult<Control> {
         let Some(callback) = &callback else { return Ok(Control::Continue) };
         let answer = callback.call1((arrays::to_python(py, &event)?,))?;
@@ -259,11 +271,15 @@ pub(crate) fn train(
         || requested.store(true, Ordering::Relaxed),
         answer,
         |questions| {
-            run.run(&mut |event| {
-                let control = is_watched.then(|| questions.ask(event.clone())).flatten();
-                control.unwrap_or_default()
-            })
-            .map_err(|error| error.with_help())
+            let ask = move |event: &TrainEvent| {
+                is_watched.then(|| questions.ask(event.clone())).flatten().unwrap_or_default()
+            };
+            let ask = Arc::new(ask);
+            let phases = Phases::from(stop).reported_to({
+                let ask = Arc::clone(&ask);
+                move |event| ask(event)
+            });
+            run.run(&phases, &mut |event| ask(event)).map_err(|error| error.with_help())
         },
     )?;
     Ok(Field { inner: trained.map_err(cif_error)? })

@@ -52,9 +52,9 @@ pub struct CurvePoint {
     pub iteration: u32,
     /// Steps done in all stages.
     pub step: u64,
-    /// Wall time of training so far, measuring not counted, seconds.
+    /// Wall time of the run so far, from the opening of the capture on: everything but measuring, seconds.
     pub wall_s: f64,
-    /// Processor time of training so far, all threads together, measuring not counted, seconds.
+    /// Processor time of the same, all threads together, seconds.
     pub cpu_s: f64,
     /// Gaussians.
     pub gaussians: usize,

@@ -90,9 +90,12 @@ pub enum TrainError {
         /// Step, from 1.
         iteration: u32,
     },
-    /// A stop was requested before the run had anything to save.
+    /// A stop was requested inside work that has no result half way.
     #[error("stopped before the first step")]
     Stopped,
+    /// The budget has no time left for work that can be left out.
+    #[error("the budget leaves no time for it")]
+    OutOfTime,
     /// No labels for the instance stage.
     #[error("{}: no training mask has a labelled pixel, so there is no instance stage", root.display())]
     NoLabels {

@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use crate::guard::Fault;
+use crate::phase::Phase;
 use crate::stage::Stage;
 use crate::times::Work;
 
@@ -10,6 +11,44 @@ use crate::times::Work;
 #[derive(Clone, Debug, PartialEq, Serialize)]
 #[serde(tag = "event", rename_all = "snake_case")]
 pub enum TrainEvent {
+    /// A phase begins. Events of phases go to the receiver of [`Phases`](crate::Phases), all others to the observer of
+    /// the run.
+    PhaseStarted {
+        /// Phase.
+        phase: Phase,
+        /// Units of work that it has, see [`Phase::unit`]; 0 where they are not counted.
+        total: u64,
+    },
+    /// How far a phase is; sent a few times a second while it goes on. Stages send [`Self::Step`] instead.
+    PhaseProgress {
+        /// Phase.
+        phase: Phase,
+        /// Units done.
+        done: u64,
+        /// Units in all; 0 where they are not counted.
+        total: u64,
+        /// Steps of fits so far, over all units.
+        steps: u64,
+        /// Time since the phase began, seconds.
+        elapsed_s: f64,
+        /// Estimated time to the end of the phase, seconds; none before a unit is done.
+        eta_s: Option<f64>,
+    },
+    /// A phase is over, completed or not.
+    PhaseEnded {
+        /// Phase.
+        phase: Phase,
+        /// Units done.
+        done: u64,
+        /// Units in all.
+        total: u64,
+        /// Steps of fits, over all units.
+        steps: u64,
+        /// Time that it took, phases inside it not counted, seconds.
+        wall_s: f64,
+        /// Processor time that it took, all threads together, seconds.
+        cpu_s: f64,
+    },
     /// A stage begins, or goes on after a resume.
     StageStarted {
         /// Stage.
@@ -156,11 +195,16 @@ pub enum TrainEvent {
         point: crate::curve::CurvePoint,
         /// Frames that it was measured on.
         frames: usize,
-        /// Wall time that measuring took so far, which the point does not count, seconds.
+        /// Wall time that measuring took so far, which no point counts, seconds.
         measuring_s: f64,
     },
-    /// Something that the user should know; the run goes on.
+    /// Something that may be wrong; the run goes on.
     Warning {
+        /// One sentence.
+        message: String,
+    },
+    /// Something that was found, or decided, and is as it should be.
+    Note {
         /// One sentence.
         message: String,
     },
@@ -174,7 +218,7 @@ pub enum TrainEvent {
     },
     /// The run is complete.
     Finished {
-        /// Wall time of all stages, interruptions not counted, seconds.
+        /// Wall time of all phases so far, interruptions not counted, seconds.
         wall_s: f64,
         /// Optimiser steps of all stages.
         iterations: u64,
@@ -189,6 +233,16 @@ pub enum TrainEvent {
         /// Counts of the work of all steps.
         work: Work,
     },
+}
+
+impl TrainEvent {
+    pub(crate) fn note(message: impl Into<String>) -> Self {
+        Self::Note { message: message.into() }
+    }
+
+    pub(crate) fn warning(message: impl Into<String>) -> Self {
+        Self::Warning { message: message.into() }
+    }
 }
 
 /// Request of the observer in reply to an event.

@@ -17,7 +17,8 @@ use rayon::prelude::*;
 
 use crate::error::TrainError;
 use crate::mask_edges::{self, Doubt};
-use crate::stop::Stop;
+use crate::phase::Phase;
+use crate::phases::Phases;
 use crate::switches::{Seen, put_right, switches};
 use crate::tracks::{misfits, observe};
 
@@ -72,7 +73,7 @@ impl FrameStore {
         background: [f32; 3],
         maps: BTreeMap<usize, PathBuf>,
         budget: u64,
-        stop: &Stop,
+        phases: &Phases,
     ) -> Result<Self, TrainError> {
         let mut label_of_id = vec![UNLABELLED; usize::from(u16::MAX) + 1];
         for (k, instance) in dataset.instances.iter().enumerate() {
@@ -86,21 +87,30 @@ impl FrameStore {
         if store.frames.is_empty() {
             return Err(TrainError::NoTrainingFrames { root: dataset.root.clone() });
         }
-        let mut used = 0;
+        let _phase = phases.enter(Phase::Decode, store.frames.len());
+        let decode = |k: usize| {
+            phases.check()?;
+            let frame = store.load(dataset, k)?;
+            phases.advance();
+            Ok(frame)
+        };
+        let (mut used, mut kept) = (0, Vec::new());
         for start in (0..store.frames.len()).step_by(BATCH) {
-            stop.check()?;
             let end = (start + BATCH).min(store.frames.len());
             if used > budget {
                 break;
             }
             let decoded: Vec<_> =
-                (start..end).into_par_iter().map(|k| store.load(dataset, k)).collect::<Result<_, _>>()?;
+                (start..end).into_par_iter().map(decode).collect::<Result<_, TrainError>>()?;
             for (k, frame) in (start..end).zip(decoded) {
                 used += frame.bytes();
                 if used <= budget {
-                    store.frames[k].1 = Some(Arc::new(frame));
+                    kept.push((k, frame));
                 }
             }
+        }
+        for (k, frame) in kept {
+            store.frames[k].1 = Some(Arc::new(frame));
         }
         if store.not_kept() > 0 {
             store.ahead = Some(Ahead::of(dataset));
@@ -156,17 +166,18 @@ impl FrameStore {
         &mut self,
         dataset: &Dataset,
         limit: f64,
-        stop: &Stop,
+        phases: &Phases,
     ) -> Result<Vec<usize>, TrainError> {
         let mut masked = Vec::new();
         let mut seen = Vec::new();
         for k in 0..self.len() {
-            stop.check()?;
+            phases.check()?;
             if let Some(labels) = &self.get(dataset, k)?.labels {
                 let frame = &dataset.frames[self.index(k)];
                 masked.push(k);
                 seen.push(observe(labels, &frame.camera, frame.time_index));
             }
+            phases.advance();
         }
         let left_out: Vec<usize> = misfits(&seen, limit).into_iter().map(|k| self.index(masked[k])).collect();
         self.frames.retain(|(index, _)| !left_out.contains(index));
@@ -178,12 +189,13 @@ impl FrameStore {
     pub(crate) fn put_switches_right(
         &mut self,
         dataset: &Dataset,
-        stop: &Stop,
+        phases: &Phases,
     ) -> Result<&BTreeMap<usize, BTreeMap<u16, u16>>, TrainError> {
         let of = |k: usize| {
-            stop.check()?;
+            phases.check()?;
             let of = &dataset.frames[self.index(k)];
             let frame = self.get(dataset, k)?;
+            phases.advance();
             Ok(Seen::of(&frame.image, frame.labels.as_ref(), &of.camera_name, of.time_index))
         };
         let seen: Vec<_> = (0..self.len()).into_par_iter().map(of).collect::<Result<_, TrainError>>()?;
@@ -202,11 +214,11 @@ impl FrameStore {
 
     /// Moves the outlines of masks to where colours change if they are rough (see [`crate::mask_edges`]); true where
     /// they are. Masks that tell how sure they are, pixel by pixel, stay.
-    pub(crate) fn put_edges_right(&mut self, dataset: &Dataset, stop: &Stop) -> Result<bool, TrainError> {
+    pub(crate) fn put_edges_right(&mut self, dataset: &Dataset, phases: &Phases) -> Result<bool, TrainError> {
         let is_plain = |k: &usize| dataset.frames[self.index(*k)].confidence.is_none();
         let plain: Vec<usize> = (0..self.len()).filter(is_plain).collect();
         let doubt = |k: &usize| {
-            stop.check()?;
+            phases.check()?;
             let frame = self.get(dataset, *k)?;
             Ok(frame.labels.as_ref().map(|labels| Doubt::of(&frame.image, labels)))
         };
@@ -217,10 +229,13 @@ impl FrameStore {
         }
         let kept =
             self.frames.par_iter_mut().filter(|(index, _)| dataset.frames[*index].confidence.is_none());
-        kept.filter_map(|(_, frame)| frame.as_mut()).for_each(|frame| {
+        kept.filter_map(|(_, frame)| frame.as_mut()).try_for_each(|frame| {
+            phases.check()?;
             let labels = frame.labels.as_ref().map(|labels| mask_edges::moved(&frame.image, labels));
             *frame = Arc::new(TrainFrame::new(frame.image.clone(), labels, frame.features.clone()));
-        });
+            phases.advance();
+            Ok::<(), TrainError>(())
+        })?;
         Arc::make_mut(&mut self.decoding).moves_edges = true;
         self.ahead.iter().for_each(Ahead::give_up);
         Ok(true)
@@ -301,7 +316,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut dataset = capture(folder.path(), Scene { times: 1, views: 2, ..Scene::default() });
         let open = |dataset: &Dataset| {
-            FrameStore::open(dataset, [1.0; 3], BTreeMap::new(), u64::MAX, &Stop::default()).unwrap()
+            FrameStore::open(dataset, [1.0; 3], BTreeMap::new(), u64::MAX, &Phases::default()).unwrap()
         };
         let certain = open(&dataset);
         // Rows alternate between just too little and just enough.
@@ -322,7 +337,7 @@ mod tests {
         assert_eq!(unsure.get(&dataset, 0).unwrap().labelled, labelled(&after));
         // Frames without a confidence are as before, and so are frames that memory has no room for.
         assert_eq!(labels(&unsure, 1), labels(&certain, 1));
-        let none_kept = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Stop::default()).unwrap();
+        let none_kept = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Phases::default()).unwrap();
         assert_eq!(none_kept.not_kept(), none_kept.len());
         assert_eq!(labels(&none_kept, 0), after);
     }
@@ -331,8 +346,9 @@ mod tests {
     fn frames_read_ahead_are_those_read_when_they_are_needed() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 2, views: 3, ..Scene::default() });
-        let open =
-            |budget| FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Stop::default()).unwrap();
+        let open = |budget| {
+            FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Phases::default()).unwrap()
+        };
         let (kept, mut read) = (open(u64::MAX), open(0));
         let same = |a: &FrameStore, b: &FrameStore, k: usize| {
             let (a, b) = (a.get(&dataset, k).unwrap(), b.get(&dataset, k).unwrap());
@@ -362,8 +378,9 @@ mod tests {
     fn rough_outlines_are_moved_in_frames_kept_and_in_those_read_later() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 2, views: 3, ..Scene::default() });
-        let open =
-            |budget| FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Stop::default()).unwrap();
+        let open = |budget| {
+            FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), budget, &Phases::default()).unwrap()
+        };
         let labels = |store: &FrameStore, k| store.get(&dataset, k).unwrap().labels.clone().unwrap();
         // Plain balls, and masks that are larger than these by two pixels.
         let mut grown_masks = Vec::new();
@@ -382,7 +399,7 @@ mod tests {
         }
         let mut exact = open(u64::MAX);
         let before = labels(&exact, 0);
-        assert!(!exact.put_edges_right(&dataset, &Stop::default()).unwrap());
+        assert!(!exact.put_edges_right(&dataset, &Phases::default()).unwrap());
         assert_eq!(labels(&exact, 0), before);
         grown_masks.into_iter().for_each(|(path, grown)| grown.save(path).unwrap());
         let (mut kept, mut read) = (open(u64::MAX), open(0));
@@ -391,7 +408,7 @@ mod tests {
         };
         let grown = off(&labels(&kept, 0));
         for store in [&mut kept, &mut read] {
-            assert!(store.put_edges_right(&dataset, &Stop::default()).unwrap());
+            assert!(store.put_edges_right(&dataset, &Phases::default()).unwrap());
             assert!(4 * off(&labels(store, 0)) < grown, "{} of {grown}", off(&labels(store, 0)));
         }
         assert_eq!(labels(&kept, 3), labels(&read, 3));
@@ -401,7 +418,7 @@ mod tests {
     fn no_more_frames_are_read_ahead_than_there_is_room_for() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 8, views: 3, ..Scene::default() });
-        let store = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Stop::default()).unwrap();
+        let store = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Phases::default()).unwrap();
         assert!(store.len() > ahead::MOST);
         for _ in 0..3 {
             store.expect(0..store.len());
@@ -413,7 +430,7 @@ mod tests {
     fn a_damaged_frame_read_ahead_is_named_when_it_is_needed() {
         let folder = tempfile::tempdir().unwrap();
         let dataset = capture(folder.path(), Scene { times: 2, views: 2, ..Scene::default() });
-        let store = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Stop::default()).unwrap();
+        let store = FrameStore::open(&dataset, [1.0; 3], BTreeMap::new(), 0, &Phases::default()).unwrap();
         let image = &dataset.frames[store.index(1)].image;
         std::fs::write(image, b"no image").unwrap();
         store.expect([0, 1]);

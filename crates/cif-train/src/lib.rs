@@ -5,7 +5,8 @@
 //! | [`config`] | every setting, and the presets |
 //! | [`plan`] | which effects a capture calls for |
 //! | [`trainer`] | how a run goes through its stages, stops and resumes |
-//! | [`events`] | what a run tells its observer |
+//! | [`events`] | what a run reports |
+//! | [`phase`], [`phases`] | where the time of a run goes, how far it is, and whether it may go on |
 //! | [`stop`] | how a run is asked to stop |
 //! | [`schedule`] | learning rates, spherical-harmonics degree |
 //! | [`losses`] | colour losses and their gradients |
@@ -68,6 +69,8 @@ mod measured;
 pub mod metrics;
 mod objects;
 mod optimiser;
+pub mod phase;
+pub mod phases;
 pub mod plan;
 mod poses;
 mod progress;
@@ -93,6 +96,8 @@ pub use error::TrainError;
 pub use events::{Control, Outcome, TrainEvent};
 pub use guard::{Fault, Hint};
 pub use heads::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, ValueHead};
+pub use phase::Phase;
+pub use phases::Phases;
 pub use plan::{EffectChoice, EffectPlan};
 pub use stage::Stage;
 pub use stop::{Start, Stop};

@@ -9,6 +9,7 @@ use crate::config::{HeadName, TrainConfig};
 use crate::curve::{Curve, Targets};
 use crate::exposure::Exposures;
 use crate::guard::Rollbacks;
+use crate::phase::Phase;
 use crate::stage::Stage;
 use crate::times::Work;
 
@@ -24,9 +25,9 @@ pub(crate) struct Progress {
     pub total_steps: u64,
     /// Steps done per finished or current stage.
     pub steps: BTreeMap<String, u64>,
-    /// Wall time per stage, seconds.
+    /// Wall time per phase, before this process, seconds.
     pub wall_s: BTreeMap<String, f64>,
-    /// Processor time per stage, all threads together, seconds.
+    /// Processor time per phase, all threads together, seconds.
     #[serde(default)]
     pub cpu_s: BTreeMap<String, f64>,
     /// Quality over the run, as measured so far.
@@ -184,17 +185,28 @@ impl Progress {
         self.psnr = Some(self.psnr.map_or(psnr, |mean| mean + PSNR_SHARE * (psnr - mean)));
     }
 
-    pub(crate) fn add_time(&mut self, stage: Stage, spent: Seconds) {
-        *self.wall_s.entry(stage.name().to_owned()).or_default() += spent.wall_s;
-        *self.cpu_s.entry(stage.name().to_owned()).or_default() += spent.cpu_s;
+    /// The same with the time of this process.
+    pub(crate) fn with_times(&self, times: &BTreeMap<Phase, Seconds>) -> Self {
+        let mut progress = self.clone();
+        for (phase, spent) in times {
+            *progress.wall_s.entry(phase.name().to_owned()).or_default() += spent.wall_s;
+            *progress.cpu_s.entry(phase.name().to_owned()).or_default() += spent.cpu_s;
+        }
+        progress
     }
 
-    pub(crate) fn total_cpu_s(&self) -> f64 {
-        self.cpu_s.values().sum()
+    /// Time of all phases.
+    pub(crate) fn total(&self) -> Seconds {
+        Seconds { wall_s: self.wall_s.values().sum(), cpu_s: self.cpu_s.values().sum() }
     }
 
-    pub(crate) fn total_wall_s(&self) -> f64 {
-        self.wall_s.values().sum()
+    /// Time of all phases but those that only look at what was reached.
+    pub(crate) fn of_training(&self) -> Seconds {
+        let measuring = [Phase::Measure, Phase::Evaluate].map(Phase::name);
+        let sum = |times: &BTreeMap<String, f64>| {
+            times.iter().filter(|(name, _)| !measuring.contains(&name.as_str())).map(|(_, s)| s).sum()
+        };
+        Seconds { wall_s: sum(&self.wall_s), cpu_s: sum(&self.cpu_s) }
     }
 }
 

@@ -16,9 +16,9 @@ use crate::frames::{FrameStore, TrainFrame};
 use crate::guidance::{Guidance, Pulls};
 use crate::heads::{self, Head, HeadTensors, Pass, Target, ValueHead};
 use crate::optimiser::Optimiser;
+use crate::phases::Phases;
 use crate::poses::PoseMoments;
 use crate::progress::Progress;
-use crate::stop::Stop;
 use crate::times::StepTimes;
 
 /// Capture, settings, and what steps change.
@@ -26,8 +26,8 @@ pub(crate) struct State {
     pub dataset: Dataset,
     pub config: TrainConfig,
     pub frames: FrameStore,
-    /// Asked for between two events, and inside long work.
-    pub stop: Stop,
+    /// Asked for a stop between two events, and inside long work.
+    pub phases: Phases,
     pub field: Field,
     pub optimiser: Optimiser,
     /// Moments of the poses of groups.
@@ -120,6 +120,7 @@ impl State {
     /// The frame of a view of [`Self::views_of_identities`]; those behind it are read ahead.
     pub(crate) fn frame_of_identities(&self, view: usize) -> Result<Arc<TrainFrame>, TrainError> {
         let frame = self.frames.get(&self.dataset, view)?;
+        self.phases.advance();
         self.frames.expect(self.views_of_identities().filter(|later| *later > view));
         Ok(frame)
     }

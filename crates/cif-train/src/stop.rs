@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use cif_dataset::Dataset;
 
-use crate::error::TrainError;
+use crate::phases::Phases;
 
 /// A question that a run asks again and again: shall it stop? Asked between steps, and between views and the like
 /// wherever the work between two steps takes longer than a step.
@@ -23,24 +23,19 @@ impl Stop {
     pub fn requested(&self) -> bool {
         self.0.as_ref().is_some_and(|requested| requested())
     }
-
-    /// [`TrainError::Stopped`] once a stop is requested.
-    pub(crate) fn check(&self) -> Result<(), TrainError> {
-        if self.requested() { Err(TrainError::Stopped) } else { Ok(()) }
-    }
 }
 
-/// A capture to train on, and what may stop the run, also while it is still being prepared. A capture alone is
-/// enough where nothing may.
+/// A capture to train on, and the phases of the run, which may be watched and stopped from its preparation on. A capture
+/// alone is enough where nobody does.
 pub struct Start {
     /// Capture.
     pub dataset: Dataset,
-    /// Request to stop.
-    pub stop: Stop,
+    /// Phases, of which the caller may have been through some.
+    pub phases: Phases,
 }
 
 impl From<Dataset> for Start {
     fn from(dataset: Dataset) -> Self {
-        Self { dataset, stop: Stop::default() }
+        Self { dataset, phases: Phases::default() }
     }
 }

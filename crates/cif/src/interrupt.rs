@@ -1,7 +1,8 @@
 //! Requests to stop: Ctrl-C, SIGTERM and SIGHUP where the process is the command's own, else whatever the process
 //! asks through a [`Session`].
 //!
-//! Until a command has something to save, signals end the process, and remove what it has not finished writing.
+//! Until a command has something to save, signals end the process with a word, and remove what it has not finished
+//! writing.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, OnceLock, PoisonError};
@@ -24,6 +25,7 @@ fn end_cleanly() {
     if let Ok(mut signals) = signal_hook::iterator::Signals::new(heeded) {
         std::thread::spawn(move || {
             if signals.forever().next().is_some() {
+                eprintln!("\n{}", last_words());
                 end();
             }
         });
@@ -41,6 +43,9 @@ fn ignored_signals() -> u64 {
     let mask = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     mask.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok()).unwrap_or(0)
 }
+
+/// Message of a process that a signal ends.
+static LAST_WORDS: Mutex<&str> = Mutex::new("interrupted");
 
 static OWNED: AtomicBool = AtomicBool::new(false);
 static SAVES: AtomicBool = AtomicBool::new(false);
@@ -88,6 +93,15 @@ pub(crate) fn own_process() {
     end_cleanly();
 }
 
+/// Sets the message with which a signal ends the process before the command has something to save.
+pub fn set_last_words(message: &'static str) {
+    *LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner) = message;
+}
+
+fn last_words() -> &'static str {
+    *LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// From here on a signal asks the command to stop; the process ends 1.5 seconds later at the latest.
 pub fn watch() {
     // Elsewhere signals belong to others.
@@ -103,7 +117,7 @@ pub fn watch() {
                 eprintln!("\nstopping and saving; press Ctrl-C again to quit without saving");
             } else {
                 std::thread::sleep(GRACE);
-                eprintln!("interrupted");
+                eprintln!("{}", last_words());
                 end();
             }
         })

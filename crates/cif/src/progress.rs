@@ -1,17 +1,27 @@
 //! Progress of a training run: a bar on terminals, plain lines elsewhere, JSON lines in a log.
 
+use std::collections::BTreeMap;
 use std::fs::{File, OpenOptions};
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use cif_train::TrainEvent;
+use cif_train::{Phase, TrainEvent};
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
 use crate::error::Error;
 
 /// Pause between two plain lines of one stage.
 const LINE_EVERY: Duration = Duration::from_secs(10);
+
+/// Pause between two drawings of the bar, whose clock goes on while nothing else changes.
+const TICK: Duration = Duration::from_millis(500);
+
+/// Share of the time of a run below which the times of phases are summed up.
+const SHORT: f64 = 0.005;
+
+/// Time that a phase goes on before it is worth a line or the bar.
+const WORTH_SHOWING_S: f64 = 2.0;
 
 /// Shows and logs the events of a run.
 pub struct Progress {
@@ -20,45 +30,87 @@ pub struct Progress {
     last_line: Option<Instant>,
     miou: Option<f64>,
     start: Instant,
-    log: Option<(PathBuf, File)>,
+    log: Log,
     log_failure: Option<Error>,
+    /// Phases under way, the innermost last, with what the bar showed of each.
+    phases: Vec<(Phase, Shown)>,
+    /// What was trained, once it is.
+    trained: Option<String>,
+}
+
+/// State of the bar.
+#[derive(Clone, Debug, Default)]
+struct Shown {
+    prefix: &'static str,
+    done: u64,
+    total: u64,
+    message: String,
+}
+
+/// Where events are logged.
+enum Log {
+    /// It is not known yet; lines so far.
+    Undecided(Vec<String>),
+    File(PathBuf, File),
+    Nowhere,
 }
 
 impl Progress {
-    /// Draws on stderr unless `quiet`, and logs to `log`, behind what is there when `append` is set.
+    /// Draws on stderr unless `quiet`.
+    #[must_use]
+    pub fn new(quiet: bool) -> Self {
+        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
+            let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
+            let style =
+                ProgressStyle::with_template("{prefix:>9} [{bar:30}] {pos}/{len}  {elapsed} {wide_msg}");
+            bar.set_style(style.expect("the template is valid").progress_chars("=> "));
+            bar.enable_steady_tick(TICK);
+            bar
+        });
+        Self {
+            bar,
+            quiet,
+            last_line: None,
+            miou: None,
+            start: Instant::now(),
+            log: Log::Undecided(Vec::new()),
+            log_failure: None,
+            phases: Vec::new(),
+            trained: None,
+        }
+    }
+
+    /// Logs to a file, behind what is there when `append` is set, or nowhere; events from before are logged too.
     ///
     /// # Errors
     /// When the log cannot be opened.
-    pub fn new(quiet: bool, log: Option<&Path>, append: bool) -> Result<Self, Error> {
-        let log = log
-            .map(|path| {
-                let file =
-                    OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path);
-                file.map(|file| (path.to_owned(), file)).map_err(Error::io("open the log", path))
-            })
-            .transpose()?;
-        let bar = (!quiet && std::io::stderr().is_terminal()).then(|| {
-            let bar = ProgressBar::with_draw_target(None, ProgressDrawTarget::stderr());
-            let style = ProgressStyle::with_template("{prefix:>8} [{bar:30}] {pos}/{len} {wide_msg}");
-            bar.set_style(style.expect("the template is valid").progress_chars("=> "));
-            bar
-        });
-        Ok(Self { bar, quiet, last_line: None, miou: None, start: Instant::now(), log, log_failure: None })
+    pub fn log_to(&mut self, log: Option<&Path>, append: bool) -> Result<(), Error> {
+        let earlier = std::mem::replace(&mut self.log, Log::Nowhere);
+        let Some(path) = log else { return Ok(()) };
+        let file = OpenOptions::new().create(true).write(true).append(append).truncate(!append).open(path);
+        self.log = Log::File(path.to_owned(), file.map_err(Error::io("open the log", path))?);
+        if let Log::Undecided(lines) = earlier {
+            lines.into_iter().for_each(|line| self.log_line(line));
+        }
+        Ok(())
     }
 
     /// Takes one event.
     pub fn event(&mut self, event: &TrainEvent) {
         self.write_log(event);
         match event {
+            TrainEvent::PhaseStarted { phase, total } => self.phase_started(*phase, *total),
+            TrainEvent::PhaseProgress { phase, done, total, steps, elapsed_s, eta_s } => {
+                if *elapsed_s >= WORTH_SHOWING_S || self.phases.len() == 1 {
+                    self.phase_progress(*phase, [*done, *total, *steps], *elapsed_s, *eta_s);
+                }
+            }
+            TrainEvent::PhaseEnded { phase, done, wall_s, .. } => self.phase_ended(*phase, *done, *wall_s),
             TrainEvent::StageStarted { stage, iteration, iterations, gaussians } => {
                 self.last_line = None;
-                if let Some(bar) = &self.bar {
-                    bar.set_prefix(stage.name());
-                    bar.set_length(u64::from(*iterations));
-                    bar.set_position(u64::from(*iteration));
-                    bar.set_message("");
-                }
-                // Identity estimation has no steps and tells its result itself.
+                let (done, total) = (u64::from(*iteration), u64::from(*iterations));
+                self.show(Shown { prefix: stage.name(), done, total, message: String::new() });
+                // Identity estimation has no steps and reports its result itself.
                 if *iterations > 0 {
                     self.plain(&format!(
                         "{stage}: {iterations} steps from step {iteration}, {gaussians} Gaussians"
@@ -77,19 +129,16 @@ impl Progress {
                 ..
             } => {
                 let miou = self.miou.map_or(String::new(), |miou| format!("  mIoU {miou:.1}"));
-                let text = format!(
+                let message = format!(
                     "{iterations_per_second:.1} it/s  ETA {}  loss {loss:.4}  {gaussians} Gaussians  PSNR {psnr:.2}{miou}",
                     duration(*eta_s)
                 );
-                if let Some(bar) = &self.bar {
-                    bar.set_position(u64::from(*iteration));
-                    bar.set_message(text);
-                } else if self.last_line.is_none_or(|last| last.elapsed() >= LINE_EVERY)
-                    || iteration == iterations
-                {
+                if self.is_line_due() || iteration == iterations {
                     self.last_line = Some(Instant::now());
-                    self.plain(&format!("{stage} {iteration}/{iterations}  {text}"));
+                    self.plain(&format!("{stage} {iteration}/{iterations}  {message}"));
                 }
+                let (done, total) = (u64::from(*iteration), u64::from(*iterations));
+                self.show(Shown { prefix: stage.name(), done, total, message });
             }
             TrainEvent::IdentityEstimated { frames, instances, unseen, empty_instances, .. } => {
                 self.line(&format!("identities of {instances} instances from {frames} frames; {unseen} Gaussians were never seen on a labelled pixel"));
@@ -112,10 +161,8 @@ impl Progress {
             }
             TrainEvent::Measured { point, .. } => self.miou = point.miou.or(self.miou),
             TrainEvent::Warning { message } => self.line(&format!("warning: {message}")),
-            TrainEvent::Finished {
-                wall_s, iterations, gaussians, psnr, peak_rss_mb, rolled_back, ..
-            } => {
-                self.clear();
+            TrainEvent::Note { message } => self.line(&format!("note: {message}")),
+            TrainEvent::Finished { iterations, gaussians, psnr, peak_rss_mb, rolled_back, .. } => {
                 let memory = peak_rss_mb.map_or(String::new(), |mb| format!(", peak memory {mb:.0} MB"));
                 if *rolled_back > 0 {
                     self.line(&format!(
@@ -123,10 +170,8 @@ impl Progress {
                          back; the scene's record names the last"
                     ));
                 }
-                self.plain_or_bar(&format!(
-                    "trained {iterations} steps in {}: {gaussians} Gaussians, PSNR of training views {psnr:.2}{memory}",
-                    duration(*wall_s)
-                ));
+                self.trained =
+                    Some(format!("{gaussians} Gaussians, PSNR of training views {psnr:.2}{memory}"));
             }
             TrainEvent::Densified { .. }
             | TrainEvent::Resampled { .. }
@@ -136,18 +181,86 @@ impl Progress {
         }
     }
 
-    /// Writes a line without tearing the bar.
-    pub fn line(&self, text: &str) {
-        self.plain_or_bar(text);
+    fn phase_started(&mut self, phase: Phase, total: u64) {
+        let shown = Shown { prefix: phase.name(), done: 0, total, message: phase.describe().to_owned() };
+        // What interrupts a stage is mostly over at once.
+        if self.phases.is_empty() && !phase.has_steps() {
+            self.last_line = Some(Instant::now());
+            if let Some(bar) = &self.bar {
+                draw(bar, &shown);
+            } else if total == 0 && phase == Phase::Open {
+                self.plain(phase.describe());
+            }
+        }
+        self.phases.push((phase, shown));
     }
 
-    /// Removes the bar; the first failure to write the log, if there was one.
+    fn phase_progress(
+        &mut self,
+        phase: Phase,
+        [done, total, steps]: [u64; 3],
+        elapsed_s: f64,
+        eta_s: Option<f64>,
+    ) {
+        let steps = if steps > 0 {
+            format!("  {steps} steps, {:.0}/s", steps as f64 / elapsed_s.max(1e-9))
+        } else {
+            String::new()
+        };
+        let eta =
+            eta_s.filter(|_| total > 0).map_or(String::new(), |eta_s| format!("  ETA {}", duration(eta_s)));
+        let message = format!("{}{steps}{eta}", phase.describe());
+        if elapsed_s >= WORTH_SHOWING_S && self.is_line_due() {
+            self.last_line = Some(Instant::now());
+            let count = if total > 0 { format!(" {done}/{total} {}", phase.unit()) } else { String::new() };
+            self.plain(&format!("{phase}{count}  {message}"));
+        }
+        self.show(Shown { prefix: phase.name(), done, total, message });
+    }
+
+    fn phase_ended(&mut self, phase: Phase, done: u64, wall_s: f64) {
+        self.phases.pop();
+        if let (Some(bar), Some((_, outer))) = (&self.bar, self.phases.last()) {
+            draw(bar, outer);
+        }
+        if wall_s >= LINE_EVERY.as_secs_f64() && !phase.has_steps() {
+            let count = if done > 0 { format!(" {done} {}", phase.unit()) } else { String::new() };
+            self.plain(&format!("{phase}:{count} in {}", duration(wall_s)));
+        }
+    }
+
+    /// Shows the progress of the innermost phase.
+    fn show(&mut self, shown: Shown) {
+        if let Some(bar) = &self.bar {
+            draw(bar, &shown);
+        }
+        if let Some((_, kept)) = self.phases.last_mut() {
+            *kept = shown;
+        }
+    }
+
+    fn is_line_due(&self) -> bool {
+        self.last_line.is_none_or(|last| last.elapsed() >= LINE_EVERY)
+    }
+
+    /// Removes the bar, and says what was trained in which time, phase by phase, where it was; the first failure to write
+    /// the log, if there was one.
     ///
     /// # Errors
     /// When an event could not be logged.
-    pub fn finish(&mut self) -> Result<(), Error> {
+    pub fn finish(&mut self, steps: u64, times: &BTreeMap<String, f64>) -> Result<(), Error> {
         self.clear();
+        if let Some(trained) = self.trained.take() {
+            let total: f64 = times.values().sum();
+            self.line(&format!("trained {steps} steps in {}: {trained}", duration(total)));
+            self.line(&format!("time: {}", phase_times(times)));
+        }
         self.log_failure.take().map_or(Ok(()), Err)
+    }
+
+    /// Writes a line without tearing the bar.
+    pub fn line(&self, text: &str) {
+        self.plain_or_bar(text);
     }
 
     fn clear(&self) {
@@ -172,15 +285,53 @@ impl Progress {
 
     /// One JSON object per line: the event with `time_s` since the start of this run.
     fn write_log(&mut self, event: &TrainEvent) {
-        let Some((path, file)) = &mut self.log else { return };
+        if matches!(self.log, Log::Nowhere) {
+            return;
+        }
         let mut value = serde_json::to_value(event).expect("events are plain data");
         value["time_s"] = serde_json::json!((self.start.elapsed().as_secs_f64() * 1e3).round() / 1e3);
-        if let Err(error) = writeln!(file, "{value}") {
-            // Reported once, at the end: a full disk must not end the training.
-            self.log_failure = Some(Error::io("write the log", path)(error));
-            self.log = None;
+        self.log_line(value.to_string());
+    }
+
+    fn log_line(&mut self, line: String) {
+        match &mut self.log {
+            Log::Undecided(lines) => lines.push(line),
+            Log::File(path, file) => {
+                if let Err(error) = writeln!(file, "{line}") {
+                    // Reported once, at the end: a full disk must not end the training.
+                    self.log_failure = Some(Error::io("write the log", path)(error));
+                    self.log = Log::Nowhere;
+                }
+            }
+            Log::Nowhere => {}
         }
     }
+}
+
+fn draw(bar: &ProgressBar, shown: &Shown) {
+    bar.set_prefix(shown.prefix);
+    bar.set_length(shown.total);
+    bar.set_position(shown.done);
+    bar.set_message(shown.message.clone());
+}
+
+/// Times of phases in words, in the order of a run, without those that are too short to matter.
+#[must_use]
+pub fn phase_times(times: &BTreeMap<String, f64>) -> String {
+    let total: f64 = times.values().sum();
+    let mut known: Vec<(Option<Phase>, &str, f64)> = Vec::new();
+    for (name, seconds) in times {
+        let phase = serde_json::from_value(serde_json::Value::String(name.clone())).ok();
+        known.push((phase, name, *seconds));
+    }
+    known.sort_by_key(|(phase, ..)| *phase);
+    let (long, short): (Vec<_>, Vec<_>) = known.into_iter().partition(|(.., s)| *s >= SHORT * total);
+    let mut words: Vec<String> = long.iter().map(|(_, name, s)| format!("{name} {}", duration(*s))).collect();
+    let rest: f64 = short.iter().map(|(.., seconds)| seconds).sum();
+    if rest >= 0.5 {
+        words.push(format!("others {}", duration(rest)));
+    }
+    words.join(", ")
 }
 
 /// Progress of work on frames, whose number is known: a bar on terminals, a line every ten seconds elsewhere.
@@ -270,13 +421,23 @@ mod tests {
     }
 
     #[test]
+    fn times_of_phases_are_told_in_their_order_and_add_up() {
+        let times = [("fine", 120.0), ("objects", 61.0), ("save", 0.4), ("open", 0.3), ("later", 3.0)];
+        let times = times.into_iter().map(|(name, s)| (name.to_owned(), s)).collect();
+        // Phases of other versions are kept by their names.
+        assert_eq!(phase_times(&times), "later 3 s, objects 1 min 01 s, fine 2 min 00 s, others 1 s");
+    }
+
+    #[test]
     fn logs_are_json_lines_and_can_be_appended_to() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("run.jsonl");
         for append in [false, true] {
-            let mut progress = Progress::new(true, Some(&path), append).unwrap();
+            let mut progress = Progress::new(true);
+            // Events come before it is known whether the file may be written.
             progress.event(&TrainEvent::Warning { message: "one \"two\"".into() });
-            progress.finish().unwrap();
+            progress.log_to(Some(&path), append).unwrap();
+            progress.finish(0, &BTreeMap::new()).unwrap();
         }
         let text = std::fs::read_to_string(&path).unwrap();
         assert_eq!(text.lines().count(), 2);

@@ -1,12 +1,13 @@
 //! A training run with the file that it saves into.
 
-use cif_train::{Control, Outcome, TrainError, TrainEvent, Trainer};
+use cif_train::{Control, Outcome, Phase, TrainError, TrainEvent, Trainer};
 
 use crate::destination::{Destination, Unsaved};
 use crate::error::Error;
 
 /// Runs a trainer to its end or to a request to stop, and saves into `destination`, where there is one, whenever the
-/// run asks for it and in the end. A run that was stopped, or that failed on the way, is saved with its state.
+/// run asks for it and in the end. A run that was stopped, or that failed on the way, is saved with its state, unless it
+/// was stopped before it had done anything: what is there, or is not, then stays as it is.
 ///
 /// # Errors
 /// When training fails or a state cannot be saved.
@@ -21,7 +22,10 @@ pub fn run(
         if matches!(event, TrainEvent::CheckpointDue { .. })
             && let Some(destination) = destination.as_deref_mut()
         {
-            match destination.save(&view.checkpoint(true), view.config()) {
+            let phase = view.phases().enter(Phase::Save, 0);
+            let saved = destination.save(&view.checkpoint(true), view.config());
+            drop(phase);
+            match saved {
                 Ok(()) => {}
                 Err(Unsaved::Taken(error)) => {
                     taken = Some(error);
@@ -39,7 +43,12 @@ pub fn run(
         return Err(error);
     }
     let Some(destination) = destination else { return outcome.map_err(Error::plain) };
+    let phases = trainer.phases().clone();
+    let _run = phases.enter(Phase::Save, 0);
     let outcome = outcome.map_err(|error| stopped_by(&error, trainer, destination))?;
+    if outcome == Outcome::Interrupted && !trainer.has_begun() {
+        return Ok(outcome);
+    }
     destination.save_or_rescue(&trainer.checkpoint(outcome == Outcome::Interrupted), trainer.config())?;
     Ok(outcome)
 }

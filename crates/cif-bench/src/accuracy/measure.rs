@@ -64,12 +64,12 @@ pub fn train(
     };
     let begin = |start: Start| Trainer::new(start, training.config.clone());
     let Some(trainer) = run.train(&begin, stop, tell)? else { return Ok(None) };
-    let curve = trainer.curve().clone();
+    let (curve, spent) = (trainer.curve().clone(), trainer.time_of_training());
     let field = trainer.into_field();
     let run = field.record.run.clone().unwrap_or_default();
     let record = Record {
-        cpu_s: run.cpu_s.unwrap_or(0.0),
-        wall_s: run.wall_s.unwrap_or(0.0),
+        cpu_s: spent.cpu_s,
+        wall_s: spent.wall_s,
         gaussians: Some(field.len()),
         bytes: Some(parameter_bytes(&field, 4, 4, 4)),
         peak_rss_mb: run.peak_rss_mb,

@@ -387,7 +387,7 @@ fn page(
     page::close(
         &mut page,
         "PSNR and SSIM are means over the held-out frames; mIoU is over pairs of instance and frame. Processor time counts \
-         all threads together and no measuring. Filled dots mark the fronts: no other trained rung is both cheaper and \
+         all threads together and everything from the decoding of frames on, fits of objects too, but no measuring. Filled dots mark the fronts: no other trained rung is both cheaper and \
          better.",
     );
     Ok(page)

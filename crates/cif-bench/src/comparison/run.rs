@@ -144,7 +144,7 @@ impl Subject<'_> {
         };
         // Rows are estimated for the method alone; other heads have no use for them.
         let is_cif = config.head.name == HeadName::Cif;
-        let identities = if is_cif { of_stage("cpu_s_by_stage", Stage::Identity) } else { 0.0 };
+        let identities = if is_cif { of_stage("cpu_s_by_phase", Stage::Identity) } else { 0.0 };
         Ok(Some(Record {
             row: Row {
                 capture: self.capture.to_owned(),
@@ -156,7 +156,7 @@ impl Subject<'_> {
                 psnr: scores.psnr,
                 ssim: scores.ssim,
                 gaussians: field.len(),
-                seconds: identities + of_stage("cpu_s_by_stage", Stage::Instance),
+                seconds: identities + of_stage("cpu_s_by_phase", Stage::Instance),
             },
             steps: of_stage("iterations_by_stage", Stage::Instance) as u64,
             pictures,

@@ -19,8 +19,13 @@ const NEWEST: f64 = 0.5;
 /// Share of the budget that is left for writing the scene, and its least length in seconds.
 const SAVING: (f64, f64) = (0.005, 0.2);
 
+/// Part of the time that is left, up to which objects that travel are fitted: poses are worth more to them than steps.
+/// Part of that up to which other objects are tried for motion, and for parts.
+pub(crate) const FITS: f64 = 0.35;
+pub(crate) const TRIALS: [f64; 2] = [0.12, 0.12];
+
 /// Passes of identity estimation over the training frames, in steps of the fine stage per frame.
-const IDENTITY_STEPS_PER_FRAME: f64 = 0.35;
+pub(crate) const IDENTITY_STEPS_PER_FRAME: f64 = 0.35;
 
 /// A stage to come with its weight: expected time relative to the others.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,13 +80,25 @@ impl Pacer {
         self.budget.seconds - (SAVING.0 * self.budget.seconds).max(SAVING.1)
     }
 
+    /// Seconds of the budget that are left for steps and fits.
+    #[must_use]
+    pub fn left(&self, now: Seconds) -> f64 {
+        (self.end() - self.budget.used(now)).max(0.0)
+    }
+
     /// Begins the first of `stages`, which are all that are left and have steps; `identity_frames` are those
-    /// that identity estimation still has to pass over.
-    pub fn enter(&mut self, stages: &[StageShare], iteration: u32, identity_frames: usize, now: Seconds) {
+    /// that identity estimation still has to pass over, `has_fits` is true where objects are fitted after the stage.
+    pub fn enter(
+        &mut self,
+        stages: &[StageShare],
+        iteration: u32,
+        (identity_frames, has_fits): (usize, bool),
+        now: Seconds,
+    ) {
         let used = self.budget.used(now);
         let whole: f64 = stages.iter().map(|share| share.weight).sum();
         let mine = stages.first().map_or(0.0, |share| share.weight);
-        let left = (self.end() - used).max(0.0);
+        let left = self.left(now) * if has_fits { 1.0 - FITS } else { 1.0 };
         // A coarse step costs less than a fine one, so that this is too little rather than too much.
         let identity = self.cost.map_or(0.0, |cost| cost * IDENTITY_STEPS_PER_FRAME) * identity_frames as f64;
         let left = (left - identity.min(0.2 * left)).max(0.0);
@@ -145,7 +162,7 @@ mod tests {
                 now += identity;
             }
             let frames = if share.stage == Stage::Instance { 0 } else { 100 };
-            pacer.enter(&shares[k..], 0, frames, at(now));
+            pacer.enter(&shares[k..], 0, (frames, false), at(now));
             let (mut iteration, mut steps) = (0, 1_000);
             while iteration < steps {
                 iteration += 1;

@@ -324,7 +324,7 @@ impl Engine for Processor {
         each: &mut dyn FnMut(RenderedImage),
     ) -> Result<(), TrainError> {
         for index in views.frames {
-            state.stop.check()?;
+            state.phases.check()?;
             let frame = &state.dataset.frames[*index];
             let field = trial.unwrap_or(&state.field);
             let by_values = state.started_head().filter(|_| views.channels.instances);
@@ -349,7 +349,7 @@ impl Engine for Processor {
         let mut counts = IdentityCounts::zeros(state.field.gaussians.len(), state.field.instances.len());
         let mut frames = 0;
         for view in state.views_of_identities() {
-            state.stop.check()?;
+            state.phases.check()?;
             let data = state.frame_of_identities(view)?;
             let Some(labels) = data.labels.as_ref().filter(|_| data.labelled > 0) else { continue };
             let frame = &state.dataset.frames[state.frames.index(view)];

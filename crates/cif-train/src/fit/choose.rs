@@ -1,7 +1,7 @@
 //! Which settings fit a budget: steps, Gaussians and, where nothing else helps, resolution.
 
 use super::Calibration;
-use crate::budget::{COARSE, INSTANCE};
+use crate::budget::{COARSE, FITS, INSTANCE};
 use crate::config::TrainConfig;
 
 /// Mean Gaussians of the fine stage as a share of the most.
@@ -69,6 +69,15 @@ fn expected_s(config: &TrainConfig, calibration: &Calibration, work: Workload, r
     let coarse = f64::from(config.stages.coarse) * few * if work.is_dynamic { COARSE } else { 1.0 };
     let instance = f64::from(config.stages.instance) * INSTANCE * calibration.step_s(most, reduction);
     coarse + fine + if work.has_instances { instance } else { 0.0 }
+}
+
+/// Part of a budget that fits of objects may take before and between the stages; 0 where there are none.
+#[must_use]
+pub fn share_of_fits(config: &TrainConfig, work: Workload) -> f64 {
+    let motion = &config.motion;
+    let are_fitted =
+        motion.rigid && motion.guidance > 0.0 && config.effects.motion && config.effects.instances;
+    if are_fitted && work.is_dynamic && work.has_instances { FITS } else { 0.0 }
 }
 
 /// Settings like `base` that take about `seconds`.

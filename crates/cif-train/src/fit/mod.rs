@@ -9,4 +9,4 @@ mod calibrate;
 mod choose;
 
 pub use calibrate::{Calibration, calibrate};
-pub use choose::{Change, Choice, Workload, choose, stretched};
+pub use choose::{Change, Choice, Workload, choose, share_of_fits, stretched};

@@ -29,7 +29,7 @@ impl TrainingViews<'_> {
         each: &mut dyn FnMut(&mut Renderer, usize, &PixelGrid<u16>),
     ) -> Result<(), TrainError> {
         for view in 0..self.state.frames.len() {
-            self.state.stop.check()?;
+            self.state.phases.check()?;
             let index = self.state.frames.index(view);
             if !wanted(&self.state.dataset.frames[index].camera_name) {
                 continue;

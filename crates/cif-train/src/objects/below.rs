@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::error::TrainError;
 use crate::frames::FrameStore;
-use crate::stop::Stop;
+use crate::phases::Phases;
 
 /// Frames that are looked at.
 const LOOKED: usize = 30;
@@ -25,11 +25,11 @@ pub(super) fn below(
     points: &[DVec3],
     dataset: &Dataset,
     frames: &FrameStore,
-    stop: &Stop,
+    phases: &Phases,
 ) -> Result<Vec<DVec3>, TrainError> {
     let looked: Vec<usize> = (0..frames.len()).step_by(frames.len().div_ceil(LOOKED).max(1)).collect();
     let seen = |k: &usize| {
-        stop.check()?;
+        phases.check()?;
         let frame = frames.get(dataset, *k)?;
         let camera = &dataset.frames[frames.index(*k)].camera;
         let Some(labels) = &frame.labels else { return Ok(Vec::new()) };

@@ -12,6 +12,7 @@ use super::outline::Outline;
 use super::plane::Plane;
 use super::shape::{Adam, Pose, Shape};
 use super::view::{ObjectView, Seen, is_one_camera};
+use crate::phases::Phases;
 
 /// Rates of turns, radians, and of translations, of the size.
 const POSE_RATE: f64 = 0.02;
@@ -82,7 +83,7 @@ pub(super) fn hull(
     poses: &BTreeMap<usize, Pose>,
     (size, bound): (f64, Option<&dyn Fn(DVec3) -> bool>),
     count: usize,
-    near: f32,
+    (near, phases): (f32, &Phases),
     rng: &mut Pcg64,
 ) -> Option<Shape> {
     /// Candidates, and the times that they are looked at.
@@ -131,7 +132,7 @@ pub(super) fn hull(
     taken.truncate(count);
     let places: Vec<[f32; 3]> = taken.iter().map(|k| found[*k].1).collect();
     let colors: Vec<[f32; 3]> = taken.iter().map(|k| found[*k].2).collect();
-    if places.len() < 8 { None } else { Shape::new(&places, &colors, size, near) }
+    if places.len() < 8 { None } else { Shape::new(&places, &colors, size, near, phases) }
 }
 
 impl<'a> Fit<'a> {
@@ -317,6 +318,9 @@ impl<'a> Fit<'a> {
     pub(super) fn steps(&mut self, views: &[usize], count: usize, rates: impl Fn(f64) -> (f64, f64, usize)) {
         let mut order = views.to_vec();
         for step in 0..if order.is_empty() { 0 } else { count } {
+            if self.shape.phases().is_over() {
+                break;
+            }
             let place = step % order.len();
             if place == 0 {
                 order.shuffle(&mut self.rng);

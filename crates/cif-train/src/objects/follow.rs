@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::fit::{Fit, fresh_moments, hull, log};
 use super::shape::Pose;
 use crate::error::TrainError;
-use crate::stop::Stop;
+use crate::phases::Phases;
 
 /// Steps of the shape at the first time, per level.
 const FIRST: usize = 120;
@@ -51,7 +51,7 @@ pub(super) fn follow(
     reference: usize,
     path: &BTreeMap<usize, DVec3>,
     views: &[usize],
-    stop: &Stop,
+    phases: &Phases,
 ) -> Result<(), TrainError> {
     let levels = fit.levels();
     let mut at: BTreeMap<usize, Vec<usize>> = BTreeMap::new();
@@ -76,7 +76,7 @@ pub(super) fn follow(
         }
     }
     for time in order {
-        stop.check()?;
+        phases.check()?;
         let views = &at[&time];
         let pose = found(fit, time, path, views, reference);
         fit.poses.insert(time, pose);
@@ -102,10 +102,8 @@ fn carve(fit: &mut Fit<'_>, at: &BTreeMap<usize, Vec<usize>>, steps: usize, pose
     let count = fit.shape.gaussians().len();
     let upright = fit.outline.upright(fit.plane.as_ref());
     let bound: Option<&dyn Fn(DVec3) -> bool> = if fit.outline.is_surrounded { None } else { Some(&upright) };
-    let Some(shape) = hull(fit.views, &fit.poses, (fit.outline.size(), bound), count, fit.near, &mut fit.rng)
-    else {
-        return;
-    };
+    let (bounded, drawn) = ((fit.outline.size(), bound), (fit.near, &fit.shape.phases().clone()));
+    let Some(shape) = hull(fit.views, &fit.poses, bounded, count, drawn, &mut fit.rng) else { return };
     fit.shape = shape;
     let known: Vec<usize> = fit.poses.keys().flat_map(|time| at[time].iter().copied()).collect();
     let level = fit.trial_level();

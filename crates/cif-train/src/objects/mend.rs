@@ -5,7 +5,7 @@ use super::fit::{Fit, log, onward};
 use super::shape::Pose;
 use super::view::median;
 use crate::error::TrainError;
-use crate::stop::Stop;
+use crate::phases::Phases;
 
 /// Turn per time, degrees, and shift, of the size, from which poses may jump, and how much more than the usual ones
 /// around them.
@@ -33,10 +33,10 @@ const TOLD: f64 = 0.2;
 ///
 /// # Errors
 /// [`TrainError::Stopped`] when the run is to stop.
-pub(super) fn mend(fit: &mut Fit<'_>, stop: &Stop) -> Result<(), TrainError> {
+pub(super) fn mend(fit: &mut Fit<'_>, phases: &Phases) -> Result<(), TrainError> {
     let times: Vec<usize> = fit.poses.keys().copied().collect();
     for after in jumps(fit, &times) {
-        stop.check()?;
+        phases.check()?;
         let earlier: Vec<usize> = times[..after].iter().rev().copied().collect();
         march(fit, &earlier, &times[after..]);
         march(fit, &times[after..], &earlier);

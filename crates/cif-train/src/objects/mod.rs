@@ -45,6 +45,7 @@ mod ways;
 
 use cif_dataset::{Dataset, Split};
 use glam::DVec3;
+use serde::{Deserialize, Serialize};
 
 pub(crate) use self::order::Order;
 pub(crate) use self::parts::Jointed;
@@ -55,8 +56,8 @@ pub(crate) use self::trials::BENDS_NO_BETTER;
 use self::view::ObjectView;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
+use crate::phases::Phases;
 use crate::random::{Purpose, stream};
-use crate::stop::Stop;
 
 /// Distance from a plane within which a point is on it, of the extent of the cameras.
 const ON_PLANE: f64 = 0.005;
@@ -76,9 +77,9 @@ pub(crate) fn support_below(
     dataset: &Dataset,
     frames: &FrameStore,
     seed: u64,
-    stop: &Stop,
+    phases: &Phases,
 ) -> Result<Option<Plane>, TrainError> {
-    let below = below::below(&doubles(&dataset.points.positions), dataset, frames, stop)?;
+    let below = below::below(&doubles(&dataset.points.positions), dataset, frames, phases)?;
     let rng = stream(seed, Purpose::Objects, 0);
     Ok(plane::rough_support(&below, (&cameras(dataset), up(dataset)), rng))
 }
@@ -101,6 +102,7 @@ pub(crate) fn up(dataset: &Dataset) -> DVec3 {
 }
 
 /// Finding about one object.
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) enum Found {
     /// Its motion as a whole.
     Moves(Box<Fitted>),
@@ -113,7 +115,7 @@ pub(crate) enum Found {
 /// Fits one object (a label: dense index + 1); one that rests is fitted only where it is told to be rigid.
 ///
 /// # Errors
-/// When a frame cannot be read, or the run is to stop.
+/// When a frame cannot be read, or the run is to stop, or is out of time for this.
 pub(crate) fn fit(
     label: u16,
     dataset: &Dataset,
@@ -126,7 +128,9 @@ pub(crate) fn fit(
     if outlines.is_empty() {
         return Ok(if views.is_empty() { Found::Nothing } else { Found::Nowhere });
     }
-    let fitted = start::fit_object(&Object::by_outlines(label, &views, &outlines, is_told, surroundings))?;
+    let objects = Object::by_outlines(label, &views, &outlines, is_told, surroundings);
+    let fitted = start::fit_object(&objects)?;
+    surroundings.phases.check()?;
     Ok(fitted.map_or(Found::Nothing, |fitted| Found::Moves(Box::new(fitted))))
 }
 
@@ -134,7 +138,7 @@ pub(crate) fn fit(
 /// has none, or the masks do not tell enough.
 ///
 /// # Errors
-/// When a frame cannot be read, or the run is to stop.
+/// As of [`fit`].
 pub(crate) fn find_part(
     label: u16,
     dataset: &Dataset,
@@ -145,7 +149,9 @@ pub(crate) fn find_part(
     let outlines = outline::outlines(&views, surroundings.plane, surroundings.times);
     // It rests: as standing, which is the first of its outlines.
     let object = Object::by_outlines(label, &views, &outlines, false, surroundings).into_iter().next();
-    object.map_or(Ok(None), parts::find)
+    let found = object.map_or(Ok(None), parts::find)?;
+    surroundings.phases.check()?;
+    Ok(found)
 }
 
 /// The object in all training frames that show it, in the order of times.
@@ -158,7 +164,7 @@ fn views_of(
     let behind = surroundings.order.behind(label);
     let mut views = Vec::new();
     for k in 0..frames.len() {
-        surroundings.stop.check()?;
+        surroundings.phases.check()?;
         let frame = &dataset.frames[frames.index(k)];
         let data = frames.get(dataset, k)?;
         views.extend(ObjectView::new((label, &behind), frame.time_index, &frame.camera, &data));

@@ -10,7 +10,7 @@ use cif_render::UNLABELLED;
 use super::view::median;
 use crate::error::TrainError;
 use crate::frames::FrameStore;
-use crate::stop::Stop;
+use crate::phases::Phases;
 
 /// Share of the outline that one label has where it surrounds an object, and that counts as touching it.
 const SURROUNDS: f64 = 0.9;
@@ -46,11 +46,11 @@ impl Order {
     ///
     /// # Errors
     /// When a frame cannot be read, or the run is to stop.
-    pub(crate) fn of(dataset: &Dataset, frames: &FrameStore, stop: &Stop) -> Result<Self, TrainError> {
+    pub(crate) fn of(dataset: &Dataset, frames: &FrameStore, phases: &Phases) -> Result<Self, TrainError> {
         let labels = dataset.instances.len() + 1;
         let mut found = Vec::new();
         for k in 0..frames.len() {
-            stop.check()?;
+            phases.check()?;
             if let Some(grid) = &frames.get(dataset, k)?.labels {
                 found.extend(masks(grid, labels));
             }

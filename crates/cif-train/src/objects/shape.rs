@@ -8,6 +8,7 @@ use cif_render::{Gradients, PoseGradient, RenderSettings};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::view::Crop;
+use crate::phases::Phases;
 
 /// Rates of centres (of the size), log-scales, quaternions, opacities and colours.
 const RATES: [f64; 5] = [0.01, 0.02, 0.01, 0.05, 0.02];
@@ -72,6 +73,7 @@ pub(super) struct Shape {
     renderer: Renderer,
     settings: RenderSettings,
     size: f64,
+    phases: Phases,
 }
 
 /// Gradients of a view, by the Gaussians (kept in the shape) and by the pose, in the world.
@@ -83,7 +85,13 @@ pub(super) struct Loss {
 
 impl Shape {
     /// Gaussians at places in the object's frame, with colours in [0, 1].
-    pub(super) fn new(places: &[[f32; 3]], colors: &[[f32; 3]], size: f64, near: f32) -> Option<Self> {
+    pub(super) fn new(
+        places: &[[f32; 3]],
+        colors: &[[f32; 3]],
+        size: f64,
+        near: f32,
+        phases: &Phases,
+    ) -> Option<Self> {
         let mut gaussians = Gaussians::from_points(places, colors).ok()?;
         let n = gaussians.len();
         // As many as 150 overlap at this size; more are smaller.
@@ -111,6 +119,7 @@ impl Shape {
             renderer: Renderer::new(SimdLevel::Auto),
             settings: RenderSettings { sh_degree: 0, near, deform: false, ..RenderSettings::default() },
             size,
+            phases: phases.clone(),
         })
     }
 
@@ -124,11 +133,17 @@ impl Shape {
             renderer: Renderer::new(SimdLevel::Auto),
             settings: self.settings,
             size: self.size,
+            phases: self.phases.clone(),
         }
     }
 
     pub(super) fn gaussians(&self) -> &Gaussians {
         &self.field.gaussians
+    }
+
+    /// Phases of the run that it is fitted in.
+    pub(super) fn phases(&self) -> &Phases {
+        &self.phases
     }
 
     /// The same Gaussians in groups, each with a pose in the object's frame or none.
@@ -178,7 +193,9 @@ impl Shape {
         self.field.gaussians.len()
     }
 
-    /// Loss of a crop in a pose, on a background; with gradients unless only the value is asked for.
+    /// Loss of a crop in a pose, on a background; with gradients unless only the value is asked for. This is where fits
+    /// spend their time: once the run is to end, nothing is rendered any more and the loss is 0, so that every fit comes
+    /// to its end at once, where [`Phases::check`] refuses what came out.
     pub(super) fn loss(
         &mut self,
         crop: &Crop,
@@ -187,6 +204,10 @@ impl Shape {
         weight: f32,
         differentiates: bool,
     ) -> Loss {
+        let is_over = if differentiates { self.phases.tick() } else { self.phases.is_over() };
+        if is_over {
+            return Loss { value: 0.0, pose: PoseGradient::default() };
+        }
         let rotation = DMat3::from_quat(pose.rotation);
         let world = crop.camera.camera_from_world;
         let camera = PinholeCamera {

@@ -8,6 +8,7 @@ use cif_field::tracks::RotationEvidence;
 use glam::{DQuat, DVec3};
 use rand_pcg::Pcg64;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
 use super::fit::{Fit, Turns, between, hull};
 use super::follow::follow;
@@ -21,8 +22,8 @@ use super::trials::{self, GAUSSIANS, STEPS};
 use super::view::{ObjectView, is_one_camera, median};
 use super::ways::{Way, rolled};
 use crate::error::TrainError;
+use crate::phases::Phases;
 use crate::random::{Purpose, stream};
-use crate::stop::Stop;
 
 /// Reliable times below which ways of moving cannot be told apart.
 const FEWEST_TIMES: usize = 8;
@@ -56,13 +57,14 @@ const LEAST_SHARE: f64 = 0.1;
 const ADDED: usize = 30;
 
 /// An object with its motion.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Fitted {
     /// World from object, by time.
     pub(crate) poses: BTreeMap<usize, (DQuat, DVec3)>,
     /// How far training may move each of these poses: 1 where its time shows nothing that the fit explains.
     pub(crate) shares: BTreeMap<usize, f64>,
     /// In the frame of the object.
+    #[serde(skip)]
     pub(crate) gaussians: Gaussians,
     /// Pose at the time that shows most of it.
     pub(crate) reference: (DQuat, DVec3),
@@ -94,7 +96,7 @@ pub(crate) struct Surroundings<'a> {
     pub(crate) seed: u64,
     /// Gaussians that an object leaves with.
     pub(crate) gaussians: usize,
-    pub(crate) stop: &'a Stop,
+    pub(crate) phases: &'a Phases,
 }
 
 /// An object to be fitted, with what is known of it.
@@ -153,12 +155,12 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
     else {
         return Ok(None);
     };
-    let (outline, stop) = (object.outline, object.surroundings.stop);
+    let (outline, phases) = (object.outline, object.surroundings.phases);
     grow(&mut fit, &path);
     if way == Way::Followed {
-        mend(&mut fit, stop)?;
+        mend(&mut fit, phases)?;
     }
-    stop.check()?;
+    phases.check()?;
     let all: Vec<usize> = object.views_at(&fit.poses).collect();
     let levels = fit.levels();
     fit.steps(&all, JOINT, |share| {
@@ -166,7 +168,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         let level = if share < 0.2 && levels.len() > 1 { 1 } else { 0 };
         (0.6 * decay, 1.5 * decay, level)
     });
-    stop.check()?;
+    phases.check()?;
     if let (RotationEvidence::Assumed, Way::Roll(factor), Some(plane)) =
         (rotation, way, object.surroundings.plane)
     {
@@ -182,7 +184,7 @@ pub(super) fn fit_object<'a>(objects: &[Object<'a>]) -> Result<Option<Fitted>, T
         fit.shape = shape;
         fit.steps(&all, STEPS[1], |share| (0.6 * 0.05_f64.powf(share), 0.1, 0));
     }
-    stop.check()?;
+    phases.check()?;
     if let Way::Roll(factor) = way {
         fit.rolls = Some(outline.height / factor);
     }
@@ -275,7 +277,8 @@ impl<'a> Object<'a> {
 
     /// Gaussians inside the masks in poses.
     pub(super) fn hull(&self, poses: &BTreeMap<usize, Pose>, count: usize, rng: &mut Pcg64) -> Option<Shape> {
-        hull(self.views, poses, (self.outline.size(), None), count, self.surroundings.near, rng)
+        let Surroundings { near, phases, .. } = self.surroundings;
+        hull(self.views, poses, (self.outline.size(), None), count, (near, phases), rng)
     }
 
     /// Of some times the one that shows most of it: the largest mask, whole if there is one.
@@ -305,8 +308,9 @@ impl<'a> Object<'a> {
             poses.extend(near.iter().take(TOGETHER).map(|time| (*time, at(path[time]))));
         }
         let upright = self.outline.upright(self.surroundings.plane);
-        let (size, near) = (self.outline.size(), self.surroundings.near);
-        let shape = hull(self.views, &poses, (size, Some(&upright)), FOLLOWED, near, &mut self.rng())?;
+        let Surroundings { near, phases, .. } = self.surroundings;
+        let bounded: (f64, Option<&dyn Fn(DVec3) -> bool>) = (self.outline.size(), Some(&upright));
+        let shape = hull(self.views, &poses, bounded, FOLLOWED, (near, phases), &mut self.rng())?;
         let mut fit = self.fit(poses, shape, self.rng());
         fit.air = self.may_be_off(path);
         Some((reference, fit))
@@ -338,7 +342,7 @@ impl<'a> Object<'a> {
         let first = self.first(&path, &times).filter(|_| path.len() >= FEWEST_SEEN);
         let Some((reference, mut fit)) = first else { return Ok(None) };
         let all: Vec<usize> = self.views_at(&path).collect();
-        follow(&mut fit, reference, &path, &all, self.surroundings.stop)?;
+        follow(&mut fit, reference, &path, &all, self.surroundings.phases)?;
         let error = fit.mean_loss(&all, 0);
         if !self.is_told && self.at_rest(&all).is_some_and(|rests| rests <= trials::REST_GAIN[1] * error) {
             return Ok(None);

@@ -17,8 +17,8 @@ use super::plane::Plane;
 use super::start::{Object, Surroundings};
 use super::view::{ObjectView, set_visible};
 use crate::frames::TrainFrame;
+use crate::phases::Phases;
 use crate::random::{Purpose, stream};
-use crate::stop::Stop;
 
 pub(super) const TIMES: usize = 30;
 pub(super) const FLOOR: Plane = Plane { normal: DVec3::Z, offset: 0.0 };
@@ -130,7 +130,7 @@ pub(super) fn with_objects<T>(
     act: impl FnOnce(&[Object<'_>]) -> T,
 ) -> T {
     let outlines = outline::outlines(views, plane, TIMES);
-    let stop = Stop::default();
+    let phases = Phases::default();
     let order = Order::among(&[], 2);
     let surroundings = Surroundings {
         plane,
@@ -140,7 +140,7 @@ pub(super) fn with_objects<T>(
         near: 0.05,
         seed: 0,
         gaussians: 150,
-        stop: &stop,
+        phases: &phases,
     };
     act(&Object::by_outlines(1, views, &outlines, false, surroundings))
 }

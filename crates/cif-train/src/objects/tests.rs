@@ -19,8 +19,8 @@ use super::testing::{
     views_in_masks, views_of_groups, with_objects,
 };
 use super::view::ObjectView;
+use crate::phases::Phases;
 use crate::random::{Purpose, stream};
-use crate::stop::Stop;
 
 fn fit(views: &[ObjectView]) -> Fitted {
     fit_on(Some(&FLOOR), views).unwrap()
@@ -417,7 +417,7 @@ fn mended(
         }
         let all: Vec<usize> = (0..views.len()).collect();
         fit.steps(&all, 600, |_| (1.0, 0.0, 0));
-        mend(&mut fit, &Stop::default()).unwrap();
+        mend(&mut fit, &Phases::default()).unwrap();
         fit.poses
     });
     (truth, poses)

@@ -264,7 +264,7 @@ impl<'a> Contest<'a> {
         let followed = |air: Option<Vec<usize>>| -> Result<Option<Fit<'a>>, TrainError> {
             let Some((reference, mut fit)) = object.first(along, known) else { return Ok(None) };
             fit.air = air.unwrap_or(fit.air);
-            follow(&mut fit, reference, along, &self.train, object.surroundings.stop)?;
+            follow(&mut fit, reference, along, &self.train, object.surroundings.phases)?;
             Ok(Some(fit))
         };
         let Some(mut on) = followed(None)? else { return Ok(None) };
@@ -368,7 +368,7 @@ impl<'a> Contest<'a> {
             });
             trial.losses[0] = trial.fit.mean_loss(&self.train, level);
         });
-        self.object.surroundings.stop.check()
+        self.object.surroundings.phases.check()
     }
 
     /// Moves the poses of times that were left out onto their views, the shape as it is: from one side to the next an

@@ -8,6 +8,8 @@ use rayon::prelude::*;
 
 use crate::config::MotionConfig;
 use crate::error::TrainError;
+use crate::phase::Phase;
+use crate::phases::Phases;
 use crate::sightings::Sightings;
 use crate::switches::{Seen, put_right, switches};
 use crate::tracks::{Observation, misfits, observe, travels};
@@ -71,7 +73,7 @@ pub(super) struct Evidence {
 }
 
 impl Evidence {
-    pub(super) fn of(dataset: &Dataset) -> Result<Self, TrainError> {
+    pub(super) fn of(dataset: &Dataset, phases: &Phases) -> Result<Self, TrainError> {
         let training: Vec<(usize, &Frame)> =
             dataset.frames.iter().enumerate().filter(|(_, frame)| frame.split == Split::Train).collect();
         let mut cameras: BTreeMap<&str, Vec<(usize, &Frame)>> = BTreeMap::new();
@@ -85,14 +87,13 @@ impl Evidence {
         };
         let fixed: Vec<&Vec<(usize, &Frame)>> = several().filter(is_fixed).collect();
         let moving_cameras = several().count() - fixed.len();
-        let change = if dataset.times.len() > 1 && moving_cameras == 0 && !fixed.is_empty() {
-            Some(largest_change(dataset, &fixed)?)
-        } else {
-            None
-        };
+        let is_compared = dataset.times.len() > 1 && moving_cameras == 0 && !fixed.is_empty();
         let masked: Vec<(usize, &Frame)> =
             training.iter().filter(|(_, frame)| frame.mask.is_some()).copied().collect();
-        let sightings = sightings(dataset, &masked)?;
+        let looked = if dataset.times.len() > 1 { masked.len().min(MASKS) } else { 0 };
+        let _phase = phases.enter(Phase::Plan, looked);
+        let change = if is_compared { Some(largest_change(dataset, &fixed, phases)?) } else { None };
+        let sightings = sightings(dataset, &masked, phases)?;
         Ok(Self {
             times: dataset.times.len(),
             frames: training.len(),
@@ -103,7 +104,7 @@ impl Evidence {
             instances: dataset.instances.len(),
             travelling: labels(dataset, |id| travels(&sightings.of(id))),
             appearing: labels(dataset, |id| sightings.appears(id) || sightings.vanishes(id)),
-            exposures: exposures(dataset, &cameras)?,
+            exposures: exposures(dataset, &cameras, phases)?,
             footprint_ratio: footprint_ratio(dataset, &training),
             view_angle: view_angle(dataset, &training),
             lenses: training.iter().filter(|(_, frame)| !frame.lens.is_identity()).count(),
@@ -121,11 +122,16 @@ fn spread<T: Copy>(all: &[T], count: usize) -> Vec<T> {
 }
 
 /// Largest share of pixels that differ between the first and a later image of a fixed camera.
-fn largest_change(dataset: &Dataset, cameras: &[&Vec<(usize, &Frame)>]) -> Result<f64, TrainError> {
+fn largest_change(
+    dataset: &Dataset,
+    cameras: &[&Vec<(usize, &Frame)>],
+    phases: &Phases,
+) -> Result<f64, TrainError> {
     let mut largest = 0.0_f64;
     for frames in spread(cameras, CAMERAS) {
         let mut first: Option<cif_geometry::PixelGrid<[u8; 3]>> = None;
         for (index, _) in spread(frames, IMAGES) {
+            phases.check()?;
             let image = dataset.load_image(index, [1.0; 3])?;
             let Some(first) = &first else {
                 first = Some(image);
@@ -144,7 +150,11 @@ fn largest_change(dataset: &Dataset, cameras: &[&Vec<(usize, &Frame)>]) -> Resul
 }
 
 /// Where masks show instances, in a sample of the frames; nothing for a single time.
-fn sightings<'a>(dataset: &Dataset, masked: &[(usize, &'a Frame)]) -> Result<Sightings<'a>, TrainError> {
+fn sightings<'a>(
+    dataset: &Dataset,
+    masked: &[(usize, &'a Frame)],
+    phases: &Phases,
+) -> Result<Sightings<'a>, TrainError> {
     let mut found = Sightings::default();
     if dataset.times.len() < 2 {
         return Ok(found);
@@ -152,9 +162,11 @@ fn sightings<'a>(dataset: &Dataset, masked: &[(usize, &'a Frame)]) -> Result<Sig
     let mut masked = masked.to_vec();
     masked.sort_by_key(|(_, frame)| frame.time_index);
     let load = |(index, frame): (usize, &'a Frame)| {
+        phases.check()?;
         let Some(mask) = dataset.load_mask(index)? else { return Ok(None) };
         let image = dataset.load_image(index, [1.0; 3])?;
         let seen = Seen::of(&image, Some(&mask), &frame.camera_name, frame.time_index);
+        phases.advance();
         Ok(Some((frame, mask, seen)))
     };
     let loaded: Vec<_> =
@@ -191,6 +203,7 @@ fn labels(dataset: &Dataset, wanted: impl Fn(u16) -> bool) -> Vec<String> {
 fn exposures(
     dataset: &Dataset,
     cameras: &BTreeMap<&str, Vec<(usize, &Frame)>>,
+    phases: &Phases,
 ) -> Result<Option<(usize, f64)>, TrainError> {
     if cameras.len() < 2 || matches!(dataset.points.source, PointSource::Random) {
         return Ok(None);
@@ -202,6 +215,7 @@ fn exposures(
     for frames in spread(&cameras.values().collect::<Vec<_>>(), EXPOSED_CAMERAS) {
         let mut ratios: [Vec<f64>; 3] = Default::default();
         for (index, frame) in spread(frames, EXPOSED_IMAGES) {
+            phases.check()?;
             let image = dataset.load_image(index, [1.0; 3])?;
             for (position, color) in &points {
                 let Some([x, y]) = frame.camera.pixel_of(DVec3::from(position.map(f64::from))) else {

@@ -21,6 +21,7 @@ pub use choice::{Basis, EffectChoice};
 use self::evidence::Evidence;
 use crate::config::{ObjectMotion, TrainConfig};
 use crate::error::TrainError;
+use crate::phases::Phases;
 use crate::trainer::automatic_time_nodes;
 
 /// Steps between tests for Gaussians that stand still.
@@ -189,7 +190,20 @@ impl EffectPlan {
     /// # Errors
     /// When a mask or an image that must be looked at cannot be read.
     pub fn new(dataset: &Dataset, config: &TrainConfig, choice: &EffectChoice) -> Result<Self, TrainError> {
-        let evidence = Evidence::of(dataset)?;
+        Self::watched(dataset, config, choice, &Phases::default())
+    }
+
+    /// The same in the phase [`Phase::Plan`](crate::Phase::Plan) of a run.
+    ///
+    /// # Errors
+    /// As [`Self::new`], and [`TrainError::Stopped`] when a stop is requested.
+    pub fn watched(
+        dataset: &Dataset,
+        config: &TrainConfig,
+        choice: &EffectChoice,
+        phases: &Phases,
+    ) -> Result<Self, TrainError> {
+        let evidence = Evidence::of(dataset, phases)?;
         Ok(Self { effects: decide(&evidence, config, choice) })
     }
 

@@ -122,12 +122,12 @@ mod on_gpu {
         /// As [`Self::use_gpu`], and when a step fails; the run then stays on the processor.
         pub fn use_faster(&mut self, gpu: &Gpu) -> Result<Probe, TrainError> {
             self.engine = Box::new(Processor::new(self.simd));
-            let (kept, loss, warnings) = (self.state.keep(), self.last_loss, self.warnings.len());
+            let (kept, loss, messages) = (self.state.keep(), self.last_loss, self.messages.len());
             let stage = self.state.progress.stage;
             let probed = self.probe(gpu);
             self.state.put_back(kept);
             self.last_loss = loss;
-            self.warnings.truncate(warnings);
+            self.messages.truncate(messages);
             self.arrived.clear();
             let probe = probed.map(|(processor_s, gpu_s)| Probe { processor_s, gpu_s, stage });
             match &probe {
@@ -159,17 +159,17 @@ mod on_gpu {
 
         /// Mean time of a step over [`SECONDS_EACH`], everything recorded being done.
         fn time_of_steps(&mut self) -> Result<f64, TrainError> {
-            let start = self.clock.now().wall_s;
+            let start = self.state.phases.now().wall_s;
             let mut steps = 0_u32;
             loop {
                 self.step(&mut Vec::new())?;
                 steps += 1;
-                if self.clock.now().wall_s - start >= SECONDS_EACH {
+                if self.state.phases.now().wall_s - start >= SECONDS_EACH {
                     break;
                 }
             }
             self.fetch()?;
-            Ok((self.clock.now().wall_s - start) / f64::from(steps))
+            Ok((self.state.phases.now().wall_s - start) / f64::from(steps))
         }
     }
 }

@@ -4,6 +4,7 @@ use cif_dataset::{Dataset, FrameData, Split};
 use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
+use crate::clock::Seconds;
 use crate::config::TrainConfig;
 use crate::curve::{CurveFrames, CurvePoint};
 use crate::engine::Views;
@@ -12,6 +13,7 @@ use crate::events::TrainEvent;
 use crate::metrics::evaluate::mask_ids;
 use crate::metrics::image::{psnr, ssim, unit_color};
 use crate::metrics::{FrameConfusion, instance_metrics};
+use crate::phase::Phase;
 use crate::stage::Stage;
 
 /// PSNR that equal images count as, dB.
@@ -91,6 +93,7 @@ impl Trainer {
             })
             .collect();
         let count = held_out.len().min(self.state.config.report.evaluate_frames as usize);
+        let _phase = self.state.phases.enter(Phase::Evaluate, count);
         let frames = (0..count)
             .map(|k| {
                 self.check_stop()?;
@@ -124,7 +127,8 @@ impl Trainer {
             return Ok(None);
         }
         self.fetch()?;
-        let start = self.clock.now();
+        let phase = self.state.phases.enter(Phase::Measure, count as usize);
+        let before = self.state.phases.spent(Phase::Measure);
         let frames = match self.measured_frames.decoded.take() {
             Some(frames) => frames,
             None => {
@@ -140,12 +144,13 @@ impl Trainer {
             }
         };
         let scores = self.score(&frames)?;
+        let Seconds { wall_s, cpu_s } = self.time_of_training();
         let point = CurvePoint {
             stage,
             iteration,
             step,
-            wall_s: self.state.progress.total_wall_s(),
-            cpu_s: self.state.progress.total_cpu_s(),
+            wall_s,
+            cpu_s,
             gaussians: self.state.field.gaussians.len(),
             psnr: scores.psnr,
             ssim: scores.ssim,
@@ -154,7 +159,8 @@ impl Trainer {
         let count = frames.len();
         self.measured_frames.decoded = Some(frames);
         self.state.progress.curve.points.push(point.clone());
-        self.state.progress.curve.measuring += self.clock.now() - start;
+        drop(phase);
+        self.state.progress.curve.measuring += self.state.phases.spent(Phase::Measure) - before;
         let measuring_s = self.state.progress.curve.measuring.wall_s;
         Ok(Some(TrainEvent::Measured { point, frames: count, measuring_s }))
     }
@@ -173,8 +179,10 @@ impl Trainer {
         let indices: Vec<usize> = frames.iter().map(|(index, _)| *index).collect();
         let views = Views { frames: &indices, settings: &settings, channels };
         let mut truths = frames.iter();
+        let phases = self.state.phases.clone();
         self.draw(None, views, &mut |rendered| {
             let Some((_, truth)) = truths.next() else { return };
+            phases.advance();
             let target = unit_color(&truth.image);
             psnrs.push(psnr(&rendered.color, &target).min(MAX_PSNR));
             ssims.push(ssim(&rendered.color, &target));

@@ -12,6 +12,7 @@ use super::{Trainer, initialize};
 use crate::config::TrainConfig;
 use crate::error::TrainError;
 use crate::exposure::trained_exposures;
+use crate::phase::Phase;
 use crate::progress::{Progress, Source};
 use crate::stage::Stage;
 use crate::stop::Start;
@@ -41,7 +42,8 @@ impl Trainer {
         scene: Checkpoint,
         name: &str,
     ) -> Result<Self, TrainError> {
-        let Start { mut dataset, stop } = start.into();
+        let Start { mut dataset, phases } = start.into();
+        let _run = phases.enter(Phase::Other, 0);
         config.validate()?;
         // Settings of a scene without instances say that there shall be none; here they are all there is to train.
         config.effects.instances = true;
@@ -79,8 +81,13 @@ impl Trainer {
         field.instances = initialize::instances(&dataset);
         field.gaussians.occupancy_logits.fill(logit(config.instance.occupancy));
         (field.background, field.sort_metric) = (config.background, config.sort_metric);
-        let mut trainer =
-            Self::assemble(Start { dataset, stop }, measured_frames, config, field, Some(progress))?;
+        let mut trainer = Self::assemble(
+            Start { dataset, phases: phases.clone() },
+            measured_frames,
+            config,
+            field,
+            Some(progress),
+        )?;
         if !trainer.stages.has_instances {
             return Err(TrainError::NoLabels { root: trainer.state.dataset.root });
         }

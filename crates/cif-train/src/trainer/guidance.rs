@@ -12,8 +12,10 @@ use rand::RngExt;
 use super::Trainer;
 use super::plan_step::plane_weights;
 use crate::error::TrainError;
+use crate::events::TrainEvent;
 use crate::guidance::Guide;
 use crate::optimiser::{Optimiser, StepRates};
+use crate::phase::Phase;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
 use crate::state::State;
@@ -27,15 +29,17 @@ const OPACITY: f32 = 0.4;
 const OUTSIDE: f64 = 0.15;
 
 impl Trainer {
-    fn is_guided(&self) -> bool {
+    pub(super) fn is_guided(&self) -> bool {
         // Without masks nobody knows what may be held in place.
         let is_asked = self.state.config.motion.guidance > 0.0 || self.state.config.motion.stillness > 0.0;
         is_asked && self.stages.is_dynamic && self.stages.has_instances
     }
 
-    /// Finds out which instances travel.
+    /// Finds out which instances travel, once in a run that is not beyond the coarse stage.
     pub(super) fn find_travelling(&mut self) -> Result<(), TrainError> {
-        self.check_told()?;
+        if self.is_searched || self.state.progress.stage != Stage::Coarse {
+            return Ok(());
+        }
         if self.state.config.motion.guidance <= 0.0 || !self.is_guided() {
             return Ok(());
         }
@@ -49,8 +53,10 @@ impl Trainer {
             .map(|k| self.state.field.instances[k].label.as_str())
             .collect();
         if !names.is_empty() {
-            self.warnings.push(format!("guided by their masks: {}", names.join(", ")));
+            let message = format!("guided by their masks: {}", names.join(", "));
+            self.messages.push(TrainEvent::note(message));
         }
+        self.is_searched = true;
         Ok(())
     }
 
@@ -58,10 +64,13 @@ impl Trainer {
     fn observe(&mut self, with_contacts: bool) -> Result<Vec<Vec<Observation>>, TrainError> {
         let k = self.state.field.instances.len();
         let mut observations = vec![Vec::new(); k];
+        let phases = self.state.phases.clone();
+        let _phase = phases.enter(Phase::Paths, self.state.frames.len());
         let mut renderer = Renderer::new(self.simd);
         let scene = with_contacts.then(|| self.without_outliers()).flatten();
         for view in 0..self.state.frames.len() {
-            self.state.stop.check()?;
+            phases.check()?;
+            phases.advance();
             let data = self.state.frames.get(&self.state.dataset, view)?;
             let Some(labels) = &data.labels else { continue };
             let settings = RenderSettings { deform: false, ..self.state.color_settings() };
@@ -146,7 +155,7 @@ impl Trainer {
         let wanted = self.state.config.motion.gaussians as usize;
         let frames: Vec<_> = (0..self.state.frames.len())
             .map(|view| {
-                self.state.stop.check()?;
+                self.state.phases.check()?;
                 Ok((self.state.frames.index(view), self.state.frames.get(&self.state.dataset, view)?))
             })
             .collect::<Result<_, TrainError>>()?;
@@ -155,6 +164,7 @@ impl Trainer {
             if positions.len() == wanted {
                 break;
             }
+            self.state.phases.check()?;
             let offset = DVec3::from(std::array::from_fn(|_| rng.random::<f64>() * 2.0 - 1.0));
             let offset = offset * 1.5 * track.radius;
             let (mut inside, mut outside, mut sum) = (0.0_f64, 0.0_f64, DVec3::ZERO);
@@ -207,8 +217,11 @@ impl Trainer {
         let times = self.state.dataset.times.clone();
         let mut rng = stream(self.state.config.seed, Purpose::Guidance, 0);
         let mut renderer = Renderer::new(self.simd);
+        let phases = self.state.phases.clone();
+        let _phase = phases.enter(Phase::Rehearsal, self.state.config.motion.rehearsal as usize);
         for _ in 0..self.state.config.motion.rehearsal {
-            self.state.stop.check()?;
+            phases.check()?;
+            phases.advance();
             let time = times[rng.random_range(0..times.len())];
             renderer.displace(&self.state.field, time);
             let guided =

@@ -12,6 +12,7 @@ use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
 use crate::heads::{self, Decoder, HeadTensors, Pass, TrainingViews};
+use crate::phase::Phase;
 use crate::random::{Purpose, stream};
 use crate::stage::Stage;
 use crate::state::State;
@@ -27,7 +28,7 @@ impl Trainer {
         let Some(head) = heads::value_head(&head, &self.state.config) else { return Ok(()) };
         self.fetch()?;
         self.check_cameras()?;
-        let start = self.clock.now();
+        let _phase = self.state.phases.enter(Phase::Instance, 0);
         let mut tensors = HeadTensors::start(head, &self.state.field, self.state.config.seed);
         head.begin(&mut tensors, &mut self.training_views())?;
         if skipped {
@@ -37,7 +38,6 @@ impl Trainer {
             self.state.field.gaussians.occupancy_logits.fill(logit(own.start));
         }
         self.state.head_tensors = tensors;
-        self.state.progress.add_time(Stage::Instance, self.clock.now() - start);
         Ok(())
     }
 
@@ -48,11 +48,10 @@ impl Trainer {
         if stage != Stage::Instance || self.state.head_tensors.is_empty() {
             return Ok(());
         }
-        let start = self.clock.now();
+        let _phase = self.state.phases.enter(Phase::Instance, 0);
         let mut tensors = self.state.head_tensors.clone();
         head.finish(&mut tensors, &mut self.training_views())?;
         self.state.head_tensors = tensors;
-        self.state.progress.add_time(Stage::Instance, self.clock.now() - start);
         Ok(())
     }
 

@@ -11,12 +11,13 @@
 //! | `judged` | degrees of harmonics and outputs of the network that must show that they help |
 //! | `heads` | what heads of other systems see and change between steps |
 //! | `guidance` | how travelling objects start on the paths that masks tell |
-//! | `objects` | which objects move as a whole, and how they join the field |
+//! | `objects`, `known` | which objects move as a whole, how they join the field, and what is kept of fits until then |
 //! | `identity` | how identity rows come about |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `resume` | what is saved, and how a run resumes |
 //! | `evaluate` | what a run has reached, on a few frames |
 //! | `pacing` | when stages end by time, or by what was reached |
+//! | `eta` | how long the rest of a run takes |
 //! | `saving` | when a run asks to be saved |
 //! | `measure`, `shape` | steps for measuring, and what they work on |
 //! | `backend` | which engine computes the steps |
@@ -27,6 +28,7 @@
 
 mod backend;
 mod changes;
+mod eta;
 mod evaluate;
 mod from_scene;
 #[cfg(test)]
@@ -46,6 +48,7 @@ mod heads;
 mod identity;
 mod initialize;
 mod judged;
+mod known;
 mod measure;
 mod motions;
 mod objects;
@@ -77,11 +80,12 @@ pub use self::backend::Probe;
 use self::changes::Changes;
 use self::evaluate::MeasuredFrames;
 pub(crate) use self::initialize::automatic_time_nodes;
+use self::known::KnownObjects;
 pub use self::measure::InstancePass;
 use self::pacing::Pacing;
 use self::resume::SavedHead;
 use self::saving::Saving;
-use crate::clock::{Clock, SystemClock};
+use crate::clock::{Clock, Seconds};
 use crate::config::{HeadName, TrainConfig};
 use crate::curve::Curve;
 use crate::densify::DensifyStatistics;
@@ -95,6 +99,8 @@ use crate::guidance::Guidance;
 use crate::heads::{Head, HeadTensors, configured};
 use crate::objects::{Fitted, Jointed};
 use crate::optimiser::Optimiser;
+use crate::phase::Phase;
+use crate::phases::Phases;
 use crate::poses::PoseMoments;
 use crate::progress::{Progress, Stages};
 use crate::stage::Stage;
@@ -107,21 +113,22 @@ use crate::times::{StepTimes, Work};
 const MOST_NAMES: usize = 8;
 
 /// Warning that names the frames left out of training; `None` without such frames.
-fn misfit_warning(dataset: &Dataset, left_out: &[usize]) -> Option<String> {
+fn misfit_warning(dataset: &Dataset, left_out: &[usize]) -> Option<TrainEvent> {
     let names: Vec<&str> =
         left_out.iter().take(MOST_NAMES).map(|index| dataset.frames[*index].name.as_str()).collect();
     let more = left_out.len() - names.len();
     let more = if more > 0 { format!(" and {more} more") } else { String::new() };
     (!names.is_empty()).then(|| {
-        format!(
+        TrainEvent::warning(format!(
             "left out of training: {}{more}: they show most instances far from where all other frames see them; \
              check their cameras and masks (motion.misfit = 0 keeps such frames)",
             names.join(", ")
-        )
+        ))
     })
 }
 
-fn switch_warning(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>) -> Option<String> {
+/// Note that counts the masks that were given other labels; `None` where none was.
+fn switch_note(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>) -> Option<TrainEvent> {
     let name = |label: u16| dataset.instances[usize::from(label) - 1].label.as_str();
     let (mut exchanged, mut alone): (BTreeMap<[u16; 2], usize>, BTreeMap<u16, usize>) = Default::default();
     for (from, to) in switched.values().flatten() {
@@ -135,11 +142,11 @@ fn switch_warning(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u1
     let singles = alone.iter().map(|(label, n)| format!("{} left out in {n}", name(*label)));
     let found: Vec<String> = pairs.chain(singles).collect();
     (!found.is_empty()).then(|| {
-        format!(
+        TrainEvent::note(format!(
             "masks show other objects by their colours and places, frames: {} (motion.switches = false keeps such \
              masks)",
             found.join(", ")
-        )
+        ))
     })
 }
 
@@ -160,24 +167,28 @@ pub struct Trainer {
     debug_validation: bool,
     /// Off only while the cost of the pass is measured.
     instance_pass: InstancePass,
-    /// Where the run reads time.
-    clock: Arc<dyn Clock>,
     /// When the next state is saved by time.
     saving: Saving,
     /// Frames that the curve is measured on.
     measured_frames: MeasuredFrames,
     /// A budget that stages keep to.
     pacing: Option<Pacing>,
-    /// Warnings not sent yet.
-    warnings: Vec<String>,
+    /// Notes and warnings not sent yet.
+    messages: Vec<TrainEvent>,
+    /// True once it is known which objects travel, or that none is asked for.
+    is_searched: bool,
     /// Head of a saved run, and its arrays, until it is set.
     saved_head: Option<SavedHead>,
     /// Loss of the last step that was taken in.
     last_loss: StepLoss,
+    /// Objects that were fitted so far, until the fine stage has taken them over.
+    known: KnownObjects,
     /// Objects that move as a whole, by label, until the fine stage gives them Gaussians.
     fits: BTreeMap<u16, Fitted>,
     /// Labels of objects of which nothing tells how far away they are.
     nowhere: BTreeSet<u16>,
+    /// Labels of travelling objects for which a budget left no time.
+    left_out: BTreeSet<u16>,
     /// Objects with a part on a joint, likewise.
     jointed: BTreeMap<u16, Jointed>,
     /// Events of steps that were taken in, not sent yet.
@@ -191,14 +202,18 @@ impl Trainer {
     /// When a setting cannot work, the capture has no training frame or no initial point, or a frame cannot
     /// be read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
     pub fn new(start: impl Into<Start>, config: TrainConfig) -> Result<Self, TrainError> {
-        let Start { mut dataset, stop } = start.into();
+        let Start { mut dataset, phases } = start.into();
+        let _run = phases.enter(Phase::Other, 0);
         config.validate()?;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &config);
         let field = initialize::initial_field(&dataset, &config)?;
-        let mut trainer = Self::assemble(Start { dataset, stop }, measured_frames, config, field, None)?;
+        let start = Start { dataset, phases: phases.clone() };
+        let mut trainer = Self::assemble(start, measured_frames, config, field, None)?;
         trainer.warn_of_capture();
-        trainer.find_travelling()?;
+        trainer.check_told()?;
         let first = trainer.stages.from(&trainer.state.config, Stage::Coarse);
+        // What the fine stage begins with takes long where objects are fitted: that is left to the run.
+        let first = if first == Stage::Fine && trainer.is_guided() { Stage::Coarse } else { first };
         trainer.state.progress = Progress::at(first);
         trainer.state.progress.exposures = trainer.exposures();
         trainer.enter(first)?;
@@ -207,7 +222,7 @@ impl Trainer {
 
     /// Everything but the state of the optimiser; frames of `measured_frames` are no training frames of the capture.
     fn assemble(
-        Start { dataset, stop }: Start,
+        Start { dataset, phases }: Start,
         measured_frames: MeasuredFrames,
         config: TrainConfig,
         field: Field,
@@ -221,22 +236,29 @@ impl Trainer {
             HeadName::LangSplat => cif_dataset::feature_maps(&dataset, Path::new(&config.head.maps))?,
             _ => BTreeMap::new(),
         };
-        let mut frames = FrameStore::open(&dataset, config.background, maps, budget, &stop)?;
+        let mut frames = FrameStore::open(&dataset, config.background, maps, budget, &phases)?;
         let has_instances =
             config.effects.instances && !dataset.instances.is_empty() && frames.has_labels(&dataset);
-        let mut warnings = Vec::new();
-        if has_instances && config.motion.misfit > 0.0 {
-            let left_out = frames.leave_out_misfits(&dataset, f64::from(config.motion.misfit), &stop)?;
-            warnings.extend(misfit_warning(&dataset, &left_out));
-        }
-        if has_instances && config.motion.switches {
-            let switched = frames.put_switches_right(&dataset, &stop)?;
-            warnings.extend(switch_warning(&dataset, switched));
-        }
-        if has_instances && config.motion.edges && frames.put_edges_right(&dataset, &stop)? {
-            let what = "outlines of masks are rough, and were moved to where the colours change (motion.edges = false \
-                        keeps them)";
-            warnings.push(what.to_owned());
+        let mut messages = Vec::new();
+        let motion = &config.motion;
+        let checks = [motion.misfit > 0.0, motion.switches, motion.edges].map(|on| on && has_instances);
+        if checks.contains(&true) {
+            let count = checks.iter().filter(|on| **on).count();
+            let _phase = phases.enter(Phase::Masks, count * frames.len());
+            if checks[0] {
+                let left_out = frames.leave_out_misfits(&dataset, f64::from(motion.misfit), &phases)?;
+                messages.extend(misfit_warning(&dataset, &left_out));
+            }
+            if checks[1] {
+                let switched = frames.put_switches_right(&dataset, &phases)?;
+                messages.extend(switch_note(&dataset, switched));
+            }
+            if checks[2] && frames.put_edges_right(&dataset, &phases)? {
+                messages.push(TrainEvent::note(
+                    "outlines of masks are rough, and were moved to where the colours change (motion.edges = false \
+                     keeps them)",
+                ));
+            }
         }
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
@@ -249,15 +271,17 @@ impl Trainer {
             changes: None,
             debug_validation: false,
             instance_pass: InstancePass::On,
-            clock: Arc::new(SystemClock::start()),
             saving: Saving::default(),
             measured_frames,
             pacing: None,
-            warnings,
+            messages,
+            is_searched: false,
             saved_head: None,
             last_loss: StepLoss::default(),
+            known: KnownObjects::default(),
             fits: BTreeMap::new(),
             nowhere: BTreeSet::new(),
+            left_out: BTreeSet::new(),
             jointed: BTreeMap::new(),
             arrived: Vec::new(),
             state: State {
@@ -275,7 +299,7 @@ impl Trainer {
                 dataset,
                 config,
                 frames,
-                stop,
+                phases,
                 field,
             },
         })
@@ -288,14 +312,16 @@ impl Trainer {
 
     fn warn_of_capture(&mut self) {
         if !self.stages.has_instances {
-            let why = if !self.state.config.effects.instances {
-                "instances are switched off"
+            let (why, is_wanted) = if !self.state.config.effects.instances {
+                ("instances are switched off", true)
             } else if self.state.dataset.instances.is_empty() {
-                "the capture has no masks"
+                ("the capture has no masks", true)
             } else {
-                "no training mask has a labelled pixel"
+                ("no training mask has a labelled pixel", false)
             };
-            self.warnings.push(format!("{why}: colour only, without identity and instance stages"));
+            let message = format!("{why}: colour only, without identity and instance stages");
+            let message = if is_wanted { TrainEvent::note(message) } else { TrainEvent::warning(message) };
+            self.messages.push(message);
         }
         if !self.stages.is_dynamic {
             let why = if self.state.dataset.times.len() > 1 {
@@ -303,19 +329,20 @@ impl Trainer {
             } else {
                 "the capture has a single time"
             };
-            self.warnings.push(format!("{why}: trained without deformation"));
+            self.messages.push(TrainEvent::note(format!("{why}: trained without deformation")));
         }
         if self.state.frames.len() == 1 {
-            self.warnings.push("one training frame: depth and occluded parts are not determined".into());
+            let message = "one training frame: depth and occluded parts are not determined";
+            self.messages.push(TrainEvent::warning(message));
         }
         let not_kept = self.state.frames.not_kept();
         if not_kept > 0 {
-            self.warnings.push(format!(
+            self.messages.push(TrainEvent::note(format!(
                 "{not_kept} of {} training frames do not fit into frame_memory_mib = {} and are decoded \
                  again for every step that needs them",
                 self.state.frames.len(),
                 self.state.config.frame_memory_mib
-            ));
+            )));
         }
     }
 
@@ -362,6 +389,12 @@ impl Trainer {
         self.state.progress.total_steps
     }
 
+    /// True once there is something that a run begun anew would have to do again.
+    #[must_use]
+    pub fn has_begun(&self) -> bool {
+        self.steps_done() > 0 || self.stage() > Stage::Coarse || !self.known.is_empty()
+    }
+
     /// Steps left in all stages.
     #[must_use]
     pub fn steps_left(&self) -> u64 {
@@ -385,7 +418,32 @@ impl Trainer {
 
     /// Reads time from another clock; times of the run and its curve follow it.
     pub fn set_clock(&mut self, clock: Arc<dyn Clock>) {
-        self.clock = clock;
+        self.state.phases.set_clock(clock);
+    }
+
+    /// Phases of the run, which work of the caller may enter too.
+    #[must_use]
+    pub fn phases(&self) -> &Phases {
+        &self.state.phases
+    }
+
+    /// Progress with the time of the run so far.
+    fn progress(&self) -> Progress {
+        self.state.progress.with_times(&self.state.phases.times())
+    }
+
+    /// Time of the run so far, over interruptions, by name of [`Phase`]: what its phases took add up to what passed on
+    /// the clock while it was prepared, trained and saved.
+    #[must_use]
+    pub fn wall_s_by_phase(&self) -> BTreeMap<String, f64> {
+        self.progress().wall_s
+    }
+
+    /// The time of the run so far, without [`Phase::Measure`] and [`Phase::Evaluate`], which only look at what was
+    /// reached: the time that points of the curve count.
+    #[must_use]
+    pub fn time_of_training(&self) -> Seconds {
+        self.progress().of_training()
     }
 
     /// Quality of the field over the run, as measured so far.
@@ -441,6 +499,12 @@ impl TrainerView<'_> {
     #[must_use]
     pub fn config(&self) -> &crate::TrainConfig {
         self.trainer.config()
+    }
+
+    /// Phases of the run, which work of the observer may enter too.
+    #[must_use]
+    pub fn phases(&self) -> &Phases {
+        self.trainer.phases()
     }
 
     /// A checkpoint, see [`Trainer::checkpoint`].

@@ -12,7 +12,9 @@ use rayon::prelude::*;
 use super::Trainer;
 use crate::config::ObjectMotion;
 use crate::error::TrainError;
+use crate::events::TrainEvent;
 use crate::objects::{self, BENDS_NO_BETTER, Fitted, Found, Order, Plane, Surroundings};
+use crate::phase::Phase;
 use crate::schedule::log_linear;
 use crate::stage::Stage;
 
@@ -69,16 +71,29 @@ pub(super) fn is_rigid(fitted: &Fitted, most: f64) -> bool {
     is_explained && !deforms
 }
 
+/// What work found, or `None` where the time of a budget ended before.
+pub(super) fn in_time<T>(found: Result<T, TrainError>) -> Result<Option<T>, TrainError> {
+    match found {
+        Err(TrainError::OutOfTime) => Ok(None),
+        found => found.map(Some),
+    }
+}
+
 impl Trainer {
     /// Finds objects that move although no path of theirs shows it: a little, late, or in place.
     pub(super) fn find_other_movers(&mut self) -> Result<(), TrainError> {
         let travelling = &self.state.guidance.travelling;
         let others: Vec<u16> = (1..travelling.len()).filter(|k| !travelling[*k]).map(|k| k as u16).collect();
+        if others.is_empty() {
+            return Ok(());
+        }
         let plane = self.support()?;
-        for (label, fitted) in self.fit_objects(&others, plane.as_ref())? {
+        let (fits, left_out) = self.fit_objects(Phase::Search, &others, plane.as_ref())?;
+        for (label, fitted) in fits {
             self.state.guidance.travelling[usize::from(label)] = true;
             self.fits.insert(label, fitted);
         }
+        self.note_left_out(&left_out, "taken to rest");
         self.find_parts(&others, plane.as_ref())
     }
 
@@ -89,10 +104,25 @@ impl Trainer {
             .map(|(label, _)| label as u16)
             .filter(|label| !self.fits.contains_key(label) && !self.jointed.contains_key(label))
             .collect();
+        if rest.is_empty() {
+            return Ok(());
+        }
         let plane = self.support()?;
-        let fits = self.fit_objects(&rest, plane.as_ref())?;
+        let (fits, left_out) = self.fit_objects(Phase::Objects, &rest, plane.as_ref())?;
         self.fits.extend(fits);
+        self.note_left_out(&left_out, "moved by the deformation network, not by poses of their own");
+        self.left_out.extend(left_out);
         Ok(())
+    }
+
+    /// Notes the objects for which a budget left no time, and what is made of them instead.
+    pub(super) fn note_left_out(&mut self, labels: &[u16], instead: &str) {
+        let name = |label: &u16| self.state.field.instances[usize::from(*label) - 1].label.as_str();
+        let names: Vec<&str> = labels.iter().map(name).collect();
+        if !names.is_empty() {
+            let message = format!("the budget leaves no time to fit {}: {instead}", names.join(", "));
+            self.messages.push(TrainEvent::note(message));
+        }
     }
 
     /// Motion that an object (a label: dense index + 1) is told to have.
@@ -121,10 +151,11 @@ impl Trainer {
     /// When a frame cannot be read, or the run is to stop.
     pub(super) fn support(&self) -> Result<Option<Plane>, TrainError> {
         let (state, seed) = (&self.state, self.state.config.seed);
+        let _phase = state.phases.enter(Phase::Paths, 0);
         if state.dataset.points.source != PointSource::Random {
             return match objects::support(&state.dataset, &state.dataset.points.positions, seed) {
                 Some(plane) => Ok(Some(plane)),
-                None => objects::support_below(&state.dataset, &state.frames, seed, &state.stop),
+                None => objects::support_below(&state.dataset, &state.frames, seed, &state.phases),
             };
         }
         Ok(objects::support(&state.dataset, &self.seen_surfaces()?, seed))
@@ -138,7 +169,7 @@ impl Trainer {
         let mut renderer = Renderer::new(self.simd);
         let (mut points, mut depths_seen, mut centres) = (Vec::new(), Vec::new(), Vec::new());
         for view in (0..state.frames.len()).step_by(state.frames.len().div_ceil(LOOKS)) {
-            state.stop.check()?;
+            state.phases.check()?;
             let frame = &state.dataset.frames[state.frames.index(view)];
             let channels = Channels { depth: true, instances: false };
             let seen = renderer.render(&state.field, &frame.camera, frame.time, &settings, channels);
@@ -174,50 +205,77 @@ impl Trainer {
             near: state.config.near,
             seed: state.config.seed,
             gaussians: state.config.motion.gaussians as usize,
-            stop: &state.stop,
+            phases: &state.phases,
         }
     }
 
-    /// Rigid motions of objects (labels: dense index + 1), without those that rest, are not rigid, or whose masks do
-    /// not tell enough.
+    /// Rigid motions of objects (labels: dense index + 1), fitted in a phase, without those that rest, are not rigid, or
+    /// whose masks do not show enough; and the objects that a budget left no time for.
+    #[expect(clippy::type_complexity, reason = "a list of fits and a list of labels")]
     fn fit_objects(
         &mut self,
+        phase: Phase,
         labels: &[u16],
         plane: Option<&Plane>,
-    ) -> Result<Vec<(u16, Fitted)>, TrainError> {
+    ) -> Result<(Vec<(u16, Fitted)>, Vec<u16>), TrainError> {
         if !self.state.config.motion.rigid {
-            return Ok(Vec::new());
+            return Ok((Vec::new(), Vec::new()));
         }
+        let is_known = |label: &&u16| self.known.rigid.contains_key(*label);
+        let unknown: Vec<u16> = labels.iter().filter(|label| !is_known(label)).copied().collect();
+        let left_out =
+            if unknown.is_empty() { Vec::new() } else { self.fit_unknown(phase, &unknown, plane)? };
+        let mut fits = Vec::new();
+        for label in labels {
+            match self.known.rigid.get(label) {
+                Some(Found::Moves(fitted)) => fits.push((*label, (**fitted).clone())),
+                Some(Found::Nowhere) => drop(self.nowhere.insert(*label)),
+                Some(Found::Nothing) | None => {}
+            }
+        }
+        Ok((fits, left_out))
+    }
+
+    /// Fits objects of which nothing is known yet, and keeps what is found, also where the run is stopped meanwhile;
+    /// returns those that a budget left no time for.
+    fn fit_unknown(
+        &mut self,
+        phase: Phase,
+        labels: &[u16],
+        plane: Option<&Plane>,
+    ) -> Result<Vec<u16>, TrainError> {
         let state = &self.state;
-        let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
+        let entered = state.phases.enter(phase, labels.len());
+        let order = Order::of(&state.dataset, &state.frames, &state.phases)?;
+        entered.until(self.deadline(phase));
         let surroundings = self.surroundings(plane, &order);
         let most = MOST_ERROR[usize::from(state.dataset.points.source == PointSource::Random)];
         let wanted: Vec<(u16, Option<ObjectMotion>)> =
             labels.iter().map(|label| (*label, self.told(*label))).collect();
         let fit = |(label, told): &(u16, Option<ObjectMotion>)| {
-            if *told == Some(ObjectMotion::Free) {
-                return Ok((*label, Found::Nothing));
-            }
             let is_told = *told == Some(ObjectMotion::Rigid);
-            let found = objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told)?;
-            Ok((
-                *label,
-                match found {
-                    Found::Moves(fitted) if !is_told && !is_rigid(&fitted, most) => Found::Nothing,
-                    found => found,
-                },
-            ))
+            let found = if *told == Some(ObjectMotion::Free) {
+                Some(Found::Nothing)
+            } else {
+                in_time(objects::fit(*label, &state.dataset, &state.frames, surroundings, is_told))?
+            };
+            state.phases.advance();
+            Ok(match found {
+                Some(Found::Moves(fitted)) if !is_told && !is_rigid(&fitted, most) => Some(Found::Nothing),
+                found => found,
+            })
         };
-        let found: Vec<(u16, Found)> = wanted.par_iter().map(fit).collect::<Result<_, TrainError>>()?;
-        let mut fits = Vec::new();
-        for (label, found) in found {
+        let found: Vec<Result<Option<Found>, TrainError>> = wanted.par_iter().map(fit).collect();
+        drop(entered);
+        let (mut left_out, mut failed) = (Vec::new(), None);
+        for (label, found) in labels.iter().zip(found) {
             match found {
-                Found::Moves(fitted) => fits.push((label, *fitted)),
-                Found::Nowhere => drop(self.nowhere.insert(label)),
-                Found::Nothing => {}
+                Ok(Some(found)) => drop(self.known.rigid.insert(*label, found)),
+                Ok(None) => left_out.push(*label),
+                Err(error) => failed = failed.or(Some(error)),
             }
         }
-        Ok(fits)
+        failed.map_or(Ok(left_out), Err)
     }
 
     /// Gives an object (a label: dense index + 1) that was fitted a group with Gaussians; false where it was not. What
@@ -229,14 +287,16 @@ impl Trainer {
                 self.add_parts(name, &found);
                 return true;
             }
-            if self.told(label) == Some(ObjectMotion::Rigid) {
-                self.warnings
-                    .push(format!("{name} is told to be rigid, but its masks do not tell its poses"));
+            if self.left_out.contains(&label) {
+                // That was said.
+            } else if self.told(label) == Some(ObjectMotion::Rigid) {
+                let message = format!("{name} is set to be rigid, but its masks do not show its poses");
+                self.messages.push(TrainEvent::warning(message));
             } else if self.nowhere.contains(&label) {
-                self.warnings.push(format!(
+                self.messages.push(TrainEvent::warning(format!(
                     "{name}: depth uncertain: one camera sees it, and nothing that it stands on is known, so its size \
                      and distance are guesses"
-                ));
+                )));
             }
             return false;
         };
@@ -244,10 +304,10 @@ impl Trainer {
             RotationEvidence::Observed => "",
             RotationEvidence::Assumed => ", which the pictures do not tell: assumed",
         };
-        self.warnings.push(format!(
+        self.messages.push(TrainEvent::note(format!(
             "{name} moves as a whole: {}{how} (error {:.3} on pixels left out)",
             fitted.way, fitted.error
-        ));
+        )));
         posed.push((label, self.join(name, &fitted)));
         true
     }

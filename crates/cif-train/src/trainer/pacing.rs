@@ -7,9 +7,11 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
-use crate::budget::{Budget, Pacer, weights};
+use crate::budget::{Budget, FITS, Pacer, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
+use crate::phase::Phase;
+use crate::phases::Deadline;
 use crate::progress::Goals;
 use crate::stage::Stage;
 
@@ -84,7 +86,6 @@ impl Trainer {
 
     /// Gives a stage that begins, or goes on, its deadline.
     pub(super) fn pace_stage(&mut self, stage: Stage) {
-        let Some(pacing) = &mut self.pacing else { return };
         let steps: Vec<(Stage, u32)> = [Stage::Coarse, Stage::Fine, Stage::Instance]
             .into_iter()
             .filter(|other| *other >= stage)
@@ -95,17 +96,41 @@ impl Trainer {
             })
             .filter(|(other, steps)| *steps > 0 || *other == stage)
             .collect();
-        let frames = if self.stages.has_instances && stage < Stage::Identity {
-            self.state.frames.len().div_ceil(self.state.config.identity.stride.max(1) as usize)
-        } else {
-            0
+        let frames = self.frames_of_identities(stage);
+        let has_fits = stage == Stage::Coarse && self.objects_to_fit() > 0;
+        let (iteration, now) = (self.state.progress.iteration, self.state.phases.now());
+        let Some(pacing) = &mut self.pacing else { return };
+        pacing.pacer.enter(&weights(&steps), iteration, (frames, has_fits), now);
+    }
+
+    /// Frames that identity estimation passes over behind a stage.
+    pub(super) fn frames_of_identities(&self, stage: Stage) -> usize {
+        let comes = self.stages.has_instances && stage < Stage::Identity;
+        if comes { self.state.views_of_identities().count() } else { 0 }
+    }
+
+    /// Time by which fits have to be done that a budget can do without.
+    pub(super) fn deadline(&self, phase: Phase) -> Option<Deadline> {
+        let pacer = &self.pacing.as_ref()?.pacer;
+        let [search, joints] = TRIALS;
+        let share = match phase {
+            Phase::Search => search,
+            Phase::Joints => joints,
+            _ => FITS,
         };
-        pacing.pacer.enter(&weights(&steps), self.state.progress.iteration, frames, self.clock.now());
+        let (budget, now) = (*pacer.budget(), self.state.phases.now());
+        Some(Deadline { budget, at_s: budget.used(now) + share * pacer.left(now) })
+    }
+
+    /// Seconds left of the budget; `None` without one.
+    pub(super) fn budget_left_s(&self) -> Option<f64> {
+        let pacer = &self.pacing.as_ref()?.pacer;
+        Some(pacer.left(self.state.phases.now()))
     }
 
     /// Stretches or ends the stage as the budget says.
     pub(super) fn follow_budget(&mut self, stage: Stage) {
-        let now = self.clock.now();
+        let now = self.state.phases.now();
         let Some(pacing) = &mut self.pacing else { return };
         let Some(steps) = pacing.pacer.after_step(self.state.progress.iteration, now) else { return };
         let shares = pacing.shares;
@@ -246,7 +271,7 @@ impl Trainer {
                 "seconds": budget.seconds,
                 "clock": budget.clock,
                 "threads": budget.threads,
-                "used_s": budget.used(self.clock.now()),
+                "used_s": budget.used(self.state.phases.now()),
             })
         });
         let goals = &self.state.progress.goals;

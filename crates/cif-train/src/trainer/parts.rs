@@ -5,8 +5,11 @@ use cif_field::tracks::{Joint, TrackGroup};
 use rayon::prelude::*;
 
 use super::Trainer;
+use super::objects::in_time;
 use crate::error::TrainError;
+use crate::events::TrainEvent;
 use crate::objects::{self, Jointed, Order, Plane};
+use crate::phase::Phase;
 
 impl Trainer {
     /// Looks for parts of objects (labels: dense index + 1) that do not travel, nor move as a whole, and of which nothing
@@ -18,29 +21,54 @@ impl Trainer {
         }
         let is_open = |label: &u16| !self.fits.contains_key(label) && self.told(*label).is_none();
         let wanted: Vec<u16> = labels.iter().copied().filter(is_open).collect();
-        let state = &self.state;
-        let order = Order::of(&state.dataset, &state.frames, &state.stop)?;
-        let surroundings = self.surroundings(plane, &order);
-        let find = |label: &u16| {
-            let found = objects::find_part(*label, &state.dataset, &state.frames, surroundings)?;
-            Ok(found.map(|found| (*label, found)))
-        };
-        let found: Vec<Option<(u16, Jointed)>> =
-            wanted.par_iter().map(find).collect::<Result<_, TrainError>>()?;
-        for (label, found) in found.into_iter().flatten() {
-            self.state.guidance.travelling[usize::from(label)] = true;
-            self.jointed.insert(label, found);
+        let is_known = |label: &&u16| self.known.parts.contains_key(*label);
+        let unknown: Vec<u16> = wanted.iter().filter(|label| !is_known(label)).copied().collect();
+        if !unknown.is_empty() {
+            self.find_unknown_parts(&unknown, plane)?;
+        }
+        for label in wanted {
+            if let Some(Some(found)) = self.known.parts.get(&label) {
+                self.state.guidance.travelling[usize::from(label)] = true;
+                self.jointed.insert(label, found.clone());
+            }
         }
         Ok(())
+    }
+
+    /// Looks for parts of objects of which that is not known yet, and keeps what is found, also where the run is stopped
+    /// meanwhile.
+    fn find_unknown_parts(&mut self, labels: &[u16], plane: Option<&Plane>) -> Result<(), TrainError> {
+        let state = &self.state;
+        let entered = state.phases.enter(Phase::Joints, labels.len());
+        let order = Order::of(&state.dataset, &state.frames, &state.phases)?;
+        entered.until(self.deadline(Phase::Joints));
+        let surroundings = self.surroundings(plane, &order);
+        let find = |label: &u16| {
+            let found = in_time(objects::find_part(*label, &state.dataset, &state.frames, surroundings))?;
+            state.phases.advance();
+            Ok(found)
+        };
+        let found: Vec<Result<Option<Option<Jointed>>, TrainError>> = labels.par_iter().map(find).collect();
+        drop(entered);
+        let (mut left_out, mut failed) = (Vec::new(), None);
+        for (label, found) in labels.iter().zip(found) {
+            match found {
+                Ok(Some(found)) => drop(self.known.parts.insert(*label, found)),
+                Ok(None) => left_out.push(*label),
+                Err(error) => failed = failed.or(Some(error)),
+            }
+        }
+        self.note_left_out(&left_out, "taken to have no parts on joints");
+        failed.map_or(Ok(()), Err)
     }
 
     /// Gives an object with a part groups for both.
     pub(super) fn add_parts(&mut self, name: String, found: &Jointed) {
         let [with, without] = found.errors;
-        self.warnings.push(format!(
+        self.messages.push(TrainEvent::note(format!(
             "{name} rests, but {} (error {with:.3} on pixels left out, {without:.3} without)",
             found.told()
-        ));
+        )));
         let base = TrackGroup { deformed: false, ..TrackGroup::still(name.clone(), found.hinge.point) };
         let base = self.add_group(found.base.clone(), base, &[]);
         let times = &self.state.dataset.times;

@@ -7,6 +7,8 @@ use cif_render::{Channels, RenderSettings};
 
 use super::Trainer;
 use crate::error::TrainError;
+use crate::events::TrainEvent;
+use crate::phase::Phase;
 use crate::sightings::Sightings;
 use crate::tracks::observe;
 
@@ -29,6 +31,7 @@ impl Trainer {
             return Ok(());
         }
         let mut found = Vec::new();
+        let phase = self.state.phases.enter(Phase::Presence, groups.len());
         let sightings = self.sightings()?;
         for (label, group) in groups {
             let seen = sightings.of(*label);
@@ -52,14 +55,16 @@ impl Trainer {
                 steps.push((times[(last + after).div_ceil(2)], false));
             }
             found.push((*label, *group, steps));
+            self.state.phases.advance();
         }
+        drop(phase);
         for (label, group, steps) in found.into_iter().filter(|(.., steps)| !steps.is_empty()) {
             let state = &mut self.state;
             let Some(tracks) = &mut state.field.tracks else { continue };
             let name = &state.field.instances[usize::from(label) - 1].label;
-            self.warnings.push(format!(
+            self.messages.push(TrainEvent::note(format!(
                 "{name} is not there all the time, by its masks and by what is seen in its place: hidden meanwhile"
-            ));
+            )));
             tracks.groups[group as usize].visibility =
                 steps.into_iter().map(|(time, visible)| VisibilityStep { time, visible }).collect();
         }
@@ -73,7 +78,7 @@ impl Trainer {
         views.sort_by_key(|view| state.dataset.frames[state.frames.index(*view)].time_index);
         let mut sightings = Sightings::default();
         for view in views {
-            state.stop.check()?;
+            state.phases.check()?;
             let frame = &state.dataset.frames[state.frames.index(view)];
             let data = state.frames.get(&state.dataset, view)?;
             if let Some(labels) = &data.labels {
@@ -110,7 +115,7 @@ impl Trainer {
         let mut renderer = Renderer::new(self.simd);
         let (mut errors, mut pixels) = ([0.0_f64; 2], 0);
         for view in views.iter().step_by(views.len().div_ceil(LOOKS).max(1)) {
-            state.stop.check()?;
+            state.phases.check()?;
             let frame = &state.dataset.frames[state.frames.index(*view)];
             let truth = state.frames.get(&state.dataset, *view)?;
             let [with, without] = [&state.field, &without]

@@ -18,7 +18,7 @@ fn members(object: Value) -> Map<String, Value> {
 impl Trainer {
     /// The record: how to draw the field, settings, capture, steps, times, memory, versions.
     pub(super) fn provenance(&self) -> Record {
-        let (dataset, config, progress) = (&self.state.dataset, &self.state.config, &self.state.progress);
+        let (dataset, config, progress) = (&self.state.dataset, &self.state.config, &self.progress());
         let masks = dataset.frames.iter().find_map(|frame| frame.mask.as_ref()).and_then(|mask| {
             let folder = mask.strip_prefix(&dataset.root).ok().unwrap_or(mask).components().next()?;
             folder.as_os_str().to_str().map(str::to_owned)
@@ -42,13 +42,13 @@ impl Trainer {
                 preset: json!(config.preset).as_str().map(str::to_owned),
                 seed: Some(config.seed),
                 iterations: Some(progress.total_steps),
-                wall_s: Some(progress.total_wall_s()),
-                wall_s_by_stage: progress.wall_s.clone(),
-                cpu_s: Some(progress.total_cpu_s()),
+                wall_s: Some(progress.total().wall_s),
+                wall_s_by_phase: progress.wall_s.clone(),
+                cpu_s: Some(progress.total().cpu_s),
                 peak_rss_mb: peak_rss_mb(),
                 notes: members(json!({
                     "iterations_by_stage": progress.steps,
-                    "cpu_s_by_stage": progress.cpu_s,
+                    "cpu_s_by_phase": progress.cpu_s,
                     "simd": self.simd_name(),
                     "gaussians": self.state.field.gaussians.len(),
                     "psnr_training_views": progress.psnr,

@@ -12,11 +12,13 @@ use serde_json::Value;
 
 use super::Trainer;
 use super::evaluate::MeasuredFrames;
+use super::known::KnownObjects;
 use crate::config::TrainConfig;
 use crate::densify::DensifyStatistics;
 use crate::error::TrainError;
 use crate::heads::{Cif, Head, HeadTensors, value_head};
 use crate::optimiser::Optimiser;
+use crate::phase::Phase;
 use crate::progress::Progress;
 use crate::stage::Stage;
 use crate::state::State;
@@ -37,6 +39,9 @@ pub(super) struct SavedState {
     /// Name of the head that the instance stage trains.
     #[serde(default = "name_of_cif", skip_serializing_if = "is_cif")]
     head: String,
+    /// Objects that were fitted, before the fine stage takes them over.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    objects: Option<Value>,
     /// Steps per parameter group.
     pub(super) adam_steps: BTreeMap<String, u32>,
 }
@@ -174,12 +179,15 @@ impl Trainer {
         for (name, tensor) in self.state.pose_moments.saved() {
             tensors.insert(name.to_owned(), tensor);
         }
+        let (objects, of_objects) = self.known.saved();
+        tensors.extend(of_objects);
         let state = SavedState {
             version: VERSION,
             config: self.state.config.clone(),
-            progress: self.state.progress.clone(),
+            progress: self.progress(),
             capture: Capture::of(&self.state.dataset),
             head: self.state.head.name().to_owned(),
+            objects,
             adam_steps,
         };
         let json = serde_json::to_value(state).expect("the state holds only strings, numbers and lists");
@@ -192,13 +200,14 @@ impl Trainer {
     /// When the checkpoint has no training state, is damaged, or belongs to another capture; when a frame cannot
     /// be read; [`TrainError::Stopped`] when the stop of `start` was requested meanwhile.
     pub fn resume(start: impl Into<Start>, checkpoint: Checkpoint) -> Result<Self, TrainError> {
-        let Start { mut dataset, stop } = start.into();
+        let Start { mut dataset, phases } = start.into();
+        let _run = phases.enter(Phase::Other, 0);
         let TrainingState { json, mut tensors } = checkpoint.training.ok_or(TrainError::NoState)?;
         let state = SavedState::parse(json)?;
         state.config.validate()?;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &state.config);
         state.capture.check(&Capture::of(&dataset), &dataset)?;
-        let start = Start { dataset, stop };
+        let start = Start { dataset, phases: phases.clone() };
         let mut trainer =
             Self::assemble(start, measured_frames, state.config, checkpoint.field, Some(state.progress))?;
 
@@ -211,8 +220,10 @@ impl Trainer {
         };
         trainer.restore_guidance(&mut tensors)?;
         trainer.restore_poses(&mut tensors)?;
-        if trainer.state.progress.stage == Stage::Coarse {
-            trainer.find_travelling()?;
+        if let Some(objects) = state.objects {
+            let counts = (trainer.state.field.instances.len(), trainer.state.dataset.times.len());
+            trainer.known = KnownObjects::restored(objects, &mut tensors, counts)
+                .ok_or_else(|| unusable("the fitted objects do not fit the capture"))?;
         }
         let has_rows = trainer.state.field.identities.is_some();
         let unseen = counters(&mut tensors, "identity.unseen", if has_rows { n } else { 0 })?;

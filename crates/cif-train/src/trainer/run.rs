@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use cif_render::Gradients;
 
+use super::known::KnownObjects;
 use super::saving::Saving;
 use super::{Trainer, TrainerView, initialize, provenance};
 use crate::curve::MIN_GAP;
@@ -13,6 +14,7 @@ use crate::error::TrainError;
 use crate::events::{Control, Outcome, TrainEvent};
 use crate::heads::{self, Target};
 use crate::optimiser::Optimiser;
+use crate::phase::Phase;
 use crate::progress::{AfterStep, Progress};
 use crate::schedule::falls_on;
 use crate::stage::Stage;
@@ -50,6 +52,8 @@ impl Trainer {
     /// When a frame cannot be read, or too many steps in a row leave the finite numbers; the field then still is
     /// finite.
     pub fn run(&mut self, observer: &mut Observer<'_>) -> Result<Outcome, TrainError> {
+        let phases = self.state.phases.clone();
+        let _run = phases.enter(Phase::Other, 0);
         let result = match self.run_stages(observer) {
             Err(TrainError::Stopped) => Ok(Outcome::Interrupted),
             result => result,
@@ -64,30 +68,35 @@ impl Trainer {
             return Err(TrainError::BadState { reason });
         }
         let mut requests = Requests::default();
-        self.saving = Saving::begin(self.state.config.report.checkpoint_seconds, self.clock.now().wall_s);
-        for message in std::mem::take(&mut self.warnings) {
-            requests.add(self.emit(observer, &TrainEvent::Warning { message }));
+        self.saving = Saving::begin(self.state.config.report.checkpoint_seconds, self.now_s());
+        self.send_messages(observer, &mut requests);
+        if requests.stop {
+            return Ok(Outcome::Interrupted);
         }
+        self.find_travelling()?;
+        self.send_messages(observer, &mut requests);
         loop {
             let stage = self.state.progress.stage;
             if stage == Stage::Done {
                 break;
             }
             let iterations = self.stages.iterations(&self.state.config, stage);
-            let started = TrainEvent::StageStarted {
-                stage,
-                iteration: self.state.progress.iteration,
-                iterations,
-                gaussians: self.state.field.gaussians.len(),
-            };
-            requests.add(self.emit(observer, &started));
+            if iterations > 0 || stage == Stage::Identity {
+                let started = TrainEvent::StageStarted {
+                    stage,
+                    iteration: self.state.progress.iteration,
+                    iterations,
+                    gaussians: self.state.field.gaussians.len(),
+                };
+                requests.add(self.emit(observer, &started));
+            }
             if stage == Stage::Identity {
-                if requests.stop || self.state.stop.requested() {
+                if requests.stop || self.state.phases.is_stopped() {
                     return Ok(Outcome::Interrupted);
                 }
-                let start = self.clock.now();
+                let phase = self.state.phases.enter(stage.into(), self.state.views_of_identities().count());
                 let event = self.estimate_identities(true)?;
-                self.state.progress.add_time(stage, self.clock.now() - start);
+                drop(phase);
                 requests.add(self.emit(observer, &event));
                 if let TrainEvent::IdentityEstimated { empty_instances, .. } = &event
                     && !empty_instances.is_empty()
@@ -99,9 +108,11 @@ impl Trainer {
                     requests.add(self.emit(observer, &TrainEvent::Warning { message }));
                 }
             } else {
+                let phase = self.state.phases.enter(stage.into(), iterations as usize);
                 let outcome = self.run_steps(stage, observer, &mut requests);
                 // Whatever ended the steps, the field is whole again.
                 let fetched = self.fetch();
+                drop(phase);
                 for event in std::mem::take(&mut self.arrived) {
                     requests.add(self.emit(observer, &event));
                 }
@@ -122,10 +133,11 @@ impl Trainer {
                 }
             }
             self.enter(next)?;
+            self.send_messages(observer, &mut requests);
             if next == Stage::Done {
                 continue;
             }
-            if requests.stop || self.state.stop.requested() {
+            if requests.stop || self.state.phases.is_stopped() {
                 return Ok(Outcome::Interrupted);
             }
             if self.state.config.report.checkpoint_seconds > 0 {
@@ -136,7 +148,7 @@ impl Trainer {
             self.emit(observer, &TrainEvent::Warning { message });
         }
         let finished = TrainEvent::Finished {
-            wall_s: self.state.progress.total_wall_s(),
+            wall_s: self.progress().total().wall_s,
             iterations: self.state.progress.total_steps,
             gaussians: self.state.field.gaussians.len(),
             psnr: self.state.progress.psnr.unwrap_or(0.0),
@@ -156,27 +168,23 @@ impl Trainer {
         requests: &mut Requests,
     ) -> Result<Outcome, TrainError> {
         let mut events = Vec::new();
-        let (mut lap, mut lap_steps) = (0.0, 0);
+        let (phases, phase) = (self.state.phases.clone(), Phase::from(stage));
+        let (mut lap, mut lap_steps) = (phases.spent(phase).wall_s, 0);
         self.pace_stage(stage);
         // A budget or a target may change how many there are.
         while self.state.progress.after_step.is_some()
             || self.state.progress.iteration < self.stages.iterations(&self.state.config, stage)
         {
-            if requests.stop || self.state.stop.requested() {
+            if requests.stop || phases.is_stopped() {
                 return Ok(Outcome::Interrupted);
             }
-            let start = self.clock.now();
             let resumed = self.state.progress.after_step;
             let done = match resumed {
                 None => self.step(&mut events).map(Some),
                 Some(_) => self.finish_step(stage, &mut events).map(|()| None),
             };
-            let spent = self.clock.now() - start;
-            self.state.progress.add_time(stage, spent);
-            (lap, lap_steps) = (lap + spent.wall_s, lap_steps + u32::from(resumed.is_none()));
-            for message in std::mem::take(&mut self.warnings) {
-                events.push(TrainEvent::Warning { message });
-            }
+            lap_steps += u32::from(resumed.is_none());
+            events.append(&mut self.messages);
             for event in events.drain(..) {
                 requests.add(self.emit(observer, &event));
             }
@@ -186,10 +194,12 @@ impl Trainer {
             if let Some(loss) = loss
                 && (falls_on(iteration, self.state.config.report.step_every) || iteration == iterations)
             {
-                let rate = f64::from(lap_steps) / lap.max(1e-9);
+                let spent = phases.spent(phase).wall_s;
+                let rate = f64::from(lap_steps) / (spent - lap).max(1e-9);
+                phases.advance_to(u64::from(iteration));
                 let event = self.step_event(stage, iterations, &loss, rate);
                 requests.add(self.emit(observer, &event));
-                (lap, lap_steps) = (0.0, 0);
+                (lap, lap_steps) = (spent, 0);
             }
             if let Some(share) =
                 loss.and_then(|loss| loss.unsupported).filter(|share| *share > MANY_UNSUPPORTED)
@@ -218,7 +228,7 @@ impl Trainer {
             self.state.progress.after_step = None;
             let report = &self.state.config.report;
             if falls_on(total, report.checkpoint_every)
-                || self.saving.is_due(report.checkpoint_seconds, self.clock.now().wall_s)
+                || self.saving.is_due(report.checkpoint_seconds, self.now_s())
                 || requests.save
             {
                 requests.save = false;
@@ -231,15 +241,15 @@ impl Trainer {
 
     /// Asks the observer to save the run as it stands.
     fn request_checkpoint(&mut self, observer: &mut Observer<'_>, requests: &mut Requests) {
-        let start_s = self.clock.now().wall_s;
+        let start_s = self.now_s();
         let Progress { stage, iteration, .. } = self.state.progress;
         requests.add(self.emit(observer, &TrainEvent::CheckpointDue { stage, iteration }));
-        self.saving.saved(self.state.config.report.checkpoint_seconds, start_s, self.clock.now().wall_s);
+        self.saving.saved(self.state.config.report.checkpoint_seconds, start_s, self.now_s());
     }
 
     /// [`TrainError::Stopped`] once a stop is requested. Work between two steps on a GPU is never left half way.
     pub(super) fn check_stop(&self) -> Result<(), TrainError> {
-        if self.engine.gpu_name().is_some() { Ok(()) } else { self.state.stop.check() }
+        if self.engine.gpu_name().is_some() { Ok(()) } else { self.state.phases.check() }
     }
 
     /// Measures a point of the curve where one is due, and acts on it.
@@ -272,8 +282,19 @@ impl Trainer {
             gaussians: self.state.field.gaussians.len(),
             psnr: self.state.progress.psnr.unwrap_or(0.0),
             iterations_per_second: rate,
-            eta_s: self.steps_left() as f64 / rate,
+            eta_s: self.eta_s(stage, rate),
         }
+    }
+
+    /// Sends what was found meanwhile.
+    fn send_messages(&mut self, observer: &mut Observer<'_>, requests: &mut Requests) {
+        for event in std::mem::take(&mut self.messages) {
+            requests.add(self.emit(observer, &event));
+        }
+    }
+
+    fn now_s(&self) -> f64 {
+        self.state.phases.now().wall_s
     }
 
     fn emit(&self, observer: &mut Observer<'_>, event: &TrainEvent) -> Control {
@@ -283,11 +304,13 @@ impl Trainer {
     /// Begins a stage. The run stays at the end of the stage before it when that fails or is stopped.
     pub(super) fn enter(&mut self, stage: Stage) -> Result<(), TrainError> {
         if stage == Stage::Fine {
-            let before = self.state.keep();
+            let before = (self.state.keep(), self.fits.clone(), self.jointed.clone());
             if let Err(error) = self.prepare_fine() {
-                self.state.put_back(before);
+                self.state.put_back(before.0);
+                (self.fits, self.jointed) = (before.1, before.2);
                 return Err(error);
             }
+            self.known = KnownObjects::default();
         }
         self.prepare_head(stage)?;
         self.begin(stage);

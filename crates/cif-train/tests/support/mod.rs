@@ -3,11 +3,12 @@
 #![allow(clippy::unwrap_used)] // Only tests call these.
 
 use std::path::Path;
+use std::sync::Mutex;
 
 use cif_dataset::{Dataset, Frame, InstanceLabel, Layout, PointCloud, PointSource, Split};
 use cif_field::Field;
 use cif_geometry::{LensDistortion, PinholeCamera, RigidTransform};
-use cif_train::{Control, Outcome, TrainConfig, TrainEvent, Trainer};
+use cif_train::{Clock, Control, Outcome, Seconds, TrainConfig, TrainEvent, Trainer};
 use glam::{DMat3, DVec2, DVec3};
 
 /// Size of the images.
@@ -296,6 +297,24 @@ pub(crate) fn stopped_after(dataset: &Dataset, config: &TrainConfig, steps: u64)
     });
     assert_eq!((outcome.unwrap(), trainer.steps_done()), (Outcome::Interrupted, steps));
     trainer
+}
+
+/// A clock that stands still until time passes on it; two processors are busy.
+#[derive(Default)]
+pub(crate) struct Manual(Mutex<f64>);
+
+impl Manual {
+    /// So many seconds pass.
+    pub(crate) fn pass(&self, seconds: f64) {
+        *self.0.lock().unwrap() += seconds;
+    }
+}
+
+impl Clock for Manual {
+    fn now(&self) -> Seconds {
+        let wall_s = *self.0.lock().unwrap();
+        Seconds { wall_s, cpu_s: 2.0 * wall_s }
+    }
 }
 
 /// A field without its record, which holds wall times.

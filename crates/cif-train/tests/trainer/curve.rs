@@ -1,20 +1,11 @@
 //! The curve of a run: quality against time, on a clock of the tests' own.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::support::{Scene, capture, small_config, train, without_record};
-use cif_train::{Clock, Control, Curve, CurveFrames, Outcome, Seconds, Stage, TrainEvent, Trainer};
-
-/// A clock that moves on by a quarter of a second whenever it is read.
-struct Ticking(AtomicU64);
-
-impl Clock for Ticking {
-    fn now(&self) -> Seconds {
-        let ticks = self.0.fetch_add(1, Ordering::SeqCst) as f64;
-        Seconds { wall_s: 0.25 * ticks, cpu_s: 0.5 * ticks }
-    }
-}
+use crate::support::{Manual, Scene, capture, small_config, train, without_record};
+use cif_train::{
+    Control, Curve, CurveFrames, Outcome, Phase, Phases, Stage, Start, Stop, TrainEvent, Trainer,
+};
 
 #[test]
 fn a_run_records_its_curve_and_ends_as_without_it() {
@@ -22,10 +13,26 @@ fn a_run_records_its_curve_and_ends_as_without_it() {
     let dataset = capture(folder.path(), Scene { times: 3, views: 3, ..Scene::default() });
     let mut config = small_config();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (40, 210, 110);
-    let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
-    trainer.set_clock(Arc::new(Ticking(AtomicU64::new(0))));
+    config.report.step_every = 1;
+    // Decoding takes 5 s, each step 1 s, and each point a quarter.
+    let clock = Arc::new(Manual::default());
+    let phases = Phases::new(Arc::clone(&clock) as _, Stop::default()).reported_to({
+        let clock = Arc::clone(&clock);
+        move |event| {
+            match event {
+                TrainEvent::PhaseStarted { phase: Phase::Decode, .. } => clock.pass(5.0),
+                TrainEvent::PhaseStarted { phase: Phase::Measure, .. } => clock.pass(0.25),
+                _ => {}
+            }
+            Control::Continue
+        }
+    });
+    let mut trainer = Trainer::new(Start { dataset: dataset.clone(), phases }, config.clone()).unwrap();
     let mut measured = Vec::new();
     let outcome = trainer.run(&mut |event, _| {
+        if let TrainEvent::Step { .. } = event {
+            clock.pass(1.0);
+        }
         if let TrainEvent::Measured { point, frames, .. } = event {
             assert_eq!(*frames, 3, "as many held-out frames as there are");
             measured.push(point.clone());
@@ -50,17 +57,20 @@ fn a_run_records_its_curve_and_ends_as_without_it() {
         ],
         "short stages have no point of their own"
     );
-    // A step reads the clock before and after; what measuring reads falls between steps.
     let walls: Vec<f64> = curve.points.iter().map(|point| point.wall_s).collect();
-    assert_eq!(walls, [35.0, 60.0, 62.5, 62.75, 87.75, 90.25]);
-    assert_eq!(curve.points[0].cpu_s, 70.0);
+    assert_eq!(walls, [145.0, 245.0, 255.0, 255.0, 355.0, 365.0], "everything but measuring is counted");
+    assert_eq!(curve.points[0].cpu_s, 290.0);
     assert_eq!(curve.measuring.wall_s, 6.0 * 0.25);
+    assert_eq!(trainer.time_of_training().wall_s, 365.0);
     assert_eq!((curve.frames, curve.frame_names.len()), (CurveFrames::HeldOut, 3));
     assert!(curve.points[..3].iter().all(|point| point.miou.is_none() && point.psnr > Some(10.0)));
     assert!(curve.points[3..].iter().all(|point| point.miou > Some(30.0) && point.ssim > Some(0.3)));
     let recorded: Curve = serde_json::from_value(trainer.field().record.curve.clone().unwrap()).unwrap();
     assert_eq!(recorded, curve);
-    assert_eq!(trainer.field().record.to_json()["train"]["cpu_s"], 180.5);
+    let record = trainer.field().record.to_json()["train"].clone();
+    assert_eq!((&record["wall_s"], &record["cpu_s"]), (&366.5.into(), &733.0.into()));
+    assert_eq!(record["wall_s_by_phase"]["fine"], 210.0);
+    assert_eq!(record["wall_s_by_phase"]["measure"], 1.5);
 
     config.report.curve_frames = 0;
     let without = train(dataset, config);

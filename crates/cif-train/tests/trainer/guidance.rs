@@ -57,15 +57,15 @@ fn a_travelling_object_is_followed() {
     let dataset = dataset(folder.path(), 12);
     let truth = DVec3::new(TRAVEL, 0.0, 0.0);
     let mut config = guided();
-    let mut warned = false;
+    let mut noted = false;
     let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
     trainer
         .run(&mut |event, _| {
-            warned |= matches!(event, TrainEvent::Warning { message } if message.contains("ball 9"));
+            noted |= matches!(event, TrainEvent::Note { message } if message.contains("ball 9"));
             Control::Continue
         })
         .unwrap();
-    assert!(warned, "the user is told what is guided");
+    assert!(noted, "what is guided is a finding");
     let field = trainer.into_field();
     let followed = path(&field, 2);
     assert!((followed - truth).length() < 0.15, "{followed}");
@@ -140,14 +140,14 @@ fn check_rigid_object([coarse, fine, instance]: [u32; 3], use_engine: impl Fn(&m
     (config.effects.still_every, config.effects.still_told) = (100, 15);
     // Inside the fine stage.
     config.report.checkpoint_every = coarse + fine / 2;
-    let mut warnings = Vec::new();
+    let mut notes = Vec::new();
     let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
     use_engine(&mut trainer);
     let (mut saved, mut densified) = (None, false);
     trainer
         .run(&mut |event, view| {
             match event {
-                TrainEvent::Warning { message } => warnings.push(message.clone()),
+                TrainEvent::Note { message } => notes.push(message.clone()),
                 TrainEvent::Densified { stage: Stage::Fine, .. } => densified = true,
                 TrainEvent::CheckpointDue { stage: Stage::Fine, .. } if densified => {
                     saved = Some(view.checkpoint(true));
@@ -157,16 +157,16 @@ fn check_rigid_object([coarse, fine, instance]: [u32; 3], use_engine: impl Fn(&m
             Control::Continue
         })
         .unwrap();
-    assert!(warnings.iter().any(|w| w.contains("ball 9 moves as a whole")), "{warnings:?}");
+    assert!(notes.iter().any(|w| w.contains("ball 9 moves as a whole")), "{notes:?}");
     let field = trainer.into_field();
     field.validate().unwrap();
     let tracks = field.tracks.as_ref().unwrap();
     assert_eq!((tracks.groups.len(), tracks.groups[0].poses.len()), (1, 12));
-    let evidence = match warnings.iter().any(|w| w.contains("moves as a whole") && w.contains("assumed")) {
+    let evidence = match notes.iter().any(|w| w.contains("moves as a whole") && w.contains("assumed")) {
         true => RotationEvidence::Assumed,
         false => RotationEvidence::Observed,
     };
-    assert_eq!(tracks.groups[0].rotation, Some(evidence), "{warnings:?}");
+    assert_eq!(tracks.groups[0].rotation, Some(evidence), "{notes:?}");
     // Where the ball is, from the first time to half-time.
     let place = |time: f64| tracks.groups[0].pose(time).1;
     let followed = place(0.5) - place(0.0);
@@ -317,12 +317,12 @@ fn far_points_lead_no_path_astray() {
     assert!((followed - DVec3::new(TRAVEL, 0.0, 0.0)).length() < 0.15, "{followed}");
 }
 
-/// Warnings of a run before its first step.
-fn warnings(dataset: &Dataset, config: &TrainConfig) -> Vec<String> {
+/// Notes and warnings of a run before its first step.
+fn messages(dataset: &Dataset, config: &TrainConfig) -> Vec<String> {
     let mut messages = Vec::new();
     let mut trainer = Trainer::new(dataset.clone(), config.clone()).unwrap();
     let outcome = trainer.run(&mut |event, _| match event {
-        TrainEvent::Warning { message } => {
+        TrainEvent::Warning { message } | TrainEvent::Note { message } => {
             messages.push(message.clone());
             Control::Continue
         }
@@ -337,18 +337,18 @@ fn a_wrong_camera_is_named_and_left_out() {
     let folder = tempfile::tempdir().unwrap();
     let sound = dataset(folder.path(), 12);
     let mut config = guided();
-    assert!(!warnings(&sound, &config).iter().any(|message| message.contains("left out")));
+    assert!(!messages(&sound, &config).iter().any(|message| message.contains("left out")));
     let mut wrong = sound.clone();
     let frame = wrong.frames.iter_mut().find(|frame| frame.time_index == 5).unwrap();
     let pose = &mut frame.camera.camera_from_world;
     let centre = pose.inverse().translation;
     pose.rotation = glam::DMat3::from_rotation_y(std::f64::consts::FRAC_PI_2) * pose.rotation;
     pose.translation = -(pose.rotation * centre);
-    let told = warnings(&wrong, &config);
+    let told = messages(&wrong, &config);
     assert!(told.iter().any(|message| message.starts_with("left out of training: 5_5:")), "{told:?}");
     assert!(told.iter().any(|message| message.ends_with("masks: ball 9")), "{told:?}");
     // With the frame, everything seems to travel.
     config.motion.misfit = 0.0;
-    let told = warnings(&wrong, &config);
+    let told = messages(&wrong, &config);
     assert!(told.iter().any(|message| message.ends_with("masks: ball 4, ball 7, ball 9")), "{told:?}");
 }

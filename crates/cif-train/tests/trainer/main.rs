@@ -9,6 +9,7 @@
 //! | `heads` | a head declared by a test, on every engine |
 //! | `memory` | frames that do not fit into memory, read ahead |
 //! | `curve`, `pacing`, `measure` | error curves, budgets of time, measured steps |
+//! | `phases` | where the time of a run goes, stops and limits inside what is no step |
 //! | `gpu` | runs on a GPU beside the same runs on the processor (`CIF_TEST_GPU=off|auto|require`) |
 #![allow(clippy::unwrap_used)] // Helpers of tests.
 
@@ -24,6 +25,7 @@ mod heads;
 mod measure;
 mod memory;
 mod pacing;
+mod phases;
 #[path = "../support/mod.rs"]
 mod support;
 mod training;

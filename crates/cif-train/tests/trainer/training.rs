@@ -117,7 +117,7 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
     let finished = (0..500).find_map(|_| {
         let asked = Arc::new(AtomicU32::new(0));
         let stop = Stop::when(move || asked.fetch_add(1, Ordering::Relaxed) >= limit);
-        let start = Start { dataset: dataset.clone(), stop };
+        let start = Start { dataset: dataset.clone(), phases: stop.into() };
         let begun = match state.clone() {
             None => Trainer::new(start, config.clone()),
             Some(state) => Trainer::resume(start, state),
@@ -125,7 +125,7 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
         let mut trainer = match begun {
             Ok(trainer) => trainer,
             Err(TrainError::Stopped) => {
-                limit += 5;
+                limit *= 2;
                 return None;
             }
             Err(error) => panic!("{error}"),
@@ -138,7 +138,7 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
         let checkpoint = trainer.checkpoint(true);
         let progress = checkpoint.training.as_ref().unwrap().json["progress"].clone();
         let place = (trainer.stage(), trainer.iteration(), progress["after_step"].clone());
-        limit = if stopped.last() == Some(&place) { limit + 5 } else { FIRST };
+        limit = if stopped.last() == Some(&place) { 2 * limit } else { FIRST };
         stopped.push(place);
         state = Some(checkpoint);
         None
@@ -257,7 +257,7 @@ fn without_masks_it_trains_colour_only_and_says_so() {
         let mut warnings = Vec::new();
         trainer
             .run(&mut |event, _| {
-                if let TrainEvent::Warning { message } = event {
+                if let TrainEvent::Warning { message } | TrainEvent::Note { message } = event {
                     warnings.push(message.clone());
                 }
                 assert!(!matches!(event, TrainEvent::StageStarted { stage: Stage::Instance, .. }));

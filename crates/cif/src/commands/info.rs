@@ -208,7 +208,7 @@ fn print_curve(curve: &Value) {
         return;
     };
     println!(
-        "{:>28}  {} {}; measuring took {:.1} s, which the points do not count",
+        "{:>28}  {} {}; measuring took {:.1} s; points count everything else, fits of objects too",
         "curve",
         curve.frame_names.len(),
         curve.frames.describe(),

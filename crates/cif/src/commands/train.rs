@@ -1,13 +1,14 @@
 //! `cif train`: from a capture to a scene.
 
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use cif_dataset::{Dataset, Layout};
 use cif_field::Checkpoint;
 use cif_train::plan::Basis;
 use cif_train::{
-    Control, EffectChoice, EffectPlan, HeadName, Outcome, Preset, Start, Stop, TrainConfig, TrainError,
-    TrainEvent, Trainer,
+    Control, EffectChoice, EffectPlan, HeadName, Outcome, Phase, Phases, Preset, Start, Stop, TrainConfig,
+    TrainError, TrainEvent, Trainer,
 };
 use clap::{Args, ValueEnum};
 
@@ -52,9 +53,11 @@ As good as it gets in a minute and a half, or only as long as it has to:
   cif train captures/table -o table.cif --budget 90s
   cif train captures/table -o table.cif --target-psnr 28 --target-miou 85 --budget 10m
 
-With --resume, a budget is for the rest. SCENE.train.toml then holds the settings that came of it.
+With --resume, a budget is for the rest. SCENE.train.toml then holds the settings that came of it. A budget counts
+everything from the start of the command on; fits of objects that it has no time for are left out, and noted.
 
-Ctrl-C and SIGTERM save and stop; the same command with --resume goes on as if nothing had happened. It does so
+Ctrl-C and SIGTERM save and stop, inside fits of objects too, which keep the objects that are done; the same command
+with --resume goes on as if nothing had happened. It does so
 after a power cut as well, from the state saved last: there is one every five minutes and at the end of each stage
 (--checkpoint-seconds). While a run lasts, its scene is locked: another one to the same file is refused.")]
 pub(super) struct Train {
@@ -217,11 +220,24 @@ enum AblationName {
 
 pub(super) fn run(command: &Train) -> Result<(), Error> {
     let mut timing = Timing::start();
+    interrupt::set_last_words("interrupted; nothing was saved");
     // Everything that can be refused is refused before the first image is read.
     check_outputs(command)?;
     let existing = if command.force || command.resume { Existing::Replace } else { Existing::Keep };
     let mut destination = Destination::open(&command.output, existing)?;
     let checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
+    if command.resume {
+        interrupt::set_last_words("interrupted; the saved state is as it was");
+    }
+    let progress = Arc::new(Mutex::new(Progress::new(command.quiet)));
+    let phases = timing.phases(Stop::when(interrupt::requested)).reported_to({
+        let progress = Arc::clone(&progress);
+        move |event| {
+            shown(&progress).event(event);
+            Control::Continue
+        }
+    });
+    let _run = phases.enter(Phase::Other, 0);
     let source = command.from.as_deref().map(load_source).transpose()?;
     let base = source.as_ref().and_then(|source| cif_train::metrics::training_config(&source.field));
     let layout = command.capture_options.layout_after(&command.capture, |layout| match checkpoint {
@@ -238,31 +254,30 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         None => resolve(command, base.as_ref(), layout, None)?.downscale,
     };
     capture.downscale = capture.downscale.or(wanted);
+    let phase = phases.enter(Phase::Open, 0);
     let mut dataset = capture.open(&command.capture)?;
+    drop(phase);
     print_warnings(&dataset);
-    if dataset.frames.iter().all(|frame| frame.mask.is_none()) {
-        eprintln!("note: the capture has no masks, so colour and motion are trained, but no instances");
-    }
 
-    let stop = Stop::when(interrupt::requested);
     let mut trainer = match checkpoint {
-        Some(checkpoint) => Trainer::resume(Start { dataset, stop }, checkpoint)
+        Some(checkpoint) => Trainer::resume(Start { dataset, phases: phases.clone() }, checkpoint)
             .map_err(|error| error.of_scene(&command.output))
             .inspect(|trainer| destination.resumes(trainer.config())),
         None => {
             let plan = match &source {
                 Some(_) => None,
-                None => Some(plan(command, &dataset)?),
+                None => Some(plan(command, &dataset, &phases)?),
             };
             let mut config = resolve(command, base.as_ref(), dataset.layout, plan.as_ref())?;
             command.goals.prepare(&mut config);
             if source.is_none() {
                 let preset = TrainConfig::preset(config.preset, dataset.layout);
                 let (goals, options) = (&command.goals, &command.capture_options);
-                dataset = goals.fit(&mut timing, &mut config, &preset, dataset, options, command.quiet)?;
+                let quiet = command.quiet;
+                dataset = goals.fit(&mut timing, &mut config, &preset, dataset, options, &phases, quiet)?;
             }
             destination.check_settings(&config)?;
-            let start = Start { dataset, stop };
+            let start = Start { dataset, phases: phases.clone() };
             let trainer = match (source, &command.from) {
                 (Some(source), Some(path)) => {
                     let name = path.file_name().unwrap_or_default().to_string_lossy();
@@ -288,17 +303,20 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     trainer.set_debug_validation(command.debug_validation);
     command.goals.apply(&timing, &mut trainer)?;
     #[cfg(feature = "wgpu")]
-    command.backend.apply(gpu.as_ref(), &mut trainer)?;
+    {
+        let _phase = gpu.as_ref().map(|_| phases.enter(Phase::Probe, 0));
+        command.backend.apply(gpu.as_ref(), &mut trainer)?;
+    }
 
-    let mut progress = Progress::new(command.quiet, command.log.as_deref(), command.resume)?;
+    shown(&progress).log_to(command.log.as_deref(), command.resume)?;
     interrupt::watch_and_save();
     let mut steps_done = StepCount::default();
     let outcome = training::run(&mut trainer, Some(&mut destination), &mut |event| {
-        progress.event(event);
+        shown(&progress).event(event);
         let enough = command.stop_after.is_some_and(|limit| steps_done.after(event) >= limit);
         if enough { Control::Stop } else { Control::Continue }
     });
-    let logged = progress.finish();
+    let logged = shown(&progress).finish(trainer.steps_done(), &trainer.wall_s_by_phase());
     let outcome = outcome?;
     if command.goals.changes_steps() && !command.quiet {
         command.goals.report(&timing, &trainer);
@@ -308,6 +326,10 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         Outcome::Finished => eprintln!("saved {saved}"),
         Outcome::Interrupted => {
             let help = format!("go on with: {}", resume_command(command));
+            if !trainer.has_begun() {
+                let message = "interrupted before the first step; nothing was saved".to_owned();
+                return Err(Error::Interrupted { message, help: None });
+            }
             if interrupt::requested() {
                 return Err(Error::Interrupted {
                     message: format!("interrupted; saved {saved}"),
@@ -318,6 +340,11 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         }
     }
     logged
+}
+
+/// The progress of the run, for one event.
+fn shown(progress: &Mutex<Progress>) -> MutexGuard<'_, Progress> {
+    progress.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Checks that no file is written twice or both read and written, but for the settings, which may be those of an
@@ -417,11 +444,11 @@ fn load_source(path: &Path) -> Result<Checkpoint, Error> {
 }
 
 /// Effects that the capture calls for; the paper's settings stay as they are unless the user says otherwise.
-fn plan(command: &Train, dataset: &Dataset) -> Result<EffectPlan, Error> {
+fn plan(command: &Train, dataset: &Dataset, phases: &Phases) -> Result<EffectPlan, Error> {
     let config = resolve(command, None, dataset.layout, None)?;
     let basis = if config.preset == Preset::Paper { Basis::All } else { Basis::Auto };
     let choice = command.effects.clone().unwrap_or(EffectChoice { basis, ..EffectChoice::default() });
-    EffectPlan::new(dataset, &config, &choice).map_err(Error::plain)
+    EffectPlan::watched(dataset, &config, &choice, phases).map_err(Error::plain)
 }
 
 /// Preset or the settings of the scene to begin with, what the capture calls for, file, flags.

@@ -6,8 +6,8 @@ use std::time::Duration;
 use cif_dataset::Dataset;
 use cif_train::budget::{Budget, BudgetClock};
 use cif_train::curve::Targets;
-use cif_train::fit::{Choice, Workload, calibrate, choose};
-use cif_train::{Clock, Seconds, SystemClock, TrainConfig, Trainer};
+use cif_train::fit::{Choice, Workload, calibrate, choose, share_of_fits};
+use cif_train::{Clock, Phase, Phases, Seconds, Stop, SystemClock, TrainConfig, Trainer};
 use clap::{Args, ValueEnum};
 
 use super::CaptureOptions;
@@ -78,6 +78,11 @@ impl Timing {
         let start = clock.now();
         Self { clock, start, budget: None }
     }
+
+    /// Phases of the command, of which it is in the first.
+    pub(super) fn phases(&self, stop: Stop) -> Phases {
+        Phases::new(Arc::clone(&self.clock), stop)
+    }
 }
 
 impl Goals {
@@ -114,9 +119,11 @@ impl Goals {
         preset: &TrainConfig,
         dataset: Dataset,
         capture: &CaptureOptions,
+        phases: &Phases,
         quiet: bool,
     ) -> Result<Dataset, Error> {
         let Some(mut budget) = self.budget(timing) else { return Ok(dataset) };
+        let phase = phases.enter(Phase::Calibrate, 0);
         let (part, least, most) = CALIBRATION;
         let limit = (part * budget.seconds).clamp(least, most);
         let calibration = calibrate(&dataset, config, &timing.clock, budget.clock, budget.threads, limit)
@@ -127,7 +134,10 @@ impl Goals {
             may_reduce: capture.downscale.is_none() && config.downscale == preset.downscale,
             may_change_gaussians: config.densify.max_gaussians == preset.densify.max_gaussians,
         };
+        drop(phase);
         let left = (budget.seconds - budget.used(timing.clock.now())).max(0.0);
+        // Fits of objects have their part; where they need less of it, steps get the rest.
+        let left = left * (1.0 - share_of_fits(config, work));
         let choice = choose(config, &calibration, work, left);
         if !quiet {
             tell(&budget, &choice, config, calibration.steps);
@@ -144,6 +154,7 @@ impl Goals {
         *config = choice.config;
         if reopened {
             let options = CaptureOptions { downscale: config.downscale, ..capture.clone() };
+            let _phase = phases.enter(Phase::Open, 0);
             return options.open(&dataset.root);
         }
         Ok(dataset)
@@ -151,7 +162,6 @@ impl Goals {
 
     /// Holds a run to budget and targets.
     pub(super) fn apply(&self, timing: &Timing, trainer: &mut Trainer) -> Result<(), Error> {
-        trainer.set_clock(Arc::clone(&timing.clock));
         if let Some(budget) = timing.budget.or_else(|| self.budget(timing)) {
             trainer.set_budget(budget);
         }
@@ -179,14 +189,10 @@ impl Goals {
     pub(super) fn report(&self, timing: &Timing, trainer: &Trainer) {
         let curve = trainer.curve();
         if let Some(budget) = self.budget(timing) {
-            let stages = trainer.field().record.run.iter().flat_map(|run| &run.wall_s_by_stage);
-            let stages: Vec<String> = stages.map(|(stage, s)| format!("{stage} {s:.1} s")).collect();
             eprintln!(
-                "used {:.1} s of the budget of {:.0} s: {}; measuring {:.1} s",
+                "used {:.1} s of the budget of {:.0} s",
                 budget.used(timing.clock.now()),
-                budget.seconds,
-                stages.join(", "),
-                curve.measuring.wall_s
+                budget.seconds
             );
         }
         if trainer.reached_targets() {

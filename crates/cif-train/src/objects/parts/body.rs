@@ -7,6 +7,7 @@ use glam::{DQuat, DVec3};
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64;
+use serde::{Deserialize, Serialize};
 
 use super::super::shape::{Adam, Pose, Shape};
 use super::super::view::ObjectView;
@@ -21,7 +22,7 @@ const UPRIGHT: f64 = 0.99;
 const GREY: [f32; 3] = [0.5; 3];
 
 /// A joint in the frame of the object.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Hinge {
     pub(crate) kind: JointKind,
     /// Unit.
@@ -157,6 +158,9 @@ impl<'a> Body<'a> {
     ) {
         let mut order = views.to_vec();
         for step in 0..if order.is_empty() { 0 } else { count } {
+            if self.shape.phases().is_over() {
+                break;
+            }
             let place = step % order.len();
             if place == 0 {
                 order.shuffle(&mut self.rng);

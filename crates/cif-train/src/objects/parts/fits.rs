@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use cif_field::Gaussians;
 use cif_field::tracks::JointKind;
 use glam::{DQuat, DVec3};
+use serde::{Deserialize, Serialize};
 
 use super::super::shape::Pose;
 use super::body::{Body, Hinge, between, range};
@@ -168,10 +169,12 @@ impl<'a> Search<'a> {
 }
 
 /// An object that rests and a part of it that moves, in the world.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(crate) struct Jointed {
+    #[serde(skip)]
     pub(crate) base: Gaussians,
     /// As at the value 0.
+    #[serde(skip)]
     pub(crate) part: Gaussians,
     pub(crate) hinge: Hinge,
     /// Radians or metres, by time.

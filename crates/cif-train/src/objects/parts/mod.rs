@@ -86,7 +86,7 @@ pub(super) fn find(object: Object<'_>) -> Result<Option<Jointed>, TrainError> {
 /// The part in the frame of an object whose poses (world from object, by time) are known.
 fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jointed>, TrainError> {
     let views = object.views;
-    let stop = object.surroundings.stop;
+    let phases = object.surroundings.phases;
     let is_usable = |view: &usize| views[*view].is_reliable() && base.contains_key(&views[*view].time_index);
     let reliable: Vec<usize> = (0..views.len()).filter(is_usable).collect();
     let mut times: Vec<usize> = reliable.iter().map(|view| views[*view].time_index).collect();
@@ -109,7 +109,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let level = search.level();
     let Some(rough) = search.rigid(&search.train, ROUGH, level) else { return Ok(None) };
     let uncut = rough.mean_loss(&search.train, level);
-    stop.check()?;
+    phases.check()?;
     let Some((closed, still)) = search.closed(ROUGH, level) else { return Ok(None) };
     if uncut <= ALIKE * closed.mean_loss(&still, level) {
         return Ok(None);
@@ -118,14 +118,14 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     if tried.is_empty() {
         return Ok(None);
     }
-    stop.check()?;
+    phases.check()?;
     let mut begun: Vec<Fit<'_>> = tried
         .into_par_iter()
         .take(FITTED)
         .filter_map(|(guess, values, _)| search.begun(guess, &values, FIT, level))
         .collect();
     keep_kinds(&mut begun, AGAIN);
-    stop.check()?;
+    phases.check()?;
     let promises = |fits: &[Fit<'_>], most: f64| fits.first().is_some_and(|best| best.loss < most * uncut);
     if !promises(&begun, PROMISES[0]) {
         return Ok(None);
@@ -133,7 +133,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
     let mut fitted: Vec<Fit<'_>> =
         begun.into_par_iter().map(|begun| search.finely_valued(begun, FIT.1, level)).collect();
     keep_kinds(&mut fitted, FINE);
-    stop.check()?;
+    phases.check()?;
     if !promises(&fitted, PROMISES[1]) {
         return Ok(None);
     }
@@ -151,7 +151,7 @@ fn find_on(object: Object<'_>, base: &BTreeMap<usize, Pose>) -> Result<Option<Jo
             fitted.into_par_iter().filter_map(finely).collect::<Vec<_>>()
         },
     );
-    stop.check()?;
+    phases.check()?;
     let Some(rigid) = rigid else { return Ok(None) };
     let judged = if search.left_out.is_empty() { &search.train } else { &search.left_out };
     let still = rigid.mean_loss(judged, 0);

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::super::fit::hull;
 use super::super::shape::{Pose, Shape};
-use super::super::start::Object;
+use super::super::start::{Object, Surroundings};
 use super::super::view::median;
 use super::body::{Body, Hinge};
 
@@ -50,14 +50,15 @@ impl<'a> Search<'a> {
         bound: Option<&dyn Fn(DVec3) -> bool>,
         count: usize,
     ) -> Option<Shape> {
-        let near = self.object.surroundings.near;
+        let Surroundings { near, phases, .. } = self.object.surroundings;
         let reach = 1.3 * self.size;
         // A part leaves the room of the base.
         let bounded = bound.is_none();
         let inside =
             |place: DVec3| (!bounded || self.is_within(place)) && bound.is_none_or(|bound| bound(place));
         let bound: Option<&dyn Fn(DVec3) -> bool> = Some(&inside);
-        let mut shape = hull(self.object.views, poses, (reach, bound), count, near, &mut self.object.rng())?;
+        let mut rng = self.object.rng();
+        let mut shape = hull(self.object.views, poses, (reach, bound), count, (near, phases), &mut rng)?;
         shape.fade(0.0, |_| true);
         Some(shape)
     }

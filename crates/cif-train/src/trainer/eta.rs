@@ -1,0 +1,49 @@
+//! How long the rest of a run takes, by what its steps and fits took so far.
+
+use super::Trainer;
+use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE};
+use crate::phase::Phase;
+use crate::stage::Stage;
+
+impl Trainer {
+    /// Travelling objects that are not fitted yet.
+    pub(super) fn objects_to_fit(&self) -> usize {
+        if !self.state.config.motion.rigid || !self.is_guided() {
+            return 0;
+        }
+        let travelling = self.state.guidance.travelling.iter().enumerate().filter(|(_, travels)| **travels);
+        let is_open = |label: u16| !self.fits.contains_key(&label) && !self.jointed.contains_key(&label);
+        travelling.filter(|(label, _)| is_open(*label as u16)).count()
+    }
+
+    /// Estimated seconds to the end of the run, within a stage whose steps are done at a rate per second: the budget's
+    /// where there is one, else by steps, by the frames that identities are estimated from, and by the objects that are
+    /// fitted between the coarse and the fine stage.
+    pub(super) fn eta_s(&self, stage: Stage, rate: f64) -> f64 {
+        if let Some(left_s) = self.budget_left_s() {
+            return left_s;
+        }
+        let cost = |stage: Stage| match stage {
+            Stage::Coarse if self.stages.is_dynamic => COARSE,
+            Stage::Instance => INSTANCE,
+            _ => 1.0,
+        };
+        let step_s = 1.0 / (rate * cost(stage)).max(1e-9);
+        let steps = |of: Stage| {
+            let done = if of == stage { self.state.progress.iteration } else { 0 };
+            f64::from(self.stages.iterations(&self.state.config, of).saturating_sub(done)) * cost(of)
+        };
+        let stages = [Stage::Coarse, Stage::Fine, Stage::Instance].into_iter().filter(|of| *of >= stage);
+        let identity = IDENTITY_STEPS_PER_FRAME * self.frames_of_identities(stage) as f64;
+        let fits_s = if stage == Stage::Coarse { self.fits_s() } else { 0.0 };
+        (stages.map(steps).sum::<f64>() + identity) * step_s + fits_s
+    }
+
+    /// Estimated seconds of the fits to come: as long for each object as for one that was tried before.
+    fn fits_s(&self) -> f64 {
+        let others = self.state.guidance.travelling.iter().skip(1).filter(|travels| !**travels).count();
+        let tried = others + self.fits.len();
+        let spent = self.state.phases.spent(Phase::Search).wall_s;
+        if tried == 0 { 0.0 } else { self.objects_to_fit() as f64 * spent / tried as f64 }
+    }
+}

@@ -1,0 +1,103 @@
+//! Objects that were fitted so far: kept, and saved with the run, until the fine stage takes them over, so that a run
+//! that was stopped fits none of them again.
+
+use std::collections::BTreeMap;
+
+use cif_field::Gaussians;
+use cif_field::checkpoint::StateTensor;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+
+use crate::objects::{Found, Jointed};
+
+/// Findings about objects, by label (dense index + 1). Gaussians are saved as tensors, everything else as JSON.
+#[derive(Clone, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct KnownObjects {
+    /// How they move as a whole.
+    pub(super) rigid: BTreeMap<u16, Found>,
+    /// Their parts on joints; `None` where they have none.
+    pub(super) parts: BTreeMap<u16, Option<Jointed>>,
+}
+
+/// Start of the names of tensors.
+const TENSORS: &str = "objects.";
+
+impl KnownObjects {
+    pub(super) fn is_empty(&self) -> bool {
+        self.rigid.is_empty() && self.parts.is_empty()
+    }
+
+    /// Sets of Gaussians, each under its name.
+    fn sets(&mut self) -> Vec<(String, &mut Gaussians)> {
+        let mut sets = Vec::new();
+        for (label, found) in &mut self.rigid {
+            if let Found::Moves(fitted) = found {
+                sets.push((format!("{TENSORS}{label}.whole"), &mut fitted.gaussians));
+            }
+        }
+        for (label, found) in &mut self.parts {
+            if let Some(Jointed { base, part, .. }) = found {
+                sets.push((format!("{TENSORS}{label}.base"), base));
+                sets.push((format!("{TENSORS}{label}.part"), part));
+            }
+        }
+        sets
+    }
+
+    /// JSON and tensors to save; nothing where nothing is known.
+    pub(super) fn saved(&self) -> (Option<Value>, Vec<(String, StateTensor)>) {
+        if self.is_empty() {
+            return (None, Vec::new());
+        }
+        let mut tensors = Vec::new();
+        for (name, gaussians) in self.clone().sets() {
+            for (parameter, values) in gaussians.tensors() {
+                tensors.push((format!("{name}.{}", parameter.name), StateTensor::F32(values.to_vec())));
+            }
+        }
+        (serde_json::to_value(self).ok(), tensors)
+    }
+
+    /// What [`Self::saved`] gave; `None` when it is damaged, or not of a capture with so many instances and times.
+    pub(super) fn restored(
+        json: Value,
+        tensors: &mut BTreeMap<String, StateTensor>,
+        (instances, times): (usize, usize),
+    ) -> Option<Self> {
+        let mut known: Self = serde_json::from_value(json).ok()?;
+        let labels = known.rigid.keys().chain(known.parts.keys());
+        let are_labels = labels.copied().all(|label| (1..=instances).contains(&usize::from(label)));
+        let of_rigid = known.rigid.values().filter_map(|found| match found {
+            Found::Moves(fitted) => Some(
+                fitted.poses.len() == fitted.shares.len() && {
+                    let last = fitted.poses.last_key_value();
+                    last.is_some_and(|(time, _)| *time < times)
+                },
+            ),
+            _ => None,
+        });
+        let of_parts = known.parts.values().flatten().map(|found| {
+            let last = found.values.last_key_value();
+            last.is_some_and(|(time, _)| *time < times)
+        });
+        if !are_labels || !of_rigid.chain(of_parts).all(|fits| fits) {
+            return None;
+        }
+        for (name, gaussians) in known.sets() {
+            let StateTensor::F32(means) = tensors.get(&format!("{name}.means"))? else { return None };
+            *gaussians = Gaussians::zeros(means.len() / 3);
+            for (parameter, values) in gaussians.tensors_mut() {
+                let Some(StateTensor::F32(saved)) = tensors.remove(&format!("{name}.{}", parameter.name))
+                else {
+                    return None;
+                };
+                if saved.len() != values.len() || !saved.iter().all(|value| value.is_finite()) {
+                    return None;
+                }
+                values.copy_from_slice(&saved);
+            }
+        }
+        Some(known)
+    }
+}
