@@ -33,7 +33,7 @@ pub(in crate::commands) struct Capture {
     #[arg(required = true, value_name = "INPUT")]
     pub(super) inputs: Vec<String>,
     /// New folder for the capture
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     pub(super) output: PathBuf,
     /// Frames per second to take of videos
     #[arg(long, value_name = "HZ", value_parser = positive, conflicts_with = "count", help_heading = "Frames")]
@@ -108,9 +108,10 @@ pub(in crate::commands) struct Capture {
         help_heading = "World"
     )]
     pub(super) up: UpName,
-    /// Show no progress
-    #[arg(short, long)]
+    #[arg(from_global)]
     pub(super) quiet: bool,
+    #[command(flatten)]
+    pub(super) report: crate::report::OnlyReport,
     /// A step of `cif make`, which tells what comes next
     #[arg(long, hide = true)]
     pub(super) step: bool,
