@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
+use crate::moment::Moment;
+
 /// Make a capture out of videos or photographs: frames, camera poses, times
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -41,11 +43,11 @@ pub(in crate::commands) struct Capture {
     /// Frames to take of every input [default: 150 of a video, all photographs]
     #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000), help_heading = "Frames")]
     pub(super) count: Option<usize>,
-    /// First second of videos to take
-    #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Frames")]
+    /// Time of videos to begin at, seconds with an s: 12s
+    #[arg(long, value_name = "TIME", value_parser = seconds, help_heading = "Frames")]
     pub(super) from: Option<f64>,
-    /// Last second of videos to take
-    #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Frames")]
+    /// Time of videos to end at, as 20.5s
+    #[arg(long, value_name = "TIME", value_parser = seconds, help_heading = "Frames")]
     pub(super) to: Option<f64>,
     /// Reduce frames of videos so that their larger side has at most so many pixels
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(16..=16_384), help_heading = "Frames")]
@@ -174,8 +176,13 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
-    let value = text.parse().ok().filter(|value: &f64| value.is_finite() && *value >= 0.0);
-    value.ok_or_else(|| "seconds from 0 on are expected".to_owned())
+    match text.parse() {
+        Ok(Moment::Seconds(value)) if value >= 0.0 => Ok(value),
+        Ok(Moment::Frame(value)) => Err(format!(
+            "frames of a video have no numbers before they are taken; {value}s is that second of it"
+        )),
+        _ => Err("seconds from 0 on are expected, with an s: 12.5s".to_owned()),
+    }
 }
 
 /// A camera and seconds.
