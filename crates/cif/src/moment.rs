@@ -16,11 +16,6 @@ use cif_scene::CodeRange;
 
 use crate::error::Error;
 
-/// The suffixes in words, for the help of the command.
-pub(crate) const HELP: &str = "\
-Times are frames as captured, which are the time codes of exported stages: --time 36. Seconds after the first frame
-have an s (--time 1.5s), shares of the whole a percent sign (--time 50%). Intervals are FROM:TO.";
-
 /// A time as it was typed.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Moment {

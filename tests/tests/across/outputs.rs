@@ -109,7 +109,7 @@ fn inputs_are_kept_whatever_is_forced() {
     cif(path, "import t.ply --base t.cif -o ./t.cif --force").fails(2, &[kept]);
     let line = "export t.cif --ground-truth motion.json --json motion.json --force";
     cif(path, line).fails(2, &[read]);
-    cif(path, "export t.cif --json t.cif --force").fails(2, &["--json FILE.json"]);
+    cif(path, "export t.cif --json t.cif --force").fails(2, &[".usda"]);
     cif(path, "export t.cif --json=t.cif --force").fails(2, &["t.json"]);
     cif(path, "train table -o t.cif --from t.cif --force").fails(2, &[kept]);
     cif(path, "train table -o a.cif --log a.cif --force").fails(2, &["a.jsonl"]);

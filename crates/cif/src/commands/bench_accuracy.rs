@@ -68,7 +68,7 @@ pub(super) struct BenchAccuracy {
     #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
     #[command(flatten)]
-    report: crate::report::OnlyReport,
+    report: crate::report::Report,
     /// Small scenes, reduced images and fewer rungs, in five minutes
     #[arg(long, conflicts_with = "preset")]
     quick: bool,
@@ -125,6 +125,7 @@ impl BenchAccuracy {
 }
 
 pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
+    command.report.check(&mut crate::output::Outputs::new(command.force))?;
     let paper = command.paper()?;
     let check = |layout| {
         if let Some(Paper { share, settings }) = &paper {

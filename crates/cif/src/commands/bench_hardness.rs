@@ -80,6 +80,7 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
             "give a capture with held-out frames",
         ));
     }
+    command.report.check(&mut output::Outputs::new(command.force))?;
     output::check_folder(&command.output, command.force)?;
     let config = resolve(command, dataset.layout)?;
     let chosen: Vec<&HardCapture> = HARD_CAPTURES

@@ -26,10 +26,10 @@ pub(super) struct Man {
 }
 
 pub(super) fn run(command: &Man) -> Result<(), Error> {
-    let mut root = Arguments::command();
+    let mut root = Arguments::command().disable_help_subcommand(true);
     root.build();
     let mut pages = Vec::new();
-    collect(&root, "cif".to_owned(), &mut pages)?;
+    collect(&root, &mut pages)?;
     std::fs::create_dir_all(&command.folder).map_err(Error::io("create the folder", &command.folder))?;
     let mut outputs = Outputs::new(command.force);
     for (name, _) in &pages {
@@ -43,15 +43,13 @@ pub(super) fn run(command: &Man) -> Result<(), Error> {
 }
 
 /// The page of a command, and those of its subcommands.
-fn collect(command: &clap::Command, name: String, pages: &mut Vec<(String, Vec<u8>)>) -> Result<(), Error> {
+fn collect(command: &clap::Command, pages: &mut Vec<(String, Vec<u8>)>) -> Result<(), Error> {
+    // Once built, a subcommand is displayed as `cif-train`.
+    let name = command.get_display_name().unwrap_or_else(|| command.get_name());
     let mut page = Vec::new();
-    Page::new(command.clone().name(name.clone()))
+    Page::new(command.clone())
         .render(&mut page)
         .map_err(|error| Error::plain(format!("the page of {name} cannot be made: {error}")))?;
     pages.push((format!("{name}.1"), page));
-    let shown = |sub: &&clap::Command| !sub.is_hide_set() && sub.get_name() != "help";
-    command
-        .get_subcommands()
-        .filter(shown)
-        .try_for_each(|sub| collect(sub, format!("{name}-{}", sub.get_name()), pages))
+    command.get_subcommands().filter(|sub| !sub.is_hide_set()).try_for_each(|sub| collect(sub, pages))
 }

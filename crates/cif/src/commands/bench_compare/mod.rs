@@ -77,7 +77,7 @@ pub(super) struct BenchCompare {
     #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
     #[command(flatten)]
-    report: crate::report::OnlyReport,
+    report: crate::report::Report,
     /// Heads to compare, comma separated [default: all]
     #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
     heads: Vec<HeadArgument>,
@@ -169,6 +169,7 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
         answers::check(models)?;
     }
     let goes_on = command.output.join("runs").is_dir();
+    command.report.check(&mut output::Outputs::new(command.force))?;
     output::check_folder(&command.output, command.force || goes_on)?;
     let captures = command
         .captures

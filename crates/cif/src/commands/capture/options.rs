@@ -178,9 +178,7 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
 fn seconds(text: &str) -> Result<f64, String> {
     match text.parse() {
         Ok(Moment::Seconds(value)) if value >= 0.0 => Ok(value),
-        Ok(Moment::Frame(value)) => Err(format!(
-            "frames of a video have no numbers before they are taken; {value}s is that second of it"
-        )),
+        Ok(Moment::Frame(value)) => Err(format!("times of a video are seconds with an s: {value}s")),
         _ => Err("seconds from 0 on are expected, with an s: 12.5s".to_owned()),
     }
 }
