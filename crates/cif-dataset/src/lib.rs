@@ -46,6 +46,7 @@ mod lens_removal;
 mod load;
 mod mask_files;
 pub mod masks;
+pub mod meant;
 pub mod motion_truth;
 mod open;
 mod placement;

@@ -130,7 +130,7 @@ fn edit(
         let known: Vec<String> = nodes.iter().filter(|node| is_object(node)).map(name).collect();
         return Err(match found.len() {
             0 if known.is_empty() => "there is no object in the file".to_owned(),
-            0 => format!("there is none; objects: {}", known.join(", ")),
+            0 => format!("there is none; {}", cif_scene::known_names(object, "objects", &known)),
             count => format!("{count} nodes are called so; rename them apart first"),
         });
     };

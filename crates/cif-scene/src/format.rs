@@ -7,8 +7,8 @@ use cif_field::Field;
 use serde::Deserialize;
 
 use crate::{
-    LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneError, SceneGraph,
-    SceneOptions, build, query, search,
+    CodeRange, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneError,
+    SceneGraph, SceneOptions, build, query, search,
 };
 
 /// Why a format refuses; the message names the file and what to do.
@@ -86,6 +86,14 @@ pub trait SceneFormat: Sync {
     /// # Errors
     /// Missing, damaged or foreign files without splats.
     fn read(&self, path: &Path, options: ReadOptions) -> Result<SceneGraph, FormatError>;
+
+    /// Range of the time codes of a file.
+    ///
+    /// # Errors
+    /// As [`SceneFormat::read`].
+    fn code_range(&self, path: &Path, options: ReadOptions) -> Result<CodeRange, FormatError> {
+        Ok(self.read(path, options)?.time_codes.range())
+    }
 
     /// Gives an object of a file another label, and another class where one is given. `object` is a mask value or
     /// what the file calls it. The result takes the place of `output`, which may be `path` itself.

@@ -72,7 +72,7 @@ pub use format::{
     About, Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
 };
 pub use graph::{
-    Appearance, AppearanceSample, CameraSample, CameraTrack, ConvexHull, DenseMotion, DenseSample,
+    Appearance, AppearanceSample, CameraSample, CameraTrack, CodeRange, ConvexHull, DenseMotion, DenseSample,
     IdentityShare, IdentityShares, Motion, MotionModel, Node, NodeKind, Origin, Part, PartsMotion,
     PointProxy, PoseSample, SceneGraph, Splats, TimeCodes, VisibilitySample,
 };
@@ -92,3 +92,4 @@ pub use world::frame_of;
 
 /// Where coordinates lie in the world of the capture; see [`world`].
 pub use cif_dataset::CaptureFrame;
+pub use cif_dataset::meant::known_names;

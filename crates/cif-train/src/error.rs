@@ -37,13 +37,13 @@ pub enum TrainError {
         root: PathBuf,
     },
     /// The motion of an object is told that the capture does not have.
-    #[error("{}: the motion of `{label}` is told, but no instance has this label; there are: {known}", root.display())]
+    #[error("{}: the motion of `{label}` is told, but no instance has this label; {known}", root.display())]
     UnknownObject {
         /// Folder of the capture.
         root: PathBuf,
         /// Label that was told.
         label: String,
-        /// Labels of the capture.
+        /// Labels of the capture, in words.
         known: String,
     },
     /// The optimisation left the finite numbers.

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use cif_geometry::Bounds;
 use cif_scene::search::{TAXONOMY_CLASS, TAXONOMY_INSTANCE, sampled_codes, speed, volume};
-use cif_scene::{ConvexHull, LabelMatch, LabelQuery, ObjectMatch, ObjectQuery, When};
+use cif_scene::{CodeRange, ConvexHull, LabelMatch, LabelQuery, ObjectMatch, ObjectQuery, When};
 use glam::{DMat4, DVec3};
 use pyo3::prelude::*;
 
@@ -48,6 +48,21 @@ pub(crate) fn search(
             }
             _ => Ok(found),
         }
+    })
+}
+
+/// Range of the time codes of a stage.
+pub(crate) fn code_range(path: &Path, options: ReadOptions) -> Result<CodeRange, UsdError> {
+    pxr::with(|pxr| {
+        let stage = crate::read::open::open(pxr, path, options)?;
+        let range = || -> PyResult<CodeRange> {
+            let number = |name: &str| -> PyResult<f64> { stage.call_method0(name)?.extract() };
+            let has_ends = stage.call_method0("HasAuthoredTimeCodeRange")?.is_truthy()?;
+            let ends =
+                if has_ends { Some((number("GetStartTimeCode")?, number("GetEndTimeCode")?)) } else { None };
+            Ok(CodeRange { ends, per_second: number("GetTimeCodesPerSecond")? })
+        };
+        range().map_err(|error| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) })
     })
 }
 

@@ -48,7 +48,8 @@ mod write;
 use std::path::Path;
 
 use cif_scene::{
-    About, Ending, FormatError, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, SceneGraph,
+    About, CodeRange, Ending, FormatError, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery,
+    SceneGraph,
 };
 
 pub use cif_scene::format::{ExportOptions, ExportSummary, Payloads, ReadOptions, Relabelled, SceneFormat};
@@ -105,6 +106,10 @@ impl SceneFormat for Usd {
 
     fn read(&self, path: &Path, options: ReadOptions) -> Result<SceneGraph, FormatError> {
         Ok(read_scene_with(path, options)?)
+    }
+
+    fn code_range(&self, path: &Path, options: ReadOptions) -> Result<CodeRange, FormatError> {
+        Ok(code_range(path, options)?)
     }
 
     fn relabel(
@@ -172,6 +177,14 @@ pub fn query(path: &Path, query: &LabelQuery, options: ReadOptions) -> Result<Ve
 /// As [`query`].
 pub fn search(path: &Path, wanted: &ObjectQuery, options: ReadOptions) -> Result<Vec<ObjectMatch>, UsdError> {
     with_usd!(find::search(path, wanted, options))
+}
+
+/// Range of the time codes of any stage; without ends where its root layer does not say.
+///
+/// # Errors
+/// As [`query`].
+pub fn code_range(path: &Path, options: ReadOptions) -> Result<CodeRange, UsdError> {
+    with_usd!(find::code_range(path, options))
 }
 
 /// Gives an object of a stage another label, and another class where one is given: as semantic labels, display name

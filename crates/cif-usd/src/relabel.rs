@@ -68,9 +68,10 @@ pub(crate) fn relabel(
         }
         let (prims, known) = find(pxr, &stage, object).map_err(python)?;
         let [prim] = prims.as_slice() else {
-            let known = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
             return Err(refused(match prims.len() {
-                0 => format!("no object is '{object}'; objects: {known}"),
+                0 => {
+                    format!("no object is '{object}'; {}", cif_scene::known_names(object, "objects", &known))
+                }
                 count => format!("{count} prims are '{object}'; give the path of the one that is meant"),
             }));
         };

@@ -41,14 +41,14 @@ impl Backend {
             Self::Auto => Ok(match Gpu::open() {
                 Ok(gpu) if !gpu.facts().software => Some(gpu),
                 Ok(gpu) => {
-                    eprintln!(
-                        "note: {} is no GPU but software on the processor; using --backend cpu",
+                    crate::messages::note!(
+                        "{} is no GPU but software on the processor; using --backend cpu",
                         gpu.facts().name
                     );
                     None
                 }
                 Err(error) => {
-                    eprintln!("note: {error}");
+                    crate::messages::note!("{error}");
                     None
                 }
             }),
@@ -56,7 +56,7 @@ impl Backend {
         if let Some(gpu) = &gpu
             && let SubgroupUse::Wrong(_) = gpu.subgroups()
         {
-            eprintln!("note: subgroups of {} are {}", gpu.facts().name, gpu.subgroups());
+            crate::messages::note!("subgroups of {} are {}", gpu.facts().name, gpu.subgroups());
         }
         Ok(gpu)
     }
@@ -71,14 +71,14 @@ impl Backend {
         let name = format!("{} ({})", gpu.facts().name, gpu.facts().interface);
         if self != Self::Auto {
             trainer.use_gpu(gpu).map_err(Error::plain)?;
-            eprintln!("training on {name}");
+            crate::messages::outcome!("training on {name}");
             return Ok(());
         }
         match trainer.use_faster(gpu) {
-            Ok(probe) if probe.gpu_is_faster() => eprintln!("training on {name}: {probe}"),
-            Ok(probe) => eprintln!("training on the processor, not on {name}: {probe}"),
+            Ok(probe) if probe.gpu_is_faster() => crate::messages::outcome!("training on {name}: {probe}"),
+            Ok(probe) => crate::messages::outcome!("training on the processor, not on {name}: {probe}"),
             Err(error @ TrainError::Device(_)) => {
-                eprintln!("note: {error}; using --backend cpu");
+                crate::messages::note!("{error}; using --backend cpu");
             }
             Err(error) => return Err(Error::plain(error)),
         }

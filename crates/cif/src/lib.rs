@@ -20,6 +20,10 @@
 //! | [`instance_views`] | which views show an object best, and what they show of it |
 //! | [`words`] | words of a text, matched with the names of objects |
 //! | [`ground_truth`] | exported motion against known motion |
+//! | `report` | reports as JSON: where they go |
+//! | `moment` | times as they are typed |
+//! | `endings` | names of outputs, and what they may end in |
+//! | `messages` | notes and outcomes on stderr, and who wants none |
 //! | [`error`] | what is reported, and the exit code |
 
 #[cfg(feature = "wgpu")]
@@ -28,6 +32,7 @@ pub mod camera_file;
 pub mod commands;
 pub mod destination;
 pub mod detector;
+mod endings;
 pub mod error;
 pub mod formats;
 pub mod ground_truth;
@@ -35,9 +40,12 @@ pub mod instance_views;
 pub mod interrupt;
 pub mod lock;
 pub mod mask_query;
+mod messages;
+mod moment;
 pub mod output;
 pub mod pictures;
 pub mod progress;
+mod report;
 pub mod settings;
 pub mod training;
 pub mod words;
@@ -62,11 +70,15 @@ pub fn own_process() {
 /// Runs a command line, the first argument being the name of the program, and returns the exit code:
 /// 0 done, 1 failed, 2 not understood, 130 interrupted. Errors are written to stderr.
 pub fn run(arguments: Vec<OsString>) -> i32 {
-    let arguments = match commands::Arguments::try_parse_from(arguments) {
+    let words = report::join_files(arguments);
+    let arguments = match commands::Arguments::try_parse_from(&words) {
         Ok(arguments) => arguments,
         Err(error) => {
             // Nothing is left to be said when even stderr is closed.
             let _ = error.print();
+            if let Some(advice) = commands::advice(&error, &words) {
+                eprintln!("\n{advice}");
+            }
             return error.exit_code();
         }
     };

@@ -101,7 +101,7 @@ fn what_is_not_understood_ends_with_2() {
     cif(folder.path(), "train table -o a.cif --ablate everything").fails(2, &["no-resampling"]);
     cif(folder.path(), "train table -o a.cif --set seed").fails(2, &["KEY=VALUE"]);
     cif(folder.path(), "render a.cif -o out").fails(2, &["--capture"]);
-    cif(folder.path(), "render a.cif --capture table -o out --time 3").fails(2, &["from 0"]);
+    cif(folder.path(), "render a.cif --capture table -o out --time 3x").fails(2, &["seconds (1.5s)"]);
     cif(folder.path(), "train table -o a.cif --simd widest").fails(2, &["avx2", "portable"]);
     cif(folder.path(), "query a.cif --at 1,2").fails(2, &["three"]);
     cif(folder.path(), "label a.cif x").fails(2, &["--instance"]);
@@ -111,7 +111,7 @@ fn what_is_not_understood_ends_with_2() {
     cif(folder.path(), "export a.cif --gltf out.usda").fails(2, &[".glb"]);
     cif(folder.path(), "export a.cif --ply out.splat").fails(2, &[".ply"]);
     cif(folder.path(), "export a.cif --ply out.ply --ply-split").fails(2, &["folder"]);
-    cif(folder.path(), "export a.cif --ply out.ply --ply-time 2").fails(2, &["from 0"]);
+    cif(folder.path(), "export a.cif --ply out.ply --ply-time two").fails(2, &["seconds (1.5s)"]);
     cif(folder.path(), "export a.cif --report --ply-sequence").fails(2, &["--ply"]);
 }
 
@@ -226,7 +226,7 @@ fn outputs_are_checked_before_training() {
     let folder = with_capture();
     let path = folder.path();
     cif(path, "train table -o no/where/a.cif").fails(1, &["no/where", "mkdir -p"]);
-    cif(path, "train table -o table").fails(1, &["is a folder"]);
+    cif(path, "train table -o table").fails(2, &["end its name in .cif: table/scene.cif"]);
     cif(path, "train table -o a.cif --resume").fails(1, &["a.cif", "nothing to resume"]);
     cif(path, "train table -o a.cif --from b.cif").fails(1, &["b.cif", "no such scene"]);
     fs::write(path.join("kept.cif"), "precious").unwrap();

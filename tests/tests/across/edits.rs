@@ -85,7 +85,8 @@ fn write_glb(graph: &SceneGraph, path: &Path) {
 }
 
 fn picture(folder: &Path, scene: &str, output: &str, time: f64) -> Vec<u8> {
-    cif(folder, &format!("render {scene} --camera left.json --time {time} -o {output}")).succeeds();
+    cif(folder, &format!("render {scene} --camera left.json --time {}% -o {output}", 100.0 * time))
+        .succeeds();
     image::open(folder.join(output).join("rgb/left.png")).unwrap().into_rgb8().into_raw()
 }
 
@@ -206,7 +207,7 @@ fn exports_are_checked_against_the_scene() {
     let number = |value: &Value| value.as_f64().unwrap_or_else(|| panic!("no number: {value}"));
 
     // A close export loses next to nothing, of any object; a PLY shows its moment.
-    let close = check("--gltf out.glb --ply out.ply --ply-time 1");
+    let close = check("--gltf out.glb --ply out.ply --ply-time 100%");
     let [gltf, ply] = &close[..] else { panic!("{close:#?}") };
     let views = field.cameras.len().min(12);
     assert_eq!((&gltf["format"], &gltf["against_scene"]["views"]), (&json!("gltf"), &json!(views)));

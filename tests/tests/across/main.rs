@@ -7,6 +7,7 @@ mod bench;
 mod check;
 mod command_line;
 mod compare;
+mod conventions;
 mod dependency_direction;
 mod determinism;
 mod edits;

@@ -89,7 +89,7 @@ fn a_scene_shows_and_tells_its_objects() {
     let listed: Vec<&str> = all.as_array().unwrap().iter().filter_map(|one| one["label"].as_str()).collect();
     assert_eq!(listed, ["red ball", "blue ball", "background", "moving background"]);
     // On average over the capture: a scene of seconds of training wavers from frame to frame.
-    let line = "query scene.cif --label ball --taxonomy class --interval 0:1 --json";
+    let line = "query scene.cif --label ball --taxonomy class --interval 0%:100% --json";
     let moving = json(&cif(path, line).succeeds().stdout);
     let speed = |one: &Value| one["speed"].as_f64().unwrap();
     assert!(speed(&moving[0]) > speed(&moving[1]), "{moving:#}");
@@ -97,7 +97,16 @@ fn a_scene_shows_and_tells_its_objects() {
     let near = |id: u16, time: f64| {
         let at = capture::centre(id, time);
         let (low, high) = (at - 0.02, at + 0.02);
-        format!("--box={},{},{},{},{},{} --time {time}", low.x, low.y, low.z, high.x, high.y, high.z)
+        format!(
+            "--box={},{},{},{},{},{} --time {}%",
+            low.x,
+            low.y,
+            low.z,
+            high.x,
+            high.y,
+            high.z,
+            100.0 * time
+        )
     };
     let hit = |question: &str| -> Vec<String> {
         let found =
@@ -107,7 +116,7 @@ fn a_scene_shows_and_tells_its_objects() {
     assert!(hit(&near(STANDING, 0.0)).contains(&"blue ball".to_owned()));
     assert!(hit(&near(ROLLING, 0.0)).contains(&"red ball".to_owned()));
     assert!(hit("--box 5,5,5,6,6,6").is_empty());
-    assert_eq!(hit("--interval 0:1").len(), 2);
+    assert_eq!(hit("--interval 0%:100%").len(), 2);
     let elsewhere = cif(path, "query scene.cif --box 5,5,5,6,6,6").succeeds().stdout;
     assert!(elsewhere.contains("nothing is there"), "{elsewhere}");
     cif(path, "query scene.cif --label ball --taxonomy instance").fails(1, &["ball", "red_ball_003"]);
@@ -212,7 +221,7 @@ fn questions_that_cannot_be_asked_end_with_2() {
     cif(path, "query a.cif --point 1,2").fails(2, &["three"]);
     cif(path, "query a.cif --box 1,2,3").fails(2, &["six"]);
     cif(path, "query a.cif --interval 3").fails(2, &["earlier"]);
-    cif(path, "query a.cif --interval 0:3").fails(2, &["from 0"]);
+    cif(path, "query a.cif --interval 0:x").fails(2, &["seconds (1.5s)"]);
     cif(path, "query a.cif --point 1,2,3 --label x").fails(2, &["without other conditions"]);
     cif(path, "query a.txt").fails(2, &[".cif, .usda"]);
     cif(path, "query a.cif --masks m").fails(2, &["--capture"]);

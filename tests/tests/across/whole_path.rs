@@ -95,12 +95,12 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
              "position": [0, -1, 1.5], "look_at": [0, 0, 0]}]"#,
     )
     .unwrap();
-    cif(path, "render scene.cif --camera views.json --time 0.5 -o own").succeeds();
+    cif(path, "render scene.cif --camera views.json --time 50% -o own").succeeds();
     assert_eq!(image::open(path.join("own/rgb/above.png")).unwrap().width(), 20);
 
     // Places and labels.
     let place = capture::centre(capture::STANDING, 0.5) + glam::DVec3::Z * 0.2;
-    let at = format!("query scene.cif --at={},{},{} --time 0.5 --json", place.x, place.y, place.z);
+    let at = format!("query scene.cif --at={},{},{} --time 50% --json", place.x, place.y, place.z);
     let answer = json(&cif(path, &at).succeeds().stdout);
     let best = answer["instances"]
         .as_array()
@@ -467,7 +467,7 @@ fn motion_is_measured_against_followed_points() {
     }
 
     // Known motion is read, not written; damage is told before anything is rendered.
-    cif(path, "eval still.cif table --json table/tracks.npz --force").fails(2, &["is read by this command"]);
+    cif(path, "eval still.cif table --json table/motion.json --force").fails(2, &["is read by this command"]);
     assert!(motion("eval still.cif table --no-masks --json -").is_null(), "nobody knows what is seen");
     let tracks = path.join("table/tracks.npz");
     let bytes = fs::read(&tracks).unwrap();
@@ -539,7 +539,10 @@ fn paths_of_moving_objects_are_drawn() {
     let picture = |what: &str, time: f64| {
         cif(
             path,
-            &format!("render scene.cif --camera views.json --what {what} --time {time} -o out --force"),
+            &format!(
+                "render scene.cif --camera views.json --what {what} --time {}% -o out --force",
+                100.0 * time
+            ),
         )
         .succeeds();
         image::open(path.join(format!("out/{what}/above.png"))).unwrap().into_rgb8()

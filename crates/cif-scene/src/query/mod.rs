@@ -3,6 +3,7 @@
 pub mod label_pattern;
 pub mod search;
 
+use cif_dataset::meant::known_names;
 use cif_geometry::Bounds;
 use serde::Serialize;
 
@@ -41,7 +42,7 @@ pub struct LabelMatch {
 #[non_exhaustive]
 pub enum QueryError {
     /// No object carries the label.
-    #[error("no object is labelled '{pattern}' in {place}; known labels: {}", list(.known))]
+    #[error("no object is labelled '{pattern}' in {place}; {}", known_names(.pattern, "known labels", .known))]
     Unknown {
         /// Given pattern.
         pattern: String,
@@ -50,10 +51,6 @@ pub enum QueryError {
         /// Labels that exist.
         known: Vec<String>,
     },
-}
-
-fn list(known: &[String]) -> String {
-    if known.is_empty() { "none".to_owned() } else { known.join(", ") }
 }
 
 impl LabelQuery {

@@ -2,6 +2,7 @@
 //! poses.
 
 use cif_dataset::PointSource;
+use cif_dataset::meant::known_names;
 use cif_field::Gaussians;
 use cif_field::tracks::{NO_GROUP, RotationEvidence, TrackGroup, TrackPose, Tracks};
 use cif_render::cpu::Renderer;
@@ -133,13 +134,13 @@ impl Trainer {
 
     /// Refuses motion that is told of objects that there are not.
     pub(super) fn check_told(&self) -> Result<(), TrainError> {
-        let labels: Vec<&str> = self.state.field.instances.iter().map(|i| i.label.as_str()).collect();
-        match self.state.config.motion.of.keys().find(|label| !labels.contains(&label.as_str())) {
+        let labels: Vec<String> = self.state.field.instances.iter().map(|i| i.label.clone()).collect();
+        match self.state.config.motion.of.keys().find(|label| !labels.contains(label)) {
             None => Ok(()),
             Some(label) => Err(TrainError::UnknownObject {
                 root: self.state.dataset.root.clone(),
                 label: label.clone(),
-                known: labels.join(", "),
+                known: known_names(label, "there are", &labels),
             }),
         }
     }

@@ -19,7 +19,8 @@ use serde_json::{Map, Value, json};
 
 use super::{CaptureOptions, Simd, print_warnings, scene, train};
 use crate::error::Error;
-use crate::output::{self, Outputs};
+use crate::output::Outputs;
+use crate::report::Report as JsonReport;
 use crate::settings::Layers;
 
 /// Measure what a training step, an export or accuracy costs, how hard captures fare and how the method compares
@@ -39,7 +40,7 @@ enum What {
     Compare(super::bench_compare::BenchCompare),
 }
 
-/// Tell where the time of a training step goes
+/// Show where the time of a training step goes
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Times are milliseconds per step, mean and median over the measured steps; shares are of the mean.
@@ -75,9 +76,8 @@ struct Step {
     /// Repeat the instance stage with so many instances
     #[arg(long, value_name = "K,...", value_delimiter = ',', value_parser = clap::value_parser!(u16).range(1..=60_000))]
     instances: Vec<u16>,
-    /// Write the costs as JSON; - for stdout
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    report: JsonReport,
     /// Replace existing output
     #[arg(long)]
     force: bool,
@@ -127,12 +127,9 @@ pub(super) fn run(command: &Bench) -> Result<(), Error> {
 }
 
 fn step(command: &Step) -> Result<(), Error> {
-    let to_stdout = command.json.as_deref().is_some_and(output::is_stdout);
-    if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
-        let mut outputs = Outputs::new(command.force);
-        command.scene.as_deref().map_or(Ok(()), |scene| outputs.reads(scene))?;
-        outputs.text(path)?;
-    }
+    let mut outputs = Outputs::new(command.force);
+    command.scene.as_deref().map_or(Ok(()), |scene| outputs.reads(scene))?;
+    command.report.check(&mut outputs)?;
     if !command.instances.is_empty() && command.stage.is_some_and(|stage| stage != StageName::Instance) {
         return Err(no_instances());
     }
@@ -158,15 +155,7 @@ fn step(command: &Step) -> Result<(), Error> {
     print_warnings(&dataset);
     let config = resolve(command, field.as_ref(), dataset.layout)?;
     let report = measure(command, &dataset, &config, field, stage)?;
-    if to_stdout {
-        println!("{:#}", report.json());
-    } else {
-        report.print();
-        if let Some(path) = &command.json {
-            output::write_file(path, format!("{:#}\n", report.json()).as_bytes())?;
-        }
-    }
-    Ok(())
+    command.report.give(|| report.json(), || report.print())
 }
 
 fn no_instances() -> Error {

@@ -65,8 +65,10 @@ pub(super) struct BenchAccuracy {
     /// Folder of the capture
     capture: PathBuf,
     /// Folder to write into
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
+    #[command(flatten)]
+    report: crate::report::Report,
     /// Small scenes, reduced images and fewer rungs, in five minutes
     #[arg(long, conflicts_with = "preset")]
     quick: bool,
@@ -123,6 +125,7 @@ impl BenchAccuracy {
 }
 
 pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
+    command.report.check(&mut crate::output::Outputs::new(command.force))?;
     let paper = command.paper()?;
     let check = |layout| {
         if let Some(Paper { share, settings }) = &paper {
@@ -241,13 +244,14 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
         });
     }
     if !left_out.is_empty() {
-        eprintln!(
+        crate::messages::outcome!(
             "left out, for they do not fit into five minutes: {}; the same command goes on with them",
             left_out.join("; ")
         );
     }
-    eprintln!("wrote {}", page.display());
-    Ok(())
+    crate::messages::outcome!("wrote {}", page.display());
+    let report = crate::report::read(&command.output.join("report.json"))?;
+    command.report.give(|| report, || ())
 }
 
 /// Pixels that training images of a quick report have at the most.
@@ -319,7 +323,7 @@ impl Bench {
             return Ok(None);
         }
         if let Some(record) = self.kept(rung) {
-            eprintln!("{heading}: kept, {}", told(&record));
+            crate::messages::outcome!("{heading}: kept, {}", told(&record));
             return Ok(Some(record));
         }
         let Some(mut record) = self.measure(rung, heading)? else { return Ok(None) };
@@ -335,7 +339,7 @@ impl Bench {
             eprint!("\r\x1b[K{text}{}", if ends { "\n" } else { "" });
             let _ = std::io::stderr().flush();
         } else if ends {
-            eprintln!("{text}");
+            crate::messages::outcome!("{text}");
         }
     }
 

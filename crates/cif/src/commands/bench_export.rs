@@ -12,9 +12,11 @@ use super::model_options::ModelOptions;
 use super::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::FORMATS;
-use crate::output::{self, Outputs};
+use crate::messages::note;
+use crate::output::Outputs;
+use crate::report::Report;
 
-/// Tell what accuracy of motion costs
+/// Show what accuracy of motion costs
 #[derive(Debug, Args)]
 #[command(after_help = "\
 The scene is built once per tolerance. Residuals are distances in world units: decisive is what the
@@ -38,21 +40,17 @@ pub(super) struct BenchExport {
     no_files: bool,
     #[command(flatten)]
     models: ModelOptions,
-    /// Write the ladder as JSON; - for stdout
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    report: Report,
     /// Replace existing output
     #[arg(long)]
     force: bool,
 }
 
 pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
-    let to_stdout = command.json.as_deref().is_some_and(output::is_stdout);
-    if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
-        let mut outputs = Outputs::new(command.force);
-        outputs.reads(&command.scene)?;
-        outputs.text(path)?;
-    }
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.scene)?;
+    command.report.check(&mut outputs)?;
     let field = scene::load(&command.scene)?;
     let folder = tempfile::tempdir()
         .map_err(|error| Error::plain(format!("cannot make a temporary folder: {error}")))?;
@@ -76,23 +74,15 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
                     true
                 }
                 Err(reason) => {
-                    eprintln!("note: no {} files are measured: {reason}", format.about().name);
+                    note!("no {} files are measured: {reason}", format.about().name);
                     false
                 }
             }
         });
         rungs.push(rung);
     }
-    let text = format!("{:#}\n", serde_json::json!({ "scene": command.scene, "rungs": rungs }));
-    if to_stdout {
-        print!("{text}");
-        return Ok(());
-    }
-    print_ladder(&rungs);
-    if let Some(path) = &command.json {
-        output::write_file(path, text.as_bytes())?;
-    }
-    Ok(())
+    let report = || serde_json::json!({ "scene": command.scene, "rungs": rungs });
+    command.report.give(report, || print_ladder(&rungs))
 }
 
 fn name_of(tolerance: Tolerance) -> String {

@@ -11,6 +11,7 @@ use serde_json::json;
 
 use super::{CaptureOptions, print_warnings, train};
 use crate::error::Error;
+use crate::report::Report;
 use crate::settings::Layers;
 use crate::{interrupt, output};
 
@@ -35,11 +36,13 @@ pub(super) struct BenchHardness {
     /// Folder of the capture
     capture: PathBuf,
     /// Folder of the report
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
-    /// Write into a folder that is not empty
+    /// Write into a folder that is not empty, and replace an existing file of --json
     #[arg(long)]
     force: bool,
+    #[command(flatten)]
+    report: Report,
     /// Fewer variants and a short schedule
     #[arg(long)]
     quick: bool,
@@ -77,6 +80,7 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
             "give a capture with held-out frames",
         ));
     }
+    command.report.check(&mut output::Outputs::new(command.force))?;
     output::check_folder(&command.output, command.force)?;
     let config = resolve(command, dataset.layout)?;
     let chosen: Vec<&HardCapture> = HARD_CAPTURES
@@ -102,7 +106,7 @@ pub(super) fn run(command: &BenchHardness) -> Result<(), Error> {
         runs.push(row);
     }
     let baseline = mean_of(&runs);
-    eprintln!("{:>18}  {}", "their mean", baseline.notes.last().map_or("", String::as_str));
+    crate::messages::outcome!("{:>18}  {}", "their mean", baseline.notes.last().map_or("", String::as_str));
     let mut rows = vec![baseline.clone()];
     for hard in chosen {
         let folder = tempfile::tempdir()
@@ -167,7 +171,7 @@ fn measure(row: &mut Row, dataset: &Dataset, config: &TrainConfig) -> Result<(),
 }
 
 fn tell(row: &Row) {
-    eprintln!(
+    crate::messages::outcome!(
         "{:>18}  {:<8} PSNR {} {}  mIoU {} {}  {:.0} s",
         row.name,
         row.verdict,
@@ -218,7 +222,6 @@ fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> 
         rows.iter().flat_map(|row| row.notes.iter().map(move |note| format!("- {}: {note}\n", row.name)));
     text += "\n";
     text.extend(notes);
-    println!("{table}");
     let report = json!({
         "capture": command.capture,
         "limits": { "psnr_db": MAX_PSNR_LOSS, "miou_percent": MAX_MIOU_LOSS },
@@ -226,7 +229,8 @@ fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> 
         "variants": rows,
     });
     write(&command.output.join("report.json"), &format!("{report:#}\n"))?;
-    write(&command.output.join("report.md"), &text)
+    write(&command.output.join("report.md"), &text)?;
+    command.report.give(|| report, || println!("{table}"))
 }
 
 fn write(path: &Path, text: &str) -> Result<(), Error> {

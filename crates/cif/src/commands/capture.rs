@@ -1,5 +1,6 @@
 //! `cif capture`: videos and photographs to a capture that `cif train` takes.
 
+mod as_json;
 mod options;
 mod report;
 mod scale;
@@ -58,6 +59,7 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
             "choose another name for the capture, or remove it; nothing is overwritten",
         ));
     }
+    command.report.check([])?;
     interrupt::watch();
     let progress = |words: &str| {
         if !command.quiet {
@@ -111,7 +113,7 @@ fn make(
         None => find(command, shots, masks.as_ref(), scratch, hooks, notes)?,
     };
     for note in notes.iter() {
-        eprintln!("note: {note}");
+        crate::messages::note!("{note}");
     }
     if let Some(verdict) = posed.verdict.as_ref().filter(|verdict| !verdict.is_good()) {
         if !command.accept {
@@ -131,8 +133,7 @@ fn make(
         poses_from: &posed.from,
     };
     write::write(&capture, &command.output, hooks)?;
-    report::print(command, shots, masks.as_ref(), &posed, &lines);
-    Ok(())
+    as_json::give(command, shots, masks.as_ref(), &posed, &lines)
 }
 
 fn choice(command: &Capture) -> Choice {

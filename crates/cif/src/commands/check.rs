@@ -11,8 +11,10 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::scene;
+use crate::endings;
 use crate::error::Error;
 use crate::output::Outputs;
+use crate::report::Report;
 
 /// Blended weight over all recorded views, in pixels, below which a Gaussian was never seen.
 const MIN_MASS: f64 = 1e-3;
@@ -37,22 +39,20 @@ pub(super) struct Check {
     #[arg(value_name = "SCENE.cif")]
     scene: PathBuf,
     /// Write a repaired copy
-    #[arg(long, value_name = "OUT.cif")]
+    #[arg(long, value_name = "OUT.cif", value_parser = endings::scene())]
     fix: Option<PathBuf>,
     /// Replace an existing file
-    #[arg(long, requires = "fix")]
-    force: bool,
-    /// Print JSON
     #[arg(long)]
-    json: bool,
+    force: bool,
+    #[command(flatten)]
+    report: Report,
 }
 
 pub(super) fn run(command: &Check) -> Result<(), Error> {
-    if let Some(target) = &command.fix {
-        let mut outputs = Outputs::new(command.force);
-        outputs.reads(&command.scene)?;
-        outputs.file(target)?;
-    }
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.scene)?;
+    command.fix.as_deref().map_or(Ok(()), |target| outputs.file(target))?;
+    command.report.check(&mut outputs)?;
     if command.scene.is_dir() {
         // The usual words for a capture in place of a scene.
         scene::load(&command.scene)?;
@@ -74,8 +74,8 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
         })?;
         checkpoint.save(target).map_err(Error::plain)?;
     }
-    if command.json {
-        let report = json!({
+    let report = || {
+        json!({
             "scene": command.scene,
             "gaussians": gaussians,
             "broken": broken,
@@ -84,11 +84,10 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
             "findings": findings,
             "repaired": command.fix,
             "repairs": repairs,
-        });
-        println!("{report:#}");
-    } else {
-        print(command, gaussians, &findings, &repairs, never_seen.is_some());
-    }
+        })
+    };
+    let views = never_seen.is_some();
+    command.report.give(report, || print(command, gaussians, &findings, &repairs, views))?;
     if broken == 0 || command.fix.is_some() {
         return Ok(());
     }

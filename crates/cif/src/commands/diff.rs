@@ -8,8 +8,9 @@ use serde_json::json;
 
 use crate::error::Error;
 use crate::formats;
+use crate::report::OnlyReport;
 
-/// Tell what differs between two scenes, object by object
+/// Show what differs between two scenes, object by object
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Objects are matched by id, else by name. Distances are in world units, the largest over time. A scene
@@ -24,20 +25,15 @@ pub(super) struct Diff {
     /// Scene, stage or glTF file
     #[arg(value_name = "AFTER")]
     after: PathBuf,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    report: OnlyReport,
 }
 
 pub(super) fn run(command: &Diff) -> Result<(), Error> {
+    command.report.check([command.before.as_path(), command.after.as_path()])?;
     let [before, after] = formats::read_both(&command.before, &command.after)?;
     let changes = cif_scene::diff::diff(&before, &after);
-    if command.json {
-        println!("{:#}", json!(changes));
-    } else {
-        print_changes(&changes);
-    }
-    Ok(())
+    command.report.give(|| json!(changes), || print_changes(&changes))
 }
 
 /// The differences as a table, one line each.

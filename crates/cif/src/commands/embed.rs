@@ -11,14 +11,17 @@ use cif_render::{Channels, RenderSettings};
 use cif_vision::embedding::{PictureEmbedder, unit};
 use cif_vision::{Models, library};
 use clap::Args;
+use serde_json::json;
 
 use super::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, scene};
 use crate::error::Error;
 use crate::formats;
 use crate::instance_views::{Coverage, cut_out};
-use crate::interrupt;
+use crate::messages::is_quiet;
 use crate::output::Outputs;
 use crate::progress::FrameProgress;
+use crate::report::Report;
+use crate::{endings, interrupt};
 
 /// Keep what objects look like, so that cif query --text finds them by meaning
 #[derive(Debug, Args)]
@@ -46,11 +49,13 @@ pub(super) struct Embed {
     #[arg(long, value_name = "N", default_value_t = 8, value_parser = clap::value_parser!(u32).range(1..=1000))]
     views: u32,
     /// Write to another file and leave this one as it is
-    #[arg(short, long, value_name = "OUT")]
+    #[arg(short, long, value_name = "OUT.cif", value_parser = endings::scene())]
     output: Option<PathBuf>,
-    /// Replace OUT where it exists
-    #[arg(long, requires = "output")]
+    /// Replace existing files of -o and --json
+    #[arg(long)]
     force: bool,
+    #[command(flatten)]
+    report: Report,
     /// Reduce images by 1, 2, 4, ... [default: as the scene was trained]
     #[arg(long, value_name = "FACTOR", value_parser = clap::value_parser!(u32).range(1..=64))]
     downscale: Option<u32>,
@@ -62,19 +67,16 @@ pub(super) struct Embed {
 }
 
 pub(super) fn run(command: &Embed) -> Result<(), Error> {
-    if !formats::is_field(&command.path)
-        || command.output.as_deref().is_some_and(|out| !formats::is_field(out))
-    {
+    if !formats::is_field(&command.path) {
         return Err(Error::usage(
             "embeddings are made for a trained scene (.cif)",
             "give the .cif, and export the stage again afterwards",
         ));
     }
-    if let Some(output) = &command.output {
-        let mut outputs = Outputs::new(command.force);
-        outputs.reads(&command.path)?;
-        outputs.file(output)?;
-    }
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.path)?;
+    command.output.as_deref().map_or(Ok(()), |output| outputs.file(output))?;
+    command.report.check(&mut outputs)?;
     let models = Models::open(&command.models)?;
     let name = models.embedder_name()?;
     let mut embedder = PictureEmbedder::open(&library::find(&crate::pythons())?, &models)?;
@@ -100,10 +102,7 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
     };
     let shown = views.best(command.views as usize)?;
     let embeddings = views.embed(&mut embedder, &shown)?;
-    let mut table = super::table(["id", "label", "views"]);
-    for (instance, shown) in field.instances.iter().zip(&shown) {
-        table.add_row([instance.id.to_string(), instance.label.clone(), shown.len().to_string()]);
-    }
+    let views: Vec<_> = field.instances.iter().cloned().zip(shown.iter().map(Vec::len)).collect();
     if embeddings.is_empty() {
         return Err(Error::failed(
             format!("no training view of {} shows an object", command.capture.display()),
@@ -113,9 +112,20 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
     checkpoint.field.record.embeddings = Some(Embeddings { model: name.to_owned(), of: embeddings });
     let target = command.output.as_deref().unwrap_or(&command.path);
     checkpoint.save(target).map_err(Error::plain)?;
-    println!("{table}");
-    println!("{}: embeddings by {name}", target.display());
-    Ok(())
+    let report = || {
+        let views = views
+            .iter()
+            .map(|(instance, views)| json!({ "id": instance.id, "label": instance.label, "views": views }));
+        json!({ "scene": target, "model": name, "instances": views.collect::<Vec<_>>() })
+    };
+    command.report.give(report, || {
+        let mut table = super::table(["id", "label", "views"]);
+        for (instance, views) in &views {
+            table.add_row([instance.id.to_string(), instance.label.clone(), views.to_string()]);
+        }
+        println!("{table}");
+        println!("{}: embeddings by {name}", target.display());
+    })
 }
 
 /// The training views of a scene.
@@ -139,7 +149,7 @@ impl Views<'_> {
     fn best(&mut self, most: usize) -> Result<Vec<Vec<usize>>, Error> {
         let frames = self.dataset.train_frames();
         let mut coverage = Coverage::new(self.field.instances.len());
-        let mut progress = FrameProgress::new(false, frames.len());
+        let mut progress = FrameProgress::new(is_quiet(), frames.len());
         for index in frames {
             interrupt::go_on()?;
             let labels = self.labels(index);
@@ -162,7 +172,7 @@ impl Views<'_> {
             }
         }
         let mut sums: Vec<Vec<f32>> = vec![Vec::new(); shown.len()];
-        let mut progress = FrameProgress::new(false, of_frame.len());
+        let mut progress = FrameProgress::new(is_quiet(), of_frame.len());
         for (index, instances) in of_frame {
             let labels = self.labels(index);
             let picture = self.dataset.load_image(index, self.settings.background)?;

@@ -12,11 +12,13 @@ use serde_json::{Value, json};
 use super::eval_motion::{self, Motion};
 use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::error::Error;
+use crate::messages::outcome;
 use crate::output::Outputs;
 use crate::pictures::{
     Picture, depth_picture, error_picture, instance_picture, rgb_picture, save_rgb, side_by_side,
 };
-use crate::{interrupt, output};
+use crate::report::Report;
+use crate::{endings, interrupt, output};
 
 /// Score a scene on the held-out frames of a capture
 #[derive(Debug, Args)]
@@ -52,11 +54,10 @@ pub(super) struct Eval {
     /// Frames to score
     #[arg(long, default_value = "val", value_name = "SPLIT")]
     split: SplitName,
-    /// Write all scores as JSON; - for stdout
-    #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    #[command(flatten)]
+    report: Report,
     /// Write a picture per frame into this folder
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", value_parser = endings::folder())]
     images: Option<PathBuf>,
     /// Replace existing output
     #[arg(long)]
@@ -85,12 +86,9 @@ impl From<SplitName> for Split {
 }
 
 pub(super) fn run(command: &Eval) -> Result<(), Error> {
-    let to_stdout = command.json.as_deref().is_some_and(output::is_stdout);
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
-    if let Some(path) = command.json.as_deref().filter(|_| !to_stdout) {
-        outputs.text(path)?;
-    }
+    command.report.check(&mut outputs)?;
     let (field, decoder) = scene::load_with_head(&command.scene)?;
     let mut capture = command.capture_options.clone();
     capture.downscale = capture.downscale.or(scene::trained_downscale(&field));
@@ -130,10 +128,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
         None => None,
     };
     let labels_by = decoder.as_ref().map(Decoder::name);
-    let report = to_json(&evaluation, motion.as_ref(), &field, labels_by);
-    if to_stdout {
-        println!("{report:#}");
-    } else {
+    let print = || {
         print_table(&evaluation, &field);
         if let Some(head) = labels_by {
             println!("labels as the head {head} decodes every pixel");
@@ -141,12 +136,10 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
         if let Some(motion) = &motion {
             motion.print();
         }
-        if let Some(path) = &command.json {
-            output::write_file(path, format!("{report:#}\n").as_bytes())?;
-        }
-    }
+    };
+    command.report.give(|| to_json(&evaluation, motion.as_ref(), &field, labels_by), print)?;
     if let Some(folder) = &command.images {
-        eprintln!("pictures in {}", folder.display());
+        outcome!("pictures in {}", folder.display());
     }
     Ok(())
 }

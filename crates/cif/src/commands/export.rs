@@ -10,30 +10,31 @@ use serde_json::json;
 
 use super::export_check::{Check, Finding};
 use super::model_options::ModelOptions;
-use super::query::code_at;
-use super::targets::{Targets, Writing};
+use super::targets::{FILES, Targets, Writing};
 use super::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::FORMATS;
 use crate::ground_truth::{self, MotionError};
 use crate::interrupt;
-use crate::output::{self, Outputs};
+use crate::moment::Frames;
+use crate::output::Outputs;
+use crate::report::Report;
 
 /// Export a scene as USD, glTF or PLY, one prim or node per object
 #[derive(Debug, Args)]
 #[command(
     group = ArgGroup::new("result").required(true).multiple(true)
-        .args(FORMATS.iter().map(|format| format.about().key).chain(["report", "report_json"])),
+        .args(FORMATS.iter().map(|format| format.about().key).chain([FILES, "report", "json"])),
     after_help = "\
 Every object gets the cheapest motion that stays inside the tolerance: static, rigid, parts (a few
 rigid bodies), or dense (a path for every splat). Samples that interpolation reproduces inside the
 tolerance are left out. The table tells which motion was chosen, and what it misses.
 
-  cif export table.cif --usd table.usda
-  cif export table.cif --usd table.usdz --tolerance 0.5%
-  cif export table.cif --gltf table.glb --usd table.usdc
-  cif export table.cif --ply table.ply --ply-time 0.5
-  cif export table.cif --ply frames --ply-sequence
+  cif export table.cif table.usda
+  cif export table.cif table.usdz --tolerance 0.5%
+  cif export table.cif table.glb table.usdc             the endings decide the formats
+  cif export table.cif table.ply --ply-time 36          or 1.5s, or 50%
+  cif export table.cif --ply frames --ply-sequence      a folder has no ending: its flag says the format
   cif export table.cif --report --ground-truth motion.json
 
 --check reads every file back as `cif import` would and draws it beside the scene, from cameras that
@@ -41,7 +42,7 @@ the scene recorded and, with --capture, from those of held-out images. PSNR of a
 pixels where the scene shows it; IoU is against where the scene shows it, or against the masks of the
 held-out images. A PLY is compared at its moment, and has no objects.
 
-  cif export table.cif --usd table.usda --check --capture captures/table"
+  cif export table.cif table.usda --check --capture captures/table"
 )]
 pub(super) struct Export {
     /// Trained scene
@@ -81,12 +82,8 @@ pub(super) struct Export {
     /// Print the motion table even when nothing is written
     #[arg(long)]
     report: bool,
-    /// Write the motion table and the comparison with known motion as JSON; - for stdout
-    #[arg(long, value_name = "FILE")]
-    report_json: Option<PathBuf>,
-    /// Print tables as JSON
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    tables: Report,
     /// Compare with known motion
     #[arg(long, value_name = "motion.json")]
     ground_truth: Option<PathBuf>,
@@ -103,10 +100,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
     command.ground_truth.as_deref().map_or(Ok(()), |truth| outputs.reads(truth))?;
-    let report_to_stdout = command.report_json.as_deref().is_some_and(output::is_stdout);
-    if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
-        outputs.text(path)?;
-    }
+    command.tables.check(&mut outputs)?;
     command.targets.check(&command.writing, command.force, &mut outputs)?;
     command.check.refuse(&command.targets, &command.writing)?;
     let truth = command.ground_truth.as_deref().map(MotionTruth::read).transpose().map_err(Error::plain)?;
@@ -122,8 +116,8 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }
-    let codes = &graph.time_codes;
-    let writing = command.writing.options(command.force, |time| code_at(&codes.times, &codes.samples, time));
+    let place = command.scene.display().to_string();
+    let writing = command.writing.options(command.force, &Frames::new(graph.time_codes.range(), &place))?;
     let mut rebuilt: Vec<(&dyn SceneFormat, SceneGraph)> = Vec::new();
     let mut findings: Vec<Finding> = Vec::new();
     if checker.is_some() {
@@ -152,12 +146,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     if checker.is_some() {
         tables["check"] = findings.iter().map(|finding| finding.json(&field)).collect();
     }
-    if let Some(path) = command.report_json.as_deref().filter(|_| !report_to_stdout) {
-        output::write_file(path, format!("{tables:#}\n").as_bytes())?;
-    }
-    if command.json || report_to_stdout {
-        println!("{tables:#}");
-    } else {
+    let print = || {
         print_motion(&graph);
         for (format, graph) in &rebuilt {
             println!(
@@ -170,8 +159,8 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
             print_errors(errors);
         }
         findings.iter().for_each(|finding| finding.print(&field));
-    }
-    Ok(())
+    };
+    command.tables.give(|| tables.clone(), print)
 }
 
 fn options(command: &Export, field: &Field) -> SceneOptions {

@@ -74,10 +74,10 @@ impl Check {
         if targets.iter().next().is_none() {
             return Err(Error::usage(
                 "--check reads what was written",
-                "give --usd, --gltf or --ply as well",
+                "name a file to write as well, for example OUT.usda",
             ));
         }
-        let options = writing.options(false, |time| time);
+        let options = writing.without_moment(false);
         match targets.iter().find(|target| target.format.fills_folder(&options)) {
             None => Ok(()),
             Some(target) => Err(Error::usage(

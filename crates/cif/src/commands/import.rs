@@ -8,9 +8,12 @@ use serde_json::json;
 
 use super::diff::{cameras, print_objects};
 use super::scene;
+use crate::endings;
 use crate::error::Error;
 use crate::formats;
+use crate::messages::{note, outcome};
 use crate::output::Outputs;
+use crate::report::Report;
 
 /// Turn USD, glTF or PLY into a scene, or bring edits of an exported file home
 #[derive(Debug, Args)]
@@ -21,10 +24,12 @@ file has it, cameras. It can be rendered, labelled, queried and exported, but no
 With --base, the scene that the file was exported from, only what was changed in the file is applied
 to it: objects moved (also over time), renamed, relabelled, hidden, deleted, duplicated or added, and
 splats recoloured, faded, resized, deleted or moved. Everything else keeps its learned motion.
-Cameras stay as they were recorded; edits of them are told.
+Cameras stay as they were recorded; edits of them are named.
+
+--json lists the edits, or without --base what the scene holds.
 
   cif import fox.ply -o fox.cif
-  cif export table.cif --usd table.usda        # then edit table.usda in any tool
+  cif export table.cif table.usda              # then edit table.usda in any tool
   cif import table.usda --base table.cif -o edited.cif
   cif diff table.cif edited.cif")]
 pub(super) struct Import {
@@ -32,7 +37,7 @@ pub(super) struct Import {
     #[arg(value_name = "FILE")]
     file: PathBuf,
     /// Scene to write
-    #[arg(short, long, value_name = "SCENE.cif")]
+    #[arg(short, long, value_name = "SCENE.cif", value_parser = endings::scene())]
     output: PathBuf,
     /// Scene that the file was exported from; it is not changed
     #[arg(long, value_name = "ORIGINAL.cif")]
@@ -43,60 +48,65 @@ pub(super) struct Import {
     /// Read layers that a stage brings in from outside its folder
     #[arg(long)]
     follow_external: bool,
-    /// Print the edits as JSON
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    report: Report,
     /// Replace an existing scene
     #[arg(long)]
     force: bool,
 }
 
 pub(super) fn run(command: &Import) -> Result<(), Error> {
-    if !formats::is_field(&command.output) {
-        return Err(Error::usage(
-            format!("-o {}: a scene is written", command.output.display()),
-            "end its name in .cif",
-        ));
-    }
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.file)?;
     command.base.as_deref().map_or(Ok(()), |base| outputs.reads(base))?;
     outputs.file(&command.output)?;
+    command.report.check(&mut outputs)?;
     // Before the file is read, which may take longer.
     let base = command.base.as_deref().map(scene::load).transpose()?;
     let graph = formats::read(&command.file, ReadOptions { follow_external: command.follow_external })?;
     for warning in &graph.warnings {
         eprintln!("warning: {warning}");
     }
+    let mut edits = None;
     let field = match &base {
         Some(base) => {
             let source = formats::name_of(&command.file);
             let (field, changes) = cif_scene::import_edits(base, &graph, &source, command.force_base)
                 .map_err(|error| import_error(&error))?;
-            if command.json {
-                println!("{:#}", json!(changes));
-            } else {
-                print_objects(&changes);
-            }
             if !changes.cameras.is_empty() {
                 eprintln!(
                     "warning: cameras stay as they were recorded; not taken over: {}",
                     cameras(&changes)
                 );
             }
+            edits = Some(changes);
             field
         }
         None => {
             if graph.origin.field_fingerprint.is_some() {
-                eprintln!(
-                    "note: cif exported this file; give the scene it came from with --base to keep what was learned"
+                note!(
+                    "cif exported this file; give the scene it came from with --base to keep what was learned"
                 );
             }
             formats::field_of(&graph, &command.file)?
         }
     };
     field.save(&command.output).map_err(Error::plain)?;
-    eprintln!(
+    let report = || match &edits {
+        Some(changes) => json!(changes),
+        None => json!({
+            "scene": command.output,
+            "gaussians": field.len(),
+            "instances": field.instances,
+            "times": field.timeline.times.len(),
+        }),
+    };
+    command.report.give(report, || {
+        if let Some(changes) = &edits {
+            print_objects(changes);
+        }
+    })?;
+    outcome!(
         "wrote {}: {} Gaussians, {} instances, {} times",
         command.output.display(),
         field.len(),

@@ -18,8 +18,9 @@ use super::object_motion::ObjectMotion;
 use super::{CaptureOptions, scene};
 use crate::error::Error;
 use crate::formats;
+use crate::report::OnlyReport;
 
-/// Tell what is in a capture or a trained scene, or what GPUs there are
+/// Show what is in a capture or a trained scene, or what GPUs there are
 #[derive(Debug, Args)]
 pub(super) struct Info {
     /// Folder of a capture, or a .cif file
@@ -27,14 +28,13 @@ pub(super) struct Info {
     #[cfg_attr(feature = "wgpu", arg(required_unless_present = "gpu"))]
     #[cfg_attr(not(feature = "wgpu"), arg(required = true))]
     path: Option<PathBuf>,
-    /// Tell which GPUs Vulkan, Metal and Direct3D 12 offer, their features and limits, and what of them is used.
+    /// Show which GPUs Vulkan, Metal and Direct3D 12 offer, their features and limits, and what of them is used.
     /// The first is taken; WGPU_ADAPTER_NAME=PART takes the first whose name contains PART
     #[cfg(feature = "wgpu")]
     #[arg(long, conflicts_with = "path")]
     gpu: bool,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    report: OnlyReport,
     #[command(flatten)]
     capture_options: CaptureOptions,
 }
@@ -42,11 +42,13 @@ pub(super) struct Info {
 pub(super) fn run(command: &Info) -> Result<(), Error> {
     #[cfg(feature = "wgpu")]
     if command.gpu {
-        return super::info_gpu::run(command.json);
+        command.report.check([])?;
+        return super::info_gpu::run(&command.report);
     }
     let Some(path) = &command.path else {
         return Err(Error::usage("nothing to tell of", "name a capture or a scene"));
     };
+    command.report.check([path.as_path()])?;
     let facts = if path.is_file() {
         let checkpoint = Checkpoint::load(path).map_err(Error::plain)?;
         scene_facts(&checkpoint)
@@ -55,12 +57,7 @@ pub(super) fn run(command: &Info) -> Result<(), Error> {
     } else {
         capture_facts(&command.capture_options.open(path)?)?
     };
-    if command.json {
-        println!("{:#}", Value::Object(facts.into_iter().collect()));
-    } else {
-        print(&facts);
-    }
-    Ok(())
+    command.report.give(|| Value::Object(facts.iter().cloned().collect()), || print(&facts))
 }
 
 /// Facts in the order they are told.

@@ -1,26 +1,29 @@
 //! `cif info --gpu`: GPUs, their features and limits, and what of them is used.
 
-use cif_render::wgpu::{AdapterFacts, Gpu, GpuFeatures, Rasterizer, SubgroupUse};
+use cif_render::wgpu::{AdapterFacts, Gpu, GpuError, GpuFeatures, Rasterizer, SubgroupUse};
 use serde_json::{Value, json};
 
 use crate::error::Error;
+use crate::report::OnlyReport;
 
-pub(super) fn run(as_json: bool) -> Result<(), Error> {
+pub(super) fn run(report: &OnlyReport) -> Result<(), Error> {
     let allowed = GpuFeatures::from_environment().map_err(Error::plain)?;
     let adapters = Gpu::adapters();
     // Opened like any command would, kernels included: a GPU that is listed may still refuse.
     let opened = Gpu::open_with(allowed).and_then(|gpu| Rasterizer::new(&gpu).map(|_| gpu));
-    if as_json {
+    let report_of = || {
         let adapters: Vec<Value> = adapters.iter().map(|adapter| facts(adapter, allowed)).collect();
         let (used, subgroups, fault) = match &opened {
             Ok(gpu) => (json!(gpu.facts().name), json!(gpu.subgroups().to_string()), Value::Null),
             Err(error) => (Value::Null, Value::Null, json!(error.to_string())),
         };
-        let text = json!({ "adapters": adapters, "used": used, "used_subgroups": subgroups, "fault": fault });
-        println!("{text:#}");
-        return Ok(());
-    }
-    for adapter in &adapters {
+        json!({ "adapters": adapters, "used": used, "used_subgroups": subgroups, "fault": fault })
+    };
+    report.give(report_of, || print_all(&adapters, &opened, allowed))
+}
+
+fn print_all(adapters: &[AdapterFacts], opened: &Result<Gpu, GpuError>, allowed: GpuFeatures) {
+    for adapter in adapters {
         print(adapter, allowed);
     }
     match opened {
@@ -40,7 +43,6 @@ pub(super) fn run(as_json: bool) -> Result<(), Error> {
     if !(allowed.subgroups && allowed.timestamps) {
         println!("{} holds optional features back", GpuFeatures::VARIABLE);
     }
-    Ok(())
 }
 
 /// Features of an adapter that kernels use, in words.

@@ -2,12 +2,16 @@
 
 use std::path::{Path, PathBuf};
 
+use cif_dataset::meant::meant;
 use cif_field::{Checkpoint, Instance};
+use cif_scene::naming::instance_name;
 use clap::Args;
+use serde_json::json;
 
 use crate::error::Error;
 use crate::formats::Content;
 use crate::output::Outputs;
+use crate::report::Report;
 
 /// Give an object another label
 #[derive(Debug, Args)]
@@ -35,9 +39,11 @@ pub(super) struct Label {
     /// Write to another file and leave this one as it is
     #[arg(short, long, value_name = "OUT")]
     output: Option<PathBuf>,
-    /// Replace OUT where it exists
-    #[arg(long, requires = "output")]
+    /// Replace existing files of -o and --json
+    #[arg(long)]
     force: bool,
+    #[command(flatten)]
+    report: Report,
 }
 
 pub(super) fn run(command: &Label) -> Result<(), Error> {
@@ -52,21 +58,36 @@ pub(super) fn run(command: &Label) -> Result<(), Error> {
                 format!("give it the ending of {}; cif export writes other formats", command.path.display()),
             ));
         }
-        let mut outputs = Outputs::new(command.force);
-        outputs.reads(&command.path)?;
-        outputs.file(output)?;
     }
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.path)?;
+    command.output.as_deref().map_or(Ok(()), |output| outputs.file(output))?;
+    command.report.check(&mut outputs)?;
     let target = command.output.as_deref().unwrap_or(&command.path);
-    let (before, after) = match content {
+    let Renamed { object, before, label, category } = match content {
         Content::Field => in_scene(&command.path, target, &command.instance, label, category)?,
         Content::Graph(format) => {
             let done = format.relabel(&command.path, target, &command.instance, label, category);
             let done = done.map_err(Error::plain)?;
-            (done.before, format!("'{}', class '{}' ({})", done.label, done.category, done.object))
+            Renamed { object: done.object, before: done.before, label: done.label, category: done.category }
         }
     };
-    println!("{}: '{before}' is now {after}", target.display());
-    Ok(())
+    let report = || {
+        json!({
+            "file": target, "object": object, "before": before, "label": label, "category": category,
+        })
+    };
+    command.report.give(report, || {
+        println!("{}: '{before}' is now '{label}', class '{category}' ({object})", target.display());
+    })
+}
+
+/// An object with its names, before and now.
+struct Renamed {
+    object: String,
+    before: String,
+    label: String,
+    category: String,
 }
 
 /// A label without surrounding space.
@@ -87,18 +108,21 @@ fn in_scene(
     object: &str,
     label: &str,
     category: Option<&str>,
-) -> Result<(String, String), Error> {
+) -> Result<Renamed, Error> {
     // The whole file, so that a training state in it stays.
     let mut checkpoint = Checkpoint::load(path).map_err(Error::plain)?;
     let instances = &mut checkpoint.field.instances;
     let index = find(instances, object).ok_or_else(|| {
         let known: Vec<String> =
             instances.iter().map(|instance| format!("{} {}", instance.id, instance.label)).collect();
+        let names = instances.iter().map(|instance| instance_name(&instance.label, instance.id));
+        let names: Vec<String> = names.collect();
+        let help = match meant(object, names.iter().map(String::as_str)) {
+            Some(name) => format!("did you mean --instance {name}?"),
+            None => "give the number of one of them".to_owned(),
+        };
         let known = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
-        Error::failed(
-            format!("{} has no instance '{object}'; instances: {known}", path.display()),
-            "give the number of one of them",
-        )
+        Error::failed(format!("{} has no instance '{object}'; instances: {known}", path.display()), help)
     })?;
     let instance = &mut instances[index];
     let before = std::mem::replace(&mut instance.label, label.to_owned());
@@ -107,16 +131,16 @@ fn in_scene(
     } else if instance.category == before {
         label.clone_into(&mut instance.category);
     }
-    let after = format!("'{}', class '{}' (id {})", instance.label, instance.category, instance.id);
+    let (label, category) = (instance.label.clone(), instance.category.clone());
+    let renamed = Renamed { object: format!("id {}", instance.id), before, label, category };
     checkpoint.save(target).map_err(Error::plain)?;
-    Ok((before, after))
+    Ok(renamed)
 }
 
 /// An instance by mask value or unique name, as exports name its node.
 fn find(instances: &[Instance], object: &str) -> Option<usize> {
     let node = object.rsplit('/').next().unwrap_or(object);
     instances.iter().position(|instance| {
-        object.parse() == Ok(instance.id)
-            || cif_scene::naming::instance_name(&instance.label, instance.id) == node
+        object.parse() == Ok(instance.id) || instance_name(&instance.label, instance.id) == node
     })
 }

@@ -40,7 +40,7 @@ pub(super) struct Make {
     #[arg(required = true, value_name = "INPUT")]
     inputs: Vec<OsString>,
     /// Folder for everything that is made
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
     /// Painted masks of a few frames, PNG files of ids named as the frames [default: DIR/keyframes]
     #[arg(long, value_name = "DIR", conflicts_with = "masks")]
@@ -57,8 +57,7 @@ pub(super) struct Make {
     /// Settings file of the training
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
-    /// Show no progress
-    #[arg(short, long)]
+    #[arg(from_global)]
     quiet: bool,
 }
 

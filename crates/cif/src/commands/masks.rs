@@ -7,9 +7,11 @@ use std::path::{Path, PathBuf};
 
 use cif_dataset::masks::{INDEX_FILE, ViewOrder, ZigzagIndex, split_tracker_masks, write_zigzag};
 use clap::{Args, Subcommand, ValueEnum};
+use serde_json::json;
 
 use super::{CaptureOptions, print_warnings};
 use crate::error::Error;
+use crate::report::OnlyReport;
 
 /// Make masks: out of those of other tools, out of a few painted frames, or with a video tracker
 #[derive(Debug, Args)]
@@ -47,13 +49,15 @@ enum Step {
         /// Folder of the capture
         capture: PathBuf,
         /// New folder for the sequence
-        #[arg(short, long, value_name = "DIR")]
+        #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
         output: PathBuf,
         /// Order of the cameras
         #[arg(long, default_value = "name", value_name = "ORDER")]
         order: Order,
         #[command(flatten)]
         capture_options: CaptureOptions,
+        #[command(flatten)]
+        report: OnlyReport,
     },
     /// Bring the ids of a tracker back to the cameras, and drop objects that some camera never sees
     Split {
@@ -62,11 +66,13 @@ enum Step {
         /// Folder of the tracker's id images
         tracked: PathBuf,
         /// New folder for the masks
-        #[arg(short, long, value_name = "DIR")]
+        #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
         output: PathBuf,
         /// Pixels that an object needs in one frame of every camera
         #[arg(long, default_value_t = 1, value_name = "PIXELS")]
         min_px: u64,
+        #[command(flatten)]
+        report: OnlyReport,
     },
 }
 
@@ -83,14 +89,24 @@ pub(super) fn run(command: &Masks) -> Result<(), Error> {
     match &command.step {
         Step::Import(command) => import::run(command),
         Step::Propagate(command) => propagate::run(command),
-        Step::Zigzag { capture, output, order, capture_options } => {
-            zigzag(capture, output, *order, capture_options)
+        Step::Zigzag { capture, output, order, capture_options, report } => {
+            report.check([capture.as_path()])?;
+            zigzag(capture, output, *order, capture_options, report)
         }
-        Step::Split { sequence, tracked, output, min_px } => split(sequence, tracked, output, *min_px),
+        Step::Split { sequence, tracked, output, min_px, report } => {
+            report.check([sequence.as_path(), tracked.as_path()])?;
+            split(sequence, tracked, output, *min_px, report)
+        }
     }
 }
 
-fn zigzag(capture: &Path, output: &Path, order: Order, options: &CaptureOptions) -> Result<(), Error> {
+fn zigzag(
+    capture: &Path,
+    output: &Path,
+    order: Order,
+    options: &CaptureOptions,
+    report: &OnlyReport,
+) -> Result<(), Error> {
     let mut options = options.clone();
     options.no_masks = options.masks.is_none();
     let dataset = options.open(capture)?;
@@ -100,27 +116,48 @@ fn zigzag(capture: &Path, output: &Path, order: Order, options: &CaptureOptions)
         Order::Greedy => ViewOrder::Greedy,
     };
     let index = write_zigzag(&dataset, output, order).map_err(Error::plain)?;
-    println!("{} images and {INDEX_FILE} in {}", index.images.len(), output.display());
-    if index.is_multi_view() {
-        println!("cameras in order: {}; way between them {:.3} m", index.views.join(", "), index.view_path_m);
-    } else {
-        println!("one view, in the order of the capture");
-    }
-    Ok(())
+    report.give(
+        || json!(index),
+        || {
+            println!("{} images and {INDEX_FILE} in {}", index.images.len(), output.display());
+            if index.is_multi_view() {
+                let (views, way) = (index.views.join(", "), index.view_path_m);
+                println!("cameras in order: {views}; way between them {way:.3} m");
+            } else {
+                println!("one view, in the order of the capture");
+            }
+        },
+    )
 }
 
-fn split(sequence: &Path, tracked: &Path, output: &Path, min_px: u64) -> Result<(), Error> {
+fn split(
+    sequence: &Path,
+    tracked: &Path,
+    output: &Path,
+    min_px: u64,
+    json_report: &OnlyReport,
+) -> Result<(), Error> {
     let index = ZigzagIndex::load(sequence).map_err(Error::plain)?;
     let report = split_tracker_masks(&index, tracked, output, min_px).map_err(Error::plain)?;
-    println!("{} masks of {} instances in {}", report.masks, report.instances.len(), output.display());
-    for removed in &report.removed {
-        println!(
-            "removed id {} ({} pixels): not seen by {}",
-            removed.tracker_id,
-            removed.pixels,
-            removed.missing_in.join(", ")
-        );
-    }
+    json_report.give(
+        || json!(report),
+        || {
+            println!(
+                "{} masks of {} instances in {}",
+                report.masks,
+                report.instances.len(),
+                output.display()
+            );
+            for removed in &report.removed {
+                println!(
+                    "removed id {} ({} pixels): not seen by {}",
+                    removed.tracker_id,
+                    removed.pixels,
+                    removed.missing_in.join(", ")
+                );
+            }
+        },
+    )?;
     if !report.without_mask.is_empty() {
         eprintln!("warning: the tracker wrote no mask for {}", report.without_mask.join(", "));
     }

@@ -8,6 +8,7 @@ mod bench_export;
 mod bench_hardness;
 mod capture;
 mod check;
+mod completions;
 mod diff;
 mod embed;
 mod eval;
@@ -20,6 +21,7 @@ mod info;
 mod info_gpu;
 mod label;
 mod make;
+mod man;
 mod masks;
 mod model_options;
 mod motion_table;
@@ -33,6 +35,7 @@ mod scene;
 mod targets;
 mod train;
 mod train_budget;
+mod train_report;
 mod trajectories;
 
 use cif_render::cpu::SimdLevel;
@@ -42,6 +45,7 @@ use clap::{Args, Parser, Subcommand, ValueEnum};
 #[cfg(feature = "wgpu")]
 use crate::backend;
 use crate::error::Error;
+use crate::{messages, report};
 
 /// From captured images to an editable, segmented 3D scene.
 #[derive(Debug, Parser)]
@@ -59,6 +63,9 @@ pub struct Arguments {
     command: Command,
     #[command(flatten)]
     machine: Machine,
+    /// Show no progress, notes or outcomes; warnings, errors and what was asked for stay
+    #[arg(short, long, global = true)]
+    quiet: bool,
 }
 
 const TOUR: &str = "\
@@ -69,7 +76,7 @@ A short tour:
   cif plan captures/table                                which effects does it call for?
   cif train captures/table -o table.cif                  train it (--preset draft for a quick look)
   cif eval table.cif captures/table --images pictures    score the held-out views, and look at them
-  cif export table.cif --usd table.usda                  one moving prim per object
+  cif export table.cif table.usda                        one moving prim per object
   cif import table.usda --base table.cif -o new.cif      edits of that file come home
   cif query table.usda --label 'red mug' --time 36       which prim is it, and where?
   cif query table.usda --text 'something to drink from'  what could that be? (with cif embed, by meaning)
@@ -80,6 +87,12 @@ A capture is a folder in the layout of HyperNeRF, DyCheck, Neu3D, D-NeRF, Dynami
 Panoptic), LLFF sequences (NSFF, EndoNeRF), nerfstudio or COLMAP, with instance masks (PNG, value =
 instance id, 0 = unlabelled; or Cryptomatte EXR) in its folder masks/ or beside its images.
 `cif masks` makes them out of those of other tools, a few painted frames, or with a video tracker.
+
+Times are frames as captured, which are the time codes of exported stages: --time 36. Seconds after the
+first frame have an s (--time 1.5s), shares of the whole a percent sign (--time 50%).
+--json prints the report of a command as JSON and nothing else on stdout; --json FILE.json writes it.
+Tables fold to the width of the terminal, and do not where they are piped.
+Existing files are replaced with --force only. -q leaves out progress, notes and outcomes.
 Exit code: 0 done, 1 failed, 2 not understood, 130 interrupted.
 `cif COMMAND --help` explains one command.";
 
@@ -101,6 +114,8 @@ enum Command {
     Check(check::Check),
     Masks(masks::Masks),
     Bench(bench::Bench),
+    Completions(completions::Completions),
+    Man(man::Man),
 }
 
 /// Use of the machine; results never depend on the number of threads.
@@ -166,6 +181,7 @@ impl From<Simd> for SimdLevel {
 /// # Errors
 /// Whatever keeps the command from doing what was asked.
 pub fn run(arguments: Arguments) -> Result<(), Error> {
+    messages::set_quiet(arguments.quiet);
     let run = || dispatch(arguments.command);
     match arguments.machine.threads {
         None => run(),
@@ -175,6 +191,15 @@ pub fn run(arguments: Arguments) -> Result<(), Error> {
             .build()
             .map_err(|error| Error::plain(format!("cannot start {threads} threads: {error}")))?
             .install(run),
+    }
+}
+
+/// Advice on arguments that were not understood, where the message of the parser has none.
+#[must_use]
+pub fn advice(error: &clap::Error, arguments: &[std::ffi::OsString]) -> Option<String> {
+    match error.get(clap::error::ContextKind::InvalidArg)? {
+        clap::error::ContextValue::String(word) => report::advice(arguments, word),
+        _ => None,
     }
 }
 
@@ -197,6 +222,8 @@ fn dispatch(command: Command) -> Result<(), Error> {
         Command::Check(command) => check::run(&command),
         Command::Masks(command) => masks::run(&command),
         Command::Bench(command) => bench::run(&command),
+        Command::Completions(command) => completions::run(&command),
+        Command::Man(command) => man::run(&command),
     }
 }
 
@@ -331,15 +358,16 @@ fn print_misfits(field: &cif_field::Field, dataset: &cif_dataset::Dataset, split
     for misfit in misfits(field, dataset, split) {
         match misfit.severity {
             Severity::Warning => eprintln!("warning: {}", misfit.message),
-            Severity::Note => eprintln!("note: {}", misfit.message),
+            Severity::Note => messages::note!("{}", misfit.message),
         }
     }
 }
 
-/// A plain table with a heading.
+/// A plain table with a heading. On a terminal its cells fold to the width; elsewhere every row is a line.
 fn table<'a>(heading: impl IntoIterator<Item = &'a str>) -> comfy_table::Table {
     let mut table = comfy_table::Table::new();
     table.load_style(comfy_table::presets::NOTHING).set_header(heading);
+    table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
     table
 }
 

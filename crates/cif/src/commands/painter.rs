@@ -58,7 +58,7 @@ impl Painter {
         let facts = gpu.facts();
         let name = format!("{} ({})", facts.name, facts.interface);
         if backend == Backend::Wgpu {
-            eprintln!("rendering on {name}");
+            crate::messages::outcome!("rendering on {name}");
             return sample.renderer(&gpu).map(|renderer| Self::Gpu(Box::new(renderer))).map_err(Error::plain);
         }
         let mut processor = Renderer::new(simd);
@@ -75,15 +75,19 @@ impl Painter {
         let on_processor = start.elapsed();
         match probe(&gpu, sample) {
             Ok((renderer, on_gpu)) if on_gpu < on_processor => {
-                eprintln!("rendering on {name}: {on_gpu:.1?} a view, {on_processor:.1?} on the processor");
+                crate::messages::outcome!(
+                    "rendering on {name}: {on_gpu:.1?} a view, {on_processor:.1?} on the processor"
+                );
                 Ok(Self::Gpu(Box::new(renderer)))
             }
             Ok((_, on_gpu)) => {
-                eprintln!("rendering on the processor: {on_processor:.1?} a view, {on_gpu:.1?} on {name}");
+                crate::messages::outcome!(
+                    "rendering on the processor: {on_processor:.1?} a view, {on_gpu:.1?} on {name}"
+                );
                 Ok(Self::Cpu(Box::new(processor)))
             }
             Err(error) => {
-                eprintln!("note: rendering on the processor, because {name} does not do it: {error}");
+                crate::messages::note!("rendering on the processor, because {name} does not do it: {error}");
                 Ok(Self::Cpu(Box::new(processor)))
             }
         }

@@ -8,8 +8,9 @@ use serde_json::json;
 
 use super::{CaptureOptions, print_warnings};
 use crate::error::Error;
+use crate::report::OnlyReport;
 
-/// Tell which effects a capture calls for, and what they cost
+/// Show which effects a capture calls for, and what they cost
 #[derive(Debug, Args)]
 #[command(after_help = "\
 `cif train` follows this plan (unless the preset is paper, or --effects says otherwise) and records it in the scene.
@@ -21,9 +22,8 @@ Each line tells the flag of `cif train` that decides otherwise; settings that ar
 pub(super) struct Plan {
     /// Folder of the capture
     capture: PathBuf,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    report: OnlyReport,
     /// Named settings that the capture would be trained with: draft, standard or paper
     #[arg(long, value_name = "NAME", default_value = "standard")]
     preset: String,
@@ -36,17 +36,17 @@ pub(super) struct Plan {
 }
 
 pub(super) fn run(command: &Plan) -> Result<(), Error> {
+    command.report.check([command.capture.as_path()])?;
     let preset = super::train::preset(&command.preset, "--preset")?;
     let dataset = command.capture_options.open(&command.capture)?;
     print_warnings(&dataset);
     let config = TrainConfig::preset(preset, dataset.layout);
     let plan = EffectPlan::new(&dataset, &config, &command.effects).map_err(Error::plain)?;
-    if command.json {
-        println!("{:#}", json!(plan));
-        return Ok(());
-    }
+    command.report.give(|| json!(plan), || print(&plan))
+}
+
+fn print(plan: &EffectPlan) {
     let mut table = super::table(["effect", "decision", "evidence", "cost", "otherwise"]);
-    table.set_content_arrangement(comfy_table::ContentArrangement::Dynamic);
     for effect in &plan.effects {
         table.add_row([
             effect.effect.name(),
@@ -57,5 +57,4 @@ pub(super) fn run(command: &Plan) -> Result<(), Error> {
         ]);
     }
     println!("{table}");
-    Ok(())
 }

@@ -3,7 +3,7 @@
 mod by_masks;
 mod by_text;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use cif_field::Field;
 use cif_geometry::Bounds;
@@ -15,6 +15,8 @@ use serde_json::json;
 use super::scene;
 use crate::error::Error;
 use crate::formats::Content;
+use crate::moment::{Frames, Interval, Moment, note_fraction};
+use crate::report::OnlyReport;
 
 const HELP: &str = "\
 Without conditions every object is listed; several conditions must all hold. Labels match the name,
@@ -22,15 +24,17 @@ class or unique name of an object; case does not matter, * stands for any charac
 Boxes hold the splats to three standard deviations; volumes are those of the colliders, where there
 are any, else of the boxes; speeds are world units per second. Stages of other programs need semantic
 labels only.
-Time in a stage or glTF file is its time code, which counts captured frames; in a .cif it runs from 0
-(first captured time) to 1 (last).
+Times are frames as captured, in a .cif as in what is exported of it: time codes of stages. With a suffix they are
+seconds after the first frame or a share of the whole.
 
   cif query table.usda --label 'red mug' --time 36
+  cif query table.cif --label 'red mug' --time 1.5s
   cif query table.usda --taxonomy class --label mug --interval 0:20
+  cif query table.usda --label mug --interval 50%:100%
   cif query table.cif --taxonomy wikidata_qcode=Q81727
   cif query table.glb --box -0.2,-0.2,0,0.2,0.2,0.3
   cif query table.cif --label '*box' --json
-  cif query table.cif --point 0.1,0.2,0.05 --time 0.5
+  cif query table.cif --point 0.1,0.2,0.05 --time 50%
 
 By words: with --models, the objects whose embeddings (cif embed) are nearest to the text; those with a
 * are nearer to it than to texts of anything. Else those that have most of the words in their names.
@@ -45,7 +49,7 @@ masks of training frames; --eval renders them from held-out frames and compares 
   cif query table.cif --masks found --capture captures/table --eval
 
 By a prompt: Grounding DINO finds boxes (scores above 0.3) and SAM the masks in them, both ONNX models of
-yours; --json tells the boxes, with the words that score above 0.45. Masks are kept in
+yours; --json lists the boxes, with the words that score above 0.45. Masks are kept in
 CAPTURE/.cif-cache. Or a command of your own makes them.
 
   cif query table.cif --prompt 'steel jug' --capture captures/table --models models
@@ -63,7 +67,7 @@ fn help() -> String {
     format!("{HELP}{}", cif_vision::models::EXAMPLE)
 }
 
-/// Find objects by label, time, place, or masks; or tell what is at a place
+/// Find objects by label, time, place, or masks; or show what is at a place
 #[derive(Debug, Args)]
 #[command(after_help = help())]
 pub(super) struct Query {
@@ -96,12 +100,12 @@ pub(super) struct Query {
         allow_hyphen_values = true
     )]
     region: Option<Vec<f64>>,
-    /// Time: time code of a stage, 0 to 1 in a .cif [default: the first]
-    #[arg(long, value_name = "T", allow_hyphen_values = true)]
-    time: Option<f64>,
+    /// Time: a frame (36), seconds (1.5s) or a share (50%) [default: the first frame]
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    time: Option<Moment>,
     /// Interval of time: objects that are there at any time in it
     #[arg(long, value_name = "FROM:TO", conflicts_with = "time", allow_hyphen_values = true)]
-    interval: Option<String>,
+    interval: Option<Interval>,
     /// Words that describe what to look for: by embeddings, where the file has some (cif embed) and --models are
     /// given, else by the words of labels, classes and taxonomies
     #[arg(long, value_name = "TEXT", conflicts_with_all = ["label", "taxonomy", "masks"])]
@@ -112,14 +116,14 @@ pub(super) struct Query {
     /// Read layers that a stage brings in from outside its folder
     #[arg(long)]
     follow_external: bool,
-    /// Print JSON
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    report: OnlyReport,
     #[command(flatten)]
     by_masks: by_masks::ByMasks,
 }
 
 pub(super) fn run(command: &Query) -> Result<(), Error> {
+    command.report.check([command.path.as_path()])?;
     if command.by_masks.is_asked() {
         return by_masks::run(command);
     }
@@ -130,7 +134,7 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         ));
     }
     let is_field = matches!(Content::of(&command.path)?, Content::Field);
-    let wanted = question(command, is_field)?;
+    let wanted = question(command)?;
     if let (true, Some(place)) = (is_field, wanted.point) {
         let others = wanted.label.is_some() || wanted.region.is_some();
         if others || command.interval.is_some() || command.text.is_some() {
@@ -146,40 +150,47 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     }
     let place = command.path.display().to_string();
     let found = search(command, wanted)?;
-    if command.json {
-        println!("{:#}", json!(found));
-    } else if found.is_empty() {
-        println!("nothing is there in {place}");
-    } else {
-        print_table(&found);
-    }
-    Ok(())
+    command.report.give(
+        || json!(found),
+        || match found.as_slice() {
+            [] => println!("nothing is there in {place}"),
+            found => print_table(found),
+        },
+    )
 }
 
 /// Objects of the file that meet every condition.
-fn search(command: &Query, wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
+fn search(command: &Query, mut wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
     match Content::of(&command.path)? {
-        Content::Field => in_scene(&command.path, wanted),
+        Content::Field => in_scene(command, wanted),
         Content::Graph(format) => {
             let options = ReadOptions { follow_external: command.follow_external };
+            if command.time.is_some() || command.interval.is_some() {
+                let range = format.code_range(&command.path, options).map_err(Error::plain)?;
+                wanted.when = when(command, &Frames::new(range, &command.path.display().to_string()))?;
+            }
             format.search(&command.path, &wanted, options).map_err(Error::plain)
         }
     }
 }
 
-/// The conditions of the command line; times of a `.cif` are still normalised.
-fn question(command: &Query, is_field: bool) -> Result<ObjectQuery, Error> {
-    if is_field {
-        scene::check_time(command.time)?;
-    }
-    let when = match (command.time, &command.interval) {
-        (Some(time), _) if !time.is_finite() => {
-            return Err(Error::usage("--time needs a finite number", "for example --time 12"));
+/// Time or interval of the command line, in the time codes of what is asked.
+fn when(command: &Query, frames: &Frames<'_>) -> Result<When, Error> {
+    Ok(match (command.time, command.interval) {
+        (Some(time), _) => {
+            note_fraction("--time", time);
+            When::At(frames.code("--time", time)?)
         }
-        (Some(time), _) => When::At(time),
-        (None, Some(text)) => interval(text, is_field)?,
+        (None, Some(interval)) => {
+            let (from, to) = frames.interval("--interval", interval)?;
+            When::Over(from, to)
+        }
         (None, None) => When::Default,
-    };
+    })
+}
+
+/// The conditions of the command line but that of time, for which the file has to be read.
+fn question(command: &Query) -> Result<ObjectQuery, Error> {
     let point = command.point.as_deref().map(|numbers| corner("--point", numbers)).transpose()?;
     let region = match command.region.as_deref() {
         None => None,
@@ -195,7 +206,7 @@ fn question(command: &Query, is_field: bool) -> Result<ObjectQuery, Error> {
         }
     };
     let (taxonomy, label) = labels(command)?;
-    Ok(ObjectQuery { label, taxonomy, when, point, region })
+    Ok(ObjectQuery { label, taxonomy, when: When::Default, point, region })
 }
 
 /// Taxonomy and label that are looked for.
@@ -210,26 +221,6 @@ fn labels(command: &Query) -> Result<(Option<String>, Option<String>), Error> {
         Some(_) => Err(Error::usage(
             "--taxonomy NAME=PATTERN needs both names, and takes the place of --label",
             "for example --taxonomy wikidata_qcode=Q81727",
-        )),
-    }
-}
-
-fn interval(text: &str, is_field: bool) -> Result<When, Error> {
-    let ends: Option<(f64, f64)> = text
-        .split_once(':')
-        .and_then(|(from, to)| Some((from.trim().parse().ok()?, to.trim().parse().ok()?)));
-    let example = if is_field { "--interval 0:0.5" } else { "--interval 0:20" };
-    match ends {
-        Some((from, to)) if from.is_finite() && to.is_finite() && from <= to => {
-            if is_field {
-                scene::check_time(Some(from))?;
-                scene::check_time(Some(to))?;
-            }
-            Ok(When::Over(from, to))
-        }
-        _ => Err(Error::usage(
-            format!("--interval {text}: two times are needed, the earlier one first"),
-            format!("for example {example}"),
         )),
     }
 }
@@ -251,19 +242,13 @@ fn corner(option: &str, numbers: &[f64]) -> Result<DVec3, Error> {
     }
 }
 
-fn in_scene(path: &Path, mut wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
-    let field = scene::load(path)?;
+fn in_scene(command: &Query, mut wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
+    let place = command.path.display().to_string();
+    let field = scene::load(&command.path)?;
     let options = SceneOptions { proxy_points: 0, ..SceneOptions::default() };
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
-    let codes = &graph.time_codes;
-    let code = |time| code_at(&codes.times, &codes.samples, time);
-    wanted.when = match wanted.when {
-        When::Default => When::Default,
-        When::At(time) => When::At(code(time)),
-        When::Over(from, to) => When::Over(code(from), code(to)),
-    };
-    cif_scene::search(&graph, &wanted, &path.display().to_string(), |name| format!("/World/{name}"))
-        .map_err(Error::plain)
+    wanted.when = when(command, &Frames::new(graph.time_codes.range(), &place))?;
+    cif_scene::search(&graph, &wanted, &place, |name| format!("/World/{name}")).map_err(Error::plain)
 }
 
 /// Time code of a normalised time: linear between captured times, which need not be evenly spaced.
@@ -281,7 +266,11 @@ pub(super) fn code_at(times: &[f64], codes: &[f64], time: f64) -> f64 {
 
 fn at(command: &Query, place: DVec3) -> Result<(), Error> {
     let field: Field = scene::load(&command.path)?;
-    let time = command.time.unwrap_or(0.0);
+    let place_of_file = command.path.display().to_string();
+    let time = match command.time {
+        Some(moment) => scene::time(&field, &place_of_file, "--time", moment)?,
+        None => 0.0,
+    };
     let answers = field.query(&[scene::frame(&field)?.dataset_from_capture(place)], time);
     let answer = &answers[0];
     let named: Vec<_> = answer
@@ -289,25 +278,24 @@ fn at(command: &Query, place: DVec3) -> Result<(), Error> {
         .iter()
         .map(|(index, probability)| (&field.instances[usize::from(*index)], *probability))
         .collect();
-    if command.json {
+    let report = || {
         let instances: Vec<_> = named
             .iter()
             .map(|(instance, probability)| {
                 json!({ "id": instance.id, "label": instance.label, "probability": probability })
             })
             .collect();
-        let report = json!({
+        json!({
             "at": place.to_array(), "time": time, "existence": answer.existence,
             "gaussians": answer.gaussians, "instances": instances,
-        });
-        println!("{report:#}");
-        return Ok(());
-    }
-    println!("existence {:.4}, {} Gaussians", answer.existence, answer.gaussians);
-    for (instance, probability) in named {
-        println!("{:>8.4}  {} (id {})", probability, instance.label, instance.id);
-    }
-    Ok(())
+        })
+    };
+    command.report.give(report, || {
+        println!("existence {:.4}, {} Gaussians", answer.existence, answer.gaussians);
+        for (instance, probability) in &named {
+            println!("{:>8.4}  {} (id {})", probability, instance.label, instance.id);
+        }
+    })
 }
 
 fn print_table(found: &[ObjectMatch]) {
@@ -364,15 +352,5 @@ mod tests {
         }
         assert_eq!(code_at(&[0.5], &[3.0], 0.0), 3.0);
         assert_eq!(code_at(&[0.5], &[3.0], 1.0), 3.0);
-    }
-
-    #[test]
-    fn intervals_are_two_times_in_order() {
-        assert_eq!(interval("2:7.5", false).unwrap(), When::Over(2.0, 7.5));
-        assert_eq!(interval("-3:-3", false).unwrap(), When::Over(-3.0, -3.0));
-        for text in ["7:2", "3", "a:b", "nan:1", "0:inf"] {
-            assert!(interval(text, false).is_err(), "{text}");
-        }
-        assert!(interval("0:2", true).is_err(), "times of a .cif end at 1");
     }
 }

@@ -26,8 +26,10 @@ use super::trajectories::Trajectories;
 use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
+use crate::messages::outcome;
+use crate::moment::Moment;
 use crate::output::Outputs;
-use crate::{interrupt, output};
+use crate::{endings, interrupt, output};
 
 /// Render a scene from captured or new views
 #[derive(Debug, Args)]
@@ -48,11 +50,11 @@ pub(super) struct Render {
     /// Render the views of a camera file
     #[arg(long, value_name = "FILE.json")]
     camera: Option<PathBuf>,
-    /// Time of all views, from 0 to 1, instead of their own
-    #[arg(long, value_name = "T")]
-    time: Option<f64>,
+    /// Time of all views instead of their own: a frame (36), seconds (1.5s) or a share (50%)
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    time: Option<Moment>,
     /// Folder to write into: DIR/WHAT/VIEW.png
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = endings::folder())]
     output: PathBuf,
     /// Layers to write, comma separated [default: rgb, or nothing beside --exr]
     #[arg(long, value_delimiter = ',', value_name = "WHAT")]
@@ -172,13 +174,14 @@ fn after_help() -> String {
          cif render table.cif --capture captures/table --split val -o out --what rgb,instance,depth\n  \
          cif render table.cif --capture captures/table -o look --quality draft\n  \
          cif render table.cif --capture captures/table -o paths --what tracks\n  \
-         cif render table.cif --camera views.json --time 0.5 -o out\n\n{FORMAT_HELP}"
+         cif render table.cif --camera views.json --time 50% -o out\n\n{FORMAT_HELP}"
     )
 }
 
 pub(super) fn run(command: &Render) -> Result<(), Error> {
-    scene::check_time(command.time)?;
     let field = scene::load(&command.scene)?;
+    let place = command.scene.display().to_string();
+    let time_of_all = command.time.map(|moment| scene::time(&field, &place, "--time", moment)).transpose()?;
     let mut what: BTreeSet<What> = command.what.iter().copied().collect();
     if what.is_empty() && !command.exr {
         what.insert(What::Rgb);
@@ -217,21 +220,21 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     };
     if command.quality == QualityName::Draft {
         let mut renderer = Renderer::new(command.simd.into());
-        tell_draft(&mut renderer, &field, &views, &settings, command.time);
+        tell_draft(&mut renderer, &field, &views, &settings, time_of_all);
     }
     let field = quality.thin(&field);
     let channels = Channels { depth, instances };
-    let mut painter = painter(command, &field, &views, &settings, channels)?;
+    let mut painter = painter(command, &field, &views, &settings, channels, time_of_all)?;
     let trajectories = what.contains(&What::Tracks).then(|| Trajectories::new(&field, command.simd.into()));
     interrupt::watch();
     let settings = quality.settings(&settings);
     for (index, Shot { view, .. }) in views.iter().enumerate() {
-        let time = command.time.or(view.time).unwrap_or(0.0);
+        let time = time_of_all.or(view.time).unwrap_or(0.0);
         let lines = trajectories.as_ref().map(|paths| paths.lines(&view.camera, time)).unwrap_or_default();
         let mut files = ViewFiles::create(&what, &field, &command.output, view, lines)?;
         match &mut painter {
             Painter::Cpu(renderer) if command.exr => {
-                let place = Place { field: &field, views: &views, index, time: command.time };
+                let place = Place { field: &field, views: &views, index, time: time_of_all };
                 write_exr(renderer, channels, &settings, &place, command, &mut files)?;
             }
             Painter::Cpu(renderer) => {
@@ -251,7 +254,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         }
         files.finish()?;
     }
-    eprintln!("rendered {} views into {}", views.len(), command.output.display());
+    outcome!("rendered {} views into {}", views.len(), command.output.display());
     Ok(())
 }
 
@@ -297,7 +300,7 @@ fn tell_draft(
         worst = worst.min(psnr);
         mean += psnr / count as f64;
     }
-    eprintln!(
+    outcome!(
         "draft: PSNR {mean:.1} dB against final quality, {worst:.1} in the worst of {count} views measured; \
          {} of {} Gaussians, {:.2} times as fast by processor time",
         thinned.len(),
@@ -314,6 +317,7 @@ fn painter(
     views: &[Shot],
     settings: &RenderSettings,
     channels: Channels,
+    time: Option<f64>,
 ) -> Result<Painter, Error> {
     use super::backend::Backend;
     if command.exr && command.backend == Backend::Wgpu {
@@ -325,7 +329,7 @@ fn painter(
     let (false, Some(Shot { view, .. })) = (command.exr, views.first()) else {
         return Ok(Painter::cpu(command.simd.into()));
     };
-    let time = command.time.or(view.time).unwrap_or(0.0);
+    let time = time.or(view.time).unwrap_or(0.0);
     let compact = command.quality == QualityName::Draft;
     let sample = Sample { field, camera: &view.camera, time, settings, channels, compact };
     Painter::choose(command.backend, command.simd.into(), &sample)
@@ -339,6 +343,7 @@ fn painter(
     _: &[Shot],
     _: &RenderSettings,
     _: Channels,
+    _: Option<f64>,
 ) -> Result<Painter, Error> {
     Ok(Painter::cpu(command.simd.into()))
 }

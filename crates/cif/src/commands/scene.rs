@@ -7,7 +7,10 @@ use cif_render::RenderSettings;
 use cif_scene::CaptureFrame;
 use cif_train::heads::Decoder;
 
+use super::query::code_at;
 use crate::error::Error;
+use crate::messages::note;
+use crate::moment::{Frames, Moment, note_fraction};
 
 /// Loads a `.cif` file.
 ///
@@ -63,13 +66,13 @@ pub(super) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &
         return;
     }
     let [x, y, z] = frame.offset;
-    eprintln!(
-        "note: the capture was read in a frame of its own, around ({x}, {y}, {z}), lengths times {}; the root of a stage \
+    note!(
+        "the capture was read in a frame of its own, around ({x}, {y}, {z}), lengths times {}; the root of a stage \
          or glTF file places the scene there",
         frame.scale
     );
     for note in notes {
-        eprintln!("note: {note}");
+        note!("{note}");
     }
 }
 
@@ -78,16 +81,14 @@ pub(super) fn trained_downscale(field: &Field) -> Option<u32> {
     cif_train::metrics::training_config(field)?.downscale
 }
 
-/// Checks a normalised time.
+/// Normalised time of a moment in a scene; `flag` and the name of the file are for errors.
 ///
 /// # Errors
-/// Outside [0, 1].
-pub(super) fn check_time(time: Option<f64>) -> Result<(), Error> {
-    match time {
-        Some(time) if !(0.0..=1.0).contains(&time) => Err(Error::usage(
-            format!("--time {time}: times are normalised"),
-            "give a number from 0 (first captured time) to 1 (last)",
-        )),
-        _ => Ok(()),
-    }
+/// When the scene does not have it.
+pub(super) fn time(field: &Field, place: &str, flag: &str, moment: Moment) -> Result<f64, Error> {
+    note_fraction(flag, moment);
+    let times = &field.timeline.times;
+    let code = Frames::of(&field.timeline, place).code(flag, moment)?;
+    let codes: Vec<f64> = (0..times.len()).map(|frame| frame as f64).collect();
+    Ok(code_at(&codes, times, code))
 }

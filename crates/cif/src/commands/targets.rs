@@ -1,17 +1,23 @@
-//! The part of `cif export` that knows of formats: a flag for each, and what is written where.
+//! The part of `cif export` that knows of formats: files by their endings, a flag for each, and what is written where.
 
 use std::path::{Path, PathBuf};
 
 use cif_scene::{ExportOptions, ExportSummary, Payloads, SceneFormat};
-use clap::{Arg, ArgMatches, Args, Command, FromArgMatches, value_parser};
+use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, value_parser};
 
+use crate::endings;
 use crate::error::Error;
 use crate::formats::FORMATS;
+use crate::messages::outcome;
+use crate::moment::{Frames, Moment, note_fraction};
 use crate::output::{self, Outputs};
 
-/// Files to write, one per format at most; `--usd OUT`, `--gltf OUT` and so on.
+/// Files to write: `OUT` by its ending, `--usd OUT`, `--gltf OUT` and so on.
 #[derive(Debug, Default)]
 pub(super) struct Targets(Vec<Target>);
+
+/// Files that are given without a flag.
+pub(super) const FILES: &str = "files";
 
 /// A file to write.
 pub(super) struct Target {
@@ -33,6 +39,17 @@ fn written(format: &dyn SceneFormat) -> Vec<String> {
 
 impl Args for Targets {
     fn augment_args(command: Command) -> Command {
+        let help = format!(
+            "Files to write; the endings decide the formats: {}",
+            FORMATS.into_iter().flat_map(written).collect::<Vec<_>>().join(", ")
+        );
+        let files = Arg::new(FILES)
+            .value_name("OUT")
+            .num_args(0..)
+            .action(ArgAction::Append)
+            .value_parser(endings::exchanged())
+            .help(help);
+        let command = command.arg(files);
         FORMATS.into_iter().fold(command, |command, format| {
             let help = format!(
                 "{} to write; the ending decides: {}. {}",
@@ -60,7 +77,11 @@ impl FromArgMatches for Targets {
             let path = matches.get_one::<PathBuf>(format.about().key)?.clone();
             Some(Target { format, path })
         });
-        Ok(Self(given.collect()))
+        let by_ending = matches.get_many::<PathBuf>(FILES).into_iter().flatten().filter_map(|path| {
+            let format = FORMATS.into_iter().find(|format| format.writes(path))?;
+            Some(Target { format, path: path.clone() })
+        });
+        Ok(Self(by_ending.chain(given).collect()))
     }
 
     fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
@@ -82,20 +103,33 @@ pub(super) struct Writing {
     /// Leave out the variants with half and a quarter of the splats
     #[arg(long)]
     no_lod: bool,
-    /// Moment of --ply, from 0 (first time) to 1 (last) [default: the first]
-    #[arg(long, value_name = "TIME", requires = "ply", conflicts_with = "ply_sequence")]
-    ply_time: Option<f64>,
-    /// A file per object: FOLDER/red_mug_001.ply
-    #[arg(long, requires = "ply")]
+    /// Moment of a PLY: a frame (36), seconds (1.5s) or a share (50%) [default: the first frame]
+    #[arg(long, value_name = "TIME", conflicts_with = "ply_sequence", allow_hyphen_values = true)]
+    ply_time: Option<Moment>,
+    /// A file per object: --ply FOLDER makes FOLDER/red_mug_001.ply
+    #[arg(long)]
     ply_split: bool,
-    /// A file per sampled frame: FOLDER/0000.ply; with --ply-split FOLDER/red_mug_001/0000.ply
-    #[arg(long, requires = "ply")]
+    /// A file per sampled frame: --ply FOLDER makes FOLDER/0000.ply; with --ply-split FOLDER/red_mug_001/0000.ply
+    #[arg(long)]
     ply_sequence: bool,
 }
 
 impl Writing {
-    /// Options; the moment is that of a graph, which `code_at` tells.
-    pub(super) fn options(&self, force: bool, code_at: impl FnOnce(f64) -> f64) -> ExportOptions {
+    /// Options, with the moment of formats that hold one.
+    ///
+    /// # Errors
+    /// When the scene has no such moment.
+    pub(super) fn options(&self, force: bool, frames: &Frames<'_>) -> Result<ExportOptions, Error> {
+        let code = |moment| {
+            note_fraction("--ply-time", moment);
+            frames.code("--ply-time", moment)
+        };
+        let time_code = self.ply_time.map(code).transpose()?;
+        Ok(ExportOptions { time_code, ..self.without_moment(force) })
+    }
+
+    /// Options by which names and places are checked, which do not depend on the moment.
+    pub(super) fn without_moment(&self, force: bool) -> ExportOptions {
         let payloads = match (self.payloads, self.single_file) {
             (true, _) => Payloads::Separate,
             (_, true) => Payloads::SingleFile,
@@ -105,7 +139,7 @@ impl Writing {
             force,
             payloads,
             levels_of_detail: !self.no_lod,
-            time_code: self.ply_time.map(code_at),
+            time_code: None,
             split: self.ply_split,
             sequence: self.ply_sequence,
         }
@@ -119,16 +153,19 @@ impl Targets {
 
     /// Checks names and places before the work starts.
     pub(super) fn check(&self, writing: &Writing, force: bool, outputs: &mut Outputs) -> Result<(), Error> {
-        if let Some(time) = writing.ply_time
-            && !(0.0..=1.0).contains(&time)
-        {
+        let of_ply = [
+            ("--ply-time", writing.ply_time.is_some()),
+            ("--ply-split", writing.ply_split),
+            ("--ply-sequence", writing.ply_sequence),
+        ];
+        let has_ply = self.0.iter().any(|target| target.format.about().most_expensive_motion.is_none());
+        if let Some((flag, _)) = of_ply.into_iter().find(|(_, is_given)| *is_given && !has_ply) {
             return Err(Error::usage(
-                format!("--ply-time {time}: times are normalised"),
-                "give a number from 0 (first captured time) to 1 (last)",
+                format!("{flag} is about a PLY, and none is written"),
+                "add OUT.ply, or --ply OUT",
             ));
         }
-        // Nothing that is checked depends on the moment.
-        let options = writing.options(force, |time| time);
+        let options = writing.without_moment(force);
         self.0.iter().try_for_each(|target| target.check(&options, outputs))
     }
 }
@@ -171,7 +208,7 @@ impl Target {
             count => format!("{count} files, "),
         };
         let library = summary.library.as_ref().map_or_else(String::new, |library| format!(" ({library})"));
-        eprintln!(
+        outcome!(
             "wrote {}: {files}{} objects, {} splats, {} time samples, {:.1} MB{library}",
             summary.path.display(),
             summary.nodes,

@@ -19,7 +19,7 @@ use crate::error::Error;
 use crate::output::Outputs;
 use crate::progress::Progress;
 use crate::settings::Layers;
-use crate::{interrupt, training};
+use crate::{endings, interrupt, training};
 
 /// Train a scene on a capture
 #[derive(Debug, Args)]
@@ -64,7 +64,7 @@ pub(super) struct Train {
     /// Folder of the capture
     capture: PathBuf,
     /// Scene to write
-    #[arg(short, long, value_name = "SCENE.cif")]
+    #[arg(short, long, value_name = "SCENE.cif", value_parser = endings::scene())]
     output: PathBuf,
     /// Replace an existing scene
     #[arg(long)]
@@ -81,15 +81,16 @@ pub(super) struct Train {
     /// --resume goes on
     #[arg(long, value_name = "N")]
     stop_after: Option<u64>,
-    /// Write every event as a line of JSON
-    #[arg(long, value_name = "FILE.jsonl")]
+    /// Log of the run: every event as a line of JSON, as it happens; --json is the report at the end
+    #[arg(long, value_name = "FILE.jsonl", value_parser = endings::log())]
     log: Option<PathBuf>,
+    #[command(flatten)]
+    report: crate::report::Report,
     /// Look at every array of every step, and name the part, the tensor and the index of the first value that
     /// is not finite. Slower; the scene is the same. Without it such steps are rolled back and counted, too
     #[arg(long)]
     debug_validation: bool,
-    /// Show no progress
-    #[arg(short, long)]
+    #[arg(from_global)]
     quiet: bool,
     /// Named settings: draft, standard or paper [default: standard]
     #[arg(long, value_name = "NAME")]
@@ -323,7 +324,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     }
     let saved = command.output.display();
     match outcome {
-        Outcome::Finished => eprintln!("saved {saved}"),
+        Outcome::Finished => crate::messages::outcome!("saved {saved}"),
         Outcome::Interrupted => {
             let help = format!("go on with: {}", resume_command(command));
             if !trainer.has_begun() {
@@ -336,9 +337,10 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
                     help: Some(help),
                 });
             }
-            eprintln!("stopped; saved {saved}; {help}");
+            crate::messages::outcome!("stopped; saved {saved}; {help}");
         }
     }
+    super::train_report::give(&command.report, &command.output, outcome)?;
     logged
 }
 
@@ -356,7 +358,8 @@ fn check_outputs(command: &Train) -> Result<(), Error> {
     [config, command.from.as_deref()].into_iter().flatten().try_for_each(|input| outputs.reads(input))?;
     outputs.add(&command.output)?;
     outputs.add(settings_path)?;
-    command.log.as_deref().map_or(Ok(()), |log| outputs.text(log))
+    command.log.as_deref().map_or(Ok(()), |log| outputs.text(log))?;
+    command.report.check(&mut outputs)
 }
 
 /// Optimiser steps done by this command, over all stages.

@@ -46,7 +46,7 @@ pub(super) fn detect(
                     if folder.is_some() {
                         return Err(error.into());
                     }
-                    eprintln!("note: {error}; masks are not kept for the next time, see --cache");
+                    crate::messages::note!("{error}; masks are not kept for the next time, see --cache");
                     let instead = folder.insert(temporary()?);
                     cache = Cache::new(instead.path(), models, prompt, thresholds)?;
                     file = cache.file(&name, &picture);

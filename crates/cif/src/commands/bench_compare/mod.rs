@@ -74,8 +74,10 @@ pub(super) struct BenchCompare {
     #[arg(required = true)]
     captures: Vec<PathBuf>,
     /// Folder to write into
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
+    #[command(flatten)]
+    report: crate::report::Report,
     /// Heads to compare, comma separated [default: all]
     #[arg(long, value_name = "NAME,...", value_delimiter = ',')]
     heads: Vec<HeadArgument>,
@@ -167,6 +169,7 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
         answers::check(models)?;
     }
     let goes_on = command.output.join("runs").is_dir();
+    command.report.check(&mut output::Outputs::new(command.force))?;
     output::check_folder(&command.output, command.force || goes_on)?;
     let captures = command
         .captures
@@ -230,18 +233,22 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
             help: Some("the same command goes on".to_owned()),
         });
     }
-    for name in ["panoptic.md", "queries.md"].into_iter().take(1 + usize::from(comparison.queries.is_some()))
-    {
-        let path = command.output.join(name);
-        println!("{}", std::fs::read_to_string(&path).map_err(Error::io("read", &path))?);
+    let tables = ["panoptic", "queries"].into_iter().take(1 + usize::from(comparison.queries.is_some()));
+    let (mut report, mut text) = (serde_json::Map::new(), String::new());
+    for name in tables {
+        report.insert(name.to_owned(), crate::report::read(&command.output.join(format!("{name}.json")))?);
+        let path = command.output.join(format!("{name}.md"));
+        text += &std::fs::read_to_string(&path).map_err(Error::io("read", &path))?;
+        text.push('\n');
     }
-    eprintln!("wrote {}", page.display());
+    command.report.give(|| report.into(), || print!("{text}"))?;
+    crate::messages::outcome!("wrote {}", page.display());
     if bench.ended == Some(Ended::OutOfTime) {
         let answers = match unanswered {
             0 => String::new(),
             scenes => format!(", and with the questions that {scenes} scenes have not answered"),
         };
-        eprintln!(
+        crate::messages::outcome!(
             "the budget is used up; the same command goes on with the {left} runs that are not done yet{answers}"
         );
     }

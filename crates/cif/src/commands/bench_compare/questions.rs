@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use cif_dataset::InstanceLabel;
+use cif_dataset::meant::known_names;
 use cif_train::heads::lang_splat::relevance::Question as Codes;
 use serde::{Deserialize, Serialize};
 
@@ -224,7 +225,10 @@ impl File {
         }
         if !others.is_empty() {
             let path = self.path.display();
-            eprintln!("note: {path}: {} is not compared here, so nothing is asked of it", others.join(", "));
+            crate::messages::note!(
+                "{path}: {} is not compared here, so nothing is asked of it",
+                others.join(", ")
+            );
         }
         let mut found = Vec::new();
         for capture in captures {
@@ -272,11 +276,12 @@ fn ids(named: &[Named], instances: &[InstanceLabel]) -> Result<BTreeSet<u16>, St
         if !is_known {
             let known: Vec<String> =
                 instances.iter().map(|instance| format!("{} {}", instance.id, instance.label)).collect();
-            let name = match name {
-                Named::Id(id) => id.to_string(),
-                Named::Label(label) => format!("'{label}'"),
-            };
-            return Err(format!("no instance is {name}; there are {}", known.join(", ")));
+            return Err(match name {
+                Named::Id(id) => format!("no instance is {id}; there are {}", known.join(", ")),
+                Named::Label(label) => {
+                    format!("no instance is '{label}'; {}", known_names(label, "there are", &known))
+                }
+            });
         }
     }
     Ok(found)

@@ -157,7 +157,7 @@ impl Bench {
             eprint!("\r\x1b[K{text}{}", if ends { "\n" } else { "" });
             let _ = std::io::stderr().flush();
         } else if ends {
-            eprintln!("{text}");
+            crate::messages::outcome!("{text}");
         }
     }
 }

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
+use crate::moment::Moment;
+
 /// Make a capture out of videos or photographs: frames, camera poses, times
 #[derive(Debug, Args)]
 #[command(after_help = "\
@@ -34,7 +36,7 @@ pub(in crate::commands) struct Capture {
     #[arg(required = true, value_name = "INPUT")]
     pub(super) inputs: Vec<String>,
     /// New folder for the capture
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     pub(super) output: PathBuf,
     /// Frames per second to take of videos
     #[arg(long, value_name = "HZ", value_parser = positive, conflicts_with = "count", help_heading = "Frames")]
@@ -42,11 +44,11 @@ pub(in crate::commands) struct Capture {
     /// Frames to take of every input [default: 150 of a video, all photographs]
     #[arg(long, value_name = "N", value_parser = clap::builder::RangedU64ValueParser::<usize>::new().range(1..=100_000), help_heading = "Frames")]
     pub(super) count: Option<usize>,
-    /// First second of videos to take
-    #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Frames")]
+    /// Time of videos to begin at, seconds with an s: 12s
+    #[arg(long, value_name = "TIME", value_parser = seconds, help_heading = "Frames")]
     pub(super) from: Option<f64>,
-    /// Last second of videos to take
-    #[arg(long, value_name = "SECONDS", value_parser = seconds, help_heading = "Frames")]
+    /// Time of videos to end at, as 20.5s
+    #[arg(long, value_name = "TIME", value_parser = seconds, help_heading = "Frames")]
     pub(super) to: Option<f64>,
     /// Reduce frames of videos and photographs so that their larger side has at most so many pixels
     #[arg(long, value_name = "PIXELS", value_parser = clap::value_parser!(u32).range(16..=16_384), help_heading = "Frames")]
@@ -109,9 +111,10 @@ pub(in crate::commands) struct Capture {
         help_heading = "World"
     )]
     pub(super) up: UpName,
-    /// Show no progress
-    #[arg(short, long)]
+    #[arg(from_global)]
     pub(super) quiet: bool,
+    #[command(flatten)]
+    pub(super) report: crate::report::OnlyReport,
     /// A step of `cif make`, which tells what comes next
     #[arg(long, hide = true)]
     pub(super) step: bool,
@@ -174,8 +177,11 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
 }
 
 fn seconds(text: &str) -> Result<f64, String> {
-    let value = text.parse().ok().filter(|value: &f64| value.is_finite() && *value >= 0.0);
-    value.ok_or_else(|| "seconds from 0 on are expected".to_owned())
+    match text.parse() {
+        Ok(Moment::Seconds(value)) if value >= 0.0 => Ok(value),
+        Ok(Moment::Frame(value)) => Err(format!("times of a video are seconds with an s: {value}s")),
+        _ => Err("seconds from 0 on are expected, with an s: 12.5s".to_owned()),
+    }
 }
 
 /// A camera and seconds.

@@ -7,6 +7,7 @@ use cif_capture::masks::Masks;
 use cif_capture::similarity::Similarity;
 use cif_capture::world::{self, Click};
 use cif_capture::{Hooks, known_length};
+use cif_dataset::meant::known_names;
 use glam::{DVec2, DVec3};
 
 use super::options::{UpName, positive};
@@ -111,8 +112,12 @@ fn id_of(name: &str, masks: &Masks) -> Result<u16, Error> {
     };
     let labelled = labels.values().find(|instance| instance.label == name).map(|instance| instance.id);
     labelled.or_else(|| name.parse().ok().filter(|id| *id > 0)).ok_or_else(|| {
-        let known: Vec<&str> = labels.values().map(|instance| instance.label.as_str()).collect();
-        let known = if known.is_empty() { "there is no instances.json".to_owned() } else { known.join(", ") };
+        let known: Vec<String> = labels.values().map(|instance| instance.label.clone()).collect();
+        let known = if known.is_empty() {
+            "there is no instances.json".to_owned()
+        } else {
+            known_names(name, "it has", &known)
+        };
         Error::failed(
             format!("{}: no object is called {name:?}", masks.folder.display()),
             format!("give the id of one that stands still, or a label of its instances.json: {known}"),

@@ -4,13 +4,15 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use cif_dataset::masks::{Import as Source, MaskWriter, SourceKind};
-use cif_dataset::{Dataset, OpenOptions};
+use cif_dataset::{Dataset, InstanceLabel, OpenOptions};
 use clap::{Args, ValueEnum};
+use serde_json::json;
 
 use crate::commands::{LayoutName, command_line, table};
 use crate::error::Error;
 use crate::interrupt;
 use crate::progress::FrameProgress;
+use crate::report::OnlyReport;
 
 /// Bring masks of other tools into the form that training reads
 #[derive(Debug, Args)]
@@ -42,7 +44,7 @@ pub(super) struct Import {
     /// File or folder with the masks
     source: PathBuf,
     /// New folder for the masks
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
     /// Folder of the capture whose frames they show
     #[arg(long, value_name = "CAPTURE")]
@@ -60,8 +62,9 @@ pub(super) struct Import {
     /// Read the capture as this layout where two fit
     #[arg(long, value_name = "LAYOUT")]
     layout: Option<LayoutName>,
-    /// Show no progress
-    #[arg(short, long)]
+    #[command(flatten)]
+    report: OnlyReport,
+    #[arg(from_global)]
     quiet: bool,
 }
 
@@ -123,10 +126,13 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         layout: command.layout.map(Into::into),
         ..OpenOptions::default()
     };
+    command.report.check([command.source.as_path(), command.capture.as_path()])?;
     let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;
     let source = Source::open(&command.source, command.from.map(From::kind), command.first_number, &dataset)
         .map_err(Error::plain)?;
-    println!("read as {}", source.kind.described());
+    if !command.report.to_stdout() {
+        println!("read as {}", source.kind.described());
+    }
     let writer = MaskWriter::create(&command.output).map_err(Error::plain)?;
     interrupt::watch();
     let mut progress = FrameProgress::new(command.quiet, dataset.frames.len());
@@ -161,8 +167,56 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         source.instances.iter().cloned().partition(|instance| found.objects.contains_key(&instance.id));
     writer.finish(&seen).map_err(Error::plain)?;
 
+    let report = || {
+        let objects = seen.iter().map(|instance| {
+            let (frames, pixels) = found.objects[&instance.id];
+            json!({
+                "id": instance.id, "label": instance.label, "category": instance.category,
+                "frames": frames, "pixels": pixels,
+            })
+        });
+        json!({
+            "read_as": source.kind.described(),
+            "masks_in": command.output,
+            "frames": dataset.frames.len(),
+            "masks": found.masks,
+            "frames_without_mask": without,
+            "pixels": found.pixels,
+            "labelled_pixels": found.labelled,
+            "disputed_pixels": found.disputed,
+            "objects": objects.collect::<Vec<_>>(),
+            "objects_without_pixels": empty,
+        })
+    };
+    command.report.give(report, || print(command, &dataset, &found, &seen))?;
+    for note in &source.notes {
+        crate::messages::note!("{note}");
+    }
+    if let Some(Resized { count, from, to }) = found.resized {
+        crate::messages::note!(
+            "{count} masks of {} x {} pixels were brought to {} x {} by nearest neighbour",
+            from.0,
+            from.1,
+            to.0,
+            to.1
+        );
+    }
+    if found.disputed > 0 {
+        crate::messages::note!("{} pixels were claimed by several objects", found.disputed);
+    }
+    if let Some(first) = without.first() {
+        eprintln!("warning: {} frames have no mask, the first is {first}", without.len());
+    }
+    if !empty.is_empty() {
+        let names: Vec<&str> = empty.iter().map(|instance| instance.label.as_str()).collect();
+        eprintln!("warning: no pixel shows {}; left out of instances.json", names.join(", "));
+    }
+    Ok(())
+}
+
+fn print(command: &Import, dataset: &Dataset, found: &Found, seen: &[InstanceLabel]) {
     let mut rows = table(["id", "label", "category", "frames", "pixels"]);
-    for instance in &seen {
+    for instance in seen {
         let (frames, pixels) = found.objects[&instance.id];
         rows.add_row([
             instance.id.to_string(),
@@ -181,29 +235,9 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         100.0 * found.labelled as f64 / found.pixels.max(1) as f64,
         command.output.display()
     );
-    for note in &source.notes {
-        eprintln!("note: {note}");
-    }
-    if let Some(Resized { count, from, to }) = found.resized {
-        eprintln!(
-            "note: {count} masks of {} x {} pixels were brought to {} x {} by nearest neighbour",
-            from.0, from.1, to.0, to.1
-        );
-    }
-    if found.disputed > 0 {
-        eprintln!("note: {} pixels were claimed by several objects", found.disputed);
-    }
-    if let Some(first) = without.first() {
-        eprintln!("warning: {} frames have no mask, the first is {first}", without.len());
-    }
-    if !empty.is_empty() {
-        let names: Vec<&str> = empty.iter().map(|instance| instance.label.as_str()).collect();
-        eprintln!("warning: no pixel shows {}; left out of instances.json", names.join(", "));
-    }
     let masks = std::path::absolute(&command.output).unwrap_or_else(|_| command.output.clone());
     let words = ["train", &command.capture.display().to_string(), "--masks", &masks.display().to_string()];
     println!("next: {} -o scene.cif", command_line(&words));
-    Ok(())
 }
 
 impl Found {

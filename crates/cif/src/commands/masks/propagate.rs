@@ -12,6 +12,7 @@ use cif_masks::rig::{self, View};
 use cif_masks::suggest::{Camera, Propagated, doubt, next_frame};
 use cif_masks::{Clip, Keyframe, Mask};
 use clap::Args;
+use serde_json::json;
 
 use self::points::Points;
 use crate::commands::{FrameOptions, LayoutName, command_line};
@@ -51,7 +52,7 @@ pub(super) struct Propagate {
     #[arg(long, value_name = "DIR")]
     keyframes: PathBuf,
     /// New folder for the masks
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = crate::endings::folder())]
     output: PathBuf,
     /// Scene of this capture, trained with or without masks, whose Gaussians bring ids to cameras without keyframes
     #[arg(long, value_name = "SCENE.cif")]
@@ -64,8 +65,9 @@ pub(super) struct Propagate {
     layout: Option<LayoutName>,
     #[command(flatten)]
     frames: FrameOptions,
-    /// Show no progress
-    #[arg(short, long)]
+    #[command(flatten)]
+    report: crate::report::OnlyReport,
+    #[arg(from_global)]
     quiet: bool,
     /// A step of `cif make`, which tells what comes next
     #[arg(long, hide = true)]
@@ -82,13 +84,14 @@ impl From<cif_masks::Error> for Error {
 }
 
 pub(super) fn run(command: &Propagate) -> Result<(), Error> {
+    command.report.check([command.capture.as_path(), command.keyframes.as_path()])?;
     let dataset = open(command)?;
     check_ids(&dataset, &command.keyframes)?;
     let mut painted = BTreeMap::new();
     for (index, frame) in dataset.frames.iter().enumerate() {
         if let Some(ids) = dataset.load_distorted_mask(index).map_err(Error::plain)? {
             if ids.pixels.iter().all(|id| *id == 0) {
-                eprintln!("note: the keyframe of frame {} shows no object", frame.name);
+                crate::messages::note!("the keyframe of frame {} shows no object", frame.name);
             }
             painted.insert(index, Keyframe::painted(ids));
         }
@@ -296,12 +299,6 @@ impl Work<'_> {
         save_jpeg(&writer.path().join(SHEET), &sheet.finish())?;
         writer.finish(&dataset.instances).map_err(Error::plain)?;
         let masks = dataset.frames.len() - unmasked.len();
-        println!(
-            "{masks} masks of {} instances from {} keyframes in {}; {SHEET} shows them",
-            dataset.instances.len(),
-            painted.len(),
-            command.output.display()
-        );
         if !unmasked.is_empty() {
             eprintln!(
                 "warning: no point brings ids to {} frames, which have no mask: {} ...",
@@ -316,28 +313,51 @@ impl Work<'_> {
             trained: dataset.frames[*frame].split == Split::Train,
         };
         let camera = |frames: &Vec<usize>| Camera { frames: frames.iter().map(propagated).collect() };
-        if let Some(frame) = next_frame(&cameras.values().map(camera).collect::<Vec<_>>()) {
-            println!(
-                "label this frame next: {} ({:.0} % of its objects in doubt)",
-                dataset.frames[frame].name,
-                100.0 * doubts[frame]
-            );
-        }
-        if command.step {
-            return Ok(());
-        }
-        let words = [
-            "train".to_owned(),
-            command.capture.display().to_string(),
-            "--masks".to_owned(),
-            std::path::absolute(&command.output)
-                .unwrap_or_else(|_| command.output.clone())
-                .display()
-                .to_string(),
-            "-o".to_owned(),
-            "scene.cif".to_owned(),
-        ];
-        println!("next: {}", command_line(&words));
-        Ok(())
+        let next = next_frame(&cameras.values().map(camera).collect::<Vec<_>>());
+        let names = |frames: &[usize]| -> Vec<&str> {
+            frames.iter().map(|frame| dataset.frames[*frame].name.as_str()).collect()
+        };
+        let report = || {
+            json!({
+                "masks_in": command.output,
+                "masks": masks,
+                "instances": dataset.instances,
+                "keyframes": names(&painted.keys().copied().collect::<Vec<_>>()),
+                "frames_without_mask": names(&unmasked),
+                "label_next": next.map(|frame| &dataset.frames[frame].name),
+                "doubt_there": next.map(|frame| doubts[frame]),
+            })
+        };
+        command.report.give(report, || {
+            self::print(command, dataset, masks, painted.len(), next.map(|frame| (frame, doubts[frame])))
+        })
     }
+}
+
+/// Prints what was made, and what comes next.
+fn print(command: &Propagate, dataset: &Dataset, masks: usize, keyframes: usize, next: Option<(usize, f64)>) {
+    println!(
+        "{masks} masks of {} instances from {keyframes} keyframes in {}; {SHEET} shows them",
+        dataset.instances.len(),
+        command.output.display()
+    );
+    if let Some((frame, doubt)) = next {
+        println!(
+            "label this frame next: {} ({:.0} % of its objects in doubt)",
+            dataset.frames[frame].name,
+            100.0 * doubt
+        );
+    }
+    if command.step {
+        return;
+    }
+    let words = [
+        "train".to_owned(),
+        command.capture.display().to_string(),
+        "--masks".to_owned(),
+        std::path::absolute(&command.output).unwrap_or_else(|_| command.output.clone()).display().to_string(),
+        "-o".to_owned(),
+        "scene.cif".to_owned(),
+    ];
+    println!("next: {}", command_line(&words));
 }

@@ -19,7 +19,7 @@ use crate::error::Error;
 use crate::formats;
 use crate::mask_query::{Agreement, Found, FoundMasks, FrameAgreement, GATE, Selection, agreement};
 use crate::pictures::save_grey;
-use crate::{interrupt, output};
+use crate::{endings, interrupt, output};
 
 /// Masks that a detector found, and their use.
 #[derive(Debug, Args)]
@@ -65,7 +65,7 @@ pub(super) struct ByMasks {
     #[arg(long, requires = "capture")]
     eval: bool,
     /// Write the rendered masks of --eval into this folder
-    #[arg(short, long, value_name = "DIR", requires = "eval")]
+    #[arg(short, long, value_name = "DIR", requires = "eval", value_parser = endings::folder())]
     output: Option<PathBuf>,
     /// Reduce images by 1, 2, 4, ... [default: as the scene was trained]
     #[arg(long, value_name = "FACTOR", value_parser = clap::value_parser!(u32).range(1..=64))]
@@ -182,8 +182,7 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
         Protocol::Reproject => by_reprojection(&mut scene, &dataset, &source, options)?,
         Protocol::Grouping => by_grouping(&mut scene, &dataset, &source, options)?,
     };
-    report::print(command, &answer);
-    Ok(())
+    report::give(command, &answer)
 }
 
 /// Where masks come from, as far as the command line goes together.

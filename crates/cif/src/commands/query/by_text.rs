@@ -3,13 +3,14 @@
 use std::collections::BTreeSet;
 use std::path::Path;
 
-use cif_scene::{ObjectMatch, ObjectQuery};
+use cif_scene::{ObjectMatch, ObjectQuery, known_names};
 use cif_vision::embedding::TextEmbedder;
 use cif_vision::{Models, library};
 use serde_json::json;
 
 use super::{Query, point};
 use crate::error::Error;
+use crate::messages::note;
 use crate::words::{self, words};
 
 /// Texts of anything: an object that is nearer to one of them than to the question is no answer. Source: LERF (2023),
@@ -50,14 +51,11 @@ pub(super) fn run(command: &Query, text: &str, wanted: ObjectQuery) -> Result<()
                 (None, true) => "embeddings are compared by models: --models DIR".to_owned(),
                 (None, false) => "there are no models (--models DIR)".to_owned(),
             };
-            eprintln!(
-                "note: {reason}; the text is matched with labels, classes and taxonomies, word by word"
-            );
+            note!("{reason}; the text is matched with labels, classes and taxonomies, word by word");
             by_words(text, objects, &command.path)?
         }
     };
-    report(command, &scored);
-    Ok(())
+    report(command, &scored)
 }
 
 /// Objects that have an embedding, nearest to the text first.
@@ -109,9 +107,9 @@ fn by_words(text: &str, objects: Vec<ObjectMatch>, place: &Path) -> Result<Vec<S
     if shares.iter().all(|share| *share <= 0.0) {
         let known: BTreeSet<String> = objects.into_iter().map(|object| object.found.label).collect();
         let known: Vec<String> = known.into_iter().collect();
-        let known = if known.is_empty() { "none".to_owned() } else { known.join(", ") };
+        let known = known_names(text, "labels", &known);
         return Err(Error::failed(
-            format!("no object of {} has a word of '{text}'; labels: {known}", place.display()),
+            format!("no object of {} has a word of '{text}'; {known}", place.display()),
             "use words of the labels; embeddings, which cif embed makes, are found by meaning",
         ));
     }
@@ -126,17 +124,20 @@ fn by_words(text: &str, objects: Vec<ObjectMatch>, place: &Path) -> Result<Vec<S
     Ok(scored)
 }
 
-fn report(command: &Query, scored: &[Scored]) {
-    if command.json {
+fn report(command: &Query, scored: &[Scored]) -> Result<(), Error> {
+    let report = || {
         let one = |one: &Scored| {
             let mut object = json!(one.object);
             object["score"] = json!(one.score);
             object["chosen"] = json!(one.chosen);
             object
         };
-        println!("{:#}", json!(scored.iter().map(one).collect::<Vec<_>>()));
-        return;
-    }
+        json!(scored.iter().map(one).collect::<Vec<_>>())
+    };
+    command.report.give(report, || print(scored))
+}
+
+fn print(scored: &[Scored]) {
     let mut table = crate::commands::table(["", "score", "object", "label", "class", "position"]);
     for Scored { object, score, chosen } in scored {
         let rows = &object.found.transform;

@@ -1,34 +1,41 @@
 //! The answer to a question by masks, as people or programs read it.
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::{Answer, Protocol, Query};
+use crate::error::Error;
 use crate::mask_query::Selection;
 
-/// Prints what was found, and how well it agrees with the masks of held-out frames.
-pub(super) fn print(command: &Query, answer: &Answer) {
+/// Prints or writes what was found, and how well it agrees with the masks of held-out frames.
+pub(super) fn give(command: &Query, answer: &Answer) -> Result<(), Error> {
+    command.report.give(|| as_json(command, answer), || print(command, answer))
+}
+
+fn as_json(command: &Query, answer: &Answer) -> Value {
     let Answer { found, boxes, scores } = answer;
     let options = &command.by_masks;
-    if command.json {
-        let mut report = json!({
-            "instances": found.votes,
-            "gaussians": found.rows.len(),
-            "select": Selection::from(options.select),
-            "frames": found.frames,
-            "protocol": options.protocol.name(),
-        });
-        if let Some(prompt) = &options.prompt {
-            report["prompt"] = json!(prompt);
-        }
-        if !boxes.is_empty() {
-            report["boxes"] = json!(boxes);
-        }
-        if let Some(scores) = scores {
-            report["eval"] = json!(scores);
-        }
-        println!("{report:#}");
-        return;
+    let mut report = json!({
+        "instances": found.votes,
+        "gaussians": found.rows.len(),
+        "select": Selection::from(options.select),
+        "frames": found.frames,
+        "protocol": options.protocol.name(),
+    });
+    if let Some(prompt) = &options.prompt {
+        report["prompt"] = json!(prompt);
     }
+    if !boxes.is_empty() {
+        report["boxes"] = json!(boxes);
+    }
+    if let Some(scores) = scores {
+        report["eval"] = json!(scores);
+    }
+    report
+}
+
+fn print(command: &Query, answer: &Answer) {
+    let Answer { found, boxes, scores } = answer;
+    let options = &command.by_masks;
     if !boxes.is_empty() {
         let shown = boxes.values().filter(|boxes| !boxes.is_empty()).count();
         println!("the prompt is in {shown} of {} pictures", boxes.len());

@@ -1,0 +1,203 @@
+//! The report of a command as JSON: `--json` prints it, `--json FILE` writes it.
+//!
+//! A report is one JSON document. Without a file it is all that goes to stdout; with one the command prints its
+//! tables as ever. The word after `--json` is its file where it ends in `.json` or is a stream (`-`, `/dev/stdout`, a
+//! named pipe), and an argument of its own otherwise, so that `cif info --json captures/table` is what it looks like.
+
+use std::ffi::{OsStr, OsString};
+use std::path::{Path, PathBuf};
+
+use cif_output::Place;
+use clap::Args;
+use serde_json::Value;
+
+use crate::endings;
+use crate::error::Error;
+use crate::output::{self, Outputs};
+
+/// The flag.
+const FLAG: &str = "--json";
+
+/// Its name in `cif export` before there was one for all commands.
+const OLD_FLAG: &str = "--report-json";
+
+/// A report of a command that has `--force` for other files as well.
+#[derive(Clone, Debug, Default, Args)]
+pub(crate) struct Report {
+    /// Print the report as JSON and nothing else, or write it to FILE, whose name ends in .json
+    #[arg(
+        long,
+        value_name = "FILE",
+        num_args = 0..=1,
+        require_equals = true,
+        default_missing_value = "-",
+        value_parser = endings::report()
+    )]
+    json: Option<PathBuf>,
+}
+
+/// A report of a command that writes nothing else.
+#[derive(Clone, Debug, Default, Args)]
+pub(crate) struct OnlyReport {
+    #[command(flatten)]
+    report: Report,
+    /// Replace an existing file of --json
+    #[arg(long, requires = "json")]
+    force: bool,
+}
+
+impl Report {
+    /// True where the report is all that goes to stdout.
+    pub(crate) fn to_stdout(&self) -> bool {
+        self.json.as_deref().is_some_and(output::is_stdout)
+    }
+
+    /// True where there is a report to make.
+    pub(crate) fn is_asked(&self) -> bool {
+        self.json.is_some()
+    }
+
+    /// Checks that the file can be written, before the work starts.
+    ///
+    /// # Errors
+    /// When it exists and is to be kept, is an input or another output, or its folder refuses it.
+    pub(crate) fn check(&self, outputs: &mut Outputs) -> Result<(), Error> {
+        self.file().map_or(Ok(()), |path| outputs.text(path))
+    }
+
+    /// Prints or writes the report; unless it is all that goes to stdout, `print` prints tables there.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub(crate) fn give(&self, report: impl FnOnce() -> Value, print: impl FnOnce()) -> Result<(), Error> {
+        if self.to_stdout() {
+            println!("{:#}", report());
+            return Ok(());
+        }
+        print();
+        self.file().map_or(Ok(()), |path| output::write_file(path, format!("{:#}\n", report()).as_bytes()))
+    }
+
+    fn file(&self) -> Option<&Path> {
+        self.json.as_deref().filter(|path| !output::is_stdout(path))
+    }
+}
+
+impl OnlyReport {
+    /// Checks that the file can be written, and that it is none of those that the command reads.
+    ///
+    /// # Errors
+    /// As [`Report::check`].
+    pub(crate) fn check<'a>(&self, inputs: impl IntoIterator<Item = &'a Path>) -> Result<(), Error> {
+        let mut outputs = Outputs::new(self.force);
+        inputs.into_iter().try_for_each(|input| outputs.reads(input))?;
+        self.report.check(&mut outputs)
+    }
+
+    /// As [`Report::give`].
+    ///
+    /// # Errors
+    /// As [`Report::give`].
+    pub(crate) fn give(&self, report: impl FnOnce() -> Value, print: impl FnOnce()) -> Result<(), Error> {
+        self.report.give(report, print)
+    }
+
+    /// As [`Report::to_stdout`].
+    pub(crate) fn to_stdout(&self) -> bool {
+        self.report.to_stdout()
+    }
+}
+
+/// A report that the command has written into its own folder as well.
+///
+/// # Errors
+/// When it cannot be read again.
+pub(crate) fn read(path: &Path) -> Result<Value, Error> {
+    let text = std::fs::read(path).map_err(Error::io("read", path))?;
+    serde_json::from_slice(&text).map_err(|error| Error::plain(format!("{}: {error}", path.display())))
+}
+
+/// True where a word can be the file of a report.
+pub(crate) fn is_file(word: &OsStr) -> bool {
+    let path = Path::new(word);
+    path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json"))
+        || output::is_stdout(path)
+        || matches!(cif_output::place(path), Ok(Place::Stream(_)))
+}
+
+/// Joins `--json FILE` to `--json=FILE`, which is how the flag tells its file from the argument after it.
+#[must_use]
+pub(crate) fn join_files(arguments: Vec<OsString>) -> Vec<OsString> {
+    let mut joined: Vec<OsString> = Vec::with_capacity(arguments.len());
+    let mut words = arguments.into_iter().peekable();
+    while let Some(word) = words.next() {
+        if word == "--" {
+            joined.push(word);
+            joined.extend(words);
+            break;
+        }
+        let file = match word.to_str() {
+            Some(FLAG) => words.next_if(|next| is_file(next)),
+            Some(OLD_FLAG) => words.next(),
+            _ => None,
+        };
+        joined.push(match file {
+            Some(file) => {
+                let mut word = OsString::from(FLAG);
+                word.push("=");
+                word.push(file);
+                word
+            }
+            None => word,
+        });
+    }
+    joined
+}
+
+/// Advice where a word after `--json` was meant as its file and is none by its name.
+#[must_use]
+pub(crate) fn advice(arguments: &[OsString], unexpected: &str) -> Option<String> {
+    let follows = arguments.windows(2).any(|pair| pair[0] == FLAG && pair[1] == unexpected);
+    follows.then(|| {
+        let name = Path::new(unexpected).with_extension("json");
+        format!("the file of {FLAG} ends in .json: {FLAG} {}", name.display())
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn joined(line: &str) -> String {
+        let words = join_files(line.split_whitespace().map(OsString::from).collect());
+        words.iter().map(|word| word.to_str().unwrap()).collect::<Vec<_>>().join(" ")
+    }
+
+    #[test]
+    fn files_of_reports_are_told_from_other_arguments() {
+        for (line, expected) in [
+            ("cif info --json table", "cif info --json table"),
+            ("cif info table --json", "cif info table --json"),
+            ("cif eval --json out.json a.cif table", "cif eval --json=out.json a.cif table"),
+            ("cif eval a.cif table --json A/B.JSON --force", "cif eval a.cif table --json=A/B.JSON --force"),
+            ("cif eval a.cif table --json -", "cif eval a.cif table --json=-"),
+            ("cif eval --json /dev/stdout a.cif table", "cif eval --json=/dev/stdout a.cif table"),
+            ("cif eval --json=x.json a.cif", "cif eval --json=x.json a.cif"),
+            ("cif info --json --quiet table", "cif info --json --quiet table"),
+            ("cif export a.cif --report-json t.json", "cif export a.cif --json=t.json"),
+            ("cif label a.cif -- --json x.json", "cif label a.cif -- --json x.json"),
+        ] {
+            assert_eq!(joined(line), expected);
+        }
+    }
+
+    #[test]
+    fn a_file_of_another_ending_is_explained() {
+        let words: Vec<OsString> = ["eval", "--json", "scores.txt"].map(OsString::from).to_vec();
+        assert_eq!(
+            advice(&words, "scores.txt").unwrap(),
+            "the file of --json ends in .json: --json scores.json"
+        );
+        assert!(advice(&words, "eval").is_none());
+    }
+}
