@@ -7,6 +7,7 @@ WHEELS := target/wheels
 # The environment of the tests, whose wheel is built for building fast.
 TEST_BIN := $(VENV)/tests/bin
 TEST_WHEELS := target/test-wheels
+DIST := target/dist
 OUT ?= out/demo
 DEMO_CAPTURE := examples/tabletop-mini
 DEMO_LABEL := red mug
@@ -15,6 +16,8 @@ DEMO_LABEL := red mug
 MATURIN := maturin==1.16.0
 PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
+# A C compiler that links against the symbols of any glibc; the machine's own takes those of its own.
+ZIG := ziglang==0.17.1
 # Its library runs the models of tests of cif-vision; nothing else of it is needed (17 MB).
 ONNXRUNTIME := onnxruntime==1.23.2
 
@@ -26,16 +29,18 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build demo plugin test test-wheel test-rust test-python test-mujoco test-blender test-capture fuzz lint format clean
+.PHONY: help build wheel demo plugin stubs test test-wheel test-rust test-python test-mujoco test-blender test-capture fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
+	@echo "make wheel   a wheel for other machines, into $(DIST): Linux with glibc 2.28 or newer; zig is downloaded (100 MB)"
 	@echo "make demo    train, evaluate, export, query and render the small capture into $(OUT)"
 	@echo "make plugin  the Blender extension, into out/"
 	@echo "make test    all tests, Rust and Python"
 	@echo "make fuzz    damaged files for every reader, MINUTES=60 long; READER= picks one"
 	@echo "make test-mujoco, make test-blender   tests with these tools, which are downloaded (75 MB, 1.1 GB)"
 	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
+	@echo "make stubs   docstrings of the Python module into its stub"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make format  put the formatting right"
 
@@ -49,12 +54,21 @@ $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF): | $(BIN)/python
 	@rm -f $(VENV)/.tools-*
 	@touch "$@"
 
+# Builds of before were installed as cif, a name that belongs to another project.
 build: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	@rm -rf $(WHEELS)
 	$(BIN)/maturin build --release --interpreter $(BIN)/python --out $(WHEELS)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(WHEELS)/*.whl
+	@$(BIN)/python -m pip uninstall -qq --yes cif
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$$(echo $(WHEELS)/*.whl)[usd]"
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(WHEELS)/*.whl
 	@echo "built: $(BIN)/cif"
+
+wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check "$(ZIG)"
+	@rm -rf $(DIST)
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/maturin build --release --zig --compatibility manylinux_2_28 \
+		--interpreter $(BIN)/python --out $(DIST)
+	@echo "built: $$(echo $(DIST)/*.whl)"
 
 demo: build
 	@mkdir -p $(OUT)
@@ -85,11 +99,12 @@ test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	@rm -rf $(TEST_WHEELS)
 	$(BIN)/maturin build --profile dev --interpreter $(BIN)/python --out $(TEST_WHEELS)
 	test -x $(TEST_BIN)/python || $(PYTHON) -m venv $(VENV)/tests
-	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check $(PYTEST) $(TEST_WHEELS)/*.whl
+	@$(TEST_BIN)/python -m pip uninstall -qq --yes cif
+	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check $(PYTEST) "$$(echo $(TEST_WHEELS)/*.whl)[usd]"
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps $(ONNXRUNTIME)
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 
-# What cif-usd writes and reads is tested in a Python that has usd-core, which the wheel brings.
+# What cif-usd writes and reads is tested in a Python that has usd-core.
 test-rust: test-wheel
 	PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
 	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
@@ -105,10 +120,15 @@ fuzz:
 	CIF_FUZZ_MINUTES=$(MINUTES) CIF_FUZZ_READER=$(READER) \
 	cargo test --locked --test fuzz_readers readers -- --nocapture
 
+# What MuJoCo makes of our files; then ours beside the USD that MuJoCo brings, 25.11.
+OLD_USD_TESTS := $(addprefix tests/python/test_,stage.py query.py round_trip.py files.py)
 test-mujoco: test-wheel
 	test -x $(VENV)/mujoco/bin/python || $(PYTHON) -m venv $(VENV)/mujoco
-	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check "$(MUJOCO)"
+	@$(VENV)/mujoco/bin/python -m pip uninstall -qq --yes cif
+	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check "$(MUJOCO)" $(PYTEST) $(TEST_WHEELS)/*.whl
+	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 	CIF_TEST_MUJOCO=$(VENV)/mujoco/bin/python $(TEST_BIN)/python -m pytest tests/python/test_mujoco.py
+	$(VENV)/mujoco/bin/python -m pytest $(OLD_USD_TESTS)
 
 test-capture:
 	test -x $(VENV)/capture/bin/python || $(PYTHON) -m venv $(VENV)/capture
@@ -131,6 +151,9 @@ lint: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo clippy --locked --workspace --all-targets -- -D warnings
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+
+stubs: # after make test-wheel
+	$(TEST_BIN)/python crates/cif-python/stubs.py
 
 format: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	cargo fmt --all

@@ -4,6 +4,8 @@ use std::path::PathBuf;
 
 use cif_scene::files::FileError;
 
+use crate::tokens;
+
 /// Why a stage cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -12,9 +14,7 @@ pub enum UsdError {
     #[error(transparent)]
     File(#[from] FileError),
     /// The crate was built without the feature `python`.
-    #[error(
-        "this build of cif has no USD: install the Python wheel (`make build`, then .venv/bin/cif), which brings usd-core with it"
-    )]
+    #[error("this build of cif has no USD: install the Python wheel (`make build`, then .venv/bin/cif)")]
     NotBuilt,
     /// No interpreter runs in this process.
     #[error(
@@ -22,14 +22,27 @@ pub enum UsdError {
     )]
     NoInterpreter,
     /// `pxr` cannot be imported.
-    #[error("usd-core cannot be imported ({reason}): pip install \"usd-core>=26.3\"")]
+    #[error("USD cannot be imported ({reason}): pip install 'cif4d[usd]'")]
     Missing {
         /// Message of Python.
         reason: String,
     },
-    /// `pxr` is older than the splat schema.
-    #[error("usd-core {found} has no Gaussian splats: pip install --upgrade \"usd-core>=26.3\"")]
+    /// `pxr` is older than what is worked with.
+    #[error(
+        "USD {found} is too old, {year}.{month} is the oldest that will do: pip install --upgrade usd-core",
+        year = tokens::MINIMUM_USD.0,
+        month = tokens::MINIMUM_USD.1
+    )]
     TooOld {
+        /// Version found.
+        found: String,
+    },
+    /// `pxr` is older than splats, and was in use before `import cif` could add them.
+    #[error(
+        "USD {found} has no Gaussian splats, and those that cif adds came too late: import pxr, then cif, then open stages; \
+         or pip install --upgrade usd-core"
+    )]
+    SplatsUnknown {
         /// Version found.
         found: String,
     },

@@ -38,6 +38,14 @@ pub(crate) fn reason(py: Python<'_>, error: &PyErr) -> String {
     if messages.is_empty() { error.to_string() } else { messages.join("; ") }
 }
 
+/// True where USD has a schema of splats, so that it takes them for something that has an extent and can be hidden.
+fn knows_splats(usd: &Bound<'_, PyModule>) -> bool {
+    let registry = usd.getattr("SchemaRegistry").and_then(|class| class.call0());
+    let known = registry
+        .and_then(|registry| registry.call_method1("FindConcretePrimDefinition", (tokens::GAUSSIAN_SPLAT,)));
+    known.is_ok_and(|definition| !definition.is_none())
+}
+
 impl<'py> Pxr<'py> {
     fn import(py: Python<'py>) -> Result<Self, UsdError> {
         let missing = |error: PyErr| UsdError::Missing { reason: reason(py, &error) };
@@ -54,6 +62,9 @@ impl<'py> Pxr<'py> {
         let version = format!("{year}.{month}");
         if (year, month) < tokens::MINIMUM_USD {
             return Err(UsdError::TooOld { found: version });
+        }
+        if (year, month) < tokens::SPLATS_USD && !knows_splats(&usd) {
+            return Err(UsdError::SplatsUnknown { found: version });
         }
         let module = |name: &str| py.import(name).map_err(missing);
         Ok(Self {

@@ -1,7 +1,9 @@
 //! Names that are written into stages.
 
-/// Oldest usd-core that knows Gaussian splats, (year, month).
-pub const MINIMUM_USD: (u32, u32) = (26, 3);
+/// Oldest USD that stages are written and read with, (year, month).
+pub const MINIMUM_USD: (u32, u32) = (25, 11);
+/// Oldest USD with a schema of Gaussian splats; `import cif` adds one to those before, in which files are the same.
+pub const SPLATS_USD: (u32, u32) = (26, 3);
 
 /// Key in `customLayerData` under which everything of ours stands; marks a layer as ours.
 pub const CIF: &str = "cif";

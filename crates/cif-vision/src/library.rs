@@ -41,7 +41,7 @@ fn find_named(named: Option<OsString>, pythons: &[OsString]) -> Result<PathBuf, 
                 asked.join(", ")
             ),
             format!(
-                "pip install 'cif[vision]', or pip install onnxruntime; or name the library by {VARIABLE}"
+                "pip install 'cif4d[vision]', or pip install onnxruntime; or name the library by {VARIABLE}"
             ),
         )
     })

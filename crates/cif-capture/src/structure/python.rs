@@ -214,7 +214,7 @@ fn pycolmap_missing(problem: &str, python: &str, version: &str) -> Error {
     Error::refused(
         format!("poses are found by pycolmap, which Python {version} ({python}) does not have: {problem}"),
         format!(
-            "install it: {python} -m pip install 'cif[capture]', or pip install pycolmap; {VARIABLE} names another \
+            "install it: {python} -m pip install 'cif4d[capture]', or pip install pycolmap; {VARIABLE} names another \
              Python; or give poses of another tool with --poses"
         ),
     )
@@ -247,7 +247,7 @@ fn poses(model: ModelJson) -> Result<Poses, Error> {
                 let problem = format!("pycolmap answered with a lens of the unexpected kind {other}");
                 return Err(Error::refused(
                     problem,
-                    "install the version of pycolmap that cif[capture] asks for",
+                    "install the version of pycolmap that cif4d[capture] asks for",
                 ));
             }
         };
@@ -304,6 +304,6 @@ mod tests {
         let error = pycolmap_missing("No module named 'pycolmap'", "/usr/bin/python3", "3.12.1");
         let Error::Refused { problem, fix } = error else { panic!("another error") };
         assert!(problem.contains("/usr/bin/python3") && problem.contains("3.12.1"), "{problem}");
-        assert!(fix.contains("pip install 'cif[capture]'") && fix.contains("--poses"), "{fix}");
+        assert!(fix.contains("pip install 'cif4d[capture]'") && fix.contains("--poses"), "{fix}");
     }
 }

@@ -219,7 +219,7 @@ fn points(
     };
     notes.push(format!(
         "the poses come without points, and none were found: {problem}; training starts from random points, which \
-         shows less (pip install 'cif[capture]' brings pycolmap, which finds points)"
+         shows less (pip install 'cif4d[capture]' brings pycolmap, which finds points)"
     ));
     Ok(Vec::new())
 }

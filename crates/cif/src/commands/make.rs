@@ -62,6 +62,9 @@ pub(super) struct Make {
 }
 
 pub(super) fn run(command: &Make) -> Result<(), Error> {
+    // Hours before it is needed.
+    #[cfg(feature = "usd")]
+    cif_usd::usd_version().map_err(Error::plain)?;
     let capture = command.capture()?;
     let masks = command.masks(&capture)?;
     let scene = command.train(&capture, masks.as_deref())?;

@@ -10,7 +10,7 @@ use crate::moment::Moment;
 #[derive(Debug, Args)]
 #[command(after_help = "\
 Inputs are videos and folders of photographs (PNG, JPEG), one per camera; NAME=PATH names a camera. Videos need ffmpeg
-on the PATH; poses need pycolmap, which `pip install cif[capture]` brings.
+on the PATH; poses need pycolmap, which `pip install 'cif4d[capture]'` brings.
 
   cif capture walk.mp4 -o captures/table                          150 frames of a video, the sharpest of each window
   cif capture walk.mp4 -o captures/table --rate 5 --max-side 960
