@@ -32,6 +32,27 @@ pub(crate) fn run(
     command: &mut Command,
     input: &[u8],
     should_stop: &dyn Fn() -> bool,
+    line: impl FnMut(&str) + Send,
+) -> Result<Option<Answer>, Error> {
+    run_with(command, input, false, should_stop, line)
+}
+
+/// As [`run`], with a standard input that stays open until the program ends: where this process is killed, the
+/// program reads the end of it, and can end too.
+pub(crate) fn run_attended(
+    command: &mut Command,
+    input: &[u8],
+    should_stop: &dyn Fn() -> bool,
+    line: impl FnMut(&str) + Send,
+) -> Result<Option<Answer>, Error> {
+    run_with(command, input, true, should_stop, line)
+}
+
+fn run_with(
+    command: &mut Command,
+    input: &[u8],
+    stays_open: bool,
+    should_stop: &dyn Fn() -> bool,
     mut line: impl FnMut(&str) + Send,
 ) -> Result<Option<Answer>, Error> {
     let name = command.get_program().to_string_lossy().into_owned();
@@ -44,9 +65,11 @@ pub(crate) fn run(
     };
     let (stdin, stdout, stderr) = (child.stdin.take(), child.stdout.take(), child.stderr.take());
     std::thread::scope(|scope| {
-        scope.spawn(move || {
-            // A program that ends before it has read everything tells why by itself.
-            let _ = stdin.map(|mut stdin| stdin.write_all(input));
+        let written = scope.spawn(move || {
+            let mut stdin = stdin?;
+            // A program that ends before it has read everything says why by itself.
+            let _ = stdin.write_all(input);
+            stays_open.then_some(stdin)
         });
         let output = scope.spawn(move || {
             let mut bytes = Vec::new();
@@ -80,6 +103,11 @@ pub(crate) fn run(
             }
             std::thread::sleep(LOOK_EVERY);
         };
+        drop(written.join());
+        // Ctrl-C reaches all programs of a terminal: this one may have ended by it first.
+        if !status.success() && should_stop() {
+            return Err(Error::Stopped);
+        }
         let gone = || io::Error::other("its output could not be read");
         let output = output.join().map_err(|_| lost(gone()))?.map_err(lost)?;
         let last_words = words.join().ok().flatten().unwrap_or_default();
@@ -104,6 +132,20 @@ mod tests {
         assert!(!answer.succeeded);
         assert_eq!(answer.last_words, "one\ntwo");
         assert_eq!(lines, ["one", "two"]);
+    }
+
+    #[test]
+    fn the_input_of_an_attended_program_ends_with_its_caller() {
+        // `cat` ends at once where the input has an end.
+        let script = "read -r line; (sleep 0.3; echo late; kill $$) & cat; echo early";
+        let first = |attended: bool| {
+            let mut shell = Command::new("sh");
+            shell.args(["-c", script]);
+            let answer = run_with(&mut shell, b"given\n", attended, &|| false, |_| ()).unwrap().unwrap();
+            String::from_utf8(answer.output).unwrap().lines().next().map(str::to_owned)
+        };
+        assert_eq!(first(true).as_deref(), Some("late"));
+        assert_eq!(first(false).as_deref(), Some("early"));
     }
 
     #[test]
