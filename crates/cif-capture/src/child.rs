@@ -34,10 +34,24 @@ pub(crate) fn run(
     should_stop: &dyn Fn() -> bool,
     line: impl FnMut(&str) + Send,
 ) -> Result<Option<Answer>, Error> {
-    run_reading(command, input, should_stop, line, |stdout| {
-        let mut bytes = Vec::new();
-        stdout.read_to_end(&mut bytes).map(|_| bytes)
-    })
+    run_reading(command, input, should_stop, line, everything)
+}
+
+/// As [`run`], with a standard input that stays open until the program ends: where this process is killed, the
+/// program reads the end of it, and can end too.
+pub(crate) fn run_attended(
+    command: &mut Command,
+    input: &[u8],
+    should_stop: &dyn Fn() -> bool,
+    line: impl FnMut(&str) + Send,
+) -> Result<Option<Answer>, Error> {
+    run_with(command, input, true, should_stop, line, everything)
+}
+
+/// All that a program writes.
+fn everything(stdout: &mut dyn Read) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    stdout.read_to_end(&mut bytes).map(|_| bytes)
 }
 
 /// Runs a program as [`run`] does, whose standard output goes to `read` while it works. A reader that has enough returns
@@ -48,6 +62,17 @@ pub(crate) fn run(
 pub(crate) fn run_reading<T: Send>(
     command: &mut Command,
     input: &[u8],
+    should_stop: &dyn Fn() -> bool,
+    line: impl FnMut(&str) + Send,
+    read: impl FnOnce(&mut dyn Read) -> io::Result<T> + Send,
+) -> Result<Option<Answer<T>>, Error> {
+    run_with(command, input, false, should_stop, line, read)
+}
+
+fn run_with<T: Send>(
+    command: &mut Command,
+    input: &[u8],
+    stays_open: bool,
     should_stop: &dyn Fn() -> bool,
     mut line: impl FnMut(&str) + Send,
     read: impl FnOnce(&mut dyn Read) -> io::Result<T> + Send,
@@ -62,9 +87,11 @@ pub(crate) fn run_reading<T: Send>(
     };
     let (stdin, stdout, stderr) = (child.stdin.take(), child.stdout.take(), child.stderr.take());
     std::thread::scope(|scope| {
-        scope.spawn(move || {
-            // A program that ends before it has read everything tells why by itself.
-            let _ = stdin.map(|mut stdin| stdin.write_all(input));
+        let written = scope.spawn(move || {
+            let mut stdin = stdin?;
+            // A program that ends before it has read everything says why by itself.
+            let _ = stdin.write_all(input);
+            stays_open.then_some(stdin)
         });
         let output = scope.spawn(move || match stdout {
             Some(mut stdout) => read(&mut stdout),
@@ -98,6 +125,11 @@ pub(crate) fn run_reading<T: Send>(
             }
             std::thread::sleep(LOOK_EVERY);
         };
+        drop(written.join());
+        // Ctrl-C reaches all programs of a terminal: this one may have ended by it first.
+        if !status.success() && should_stop() {
+            return Err(Error::Stopped);
+        }
         let gone = || io::Error::other("its output could not be read");
         let output = output.join().map_err(|_| lost(gone()))?.map_err(lost)?;
         let last_words = words.join().ok().flatten().unwrap_or_default();
@@ -134,6 +166,21 @@ mod tests {
         };
         let answer = run_reading(&mut endless, b"", &|| false, |_| (), first).unwrap().unwrap();
         assert_eq!((&answer.output, answer.succeeded), (b"line", false));
+    }
+
+    #[test]
+    fn the_input_of_an_attended_program_ends_with_its_caller() {
+        // `cat` ends at once where the input has an end.
+        let script = "read -r line; (sleep 0.3; echo late; kill $$) & cat; echo early";
+        let first = |attended: bool| {
+            let mut shell = Command::new("sh");
+            shell.args(["-c", script]);
+            let answer =
+                run_with(&mut shell, b"given\n", attended, &|| false, |_| (), everything).unwrap().unwrap();
+            String::from_utf8(answer.output).unwrap().lines().next().map(str::to_owned)
+        };
+        assert_eq!(first(true).as_deref(), Some("late"));
+        assert_eq!(first(false).as_deref(), Some("early"));
     }
 
     #[test]

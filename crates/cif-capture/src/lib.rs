@@ -37,13 +37,22 @@ pub mod write;
 pub use error::Error;
 pub use picture::Impression;
 
+/// Work that goes on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Progress<'a> {
+    /// A few words about it.
+    pub words: &'a str,
+    /// How much of it is done, and of how much; `None` where nothing is counted.
+    pub count: Option<(usize, usize)>,
+}
+
 /// Questions to the caller while work goes on.
 #[derive(Clone, Copy)]
 pub struct Hooks<'a> {
     /// True where the work is to end.
     pub should_stop: &'a (dyn Fn() -> bool + Sync),
-    /// Takes a few words about what is being done.
-    pub progress: &'a (dyn Fn(&str) + Sync),
+    /// Takes what is being done.
+    pub progress: &'a (dyn Fn(Progress<'_>) + Sync),
 }
 
 impl Hooks<'_> {
@@ -54,7 +63,11 @@ impl Hooks<'_> {
     }
 
     fn tell(&self, words: &str) {
-        (self.progress)(words);
+        (self.progress)(Progress { words, count: None });
+    }
+
+    fn count(&self, words: &str, done: usize, total: usize) {
+        (self.progress)(Progress { words, count: Some((done, total)) });
     }
 
     fn go_on(&self) -> Result<(), Error> {

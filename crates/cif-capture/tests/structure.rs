@@ -7,7 +7,7 @@ use cif_capture::frames::{self, Choice, Notes, Shot};
 use cif_capture::poses::{Lens, Point, Pose, Poses};
 use cif_capture::source::sources;
 use cif_capture::structure::{self, Found, Lenses, Order, Request};
-use cif_capture::{Error, Hooks};
+use cif_capture::{Error, Hooks, Progress};
 use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec2, DVec3};
 
@@ -118,15 +118,17 @@ fn shots(folder: &Path) -> Vec<Shot> {
 }
 
 fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
-    let work = folder.join(work);
-    std::fs::create_dir_all(&work).expect("a new folder");
+    let (work, kept) = (folder.join(work), folder.join(format!("{work}-kept")));
+    [&work, &kept].map(|folder| std::fs::create_dir_all(folder).expect("a new folder"));
     let request = Request {
         shots,
         masks: None,
         order: Order::Any,
         lenses: Lenses::PerSize,
         focal_px: None,
+        moving: false,
         work: &work,
+        kept: &kept,
         threads: 2,
     };
     structure::find(&request, &Hooks::silent())
@@ -179,14 +181,17 @@ fn more_points_are_seen_where_poses_are_known() {
     };
     let images = shots.iter().zip(&cameras).map(pose).collect();
     let poses = Poses { lenses: vec![lens], images, ..Poses::default() };
-    let work = folder.path().join("points");
+    let (work, kept) = (folder.path().join("points"), folder.path().join("points-kept"));
+    std::fs::create_dir_all(&kept).unwrap();
     let request = Request {
         shots: &shots,
         masks: None,
         order: Order::Any,
         lenses: Lenses::PerSize,
         focal_px: None,
+        moving: false,
         work: &work,
+        kept: &kept,
         threads: 2,
     };
     let before = found.poses.points.len();
@@ -209,6 +214,116 @@ fn on_surfaces(points: &[Point]) -> bool {
         p.z.abs().min((p.x + 2.0).abs()).min((p.y + 2.0).abs()).min(outside)
     };
     points.iter().filter(|point| distance(point) > 0.05).count() * 20 < points.len()
+}
+
+#[test]
+fn a_later_run_goes_on_from_what_was_kept() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    photographs(folder.path(), &cameras(14));
+    let shots = shots(folder.path());
+    let (kept, fresh) = (folder.path().join("kept"), folder.path().join("fresh"));
+    // Phases that were shown, with what was done when they began.
+    let found = |shots: &[Shot], kept: &Path, work: &str, last: &str| {
+        let work = folder.path().join(work);
+        [work.as_path(), kept].map(|folder| std::fs::create_dir_all(folder).unwrap());
+        let shown = std::sync::Mutex::new(Vec::<(String, usize, usize)>::new());
+        let progress = |progress: Progress<'_>| {
+            let mut shown = shown.lock().unwrap();
+            if let Some((done, total)) = progress.count
+                && shown.last().is_none_or(|(words, ..)| words != progress.words)
+            {
+                shown.push((progress.words.to_owned(), done, total));
+            }
+        };
+        let stop = || shown.lock().unwrap().iter().any(|(words, ..)| words.starts_with(last));
+        let request = Request {
+            shots,
+            masks: None,
+            order: Order::Any,
+            lenses: Lenses::PerSize,
+            focal_px: None,
+            moving: false,
+            work: &work,
+            kept,
+            threads: 2,
+        };
+        let found = structure::find(&request, &Hooks { should_stop: &stop, progress: &progress });
+        (found, shown.into_inner().unwrap())
+    };
+    let began = |shown: &[(String, usize, usize)], words: &str| {
+        let phase = shown.iter().find(|(phase, ..)| phase.starts_with(words)).expect("a phase");
+        (phase.1, phase.2)
+    };
+    // The first run ends where matches begin: it has found features only.
+    let (stopped, shown) = found(&shots[..10], &kept, "1", "matches");
+    assert!(matches!(stopped, Err(Error::Stopped)));
+    assert_eq!(began(&shown, "features"), (0, 10));
+    // The second one has more images; the third the same, and all of them are matched.
+    let (second, shown) = found(&shots, &kept, "2", "nothing");
+    assert_eq!(began(&shown, "features"), (10, 14));
+    assert_eq!(began(&shown, "matches"), (0, 91));
+    let (third, shown) = found(&shots, &kept, "3", "nothing");
+    assert_eq!(began(&shown, "features"), (14, 14));
+    assert_eq!(began(&shown, "matches"), (91, 91));
+    // What was kept leaves no trace in the poses.
+    let (anew, _) = found(&shots, &fresh, "4", "nothing");
+    let anew = anew.unwrap().poses;
+    assert!(second.unwrap().poses == anew && third.unwrap().poses == anew);
+}
+
+#[test]
+fn a_camera_that_stands_still_is_refused_by_its_name() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let camera = cameras(1)[0];
+    photographs(folder.path(), &[camera; 4]);
+    // A lamp that is turned up: no two images are the same.
+    for k in 0..4_u8 {
+        let path = folder.path().join(format!("{k:02}.png"));
+        let mut image = image::open(&path).unwrap().to_luma8();
+        image.pixels_mut().for_each(|pixel| pixel.0[0] = pixel.0[0] / 2 + 20 * k);
+        image.save(&path).unwrap();
+    }
+    let Err(Error::Refused { problem, fix }) = find(folder.path(), &shots(folder.path()), "work") else {
+        panic!("poses of a camera that stands still")
+    };
+    assert!(problem.contains("walk: the camera stands still") && fix.contains("--moving"), "{problem} {fix}");
+}
+
+#[test]
+fn poses_are_found_on_reduced_images_and_are_those_of_the_images() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let cameras = cameras(14);
+    photographs(folder.path(), &cameras);
+    // Eight times as large, more than features are looked for on.
+    for k in 0..14 {
+        let path = folder.path().join(format!("{k:02}.png"));
+        let image = image::open(&path).unwrap();
+        image.resize(8 * WIDTH, 8 * HEIGHT, image::imageops::FilterType::Triangle).save(&path).unwrap();
+    }
+    let found = find(folder.path(), &shots(folder.path()), "work").unwrap();
+    assert!(found.verdict.is_good(), "{}", found.verdict);
+    let lens = &found.poses.lenses[0];
+    assert_eq!(lens.size, (8 * WIDTH, 8 * HEIGHT));
+    assert!((lens.focal_px[0] / (8.0 * FOCAL) - 1.0).abs() < 0.05, "{lens:?}");
+    let mut truth = found.poses.clone();
+    for (pose, camera) in truth.images.values_mut().zip(&cameras) {
+        pose.world_from_camera = *camera;
+    }
+    let difference = cif_capture::similarity::difference(&found.poses, &truth).unwrap();
+    assert!(difference.places < 0.02 && difference.median_angle.to_degrees() < 1.0, "{difference:?}");
+    // Colours are those of the pixels at which points are seen, not of those of the reduced image.
+    let spread =
+        found.poses.points.iter().map(|point| point.color[0]).collect::<std::collections::BTreeSet<_>>();
+    assert!(spread.len() > 40, "{spread:?}");
 }
 
 #[test]
@@ -245,15 +360,17 @@ fn work_ends_when_the_caller_stops() {
     let folder = tempfile::tempdir().unwrap();
     photographs(folder.path(), &cameras(3));
     let shots = shots(folder.path());
-    let work = folder.path().join("work");
-    std::fs::create_dir_all(&work).unwrap();
+    let (work, kept) = (folder.path().join("work"), folder.path().join("kept"));
+    [&work, &kept].map(|folder| std::fs::create_dir_all(folder).unwrap());
     let request = Request {
         shots: &shots,
         masks: None,
         order: Order::Any,
         lenses: Lenses::PerSize,
         focal_px: None,
+        moving: false,
         work: &work,
+        kept: &kept,
         threads: 1,
     };
     let hooks = Hooks { should_stop: &|| true, progress: &|_| () };

@@ -1,23 +1,22 @@
 //! Settings of structure from motion, tried in order until one is to be believed.
 //!
-//! Each setting is solved by both mappers of COLMAP, with seeds of their own: the global one, which is given
-//! out, and the incremental one, by which it is judged; where these disagree, the incremental mapper runs once
-//! more with another seed and may be given out itself. The settings were found on small captures with moving
+//! Each setting is solved by the global mapper of COLMAP, which is given out where it leaves no doubt. Where it does,
+//! the incremental mapper is run with another seed, and the two are compared; where these disagree, the incremental
+//! mapper runs once more and may be given out itself. The settings were found on small captures with moving
 //! objects: default features suffice where there is texture, a lower threshold of features is what scenes of
 //! plain objects need.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use super::features::{SETTINGS, chosen, median};
 use super::pairs::{Order, pairs};
-use super::python::{Group, Job, Mapper, Outcome, Run, run};
-use super::verdict::{Verdict, judge};
+use super::python::{Group, Job, Mapper, Model, Outcome, Run, run};
+use super::stage::Staged;
+use super::verdict::{Second, Verdict, judge};
 use crate::frames::Shot;
 use crate::poses::Poses;
 use crate::{Error, Hooks};
-
-/// Thresholds of features, in order: COLMAP's own (1/150), and lower ones for more features.
-const PEAKS: [Option<f64>; 3] = [None, Some(0.002), Some(0.001)];
 
 /// Lenses of COLMAP that are fitted.
 const LENS_MODEL: &str = "SIMPLE_RADIAL";
@@ -25,6 +24,11 @@ const LENS_MODEL: &str = "SIMPLE_RADIAL";
 /// Images have, in the median, fewer features than this where they are blurred or show nothing but plain
 /// surfaces.
 const FEW_FEATURES: usize = 40;
+
+/// A camera stands still where, in half of the pairs of its images, half of the matches are less than this share of
+/// the larger side from the same place: about the noise of features, which are found on some 600 pixels. Two
+/// recordings of fixed cameras had 0.0001 and 0.0011, eleven of moving ones 0.033 to 0.12.
+const STILL: f64 = 1.0 / 600.0;
 
 /// Which images share a lens.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -49,8 +53,12 @@ pub struct Request<'a> {
     pub lenses: Lenses,
     /// Focal length to start from, pixels; that of EXIF else, where there is one.
     pub focal_px: Option<f64>,
-    /// Folder for databases.
+    /// True where every camera moves, though its images may show otherwise.
+    pub moving: bool,
+    /// Folder for files of this request.
     pub work: &'a Path,
+    /// Folder of features and matches, which later requests of the same images take up.
+    pub kept: &'a Path,
     /// Threads for features and matches; poses do not depend on it.
     pub threads: usize,
 }
@@ -71,39 +79,36 @@ pub struct Found {
 /// Finds the poses of images.
 ///
 /// # Errors
-/// When pycolmap is missing or fails, the caller stops, or no setting gives any pose. A bad verdict is no
-/// error.
+/// When pycolmap is missing or fails, the caller stops, a camera alone stands still, or no setting gives any pose. A bad
+/// verdict is no error.
 pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
-    let (images, masks) = (request.work.join("images"), request.work.join("masks"));
-    let names = stage(request, &images, &masks)?;
+    let staged = Staged::new(request, request.work)?;
+    let names = &staged.names;
     let cameras: Vec<&str> = request.shots.iter().map(|shot| shot.camera.as_str()).collect();
     let groups = groups(request);
     let pairs = pairs(&cameras, request.order);
+    let largest = request.shots.iter().map(|shot| shot.size.0.max(shot.size.1)).max().unwrap_or(1);
+    let first = chosen(largest, names.len(), |sample, features| {
+        let job = Job { model: LENS_MODEL, ..Job::of(request, &staged, &[], &groups, features) };
+        let of = |names: &[String]| sample.iter().map(|k| names[*k].clone()).collect::<Vec<_>>();
+        let (names, keys) = (of(&staged.names), of(&staged.keys));
+        Ok(run(&Job { names: &names, keys: &keys, ..job }, hooks)?.features.into_values().collect())
+    })?;
     let mut best: Option<Found> = None;
     let mut tried = Vec::new();
-    let mut features = Vec::new();
-    for (number, peak) in PEAKS.into_iter().enumerate() {
-        let solve = |runs: &[Run]| {
-            let job = Job {
-                work: request.work,
-                images: &images,
-                masks: request.masks.map(|_| masks.as_path()),
-                names: &names,
-                pairs: &pairs,
-                cameras: &groups,
-                model: LENS_MODEL,
-                peak,
-                runs,
-                poses: None,
-                threads: request.threads,
-            };
-            run(&job, hooks)
-        };
+    let mut counted = 0;
+    for number in 0..SETTINGS {
         let name =
             if number == 0 { "default features".to_owned() } else { format!("more features ({number})") };
-        let (seen, found) = rung(names.len(), &solve)?;
-        features = seen;
-        match found {
+        let features = first.more(number, largest);
+        let job = Job { model: LENS_MODEL, ..Job::of(request, &staged, &pairs, &groups, features) };
+        let Outcome { features, moved, .. } = run(&job, hooks)?;
+        counted = median(features.into_values().collect());
+        if let Some(camera) = standing(&cameras, &pairs, &moved).filter(|_| !request.moving) {
+            return Err(stands_still(camera, &cameras));
+        }
+        let solve = |wanted| Ok(run(&Job { runs: &[wanted], ..job.clone() }, hooks)?.runs.pop().flatten());
+        match rung(names.len(), &solve)? {
             Some((mapper, poses, verdict)) => {
                 let setting = format!("{name}, {mapper} mapper");
                 tried.push(format!("{setting}: {}", reason(&verdict)));
@@ -121,14 +126,14 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
             tried.pop();
             break;
         }
-        hooks.tell("not believed, going on with more features");
+        if number + 1 < SETTINGS {
+            hooks.tell("not believed, going on with more features");
+        }
     }
-    features.sort_unstable();
-    let median = features.get(features.len() / 2).copied().unwrap_or(0);
     let Some(best) = best else {
-        return Err(if median < FEW_FEATURES {
+        return Err(if counted < FEW_FEATURES {
             Error::refused(
-                format!("no poses were found: images have {median} features in the median, which is few"),
+                format!("no poses were found: images have {counted} features in the median, which is few"),
                 "they are blurred, dark or show plain surfaces only: give sharper or larger images (--count, \
                  --max-side), put something patterned into the scene, or leave less out by --masks",
             )
@@ -148,65 +153,65 @@ pub fn find(request: &Request<'_>, hooks: &Hooks<'_>) -> Result<Found, Error> {
     Ok(Found { poses, tried, ..best })
 }
 
-/// Puts images and masks into folders of their own under names that COLMAP's lists can hold, which has no
-/// spaces.
-pub(super) fn stage(request: &Request<'_>, images: &Path, masks: &Path) -> Result<Vec<String>, Error> {
-    let mut names = Vec::with_capacity(request.shots.len());
-    for folder in [images, masks] {
-        std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
-    }
-    for (number, shot) in request.shots.iter().enumerate() {
-        let ending = shot.file.extension().map(|ending| ending.to_string_lossy().to_lowercase());
-        let name = format!("{number:06}.{}", ending.as_deref().unwrap_or("png"));
-        put(&shot.file, &images.join(&name))?;
-        let mask = request.masks.map(|masks| masks.join(format!("{}.png", shot.name)));
-        if let Some(mask) = mask.filter(|mask| mask.is_file()) {
-            put(&mask, &masks.join(format!("{name}.png")))?;
+/// The camera that stands still, by how far the matches of every pair of images are apart, as a share of the larger side.
+/// Cameras of which no pair is matched are not judged.
+fn standing<'a>(cameras: &[&'a str], pairs: &[(usize, usize)], moved: &[Option<f64>]) -> Option<&'a str> {
+    let mut apart: BTreeMap<&str, Vec<f64>> = BTreeMap::new();
+    for ((a, b), moved) in pairs.iter().zip(moved) {
+        if let Some(moved) = moved.filter(|_| cameras[*a] == cameras[*b]) {
+            apart.entry(cameras[*a]).or_default().push(moved);
         }
-        names.push(name);
     }
-    Ok(names)
+    let stands = |apart: &mut Vec<f64>| {
+        apart.sort_by(f64::total_cmp);
+        apart[apart.len() / 2] < STILL
+    };
+    apart.into_iter().find_map(|(camera, mut apart)| stands(&mut apart).then_some(camera))
 }
 
-/// A second name of a file; a copy where the file system has no links.
-fn put(from: &Path, to: &Path) -> Result<(), Error> {
-    // The file behind a link: a link with a relative target leads nowhere from another folder.
-    let link = std::fs::canonicalize(from).and_then(|file| std::fs::hard_link(file, to));
-    link.or_else(|_| std::fs::copy(from, to).map(drop)).map_err(Error::io("copy", from))
+/// Refusal of a camera that stands still.
+fn stands_still(camera: &str, cameras: &[&str]) -> Error {
+    let problem = format!(
+        "{camera}: the camera stands still: what its images share lies at the same pixels, so that they show no depth"
+    );
+    let is_alone = cameras.iter().all(|other| *other == camera);
+    Error::refused(
+        problem,
+        if is_alone {
+            "record while walking around the scene, give the videos of several fixed cameras, or, where only what \
+             moves with the camera was seen, say --moving"
+        } else {
+            "say --fixed where all cameras stand still; where it moves all the same, say --moving"
+        },
+    )
 }
 
-/// The model of one setting: the name of its mapper, its poses, and what is to be thought of them.
-type Model = (&'static str, Poses, Verdict);
+/// A model of one setting: the name of its mapper, its poses, and what is to be thought of them.
+type Judged = (&'static str, Poses, Verdict);
 
-/// Features of the images, and the model to give out of one setting; `None` where no mapper found any pose.
-fn rung(
-    images: usize,
-    solve: &dyn Fn(&[Run]) -> Result<Outcome, Error>,
-) -> Result<(Vec<usize>, Option<Model>), Error> {
-    let first = [Run { mapper: Mapper::Global, seed: 1 }, Run { mapper: Mapper::Incremental, seed: 2 }];
-    let Outcome { features, runs, .. } = solve(&first)?;
-    let features: Vec<usize> = features.into_values().collect();
-    let mut runs = runs.into_iter();
-    let (global, incremental) = (runs.next().flatten(), runs.next().flatten());
-    let judged =
-        |mapper, poses: &Poses, other: Option<&Poses>| (mapper, poses.clone(), judge(poses, other, images));
-    let mut best = global.as_ref().map(|global| judged("global", global, incremental.as_ref()));
-    if best.as_ref().is_some_and(|(_, _, verdict)| verdict.is_good()) {
-        return Ok((features, best));
+/// The model to give out of one setting for `images` images; `None` where no mapper found any pose.
+fn rung(images: usize, solve: &dyn Fn(Run) -> Result<Option<Model>, Error>) -> Result<Option<Judged>, Error> {
+    let judged = |name, model: &Model, second| (name, model.poses.clone(), judge(model, second, images));
+    let global = solve(Run { mapper: Mapper::Global, seed: 1 })?;
+    let alone = global.as_ref().map(|global| judged("global", global, Second::NotAsked));
+    if alone.as_ref().is_some_and(|(_, _, verdict)| verdict.is_good()) {
+        return Ok(alone);
     }
+    let incremental = solve(Run { mapper: Mapper::Incremental, seed: 2 })?;
+    let mut models: Vec<Judged> = Vec::new();
+    models.extend(global.as_ref().map(|global| judged("global", global, Second::of(incremental.as_ref()))));
+    let is_good = |models: &[Judged]| models.iter().any(|(_, _, verdict)| verdict.is_good());
     // One run of the incremental mapper may lose its way where another does not.
-    let Some(incremental) = incremental else { return Ok((features, best)) };
-    let again = solve(&[Run { mapper: Mapper::Incremental, seed: 3 }])?.runs.into_iter().next().flatten();
-    let mut candidates = vec![judged("incremental", &incremental, again.as_ref())];
-    if let (Some(global), Some(again)) = (&global, &again) {
-        candidates.insert(0, judged("global", global, Some(again)));
-    }
-    for candidate in candidates {
-        if best.as_ref().is_none_or(|best| candidate.2.holding() > best.2.holding()) {
-            best = Some(candidate);
+    if let Some(incremental) = incremental.as_ref().filter(|_| !is_good(&models)) {
+        let again = solve(Run { mapper: Mapper::Incremental, seed: 3 })?;
+        if let (Some(global), Some(again)) = (&global, &again) {
+            models.push(judged("global", global, Second::of(Some(again))));
         }
+        models.push(judged("incremental", incremental, Second::of(again.as_ref())));
     }
-    Ok((features, best))
+    // The first of those for which most speaks.
+    let most = models.iter().map(|(_, _, verdict)| verdict.holding()).max();
+    Ok(models.into_iter().find(|(_, _, verdict)| Some(verdict.holding()) == most))
 }
 
 /// Arguments against poses, in short.
@@ -249,53 +254,92 @@ mod tests {
         poses
     }
 
-    /// The model that [`rung`] gives where the mappers answer so, and the runs that it asked for.
-    fn given(answer: impl Fn(Run) -> Option<Poses>) -> (Option<Model>, Vec<(Mapper, u32)>) {
+    /// The model that [`rung`] gives where the mappers answer so, with this share of matches that fit, and the runs that
+    /// it asked for.
+    fn given(fitting: f64, answer: impl Fn(Run) -> Option<Poses>) -> (Option<Judged>, Vec<(Mapper, u32)>) {
         let asked = RefCell::new(Vec::new());
-        let solve = |runs: &[Run]| {
-            asked.borrow_mut().extend(runs.iter().map(|run| (run.mapper, run.seed)));
-            Ok(Outcome {
-                features: BTreeMap::new(),
-                runs: runs.iter().map(|run| answer(*run)).collect(),
-                points: Vec::new(),
-            })
+        let solve = |run: Run| {
+            asked.borrow_mut().push((run.mapper, run.seed));
+            Ok(answer(run).map(|poses| Model { poses, fitting }))
         };
-        let found = rung(20, &solve).unwrap().1;
+        let found = rung(20, &solve).unwrap();
         (found, asked.into_inner())
     }
 
+    /// Cameras of which each is held by so many points.
+    fn held(points: usize) -> Poses {
+        let mut poses = arc(20);
+        poses.images.values_mut().for_each(|pose| pose.points = points);
+        poses
+    }
+
     #[test]
-    fn mappers_that_agree_are_believed_at_once() {
-        let (found, asked) = given(|run| {
-            let mut poses = arc(20);
-            if run.mapper == Mapper::Incremental {
-                poses.transform(&somewhere());
-            }
-            Some(poses)
-        });
+    fn a_model_without_doubt_is_not_compared() {
+        let (found, asked) = given(0.99, |_| Some(held(900)));
         let (mapper, poses, verdict) = found.unwrap();
-        assert!(mapper == "global" && poses == arc(20) && verdict.is_good(), "{verdict}");
-        assert_eq!(asked, [(Mapper::Global, 1), (Mapper::Incremental, 2)]);
+        assert!(mapper == "global" && poses == held(900) && verdict.is_good(), "{verdict}");
+        assert_eq!(asked, [(Mapper::Global, 1)]);
+    }
+
+    #[test]
+    fn a_model_in_doubt_is_compared() {
+        for (points, fitting) in [(90, 0.99), (900, 0.9)] {
+            let (found, asked) = given(fitting, |run| {
+                let mut poses = held(points);
+                if run.mapper == Mapper::Incremental {
+                    poses.transform(&somewhere());
+                }
+                Some(poses)
+            });
+            let (mapper, poses, verdict) = found.unwrap();
+            assert!(mapper == "global" && poses == held(points) && verdict.is_good(), "{verdict}");
+            assert_eq!(asked, [(Mapper::Global, 1), (Mapper::Incremental, 2)]);
+        }
     }
 
     #[test]
     fn a_mapper_that_lost_its_way_once_is_asked_again() {
         // The incremental one, with its first seed.
-        let (found, asked) = given(|run| Some(if run.seed == 2 { bent(9) } else { arc(20) }));
+        let (found, asked) = given(0.9, |run| Some(if run.seed == 2 { bent(9) } else { arc(20) }));
         let (mapper, poses, verdict) = found.unwrap();
         assert!(mapper == "global" && poses == arc(20) && verdict.is_good(), "{verdict}");
         assert_eq!(asked.len(), 3);
         // The global one; the two others agree.
-        let (found, _) = given(|run| Some(if run.mapper == Mapper::Global { bent(9) } else { arc(20) }));
+        let (found, _) = given(0.9, |run| Some(if run.mapper == Mapper::Global { bent(9) } else { arc(20) }));
         let (mapper, poses, verdict) = found.unwrap();
         assert!(mapper == "incremental" && poses == arc(20) && verdict.is_good(), "{verdict}");
+        // It finds nothing.
+        let (found, asked) = given(0.9, |run| (run.mapper == Mapper::Incremental).then(|| arc(20)));
+        let (mapper, _, verdict) = found.unwrap();
+        assert!(mapper == "incremental" && verdict.is_good() && asked.len() == 3, "{verdict}");
     }
 
     #[test]
     fn models_that_differ_all_are_not_believed() {
-        let (found, _) = given(|run| Some(bent(4 * run.seed)));
+        let (found, _) = given(0.9, |run| Some(bent(4 * run.seed)));
         assert!(!found.unwrap().2.is_good());
-        let (found, asked) = given(|_| None);
+        let (found, asked) = given(0.9, |_| None);
         assert!(found.is_none() && asked.len() == 2);
+    }
+
+    #[test]
+    fn a_standing_camera_is_known_by_where_matches_lie() {
+        let cameras = ["a", "a", "a", "b", "b"];
+        let pairs = [(0, 1), (0, 2), (1, 2), (0, 3), (3, 4)];
+        let of = |moved: [Option<f64>; 5]| standing(&cameras, &pairs, &moved);
+        // Matches of one pair are wrong; another has none.
+        assert_eq!(of([Some(0.0001), Some(0.3), Some(0.0002), Some(0.2), Some(0.1)]), Some("a"));
+        assert_eq!(of([Some(0.03), Some(0.06), None, Some(0.0), Some(0.0005)]), Some("b"));
+        assert_eq!(of([Some(0.03), Some(0.0005), Some(0.04), Some(0.0), None]), None);
+        let words = |cameras: &[&str]| match stands_still("a", cameras) {
+            Error::Refused { problem, fix } => (problem, fix),
+            other => panic!("{other}"),
+        };
+        let (problem, fix) = words(&["a", "a"]);
+        assert!(
+            problem.starts_with("a: the camera stands still") && fix.contains("--moving"),
+            "{problem} {fix}"
+        );
+        assert!(words(&cameras).1.contains("--fixed"));
     }
 }

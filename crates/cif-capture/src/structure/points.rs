@@ -4,9 +4,11 @@
 
 use std::collections::BTreeMap;
 
-use super::ladder::{Request, stage};
+use super::features::Features;
+use super::ladder::Request;
 use super::pairs::pairs;
 use super::python::{Group, Job, KnownPose, run};
+use super::stage::Staged;
 use crate::frames::Shot;
 use crate::poses::{Point, Poses};
 use crate::{Error, Hooks};
@@ -52,23 +54,18 @@ fn points(
     hooks: &Hooks<'_>,
 ) -> Result<Vec<Point>, Error> {
     let work = request.work.join("points");
-    let (images, masks) = (work.join("images"), work.join("masks"));
-    let names = stage(&Request { work: &work, ..*request }, &images, &masks)?;
+    let request = &Request { work: &work, ..*request };
+    let staged = Staged::new(request, &work)?;
+    let largest = request.shots.iter().map(|shot| shot.size.0.max(shot.size.1)).max().unwrap_or(1);
+    let lenses = lenses(request.shots, poses);
     let known = |(name, shot): (&String, &Shot)| {
         (name.clone(), KnownPose::of(&poses.images[&shot.name].world_from_camera))
     };
+    // As many as there are: training starts from them.
     let job = Job {
-        work: &work,
-        images: &images,
-        masks: request.masks.map(|_| masks.as_path()),
-        names: &names,
-        pairs,
-        cameras: &lenses(request.shots, poses),
         model: KNOWN_LENS,
-        peak: None,
-        runs: &[],
-        poses: Some(names.iter().zip(request.shots).map(known).collect()),
-        threads: request.threads,
+        poses: Some(staged.names.iter().zip(request.shots).map(known).collect()),
+        ..Job::of(request, &staged, pairs, &lenses, Features::all(largest))
     };
     Ok(run(&job, hooks)?.points)
 }

@@ -11,6 +11,9 @@ use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
+use super::features::Features;
+use super::ladder::Request;
+use super::stage::Staged;
 use crate::poses::{Lens, Point, Pose, Poses};
 use crate::{Error, Hooks, child};
 
@@ -27,6 +30,10 @@ const MAX_ERROR_PX: f64 = 2.0;
 /// Points that two images with known poses see may lie this far from where they are seen: 1.5 % of them were
 /// more than a tenth of the scene from any surface, 3 % at twice the distance.
 const MAX_ERROR_OF_TWO_PX: f64 = 1.0;
+
+/// Parts of the lines with which COLMAP's global mapper begins its steps, and their number.
+const STEP_OF_GLOBAL_MAPPER: [&str; 2] = ["global_mapper.cc", "=== Running "];
+const STEPS_OF_GLOBAL_MAPPER: usize = 5;
 
 static OWN: OnceLock<PathBuf> = OnceLock::new();
 
@@ -47,21 +54,60 @@ pub fn pythons() -> Vec<OsString> {
     }
 }
 
-/// Work for pycolmap; `reconstruct.py` tells what the fields mean.
+/// Work for pycolmap; `reconstruct.py` says what the fields mean.
 #[derive(Clone, Debug, Serialize)]
 pub(super) struct Job<'a> {
+    pub(super) kept: &'a Path,
     pub(super) work: &'a Path,
     pub(super) images: &'a Path,
     pub(super) masks: Option<&'a Path>,
+    pub(super) pictures: &'a Path,
     pub(super) names: &'a [String],
+    pub(super) keys: &'a [String],
+    pub(super) matched: String,
+    pub(super) verified: String,
+    pub(super) side: u32,
+    pub(super) peak: Option<f64>,
     pub(super) pairs: &'a [(usize, usize)],
     pub(super) cameras: &'a [Group],
     pub(super) model: &'static str,
-    pub(super) peak: Option<f64>,
     pub(super) runs: &'a [Run],
     /// Where images are known to be, by name, for points.
     pub(super) poses: Option<BTreeMap<String, KnownPose>>,
     pub(super) threads: usize,
+}
+
+impl<'a> Job<'a> {
+    /// Features and matches of images; the lens model, runs and poses are for the caller to add.
+    pub(super) fn of(
+        request: &Request<'a>,
+        staged: &'a Staged,
+        pairs: &'a [(usize, usize)],
+        cameras: &'a [Group],
+        features: Features,
+    ) -> Self {
+        let Features { side, peak } = features;
+        let matched = format!("{side} {peak:?}");
+        Job {
+            kept: request.kept,
+            work: request.work,
+            images: &staged.images,
+            masks: staged.masks.as_deref(),
+            pictures: &staged.pictures,
+            names: &staged.names,
+            keys: &staged.keys,
+            verified: staged.fingerprint(&format!("{matched} {cameras:?} {pairs:?}")),
+            matched: staged.fingerprint(&matched),
+            side,
+            peak,
+            pairs,
+            cameras,
+            model: "",
+            runs: &[],
+            poses: None,
+            threads: request.threads,
+        }
+    }
 }
 
 /// Where an image is known to be: camera from world.
@@ -106,13 +152,25 @@ pub(super) enum Mapper {
     Incremental,
 }
 
+/// What a mapper found.
+#[derive(Clone, Debug)]
+pub(super) struct Model {
+    /// Of the images that have some.
+    pub(super) poses: Poses,
+    /// Share of the verified matches of these whose rays meet by the poses.
+    pub(super) fitting: f64,
+}
+
 /// Findings of pycolmap.
 #[derive(Debug)]
 pub(super) struct Outcome {
     /// Features of every image.
     pub(super) features: BTreeMap<String, usize>,
-    /// Poses of the largest model of every run.
-    pub(super) runs: Vec<Option<Poses>>,
+    /// Median distance of the matches of every pair from the same place in the other image, as a share of the larger
+    /// side; `None` where there are few. Of jobs without runs.
+    pub(super) moved: Vec<Option<f64>>,
+    /// The largest model of every run.
+    pub(super) runs: Vec<Option<Model>>,
     /// Points that images with known poses see.
     pub(super) points: Vec<Point>,
 }
@@ -125,6 +183,8 @@ struct AnswerJson {
     #[serde(default)]
     features: BTreeMap<String, usize>,
     #[serde(default)]
+    moved: Vec<Option<f64>>,
+    #[serde(default)]
     runs: Vec<Option<ModelJson>>,
     #[serde(default)]
     points: Vec<PointJson>,
@@ -136,6 +196,7 @@ struct ModelJson {
     images: BTreeMap<String, ImageJson>,
     points: Vec<PointJson>,
     reprojection_px: f64,
+    fitting: f64,
 }
 
 #[derive(Deserialize)]
@@ -173,21 +234,34 @@ impl PointJson {
 /// # Errors
 /// When Python or pycolmap is missing or fails, or the caller stops.
 pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
-    let input = serde_json::to_vec(job).map_err(|error| {
+    let mut input = serde_json::to_vec(job).map_err(|error| {
         Error::refused(format!("a name cannot be passed to Python: {error}"), "rename it")
     })?;
+    input.push(b'\n');
     let programs = pythons();
     for program in &programs {
         let mut command = Command::new(program);
         command.args(["-c", SCRIPT]);
         // A thread of one library must not start a thread per processor in another.
         command.env("OMP_NUM_THREADS", job.threads.to_string());
+        // Where logs of COLMAP go that do not go to the standard error.
+        command.env("GLOG_log_dir", job.work);
+        let mut steps = 0;
         let line = |line: &str| {
-            if let Some(words) = line.strip_prefix("@ ") {
-                (hooks.progress)(words);
+            if let Some((done, total, words)) = counted(line) {
+                if total > 0 { hooks.count(words, done, total) } else { hooks.tell(words) }
+            } else if STEP_OF_GLOBAL_MAPPER.iter().all(|part| line.contains(part)) {
+                steps += 1;
+                hooks.count(
+                    "steps of poses, global mapper",
+                    steps.min(STEPS_OF_GLOBAL_MAPPER) - 1,
+                    STEPS_OF_GLOBAL_MAPPER,
+                );
             }
         };
-        let Some(answer) = child::run(&mut command, &input, hooks.should_stop, line)? else { continue };
+        let Some(answer) = child::run_attended(&mut command, &input, hooks.should_stop, line)? else {
+            continue;
+        };
         let parsed: Option<AnswerJson> = serde_json::from_slice(&answer.output).ok();
         return match parsed {
             Some(AnswerJson { missing: Some(problem), python, version, .. }) => {
@@ -220,19 +294,28 @@ fn pycolmap_missing(problem: &str, python: &str, version: &str) -> Error {
     )
 }
 
-/// The lines that pycolmap itself wrote.
+/// Progress of a line `@ DONE TOTAL WORDS`.
+fn counted(line: &str) -> Option<(usize, usize, &str)> {
+    let mut parts = line.strip_prefix("@ ")?.splitn(3, ' ');
+    Some((parts.next()?.parse().ok()?, parts.next()?.parse().ok()?, parts.next()?))
+}
+
+/// The lines of pycolmap that say what failed.
 fn words_of(text: &str) -> String {
-    text.lines().filter(|line| !line.starts_with("@ ")).collect::<Vec<_>>().join("\n")
+    let is_log = |line: &str| line.starts_with("@ ") || line.starts_with("I20") || line.starts_with("W20");
+    text.lines().filter(|line| !is_log(line)).collect::<Vec<_>>().join("\n")
 }
 
 fn outcome(answer: AnswerJson) -> Result<Outcome, Error> {
-    let runs = answer.runs.into_iter().map(|model| model.map(poses).transpose());
+    let model = |model: ModelJson| Ok(Model { fitting: model.fitting, poses: poses(model)? });
+    let runs = answer.runs.into_iter().map(|found| found.map(model).transpose());
     // Where poses are known, two views tell a place too, if they agree well.
     let is_sure = |point: &&PointJson| {
         (point.images >= MIN_TRACK && point.error <= MAX_ERROR_PX) || point.error <= MAX_ERROR_OF_TWO_PX
     };
     let points = answer.points.iter().filter(is_sure).map(PointJson::point).collect();
-    Ok(Outcome { features: answer.features, runs: runs.collect::<Result<_, _>>()?, points })
+    let runs = runs.collect::<Result<_, Error>>()?;
+    Ok(Outcome { features: answer.features, moved: answer.moved, runs, points })
 }
 
 /// A model in the types of this crate.
@@ -289,7 +372,7 @@ mod tests {
             "rotation": [0.70710678, 0.0, 0.0, 0.70710678], "translation": [1.0, 2.0, 3.0], "points": 7}},
             "points": [{"position": [1, 2, 3], "color": [9, 8, 7], "error": 0.5, "images": 4},
             {"position": [1, 2, 9], "color": [9, 8, 7], "error": 3.5, "images": 4},
-            {"position": [1, 2, 9], "color": [9, 8, 7], "error": 0.1, "images": 2}], "reprojection_px": 0.4}"#;
+            {"position": [1, 2, 9], "color": [9, 8, 7], "error": 0.1, "images": 2}], "reprojection_px": 0.4, "fitting": 0.97}"#;
         let poses = poses(serde_json::from_str(text).unwrap()).unwrap();
         let camera = poses.images["a.png"].world_from_camera;
         // Camera to world: the camera's place maps to its origin.
@@ -297,6 +380,13 @@ mod tests {
         assert!((camera.translation - DVec3::new(-2.0, 1.0, -3.0)).length() < 1e-6, "{camera:?}");
         assert_eq!(poses.lenses[0].distortion.radial[0], -0.1);
         assert_eq!(poses.points.len(), 1, "points seen by few images, or badly, are left out");
+    }
+
+    #[test]
+    fn progress_is_read_and_logs_are_no_reasons() {
+        assert_eq!(counted("@ 3 40 features of images"), Some((3, 40, "features of images")));
+        assert_eq!(counted("3 40 features"), None);
+        assert_eq!(words_of("@ 3 40 features\nI2026 global\nW2026 slow\nno such file"), "no such file");
     }
 
     #[test]

@@ -4,6 +4,7 @@ mod as_json;
 mod options;
 mod report;
 mod scale;
+mod shown;
 mod unfinished;
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -16,10 +17,11 @@ use cif_capture::poses::{Point, Poses};
 use cif_capture::source::sources;
 use cif_capture::structure::{self, Found, Lenses, Order, Request, Verdict};
 use cif_capture::write::{self, Capture as Written};
-use cif_capture::{Hooks, times};
+use cif_capture::{Hooks, Progress, times};
 
 pub(super) use self::options::Capture;
 use self::options::{LensesName, OrderName};
+use self::shown::Shown;
 use crate::error::Error;
 use crate::interrupt;
 
@@ -61,11 +63,8 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
     }
     command.report.check([])?;
     interrupt::watch();
-    let progress = |words: &str| {
-        if !command.quiet {
-            eprintln!("{words} ...");
-        }
-    };
+    let shown = Shown::new(command.quiet);
+    let progress = |progress: Progress<'_>| shown.show(progress);
     let hooks = Hooks { should_stop: &interrupt::requested, progress: &progress };
     let scratch = tempfile::Builder::new()
         .prefix("cif-capture-")
@@ -73,21 +72,36 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
         .map_err(Error::io("create a temporary folder in", &std::env::temp_dir()))?;
     let sources = sources(&command.inputs)?;
     let mut notes = Notes::new();
-    let mut shots =
-        frames::collect(&sources, &choice(command), &scratch.path().join("frames"), &hooks, &mut notes)?;
+    let collected =
+        frames::collect(&sources, &choice(command), &scratch.path().join("frames"), &hooks, &mut notes);
+    shown.clear();
+    let mut shots = collected?;
     let mut unbelieved = None;
-    let made = make(command, &mut shots, scratch.path(), &hooks, &mut notes, &mut unbelieved);
-    if made.is_err() {
-        unfinished::keep(command, &sources, &shots, unbelieved.as_ref());
+    let kept = structure::kept_beside(place);
+    let places = Places { scratch: scratch.path(), kept: &kept, shown: &shown };
+    let made = make(command, &mut shots, &places, &hooks, &mut notes, &mut unbelieved);
+    shown.clear();
+    match &made {
+        Ok(()) => structure::remove_kept(&kept),
+        Err(error) => unfinished::keep(command, &sources, &shots, unbelieved.as_ref(), error),
     }
     made
+}
+
+/// Where files of a run lie, and what shows its progress.
+struct Places<'a> {
+    /// Folder for what is removed at the end.
+    scratch: &'a Path,
+    /// Folder for features and matches, which a run without a capture leaves to the next.
+    kept: &'a Path,
+    shown: &'a Shown,
 }
 
 /// Finds or reads the poses of images and writes the capture. Poses that are not believed are left in `unbelieved`.
 fn make(
     command: &Capture,
     shots: &mut [Shot],
-    scratch: &Path,
+    places: &Places<'_>,
     hooks: &Hooks<'_>,
     notes: &mut Notes,
     unbelieved: &mut Option<Posed>,
@@ -105,13 +119,14 @@ fn make(
             let Imported { mut poses, tool, metres_known, up_known, .. } =
                 import::read(path, shots)?.matched(path, shots)?;
             if poses.points.is_empty() {
-                poses.points = points(command, shots, masks.as_ref(), &poses, scratch, hooks, notes)?;
+                poses.points = points(command, shots, masks.as_ref(), &poses, places, hooks, notes)?;
             }
             let from = format!("{tool} ({})", path.display());
             Posed { poses, from, verdict: None, metres_known, up_known }
         }
-        None => find(command, shots, masks.as_ref(), scratch, hooks, notes)?,
+        None => find(command, shots, masks.as_ref(), places, hooks, notes)?,
     };
+    places.shown.clear();
     for note in notes.iter() {
         crate::messages::note!("{note}");
     }
@@ -153,7 +168,7 @@ fn find(
     command: &Capture,
     shots: &[Shot],
     masks: Option<&Masks>,
-    scratch: &Path,
+    places: &Places<'_>,
     hooks: &Hooks<'_>,
     notes: &mut Notes,
 ) -> Result<Posed, Error> {
@@ -169,10 +184,9 @@ fn find(
             "the first frame of each (--moving finds a pose for every frame)"
         ));
     }
-    let black = left_out(command, &solved, masks, scratch, hooks)?;
-    let work = scratch.join("work");
-    std::fs::create_dir_all(&work).map_err(Error::io("create", &work))?;
-    let request = request(command, &solved, black.as_deref(), fixed, &work);
+    let black = left_out(command, &solved, masks, places.scratch, hooks)?;
+    let work = work_folder(places)?;
+    let request = request(command, &solved, black.as_deref(), fixed, (&work, places.kept));
     let Found { mut poses, verdict, setting, tried } = structure::find(&request, hooks)?;
     notes.extend(tried.into_iter().map(|tried| format!("not believed: {tried}")));
     if fixed {
@@ -202,14 +216,14 @@ fn points(
     shots: &[Shot],
     masks: Option<&Masks>,
     poses: &Poses,
-    scratch: &Path,
+    places: &Places<'_>,
     hooks: &Hooks<'_>,
     notes: &mut Notes,
 ) -> Result<Vec<Point>, Error> {
     let fixed = is_fixed(command, shots);
-    let black = left_out(command, shots, masks, scratch, hooks)?;
-    let work = scratch.join("work");
-    let request = request(command, shots, black.as_deref(), fixed, &work);
+    let black = left_out(command, shots, masks, places.scratch, hooks)?;
+    let work = work_folder(places)?;
+    let request = request(command, shots, black.as_deref(), fixed, (&work, places.kept));
     let find = if fixed { structure::points_of_rig } else { structure::points_of_images };
     let problem = match find(&request, poses, hooks) {
         Ok(points) if !points.is_empty() => return Ok(points),
@@ -239,13 +253,22 @@ fn left_out(
     Ok(Some(black))
 }
 
-/// Work on images, as the command line has it.
+/// Creates the folders for work on poses, and returns that of files of this run alone.
+fn work_folder(places: &Places<'_>) -> Result<PathBuf, Error> {
+    let work = places.scratch.join("work");
+    for folder in [work.as_path(), places.kept] {
+        std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
+    }
+    Ok(work)
+}
+
+/// Work on images, as the command line has it, in the folders of this run and of those to come.
 fn request<'a>(
     command: &Capture,
     shots: &'a [Shot],
     masks: Option<&'a Path>,
     fixed: bool,
-    work: &'a Path,
+    (work, kept): (&'a Path, &'a Path),
 ) -> Request<'a> {
     Request {
         shots,
@@ -256,7 +279,10 @@ fn request<'a>(
             LensesName::Each => Lenses::PerCamera,
         },
         focal_px: command.focal,
+        // Of fixed cameras one image each is solved.
+        moving: command.moving,
         work,
+        kept,
         threads: rayon::current_num_threads(),
     }
 }
