@@ -22,23 +22,12 @@ pub(crate) struct Answer<T = Vec<u8>> {
     pub(crate) last_words: String,
 }
 
-/// Runs a program with `input` on its standard input. Every line that it writes to standard error goes to
-/// `line`.
+/// Runs a program with `input` on its standard input, which stays open until the program ends: where this process is
+/// killed, the program reads the end of it, and can end too. Every line that it writes to standard error goes to `line`.
 ///
 /// # Errors
 /// When it cannot be started (`Ok(None)` where there is no such program), or `should_stop` says so: it is
 /// killed then.
-pub(crate) fn run(
-    command: &mut Command,
-    input: &[u8],
-    should_stop: &dyn Fn() -> bool,
-    line: impl FnMut(&str) + Send,
-) -> Result<Option<Answer>, Error> {
-    run_reading(command, input, should_stop, line, everything)
-}
-
-/// As [`run`], with a standard input that stays open until the program ends: where this process is killed, the
-/// program reads the end of it, and can end too.
 pub(crate) fn run_attended(
     command: &mut Command,
     input: &[u8],
@@ -54,11 +43,12 @@ fn everything(stdout: &mut dyn Read) -> io::Result<Vec<u8>> {
     stdout.read_to_end(&mut bytes).map(|_| bytes)
 }
 
-/// Runs a program as [`run`] does, whose standard output goes to `read` while it works. A reader that has enough returns
+/// Runs a program as [`run_attended`] does, with an input that ends, whose standard output goes to `read` while it
+/// works. A reader that has enough returns
 /// before the end: what the program writes after that is lost.
 ///
 /// # Errors
-/// As [`run`], and when `read` fails.
+/// As [`run_attended`], and when `read` fails.
 pub(crate) fn run_reading<T: Send>(
     command: &mut Command,
     input: &[u8],
@@ -149,7 +139,9 @@ mod tests {
         shell.args(["-c", "echo one >&2; cat; echo two >&2; exit 3"]);
         let mut lines = Vec::new();
         let answer =
-            run(&mut shell, b"given", &|| false, |line| lines.push(line.to_owned())).unwrap().unwrap();
+            run_reading(&mut shell, b"given", &|| false, |line| lines.push(line.to_owned()), everything)
+                .unwrap()
+                .unwrap();
         assert_eq!(answer.output, b"given");
         assert!(!answer.succeeded);
         assert_eq!(answer.last_words, "one\ntwo");
@@ -185,14 +177,18 @@ mod tests {
 
     #[test]
     fn a_missing_program_is_told_from_a_failing_one() {
-        assert!(run(&mut Command::new("no-such-program-here"), b"", &|| false, |_| ()).unwrap().is_none());
+        assert!(
+            run_attended(&mut Command::new("no-such-program-here"), b"", &|| false, |_| ())
+                .unwrap()
+                .is_none()
+        );
     }
 
     #[test]
     fn a_program_is_killed_when_the_caller_stops() {
         let begun = Instant::now();
         let mut sleep = Command::new("sleep");
-        let stopped = run(sleep.arg("600"), b"", &|| true, |_| ());
+        let stopped = run_attended(sleep.arg("600"), b"", &|| true, |_| ());
         assert!(matches!(stopped, Err(Error::Stopped)));
         assert!(begun.elapsed().as_secs() < 300, "it was not waited for");
     }

@@ -119,7 +119,9 @@ fn shots(folder: &Path) -> Vec<Shot> {
 
 fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
     let (work, kept) = (folder.join(work), folder.join(format!("{work}-kept")));
-    [&work, &kept].map(|folder| std::fs::create_dir_all(folder).expect("a new folder"));
+    for folder in [&work, &kept] {
+        std::fs::create_dir_all(folder).unwrap();
+    }
     let request = Request {
         shots,
         masks: None,
@@ -228,7 +230,9 @@ fn a_later_run_goes_on_from_what_was_kept() {
     // Phases that were shown, with what was done when they began.
     let found = |shots: &[Shot], kept: &Path, work: &str, last: &str| {
         let work = folder.path().join(work);
-        [work.as_path(), kept].map(|folder| std::fs::create_dir_all(folder).unwrap());
+        for folder in [work.as_path(), kept] {
+            std::fs::create_dir_all(folder).unwrap();
+        }
         let shown = std::sync::Mutex::new(Vec::<(String, usize, usize)>::new());
         let progress = |progress: Progress<'_>| {
             let mut shown = shown.lock().unwrap();
@@ -361,7 +365,9 @@ fn work_ends_when_the_caller_stops() {
     photographs(folder.path(), &cameras(3));
     let shots = shots(folder.path());
     let (work, kept) = (folder.path().join("work"), folder.path().join("kept"));
-    [&work, &kept].map(|folder| std::fs::create_dir_all(folder).unwrap());
+    for folder in [&work, &kept] {
+        std::fs::create_dir_all(folder).unwrap();
+    }
     let request = Request {
         shots: &shots,
         masks: None,

@@ -6,7 +6,6 @@ use std::path::{Path, PathBuf};
 use clap::builder::{PathBufValueParser, TypedValueParser};
 
 use crate::formats::FORMATS;
-use crate::report;
 
 /// Endings of films, which `cif render` makes the frames of.
 const FILMS: [&str; 6] = ["mp4", "mov", "mkv", "webm", "avi", "gif"];
@@ -23,7 +22,7 @@ pub(crate) fn scene() -> impl TypedValueParser<Value = PathBuf> {
 /// The report of a command, `.json` or a stream.
 pub(crate) fn report() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().try_map(|path| {
-        if report::is_file(path.as_os_str()) {
+        if crate::report::is_file(path.as_os_str()) {
             return Ok(path);
         }
         let better = path.with_extension("json");

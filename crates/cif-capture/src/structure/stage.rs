@@ -36,7 +36,8 @@ impl Staged {
         for folder in [&images, &masks, &pictures] {
             std::fs::create_dir_all(folder).map_err(Error::io("create", folder))?;
         }
-        let content = |file: &Path| Ok(xxh3_128(&std::fs::read(file).map_err(Error::io("read", file))?));
+        let content =
+            |file: &Path| std::fs::read(file).map(|bytes| xxh3_128(&bytes)).map_err(Error::io("read", file));
         let mask_of = |name: &str| request.masks.map(|masks| masks.join(format!("{name}.png")));
         let read: Vec<(u128, Option<u128>)> = request
             .shots
@@ -112,6 +113,7 @@ mod tests {
                     name: (*name).to_owned(),
                     file,
                     time: None,
+                    source: None,
                     size: (64, 48),
                     impression: Impression::of(&board(50, 0)),
                 }
