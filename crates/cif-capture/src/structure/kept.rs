@@ -50,8 +50,11 @@ mod tests {
         assert!(folder.ends_with("table-features") && !has_kept(&folder));
         std::fs::create_dir(&folder).unwrap();
         let write = |name: &str| std::fs::write(folder.join(name), "").unwrap();
-        ["features-4.2.1-480-0.db", "matches-a-b.db", "matches-a-c.part", "matches-a-b.db-journal"]
-            .map(write);
+        for name in
+            ["features-4.2.1-480-0.db", "matches-a-b.db", "matches-a-c.part", "matches-a-b.db-journal"]
+        {
+            write(name);
+        }
         assert!(has_kept(&folder));
         write("notes.txt");
         remove_kept(&folder);
