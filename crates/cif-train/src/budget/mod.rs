@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::clock::Seconds;
 
 pub use pacer::{COARSE, INSTANCE, Pacer, StageShare};
-pub(crate) use pacer::{FITS, IDENTITY_STEPS_PER_FRAME, TRIALS, weights};
+pub(crate) use pacer::{FITS, IDENTITY_STEPS_PER_FRAME, REHEARSAL, TRIALS, weights};
 
 /// Which time a budget counts.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]

@@ -20,9 +20,11 @@ const NEWEST: f64 = 0.5;
 const SAVING: (f64, f64) = (0.005, 0.2);
 
 /// Part of the time that is left, up to which objects that travel are fitted: poses are worth more to them than steps.
-/// Part of that up to which other objects are tried for motion, and for parts.
+/// Parts up to which other objects are tried for motion, and for parts, and up to which the network learns paths: few of
+/// those objects move, and what is not taught is learnt in the fine stage.
 pub(crate) const FITS: f64 = 0.35;
-pub(crate) const TRIALS: [f64; 2] = [0.12, 0.12];
+pub(crate) const TRIALS: [f64; 2] = [0.05, 0.05];
+pub(crate) const REHEARSAL: f64 = 0.1;
 
 /// Passes of identity estimation over the training frames, in steps of the fine stage per frame.
 pub(crate) const IDENTITY_STEPS_PER_FRAME: f64 = 0.35;

@@ -5,6 +5,10 @@ use crate::budget::{COARSE, IDENTITY_STEPS_PER_FRAME, INSTANCE};
 use crate::phase::Phase;
 use crate::stage::Stage;
 
+/// Time of a fit of an object that travels, of that of one that turns out to rest: the first has about 32 000 steps, the
+/// second 4 700, each in two sizes of one capture.
+const TRAVELS: f64 = 7.0;
+
 impl Trainer {
     /// Travelling objects that are not fitted yet.
     pub(super) fn objects_to_fit(&self) -> usize {
@@ -39,11 +43,12 @@ impl Trainer {
         (stages.map(steps).sum::<f64>() + identity) * step_s + fits_s
     }
 
-    /// Estimated seconds of the fits to come: as long for each object as for one that was tried before.
+    /// Estimated seconds of the fits to come, by those of objects that were tried before; 0 where none was.
     fn fits_s(&self) -> f64 {
         let others = self.state.guidance.travelling.iter().skip(1).filter(|travels| !**travels).count();
-        let tried = others + self.fits.len();
+        // In units of fits of objects that rest.
+        let tried = others as f64 + TRAVELS * self.fits.len() as f64;
         let spent = self.state.phases.spent(Phase::Search).wall_s;
-        if tried == 0 { 0.0 } else { self.objects_to_fit() as f64 * spent / tried as f64 }
+        if tried > 0.0 { TRAVELS * self.objects_to_fit() as f64 * spent / tried } else { 0.0 }
     }
 }

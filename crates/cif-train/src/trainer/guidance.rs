@@ -10,6 +10,7 @@ use glam::DVec3;
 use rand::RngExt;
 
 use super::Trainer;
+use super::objects::in_time;
 use super::plan_step::plane_weights;
 use crate::error::TrainError;
 use crate::events::TrainEvent;
@@ -218,9 +219,13 @@ impl Trainer {
         let mut rng = stream(self.state.config.seed, Purpose::Guidance, 0);
         let mut renderer = Renderer::new(self.simd);
         let phases = self.state.phases.clone();
-        let _phase = phases.enter(Phase::Rehearsal, self.state.config.motion.rehearsal as usize);
+        let phase = phases.enter(Phase::Rehearsal, self.state.config.motion.rehearsal as usize);
+        phase.until(self.deadline(Phase::Rehearsal));
         for _ in 0..self.state.config.motion.rehearsal {
-            phases.check()?;
+            // What a budget has no time for, the fine stage teaches.
+            if in_time(phases.check())?.is_none() {
+                break;
+            }
             phases.advance();
             let time = times[rng.random_range(0..times.len())];
             renderer.displace(&self.state.field, time);

@@ -7,7 +7,7 @@
 use serde_json::{Value, json};
 
 use super::Trainer;
-use crate::budget::{Budget, FITS, Pacer, TRIALS, weights};
+use crate::budget::{Budget, FITS, Pacer, REHEARSAL, TRIALS, weights};
 use crate::curve::{CurvePoint, Targets};
 use crate::error::TrainError;
 use crate::phase::Phase;
@@ -116,6 +116,7 @@ impl Trainer {
         let share = match phase {
             Phase::Search => search,
             Phase::Joints => joints,
+            Phase::Rehearsal => REHEARSAL,
             _ => FITS,
         };
         let (budget, now) = (*pacer.budget(), self.state.phases.now());
