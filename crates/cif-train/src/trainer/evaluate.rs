@@ -127,8 +127,8 @@ impl Trainer {
             return Ok(None);
         }
         self.fetch()?;
-        let phase = self.state.phases.enter(Phase::Measure, count as usize);
         let before = self.state.phases.spent(Phase::Measure);
+        let phase = self.state.phases.enter(Phase::Measure, count as usize);
         let frames = match self.measured_frames.decoded.take() {
             Some(frames) => frames,
             None => {

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::support::{Scene, capture, small_config};
+use crate::support::{Manual, Scene, capture, small_config};
 use cif_train::budget::{Budget, BudgetClock};
 use cif_train::curve::Targets;
 use cif_train::fit::{Workload, calibrate, choose};
@@ -90,15 +90,23 @@ fn more_time_than_steps_need_is_not_wasted_but_used() {
     let folder = tempfile::tempdir().unwrap();
     let dataset = capture(folder.path(), Scene { times: 1, views: 3, masks: false, ..Scene::default() });
     let mut config = small_config();
-    (config.stages.coarse, config.stages.fine) = (10, 10);
-    let clock: Arc<dyn Clock> = Arc::new(Ticking::default());
-    // The clock ticks whenever it is read, by the budget as by saving.
+    (config.stages.coarse, config.stages.fine, config.report.step_every) = (10, 10, 1);
+    let manual = Arc::new(Manual::default());
+    let clock: Arc<dyn Clock> = Arc::clone(&manual) as _;
     let budget = budget(60.0, &clock, BudgetClock::Wall);
     let mut trainer = Trainer::new(dataset, config).unwrap();
     trainer.set_clock(Arc::clone(&clock));
     trainer.set_budget(budget);
-    trainer.run(&mut |_, _| Control::Continue).unwrap();
-    assert!((54.0..=61.0).contains(&budget.used(clock.now())));
+    // A step takes 0.3 s.
+    let outcome = trainer.run(&mut |event, _| {
+        if let TrainEvent::Step { .. } = event {
+            manual.pass(0.3);
+        }
+        Control::Continue
+    });
+    assert_eq!(outcome.unwrap(), Outcome::Finished);
+    let used = budget.used(clock.now());
+    assert!((58.0..=60.5).contains(&used), "{used}");
     assert!(trainer.steps_done() > 100, "{}", trainer.steps_done());
 }
 

@@ -106,10 +106,10 @@ fn every_phase_is_reported_and_all_of_them_add_up_to_the_time_that_passed() {
     }
     assert!(open.is_empty(), "{open:?}");
     use Phase::{
-        Coarse, Decode, Evaluate, Fine, Identity, Instance, Masks, Measure, Objects, Paths, Rehearsal,
+        Coarse, Decode, Evaluate, Fine, Identity, Instance, Masks, Measure, Objects, Paths, Presence,
     };
     for phase in
-        [Decode, Masks, Paths, Coarse, Objects, Rehearsal, Fine, Identity, Instance, Measure, Evaluate]
+        [Decode, Masks, Paths, Coarse, Objects, Presence, Fine, Identity, Instance, Measure, Evaluate]
     {
         assert!(seen.contains(&phase), "{phase} is missing: {seen:?}");
     }
