@@ -21,10 +21,12 @@ on the PATH; poses need pycolmap, which `pip install 'cif4d[capture]'` brings.
   cif capture walk.mp4 -o captures/table --masks masks --length 'red mug' 0.09
   cif capture photos/ -o captures/garden --poses colmap/sparse/0
 
-Poses are found by both mappers of COLMAP, and again with more features where these disagree. The verdict looks at the
-share of images with a pose, the reprojection error, the focal length and how far two runs are apart; where it says no,
-no capture is written (--accept writes it all the same), but frames of videos and the poses are kept in DIR-unfinished,
-and the commands that go on from there are told. Poses from images know neither metre nor up: up is taken from how
+Poses are found by COLMAP's global mapper; where few points hold the images or matches do not fit, the incremental one is
+run too, and again with more features where these disagree. The verdict looks at the share of images with a pose, the
+reprojection error, the focal length and how far two runs are apart; where it says no, no capture is written (--accept
+writes it all the same), but frames of videos and the poses are kept in DIR-unfinished, and the commands that go on from
+there are shown. Features and matches are kept in DIR-features until a capture is written, also after Ctrl-C: a next try
+with the same DIR, of the same or some of the same images, goes on from them. Poses from images know neither metre nor up: up is taken from how
 the cameras were held, the metre from --length or --measured, and the capture tells what is known.
 
 Cameras of a rig that stand still are told by their pictures; they are solved at one moment, and give the points of four.

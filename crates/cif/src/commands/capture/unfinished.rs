@@ -36,7 +36,10 @@ pub(super) fn keep(
     }
     let features = structure::kept_beside(&command.output);
     let has_features = structure::has_kept(&features);
-    if has_features {
+    if !has_features {
+        // Its folder, which is empty.
+        structure::remove_kept(&features);
+    } else {
         eprintln!(
             "kept: {} has the features and matches found; a next try with -o {} goes on from them",
             features.display(),
