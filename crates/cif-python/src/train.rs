@@ -266,5 +266,5 @@ pub(crate) fn train(
             .map_err(|error| error.with_help())
         },
     )?;
-    Ok(Field { inner: trained.map_err(cif_error)? })
+    Ok(Field::new(trained.map_err(cif_error)?))
 }

@@ -2,6 +2,7 @@
 
 mod by_masks;
 mod by_text;
+mod trajectory;
 
 use std::path::{Path, PathBuf};
 
@@ -32,6 +33,14 @@ Time in a stage or glTF file is its time code, which counts captured frames; in 
   cif query table.cif --label '*box' --json
   cif query table.cif --point 0.1,0.2,0.05 --time 0.5
 
+Paths: object, label and class; the frame (time code), the time from 0 to 1 and in seconds; the origin of
+the object's frame (x, y, z; world units) and its rotation (quaternion qw, qx, qy, qz; from its own axes to
+the world's, unturned at the first frame); visible, 0 while it is hidden. Parts go with the largest one,
+and what bends has the path of the rigid body that fits it best.
+
+  cif query table.cif --label 'red mug' --trajectory mug.csv
+  cif query table.usda --trajectory
+
 By words: with --models, the objects whose embeddings (cif embed) are nearest to the text; those with a
 * are nearer to it than to texts of anything. Else those that have most of the words in their names.
 
@@ -54,7 +63,7 @@ CAPTURE/.cif-cache. Or a command of your own makes them.
   cif query table.cif --prompt 'steel jug' --capture captures/table \\
       --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'
 
-Models are run by ONNX Runtime (pip install 'cif[vision]', or ORT_DYLIB_PATH); nothing is downloaded.
+Models are run by ONNX Runtime (pip install 'cif4d[vision]', or ORT_DYLIB_PATH); nothing is downloaded.
 Their folder has a file such as this, with the names of your exports:
 
 ";
@@ -112,6 +121,18 @@ pub(super) struct Query {
     /// Read layers that a stage brings in from outside its folder
     #[arg(long)]
     follow_external: bool,
+    /// Write the path of every object found, a row per captured frame, as CSV [default: to stdout]
+    #[arg(
+        long,
+        value_name = "FILE.csv",
+        num_args = 0..=1,
+        default_missing_value = "-",
+        conflicts_with_all = ["json", "time", "interval", "point", "region", "text", "masks", "prompt"]
+    )]
+    trajectory: Option<PathBuf>,
+    /// Replace an existing file
+    #[arg(long, requires = "trajectory")]
+    force: bool,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -131,6 +152,9 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     }
     let is_field = matches!(Content::of(&command.path)?, Content::Field);
     let wanted = question(command, is_field)?;
+    if let Some(file) = &command.trajectory {
+        return trajectory::run(command, file, &wanted);
+    }
     if let (true, Some(place)) = (is_field, wanted.point) {
         let others = wanted.label.is_some() || wanted.region.is_some();
         if others || command.interval.is_some() || command.text.is_some() {
@@ -252,9 +276,8 @@ fn corner(option: &str, numbers: &[f64]) -> Result<DVec3, Error> {
 }
 
 fn in_scene(path: &Path, mut wanted: ObjectQuery) -> Result<Vec<ObjectMatch>, Error> {
-    let field = scene::load(path)?;
     let options = SceneOptions { proxy_points: 0, ..SceneOptions::default() };
-    let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
+    let graph = cif_scene::build(&scene::load(path)?, &options).map_err(Error::plain)?;
     let codes = &graph.time_codes;
     let code = |time| code_at(&codes.times, &codes.samples, time);
     wanted.when = match wanted.when {
