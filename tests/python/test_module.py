@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,9 @@ from pathlib import Path
 import cif
 import numpy as np
 import pytest
-from conftest import CAR, PER_OBJECT, TIMES
+from conftest import CAR, PER_OBJECT, TIMES, turn
+
+CAPTURE = Path(__file__).parents[2] / "examples" / "tabletop-mini"
 
 
 def test_fields_survive_files(field: cif.Field, tmp_path: Path) -> None:
@@ -52,6 +55,150 @@ def test_queries(field: cif.Field) -> None:
     assert found["instance"] == "toy_car_002"
     with pytest.raises(cif.CifError, match="known labels"):
         field.find("teapot")
+
+
+def test_arrays_of_what_does_not_change_are_read_only(field: cif.Field) -> None:
+    _, _, camera = field.cameras[0]
+    named = ["means", "scales", "quaternions", "opacities", "occupancies", "sh_coefficients", "identities"]
+    for array in [*(getattr(field, name) for name in named), camera.camera_from_world]:
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 0
+    with pytest.raises(AttributeError):
+        field.means = np.zeros((3, 3), np.float32)
+    # Answers are the caller's own.
+    field.at(0.5)["means"][:] = 0
+    field.render(camera)["color"][:] = 0
+    copy = field.means.copy()
+    copy[:] = 0
+    assert field.means.any()
+
+
+@pytest.fixture(scope="module")
+def moving(field: cif.Field, motion, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The field with its motion recorded, as a .cif file."""
+    folder = tmp_path_factory.mktemp("moving")
+    field.export(folder / "scene.usda", motion=motion)
+    recorded, _ = cif.import_scene(folder / "scene.usda")
+    recorded.save(folder / "scene.cif")
+    return folder / "scene.cif"
+
+
+def check_path(times: np.ndarray, translations: np.ndarray, rotations: np.ndarray, start: np.ndarray) -> None:
+    """The way of the car in conftest: it turns about z of the world, and drives."""
+    for time, translation, rotation in zip(times, translations, rotations, strict=True):
+        matrix, quaternion = turn(2.5 * time)
+        assert translation == pytest.approx(matrix @ start + [0.5 * time, 0, 0.2 * time], abs=2e-3)
+        assert rotation == pytest.approx(quaternion, abs=2e-3)
+
+
+def test_a_trajectory_is_one_call(moving: Path) -> None:
+    field = cif.Field.load(moving)
+    path = field.trajectory("toy car")
+    assert (path["instance"], path["label"], path["class"]) == ("toy_car_002", "toy car", "car")
+    assert path["time_codes"].tolist() == list(range(len(TIMES))) and path["times"] == pytest.approx(TIMES)
+    assert path["seconds"] == pytest.approx(path["time_codes"] / 12)
+    assert path["visible"].dtype == bool and path["visible"].all()
+    check_path(path["times"], path["translations"], path["rotations"], path["translations"][0])
+    for code in [0, 3, 5]:
+        (found,) = field.find("toy car", code)
+        assert path["translations"][code] == pytest.approx(np.array(found["transform"])[:3, 3])
+    still = field.trajectory("red mug")
+    assert np.ptp(still["translations"], axis=0) == pytest.approx(0)
+    assert still["rotations"][:, 0] == pytest.approx(1)
+    with pytest.raises(cif.CifError, match=r"fits 4 objects: .*toy_car_002.*; name one"):
+        field.trajectory("*")
+    with pytest.raises(cif.CifError, match="known labels"):
+        field.trajectory("teapot")
+
+
+def test_trajectories_as_csv(moving: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    field = cif.Field.load(moving)
+    expected = field.trajectory("toy car")
+    out = tmp_path / "car.csv"
+    ask = ["query", moving, "--label", "toy car", "--trajectory"]
+    assert cif.run([*ask, out]) == 0
+    capfd.readouterr()
+    assert cif.run(ask) == 0
+    assert capfd.readouterr().out == out.read_text()
+    with out.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {(row["object"], row["label"], row["class"]) for row in rows} == {("toy_car_002", "toy car", "car")}
+    columns = {
+        "frame": expected["time_codes"],
+        "time": expected["times"],
+        "seconds": expected["seconds"],
+        "x": expected["translations"][:, 0],
+        "z": expected["translations"][:, 2],
+        "qw": expected["rotations"][:, 0],
+        "qz": expected["rotations"][:, 3],
+        "visible": expected["visible"],
+    }
+    for name, values in columns.items():
+        assert [float(row[name]) for row in rows] == values.tolist(), name
+    # The stage it came from has the same path.
+    assert cif.run(["query", moving.with_suffix(".usda"), "--label", "toy car", "--trajectory"]) == 0
+    stage = list(csv.DictReader(capfd.readouterr().out.splitlines()))
+    for name in ["frame", "x", "y", "z", "qw", "qz"]:
+        values = [float(row[name]) for row in rows]
+        assert [float(row[name]) for row in stage] == pytest.approx(values, abs=1e-3), name
+
+    before = out.read_bytes()
+    assert cif.run([*ask, out]) == 1 and out.read_bytes() == before
+    assert "--force" in capfd.readouterr().err
+    assert cif.run([*ask, out, "--force"]) == 0
+    assert cif.run([*ask, tmp_path / "car.json"]) == 2 and ".csv" in capfd.readouterr().err
+    assert cif.run([*ask, "--time", "0.5"]) == 2
+    assert cif.run(["query", moving, "--label", "teapot", "--trajectory"]) == 1
+
+
+def test_pictures_for_notebooks(field: cif.Field, tmp_path: Path) -> None:
+    _, _, camera = field.cameras[2]
+    picture = field.show(2)
+    assert picture.pixels.shape == (48, 64, 3) and picture.pixels.dtype == np.uint8
+    color = field.render(camera, TIMES[2])["color"]
+    assert np.abs(picture.pixels - 255 * color.clip(0, 1)).max() <= 0.5
+    assert np.array_equal(field.show(camera, TIMES[2]).pixels, picture.pixels)
+    assert (
+        field.show(what="instance-color").pixels.std() > 0 and field.show(what="depth-color").pixels.std() > 0
+    )
+    data = picture._repr_png_()
+    assert data.startswith(b"\x89PNG\r\n")
+    picture.save(tmp_path / "view.png")
+    assert (tmp_path / "view.png").read_bytes().startswith(b"\x89PNG\r\n")
+    with pytest.raises(cif.CifError, match="exists"):
+        picture.save(tmp_path / "view.png")
+    picture.save(tmp_path / "view.png", force=True)
+    with pytest.raises(cif.CifError, match=r"\.png"):
+        picture.save(tmp_path / "view.jpg")
+    with pytest.raises(ValueError, match="choose rgb"):
+        field.show(what="color")
+    with pytest.raises(IndexError, match="view 99 of 7"):
+        field.show(99)
+
+
+def test_tables_for_notebooks(field: cif.Field) -> None:
+    table = field._repr_html_()
+    for text in ["340 Gaussians", "<td>red mug</td>", "<td>napkin</td>", f"<td>{PER_OBJECT}</td>"]:
+        assert text in table, table
+    arrays = {name: np.ones((1, 3), np.float32) for name in ["means", "scales", "colors"]}
+    hostile = cif.Field.from_arrays(
+        **arrays,
+        quaternions=np.ones((1, 4), np.float32),
+        opacities=np.full(1, 0.5, np.float32),
+        instances=[{"id": 1, "label": "<b>&mug"}],
+    )
+    assert "<td>&lt;b&gt;&amp;mug</td>" in hostile._repr_html_()
+    dataset = cif.open_dataset(CAPTURE)
+    summary = dataset.summary()
+    assert f"<td>frames</td><td>{summary['frames']}</td>" in dataset._repr_html_()
+    image = dataset.load_frame(3)["image"]
+    assert np.array_equal(dataset.show(3).pixels, image)
+    mask = next(k for k, frame in enumerate(dataset.frames) if frame["mask"])
+    shown = dataset.show(mask, what="instance-color").pixels
+    ids = dataset.load_frame(mask)["mask"]
+    assert len(np.unique(shown.reshape(-1, 3), axis=0)) == len(np.unique(ids))
+    with pytest.raises(IndexError):
+        dataset.show(10_000)
 
 
 def test_motion_table(field: cif.Field, motion, tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 //! numpy arrays, lists and dictionaries in and out.
 
+use numpy::ndarray::Dimension;
 use numpy::{
-    Element, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
+    Element, PyArray, PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods,
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -32,6 +33,15 @@ pub(crate) fn column<T: Element + Copy>(name: &str, array: &PyReadonlyArrayDyn<'
 /// Values in row-major order, whatever the strides.
 pub(crate) fn values<T: Element + Copy>(array: &PyReadonlyArrayDyn<'_, T>) -> Vec<T> {
     array.as_array().iter().copied().collect()
+}
+
+/// The array, which numpy then refuses to change: a copy of what stays as it is, so that a change would be
+/// lost.
+pub(crate) fn read_only<T: Element, D: Dimension>(
+    array: Bound<'_, PyArray<T, D>>,
+) -> Bound<'_, PyArray<T, D>> {
+    array.readwrite().make_nonwriteable();
+    array
 }
 
 /// `[N, C]`.

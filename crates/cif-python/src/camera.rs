@@ -13,6 +13,9 @@ use crate::arrays;
 const ORTHONORMAL: f64 = 1e-4;
 
 /// A pinhole camera: x right, y down, z forward; the centre of the first pixel is (0.5, 0.5).
+///
+/// Width, height, focal lengths and principal point are in pixels; camera_from_world is a `[4, 4]` pose. By
+/// default the principal point is the middle of the image, and the pose the identity.
 #[pyclass(frozen, from_py_object, module = "cif")]
 #[derive(Clone)]
 pub(crate) struct Camera {
@@ -50,26 +53,31 @@ impl Camera {
         Ok(Self { inner })
     }
 
+    /// Width, pixels.
     #[getter]
     fn width(&self) -> u32 {
         self.inner.width
     }
 
+    /// Height, pixels.
     #[getter]
     fn height(&self) -> u32 {
         self.inner.height
     }
 
+    /// Focal lengths (x, y), pixels.
     #[getter]
     fn focal(&self) -> (f64, f64) {
         self.inner.focal_px.into()
     }
 
+    /// Principal point (x, y), pixels.
     #[getter]
     fn principal(&self) -> (f64, f64) {
         self.inner.principal_px.into()
     }
 
+    /// Pose, float64 `[4, 4]`: takes column vectors of the world to the camera; read-only.
     #[getter]
     fn camera_from_world<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
         let RigidTransform { rotation, translation } = self.inner.camera_from_world;
@@ -80,9 +88,10 @@ impl Camera {
                 [r.x, r.y, r.z, translation[row]]
             }
         });
-        arrays::matrix(py, &rows)
+        arrays::matrix(py, &rows).map(arrays::read_only)
     }
 
+    /// Return the same view at another resolution.
     fn resized(&self, width: u32, height: u32) -> PyResult<Self> {
         check_image_size(width, height).map_err(PyValueError::new_err)?;
         Ok(Self { inner: self.inner.resized(width, height) })

@@ -10,8 +10,10 @@ use pyo3::types::{PyDict, PyList};
 use crate::arrays;
 use crate::camera::Camera;
 use crate::error::cif_error;
+use crate::picture::Picture;
+use crate::{picture, tables};
 
-/// A capture, understood.
+/// A capture, understood: frames, cameras, times, masks, instances, initial points.
 #[pyclass(frozen, module = "cif")]
 pub(crate) struct Dataset {
     pub(crate) inner: cif_dataset::Dataset,
@@ -19,7 +21,10 @@ pub(crate) struct Dataset {
     pub(crate) downscale: Option<u32>,
 }
 
-/// Opens a capture.
+/// Open a capture.
+///
+/// masks names a folder inside it or anywhere, by default "masks" where it has one; downscale reduces images
+/// by 1, 2, 4 and so on, by default to the largest stored.
 #[pyfunction]
 #[pyo3(signature = (path, masks=None, downscale=None))]
 pub(crate) fn open_dataset(
@@ -34,7 +39,7 @@ pub(crate) fn open_dataset(
 }
 
 impl Dataset {
-    fn frame_at(&self, index: usize) -> PyResult<&cif_dataset::Frame> {
+    pub(crate) fn frame_at(&self, index: usize) -> PyResult<&cif_dataset::Frame> {
         self.inner.frames.get(index).ok_or_else(|| {
             PyIndexError::new_err(format!("frame {index} of {} frames", self.inner.frames.len()))
         })
@@ -43,26 +48,31 @@ impl Dataset {
 
 #[pymethods]
 impl Dataset {
+    /// Folder of the capture.
     #[getter]
     fn root(&self) -> PathBuf {
         self.inner.root.clone()
     }
 
+    /// Layout that the folder was read as.
     #[getter]
     fn layout<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::to_python(py, &self.inner.layout)
     }
 
+    /// Captured times, normalised to [0, 1].
     #[getter]
     fn times(&self) -> Vec<f64> {
         self.inner.times.clone()
     }
 
+    /// id (value in the masks), label and category of every instance.
     #[getter]
     fn instances<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::to_python(py, &self.inner.instances)
     }
 
+    /// Oddities that were met when the capture was read.
     #[getter]
     fn warnings(&self) -> Vec<String> {
         self.inner.warnings.clone()
@@ -74,6 +84,7 @@ impl Dataset {
         self.inner.notes.clone()
     }
 
+    /// name, camera_name, time, time_index, split, group, image and mask of every frame.
     #[getter]
     fn frames<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyList>> {
         let frames = PyList::empty(py);
@@ -96,10 +107,14 @@ impl Dataset {
         self.inner.frames.len()
     }
 
+    /// Return the camera of a frame.
     fn camera(&self, index: usize) -> PyResult<Camera> {
         Ok(Camera { inner: self.frame_at(index)?.camera })
     }
 
+    /// Load image, uint8 `[H, W, 3]`, and mask, uint16 `[H, W]` (None without one), of a frame.
+    ///
+    /// What is transparent in the image shows the background.
     #[pyo3(signature = (index, background=(1.0, 1.0, 1.0)))]
     fn load_frame<'py>(
         &self,
@@ -116,16 +131,32 @@ impl Dataset {
         Ok(out)
     }
 
+    /// Draw a frame as a picture, which notebooks show.
+    ///
+    /// what is "rgb" or "instance-color" (the mask in the colours of its instances).
+    #[pyo3(signature = (index=0, *, what="rgb"))]
+    fn show(&self, py: Python<'_>, index: usize, what: &str) -> PyResult<Picture> {
+        picture::of_frame(py, self, index, what)
+    }
+
+    /// The counts as a table, for notebooks.
+    fn _repr_html_(&self, py: Python<'_>) -> PyResult<String> {
+        tables::of_summary(&self.__repr__(), &self.summary(py)?)
+    }
+
+    /// Initial points, float32 `[P, 3]`; read-only.
     #[getter]
     fn points<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        arrays::matrix(py, &self.inner.points.positions)
+        arrays::matrix(py, &self.inner.points.positions).map(arrays::read_only)
     }
 
+    /// Colours of the initial points, uint8 `[P, 3]`; read-only.
     #[getter]
     fn point_colors<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<u8>>> {
-        arrays::matrix(py, &self.inner.points.colors)
+        arrays::matrix(py, &self.inner.points.colors).map(arrays::read_only)
     }
 
+    /// Return counts of everything, for a first look.
     fn summary<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
         let frames = &self.inner.frames;
         let count = |split| frames.iter().filter(|frame| frame.split == split).count();

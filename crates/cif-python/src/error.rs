@@ -4,7 +4,12 @@ use pyo3::create_exception;
 use pyo3::exceptions::PyException;
 use pyo3::prelude::*;
 
-create_exception!(cif, CifError, PyException, "A file, capture, field or stage is not as it should be.");
+create_exception!(
+    cif,
+    CifError,
+    PyException,
+    "A file, capture, field or stage is not as it should be; the message names it and the way out."
+);
 
 /// The error of a library as a Python exception.
 pub(crate) fn cif_error(error: impl std::fmt::Display) -> PyErr {

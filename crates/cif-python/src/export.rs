@@ -1,12 +1,9 @@
-//! Scenes as USD, glTF and PLY, and stages by label.
+//! Scenes as USD, glTF and PLY.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use cif::formats;
-use cif_scene::{
-    ExportOptions, FrameRange, LabelQuery, MotionSource, ReadOptions, SceneFormat, SceneGraph, SceneOptions,
-    Tolerance,
-};
+use cif_scene::{ExportOptions, FrameRange, MotionSource, SceneFormat, SceneGraph, SceneOptions, Tolerance};
 use numpy::{PyReadonlyArrayDyn, PyUntypedArrayMethods};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -135,54 +132,9 @@ pub(crate) fn export<'py>(
     Ok(out)
 }
 
-pub(crate) fn find<'py>(
-    py: Python<'py>,
-    field: &Field,
-    label: String,
-    time_code: Option<f64>,
-) -> PyResult<Bound<'py, PyAny>> {
-    let options = SceneOptions { proxy_points: 0, ..SceneOptions::default() };
-    let graph = build(py, field, &options, None)?;
-    let query = LabelQuery { pattern: label, time_code };
-    let found = cif_scene::query(&graph, &query, "the field").map_err(cif_error)?;
-    arrays::to_python(py, &found)
-}
-
-/// Labels with wildcards.
-#[pyclass(frozen, module = "cif")]
-pub(crate) struct LabelPattern {
-    inner: cif_scene::LabelPattern,
-}
-
-#[pymethods]
-impl LabelPattern {
-    #[new]
-    fn new(text: &str) -> Self {
-        Self { inner: cif_scene::LabelPattern::new(text) }
-    }
-
-    fn matches(&self, label: &str) -> bool {
-        self.inner.matches(label)
-    }
-}
-
-/// Prims of a stage by label.
-#[pyfunction]
-#[pyo3(signature = (path, label, time_code=None, *, follow_external=false))]
-pub(crate) fn query_stage<'py>(
-    py: Python<'py>,
-    path: PathBuf,
-    label: String,
-    time_code: Option<f64>,
-    follow_external: bool,
-) -> PyResult<Bound<'py, PyAny>> {
-    let query = LabelQuery { pattern: label, time_code };
-    let format = formats::format_of(&path).map_err(|error| cif_error(error.with_help()))?;
-    let found = format.query(&path, &query, ReadOptions { follow_external }).map_err(cif_error)?;
-    arrays::to_python(py, &found)
-}
-
-/// Version of the usd-core in use.
+/// Return the version of the USD in use, e.g. 26.11.
+///
+/// Raises CifError where there is none, or one older than 25.11.
 #[pyfunction]
 pub(crate) fn usd_version() -> PyResult<String> {
     cif_usd::usd_version().map_err(cif_error)

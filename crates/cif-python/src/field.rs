@@ -1,115 +1,88 @@
 //! Trained scenes: arrays, rendering, queries.
 
-use std::collections::BTreeMap;
-
 use std::path::PathBuf;
+use std::sync::OnceLock;
 
-use cif_field::{Gaussians, Identities, Instance, RecordedCamera, SortMetric, Timeline};
+use cif_field::{Gaussians, RecordedCamera};
 use cif_geometry::scalar::sigmoid;
-use cif_geometry::spherical_harmonics::{BAND_0, COEFFICIENTS};
+use cif_geometry::spherical_harmonics::COEFFICIENTS;
 use cif_render::cpu::{Renderer, SimdLevel};
-use cif_render::{Channels, RenderSettings};
+use cif_render::{Channels, RenderSettings, RenderedImage};
+use cif_scene::{SceneGraph, SceneOptions};
 use glam::DVec3;
-use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn, PyUntypedArrayMethods};
+use numpy::{PyArray1, PyArray2, PyArray3, PyArrayMethods, PyReadonlyArrayDyn};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 
 use crate::camera::Camera;
 use crate::error::cif_error;
-use crate::{arrays, export};
+use crate::from_arrays::FromArrays;
+use crate::picture::{Picture, View};
+use crate::{arrays, export, objects, picture, tables};
 
-/// Opacities and occupancies are kept this far from 0 and 1, where logits end.
-const UNIT_MARGIN: f32 = 1e-6;
-
-/// A dynamic Gaussian field with instances.
+/// A dynamic Gaussian field with instances: N Gaussians, K instances, T captured times.
+///
+/// A field does not change: its arrays are copies that numpy refuses to write to. To change one, copy it, and
+/// make a field of arrays with `from_arrays`.
 #[pyclass(frozen, module = "cif")]
 pub(crate) struct Field {
     pub(crate) inner: cif_field::Field,
+    /// The scene graph that objects are looked up in, made by the first question.
+    graph: OnceLock<Result<SceneGraph, String>>,
 }
 
-fn logits(name: &str, probabilities: &[f32]) -> PyResult<Vec<f32>> {
-    if !probabilities.iter().all(|p| (0.0..=1.0).contains(p)) {
-        return Err(PyValueError::new_err(format!("{name} must lie in [0, 1]")));
+impl Field {
+    pub(crate) fn new(inner: cif_field::Field) -> Self {
+        Self { inner, graph: OnceLock::new() }
     }
-    let logit = |p: &f32| {
-        let p = p.clamp(UNIT_MARGIN, 1.0 - UNIT_MARGIN);
-        (p / (1.0 - p)).ln()
-    };
-    Ok(probabilities.iter().map(logit).collect())
-}
 
-/// `[N, K]` probabilities as sparse rows; what a row lacks of one belongs to no instance.
-fn sparse_identities(probabilities: &PyReadonlyArrayDyn<'_, f32>, instances: usize) -> PyResult<Identities> {
-    let shape = probabilities.shape();
-    if shape.len() != 2 || shape[1] != instances || instances == 0 {
-        return Err(PyValueError::new_err(format!(
-            "identities have the shape {shape:?}, but must be [N, {instances}]: one column per instance"
-        )));
+    /// The scene graph, without stand-ins and colliders.
+    pub(crate) fn graph(&self, py: Python<'_>) -> PyResult<&SceneGraph> {
+        let build = || {
+            let options = SceneOptions { proxy_points: 0, hulls_per_instance: 0, ..SceneOptions::default() };
+            cif_scene::build(&self.inner, &options).map_err(|error| error.to_string())
+        };
+        py.detach(|| self.graph.get_or_init(build)).as_ref().map_err(cif_error)
     }
-    let mut identities = Identities {
-        row_offsets: vec![0],
-        labels: Vec::new(),
-        log_estimates: Vec::new(),
-        log_calibrations: Vec::new(),
-        owners: Vec::new(),
-    };
-    for (index, row) in arrays::values(probabilities).chunks_exact(instances).enumerate() {
-        if let Some(column) = row.iter().position(|value| !(value.is_finite() && *value >= 0.0)) {
-            return Err(PyValueError::new_err(format!(
-                "identities hold {} at row {index}, column {column}: probabilities are finite and at least 0",
-                row[column]
-            )));
-        }
-        // What a row lacks of one belongs to no instance.
-        let sum: f32 = row.iter().sum();
-        if sum <= 0.0 {
-            identities.push_certain(None);
-            continue;
-        }
-        for (label, &probability) in row.iter().enumerate() {
-            let probability = probability / sum.max(1.0);
-            if probability > 0.0 {
-                identities.labels.push(u16::try_from(label).map_err(cif_error)?);
-                identities.log_estimates.push(probability.ln());
-                identities.log_calibrations.push(0.0);
-            }
-        }
-        identities.row_offsets.push(u32::try_from(identities.labels.len()).map_err(cif_error)?);
-    }
-    Ok(identities)
-}
 
-fn instance_table(entries: &Bound<'_, PyList>) -> PyResult<Vec<Instance>> {
-    entries
-        .iter()
-        .map(|entry| {
-            let text = |key: &str| entry.get_item(key)?.extract::<String>();
-            let label = text("label")?;
-            let category = if entry.contains("category")? { text("category")? } else { label.clone() };
-            let taxonomies = if entry.contains("taxonomies")? {
-                entry.get_item("taxonomies")?.extract()?
-            } else {
-                BTreeMap::new()
-            };
-            Ok(Instance { id: entry.get_item("id")?.extract()?, label, category, taxonomies })
+    /// A view of the field with all its layers.
+    pub(crate) fn draw(
+        &self,
+        py: Python<'_>,
+        camera: &Camera,
+        time: f64,
+        channels: Channels,
+    ) -> RenderedImage {
+        let settings = RenderSettings::of_field(&self.inner);
+        let instances = channels.instances && self.inner.identities.is_some();
+        let channels = Channels { instances, ..channels };
+        py.detach(|| {
+            Renderer::new(SimdLevel::Auto).render(&self.inner, &camera.inner, time, &settings, channels)
         })
-        .collect()
+    }
 }
 
 #[pymethods]
 impl Field {
+    /// Read a .cif file.
     #[staticmethod]
     fn load(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
         let inner = py.detach(|| cif_field::Field::load(&path)).map_err(cif_error)?;
-        Ok(Self { inner })
+        Ok(Self::new(inner))
     }
 
+    /// Write a .cif file, replacing an older one only once the new one is complete.
     fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
         py.detach(|| self.inner.save(&path)).map_err(cif_error)
     }
 
-    /// A static field from arrays.
+    /// Make a static field.
+    ///
+    /// means, scales (standard deviations) and colors are float32 `[N, 3]`, quaternions `[N, 4]`, opacities and
+    /// occupancies (opacities by default) `[N]`, identities `[N, K]` probabilities, where what a row lacks of 1
+    /// belongs to no instance. instances have id, label and category; cameras are (name, index into times,
+    /// camera).
     #[staticmethod]
     #[pyo3(signature = (*, means, scales, quaternions, opacities, colors, occupancies=None, identities=None,
                         instances=None, times=vec![0.0], frames_per_second=24.0, cameras=None,
@@ -129,64 +102,21 @@ impl Field {
         cameras: Option<Vec<(String, usize, Camera)>>,
         background: (f32, f32, f32),
     ) -> PyResult<Self> {
-        let means = arrays::rows::<f32, 3>("means", &means)?;
-        let scales = arrays::rows::<f32, 3>("scales", &scales)?;
-        if !scales.as_flattened().iter().all(|scale| *scale > 0.0) {
-            return Err(PyValueError::new_err("scales must be above 0"));
-        }
-        let opacity_logits = logits("opacities", &arrays::column("opacities", &opacities)?)?;
-        let occupancy_logits = match occupancies {
-            Some(values) => logits("occupancies", &arrays::column("occupancies", &values)?)?,
-            None => opacity_logits.clone(),
-        };
-        let sh_coefficients = arrays::rows::<f32, 3>("colors", &colors)?
-            .iter()
-            .map(|color| {
-                let mut sh = [0.0; COEFFICIENTS * 3];
-                for (coefficient, value) in sh.iter_mut().zip(color) {
-                    *coefficient = (value - 0.5) / BAND_0 as f32;
-                }
-                sh
-            })
-            .collect();
-        let instances = instances.map(|entries| instance_table(&entries)).transpose()?.unwrap_or_default();
-        let identities = identities.map(|rows| sparse_identities(&rows, instances.len())).transpose()?;
-        let cameras: Vec<RecordedCamera> = cameras
-            .unwrap_or_default()
-            .into_iter()
-            .map(|(name, time_index, camera)| RecordedCamera {
-                name,
-                time_index,
-                trained: true,
-                camera: camera.inner,
-            })
-            .collect();
-        let inner = cif_field::Field {
-            extent: extent(&means),
-            gaussians: Gaussians {
-                log_scales: scales.iter().map(|scale| scale.map(f32::ln)).collect(),
-                quaternions: arrays::rows::<f32, 4>("quaternions", &quaternions)?,
-                means,
-                opacity_logits,
-                occupancy_logits,
-                sh_coefficients,
-            },
-            deformation: None,
-            tracks: None,
+        let arrays = FromArrays {
+            means,
+            scales,
+            quaternions,
+            opacities,
+            colors,
+            occupancies,
             identities,
             instances,
-            timeline: Timeline { times, frames_per_second },
+            times,
+            frames_per_second,
             cameras,
-            sh_degree: 0,
-            background: background.into(),
-            sort_metric: SortMetric::Z,
-            record: cif_field::Record {
-                notes: serde_json::Map::from_iter([("source".to_owned(), "arrays".into())]),
-                ..cif_field::Record::default()
-            },
+            background,
         };
-        inner.validate().map_err(cif_error)?;
-        Ok(Self { inner })
+        Ok(Self::new(arrays.field()?))
     }
 
     fn __len__(&self) -> usize {
@@ -198,43 +128,58 @@ impl Field {
         format!("Field({n} Gaussians, {k} instances, {} times)", self.inner.timeline.times.len())
     }
 
+    /// The objects as a table, for notebooks.
+    fn _repr_html_(&self) -> String {
+        tables::of_field(&self.inner)
+    }
+
+    /// Centres before any motion, float32 `[N, 3]`, in the frame of the field; read-only.
     #[getter]
     fn means<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        arrays::matrix(py, &self.inner.gaussians.means)
+        arrays::matrix(py, &self.inner.gaussians.means).map(arrays::read_only)
     }
 
+    /// Standard deviations along the axes before any motion, float32 `[N, 3]`; read-only.
     #[getter]
     fn scales<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        arrays::matrix(py, &scales_of(&self.inner.gaussians))
+        arrays::matrix(py, &scales_of(&self.inner.gaussians)).map(arrays::read_only)
     }
 
+    /// Quaternions (w, x, y, z) before any motion, not normalised, float32 `[N, 4]`; read-only.
     #[getter]
     fn quaternions<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
-        arrays::matrix(py, &self.inner.gaussians.quaternions)
+        arrays::matrix(py, &self.inner.gaussians.quaternions).map(arrays::read_only)
     }
 
+    /// Opacities in [0, 1], float32 `[N]`; read-only.
     #[getter]
     fn opacities<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
-        PyArray1::from_iter(py, self.inner.gaussians.opacity_logits.iter().copied().map(sigmoid))
+        let logits = self.inner.gaussians.opacity_logits.iter().copied();
+        arrays::read_only(PyArray1::from_iter(py, logits.map(sigmoid)))
     }
 
+    /// Probabilities to exist, in [0, 1], float32 `[N]`; read-only.
     #[getter]
     fn occupancies<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<f32>> {
-        PyArray1::from_iter(py, self.inner.gaussians.occupancy_logits.iter().copied().map(sigmoid))
+        let logits = self.inner.gaussians.occupancy_logits.iter().copied();
+        arrays::read_only(PyArray1::from_iter(py, logits.map(sigmoid)))
     }
 
+    /// Spherical harmonics, float32 `[N, 16, 3]`; those above sh_degree are not in use; read-only.
     #[getter]
     fn sh_coefficients<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray3<f32>>> {
         let sh = &self.inner.gaussians.sh_coefficients;
-        PyArray1::from_slice(py, sh.as_flattened()).reshape([sh.len(), COEFFICIENTS, 3])
+        let flat = PyArray1::from_slice(py, sh.as_flattened());
+        flat.reshape([sh.len(), COEFFICIENTS, 3]).map(arrays::read_only)
     }
 
+    /// Degree of the spherical harmonics in use, 0 to 3.
     #[getter]
     fn sh_degree(&self) -> u8 {
         self.inner.sh_degree
     }
 
-    /// `[N, K]`, or `None` without identities.
+    /// Probability of every instance, float32 `[N, K]`, read-only; None before identities were estimated.
     #[getter]
     fn identities<'py>(&self, py: Python<'py>) -> PyResult<Option<Bound<'py, PyArray2<f32>>>> {
         let Some(rows) = &self.inner.identities else { return Ok(None) };
@@ -246,24 +191,29 @@ impl Field {
                 dense[row * instances + usize::from(rows.labels[entry])] = probabilities[entry];
             }
         }
-        Ok(Some(PyArray1::from_vec(py, dense).reshape([rows.len(), instances])?))
+        let dense = PyArray1::from_vec(py, dense).reshape([rows.len(), instances])?;
+        Ok(Some(arrays::read_only(dense)))
     }
 
+    /// id (value in the masks), label and category of every instance, in the order of identities.
     #[getter]
     fn instances<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::to_python(py, &self.inner.instances)
     }
 
+    /// Captured times, normalised to [0, 1].
     #[getter]
     fn times(&self) -> Vec<f64> {
         self.inner.timeline.times.clone()
     }
 
+    /// Captured frames per second; the time code of frame k is k.
     #[getter]
     fn frames_per_second(&self) -> f64 {
         self.inner.timeline.frames_per_second
     }
 
+    /// (name, index into times, camera) of every captured view.
     #[getter]
     fn cameras(&self) -> Vec<(String, usize, Camera)> {
         let of = |recorded: &RecordedCamera| {
@@ -272,11 +222,13 @@ impl Field {
         self.inner.cameras.iter().map(of).collect()
     }
 
+    /// How the field came about: its run, settings and notes.
     #[getter]
     fn provenance<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::to_python(py, &self.inner.record.to_json())
     }
 
+    /// Return means, scales, quaternions and opacities as they are at a normalised time.
     fn at<'py>(&self, py: Python<'py>, time: f64) -> PyResult<Bound<'py, PyDict>> {
         check_time(time)?;
         let moved = py.detach(|| Renderer::new(SimdLevel::Auto).deform(&self.inner, time));
@@ -289,6 +241,11 @@ impl Field {
         Ok(out)
     }
 
+    /// Render a view at a normalised time, as arrays.
+    ///
+    /// color is float32 `[H, W, 3]` in [0, 1], alpha `[H, W]`, depth `[H, W]` in units of the field; where the
+    /// field has identities also label (index into instances plus 1, 0 for none), probability, coverage,
+    /// foreground and entropy, `[H, W]` each.
     #[pyo3(signature = (camera, time=0.0, *, depth=true, instances=true))]
     fn render<'py>(
         &self,
@@ -299,11 +256,7 @@ impl Field {
         instances: bool,
     ) -> PyResult<Bound<'py, PyDict>> {
         check_time(time)?;
-        let settings = RenderSettings::of_field(&self.inner);
-        let channels = Channels { depth, instances: instances && self.inner.identities.is_some() };
-        let image = py.detach(|| {
-            Renderer::new(SimdLevel::Auto).render(&self.inner, &camera.inner, time, &settings, channels)
-        });
+        let image = self.draw(py, &camera, time, Channels { depth, instances });
         let out = PyDict::new(py);
         out.set_item("color", arrays::color_image(py, image.color)?)?;
         out.set_item("alpha", arrays::image(py, image.alpha)?)?;
@@ -320,6 +273,21 @@ impl Field {
         Ok(out)
     }
 
+    /// Render a view as a picture, which notebooks show.
+    ///
+    /// view is an index into cameras (by default the first), or a camera; time is normalised, by default that
+    /// of the view, or 0. what is "rgb", "instance-color" (the most probable instance of each pixel) or
+    /// "depth-color" (near is bright).
+    #[pyo3(signature = (view=None, time=None, *, what="rgb"))]
+    fn show(&self, py: Python<'_>, view: Option<View>, time: Option<f64>, what: &str) -> PyResult<Picture> {
+        time.map_or(Ok(()), check_time)?;
+        picture::of_field(py, self, view.unwrap_or(View::Captured(0)), time, what)
+    }
+
+    /// Answer what is at points at a normalised time.
+    ///
+    /// points are float64 `[P, 3]` in the frame of the field. existence is `[P]`, instance `[P]` (index into
+    /// instances, -1 for none), probabilities `[P, K]`.
     #[pyo3(signature = (points, time=0.0))]
     fn query<'py>(
         &self,
@@ -347,6 +315,13 @@ impl Field {
         Ok(out)
     }
 
+    /// Return the objects that carry a label, each as a dictionary.
+    ///
+    /// label is a label, class or unique name; `*` stands for any characters, `?` for one, and case does not
+    /// matter. Each has path, class, instance (unique name), label, transform (`[4][4]`, world from object, for
+    /// column vectors) and low and high, the corners of its box in the world of the capture, at a time code
+    /// (captured frame number, by default the first). The first call builds the scene graph, which the field
+    /// keeps. Raises CifError, with the labels there are, where nothing carries it.
     #[pyo3(signature = (label, time_code=None))]
     fn find<'py>(
         &self,
@@ -354,9 +329,34 @@ impl Field {
         label: String,
         time_code: Option<f64>,
     ) -> PyResult<Bound<'py, PyAny>> {
-        export::find(py, self, label, time_code)
+        objects::find(py, self, label, time_code)
     }
 
+    /// Return the path of an object over all captured frames, as arrays.
+    ///
+    /// label is as in find, and has to fit one object. The answer has instance (unique name), label and class;
+    /// time_codes (captured frame numbers), times (normalised) and seconds (time codes over frames_per_second),
+    /// float64 `[T]`; translations, float64 `[T, 3]`, the origin of the object's frame in the world of the
+    /// capture, in its units: at the first frame the middle of the object; rotations, float64 `[T, 4]`, unit
+    /// quaternions (w, x, y, z) from the object's frame to the world, the identity while it is turned as at the
+    /// first frame, and without jumps of sign; visible, bool `[T]`. An object of parts goes with its largest
+    /// part, one that bends with the rigid body that fits it best. Raises CifError where no object, or more
+    /// than one, carries the label.
+    fn trajectory<'py>(&self, py: Python<'py>, label: String) -> PyResult<Bound<'py, PyDict>> {
+        objects::trajectory(py, self, label)
+    }
+
+    /// Write the scene with one prim or node per object.
+    ///
+    /// The ending decides the format: .usda, .usdc, .usdz (USD), .glb, .gltf (glTF) or .ply (splats). glTF
+    /// holds rigid motion only: what deforms leaves as a few rigid parts; the motion table says what that
+    /// misses. PLY holds all splats as they stand at one frame.
+    ///
+    /// motion replaces the trained deformation by a function of time that returns means `[N, 3]` and
+    /// quaternions `[N, 4]`. options are those of the format, as in {"payloads": "separate"}; other keyword
+    /// arguments are options of the scene, whatever the format, as in tolerance="0.5%". Unknown ones raise
+    /// ValueError. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
+    /// replaced with force.
     #[pyo3(signature = (path, *, motion=None, options=None, force=false, **scene))]
     fn export<'py>(
         &self,
@@ -381,11 +381,4 @@ fn check_time(time: f64) -> PyResult<()> {
 
 fn scales_of(gaussians: &Gaussians) -> Vec<[f32; 3]> {
     gaussians.log_scales.iter().map(|scale| scale.map(f32::exp)).collect()
-}
-
-/// Half the diagonal of the box of the centres: the scale of a scene that has no cameras.
-fn extent(means: &[[f32; 3]]) -> f32 {
-    let points = means.iter().map(|mean| DVec3::from_array(mean.map(f64::from)));
-    let size = cif_geometry::Bounds::around(points).size().length() as f32 / 2.0;
-    if size > 0.0 { size } else { 1.0 }
 }

@@ -14,7 +14,11 @@ fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-/// A file as a field, and the edits that were applied to `base`.
+/// Read a USD, glTF or PLY file as a field.
+///
+/// With base, the field that the file was exported from, what was changed in the file is applied to it, and
+/// the second value lists the edits as diff does; otherwise it is None. force_base takes a base that the file
+/// was not exported from.
 #[pyfunction]
 #[pyo3(signature = (path, *, base=None, force_base=false))]
 pub(crate) fn import_scene<'py>(
@@ -36,10 +40,13 @@ pub(crate) fn import_scene<'py>(
             .map_err(|error| error.to_string())
         })
         .map_err(cif_error)?;
-    Ok((Field { inner }, arrays::to_python(py, &changes)?))
+    Ok((Field::new(inner), arrays::to_python(py, &changes)?))
 }
 
-/// Differences between two files, object by object.
+/// Compare two scenes, stages or glTF files object by object.
+///
+/// objects lists those that differ: what happened (kind), how far they moved over time, names, labels,
+/// visibility, and counts of splats; unchanged counts the others.
 #[pyfunction]
 pub(crate) fn diff<'py>(py: Python<'py>, before: PathBuf, after: PathBuf) -> PyResult<Bound<'py, PyAny>> {
     let changes = py

@@ -7,12 +7,17 @@
 //! | `camera` | pinhole cameras |
 //! | `dataset` | captures |
 //! | `field` | trained scenes: arrays, rendering, queries |
-//! | `export` | scenes as USD, and stages by label |
+//! | `from_arrays` | fields of numpy arrays |
+//! | `objects` | objects by label, and their paths |
+//! | `picture`, `tables` | what notebooks show |
+//! | `evaluate` | scores on a capture |
+//! | `export` | scenes as files |
 //! | `import` | files as scenes, edits coming home, differences |
 //! | `train` | training with a callback |
 //! | `error` | `cif.CifError` |
 //!
-//! Everything is documented for its users in `python/cif/_native.pyi`. Work in Rust runs without the lock of the
+//! Doc comments of what Python sees are its docstrings, and are written for its users: `make stubs` takes them into
+//! `python/cif/_native.pyi`, and a test holds the two together. Work in Rust runs without the lock of the
 //! interpreter; the USD writer takes it when it needs usd-core.
 
 mod arrays;
@@ -20,9 +25,14 @@ mod beside;
 mod camera;
 mod dataset;
 mod error;
+mod evaluate;
 mod export;
 mod field;
+mod from_arrays;
 mod import;
+mod objects;
+mod picture;
+mod tables;
 mod train;
 
 use std::ffi::OsString;
@@ -38,8 +48,9 @@ fn name_python(py: Python<'_>) -> PyResult<()> {
     Ok(())
 }
 
-/// Runs the command line in this process, whose signals stay with it, and returns its exit code. `arguments` start
-/// with the name of the program.
+/// Run a command line, whose first word is the name of the program, and return its exit code.
+///
+/// Signals stay with the process.
 #[pyfunction]
 fn run(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
     name_python(py)?;
@@ -53,7 +64,7 @@ fn run(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
     beside::run(py, || session.request(), |()| Ok(()), work)
 }
 
-/// Runs the command line in a process that is nothing but the command, which takes its signals.
+/// Run a command line in a process that is nothing but the command, which takes its signals.
 #[pyfunction]
 fn main(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
     name_python(py)?;
@@ -68,12 +79,14 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<camera::Camera>()?;
     module.add_class::<dataset::Dataset>()?;
     module.add_class::<field::Field>()?;
-    module.add_class::<export::LabelPattern>()?;
+    module.add_class::<picture::Picture>()?;
+    module.add_class::<objects::LabelPattern>()?;
     module.add_function(wrap_pyfunction!(run, module)?)?;
     module.add_function(wrap_pyfunction!(main, module)?)?;
     module.add_function(wrap_pyfunction!(train::train, module)?)?;
     module.add_function(wrap_pyfunction!(dataset::open_dataset, module)?)?;
-    module.add_function(wrap_pyfunction!(export::query_stage, module)?)?;
+    module.add_function(wrap_pyfunction!(evaluate::evaluate, module)?)?;
+    module.add_function(wrap_pyfunction!(objects::query_stage, module)?)?;
     module.add_function(wrap_pyfunction!(import::import_scene, module)?)?;
     module.add_function(wrap_pyfunction!(import::diff, module)?)?;
     module.add_function(wrap_pyfunction!(export::usd_version, module)?)?;

@@ -282,5 +282,5 @@ pub(crate) fn train(
             run.run(&phases, &mut |event| ask(event)).map_err(|error| error.with_help())
         },
     )?;
-    Ok(Field { inner: trained.map_err(cif_error)? })
+    Ok(Field::new(trained.map_err(cif_error)?))
 }

@@ -28,6 +28,7 @@
 //! | [`query`] | nodes by label |
 //! | [`query::label_pattern`] | labels with wildcards |
 //! | [`query::search`](mod@query::search) | nodes by label, class, time and place |
+//! | [`query::trajectory`] | paths of nodes over all captured times |
 //! | [`diff`] | what differs between two graphs, object by object |
 //! | [`edits`] | what was changed in an exported file, applied to the field it came from |
 //! | [`format`](mod@format) | what a file format does for graphs |
@@ -84,6 +85,7 @@ pub use motion_scores::{InstanceMotion, MotionErrors, MotionScores, motion_score
 pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
 pub use query::label_pattern::LabelPattern;
 pub use query::search::{self, ObjectMatch, ObjectQuery, VolumeOf, When, search};
+pub use query::trajectory::{Trajectory, TrajectorySample, trajectories};
 pub use query::{LabelMatch, LabelQuery, QueryError, query};
 pub use report::{MotionReport, ResidualStatistics};
 pub use shape::extent;

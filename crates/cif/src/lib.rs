@@ -19,6 +19,7 @@
 //! | [`detector`] | what makes such masks: a command, or models |
 //! | [`instance_views`] | which views show an object best, and what they show of it |
 //! | [`words`] | words of a text, matched with the names of objects |
+//! | [`evaluation`] | scores of a scene on a capture, as they are reported |
 //! | [`ground_truth`] | exported motion against known motion |
 //! | `report` | reports as JSON: where they go |
 //! | `moment` | times as they are typed |
@@ -34,6 +35,7 @@ pub mod destination;
 pub mod detector;
 mod endings;
 pub mod error;
+pub mod evaluation;
 pub mod formats;
 pub mod ground_truth;
 pub mod instance_views;

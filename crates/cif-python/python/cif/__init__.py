@@ -8,6 +8,8 @@ Captures, trained scenes and stages are also here as objects with numpy arrays::
     field = cif.train("captures/table", "table.cif", preset="draft", callback=print)
     name, time_index, camera = field.cameras[0]
     picture = field.render(camera, field.times[time_index])["color"]
+    path = field.trajectory("red mug")["translations"]
+    scores = cif.evaluate(field, "captures/table")
     field.export("table.usdc")
     edited, changes = cif.import_scene("table.usdc", base=field)
     cif.query_stage("table.usdc", "red mug", time_code=12)
@@ -18,14 +20,18 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
+import cif4d
+
 from . import _native, _schema
 from ._native import (
     Camera,
     CifError,
     Dataset,
     Field,
+    Picture,
     __version__,
     diff,
+    evaluate,
     import_scene,
     open_dataset,
     query_stage,
@@ -38,8 +44,10 @@ __all__ = [
     "CifError",
     "Dataset",
     "Field",
+    "Picture",
     "__version__",
     "diff",
+    "evaluate",
     "import_scene",
     "open_dataset",
     "query_stage",
@@ -48,6 +56,7 @@ __all__ = [
     "usd_version",
 ]
 
+cif4d.warn()
 _schema.register()
 
 

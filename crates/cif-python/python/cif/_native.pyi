@@ -1,4 +1,4 @@
-"""Types and documentation of the native half of cif.
+"""Types and documentation of the native half of cif; docstrings come from the Rust code (`make stubs`).
 
 Conventions: right-handed world in metres; cameras look along +z with x right and y down; quaternions are
 (w, x, y, z); times are normalised to [0, 1]; time codes are captured frame numbers; colours are as captured.
@@ -75,6 +75,8 @@ class Dataset:
         self, index: int, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     ) -> dict[str, NDArray[Any] | None]:
         """Load image uint8 [H, W, 3] and mask uint16 [H, W] (None without one); alpha goes onto background."""
+    def show(self, index: int = 0, *, what: Literal["rgb", "instance-color"] = "rgb") -> Picture: ...
+    def _repr_html_(self) -> str: ...
     def summary(self) -> dict[str, Any]:
         """Return counts of everything, for a first look."""
 
@@ -202,8 +204,18 @@ class Field:
         color [H, W, 3] and alpha; depth in metres; label (index into instances plus 1, 0 for none),
         probability, coverage, foreground and entropy where the field has identities.
         """
+    def show(
+        self,
+        view: int | Camera | None = None,
+        time: float | None = None,
+        *,
+        what: Literal["rgb", "instance-color", "depth-color"] = "rgb",
+    ) -> Picture:
+        """Render a view as a picture."""
+    def _repr_html_(self) -> str: ...
     def query(self, points: NDArray[np.float64], time: float = 0.0) -> dict[str, NDArray[Any]]:
         """Tell what is at points [P, 3]: existence [P], instance [P] (-1 for none), probabilities [P, K]."""
+    def trajectory(self, label: str) -> dict[str, Any]: ...
     def find(self, label: str, time_code: float | None = None) -> list[dict[str, Any]]:
         """Return objects by label, class or name (see LabelPattern): path, transform, low, high."""
     def export(
@@ -227,6 +239,14 @@ class Field:
         answer holds the motion table, sizes and warnings. A file that cif did not write is only replaced with
         force.
         """
+
+class Picture:
+    """An 8-bit RGB picture."""
+
+    @property
+    def pixels(self) -> NDArray[np.uint8]: ...
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None: ...
+    def _repr_png_(self) -> bytes: ...
 
 def main(arguments: Sequence[str | os.PathLike[str]]) -> int:
     """Run the command line in a process that is nothing but the command, which takes its signals."""
@@ -268,6 +288,16 @@ def train(
     An output that exists is refused without force or resume. Raises CifError when the capture, a setting or the
     output is not as it should be. Other Python threads run meanwhile.
     """
+
+def evaluate(
+    scene: Field | str | os.PathLike[str],
+    capture: Dataset | str | os.PathLike[str],
+    *,
+    split: Literal["val", "train"] = "val",
+    masks: str | os.PathLike[str] | None = None,
+    downscale: int | None = None,
+) -> dict[str, Any]:
+    """Score a scene."""
 
 def open_dataset(
     path: str | os.PathLike[str],

@@ -2,6 +2,7 @@
 
 pub mod label_pattern;
 pub mod search;
+pub mod trajectory;
 
 use cif_dataset::meant::known_names;
 use cif_geometry::Bounds;

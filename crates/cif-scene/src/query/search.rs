@@ -177,27 +177,38 @@ pub fn search(
     place: &str,
     path: impl Fn(&str) -> String,
 ) -> Result<Vec<ObjectMatch>, QueryError> {
-    let label_query = wanted.label_query();
-    let matcher = label_query.as_ref().map(LabelQuery::matcher);
+    let nodes = labelled(graph, wanted, place)?;
     let codes = &graph.time_codes;
     let sampled = sampled_codes(wanted.when, codes.start(), codes.end());
     let at = match wanted.when {
         When::Default => codes.start(),
         When::At(code) | When::Over(code, _) => code,
     };
-    let (mut known, mut labelled, mut found) = (Vec::new(), false, Vec::new());
+    Ok(nodes.into_iter().filter_map(|node| describe(graph, node, wanted, at, &sampled, &path)).collect())
+}
+
+/// Nodes that carry the label of a query, in the order of the graph; `place` names the scene in errors.
+///
+/// # Errors
+/// When no node carries the label.
+pub(super) fn labelled<'a>(
+    graph: &'a SceneGraph,
+    wanted: &ObjectQuery,
+    place: &str,
+) -> Result<Vec<&'a Node>, QueryError> {
+    let label_query = wanted.label_query();
+    let matcher = label_query.as_ref().map(LabelQuery::matcher);
+    let (mut known, mut found) = (Vec::new(), Vec::new());
     for node in &graph.nodes {
         let names: Vec<&String> =
             all_names(node).filter_map(|(taxonomy, name)| wanted.counts(taxonomy).then_some(name)).collect();
-        let carries = names.iter().any(|name| matcher.as_ref().is_none_or(|pattern| pattern.matches(name)));
-        known.extend(names.into_iter().cloned());
-        labelled |= carries;
-        if carries && let Some(object) = describe(graph, node, wanted, at, &sampled, &path) {
-            found.push(object);
+        if names.iter().any(|name| matcher.as_ref().is_none_or(|pattern| pattern.matches(name))) {
+            found.push(node);
         }
+        known.extend(names.into_iter().cloned());
     }
     match label_query {
-        Some(label_query) if !labelled => Err(label_query.unknown(place, known)),
+        Some(label_query) if found.is_empty() => Err(label_query.unknown(place, known)),
         _ => Ok(found),
     }
 }

@@ -5,13 +5,13 @@ use std::path::PathBuf;
 use cif_dataset::Split;
 use cif_field::Field;
 use cif_train::heads::Decoder;
-use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, Scores, evaluate};
+use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, evaluate};
 use clap::{Args, ValueEnum};
-use serde_json::{Value, json};
 
-use super::eval_motion::{self, Motion};
+use super::eval_motion;
 use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
 use crate::error::Error;
+use crate::evaluation::{label_of, report_of};
 use crate::messages::outcome;
 use crate::output::Outputs;
 use crate::pictures::{
@@ -137,7 +137,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
             motion.print();
         }
     };
-    command.report.give(|| to_json(&evaluation, motion.as_ref(), &field, labels_by), print)?;
+    command.report.give(|| report_of(&evaluation, motion.as_ref(), &field, labels_by), print)?;
     if let Some(folder) = &command.images {
         outcome!("pictures in {}", folder.display());
     }
@@ -159,73 +159,6 @@ fn panel(view: &FrameView<'_>) -> Picture {
     pictures.push(error_picture(&view.rendered.color, truth));
     pictures.extend(view.rendered.depth.as_ref().map(depth_picture));
     side_by_side(&pictures)
-}
-
-fn to_json(
-    evaluation: &Evaluation,
-    motion: Option<&Motion>,
-    field: &Field,
-    head: Option<&'static str>,
-) -> Value {
-    let mut report = scores_json(&evaluation.overall, field);
-    let groups: serde_json::Map<String, Value> =
-        evaluation.groups.iter().map(|(name, scores)| (name.clone(), scores_json(scores, field))).collect();
-    let run = field.record.run.clone().unwrap_or_default();
-    report["groups"] = Value::Object(groups);
-    report["per_frame"] = json!(evaluation.frames);
-    report["motion"] = json!(motion);
-    report["labels_by"] = json!(head.unwrap_or("identity rows"));
-    report["gaussians"] = json!(evaluation.gaussians);
-    report["frames_with_exposure"] = json!(evaluation.exposed_frames);
-    report["render_ms_per_frame"] = json!(evaluation.render_ms_per_frame);
-    report["train"] = json!({
-        "wall_s": run.wall_s,
-        "iterations": run.iterations,
-        "preset": run.preset,
-        "peak_rss_mb": run.peak_rss_mb,
-        "seed": run.seed,
-    });
-    report
-}
-
-fn scores_json(scores: &Scores, field: &Field) -> Value {
-    let instance = &scores.instance;
-    let instances: Vec<Value> = instance
-        .instances
-        .iter()
-        .map(|score| {
-            let mut value = json!(score);
-            value["label"] = json!(label(field, score.id));
-            value
-        })
-        .collect();
-    json!({
-        "frames": scores.frames,
-        "psnr": scores.psnr,
-        "psnr_covisible": scores.psnr_covisible,
-        "covisible": scores.covisible,
-        "ssim": scores.ssim,
-        "macc_pix": instance.macc_pix,
-        "macc_inst": instance.macc_inst,
-        "miou": instance.miou,
-        "variants": {
-            "psnr_infinite": scores.psnr_infinite,
-            "macc_pix_pooled": instance.macc_pix_pooled,
-            "macc_inst_pooled": instance.macc_inst_pooled,
-            "miou_per_instance_first": instance.miou_per_instance_first,
-            "miou_with_fp": instance.miou_with_fp,
-            "miou_all_pixels": instance.miou_all_pixels,
-            "tube_iou": instance.tube_iou,
-            "id_switches_per_100": instance.id_switches_per_100,
-            "association_quality": instance.association_quality,
-        },
-        "instances": instances,
-    })
-}
-
-fn label(field: &Field, id: u16) -> String {
-    let known = field.instances.iter().find(|instance| instance.id == id);
-    known.map_or_else(|| format!("instance_{id} (not trained)"), |instance| instance.label.clone())
 }
 
 fn print_table(evaluation: &Evaluation, field: &Field) {
@@ -253,7 +186,7 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
         for score in &evaluation.overall.instance.instances {
             table.add_row([
                 score.id.to_string(),
-                label(field, score.id),
+                label_of(field, score.id),
                 score.frames.to_string(),
                 number(score.iou, 2),
                 number(score.accuracy, 2),

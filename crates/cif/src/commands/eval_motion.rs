@@ -1,27 +1,14 @@
 //! Motion in `cif eval`: the scene graph as `cif export` would write it, against followed points.
 
-use std::time::Instant;
-
 use cif_dataset::{Dataset, MotionTruth};
 use cif_field::Field;
-use cif_scene::motion_scores::{MotionErrors, MotionScores, motion_scores};
-use cif_scene::{SceneError, SceneOptions};
-use serde::Serialize;
+use cif_scene::motion_scores::MotionErrors;
 
 use super::eval::number;
 use crate::error::Error;
+use crate::evaluation::{Motion, motion_of};
 
-/// Measured motion of a scene.
-#[derive(Debug, Serialize)]
-pub(super) struct Motion {
-    #[serde(flatten)]
-    scores: MotionScores,
-    /// Wall-clock time of building the scene graph and measuring it.
-    seconds: f64,
-}
-
-/// Builds the scene graph of a field and measures its motion; `None`, with a warning, where there is nothing to
-/// export.
+/// Measures the motion of a scene; `None`, with a warning, where there is nothing to measure.
 ///
 /// # Errors
 /// When a mask cannot be decoded, or the field is inconsistent.
@@ -30,26 +17,8 @@ pub(super) fn measure(
     dataset: &Dataset,
     truth: &MotionTruth,
 ) -> Result<Option<Motion>, Error> {
-    let start = Instant::now();
-    // Stand-ins and colliders are not measured.
-    let options = SceneOptions { proxy_points: 0, hulls_per_instance: 0, ..SceneOptions::default() };
-    let graph = match cif_scene::build(field, &options) {
-        Ok(graph) => graph,
-        Err(error @ SceneError::NoGaussians { .. }) => {
-            eprintln!("warning: motion is not measured: {error}");
-            return Ok(None);
-        }
-        Err(error) => return Err(Error::plain(error)),
-    };
-    let seen = truth.seen_steps(dataset).map_err(Error::plain)?;
-    let scores = motion_scores(&graph, truth, &seen);
-    if scores.moving.is_none() && scores.resting.is_none() {
-        eprintln!(
-            "warning: motion is not measured: no instance with followed points is in the scene and seen at two times"
-        );
-        return Ok(None);
-    }
-    Ok(Some(Motion { scores, seconds: start.elapsed().as_secs_f64() }))
+    let measured = motion_of(field, dataset, truth)?;
+    Ok(measured.inspect_err(|reason| eprintln!("warning: motion is not measured: {reason}")).ok())
 }
 
 /// Headings of [`Motion::rows`].

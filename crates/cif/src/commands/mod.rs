@@ -31,7 +31,7 @@ mod plan;
 mod query;
 mod render;
 mod render_files;
-mod scene;
+pub(crate) mod scene;
 mod targets;
 mod train;
 mod train_budget;

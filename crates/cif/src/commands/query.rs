@@ -2,6 +2,7 @@
 
 mod by_masks;
 mod by_text;
+mod trajectory;
 
 use std::path::PathBuf;
 
@@ -16,7 +17,8 @@ use super::scene;
 use crate::error::Error;
 use crate::formats::Content;
 use crate::moment::{Frames, Interval, Moment, note_fraction};
-use crate::report::OnlyReport;
+use crate::output::Outputs;
+use crate::report::Report;
 
 const HELP: &str = "\
 Without conditions every object is listed; several conditions must all hold. Labels match the name,
@@ -35,6 +37,14 @@ seconds after the first frame or a share of the whole.
   cif query table.glb --box -0.2,-0.2,0,0.2,0.2,0.3
   cif query table.cif --label '*box' --json
   cif query table.cif --point 0.1,0.2,0.05 --time 50%
+
+Paths: object, label and class; the frame (time code), the time from 0 to 1 and in seconds; the origin of
+the object's frame (x, y, z; world units) and its rotation (quaternion qw, qx, qy, qz; from its own axes to
+the world's, unturned at the first frame); visible, 0 while it is hidden. Parts go with the largest one,
+and what bends has the path of the rigid body that fits it best.
+
+  cif query table.cif --label 'red mug' --trajectory mug.csv
+  cif query table.usda --trajectory
 
 By words: with --models, the objects whose embeddings (cif embed) are nearest to the text; those with a
 * are nearer to it than to texts of anything. Else those that have most of the words in their names.
@@ -58,7 +68,7 @@ CAPTURE/.cif-cache. Or a command of your own makes them.
   cif query table.cif --prompt 'steel jug' --capture captures/table \\
       --detector 'python detect.py --text {prompt} --in {frames} --out {masks}'
 
-Models are run by ONNX Runtime (pip install 'cif[vision]', or ORT_DYLIB_PATH); nothing is downloaded.
+Models are run by ONNX Runtime (pip install 'cif4d[vision]', or ORT_DYLIB_PATH); nothing is downloaded.
 Their folder has a file such as this, with the names of your exports:
 
 ";
@@ -116,14 +126,28 @@ pub(super) struct Query {
     /// Read layers that a stage brings in from outside its folder
     #[arg(long)]
     follow_external: bool,
+    /// Write the path of every object found, a row per captured frame, as CSV [default: to stdout]
+    #[arg(
+        long,
+        value_name = "FILE.csv",
+        num_args = 0..=1,
+        default_missing_value = "-",
+        conflicts_with_all = ["json", "time", "interval", "point", "region", "text", "masks", "prompt"]
+    )]
+    trajectory: Option<PathBuf>,
     #[command(flatten)]
-    report: OnlyReport,
+    report: Report,
+    /// Replace an existing file of --json or --trajectory
+    #[arg(long)]
+    force: bool,
     #[command(flatten)]
     by_masks: by_masks::ByMasks,
 }
 
 pub(super) fn run(command: &Query) -> Result<(), Error> {
-    command.report.check([command.path.as_path()])?;
+    let mut outputs = Outputs::new(command.force);
+    outputs.reads(&command.path)?;
+    command.report.check(&mut outputs)?;
     if command.by_masks.is_asked() {
         return by_masks::run(command);
     }
@@ -135,6 +159,9 @@ pub(super) fn run(command: &Query) -> Result<(), Error> {
     }
     let is_field = matches!(Content::of(&command.path)?, Content::Field);
     let wanted = question(command)?;
+    if let Some(file) = &command.trajectory {
+        return trajectory::run(command, file, &wanted);
+    }
     if let (true, Some(place)) = (is_field, wanted.point) {
         let others = wanted.label.is_some() || wanted.region.is_some();
         if others || command.interval.is_some() || command.text.is_some() {

@@ -36,7 +36,7 @@ fn refuse_folder(path: &Path) -> Result<(), Error> {
 ///
 /// # Errors
 /// As [`load`], and when the head does not fit the scene.
-pub(super) fn load_with_head(path: &Path) -> Result<(Field, Option<Decoder>), Error> {
+pub fn load_with_head(path: &Path) -> Result<(Field, Option<Decoder>), Error> {
     refuse_folder(path)?;
     let Checkpoint { field, head, .. } = Checkpoint::load(path).map_err(Error::plain)?;
     let Some(head) = head else { return Ok((field, None)) };

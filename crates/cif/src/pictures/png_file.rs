@@ -23,6 +23,21 @@ pub fn save_rgb(path: &Path, picture: &Picture) -> Result<(), Error> {
     file.finish()
 }
 
+/// An 8-bit RGB PNG in memory.
+///
+/// # Errors
+/// When the picture is empty.
+pub fn png_bytes(picture: &Picture) -> Result<Vec<u8>, Error> {
+    let failed = |error: png::EncodingError| Error::plain(format!("cannot encode a picture: {error}"));
+    let mut bytes = Vec::new();
+    let mut encoder = Encoder::new(&mut bytes, picture.width, picture.height);
+    encoder.set_color(ColorType::Rgb);
+    encoder.set_depth(BitDepth::Eight);
+    let mut writer = encoder.write_header().map_err(failed)?;
+    writer.write_image_data(picture.pixels.as_flattened()).and_then(|()| writer.finish()).map_err(failed)?;
+    Ok(bytes)
+}
+
 /// Writes a 16-bit grey PNG; missing folders on the way are made.
 ///
 /// # Errors

@@ -1,0 +1,55 @@
+"""Everything public is documented at run time, and the stub has the same names, parameters and words."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import inspect
+from pathlib import Path
+
+import cif
+import cif.usd
+import pytest
+from cif import _native
+
+PACKAGE = Path(__file__).parents[2] / "crates" / "cif-python"
+spec = importlib.util.spec_from_file_location("stubs", PACKAGE / "stubs.py")
+stubs = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(stubs)
+
+
+@pytest.mark.parametrize("name", sorted(stubs.public(_native)))
+def test_help_has_words(name: str) -> None:
+    value = stubs.public(_native)[name]
+    text = inspect.getdoc(value) or ""
+    assert len(text) > 15 and text.split("\n")[0].endswith("."), f"{name}: {text!r}"
+
+
+def test_python_itself_is_documented() -> None:
+    for module in [cif, cif.usd]:
+        for name in module.__all__:
+            if name != "__version__":
+                assert inspect.getdoc(getattr(module, name)), name
+
+
+def test_the_stub_says_the_same() -> None:
+    stub = stubs.STUB.read_text()
+    assert stubs.with_docs(stub, _native) == stub, "run `make stubs`"
+
+
+def test_the_stub_has_the_same_names_and_parameters() -> None:
+    nodes = stubs.documented(ast.parse(stubs.STUB.read_text()), _native)
+    public = stubs.public(_native)
+    assert set(nodes) == set(public)
+    for name, node in nodes.items():
+        if isinstance(node, ast.ClassDef) or inspect.isgetsetdescriptor(public[name]):
+            continue
+        value = public[name].__func__ if isinstance(public[name], staticmethod) else public[name]
+        parameters = list(inspect.signature(value).parameters.values())
+        arguments = node.args
+        by_name = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+        by_place = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]
+        assert by_name == [argument.arg for argument in arguments.kwonlyargs], name
+        assert by_place == [argument.arg for argument in arguments.args], name
+        defaults = [default for default in [*arguments.defaults, *arguments.kw_defaults] if default]
+        assert sum(p.default is not p.empty for p in parameters) == len(defaults), name
