@@ -2,15 +2,15 @@
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use crate::support::{Scene, capture, small_config, stopped_after, train, without_record};
 use cif_field::{Field, Gaussians};
 use cif_train::config::InstanceGeometry;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, evaluate};
 use cif_train::{
-    Ablation, Clock, Control, Outcome, Seconds, Stage, Start, Stop, TrainConfig, TrainError, TrainEvent,
-    Trainer,
+    Ablation, Clock, Control, Outcome, Phase, Phases, Seconds, Stage, Start, Stop, TrainConfig, TrainError,
+    TrainEvent, Trainer,
 };
 
 fn assert_equal(a: &Field, b: &Field) {
@@ -115,9 +115,20 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
     // Each part of the run is stopped at one of its first questions, later where it would come no further.
     let (mut state, mut stopped, mut limit) = (None::<cif_field::Checkpoint>, Vec::new(), FIRST);
     let finished = (0..500).find_map(|_| {
-        let asked = Arc::new(AtomicU32::new(0));
-        let stop = Stop::when(move || asked.fetch_add(1, Ordering::Relaxed) >= limit);
-        let start = Start { dataset: dataset.clone(), phases: stop.into() };
+        // Fits ask at every step, so that it takes many of their questions to come anywhere.
+        let (asked, fits) = (AtomicU32::new(0), Arc::new(AtomicBool::new(false)));
+        let is_fitting = Arc::clone(&fits);
+        let stop = Stop::when(move || {
+            let most = if is_fitting.load(Ordering::Relaxed) { 2_000 * limit } else { limit };
+            asked.fetch_add(1, Ordering::Relaxed) >= most
+        });
+        let phases = Phases::from(stop).reported_to(move |event| {
+            if let TrainEvent::PhaseStarted { phase, .. } = event {
+                fits.store(matches!(phase, Phase::Search | Phase::Objects), Ordering::Relaxed);
+            }
+            Control::Continue
+        });
+        let start = Start { dataset: dataset.clone(), phases };
         let begun = match state.clone() {
             None => Trainer::new(start, config.clone()),
             Some(state) => Trainer::resume(start, state),
@@ -125,7 +136,7 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
         let mut trainer = match begun {
             Ok(trainer) => trainer,
             Err(TrainError::Stopped) => {
-                limit *= 2;
+                limit += 5;
                 return None;
             }
             Err(error) => panic!("{error}"),
@@ -138,7 +149,7 @@ fn a_run_may_be_stopped_inside_everything_it_does() {
         let checkpoint = trainer.checkpoint(true);
         let progress = checkpoint.training.as_ref().unwrap().json["progress"].clone();
         let place = (trainer.stage(), trainer.iteration(), progress["after_step"].clone());
-        limit = if stopped.last() == Some(&place) { 2 * limit } else { FIRST };
+        limit = if stopped.last() == Some(&place) { limit + 5 } else { FIRST };
         stopped.push(place);
         state = Some(checkpoint);
         None
