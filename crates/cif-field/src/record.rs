@@ -268,7 +268,11 @@ mod tests {
             assert_eq!(json[key], older[key], "{key}");
         }
         for (key, value) in older["train"].as_object().unwrap() {
-            let moved = if key == "exposures" { &json["drawing"][key] } else { &json["train"][key] };
+            let moved = match key.as_str() {
+                "exposures" => &json["drawing"][key],
+                "wall_s_by_stage" => &json["train"]["wall_s_by_phase"],
+                _ => &json["train"][key],
+            };
             assert_eq!(moved, value, "{key}");
         }
         assert_eq!(Record::from_json(Value::Null).unwrap().to_json(), json!({}));

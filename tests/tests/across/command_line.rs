@@ -232,7 +232,10 @@ fn outputs_are_checked_before_training() {
     fs::write(path.join("kept.cif"), "precious").unwrap();
     cif(path, "train table -o a.cif --from kept.cif").fails(1, &["kept.cif"]);
     cif(path, "train table -o kept.cif").fails(1, &["kept.cif exists", "--force"]);
-    cif(path, "train table -o a.cif --log kept.cif").fails(1, &["kept.cif exists"]);
+    cif(path, "train table -o a.cif --log kept.cif").fails(2, &["kept.jsonl"]);
+    fs::write(path.join("kept.jsonl"), "precious").unwrap();
+    cif(path, "train table -o a.cif --log kept.jsonl").fails(1, &["kept.jsonl exists"]);
+    assert_eq!(fs::read_to_string(path.join("kept.jsonl")).unwrap(), "precious");
     fs::write(path.join("b.train.toml"), "# mine").unwrap();
     cif(path, "train table -o b.cif").fails(1, &["b.train.toml exists"]);
     assert_eq!(fs::read_to_string(path.join("kept.cif")).unwrap(), "precious");

@@ -49,6 +49,12 @@ pub(super) struct Check {
 }
 
 pub(super) fn run(command: &Check) -> Result<(), Error> {
+    if command.force && command.fix.is_none() && !command.report.is_asked() {
+        return Err(Error::usage(
+            "--force replaces the files of --fix and --json, of which none is given",
+            "leave it out, or add --fix OUT.cif",
+        ));
+    }
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
     command.fix.as_deref().map_or(Ok(()), |target| outputs.file(target))?;

@@ -74,7 +74,11 @@ impl Check {
         if targets.iter().next().is_none() {
             return Err(Error::usage(
                 "--check reads what was written",
-                "name a file to write as well, for example OUT.usda",
+                if cfg!(feature = "usd") {
+                    "name a file to write as well, for example OUT.usda (or --usd, --gltf)"
+                } else {
+                    "name a file to write as well, for example OUT.glb (or --gltf)"
+                },
             ));
         }
         let options = writing.without_moment(false);
