@@ -25,7 +25,8 @@ def public(module: ModuleType) -> dict[str, object]:
         found[name] = value
         if inspect.isclass(value) and not issubclass(value, Exception):
             members = [member for member in vars(value) if not member.startswith("_")]
-            found |= {f"{name}.{member}": vars(value)[member] for member in members}
+            # Through the class, which takes what is static out of its wrapping.
+            found |= {f"{name}.{member}": getattr(value, member) for member in members}
     return found
 
 
@@ -56,13 +57,10 @@ def docstring(text: str, indent: int) -> list[str]:
 def with_docs(stub: str, module: ModuleType) -> str:
     """Return the stub with the docstrings of the module."""
     lines = stub.split("\n")
-    nodes = documented(ast.parse(stub), module)
+    nodes, values = documented(ast.parse(stub), module), public(module)
     # From the end, so that line numbers hold.
     for name, node in sorted(nodes.items(), key=lambda entry: -entry[1].lineno):
-        value = module
-        for part in name.split("."):
-            value = inspect.getattr_static(value, part) if inspect.isclass(value) else getattr(value, part)
-        text = inspect.cleandoc(value.__doc__ or "")
+        text = inspect.cleandoc(values[name].__doc__ or "")
         first = node.body[0]
         new = docstring(text, node.col_offset + 4)
         before = lines[first.lineno - 1][: first.col_offset]

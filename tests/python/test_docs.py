@@ -44,8 +44,7 @@ def test_the_stub_has_the_same_names_and_parameters() -> None:
     for name, node in nodes.items():
         if isinstance(node, ast.ClassDef) or inspect.isgetsetdescriptor(public[name]):
             continue
-        value = public[name].__func__ if isinstance(public[name], staticmethod) else public[name]
-        parameters = list(inspect.signature(value).parameters.values())
+        parameters = list(inspect.signature(public[name]).parameters.values())
         arguments = node.args
         by_name = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
         by_place = [p.name for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)]

@@ -53,13 +53,13 @@ impl Camera {
         Ok(Self { inner })
     }
 
-    /// Width, pixels.
+    /// Width of the image, pixels.
     #[getter]
     fn width(&self) -> u32 {
         self.inner.width
     }
 
-    /// Height, pixels.
+    /// Height of the image, pixels.
     #[getter]
     fn height(&self) -> u32 {
         self.inner.height
