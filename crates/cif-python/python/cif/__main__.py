@@ -17,4 +17,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    import cif4d
+
+    broken = cif4d.problem()
+    sys.exit(f"Error: {broken}" if broken else main())

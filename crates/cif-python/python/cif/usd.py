@@ -12,10 +12,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Union
 
 from ._native import CifError, LabelPattern
+
+if find_spec("pxr") is None:
+    raise ImportError("cif.usd needs USD, which is not installed: pip install 'cif4d[usd]'", name="pxr")
 
 if TYPE_CHECKING:
     from pxr import Usd
