@@ -43,6 +43,11 @@ def documented(tree: ast.Module, module: ModuleType) -> dict[str, ast.ClassDef |
     return found
 
 
+def words(value: object) -> str:
+    """Return the docstring of a function, also of a static method, a class or an attribute."""
+    return inspect.cleandoc(getattr(value, "__func__", value).__doc__ or "")
+
+
 def docstring(text: str, indent: int) -> list[str]:
     """Return the lines of a docstring."""
     space = " " * indent
@@ -57,12 +62,10 @@ def with_docs(stub: str, module: ModuleType) -> str:
     """Return the stub with the docstrings of the module."""
     lines = stub.split("\n")
     nodes = documented(ast.parse(stub), module)
+    things = public(module)
     # From the end, so that line numbers hold.
     for name, node in sorted(nodes.items(), key=lambda entry: -entry[1].lineno):
-        value = module
-        for part in name.split("."):
-            value = inspect.getattr_static(value, part) if inspect.isclass(value) else getattr(value, part)
-        text = inspect.cleandoc(value.__doc__ or "")
+        text = words(things[name])
         first = node.body[0]
         new = docstring(text, node.col_offset + 4)
         before = lines[first.lineno - 1][: first.col_offset]

@@ -19,7 +19,11 @@ class CifError(Exception):
     """A file, capture, field or stage is not as it should be; the message names it and the way out."""
 
 class Camera:
-    """A pinhole camera; the centre of the first pixel is (0.5, 0.5)."""
+    """A pinhole camera: x right, y down, z forward; the centre of the first pixel is (0.5, 0.5).
+
+    Width, height, focal lengths and principal point are in pixels; camera_from_world is a `[4, 4]` pose. By
+    default the principal point is the middle of the image, and the pose the identity.
+    """
 
     def __init__(
         self,
@@ -31,15 +35,20 @@ class Camera:
     ) -> None:
         """Make a camera from pixels and a [4, 4] pose; by default central principal point, identity."""
     @property
-    def width(self) -> int: ...
+    def width(self) -> int:
+        """Width, pixels."""
     @property
-    def height(self) -> int: ...
+    def height(self) -> int:
+        """Height, pixels."""
     @property
-    def focal(self) -> tuple[float, float]: ...
+    def focal(self) -> tuple[float, float]:
+        """Focal lengths (x, y), pixels."""
     @property
-    def principal(self) -> tuple[float, float]: ...
+    def principal(self) -> tuple[float, float]:
+        """Principal point (x, y), pixels."""
     @property
-    def camera_from_world(self) -> NDArray[np.float64]: ...
+    def camera_from_world(self) -> NDArray[np.float64]:
+        """Pose, float64 `[4, 4]`: takes column vectors of the world to the camera; read-only."""
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view at another resolution."""
 
@@ -47,15 +56,20 @@ class Dataset:
     """A capture, understood: frames, cameras, times, masks, instances, initial points."""
 
     @property
-    def root(self) -> Path: ...
+    def root(self) -> Path:
+        """Folder of the capture."""
     @property
-    def layout(self) -> str: ...
+    def layout(self) -> str:
+        """Layout that the folder was read as."""
     @property
-    def times(self) -> list[float]: ...
+    def times(self) -> list[float]:
+        """Captured times, normalised to [0, 1]."""
     @property
-    def instances(self) -> list[dict[str, Any]]: ...
+    def instances(self) -> list[dict[str, Any]]:
+        """id (value in the masks), label and category of every instance."""
     @property
-    def warnings(self) -> list[str]: ...
+    def warnings(self) -> list[str]:
+        """Oddities that were met when the capture was read."""
     @property
     def notes(self) -> list[str]:
         """Findings and decisions of reading, such as what is left out, one sentence each."""
@@ -64,18 +78,25 @@ class Dataset:
         """name, camera_name, time, time_index, split, group, image and mask of every frame."""
     @property
     def points(self) -> NDArray[np.float32]:
-        """Initial points [P, 3]."""
+        """Initial points, float32 `[P, 3]`; read-only."""
     @property
     def point_colors(self) -> NDArray[np.uint8]:
-        """Colours of the initial points [P, 3]."""
+        """Colours of the initial points, uint8 `[P, 3]`; read-only."""
     def __len__(self) -> int: ...
     def camera(self, index: int) -> Camera:
         """Return the camera of a frame."""
     def load_frame(
         self, index: int, background: tuple[float, float, float] = (1.0, 1.0, 1.0)
     ) -> dict[str, NDArray[Any] | None]:
-        """Load image uint8 [H, W, 3] and mask uint16 [H, W] (None without one); alpha goes onto background."""
-    def show(self, index: int = 0, *, what: Literal["rgb", "instance-color"] = "rgb") -> Picture: ...
+        """Load image, uint8 `[H, W, 3]`, and mask, uint16 `[H, W]` (None without one), of a frame.
+
+        What is transparent in the image shows the background.
+        """
+    def show(self, index: int = 0, *, what: Literal["rgb", "instance-color"] = "rgb") -> Picture:
+        """Draw a frame as a picture, which notebooks show.
+
+        what is "rgb" or "instance-color" (the mask in the colours of its instances).
+        """
     def _repr_html_(self) -> str: ...
     def summary(self) -> dict[str, Any]:
         """Return counts of everything, for a first look."""
@@ -127,7 +148,11 @@ class PlyOptions(TypedDict, total=False):
     """The frame that is written; by default the first."""
 
 class Field:
-    """A dynamic Gaussian field with instances: N Gaussians, K instances."""
+    """A dynamic Gaussian field with instances: N Gaussians, K instances, T captured times.
+
+    A field does not change: its arrays are copies that numpy refuses to write to. To change one, copy it, and
+    make a field of arrays with `from_arrays`.
+    """
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> Field:
@@ -152,57 +177,61 @@ class Field:
     ) -> Field:
         """Make a static field.
 
-        [N, 3] means, standard deviations and colours, [N, 4] quaternions, [N] opacities and occupancies
-        (opacities by default), [N, K] identity probabilities, where what a row lacks of 1 belongs to no
-        instance; instances have id, label and category; cameras are (name, index into times, camera).
+        means, scales (standard deviations) and colors are float32 `[N, 3]`, quaternions `[N, 4]`, opacities and
+        occupancies (opacities by default) `[N]`, identities `[N, K]` probabilities, where what a row lacks of 1
+        belongs to no instance. instances have id, label and category; cameras are (name, index into times,
+        camera).
         """
     def __len__(self) -> int: ...
     @property
     def means(self) -> NDArray[np.float32]:
-        """Canonical centres [N, 3]."""
+        """Centres before any motion, float32 `[N, 3]`, in the frame of the field; read-only."""
     @property
     def scales(self) -> NDArray[np.float32]:
-        """Canonical standard deviations [N, 3]."""
+        """Standard deviations along the axes before any motion, float32 `[N, 3]`; read-only."""
     @property
     def quaternions(self) -> NDArray[np.float32]:
-        """Canonical quaternions [N, 4], not normalised."""
+        """Quaternions (w, x, y, z) before any motion, not normalised, float32 `[N, 4]`; read-only."""
     @property
     def opacities(self) -> NDArray[np.float32]:
-        """Opacities [N]."""
+        """Opacities in [0, 1], float32 `[N]`; read-only."""
     @property
     def occupancies(self) -> NDArray[np.float32]:
-        """Occupancies [N]."""
+        """Probabilities to exist, in [0, 1], float32 `[N]`; read-only."""
     @property
     def sh_coefficients(self) -> NDArray[np.float32]:
-        """Spherical harmonics [N, 16, 3]; those above sh_degree are not in use."""
+        """Spherical harmonics, float32 `[N, 16, 3]`; those above sh_degree are not in use; read-only."""
     @property
-    def sh_degree(self) -> int: ...
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics in use, 0 to 3."""
     @property
     def identities(self) -> NDArray[np.float32] | None:
-        """Identity probabilities [N, K]; None before identities were estimated."""
+        """Probability of every instance, float32 `[N, K]`, read-only; None before identities were estimated."""
     @property
     def instances(self) -> list[dict[str, Any]]:
-        """id, label and category of every instance."""
+        """id (value in the masks), label and category of every instance, in the order of identities."""
     @property
     def times(self) -> list[float]:
-        """Normalised captured times."""
+        """Captured times, normalised to [0, 1]."""
     @property
-    def frames_per_second(self) -> float: ...
+    def frames_per_second(self) -> float:
+        """Captured frames per second; the time code of frame k is k."""
     @property
     def cameras(self) -> list[tuple[str, int, Camera]]:
         """(name, index into times, camera) of every captured view."""
     @property
     def provenance(self) -> Any:
-        """How the field came about."""
+        """How the field came about: its run, settings and notes."""
     def at(self, time: float) -> dict[str, NDArray[np.float32]]:
-        """Return means, scales, quaternions and opacities moved to a time."""
+        """Return means, scales, quaternions and opacities as they are at a normalised time."""
     def render(
         self, camera: Camera, time: float = 0.0, *, depth: bool = True, instances: bool = True
     ) -> dict[str, NDArray[Any]]:
-        """Render a view.
+        """Render a view at a normalised time, as arrays.
 
-        color [H, W, 3] and alpha; depth in metres; label (index into instances plus 1, 0 for none),
-        probability, coverage, foreground and entropy where the field has identities.
+        color is float32 `[H, W, 3]` in [0, 1], alpha `[H, W]`, depth `[H, W]` in units of the field; where the
+        field has identities also label (index into instances plus 1, 0 for none), probability, coverage,
+        foreground and entropy, `[H, W]` each.
         """
     def show(
         self,
@@ -211,13 +240,40 @@ class Field:
         *,
         what: Literal["rgb", "instance-color", "depth-color"] = "rgb",
     ) -> Picture:
-        """Render a view as a picture."""
+        """Render a view as a picture, which notebooks show.
+
+        view is an index into cameras (by default the first), or a camera; time is normalised, by default that
+        of the view, or 0. what is "rgb", "instance-color" (the most probable instance of each pixel) or
+        "depth-color" (near is bright).
+        """
     def _repr_html_(self) -> str: ...
     def query(self, points: NDArray[np.float64], time: float = 0.0) -> dict[str, NDArray[Any]]:
-        """Tell what is at points [P, 3]: existence [P], instance [P] (-1 for none), probabilities [P, K]."""
-    def trajectory(self, label: str) -> dict[str, Any]: ...
+        """Answer what is at points at a normalised time.
+
+        points are float64 `[P, 3]` in the frame of the field. existence is `[P]`, instance `[P]` (index into
+        instances, -1 for none), probabilities `[P, K]`.
+        """
+    def trajectory(self, label: str) -> dict[str, Any]:
+        """Return the path of an object over all captured frames, as arrays.
+
+        label is as in find, and has to fit one object. The answer has instance (unique name), label and class;
+        time_codes (captured frame numbers), times (normalised) and seconds (time codes over frames_per_second),
+        float64 `[T]`; translations, float64 `[T, 3]`, the origin of the object's frame in the world of the
+        capture, in its units: at the first frame the middle of the object; rotations, float64 `[T, 4]`, unit
+        quaternions (w, x, y, z) from the object's frame to the world, the identity while it is turned as at the
+        first frame, and without jumps of sign; visible, bool `[T]`. An object of parts goes with its largest
+        part, one that bends with the rigid body that fits it best. Raises CifError where no object, or more
+        than one, carries the label.
+        """
     def find(self, label: str, time_code: float | None = None) -> list[dict[str, Any]]:
-        """Return objects by label, class or name (see LabelPattern): path, transform, low, high."""
+        """Return the objects that carry a label, each as a dictionary.
+
+        label is a label, class or unique name; `*` stands for any characters, `?` for one, and case does not
+        matter. Each has path, class, instance (unique name), label, transform (`[4][4]`, world from object, for
+        column vectors) and low and high, the corners of its box in the world of the capture, at a time code
+        (captured frame number, by default the first). The first call builds the scene graph, which the field
+        keeps. Raises CifError, with the labels there are, where nothing carries it.
+        """
     def export(
         self,
         path: str | os.PathLike[str],
@@ -229,30 +285,35 @@ class Field:
     ) -> dict[str, Any]:
         """Write the scene with one prim or node per object.
 
-        The ending decides the format: .usda, .usdc, .usdz (USD), .glb, .gltf (glTF) or .ply (splats).
-        glTF holds rigid motion only: what deforms leaves as a few rigid parts; the motion table says what that
+        The ending decides the format: .usda, .usdc, .usdz (USD), .glb, .gltf (glTF) or .ply (splats). glTF
+        holds rigid motion only: what deforms leaves as a few rigid parts; the motion table says what that
         misses. PLY holds all splats as they stand at one frame.
 
-        motion replaces the trained deformation by a function of time that returns means [N, 3] and quaternions
-        [N, 4]. options are those of the format, as in {"payloads": "separate"}; other keyword arguments are
-        options of the scene, whatever the format, as in tolerance="0.5%". Unknown ones raise ValueError. The
-        answer holds the motion table, sizes and warnings. A file that cif did not write is only replaced with
-        force.
+        motion replaces the trained deformation by a function of time that returns means `[N, 3]` and
+        quaternions `[N, 4]`. options are those of the format, as in {"payloads": "separate"}; other keyword
+        arguments are options of the scene, whatever the format, as in tolerance="0.5%". Unknown ones raise
+        ValueError. The answer holds the motion table, sizes and warnings. A file that cif did not write is only
+        replaced with force.
         """
 
 class Picture:
-    """An 8-bit RGB picture."""
+    """An 8-bit RGB picture, as drawn by `show`; notebooks show it."""
 
     @property
-    def pixels(self) -> NDArray[np.uint8]: ...
-    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None: ...
+    def pixels(self) -> NDArray[np.uint8]:
+        """Colours, uint8 `[H, W, 3]`; read-only."""
+    def save(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write a PNG file; one that exists is only replaced with force."""
     def _repr_png_(self) -> bytes: ...
 
 def main(arguments: Sequence[str | os.PathLike[str]]) -> int:
-    """Run the command line in a process that is nothing but the command, which takes its signals."""
+    """Run a command line in a process that is nothing but the command, which takes its signals."""
 
 def run(arguments: Sequence[str | os.PathLike[str]]) -> int:
-    """Run the command line; the first argument is the name of the program. Signals stay with the process."""
+    """Run a command line, whose first word is the name of the program, and return its exit code.
+
+    Signals stay with the process.
+    """
 
 def train(
     dataset: Dataset | str | os.PathLike[str],
@@ -269,21 +330,21 @@ def train(
 ) -> Field:
     """Train a field on a capture, and return it.
 
-    dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five
-    minutes, at the end of each stage and in the end, its settings beside it; without, it is only returned.
+    dataset is an opened capture or its folder. With output, a .cif file, the run is saved there every five minutes,
+    at the end of each stage and in the end, its settings beside it; without, it is only returned.
 
-    preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as
-    the capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are
-    single settings by their keys in the settings file, dotted or as dictionaries: {"stages.fine": 500} or
-    {"stages": {"fine": 500}}. seed makes runs repeatable: same seed and settings, same field. backend is "cpu",
-    "wgpu" (a GPU) or "auto".
+    preset is "draft", "standard" (the default) or "paper"; effects says which effects are trained, "auto" (as the
+    capture calls for), "all" or "none", then single ones on or off, as in "auto,-instances". settings are single
+    settings by their keys in the settings file, dotted or as dictionaries: {"stages.fine": 500} or {"stages":
+    {"fine": 500}}. seed makes runs repeatable: same seed and settings, same field. backend is "cpu", "wgpu" (a GPU)
+    or "auto".
 
-    callback is called in this thread with a dictionary for each event of the run; its "event" is
-    "stage_started", "step" (every report.step_every steps: stage, iteration, iterations, loss, psnr, gaussians,
-    eta_s), "evaluated", "warning", "finished" and more. When it returns False the run stops and the field as it
-    is then is returned. An exception in it stops the run and is raised, as is KeyboardInterrupt on Ctrl-C. In
-    all three cases the run is saved to output first, and resume=True goes on with it, with the settings of the
-    file.
+    callback is called in this thread with a dictionary for each event of the run; its "event" is "stage_started",
+    "step" (every report.step_every steps: stage, iteration, iterations, loss, psnr, gaussians, eta_s), "evaluated",
+    "note", "warning", "finished" and more. Work without steps is reported as "phase_started", "phase_progress" (phase,
+    done, total, elapsed_s, eta_s) and "phase_ended" (phase, wall_s, cpu_s), from the opening of the capture on. When it returns False the run stops and the field as it is then is returned. An
+    exception in it stops the run and is raised, as is KeyboardInterrupt on Ctrl-C. In all three cases the run is
+    saved to output first, and resume=True goes on with it, with the settings of the file.
 
     An output that exists is refused without force or resume. Raises CifError when the capture, a setting or the
     output is not as it should be. Other Python threads run meanwhile.
@@ -297,21 +358,37 @@ def evaluate(
     masks: str | os.PathLike[str] | None = None,
     downscale: int | None = None,
 ) -> dict[str, Any]:
-    """Score a scene."""
+    """Score a scene on frames of a capture: the scores of `cif eval --json`, as a dictionary.
+
+    scene is a field or a .cif file; a file that another head was trained on is scored by what that head
+    decodes. capture is an opened capture or its folder, which masks (a folder) and downscale (by default as
+    the scene was trained) say how to open. split is "val", the held-out frames, or "train".
+
+    The answer has frames (their number), psnr, psnr_covisible and covisible (percent of pixels), ssim,
+    macc_pix, macc_inst and miou (percent), variants (other definitions in use), instances (scores of each),
+    groups, per_frame, motion (against known motion, where the capture has it), gaussians,
+    render_ms_per_frame, train (of its run: wall_s, iterations and more), warnings, and seconds, which scoring
+    took by the clock of the wall. None means that there is nothing to measure. Ctrl-C raises
+    KeyboardInterrupt between two frames.
+    """
 
 def open_dataset(
     path: str | os.PathLike[str],
     masks: str | os.PathLike[str] | None = None,
     downscale: int | None = None,
 ) -> Dataset:
-    """Open a capture; masks name a folder inside it or anywhere."""
+    """Open a capture.
+
+    masks names a folder inside it or anywhere, by default "masks" where it has one; downscale reduces images
+    by 1, 2, 4 and so on, by default to the largest stored.
+    """
 
 class LabelPattern:
-    """A label to look for: ``*`` stands for any characters and ``?`` for one; case does not matter."""
+    """A label to look for: `*` stands for any characters and `?` for one; case does not matter."""
 
     def __init__(self, text: str) -> None: ...
     def matches(self, label: str) -> bool:
-        """Tell whether a label is spelled so."""
+        """Return True where a label is spelled so."""
 
 def query_stage(
     path: str | os.PathLike[str],
@@ -320,9 +397,10 @@ def query_stage(
     *,
     follow_external: bool = False,
 ) -> list[dict[str, Any]]:
-    """Return the prims that carry a label (see LabelPattern); an unknown label lists the known ones.
+    """Return the prims of a stage, or nodes of a glTF file, that carry a label, each as a dictionary.
 
-    Layers outside the folder of the stage are read with ``follow_external`` alone.
+    label is as in Field.find, and so are the answers; an unknown label lists the known ones. Layers outside
+    the folder of the stage are read with follow_external alone.
     """
 
 def import_scene(
@@ -330,17 +408,20 @@ def import_scene(
 ) -> tuple[Field, dict[str, Any] | None]:
     """Read a USD, glTF or PLY file as a field.
 
-    With ``base``, the field that the file was exported from, what was changed in the file is applied to it, and
-    the second value lists the edits as ``diff`` does; otherwise it is None. ``force_base`` takes a base that
-    the file was not exported from.
+    With base, the field that the file was exported from, what was changed in the file is applied to it, and
+    the second value lists the edits as diff does; otherwise it is None. force_base takes a base that the file
+    was not exported from.
     """
 
 def diff(before: str | os.PathLike[str], after: str | os.PathLike[str]) -> dict[str, Any]:
     """Compare two scenes, stages or glTF files object by object.
 
-    ``objects`` lists those that differ: what happened (``kind``), how far they moved over time, names, labels,
-    visibility, and counts of splats; ``unchanged`` counts the others.
+    objects lists those that differ: what happened (kind), how far they moved over time, names, labels,
+    visibility, and counts of splats; unchanged counts the others.
     """
 
 def usd_version() -> str:
-    """Return the version of the usd-core in use, e.g. 26.11."""
+    """Return the version of the USD in use, e.g. 26.11.
+
+    Raises CifError where there is none, or one older than 25.11.
+    """
