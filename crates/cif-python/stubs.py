@@ -25,8 +25,7 @@ def public(module: ModuleType) -> dict[str, object]:
         found[name] = value
         if inspect.isclass(value) and not issubclass(value, Exception):
             members = [member for member in vars(value) if not member.startswith("_")]
-            # Through the class, which takes what is static out of its wrapping.
-            found |= {f"{name}.{member}": getattr(value, member) for member in members}
+            found |= {f"{name}.{member}": vars(value)[member] for member in members}
     return found
 
 
@@ -44,6 +43,11 @@ def documented(tree: ast.Module, module: ModuleType) -> dict[str, ast.ClassDef |
     return found
 
 
+def words(value: object) -> str:
+    """Return the docstring of a function, also of a static method, a class or an attribute."""
+    return inspect.cleandoc(getattr(value, "__func__", value).__doc__ or "")
+
+
 def docstring(text: str, indent: int) -> list[str]:
     """Return the lines of a docstring."""
     space = " " * indent
@@ -57,10 +61,11 @@ def docstring(text: str, indent: int) -> list[str]:
 def with_docs(stub: str, module: ModuleType) -> str:
     """Return the stub with the docstrings of the module."""
     lines = stub.split("\n")
-    nodes, values = documented(ast.parse(stub), module), public(module)
+    nodes = documented(ast.parse(stub), module)
+    things = public(module)
     # From the end, so that line numbers hold.
     for name, node in sorted(nodes.items(), key=lambda entry: -entry[1].lineno):
-        text = inspect.cleandoc(values[name].__doc__ or "")
+        text = words(things[name])
         first = node.body[0]
         new = docstring(text, node.col_offset + 4)
         before = lines[first.lineno - 1][: first.col_offset]

@@ -121,9 +121,16 @@ def test_exceptions_and_ctrl_c_stop_save_and_are_raised(dataset: cif.Dataset, tm
     path = tmp_path / "b.cif"
     with pytest.raises(KeyboardInterrupt), ctrl_c(path):
         cif.train(dataset, path, settings=ENDLESS)
-    seen: list[dict[str, Any]] = []
-    assert len(cif.train(dataset, path, resume=True, callback=lambda event: bool(seen.append(event)))) > 0
-    assert seen[0]["event"] != "finished"
+    seen: list[str] = []
+
+    def until_a_stage(event: dict[str, Any]) -> bool:
+        seen.append(event["event"])
+        return event["event"] != "stage_started"
+
+    assert len(cif.train(dataset, path, resume=True, callback=until_a_stage)) > 0
+    assert seen[0] == "phase_started" and "finished" not in seen
+    with pytest.raises(cif.CifError, match="before the first step"):
+        cif.train(dataset, path, resume=True, callback=lambda event: False)
 
 
 def test_wrong_arguments_are_named(dataset: cif.Dataset, tmp_path: Path) -> None:

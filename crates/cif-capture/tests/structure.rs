@@ -120,7 +120,7 @@ fn shots(folder: &Path) -> Vec<Shot> {
 fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
     let (work, kept) = (folder.join(work), folder.join(format!("{work}-kept")));
     for folder in [&work, &kept] {
-        std::fs::create_dir_all(folder).unwrap();
+        std::fs::create_dir_all(folder).expect("a new folder");
     }
     let request = Request {
         shots,

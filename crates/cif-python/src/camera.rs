@@ -53,13 +53,13 @@ impl Camera {
         Ok(Self { inner })
     }
 
-    /// Width of the image, pixels.
+    /// Width, pixels.
     #[getter]
     fn width(&self) -> u32 {
         self.inner.width
     }
 
-    /// Height of the image, pixels.
+    /// Height, pixels.
     #[getter]
     fn height(&self) -> u32 {
         self.inner.height

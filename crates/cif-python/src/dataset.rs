@@ -66,7 +66,7 @@ impl Dataset {
         self.inner.times.clone()
     }
 
-    /// The id (value in the masks), label and category of every instance.
+    /// id (value in the masks), label and category of every instance.
     #[getter]
     fn instances<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::to_python(py, &self.inner.instances)

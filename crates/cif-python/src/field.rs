@@ -195,7 +195,7 @@ impl Field {
         Ok(Some(arrays::read_only(dense)))
     }
 
-    /// The id (value in the masks), label and category of every instance, in the order of identities.
+    /// id (value in the masks), label and category of every instance, in the order of identities.
     #[getter]
     fn instances<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         arrays::to_python(py, &self.inner.instances)

@@ -95,13 +95,6 @@ fn times_mean_the_same_in_a_scene_and_in_its_files() {
         assert_eq!(half, place(file, "50%"), "{file}");
         assert_ne!(half, place(file, "10"), "{file}: it moves");
     }
-    // What bends is rigid in glTF, so that places differ a little; the frame is the same.
-    let there = place("t.glb", "7");
-    let apart = |frame: &str| -> f64 {
-        place("t.cif", frame).iter().zip(&there).map(|(here, there)| (here - there).powi(2)).sum()
-    };
-    let off = apart("7");
-    assert!(off < apart("6") && off < apart("8"), "{off} {} {}", apart("6"), apart("8"));
     // Beyond the end the range is named, in frames and seconds.
     for file in ["t.cif", "t.glb"] {
         for line in [format!("query {file} --time 200"), format!("query {file} --interval 20:30")] {

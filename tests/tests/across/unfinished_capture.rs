@@ -13,7 +13,7 @@ const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
 
 const FRAMES: u32 = 14;
 
-/// Runs the command with a Python that gives the poses of `answer.json`, whatever it is asked.
+/// Runs the command with a Python that has an answer for each mapper, whatever the images.
 fn cif(folder: &Path, words: &[String]) -> Run {
     let python = format!("CIF_PYTHON={}", folder.join("python").display());
     run("env", folder, [python, CIF.to_owned()].iter().chain(words))
@@ -52,14 +52,25 @@ fn prepare(folder: &Path) -> bool {
     let model = json!({
         "cameras": { "1": { "model": "SIMPLE_RADIAL", "width": 96, "height": 64, "params": [90.0, 48.0, 32.0, 0.0] } },
         "images": (0..FRAMES).map(pose).collect::<Map<String, Value>>(),
-        "points": [], "reprojection_px": 0.5,
+        "points": [], "reprojection_px": 0.5, "fitting": 0.99,
     });
-    // Of one mapper alone, so that nothing confirms it.
-    let answer = json!({ "features": {}, "runs": [model, null] });
-    fs::write(folder.join("answer.json"), answer.to_string()).expect("the folder takes files");
+    // The incremental mapper finds nothing, so that nothing confirms the poses of the global one.
+    for (name, runs) in [("global", json!([model])), ("incremental", json!([null])), ("none", json!([]))] {
+        let answer = json!({ "features": {}, "runs": runs }).to_string();
+        fs::write(folder.join(format!("{name}.json")), answer).expect("the folder takes files");
+    }
     let python = folder.join("python");
-    fs::write(&python, format!("#!/bin/sh\ncat > {0}/job.json\ncat {0}/answer.json\n", folder.display()))
-        .expect("the folder takes files");
+    // One line is read: the input stays open as long as the command lives.
+    let script = r#"#!/bin/sh
+IFS= read -r job
+printf '%s' "$job" > DIR/job.json
+case "$job" in
+    *'"mapper":"global"'*) cat DIR/global.json ;;
+    *'"mapper":"incremental"'*) cat DIR/incremental.json ;;
+    *) cat DIR/none.json ;;
+esac
+"#;
+    fs::write(&python, script.replace("DIR", &folder.display().to_string())).expect("the folder takes files");
     fs::set_permissions(&python, fs::Permissions::from_mode(0o755)).expect("the file is there");
     true
 }

@@ -51,8 +51,9 @@ fn a_capture_becomes_a_scene_that_is_scored_rendered_and_queried() {
     let log = fs::read_to_string(path.join("run.jsonl")).unwrap();
     let events: Vec<Value> = log.lines().map(json).collect();
     let first = events.iter().find(|event| event["event"] != "warning").expect("there are events");
-    assert_eq!(first["event"], "stage_started");
-    assert_eq!(events.last().unwrap()["event"], "finished");
+    assert_eq!((&first["event"], &first["phase"]), (&"phase_started".into(), &"open".into()));
+    let finished = events.iter().position(|event| event["event"] == "finished").expect("the run finished");
+    assert!(events[finished..].iter().all(|event| event["event"] != "step"), "steps after the end");
     let settings = fs::read_to_string(path.join("scene.train.toml")).unwrap();
     assert!(settings.contains("fine = 350") && settings.contains("seed = 1"), "{settings}");
 

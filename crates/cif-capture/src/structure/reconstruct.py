@@ -60,9 +60,12 @@ def tell(done, total, words):
     print("@", done, total, words, file=sys.stderr, flush=True)
 
 
-def in_parts(things, size, done, words):
+def in_parts(job, things, size, done, words):
     """Yield a few things at a time, and show how many are done, of which some were before."""
     total = done + len(things)
+    if job["runs"] and not things:
+        # The job before this one has shown it.
+        return
     for start in range(0, len(things), size):
         tell(done + start, total, words)
         yield things[start : start + size]
@@ -85,7 +88,7 @@ def extract(pycolmap, job):
     if job["peak"]:
         options.sift.peak_threshold = job["peak"]
     done = len(keys) - len(missing)
-    for part in in_parts(missing, IMAGES * job["threads"], done, "features of images"):
+    for part in in_parts(job, missing, IMAGES * job["threads"], done, "features of images"):
         pycolmap.extract_features(
             database,
             job["pictures"],
@@ -192,7 +195,8 @@ def match(pycolmap, job, database):
     pairing.match_list_path = listed
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 1
-    for part in in_parts(missing, PAIRS, len(job["pairs"]) - len(missing), "matches of pairs of images"):
+    done = len(job["pairs"]) - len(missing)
+    for part in in_parts(job, missing, PAIRS, done, "matches of pairs of images"):
         listed.write_text("".join(f"{a} {b}\n" for a, b in part))
         pycolmap.match_image_pairs(
             database,

@@ -36,10 +36,10 @@ class Camera:
         """Make a camera from pixels and a [4, 4] pose; by default central principal point, identity."""
     @property
     def width(self) -> int:
-        """Width of the image, pixels."""
+        """Width, pixels."""
     @property
     def height(self) -> int:
-        """Height of the image, pixels."""
+        """Height, pixels."""
     @property
     def focal(self) -> tuple[float, float]:
         """Focal lengths (x, y), pixels."""
@@ -66,7 +66,7 @@ class Dataset:
         """Captured times, normalised to [0, 1]."""
     @property
     def instances(self) -> list[dict[str, Any]]:
-        """The id (value in the masks), label and category of every instance."""
+        """id (value in the masks), label and category of every instance."""
     @property
     def warnings(self) -> list[str]:
         """Oddities that were met when the capture was read."""
@@ -209,7 +209,7 @@ class Field:
         """Probability of every instance, float32 `[N, K]`, read-only; None before identities were estimated."""
     @property
     def instances(self) -> list[dict[str, Any]]:
-        """The id (value in the masks), label and category of every instance, in the order of identities."""
+        """id (value in the masks), label and category of every instance, in the order of identities."""
     @property
     def times(self) -> list[float]:
         """Captured times, normalised to [0, 1]."""
