@@ -4,8 +4,9 @@ use std::collections::BTreeSet;
 
 use strsim::damerau_levenshtein;
 
-/// Words of a name in lower case, without the number at the end of unique names.
+/// Words of a name in lower case, without the number at the end of unique names; of the path of a prim, its last part.
 fn words(name: &str) -> Vec<String> {
+    let name = if name.starts_with('/') { name.rsplit('/').next().unwrap_or(name) } else { name };
     let mut words: Vec<String> = name
         .split(|letter: char| !letter.is_alphanumeric())
         .filter(|word| !word.is_empty())
@@ -89,6 +90,14 @@ mod tests {
         ] {
             assert_eq!(meant(asked, known), expected, "{asked}");
         }
+    }
+
+    #[test]
+    fn paths_of_prims_are_known_by_their_last_part() {
+        let known = ["/World/background", "/World/ball_006", "/World/red_mug_001"];
+        assert_eq!(meant("red_ball", known), Some("/World/ball_006"));
+        assert_eq!(meant("red mug", known), Some("/World/red_mug_001"));
+        assert_eq!(meant("world", known), None);
     }
 
     #[test]
