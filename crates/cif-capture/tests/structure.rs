@@ -117,22 +117,27 @@ fn shots(folder: &Path) -> Vec<Shot> {
     frames::collect(&sources, &Choice::default(), folder, &Hooks::silent(), &mut notes).expect("photographs")
 }
 
-fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
-    let (work, kept) = (folder.join(work), folder.join(format!("{work}-kept")));
-    for folder in [&work, &kept] {
+/// The images as they are, each matched with each, in folders that are made.
+fn request<'a>(shots: &'a [Shot], work: &'a Path, kept: &'a Path) -> Request<'a> {
+    for folder in [work, kept] {
         std::fs::create_dir_all(folder).expect("a new folder");
     }
-    let request = Request {
+    Request {
         shots,
         masks: None,
         order: Order::Any,
         lenses: Lenses::PerSize,
         focal_px: None,
         moving: false,
-        work: &work,
-        kept: &kept,
+        work,
+        kept,
         threads: 2,
-    };
+    }
+}
+
+fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
+    let (work, kept) = (folder.join(work), folder.join(format!("{work}-kept")));
+    let request = request(shots, &work, &kept);
     structure::find(&request, &Hooks::silent())
 }
 
@@ -184,18 +189,7 @@ fn more_points_are_seen_where_poses_are_known() {
     let images = shots.iter().zip(&cameras).map(pose).collect();
     let poses = Poses { lenses: vec![lens], images, ..Poses::default() };
     let (work, kept) = (folder.path().join("points"), folder.path().join("points-kept"));
-    std::fs::create_dir_all(&kept).unwrap();
-    let request = Request {
-        shots: &shots,
-        masks: None,
-        order: Order::Any,
-        lenses: Lenses::PerSize,
-        focal_px: None,
-        moving: false,
-        work: &work,
-        kept: &kept,
-        threads: 2,
-    };
+    let request = request(&shots, &work, &kept);
     let before = found.poses.points.len();
     for find in [structure::points_of_rig, structure::points_of_images] {
         // The lens is of images twice as large, as another tool may have seen them.
@@ -230,9 +224,6 @@ fn a_later_run_goes_on_from_what_was_kept() {
     // Phases that were shown, with what was done when they began.
     let found = |shots: &[Shot], kept: &Path, work: &str, last: &str| {
         let work = folder.path().join(work);
-        for folder in [work.as_path(), kept] {
-            std::fs::create_dir_all(folder).unwrap();
-        }
         let shown = std::sync::Mutex::new(Vec::<(String, usize, usize)>::new());
         let progress = |progress: Progress<'_>| {
             let mut shown = shown.lock().unwrap();
@@ -243,17 +234,7 @@ fn a_later_run_goes_on_from_what_was_kept() {
             }
         };
         let stop = || shown.lock().unwrap().iter().any(|(words, ..)| words.starts_with(last));
-        let request = Request {
-            shots,
-            masks: None,
-            order: Order::Any,
-            lenses: Lenses::PerSize,
-            focal_px: None,
-            moving: false,
-            work: &work,
-            kept,
-            threads: 2,
-        };
+        let request = request(shots, &work, kept);
         let found = structure::find(&request, &Hooks { should_stop: &stop, progress: &progress });
         (found, shown.into_inner().unwrap())
     };
@@ -365,20 +346,7 @@ fn work_ends_when_the_caller_stops() {
     photographs(folder.path(), &cameras(3));
     let shots = shots(folder.path());
     let (work, kept) = (folder.path().join("work"), folder.path().join("kept"));
-    for folder in [&work, &kept] {
-        std::fs::create_dir_all(folder).unwrap();
-    }
-    let request = Request {
-        shots: &shots,
-        masks: None,
-        order: Order::Any,
-        lenses: Lenses::PerSize,
-        focal_px: None,
-        moving: false,
-        work: &work,
-        kept: &kept,
-        threads: 1,
-    };
+    let request = Request { threads: 1, ..request(&shots, &work, &kept) };
     let hooks = Hooks { should_stop: &|| true, progress: &|_| () };
     assert!(matches!(structure::find(&request, &hooks), Err(Error::Stopped)));
 }

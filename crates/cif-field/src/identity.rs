@@ -54,6 +54,19 @@ pub struct Identities {
     pub owners: Vec<Owner>,
 }
 
+impl Default for Identities {
+    /// No rows.
+    fn default() -> Self {
+        Self {
+            row_offsets: vec![0],
+            labels: Vec::new(),
+            log_estimates: Vec::new(),
+            log_calibrations: Vec::new(),
+            owners: Vec::new(),
+        }
+    }
+}
+
 impl Identities {
     /// Number of rows N.
     #[must_use]

@@ -34,13 +34,7 @@ pub(crate) fn field(n: usize, seed: u64) -> Field {
     };
     let bounds = Bounds { low: DVec3::splat(-1.0), high: DVec3::new(1.0, 1.0, 1.0 / 3.0 + 1.0) };
     let deformation = Deformation::new(config, bounds, 2.0, seed, false).unwrap();
-    let mut identities = Identities {
-        row_offsets: vec![0],
-        labels: Vec::new(),
-        log_estimates: Vec::new(),
-        log_calibrations: Vec::new(),
-        owners: Vec::new(),
-    };
+    let mut identities = Identities::default();
     for row in 0..n {
         for label in 0..4_u16 {
             if usize::from(label) == row % 4 || uniform(0.0, 1.0) < 0.3 {

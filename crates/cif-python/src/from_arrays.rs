@@ -118,13 +118,7 @@ fn sparse_identities(probabilities: &PyReadonlyArrayDyn<'_, f32>, instances: usi
             "identities have the shape {shape:?}, but must be [N, {instances}]: one column per instance"
         )));
     }
-    let mut identities = Identities {
-        row_offsets: vec![0],
-        labels: Vec::new(),
-        log_estimates: Vec::new(),
-        log_calibrations: Vec::new(),
-        owners: Vec::new(),
-    };
+    let mut identities = Identities::default();
     for (index, row) in arrays::values(probabilities).chunks_exact(instances).enumerate() {
         if let Some(column) = row.iter().position(|value| !(value.is_finite() && *value >= 0.0)) {
             return Err(PyValueError::new_err(format!(

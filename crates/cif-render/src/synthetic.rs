@@ -147,13 +147,7 @@ fn gaussians(config: &SyntheticConfig, camera: &PinholeCamera, random: &mut Pcg6
 }
 
 fn identities(config: &SyntheticConfig, random: &mut Pcg64Mcg) -> Identities {
-    let mut identities = Identities {
-        row_offsets: vec![0],
-        labels: Vec::new(),
-        log_estimates: Vec::new(),
-        log_calibrations: Vec::new(),
-        owners: Vec::new(),
-    };
+    let mut identities = Identities::default();
     let mut all: Vec<u16> = (0..config.instances as u16).collect();
     for _ in 0..config.gaussians {
         let support = random.random_range(1..=config.instances.min(4));

@@ -144,13 +144,7 @@ pub fn estimate(
         })
         .collect();
 
-    let mut identities = Identities {
-        row_offsets: vec![0],
-        labels: Vec::new(),
-        log_estimates: Vec::new(),
-        log_calibrations: Vec::new(),
-        owners: Vec::new(),
-    };
+    let mut identities = Identities::default();
     for (entries, share, _) in &rows {
         for (label, probability) in entries {
             identities.labels.push(*label);

@@ -599,13 +599,7 @@ fn row_42_occupancy_below_the_gate_has_no_gradient() {
 fn row_4_probabilities_sum_to_one_whatever_their_logarithms() {
     // Supports of 1 to 4 labels; shares down to 1e-45, calibrations at their limits.
     let logs = [0.0_f32, -1e-3, -9.2, -40.0, -104.0, 0.693];
-    let mut rows = Identities {
-        row_offsets: vec![0],
-        labels: Vec::new(),
-        log_estimates: Vec::new(),
-        log_calibrations: Vec::new(),
-        owners: Vec::new(),
-    };
+    let mut rows = Identities::default();
     for start in 0..logs.len() {
         for support in 1..=4_u16 {
             for label in 0..support {

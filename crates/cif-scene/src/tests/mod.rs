@@ -14,13 +14,7 @@ fn logit(p: f32) -> f32 {
 /// background Gaussians with the occupancy of the start and stray identities.
 fn field(objects: usize) -> Field {
     let mut gaussians = Gaussians::default();
-    let mut identities = Identities {
-        row_offsets: vec![0],
-        labels: Vec::new(),
-        log_estimates: Vec::new(),
-        log_calibrations: Vec::new(),
-        owners: Vec::new(),
-    };
+    let mut identities = Identities::default();
     let steps = DVec3::new(0.819_172_5, 0.671_043_6, 0.549_700_5);
     let mut push = |centre: DVec3, spread: f64, k: usize, occupancy: f32, owner: usize| {
         let at = centre + ((steps * (k + 1) as f64).fract() - 0.5) * spread;
