@@ -120,6 +120,9 @@ def test_trajectories_as_csv(moving: Path, tmp_path: Path, capfd: pytest.Capture
     capfd.readouterr()
     assert cif.run(ask) == 0
     assert capfd.readouterr().out == out.read_text()
+    # The word after the flag is its file where it ends in .csv alone.
+    assert cif.run(["query", "--trajectory", moving, "--label", "toy car"]) == 0
+    assert capfd.readouterr().out == out.read_text()
     with out.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {(row["object"], row["label"], row["class"]) for row in rows} == {("toy_car_002", "toy car", "car")}

@@ -22,7 +22,7 @@ pub(crate) fn scene() -> impl TypedValueParser<Value = PathBuf> {
 /// The report of a command, `.json` or a stream.
 pub(crate) fn report() -> impl TypedValueParser<Value = PathBuf> {
     PathBufValueParser::new().try_map(|path| {
-        if crate::report::is_file(path.as_os_str()) {
+        if crate::report::is_file(path.as_os_str(), "json") {
             return Ok(path);
         }
         let better = path.with_extension("json");

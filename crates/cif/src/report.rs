@@ -21,6 +21,9 @@ const FLAG: &str = "--json";
 /// Its name in `cif export` before there was one for all commands.
 const OLD_FLAG: &str = "--report-json";
 
+/// The flag of `cif query` whose file, a table of paths, may be left out too.
+const PATHS_FLAG: &str = "--trajectory";
+
 /// A report of a command that has `--force` for other files as well.
 #[derive(Clone, Debug, Default, Args)]
 pub(crate) struct Report {
@@ -117,15 +120,16 @@ pub(crate) fn read(path: &Path) -> Result<Value, Error> {
     serde_json::from_slice(&text).map_err(|error| Error::plain(format!("{}: {error}", path.display())))
 }
 
-/// True where a word can be the file of a report.
-pub(crate) fn is_file(word: &OsStr) -> bool {
+/// True where a word can be the file of a flag whose files have an ending.
+pub(crate) fn is_file(word: &OsStr, ending: &str) -> bool {
     let path = Path::new(word);
-    path.extension().is_some_and(|ending| ending.eq_ignore_ascii_case("json"))
+    path.extension().is_some_and(|found| found.eq_ignore_ascii_case(ending))
         || output::is_stdout(path)
         || matches!(cif_output::place(path), Ok(Place::Stream(_)))
 }
 
-/// Joins `--json FILE` to `--json=FILE`, which is how the flag tells its file from the argument after it.
+/// Joins a flag whose file may be left out to it, `--json FILE` to `--json=FILE`: so a file is distinguished from the
+/// argument after the flag.
 #[must_use]
 pub(crate) fn join_files(arguments: Vec<OsString>) -> Vec<OsString> {
     let mut joined: Vec<OsString> = Vec::with_capacity(arguments.len());
@@ -136,14 +140,15 @@ pub(crate) fn join_files(arguments: Vec<OsString>) -> Vec<OsString> {
             joined.extend(words);
             break;
         }
-        let file = match word.to_str() {
-            Some(FLAG) => words.next_if(|next| is_file(next)),
-            Some(OLD_FLAG) => words.next(),
-            _ => None,
+        let (flag, file) = match word.to_str() {
+            Some(FLAG) => (FLAG, words.next_if(|next| is_file(next, "json"))),
+            Some(OLD_FLAG) => (FLAG, words.next()),
+            Some(PATHS_FLAG) => (PATHS_FLAG, words.next_if(|next| is_file(next, "csv"))),
+            _ => ("", None),
         };
         joined.push(match file {
             Some(file) => {
-                let mut word = OsString::from(FLAG);
+                let mut word = OsString::from(flag);
                 word.push("=");
                 word.push(file);
                 word
@@ -154,13 +159,15 @@ pub(crate) fn join_files(arguments: Vec<OsString>) -> Vec<OsString> {
     joined
 }
 
-/// Advice where a word after `--json` was meant as its file and is none by its name.
+/// Advice where a word after a flag was meant as its file and is none by its name.
 #[must_use]
 pub(crate) fn advice(arguments: &[OsString], unexpected: &str) -> Option<String> {
-    let follows = arguments.windows(2).any(|pair| pair[0] == FLAG && pair[1] == unexpected);
-    follows.then(|| {
-        let name = Path::new(unexpected).with_extension("json");
-        format!("the file of {FLAG} ends in .json: {FLAG} {}", name.display())
+    [(FLAG, "json"), (PATHS_FLAG, "csv")].into_iter().find_map(|(flag, ending)| {
+        let follows = arguments.windows(2).any(|pair| pair[0] == flag && pair[1] == unexpected);
+        follows.then(|| {
+            let name = Path::new(unexpected).with_extension(ending);
+            format!("the file of {flag} ends in .{ending}: {flag} {}", name.display())
+        })
     })
 }
 
@@ -186,6 +193,9 @@ mod tests {
             ("cif info --json --quiet table", "cif info --json --quiet table"),
             ("cif export a.cif --report-json t.json", "cif export a.cif --json=t.json"),
             ("cif label a.cif -- --json x.json", "cif label a.cif -- --json x.json"),
+            ("cif query --trajectory a.cif --label mug", "cif query --trajectory a.cif --label mug"),
+            ("cif query a.cif --trajectory p.csv", "cif query a.cif --trajectory=p.csv"),
+            ("cif query --trajectory - a.cif", "cif query --trajectory=- a.cif"),
         ] {
             assert_eq!(joined(line), expected);
         }

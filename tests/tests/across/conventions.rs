@@ -11,6 +11,10 @@ use serde_json::Value;
 
 const CIF: &str = env!("CARGO_BIN_EXE_cif-under-test");
 
+/// A camera file of one view.
+const VIEWS: &str = r#"[{"name": "a", "width": 8, "height": 6, "vertical_fov_deg": 50,
+    "position": [0, -2, 1], "look_at": [0, 0, 0]}]"#;
+
 fn cif(folder: &Path, line: &str) -> Run {
     run_line(CIF, folder, line)
 }
@@ -71,6 +75,14 @@ fn reports_are_printed_or_written() {
     assert_eq!(fs::read_to_string(path.join("found.json")).unwrap(), written);
     cif(path, "query t.cif --json found.json --label box --force").succeeds();
     assert_ne!(fs::read_to_string(path.join("found.json")).unwrap(), written);
+    // Of a render that is what lies where.
+    fs::write(path.join("views.json"), VIEWS).unwrap();
+    let printed = cif(path, "render t.cif --camera views.json -o out --what rgb,depth --json").succeeds().stdout;
+    let files = &json(&printed)["views"][0]["files"];
+    for layer in ["rgb", "depth"] {
+        let file = files[layer].as_str().unwrap_or_else(|| panic!("{printed}"));
+        assert!(path.join(file).is_file(), "{file}");
+    }
     cif(path, "plan table --json no/where.json").fails(1, &["no/where.json"]);
     // A name that no report has is explained, and one that is another file's is refused.
     cif(path, "query t.cif --json found.txt").fails(2, &["--json found.json"]);
@@ -118,9 +130,7 @@ fn times_mean_the_same_in_a_scene_and_in_its_files() {
     cif(path, "query t.cif --point 0,0,0 --time 11").fails(2, &["frames 0 to 10"]);
     cif(path, "export t.cif t.ply --ply-time 11").fails(2, &["--ply-time 11", "frames 0 to 10"]);
     cif(path, "export t.cif --json --ply-time 1").fails(2, &["--ply-time", "OUT.ply"]);
-    let views = r#"[{"name": "a", "width": 8, "height": 6, "vertical_fov_deg": 50,
-        "position": [0, -2, 1], "look_at": [0, 0, 0]}]"#;
-    fs::write(path.join("views.json"), views).unwrap();
+    fs::write(path.join("views.json"), VIEWS).unwrap();
     cif(path, "render t.cif --camera views.json -o out --time 1s").fails(2, &["frames 0 to 10"]);
     assert!(!path.join("out").exists());
     cif(path, "render t.cif --camera views.json -o out --time 0.5s").succeeds();

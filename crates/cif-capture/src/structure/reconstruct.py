@@ -224,6 +224,8 @@ def reconstruct(pycolmap, job, database, mapper, seed):
         options = pycolmap.IncrementalPipelineOptions()
         # Small captures and rigs have few images.
         options.min_model_size = 3
+        # Its model is a check of the global mapper's. Further ones would be of the images that it leaves out.
+        options.multiple_models = False
         options.extract_colors = False
         level, mapping, registered = pycolmap.logging.minloglevel, pycolmap.incremental_mapping, [0]
 

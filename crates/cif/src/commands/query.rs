@@ -131,6 +131,7 @@ pub(super) struct Query {
         long,
         value_name = "FILE.csv",
         num_args = 0..=1,
+        require_equals = true,
         default_missing_value = "-",
         conflicts_with_all = ["json", "time", "interval", "point", "region", "text", "masks", "prompt"]
     )]

@@ -29,6 +29,7 @@ use crate::error::Error;
 use crate::messages::outcome;
 use crate::moment::Moment;
 use crate::output::Outputs;
+use crate::report::Report;
 use crate::{endings, interrupt, output};
 
 /// Render a scene from captured or new views
@@ -71,6 +72,8 @@ pub(super) struct Render {
     /// Write into a folder that holds files already
     #[arg(long)]
     force: bool,
+    #[command(flatten)]
+    report: Report,
     #[command(flatten)]
     capture_options: CaptureOptions,
     /// Vector instructions: `auto` takes the widest that the processor has
@@ -201,6 +204,7 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     }
     let mut outputs = Outputs::new(command.force);
     outputs.reads(&command.scene)?;
+    command.report.check(&mut outputs)?;
     let views = views(command, &field, &mut outputs)?;
     output::check_folder(&command.output, command.force)?;
     for Shot { view, .. } in &views {
@@ -228,6 +232,8 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     let trajectories = what.contains(&What::Tracks).then(|| Trajectories::new(&field, command.simd.into()));
     interrupt::watch();
     let settings = quality.settings(&settings);
+    let clock = SystemClock::start();
+    let start = clock.now();
     for (index, Shot { view, .. }) in views.iter().enumerate() {
         let time = time_of_all.or(view.time).unwrap_or(0.0);
         let lines = trajectories.as_ref().map(|paths| paths.lines(&view.camera, time)).unwrap_or_default();
@@ -254,8 +260,39 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
         }
         files.finish()?;
     }
+    let seconds = (clock.now() - start).wall_s;
     outcome!("rendered {} views into {}", views.len(), command.output.display());
-    Ok(())
+    let layers: Vec<String> =
+        what.iter().map(|what| what.folder()).chain(command.exr.then(|| EXR_FOLDER.to_owned())).collect();
+    command.report.give(|| report(&layers, &views, time_of_all, command, seconds), || {})
+}
+
+/// Views with their times and files.
+fn report(
+    layers: &[String],
+    views: &[Shot],
+    time_of_all: Option<f64>,
+    command: &Render,
+    seconds: f64,
+) -> serde_json::Value {
+    let view = |Shot { view, camera }: &Shot| {
+        let file = |layer: &String| {
+            let ending = if layer == EXR_FOLDER { "exr" } else { "png" };
+            let path = command.output.join(layer).join(format!("{}.{ending}", view.name));
+            (layer.clone(), path.display().to_string().into())
+        };
+        let files: serde_json::Map<_, _> = layers.iter().map(file).collect();
+        serde_json::json!({
+            "name": view.name,
+            "camera": (!camera.is_empty()).then_some(camera),
+            "time": time_of_all.or(view.time).unwrap_or(0.0),
+            "width": view.camera.width,
+            "height": view.camera.height,
+            "files": files,
+        })
+    };
+    let views: Vec<_> = views.iter().map(view).collect();
+    serde_json::json!({ "output": command.output, "seconds": seconds, "views": views })
 }
 
 /// Renders some of the views in both qualities and says what the draft loses and gains.

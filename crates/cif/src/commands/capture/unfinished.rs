@@ -101,8 +101,8 @@ fn choice_of_images(command: &Capture) -> Vec<String> {
         words.extend(value.map(|value| [name.to_owned(), value]).into_iter().flatten());
     };
     add("--rate", command.rate.map(|rate| rate.to_string()));
-    add("--from", command.from.map(|seconds| seconds.to_string()));
-    add("--to", command.to.map(|seconds| seconds.to_string()));
+    add("--from", command.from.map(|seconds| format!("{seconds}s")));
+    add("--to", command.to.map(|seconds| format!("{seconds}s")));
     for (camera, seconds) in &command.offset {
         add("--offset", Some(format!("{camera}={seconds}")));
     }
@@ -166,4 +166,28 @@ fn beginning(command: &Capture, inputs: &[String], times: Option<&Path>) -> Vec<
         },
     );
     words
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+    use crate::commands::{Arguments, Command};
+
+    fn read(words: &[String]) -> Capture {
+        let line = ["cif", "capture", "a.mp4", "-o", "c"].map(str::to_owned).into_iter();
+        match Arguments::try_parse_from(line.chain(words.iter().cloned())).unwrap().command {
+            Command::Capture(command) => command,
+            _ => panic!("another command"),
+        }
+    }
+
+    #[test]
+    fn frames_are_chosen_again_by_the_same_words() {
+        let words = ["--rate", "2.5", "--from", "1.5s", "--to", "20s", "--offset", "a=-0.5", "--sharpest"];
+        let words = words.map(str::to_owned);
+        assert_eq!(choice_of_images(&read(&words)), words);
+        assert_eq!(choice_of_images(&read(&choice_of_images(&read(&words)))), words);
+    }
 }

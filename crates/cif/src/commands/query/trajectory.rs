@@ -21,7 +21,7 @@ pub(super) fn run(command: &Query, file: &Path, wanted: &ObjectQuery) -> Result<
         if file.extension().is_none_or(|ending| !ending.eq_ignore_ascii_case("csv")) {
             return Err(Error::usage(
                 format!("--trajectory {}: paths are written as CSV", file.display()),
-                "end the name in .csv, or leave it away to write to stdout; the scene stands before --trajectory",
+                "end the name in .csv, or leave it away to write to stdout",
             ));
         }
         let mut outputs = Outputs::new(command.force);
