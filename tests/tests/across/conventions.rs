@@ -77,7 +77,8 @@ fn reports_are_printed_or_written() {
     assert_ne!(fs::read_to_string(path.join("found.json")).unwrap(), written);
     // Of a render that is what lies where.
     fs::write(path.join("views.json"), VIEWS).unwrap();
-    let printed = cif(path, "render t.cif --camera views.json -o out --what rgb,depth --json").succeeds().stdout;
+    let printed =
+        cif(path, "render t.cif --camera views.json -o out --what rgb,depth --json").succeeds().stdout;
     let files = &json(&printed)["views"][0]["files"];
     for layer in ["rgb", "depth"] {
         let file = files[layer].as_str().unwrap_or_else(|| panic!("{printed}"));

@@ -266,11 +266,7 @@ impl Trainer {
                 found => found,
             })
         };
-        // One after another, a budget that ends among them has some that are done.
-        let found: Vec<Result<Option<Found>, TrainError>> = match self.pacing {
-            Some(_) => wanted.iter().map(fit).collect(),
-            None => wanted.par_iter().map(fit).collect(),
-        };
+        let found: Vec<Result<Option<Found>, TrainError>> = wanted.par_iter().map(fit).collect();
         drop(entered);
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {

@@ -48,10 +48,7 @@ impl Trainer {
             state.phases.advance();
             Ok(found)
         };
-        let found: Vec<Result<Option<Option<Jointed>>, TrainError>> = match self.pacing {
-            Some(_) => labels.iter().map(find).collect(),
-            None => labels.par_iter().map(find).collect(),
-        };
+        let found: Vec<Result<Option<Option<Jointed>>, TrainError>> = labels.par_iter().map(find).collect();
         drop(entered);
         let (mut left_out, mut failed) = (Vec::new(), None);
         for (label, found) in labels.iter().zip(found) {
