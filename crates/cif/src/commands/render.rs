@@ -147,7 +147,7 @@ const EXR_FOLDER: &str = "exr";
 
 impl What {
     /// Folder of the layer inside the output: its name, as it is typed.
-    fn folder(self) -> String {
+    pub(super) fn folder(self) -> String {
         self.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default()
     }
 
@@ -264,7 +264,8 @@ pub(super) fn run(command: &Render) -> Result<(), Error> {
     outcome!("rendered {} views into {}", views.len(), command.output.display());
     let layers: Vec<String> =
         what.iter().map(|what| what.folder()).chain(command.exr.then(|| EXR_FOLDER.to_owned())).collect();
-    command.report.give(|| report(&layers, &views, time_of_all, command, seconds), || {})
+    let report = report(&layers, &views, time_of_all, command, seconds)?;
+    command.report.give(|| report, || {})
 }
 
 /// Views with their times and files.
@@ -274,25 +275,25 @@ fn report(
     time_of_all: Option<f64>,
     command: &Render,
     seconds: f64,
-) -> serde_json::Value {
+) -> Result<serde_json::Value, Error> {
     let view = |Shot { view, camera }: &Shot| {
         let file = |layer: &String| {
             let ending = if layer == EXR_FOLDER { "exr" } else { "png" };
-            let path = command.output.join(layer).join(format!("{}.{ending}", view.name));
-            (layer.clone(), path.display().to_string().into())
+            let path = output::inside(&command.output.join(layer), &view.name, ending)?;
+            Ok((layer.clone(), path.display().to_string().into()))
         };
-        let files: serde_json::Map<_, _> = layers.iter().map(file).collect();
-        serde_json::json!({
+        let files: serde_json::Map<_, _> = layers.iter().map(file).collect::<Result<_, Error>>()?;
+        Ok(serde_json::json!({
             "name": view.name,
             "camera": (!camera.is_empty()).then_some(camera),
             "time": time_of_all.or(view.time).unwrap_or(0.0),
             "width": view.camera.width,
             "height": view.camera.height,
             "files": files,
-        })
+        }))
     };
-    let views: Vec<_> = views.iter().map(view).collect();
-    serde_json::json!({ "output": command.output, "seconds": seconds, "views": views })
+    let views = views.iter().map(view).collect::<Result<Vec<_>, Error>>()?;
+    Ok(serde_json::json!({ "output": command.output, "seconds": seconds, "views": views }))
 }
 
 /// Renders some of the views in both qualities and says what the draft loses and gains.

@@ -7,7 +7,6 @@ use cif_field::Field;
 use cif_geometry::PixelGrid;
 use cif_render::{InstanceImage, RenderedImage};
 use cif_train::metrics::mask_ids;
-use clap::ValueEnum;
 
 use super::render::What;
 use crate::camera_file::View;
@@ -37,8 +36,7 @@ impl<'a> ViewFiles<'a> {
         lines: Vec<Polyline>,
     ) -> Result<Self, Error> {
         let file = |what: &What| {
-            let layer = what.to_possible_value().map(|value| value.get_name().to_owned()).unwrap_or_default();
-            let path = output::inside(&folder.join(layer), &view.name, "png")?;
+            let path = output::inside(&folder.join(what.folder()), &view.name, "png")?;
             let is_color = matches!(what, What::Rgb | What::Tracks | What::InstanceColor | What::DepthColor);
             let make = if is_color { PngFile::rgb } else { PngFile::grey };
             Ok((*what, make(&path, view.camera.width, view.camera.height)?))
