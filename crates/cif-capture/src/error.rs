@@ -18,6 +18,14 @@ pub enum Error {
         /// Remedy.
         fix: String,
     },
+    /// The images of a camera share nothing that moves, so that they show no depth.
+    #[error("{problem}")]
+    StandsStill {
+        /// The problem, naming the camera.
+        problem: String,
+        /// Remedy.
+        fix: String,
+    },
     /// The file system refused.
     #[error("cannot {action} {}: {source}", path.display())]
     Io {
@@ -37,6 +45,11 @@ impl Error {
     /// A problem and its remedy.
     pub fn refused(problem: impl Into<String>, fix: impl Into<String>) -> Self {
         Self::Refused { problem: problem.into(), fix: fix.into() }
+    }
+
+    /// A camera that stands still, and the remedy.
+    pub(crate) fn stands_still(problem: impl Into<String>, fix: impl Into<String>) -> Self {
+        Self::StandsStill { problem: problem.into(), fix: fix.into() }
     }
 
     /// Turns an error of the system into one that names the file.

@@ -54,6 +54,17 @@ impl Photograph {
         Ok(Self { image, format, exif, color_profile })
     }
 
+    /// Width and height of the image of a file, which is not decoded.
+    ///
+    /// # Errors
+    /// When it is no image.
+    pub(crate) fn size(path: &Path) -> Result<(u32, u32), Error> {
+        let file = cif_input::open(path).map_err(Error::io("read", path))?;
+        let reader = image::ImageReader::new(BufReader::new(file)).with_guessed_format();
+        let reader = reader.map_err(Error::io("read", path))?;
+        reader.into_dimensions().map_err(|error| Error::io("read", path)(io::Error::other(error)))
+    }
+
     /// Reduces the image by area averages so that its larger side has `side` pixels.
     pub(crate) fn reduce(&mut self, side: u32) {
         let (width, height) = (self.image.width(), self.image.height());
@@ -120,6 +131,11 @@ impl Impression {
             }
         }
         Self { brightness, sharpness, blocks }
+    }
+
+    /// Of an image that nobody looks at.
+    pub(crate) fn unknown() -> Self {
+        Self { brightness: 0.0, sharpness: 0.0, blocks: Vec::new() }
     }
 
     /// Judges an image, with its alpha left out.

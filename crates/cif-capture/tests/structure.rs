@@ -8,6 +8,7 @@ use cif_capture::poses::{Lens, Point, Pose, Poses};
 use cif_capture::source::sources;
 use cif_capture::structure::{self, Found, Lenses, Order, Request};
 use cif_capture::{Error, Hooks, Progress};
+use cif_dataset::{Dataset, OpenOptions, PointSource};
 use cif_geometry::{LensDistortion, RigidTransform};
 use glam::{DMat3, DVec2, DVec3};
 
@@ -202,6 +203,60 @@ fn more_points_are_seen_where_poses_are_known() {
     }
 }
 
+#[test]
+fn captures_without_points_get_those_that_their_images_show() {
+    if !has_pycolmap() {
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let cameras = cameras(10);
+    photographs(folder.path(), &cameras);
+    let lens = Lens {
+        size: (WIDTH, HEIGHT),
+        focal_px: [FOCAL; 2],
+        principal_px: [0.5 * f64::from(WIDTH), 0.5 * f64::from(HEIGHT)],
+        distortion: LensDistortion::default(),
+    };
+    let pose = |(shot, camera): (&Shot, &RigidTransform)| {
+        (shot.name.clone(), Pose { lens: 0, world_from_camera: *camera, points: 0 })
+    };
+    let mut counts = Vec::new();
+    // A camera that walks, and a rig at one moment.
+    for is_rig in [false, true] {
+        let mut shots = shots(folder.path());
+        for (k, shot) in shots.iter_mut().enumerate() {
+            shot.time = Some(if is_rig { 0.0 } else { k as f64 });
+            if is_rig {
+                (shot.camera, shot.name) = (format!("cam{k}"), format!("cam{k}/0.png"));
+            }
+        }
+        let images = shots.iter().zip(&cameras).map(pose).collect();
+        let poses = Poses { lenses: vec![lens.clone()], images, ..Poses::default() };
+        let capture = cif_capture::write::Capture {
+            shots: &shots,
+            poses: &poses,
+            masks: None,
+            metres_known: true,
+            up_known: true,
+            poses_from: "the test",
+        };
+        let place = folder.path().join(format!("capture-{is_rig}"));
+        cif_capture::write::write(&capture, &place, &Hooks::silent()).unwrap();
+        let dataset = Dataset::open(&place, &OpenOptions::default()).unwrap();
+        assert_eq!(dataset.points.source, PointSource::Random);
+        assert_eq!(dataset.images_at_once() > 2, is_rig, "{}", dataset.images_at_once());
+        let find = |work: &str| {
+            let work = folder.path().join(format!("{work}-{is_rig}"));
+            structure::points_of_capture(&dataset, &work, 2, &Hooks::silent()).unwrap()
+        };
+        let points = find("work");
+        assert!(on_surfaces(&points) && points.len() > 100, "{}", points.len());
+        assert_eq!(points, find("again"), "the same capture gives the same points");
+        counts.push(points.len());
+    }
+    assert!(counts[1] > counts[0], "two images of one moment are enough: {counts:?}");
+}
+
 /// True where all but a twentieth of the points lie on the floor, a wall or the box.
 fn on_surfaces(points: &[Point]) -> bool {
     let distance = |point: &Point| {
@@ -274,7 +329,7 @@ fn a_camera_that_stands_still_is_refused_by_its_name() {
         image.pixels_mut().for_each(|pixel| pixel.0[0] = pixel.0[0] / 2 + 20 * k);
         image.save(&path).unwrap();
     }
-    let Err(Error::Refused { problem, fix }) = find(folder.path(), &shots(folder.path()), "work") else {
+    let Err(Error::StandsStill { problem, fix }) = find(folder.path(), &shots(folder.path()), "work") else {
         panic!("poses of a camera that stands still")
     };
     assert!(problem.contains("walk: the camera stands still") && fix.contains("--moving"), "{problem} {fix}");

@@ -1,6 +1,6 @@
 //! The common form into which captures of every layout are read.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use cif_geometry::{Bounds, LensDistortion, PinholeCamera, PixelGrid};
@@ -116,6 +116,8 @@ pub struct InstanceLabel {
 pub enum PointSource {
     /// A file of the capture.
     File(PathBuf),
+    /// Images of the capture, by its own poses.
+    Triangulated,
     /// Drawn at random in the box that the cameras see.
     Random,
 }
@@ -178,7 +180,7 @@ impl Dataset {
     pub fn files(&self) -> impl Iterator<Item = &Path> {
         let points = match &self.points.source {
             PointSource::File(path) => Some(path.as_path()),
-            PointSource::Random => None,
+            PointSource::Triangulated | PointSource::Random => None,
         };
         let frames = self.frames.iter().flat_map(|frame| {
             [Some(frame.image.as_path()), frame.mask.as_deref(), frame.confidence.as_deref()]
@@ -202,6 +204,16 @@ impl Dataset {
     #[must_use]
     pub fn split_frames(&self, split: Split) -> Vec<usize> {
         (0..self.frames.len()).filter(|index| self.frames[*index].split == split).collect()
+    }
+
+    /// Most cameras that took a training frame at one time: of a rig, all; of one camera that walks, one.
+    #[must_use]
+    pub fn images_at_once(&self) -> usize {
+        let mut cameras: BTreeMap<usize, BTreeSet<&str>> = BTreeMap::new();
+        for frame in self.frames.iter().filter(|frame| frame.split == Split::Train) {
+            cameras.entry(frame.time_index).or_default().insert(&frame.camera_name);
+        }
+        cameras.values().map(BTreeSet::len).max().unwrap_or(0)
     }
 
     /// Scene extent in metres: 1.1 times the largest distance of a training camera's centre from the mean of

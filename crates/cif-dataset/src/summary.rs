@@ -269,6 +269,7 @@ impl CaptureSummary {
         });
         lines.push(match &self.point_source {
             PointSource::File(path) => format!("points      {} from {}", self.points, path.display()),
+            PointSource::Triangulated => format!("points      {} from its images", self.points),
             PointSource::Random => format!("points      {} at random", self.points),
         });
         if let Some(bounds) = &self.point_bounds {

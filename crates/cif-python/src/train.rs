@@ -139,7 +139,7 @@ impl Run {
             _ => None,
         };
         let gpu = self.backend.open()?;
-        let (dataset, downscale) = match self.dataset {
+        let (mut dataset, downscale) = match self.dataset {
             Ok(opened) => opened,
             Err(folder) => {
                 let downscale = match &state {
@@ -160,6 +160,11 @@ impl Run {
         let begun = |dataset| Start { dataset, phases: phases.clone() };
         let mut trainer = match state {
             Some(state) => {
+                if cif_train::metrics::training_config(&state.field)
+                    .is_some_and(|config| config.model.triangulate)
+                {
+                    cif::starting_points::find(&mut dataset, phases)?;
+                }
                 let trainer = Trainer::resume(begun(dataset), state).map_err(Error::plain)?;
                 if let Some(destination) = &mut destination {
                     destination.resumes(trainer.config());
@@ -167,8 +172,11 @@ impl Run {
                 trainer
             }
             None => {
+                let is_wanted = self.typed.alone(dataset.layout)?.model.triangulate;
+                let is_found = !is_wanted || cif::starting_points::find(&mut dataset, phases)?;
                 let (mut config, plan) = self.typed.on(&dataset, phases)?;
                 config.downscale = downscale;
+                config.model.triangulate &= is_found;
                 if let Some(destination) = &destination {
                     destination.check_settings(&config)?;
                 }

@@ -10,6 +10,8 @@ use crate::stage::Stage;
 pub enum Phase {
     /// The capture is opened.
     Open,
+    /// Points are triangulated for a capture that has none.
+    Points,
     /// The capture is examined for the effects that it calls for, see [`crate::plan`].
     Plan,
     /// Steps are measured, to choose settings for a budget.
@@ -56,6 +58,7 @@ impl Phase {
     pub const fn name(self) -> &'static str {
         match self {
             Self::Open => "open",
+            Self::Points => "points",
             Self::Plan => "plan",
             Self::Calibrate => "calibrate",
             Self::Decode => "decode",
@@ -83,6 +86,7 @@ impl Phase {
     pub const fn describe(self) -> &'static str {
         match self {
             Self::Open => "opening the capture",
+            Self::Points => "triangulating points by the poses of the capture",
             Self::Plan => "looking at the capture",
             Self::Calibrate => "measuring steps for the budget",
             Self::Decode => "decoding training frames",
@@ -113,7 +117,7 @@ impl Phase {
             Self::Measure | Self::Evaluate => "frames",
             Self::Search | Self::Joints | Self::Objects | Self::Presence => "objects",
             Self::Calibrate | Self::Coarse | Self::Fine | Self::Instance | Self::Rehearsal => "steps",
-            Self::Open | Self::Probe | Self::Save | Self::Other => "",
+            Self::Open | Self::Points | Self::Probe | Self::Save | Self::Other => "",
         }
     }
 

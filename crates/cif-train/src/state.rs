@@ -25,6 +25,8 @@ use crate::times::StepTimes;
 pub(crate) struct State {
     pub dataset: Dataset,
     pub config: TrainConfig,
+    /// Gaussians nearer to the camera than this are not drawn.
+    pub near: f32,
     pub frames: FrameStore,
     /// Asked for a stop between two events, and inside long work.
     pub phases: Phases,
@@ -89,7 +91,7 @@ impl State {
         RenderSettings {
             sh_degree: self.field.sh_degree,
             background: self.config.background,
-            near: self.config.near,
+            near: self.near,
             antialiased: self.config.antialiased,
             sort_metric: self.config.sort_metric,
             deform: self.field.deformation.is_some(),

@@ -86,6 +86,7 @@ fn scores_json(scores: &Scores, field: &Field) -> Value {
         .map(|score| {
             let mut value = json!(score);
             value["label"] = json!(label_of(field, score.id));
+            value["panoptic_iou"] = json!(scores.panoptic.instances.get(&score.id));
             value
         })
         .collect();
@@ -95,6 +96,12 @@ fn scores_json(scores: &Scores, field: &Field) -> Value {
         "psnr_covisible": scores.psnr_covisible,
         "covisible": scores.covisible,
         "ssim": scores.ssim,
+        "panoptic": {
+            "quality": scores.panoptic.quality,
+            "segmentation": scores.panoptic.segmentation,
+            "recognition": scores.panoptic.recognition,
+            "iou": scores.panoptic.iou,
+        },
         "macc_pix": instance.macc_pix,
         "macc_inst": instance.macc_inst,
         "miou": instance.miou,

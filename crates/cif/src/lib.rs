@@ -5,6 +5,7 @@
 //! |---|---|
 //! | [`commands`] | one file per subcommand |
 //! | [`settings`] | preset, file, flags: which value counts |
+//! | [`starting_points`] | points of captures that have none |
 //! | [`training`] | runs that save into a file |
 //! | [`destination`] | that file: saved into by one run, never over what others put there |
 //! | [`lock`] | who writes a file |
@@ -49,6 +50,7 @@ pub mod pictures;
 pub mod progress;
 mod report;
 pub mod settings;
+pub mod starting_points;
 pub mod training;
 pub mod words;
 

@@ -45,7 +45,7 @@ pub(crate) struct OnlyReport {
     #[command(flatten)]
     report: Report,
     /// Replace an existing file of --json
-    #[arg(long, requires = "json")]
+    #[arg(long)]
     force: bool,
 }
 
@@ -90,8 +90,14 @@ impl OnlyReport {
     /// Checks that the file can be written, and that it is none of those that the command reads.
     ///
     /// # Errors
-    /// As [`Report::check`].
+    /// As [`Report::check`], and when `--force` has no file to replace.
     pub(crate) fn check<'a>(&self, inputs: impl IntoIterator<Item = &'a Path>) -> Result<(), Error> {
+        if self.force && !self.report.is_asked() {
+            return Err(Error::usage(
+                "--force replaces the file of --json alone, and there is none",
+                "leave --force out; a folder of an earlier run is never replaced: remove it, or name a new one",
+            ));
+        }
         let mut outputs = Outputs::new(self.force);
         inputs.into_iter().try_for_each(|input| outputs.reads(input))?;
         self.report.check(&mut outputs)

@@ -175,6 +175,18 @@ fn outputs_of_another_kind_are_refused_with_the_fix() {
 }
 
 #[test]
+fn force_and_reports_that_cannot_be_are_refused_with_the_reason() {
+    let folder = with_scene();
+    let path = folder.path();
+    cif(path, "masks propagate table --keyframes k -o out --force")
+        .fails(2, &["--json alone", "there is none"]);
+    cif(path, "info t.cif --force").fails(2, &["there is none"]);
+    cif(path, "make walk.mp4 -o table --json").fails(2, &["--json make.json"]);
+    cif(path, "info t.cif --json t.json").succeeds();
+    cif(path, "make walk.mp4 -o table --json t.json").fails(1, &["t.json exists", "--force"]);
+}
+
+#[test]
 fn endings_of_outputs_decide_their_formats() {
     let folder = with_scene();
     let path = folder.path();

@@ -54,7 +54,7 @@ pub fn check(shots: &[Shot], fixed: bool, notes: &mut Notes) -> Result<(), Error
     // Of two or less nothing is known of whether the camera moves.
     let fixed = fixed && shots.len() >= FEWEST;
     if fixed && cameras.len() == 1 {
-        return Err(Error::refused(
+        return Err(Error::stands_still(
             format!("{}: the camera stands still, and one still camera sees no depth", names[0]),
             "record while walking around the scene, give the videos of several fixed cameras, or, where only the \
              scene fills the picture with motion, say --moving",

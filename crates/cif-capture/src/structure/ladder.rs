@@ -175,7 +175,7 @@ fn stands_still(camera: &str, cameras: &[&str]) -> Error {
         "{camera}: the camera stands still: what its images share lies at the same pixels, so that they show no depth"
     );
     let is_alone = cameras.iter().all(|other| *other == camera);
-    Error::refused(
+    Error::stands_still(
         problem,
         if is_alone {
             "record while walking around the scene, give the videos of several fixed cameras, or, where only what \

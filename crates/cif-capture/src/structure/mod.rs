@@ -13,6 +13,6 @@ mod verdict;
 pub use kept::{has_kept, kept_beside, remove_kept};
 pub use ladder::{Found, Lenses, Request, find};
 pub use pairs::Order;
-pub use points::{points_of_images, points_of_rig};
+pub use points::{points_of_capture, points_of_images, points_of_rig};
 pub use python::{pythons, set_python};
 pub use verdict::{Check, Verdict};

@@ -1,20 +1,43 @@
-//! Points that images with known poses see. One moment of a rig gives few: most are seen by two cameras alone,
+//! Points that images with known poses see, of captures that come without any too. One moment of a rig gives few: most are seen by two cameras alone,
 //! which mappers leave out because they have no poses yet to check them by. With poses, two views tell a place as
 //! well as more, and other moments show what people or things hid. Poses of other tools may come without any.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use cif_dataset::Dataset;
+use cif_geometry::PinholeCamera;
+use rayon::prelude::*;
 
 use super::features::Features;
-use super::ladder::Request;
-use super::pairs::pairs;
+use super::ladder::{Lenses, Request};
+use super::pairs::{Order, pairs};
 use super::python::{Group, Job, KnownPose, run};
 use super::stage::Staged;
 use crate::frames::Shot;
-use crate::poses::{Point, Poses};
-use crate::{Error, Hooks};
+use crate::picture::Photograph;
+use crate::poses::{Lens, Point, Pose, Poses};
+use crate::{Error, Hooks, Impression};
 
 /// Moments of the rig that are looked at; each adds about as many points, and takes as long, as the first.
 const MOMENTS: usize = 4;
+
+/// Images of a rig that are looked at, where its moments have fewer each.
+const IMAGES_OF_RIG: usize = 60;
+
+/// Images of one time from which on what moves stands still among them.
+const FEWEST_AT_ONCE: usize = 3;
+
+/// Images of cameras that take one at a time that are looked at.
+const IMAGES_OF_WALK: usize = 150;
+
+/// Each such image is matched with these of the others, from the one with the most similar view on: near ones show the
+/// same from nearly the same place, far ones tell how far it is.
+const NEIGHBOURS: [usize; 7] = [1, 2, 3, 5, 8, 13, 21];
+
+/// Images that have to see a point where they are of different times: by two alone, what has moved can look as if it lay
+/// elsewhere.
+const SEEN_AT_TIMES: usize = 3;
 
 /// Lens of COLMAP that holds those of other tools: focal lengths, principal point, k1, k2, p1, p2.
 const KNOWN_LENS: &str = "OPENCV";
@@ -25,8 +48,101 @@ const KNOWN_LENS: &str = "OPENCV";
 /// # Errors
 /// When pycolmap is missing or fails, or the caller stops.
 pub fn points_of_rig(request: &Request<'_>, poses: &Poses, hooks: &Hooks<'_>) -> Result<Vec<Point>, Error> {
-    let (shots, pairs) = moments(request.shots, poses);
-    points(&Request { shots: &shots, masks: None, ..*request }, poses, &pairs, hooks)
+    let (shots, pairs) = moments(request.shots, poses, MOMENTS);
+    points(&Request { shots: &shots, masks: None, ..*request }, poses, &pairs, 2, hooks)
+}
+
+/// Points of the training images of a capture, by the poses that it has, in its world. Cameras that take three or more
+/// images at a time are taken as a rig, and as cameras that walk otherwise: of these, points are what three images of
+/// whatever times agree on, which is what stands still. `work` is a folder for files, and may be removed afterwards.
+///
+/// # Errors
+/// When pycolmap is missing or fails, an image cannot be read, or the caller stops.
+pub fn points_of_capture(
+    dataset: &Dataset,
+    work: &Path,
+    threads: usize,
+    hooks: &Hooks<'_>,
+) -> Result<Vec<Point>, Error> {
+    let train = dataset.train_frames();
+    let at_once = dataset.images_at_once();
+    let is_rig = at_once >= FEWEST_AT_ONCE;
+    let count = if is_rig { train.len() } else { train.len().min(IMAGES_OF_WALK) };
+    let frames: Vec<usize> = (0..count).map(|k| train[k * train.len() / count.max(1)]).collect();
+    let (shots, poses) = known(dataset, &frames)?;
+    let kept = work.join("kept");
+    std::fs::create_dir_all(&kept).map_err(Error::io("create", &kept))?;
+    let request = Request {
+        shots: &shots,
+        masks: None,
+        order: Order::Any,
+        lenses: Lenses::PerCamera,
+        focal_px: None,
+        moving: true,
+        work,
+        kept: &kept,
+        threads,
+    };
+    if is_rig {
+        let (shots, pairs) = moments(&shots, &poses, MOMENTS.max(IMAGES_OF_RIG.div_ceil(at_once)));
+        return points(&Request { shots: &shots, ..request }, &poses, &pairs, 2, hooks);
+    }
+    let cameras: Vec<PinholeCamera> = frames.iter().map(|index| dataset.frames[*index].camera).collect();
+    points(&request, &poses, &neighbours(&cameras), SEEN_AT_TIMES, hooks)
+}
+
+/// Frames of a capture as images with poses, by the names of the frames.
+fn known(dataset: &Dataset, frames: &[usize]) -> Result<(Vec<Shot>, Poses), Error> {
+    let mut poses = Poses::default();
+    let mut shots = Vec::with_capacity(frames.len());
+    let sizes: Vec<(u32, u32)> = frames
+        .par_iter()
+        .map(|index| Photograph::size(&dataset.frames[*index].image))
+        .collect::<Result<_, _>>()?;
+    for (index, size) in frames.iter().zip(sizes) {
+        let frame = &dataset.frames[*index];
+        let lens = Lens {
+            size: (frame.camera.width, frame.camera.height),
+            focal_px: frame.camera.focal_px.to_array(),
+            principal_px: frame.camera.principal_px.to_array(),
+            distortion: frame.lens,
+        };
+        let number = poses.lenses.iter().position(|other| *other == lens).unwrap_or_else(|| {
+            poses.lenses.push(lens);
+            poses.lenses.len() - 1
+        });
+        let world_from_camera = frame.camera.camera_from_world.inverse();
+        poses.images.insert(frame.name.clone(), Pose { lens: number, world_from_camera, points: 0 });
+        shots.push(Shot {
+            camera: frame.camera_name.clone(),
+            name: frame.name.clone(),
+            file: frame.image.clone(),
+            time: Some(frame.time),
+            size,
+            impression: Impression::unknown(),
+            source: None,
+        });
+    }
+    Ok((shots, poses))
+}
+
+/// Pairs of images that show the same, by where their cameras are and look: as far apart as their views differ, in
+/// angles, and as they are away from each other, as a share of how far all of them spread.
+fn neighbours(cameras: &[PinholeCamera]) -> Vec<(usize, usize)> {
+    let centres: Vec<_> = cameras.iter().map(PinholeCamera::centre).collect();
+    let spread = crate::similarity::spread(&centres).max(f64::MIN_POSITIVE);
+    let mut pairs = BTreeSet::new();
+    for (a, camera) in cameras.iter().enumerate() {
+        let apart = |b: usize| {
+            camera.forward().angle_between(cameras[b].forward()) + centres[a].distance(centres[b]) / spread
+        };
+        let mut others: Vec<usize> = (0..cameras.len()).filter(|b| *b != a).collect();
+        others.sort_by(|b, c| apart(*b).total_cmp(&apart(*c)));
+        pairs.extend(
+            NEIGHBOURS.iter().filter_map(|rank| others.get(rank - 1)).map(|b| (a.min(*b), a.max(*b))),
+        );
+    }
+    pairs.into_iter().collect()
 }
 
 /// Points of images that follow each other as `request.order` tells, by poses that are known and stay as they are.
@@ -43,14 +159,15 @@ pub fn points_of_images(
     shots.retain(|shot| poses.images.contains_key(&shot.name));
     let cameras: Vec<&str> = shots.iter().map(|shot| shot.camera.as_str()).collect();
     let pairs = pairs(&cameras, request.order);
-    points(&Request { shots: &shots, ..*request }, poses, &pairs, hooks)
+    points(&Request { shots: &shots, ..*request }, poses, &pairs, 2, hooks)
 }
 
-/// Points of images that are matched in pairs; all have a pose.
+/// Points that at least so many of the images see, which are matched in pairs; all have a pose.
 fn points(
     request: &Request<'_>,
     poses: &Poses,
     pairs: &[(usize, usize)],
+    least: usize,
     hooks: &Hooks<'_>,
 ) -> Result<Vec<Point>, Error> {
     let work = request.work.join("points");
@@ -67,7 +184,8 @@ fn points(
         poses: Some(staged.names.iter().zip(request.shots).map(known).collect()),
         ..Job::of(request, &staged, pairs, &lenses, Features::all(largest))
     };
-    Ok(run(&job, hooks)?.points)
+    let found = run(&job, hooks)?.points.into_iter();
+    Ok(found.filter(|(_, images)| *images >= least).map(|(point, _)| point).collect())
 }
 
 /// Images by their lens and size.
@@ -88,13 +206,13 @@ fn lenses(shots: &[Shot], poses: &Poses) -> Vec<Group> {
 /// Images of some moments, spread evenly over the frames of the first camera, with a pose; and the pairs of
 /// those that are of one moment. The image of another camera is the one nearest in time, without times the one
 /// with the same number.
-fn moments(shots: &[Shot], poses: &Poses) -> (Vec<Shot>, Vec<(usize, usize)>) {
+fn moments(shots: &[Shot], poses: &Poses, count: usize) -> (Vec<Shot>, Vec<(usize, usize)>) {
     let mut cameras: BTreeMap<&str, Vec<&Shot>> = BTreeMap::new();
     for shot in shots.iter().filter(|shot| poses.images.contains_key(&shot.name)) {
         cameras.entry(&shot.camera).or_default().push(shot);
     }
     let Some(first) = cameras.values().next().cloned() else { return Default::default() };
-    let count = MOMENTS.min(first.len());
+    let count = count.min(first.len());
     let mut chosen: Vec<Shot> = Vec::new();
     let mut pairs = Vec::new();
     for moment in 0..count {
@@ -154,7 +272,7 @@ mod tests {
         let times: Vec<Option<f64>> = (0..10).map(|k| Some(0.1 * f64::from(k))).collect();
         let half: Vec<Option<f64>> = (0..5).map(|k| Some(0.25 * f64::from(k))).collect();
         let (shots, poses) = rig(&[("a", &times), ("b", &half), ("x", &times)]);
-        let (chosen, pairs) = moments(&shots, &poses);
+        let (chosen, pairs) = moments(&shots, &poses, MOMENTS);
         let names: Vec<&str> = chosen.iter().map(|shot| shot.name.as_str()).collect();
         assert_eq!(
             names,
@@ -163,10 +281,35 @@ mod tests {
         assert_eq!(pairs, [(0, 1), (2, 3), (4, 5), (6, 7)]);
         // Photographs of cameras, and a camera that has fewer.
         let (shots, poses) = rig(&[("a", &[None; 2]), ("b", &[None; 1]), ("c", &[None; 2])]);
-        let (chosen, pairs) = moments(&shots, &poses);
+        let (chosen, pairs) = moments(&shots, &poses, MOMENTS);
         let names: Vec<&str> = chosen.iter().map(|shot| shot.name.as_str()).collect();
         assert_eq!(names, ["a/0.png", "b/0.png", "c/0.png", "a/1.png", "c/1.png"]);
         assert_eq!(pairs, [(0, 1), (0, 2), (1, 2), (3, 4)]);
-        assert!(moments(&shots, &Poses::default()).0.is_empty());
+        assert!(moments(&shots, &Poses::default(), MOMENTS).0.is_empty());
+    }
+
+    #[test]
+    fn images_are_matched_with_near_views_and_some_far_ones() {
+        // Around a table, once.
+        let camera = |k: usize| {
+            let turn = glam::DMat3::from_rotation_y(std::f64::consts::TAU * k as f64 / 40.0);
+            let world_from_camera = RigidTransform { rotation: turn, translation: turn * -3.0 * glam::DVec3::Z };
+            PinholeCamera {
+                width: 64,
+                height: 48,
+                focal_px: glam::DVec2::splat(60.0),
+                principal_px: glam::DVec2::new(32.0, 24.0),
+                camera_from_world: world_from_camera.inverse(),
+            }
+        };
+        let cameras: Vec<PinholeCamera> = (0..40).map(camera).collect();
+        let pairs = neighbours(&cameras);
+        assert!(pairs.is_sorted() && pairs.iter().all(|(a, b)| a < b), "{pairs:?}");
+        let steps = |a: usize, b: usize| (b - a).min(40 - (b - a));
+        assert!((0..40).all(|k| pairs.contains(&(k.min((k + 1) % 40), k.max((k + 1) % 40)))), "the next one");
+        assert!(pairs.iter().all(|(a, b)| steps(*a, *b) <= 11), "views of a quarter of the way at most");
+        assert!(pairs.iter().any(|(a, b)| steps(*a, *b) > 8));
+        assert!(pairs.len() <= 40 * NEIGHBOURS.len());
+        assert!(neighbours(&cameras[..1]).is_empty());
     }
 }

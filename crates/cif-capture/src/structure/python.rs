@@ -171,8 +171,8 @@ pub(super) struct Outcome {
     pub(super) moved: Vec<Option<f64>>,
     /// The largest model of every run.
     pub(super) runs: Vec<Option<Model>>,
-    /// Points that images with known poses see.
-    pub(super) points: Vec<Point>,
+    /// Points that images with known poses see, and by how many of them each is seen.
+    pub(super) points: Vec<(Point, usize)>,
 }
 
 #[derive(Deserialize)]
@@ -313,7 +313,7 @@ fn outcome(answer: AnswerJson) -> Result<Outcome, Error> {
     let is_sure = |point: &&PointJson| {
         (point.images >= MIN_TRACK && point.error <= MAX_ERROR_PX) || point.error <= MAX_ERROR_OF_TWO_PX
     };
-    let points = answer.points.iter().filter(is_sure).map(PointJson::point).collect();
+    let points = answer.points.iter().filter(is_sure).map(|point| (point.point(), point.images)).collect();
     let runs = runs.collect::<Result<_, Error>>()?;
     Ok(Outcome { features: answer.features, moved: answer.moved, runs, points })
 }

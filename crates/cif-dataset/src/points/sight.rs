@@ -31,6 +31,7 @@ pub(crate) fn unseen_warning(dataset: &Dataset) -> Option<String> {
     }
     let what = match &dataset.points.source {
         PointSource::File(path) => path.display().to_string(),
+        PointSource::Triangulated => format!("{}: the triangulated points", dataset.root.display()),
         PointSource::Random => format!("{}: the random points", dataset.root.display()),
     };
     let looked_for = match positions.len() {

@@ -327,13 +327,12 @@ fn rows_of_nodes(
     if options.most_expensive_motion >= MotionModel::Parts {
         let (mut moving, mut still): (Vec<_>, Vec<_>) =
             background.into_iter().partition(|(_, change)| change.shows());
-        let is_loose = options.most_expensive_motion == MotionModel::Parts;
-        if is_loose {
+        if options.most_expensive_motion == MotionModel::Parts {
             still.extend(loose::leave_farthest(&mut moving));
             still.sort_unstable_by_key(|(row, _)| *row);
         }
         nodes.push(NodeRows::of(None, still));
-        nodes.push(NodeRows { is_loose, ..NodeRows::of(None, moving) });
+        nodes.push(NodeRows { is_loose: true, ..NodeRows::of(None, moving) });
     } else {
         nodes.push(NodeRows::of(None, background));
     }

@@ -209,14 +209,16 @@ fn fit_partition(group: &MovingGroup, own: &[Frame], partition: &Partition) -> F
 /// the report.
 fn decide(group: &MovingGroup, parts: &Option<FittedParts>, options: &SceneOptions) -> MotionModel {
     let limit = options.most_expensive_motion;
+    if !group.is_body {
+        // Each of these splats moves as far as a picture shows: a mean, and even more one without outliers, would hold
+        // thousands in place for the sake of some that hardly move.
+        let moves = group.is_loose && group.static_residual.statistics().max > group.tolerance;
+        return if moves { MotionModel::Dense } else { MotionModel::Static };
+    }
     let rests =
         group.stands_still && group.static_residual.statistics().decisive <= RESTING * group.tolerance;
     if rests || inside(group, &group.static_residual) || limit == MotionModel::Static {
         return MotionModel::Static;
-    }
-    if !group.is_body {
-        let is_dense = group.is_loose || limit == MotionModel::Dense;
-        return if is_dense { MotionModel::Dense } else { MotionModel::Static };
     }
     if inside(group, &group.rigid_residual) || limit == MotionModel::Rigid {
         return MotionModel::Rigid;

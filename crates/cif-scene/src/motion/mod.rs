@@ -48,7 +48,8 @@ pub struct MovingGroup {
     pub stands_still: bool,
     /// True where some splats travel that may show what passes over it ([`crate::motion::loose`]).
     pub is_passed: bool,
-    /// True where every splat may have a path of its own, whatever motion is allowed ([`crate::motion::loose`]).
+    /// True of splats of the background that move as far as a picture shows, each on a path of its own
+    /// ([`crate::motion::loose`]).
     pub is_loose: bool,
     /// Share of the weight that may be outliers.
     pub trim: f64,

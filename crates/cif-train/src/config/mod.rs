@@ -33,7 +33,8 @@ pub struct TrainConfig {
     pub downscale: Option<u32>,
     /// Colour behind everything, display-referred RGB in [0, 1], default white.
     pub background: [f32; 3],
-    /// Gaussians nearer to the camera than this are not drawn, metres, default 0.2.
+    /// Gaussians nearer to the camera than this are not drawn, units of the capture. Default 0: as near as its points
+    /// say that the scene comes; 0.2 in `paper`.
     pub near: f32,
     /// Compensates opacity for the 0.3 px low-pass filter, default off; viewers of exported files do not.
     pub antialiased: bool,
@@ -94,12 +95,15 @@ pub struct StagesConfig {
 pub struct ModelConfig {
     /// Most initial points kept; denser clouds are thinned by voxels. Default 20 000.
     pub max_initial_points: u32,
+    /// True where a capture that has no points gets those that its images show by its poses, through pycolmap; default
+    /// true, and false in `paper` for the layout D-NeRF. Where none were found, a run records false.
+    pub triangulate: bool,
     /// Opacity of initial Gaussians, (0, 1), default 0.1.
     pub initial_opacity: f32,
     /// Nodes of the spatial planes along x, y, z at multiplier 1, default 64 each.
     pub spatial_resolution: [u32; 3],
-    /// Nodes of the time planes over [-1, 1], of which times in [0, 1] use the upper half. Default 0: as many
-    /// as the capture has distinct times, within 8 and 150.
+    /// Nodes of the time planes over [-1, 1], of which times in [0, 1] use the upper half. Default 0: one for six
+    /// training images, at least 25, at most two for each distinct time, within 8 and 150.
     pub time_resolution: u32,
     /// Spatial resolution factor of each level, default [1, 2].
     pub multipliers: Vec<u32>,
@@ -166,13 +170,14 @@ pub struct AdamConfig {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct LossConfig {
-    /// Share of the structural dissimilarity in the colour loss, [0, 1], default 0.
+    /// Share of the structural dissimilarity in the colour loss, [0, 1], default 0.1; 0 in `paper`.
     pub lambda_dssim: f32,
     /// Weight of the instance loss, default 0.01; 0.005 in the `paper` preset on Neu3D captures.
     pub lambda_instance: f32,
     /// Weight of the second difference of the spatial planes, default 1e-4.
     pub plane_smoothness: f32,
-    /// Weight of the second difference of the time planes, default 1e-3.
+    /// Weight of the second difference of the time planes, default 1e-2; 1e-3 in layouts of rigs, whose times have
+    /// an image of every camera.
     pub time_smoothness: f32,
     /// Weight of the distance of the time planes from 1, default 1e-4.
     pub time_sparsity: f32,

@@ -10,8 +10,8 @@ fn removed() -> [(&'static str, Value); 2] {
 }
 
 /// Settings that there were not, with the value that runs went by.
-fn added() -> [(&'static str, Value); 1] {
-    [("/resample/weakness", "occupancy".into())]
+fn added() -> [(&'static str, Value); 2] {
+    [("/resample/weakness", "occupancy".into()), ("/model/triangulate", false.into())]
 }
 
 /// The table that holds a setting, and its key.

@@ -22,6 +22,9 @@ impl TrainConfig {
         if let (Layout::DNerf, Some(coarse)) = (layout, without_points(preset)) {
             config.stages.coarse = coarse;
         }
+        if matches!(layout, Layout::Neu3d | Layout::DynamicGaussians) {
+            config.loss.time_smoothness = 1e-3;
+        }
         config
     }
 }
@@ -50,6 +53,7 @@ fn draft() -> TrainConfig {
 
 fn paper(layout: Layout) -> TrainConfig {
     let mut config = TrainConfig { preset: Preset::Paper, ..TrainConfig::default() };
+    config.near = 0.2;
     config.stages =
         StagesConfig { coarse: 3_000, fine: 10_000, fine_includes_coarse: false, instance: 3_000, batch: 1 };
     config.model = ModelConfig {
@@ -69,8 +73,13 @@ fn paper(layout: Layout) -> TrainConfig {
         network_follows_extent: true,
         ..config.rates
     };
-    config.loss =
-        LossConfig { plane_smoothness: 1e-4, time_smoothness: 1e-2, time_sparsity: 1e-4, ..config.loss };
+    config.loss = LossConfig {
+        lambda_dssim: 0.0,
+        plane_smoothness: 1e-4,
+        time_smoothness: 1e-2,
+        time_sparsity: 1e-4,
+        ..config.loss
+    };
     config.densify = DensifyConfig {
         from: 500,
         until: 15_000,
@@ -103,6 +112,7 @@ fn paper(layout: Layout) -> TrainConfig {
     };
     match layout {
         Layout::DNerf => {
+            config.model.triangulate = false;
             config.model.multipliers = vec![1, 2];
             config.rates.planes[1] = 1.6e-5;
             config.rates.mlp[1] = 1.6e-6;
@@ -150,7 +160,7 @@ impl Default for TrainConfig {
             seed: 0,
             downscale: None,
             background: [1.0; 3],
-            near: 0.2,
+            near: 0.0,
             antialiased: false,
             sort_metric: SortMetric::Z,
             frame_memory_mib: 1_024,
@@ -181,6 +191,7 @@ impl Default for ModelConfig {
     fn default() -> Self {
         Self {
             max_initial_points: 20_000,
+            triangulate: true,
             initial_opacity: 0.1,
             spatial_resolution: [64; 3],
             time_resolution: 0,
@@ -219,10 +230,10 @@ impl Default for RatesConfig {
 impl Default for LossConfig {
     fn default() -> Self {
         Self {
-            lambda_dssim: 0.0,
+            lambda_dssim: 0.1,
             lambda_instance: 0.01,
             plane_smoothness: 1e-4,
-            time_smoothness: 1e-3,
+            time_smoothness: 1e-2,
             time_sparsity: 1e-4,
         }
     }

@@ -33,7 +33,7 @@ impl TrainConfig {
             let key = ["background[0]", "background[1]", "background[2]"][channel];
             within(key, *value, 0.0..=1.0, "expected a number in [0, 1]")?;
         }
-        positive("near", self.near)?;
+        non_negative("near", self.near)?;
         if let Some(downscale) = self.downscale {
             at_least("downscale", downscale, 1, "expected 1, 2, 4, ...")?;
         }
@@ -206,6 +206,10 @@ fn within(
 
 fn open_unit(key: &'static str, value: f32) -> Result<(), ConfigError> {
     check(value > 0.0 && value < 1.0, key, value, "expected a number inside (0, 1)")
+}
+
+fn non_negative(key: &'static str, value: f32) -> Result<(), ConfigError> {
+    check(value.is_finite() && value >= 0.0, key, value, "expected a positive number, or 0")
 }
 
 fn positive(key: &'static str, value: f32) -> Result<(), ConfigError> {

@@ -1,6 +1,10 @@
 //! Structural similarity and its gradient. Source: Wang et al. 2004; gradient from methods reference 1.4.
+//!
+//! The five blurred maps of the similarity are made and used band by band, so that they stay in the cache of the thread
+//! that works on the band; only the three maps that the gradient blurs again are kept for the whole image.
 
 use cif_geometry::PixelGrid;
+use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
 
 use super::unit;
@@ -15,15 +19,28 @@ const SIGMA: f64 = 1.5;
 pub(crate) const C1: f32 = 1e-4;
 pub(crate) const C2: f32 = 9e-4;
 
+/// Rows of a band. Each is blurred along its rows with [`RADIUS`] rows more above and below.
+const BAND: usize = 16;
+
+/// Channels of a pixel, which lie side by side.
+const CHANNELS: usize = 3;
+
 /// Memory kept between calls.
 #[derive(Clone, Debug, Default)]
 pub struct SsimScratch {
-    x: Vec<f32>,
-    y: Vec<f32>,
-    product: Vec<f32>,
-    row_pass: Vec<f32>,
-    /// Blurred x, y, x^2, y^2, x y; then D, E, F and their blurs.
-    maps: [Vec<f32>; 6],
+    /// `v D`, `v E` and `v F` of every value, before they are blurred.
+    maps: [Vec<f32>; 3],
+}
+
+/// Memory of one band at work.
+#[derive(Default)]
+struct Band {
+    /// A row between zeros.
+    padded: Vec<f32>,
+    /// Maps blurred along their rows, `[rows with those around, values of a row]` each.
+    along: [Vec<f32>; 5],
+    /// Maps blurred both ways, `[rows, values of a row]` each.
+    blurred: [Vec<f32>; 5],
 }
 
 /// Normalised taps from the centre outwards.
@@ -33,111 +50,191 @@ pub(crate) fn window() -> [f32; RADIUS + 1] {
     std::array::from_fn(|k| (tap(k) / sum) as f32)
 }
 
-/// Separable blur with zero padding.
-fn blur(source: &[f32], row_pass: &mut [f32], target: &mut [f32], width: usize) {
-    let taps = window();
-    let height = source.len() / width;
-    row_pass.par_chunks_mut(width).zip(source.par_chunks(width)).for_each(|(out, row)| {
-        for (x, out) in out.iter_mut().enumerate() {
-            let mut sum = taps[0] * row[x];
-            for (k, tap) in taps.iter().enumerate().skip(1) {
-                if x >= k {
-                    sum += tap * row[x - k];
-                }
-                if x + k < width {
-                    sum += tap * row[x + k];
+/// The row of a band with its surroundings: `None` above and below the image, which counts as zeros.
+fn row_of(start: usize, around: usize, height: usize) -> Option<usize> {
+    (start + around).checked_sub(RADIUS).filter(|row| *row < height)
+}
+
+impl Band {
+    /// Blurs a row of values into one of the maps; `value` gives the values, one by one.
+    #[inline(always)]
+    fn blur_along(&mut self, map: usize, around: usize, length: usize, value: impl Fn(usize) -> f32) {
+        const MARGIN: usize = RADIUS * CHANNELS;
+        let taps = window_of_once();
+        self.padded.resize(length + 2 * MARGIN, 0.0);
+        for (k, padded) in self.padded[MARGIN..MARGIN + length].iter_mut().enumerate() {
+            *padded = value(k);
+        }
+        let out = &mut self.along[map];
+        out.resize((BAND + 2 * RADIUS) * length, 0.0);
+        let out = &mut out[around * length..(around + 1) * length];
+        let at = |tap: isize| &self.padded[(MARGIN as isize + tap * CHANNELS as isize) as usize..][..length];
+        let (a1, b1, a2, b2) = (at(-1), at(1), at(-2), at(2));
+        let (a3, b3, a4, b4, a5, b5, centre) = (at(-3), at(3), at(-4), at(4), at(-5), at(5), at(0));
+        for k in 0..length {
+            out[k] = taps[0] * centre[k]
+                + taps[1] * (a1[k] + b1[k])
+                + taps[2] * (a2[k] + b2[k])
+                + taps[3] * (a3[k] + b3[k])
+                + taps[4] * (a4[k] + b4[k])
+                + taps[5] * (a5[k] + b5[k]);
+        }
+    }
+
+    /// Sets a row outside the image to zero.
+    fn clear_along(&mut self, maps: usize, around: usize, length: usize) {
+        for out in &mut self.along[..maps] {
+            out.resize((BAND + 2 * RADIUS) * length, 0.0);
+            out[around * length..(around + 1) * length].fill(0.0);
+        }
+    }
+
+    /// Blurs the first maps across their rows.
+    #[inline(always)]
+    fn blur_across(&mut self, maps: usize, rows: usize, length: usize) {
+        let taps = window_of_once();
+        for (out, along) in self.blurred[..maps].iter_mut().zip(&self.along) {
+            out.resize(BAND * length, 0.0);
+            for (row, out) in out.chunks_exact_mut(length).take(rows).enumerate() {
+                let at = |tap: usize| &along[(row + tap) * length..][..length];
+                let (a1, b1, a2, b2) = (at(4), at(6), at(3), at(7));
+                let (a3, b3, a4, b4, a5, b5, centre) = (at(2), at(8), at(1), at(9), at(0), at(10), at(5));
+                for k in 0..length {
+                    out[k] = taps[0] * centre[k]
+                        + taps[1] * (a1[k] + b1[k])
+                        + taps[2] * (a2[k] + b2[k])
+                        + taps[3] * (a3[k] + b3[k])
+                        + taps[4] * (a4[k] + b4[k])
+                        + taps[5] * (a5[k] + b5[k]);
                 }
             }
-            *out = sum;
         }
-    });
-    let rows = &*row_pass;
-    target.par_chunks_mut(width).enumerate().for_each(|(y, out)| {
-        for (out, value) in out.iter_mut().zip(&rows[y * width..]) {
-            *out = taps[0] * value;
-        }
-        for (k, tap) in taps.iter().enumerate().skip(1) {
-            for other in [y.checked_sub(k), Some(y + k)].into_iter().flatten().filter(|o| *o < height) {
-                for (out, value) in out.iter_mut().zip(&rows[other * width..]) {
-                    *out += tap * value;
-                }
-            }
-        }
-    });
+    }
+}
+
+/// [`window`], computed once.
+fn window_of_once() -> [f32; RADIUS + 1] {
+    static TAPS: std::sync::OnceLock<[f32; RADIUS + 1]> = std::sync::OnceLock::new();
+    *TAPS.get_or_init(window)
 }
 
 impl SsimScratch {
     /// Mean structural similarity over pixels and channels; adds its gradient times `weight` to `v_color`.
     pub(super) fn add_gradient(
         &mut self,
-        rendered: &PixelGrid<[f32; 3]>,
-        target: &PixelGrid<[u8; 3]>,
+        rendered: &PixelGrid<[f32; CHANNELS]>,
+        target: &PixelGrid<[u8; CHANNELS]>,
         weight: f32,
-        v_color: &mut PixelGrid<[f32; 3]>,
+        v_color: &mut PixelGrid<[f32; CHANNELS]>,
     ) -> f64 {
-        let pixels = rendered.pixels.len();
-        let width = (rendered.width as usize).max(1);
-        for buffer in [&mut self.x, &mut self.y, &mut self.product, &mut self.row_pass] {
-            buffer.resize(pixels, 0.0);
-        }
+        let (x, y) = (rendered.pixels.as_flattened(), target.pixels.as_flattened());
+        let length = (rendered.width as usize).max(1) * CHANNELS;
+        let height = x.len() / length;
         for map in &mut self.maps {
-            map.resize(pixels, 0.0);
+            map.resize(x.len(), 0.0);
         }
-        let values = (pixels * 3).max(1) as f64;
-        let v = (f64::from(weight) / values) as f32;
-        let mut sum = 0.0;
-        for channel in 0..3 {
-            for (x, pixel) in self.x.iter_mut().zip(&rendered.pixels) {
-                *x = pixel[channel];
-            }
-            for (y, pixel) in self.y.iter_mut().zip(&target.pixels) {
-                *y = unit(pixel[channel]);
-            }
-            sum += self.channel(width, v);
-            let [d, e, f, ..] = &self.maps;
-            for (k, v_color) in v_color.pixels.iter_mut().enumerate() {
-                v_color[channel] += d[k] + 2.0 * self.x[k] * e[k] + self.y[k] * f[k];
-            }
-        }
-        sum / values
+        let v = (f64::from(weight) / x.len().max(1) as f64) as f32;
+        let level = Level::new();
+        let [d, e, f] = &mut self.maps;
+        let size = BAND * length;
+        // Sums of bands are added in order, so that the value does not depend on threads.
+        let sums: Vec<f64> = d
+            .par_chunks_mut(size)
+            .zip(e.par_chunks_mut(size))
+            .zip(f.par_chunks_mut(size))
+            .enumerate()
+            .map_init(Band::default, |band, (index, ((d, e), f))| {
+                let rows = (index * BAND, height);
+                dispatch!(level, _simd => similarity(band, (x, y), rows, length, v, [&mut *d, &mut *e, &mut *f]))
+            })
+            .collect();
+        let maps = &self.maps;
+        v_color.pixels.as_flattened_mut().par_chunks_mut(size).enumerate().for_each_init(
+            Band::default,
+            |band, (index, v_color)| {
+                let rows = (index * BAND, height);
+                dispatch!(level, _simd => add_blurred(band, maps, (x, y), rows, length, v_color));
+            },
+        );
+        sums.iter().sum::<f64>() / x.len().max(1) as f64
     }
+}
 
-    /// Sum of the similarity of one channel; leaves the blurred `v D`, `v E`, `v F` in the first three maps.
-    fn channel(&mut self, width: usize, v: f32) -> f64 {
-        let Self { x, y, product, row_pass, maps } = self;
-        let multiply = |product: &mut [f32], a: &[f32], b: &[f32]| {
-            for ((product, a), b) in product.iter_mut().zip(a).zip(b) {
-                *product = a * b;
-            }
+/// Sum of the similarity of a band that starts at a row of an image of some height, and its `v D`, `v E`, `v F`.
+#[inline(always)]
+fn similarity(
+    band: &mut Band,
+    (x, y): (&[f32], &[u8]),
+    (start, height): (usize, usize),
+    length: usize,
+    v: f32,
+    [d, e, f]: [&mut [f32]; 3],
+) -> f64 {
+    let rows = d.len() / length;
+    for around in 0..rows + 2 * RADIUS {
+        let Some(row) = row_of(start, around, height) else {
+            band.clear_along(5, around, length);
+            continue;
         };
-        blur(x, row_pass, &mut maps[0], width);
-        blur(y, row_pass, &mut maps[1], width);
-        multiply(product, x, x);
-        blur(product, row_pass, &mut maps[2], width);
-        multiply(product, y, y);
-        blur(product, row_pass, &mut maps[3], width);
-        multiply(product, x, y);
-        blur(product, row_pass, &mut maps[4], width);
-        let [m1s, m2s, xx, yy, xy, spare] = maps;
-        let mut sum = 0.0;
-        for k in 0..x.len() {
-            let (m1, m2) = (m1s[k], m2s[k]);
+        let (x, y) = (&x[row * length..][..length], &y[row * length..][..length]);
+        band.blur_along(0, around, length, |k| x[k]);
+        band.blur_along(1, around, length, |k| unit(y[k]));
+        band.blur_along(2, around, length, |k| x[k] * x[k]);
+        band.blur_along(3, around, length, |k| unit(y[k]) * unit(y[k]));
+        band.blur_along(4, around, length, |k| x[k] * unit(y[k]));
+    }
+    band.blur_across(5, rows, length);
+    let count = d.len();
+    let [m1, m2, xx, yy, xy] = band.blurred.each_ref().map(|map| &map[..count]);
+    let (d, e, f) = (&mut d[..count], &mut e[..count], &mut f[..count]);
+    let mut sum = 0.0;
+    // In parts of few values, whose sum in single precision is as good as exact.
+    for part in (0..count).step_by(64) {
+        let mut part_sum = [0.0_f32; 8];
+        for k in part..(part + 64).min(count) {
+            let (m1, m2) = (m1[k], m2[k]);
             let (s1, s2, s12) = (xx[k] - m1 * m1, yy[k] - m2 * m2, xy[k] - m1 * m2);
-            let (a, b) = (2.0 * m1 * m2 + C1, 2.0 * s12 + C2);
-            let (c, d) = (m1 * m1 + m2 * m2 + C1, s1 + s2 + C2);
-            let similarity = a * b / (c * d);
-            sum += f64::from(similarity);
-            xx[k] =
-                v * (2.0 * m2 * (b - a) / (c * d) - 2.0 * m1 * similarity / c + 2.0 * m1 * similarity / d);
-            yy[k] = v * (-similarity / d);
-            xy[k] = v * (2.0 * a / (c * d));
+            let (luminance, structure) = (2.0 * m1 * m2 + C1, 2.0 * s12 + C2);
+            let (c, s) = (m1 * m1 + m2 * m2 + C1, s1 + s2 + C2);
+            let similarity = luminance * structure / (c * s);
+            part_sum[k % 8] += similarity;
+            d[k] = v
+                * (2.0 * m2 * (structure - luminance) / (c * s) - 2.0 * m1 * similarity / c
+                    + 2.0 * m1 * similarity / s);
+            e[k] = v * (-similarity / s);
+            f[k] = v * (2.0 * luminance / (c * s));
         }
-        blur(xx, row_pass, spare, width);
-        m1s.copy_from_slice(spare);
-        blur(yy, row_pass, spare, width);
-        m2s.copy_from_slice(spare);
-        blur(xy, row_pass, spare, width);
-        xx.copy_from_slice(spare);
-        sum
+        sum += part_sum.iter().copied().map(f64::from).sum::<f64>();
+    }
+    sum
+}
+
+/// Adds the blurred maps of a band, times what the similarity depends on, to its gradient.
+#[inline(always)]
+fn add_blurred(
+    band: &mut Band,
+    maps: &[Vec<f32>; 3],
+    (x, y): (&[f32], &[u8]),
+    (start, height): (usize, usize),
+    length: usize,
+    v_color: &mut [f32],
+) {
+    let rows = v_color.len() / length;
+    for around in 0..rows + 2 * RADIUS {
+        let Some(row) = row_of(start, around, height) else {
+            band.clear_along(3, around, length);
+            continue;
+        };
+        for (map, values) in maps.iter().enumerate() {
+            let values = &values[row * length..][..length];
+            band.blur_along(map, around, length, |k| values[k]);
+        }
+    }
+    band.blur_across(3, rows, length);
+    let count = v_color.len();
+    let (x, y) = (&x[start * length..][..count], &y[start * length..][..count]);
+    let [d, e, f, ..] = band.blurred.each_ref().map(|map| &map[..map.len().min(count)]);
+    for k in 0..count {
+        v_color[k] += d[k] + 2.0 * x[k] * e[k] + unit(y[k]) * f[k];
     }
 }

@@ -18,6 +18,7 @@ use crate::heads::Decoder;
 use super::covisible::TrainingViews;
 use super::image::{masked_psnr, psnr, ssim, unit_color};
 use super::instance::{FrameConfusion, InstanceMetrics, instance_metrics};
+use super::panoptic::{PanopticMetrics, panoptic_metrics, with_background};
 
 /// Frames to score, and settings by which they are rendered.
 #[derive(Clone, Copy)]
@@ -125,6 +126,8 @@ pub struct Scores {
     /// Instance metrics over the frames that have a mask.
     #[serde(flatten)]
     pub instance: InstanceMetrics,
+    /// The same with what is unlabelled as background.
+    pub panoptic: PanopticMetrics,
 }
 
 /// Scores of a field on a capture.
@@ -145,6 +148,15 @@ pub struct Evaluation {
     pub exposed_frames: Option<usize>,
 }
 
+/// Confusion counts of one frame.
+#[derive(Clone)]
+struct Confusions {
+    /// Of the most likely instances, for scores on labelled pixels.
+    labelled: FrameConfusion,
+    /// Of the same where they are more likely than the background.
+    panoptic: FrameConfusion,
+}
+
 /// Renders and scores every frame of a split; `observe` sees each one.
 ///
 /// # Errors
@@ -163,7 +175,7 @@ pub fn evaluate<E: From<EvaluationError>>(
     let training_views =
         options.covisible.then(|| TrainingViews::of(field, dataset, &options.settings, &mut renderer));
     let mut frames: Vec<FrameScores> = Vec::new();
-    let mut confusions: Vec<Option<FrameConfusion>> = Vec::new();
+    let mut confusions: Vec<Option<Confusions>> = Vec::new();
     for (index, frame) in dataset.frames.iter().enumerate().filter(|(_, f)| f.split == options.split) {
         let truth =
             dataset.load_frame(index, options.settings.background).map_err(EvaluationError::Dataset)?;
@@ -182,7 +194,14 @@ pub fn evaluate<E: From<EvaluationError>>(
         let predicted = rendered.instances.as_ref().map(|instances| mask_ids(field, &instances.label));
         let confusion = match (&truth.mask, &predicted) {
             (Some(mask), Some(predicted)) => {
-                Some(FrameConfusion::new(&frame.camera_name, frame.time_index, mask, predicted))
+                let of = |predicted: &PixelGrid<u16>| {
+                    FrameConfusion::new(&frame.camera_name, frame.time_index, mask, predicted)
+                };
+                let layers = rendered.instances.as_ref().expect("ids are predicted by instances");
+                Some(Confusions {
+                    labelled: of(predicted),
+                    panoptic: of(&with_background(predicted, &layers.foreground)),
+                })
             }
             _ => None,
         };
@@ -204,7 +223,7 @@ pub fn evaluate<E: From<EvaluationError>>(
             psnr_covisible: psnr_covisible.filter(|value| *value != f64::INFINITY),
             covisible,
             ssim: ssim(&rendered.color, &target),
-            macc_pix: confusion.as_ref().and_then(FrameConfusion::pixel_accuracy).map(|v| v * 100.0),
+            macc_pix: confusion.as_ref().and_then(|c| c.labelled.pixel_accuracy()).map(|v| v * 100.0),
             render_ms,
         };
         observe(FrameView {
@@ -226,7 +245,7 @@ pub fn evaluate<E: From<EvaluationError>>(
     }
     let select = |group: Option<&str>| {
         let chosen = |scores: &FrameScores| group.is_none() || scores.group.as_deref() == group;
-        let confusions: Vec<FrameConfusion> = frames
+        let confusions: Vec<Confusions> = frames
             .iter()
             .zip(&confusions)
             .filter(|(scores, _)| chosen(scores))
@@ -276,8 +295,11 @@ pub fn mask_ids(field: &Field, labels: &PixelGrid<u16>) -> PixelGrid<u16> {
     })
 }
 
-fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[FrameConfusion]) -> Scores {
+fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[Confusions]) -> Scores {
     let frames: Vec<&FrameScores> = frames.collect();
+    let of = |pick: fn(&Confusions) -> &FrameConfusion| -> Vec<FrameConfusion> {
+        confusions.iter().map(pick).cloned().collect()
+    };
     let finite: Vec<f64> = frames.iter().filter_map(|f| f.psnr).collect();
     Scores {
         frames: frames.len(),
@@ -286,7 +308,8 @@ fn scores_of<'a>(frames: impl Iterator<Item = &'a FrameScores>, confusions: &[Fr
         covisible: mean(&frames.iter().filter_map(|f| f.covisible).collect::<Vec<_>>()),
         psnr_infinite: frames.len() - finite.len(),
         ssim: mean(&frames.iter().map(|f| f.ssim).collect::<Vec<_>>()),
-        instance: instance_metrics(confusions),
+        instance: instance_metrics(&of(|confusions| &confusions.labelled)),
+        panoptic: panoptic_metrics(&of(|confusions| &confusions.panoptic)),
     }
 }
 

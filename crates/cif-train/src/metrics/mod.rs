@@ -5,6 +5,7 @@
 //! | [`image`] | PSNR and SSIM of one picture |
 //! | [`covisible`] | which pixels of a held-out view training views show too |
 //! | [`instance`] | every instance metric, from per-frame confusion counts |
+//! | [`panoptic`] | the same with what is unlabelled as background |
 //! | [`evaluate`](mod@evaluate) | renders the held-out frames of a capture and fills both in |
 //! | [`round_trip`] | what a scene loses on its way through a file |
 //! | [`fit`] | whether a capture is the one that a scene was trained on |
@@ -16,6 +17,7 @@ pub mod evaluate;
 pub mod fit;
 pub mod image;
 pub mod instance;
+pub mod panoptic;
 pub mod round_trip;
 
 pub use evaluate::{
@@ -23,3 +25,4 @@ pub use evaluate::{
     trained_settings, training_config,
 };
 pub use instance::{FrameConfusion, InstanceMetrics, InstanceScore, instance_metrics};
+pub use panoptic::PanopticMetrics;

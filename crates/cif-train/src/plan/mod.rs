@@ -271,7 +271,7 @@ fn set(kind: EffectKind, extent: Extent, config: &mut TrainConfig) {
 }
 
 fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<Effect> {
-    let deformation_mb = deformation_megabytes(config, found.times);
+    let deformation_mb = deformation_megabytes(config, found);
     let effect =
         |kind: EffectKind, auto: Extent, full: Extent, words: &str, evidence: String, cost: String| {
             let extent = match choice.switched.get(&kind) {
@@ -340,7 +340,7 @@ fn decide(found: &Evidence, config: &TrainConfig, choice: &EffectChoice) -> Vec<
     }
     if moves_now {
         let nodes = match config.model.time_resolution {
-            0 => automatic_time_nodes(found.times),
+            0 => automatic_time_nodes(found.times, found.frames),
             nodes => nodes,
         };
         effects.push(Effect {
@@ -560,9 +560,9 @@ fn speed(found: &Evidence) -> String {
 }
 
 /// Memory of the deformation with gradients and moments, megabytes.
-fn deformation_megabytes(config: &TrainConfig, times: usize) -> f64 {
+fn deformation_megabytes(config: &TrainConfig, found: &Evidence) -> f64 {
     let nodes = match config.model.time_resolution {
-        0 => automatic_time_nodes(times),
+        0 => automatic_time_nodes(found.times, found.frames),
         nodes => nodes,
     };
     let model = &config.model;

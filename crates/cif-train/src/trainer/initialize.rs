@@ -16,8 +16,13 @@ const DEFAULT_FRAMES_PER_SECOND: f64 = 24.0;
 /// deviation, radians: some pixels of a small image.
 const OUTLIER_ANGLE: f64 = 0.03;
 
-/// Fewest and most time nodes chosen automatically.
+/// Fewest and most time nodes chosen automatically, and the fewest where the times are enough for them.
 const TIME_NODES: (usize, usize) = (8, 150);
+const USUAL_TIME_NODES: usize = 25;
+
+/// Training images for each time node. Times use the upper half of the nodes, so that twelve images lie between two: with
+/// fewer, every image moves the Gaussians as it alone likes.
+const IMAGES_PER_TIME_NODE: usize = 6;
 
 /// Field without deformation, from the capture's points.
 pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<Field, TrainError> {
@@ -89,7 +94,7 @@ pub(super) fn initial_deformation(
 ) -> Result<Deformation, TrainError> {
     let model = &config.model;
     let time_resolution = match model.time_resolution {
-        0 => automatic_time_nodes(dataset.times.len()),
+        0 => automatic_time_nodes(dataset.times.len(), dataset.train_frames().len()),
         nodes => nodes,
     };
     let shape = DeformationConfig {
@@ -107,9 +112,11 @@ pub(super) fn initial_deformation(
     Ok(Deformation::new(shape, bounds, dataset.extent(), seed, model.zero_initial_heads)?)
 }
 
-/// Nodes of the time planes where the settings leave them to the capture.
-pub(crate) fn automatic_time_nodes(times: usize) -> u32 {
-    times.clamp(TIME_NODES.0, TIME_NODES.1) as u32
+/// Nodes of the time planes where the settings leave them to the capture: as many as its training images tell apart, and
+/// no more than two for each of its times, one of which is used.
+pub(crate) fn automatic_time_nodes(times: usize, images: usize) -> u32 {
+    let told_apart = (images / IMAGES_PER_TIME_NODE).max(USUAL_TIME_NODES);
+    told_apart.min(2 * times).clamp(TIME_NODES.0, TIME_NODES.1) as u32
 }
 
 /// Points of the capture with colours in [0, 1], thinned to the wanted number.
@@ -117,4 +124,22 @@ fn initial_points(dataset: &Dataset, config: &TrainConfig) -> (Vec<[f32; 3]>, Ve
     let points = dataset.points.thinned(config.model.max_initial_points as usize);
     let colors = points.colors.iter().map(|color| color.map(|c| f32::from(c) / 255.0)).collect();
     (points.positions, colors)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn time_nodes_are_as_many_as_images_tell_apart() {
+        // One camera, whose images are of a time each: one that jumps, a walk, a short walk.
+        assert_eq!(automatic_time_nodes(150, 150), 25);
+        assert_eq!(automatic_time_nodes(600, 600), 100);
+        assert_eq!(automatic_time_nodes(10, 10), 20);
+        assert_eq!(automatic_time_nodes(2, 2), 8);
+        // Rigs of 27 cameras and of 4, and a long one.
+        assert_eq!(automatic_time_nodes(24, 648), 48);
+        assert_eq!(automatic_time_nodes(60, 240), 40);
+        assert_eq!(automatic_time_nodes(300, 6_000), 150);
+    }
 }

@@ -3,6 +3,7 @@
 //! | file | answers |
 //! |---|---|
 //! | `initialize` | what a run starts from |
+//! | `near` | how near to the cameras Gaussians are drawn |
 //! | `run` | how it goes through its stages, and where it may be stopped |
 //! | `plan_step` | what decides a step |
 //! | `step` | how a step is done, and what falls behind it |
@@ -51,6 +52,7 @@ mod judged;
 mod known;
 mod measure;
 mod motions;
+mod near;
 mod objects;
 mod pacing;
 mod parts;
@@ -260,6 +262,10 @@ impl Trainer {
                 ));
             }
         }
+        let near = match config.near {
+            0.0 => field.record.drawing.near.unwrap_or_else(|| near::automatic(&dataset)),
+            near => near,
+        };
         let n = field.gaussians.len();
         let simd = SimdLevel::Auto;
         Ok(Self {
@@ -298,6 +304,7 @@ impl Trainer {
                 times: StepTimes::default(),
                 dataset,
                 config,
+                near,
                 frames,
                 phases,
                 field,

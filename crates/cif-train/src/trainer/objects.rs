@@ -203,7 +203,7 @@ impl Trainer {
             up: objects::up(&state.dataset),
             order,
             times: state.dataset.times.len(),
-            near: state.config.near,
+            near: state.near,
             seed: state.config.seed,
             gaussians: state.config.motion.gaussians as usize,
             phases: &state.phases,

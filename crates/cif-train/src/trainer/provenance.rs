@@ -29,7 +29,7 @@ impl Trainer {
         let exposures = progress.exposures.iter().flat_map(|exposures| exposures.by_camera());
         Record {
             drawing: Drawing {
-                near: Some(config.near),
+                near: Some(self.state.near),
                 antialiased: Some(config.antialiased),
                 opacity_is_occupancy: config.ablates(Ablation::OpacityOccupancy) || self.labels_by_opacity(),
                 exposures: exposures.map(|(camera, exposure)| (camera.to_owned(), exposure)).collect(),

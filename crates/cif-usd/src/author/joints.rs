@@ -16,12 +16,14 @@ pub(super) fn has_joints(node: &Node) -> bool {
 }
 
 /// Defines the joints of a node in `place`: the prim itself, or one of its variants. Their limits are the range that
-/// was recorded, from the first pose on.
+/// was recorded, from the first pose on. They are enabled where bodies are moved by forces: simulators solve them, and
+/// Newton refuses those that belong to no articulation.
 pub(super) fn author(
     scene: &Scene<'_, '_>,
     layer: &Layer<'_, '_>,
     place: &Prim<'_, '_, '_>,
     node: &Node,
+    enabled: bool,
 ) -> PyResult<()> {
     let Some(motion) = parts(node) else { return Ok(()) };
     let pxr = scene.pxr;
@@ -35,6 +37,9 @@ pub(super) fn author(
         };
         let name = format!("{}_{}", tokens::JOINT, part.name);
         let prim = layer.define(&child(place.path(), &name), prim_type)?;
+        if !enabled {
+            prim.set("physics:jointEnabled", "Bool", VARYING, false)?;
+        }
         prim.relate("physics:body0", &body(&base.name))?;
         prim.relate("physics:body1", &body(&part.name))?;
         let turn = DQuat::from_rotation_arc(DVec3::X, axis);

@@ -38,7 +38,7 @@ pub(super) fn author(
 ) -> PyResult<()> {
     let pxr = scene.pxr;
     if node.colliders.is_empty() {
-        joints::author(scene, layer, prim, node)?;
+        joints::author(scene, layer, prim, node, false)?;
         return poses(pxr, prim, node, true);
     }
     let part_tracks = parts(node).into_iter().flat_map(|motion| &motion.parts).map(|part| &part.track);
@@ -56,7 +56,7 @@ pub(super) fn author(
             variants::DYNAMIC => dynamic(scene, &inside, node)?,
             _ => continue,
         }
-        joints::author(scene, layer, &inside, node)?;
+        joints::author(scene, layer, &inside, node, variant == variants::DYNAMIC)?;
     }
     let moving = !matches!(node.motion, Motion::Static);
     prim.select(variants::PHYSICS, if moving { variants::KINEMATIC } else { variants::NONE })
@@ -90,6 +90,7 @@ fn bodies<'l, 'p, 'py>(prim: &Prim<'l, 'p, 'py>, node: &Node) -> PyResult<Vec<Pr
 /// A body with the initial velocity; parts on joints are bodies of their own, which the joints hold.
 fn dynamic(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
     if joints::has_joints(node) {
+        prim.apply(&["PhysicsArticulationRootAPI"])?;
         return bodies(prim, node)?.iter().try_for_each(|prim| body(scene, prim, false));
     }
     body(scene, prim, false)?;

@@ -29,7 +29,7 @@ use super::{CaptureOptions, eval_motion, print_warnings, train};
 use crate::error::Error;
 use crate::pictures::{Picture, instance_picture, rgb_picture};
 use crate::settings::Layers;
-use crate::{interrupt, output};
+use crate::{interrupt, output, starting_points};
 
 /// Measure what accuracy costs in time and bytes, and write a report with plots
 #[derive(Debug, Args)]
@@ -146,6 +146,9 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     {
         options.downscale = Some(factor);
         dataset = options.open(&command.capture)?;
+    }
+    if base_config(command, layout)?.model.triangulate {
+        starting_points::find(&mut dataset, &Stop::when(interrupt::requested).into())?;
     }
     print_warnings(&dataset);
     if !dataset.frames.iter().any(|frame| frame.split == Split::Val) {
@@ -468,7 +471,7 @@ impl Bench {
             self.dataset.clone()
         } else {
             let options = CaptureOptions { downscale: config.downscale, ..self.capture.clone() };
-            options.open(&self.dataset.root)?
+            Dataset { points: self.dataset.points.clone(), ..options.open(&self.dataset.root)? }
         };
         let training = Training { id: &rung.id, dataset, config };
         let mut last = 0;

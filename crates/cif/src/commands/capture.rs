@@ -34,7 +34,8 @@ impl From<cif_capture::Error> for Error {
             cif_capture::Error::Stopped => {
                 Self::Interrupted { message: "interrupted".to_owned(), help: None }
             }
-            cif_capture::Error::Refused { problem, fix } => Self::failed(problem, fix),
+            cif_capture::Error::Refused { problem, fix }
+            | cif_capture::Error::StandsStill { problem, fix } => Self::failed(problem, fix),
             other => Self::plain(other),
         }
     }
@@ -76,14 +77,14 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
         frames::collect(&sources, &choice(command), &scratch.path().join("frames"), &hooks, &mut notes);
     shown.clear();
     let mut shots = collected?;
-    let mut unbelieved = None;
+    let mut left = Left::default();
     let kept = structure::kept_beside(place);
     let places = Places { scratch: scratch.path(), kept: &kept, shown: &shown };
-    let made = make(command, &mut shots, &places, &hooks, &mut notes, &mut unbelieved);
+    let made = make(command, &mut shots, &places, &hooks, &mut notes, &mut left);
     shown.clear();
     match &made {
         Ok(()) => structure::remove_kept(&kept),
-        Err(error) => unfinished::keep(command, &sources, &shots, unbelieved.as_ref(), error),
+        Err(error) => unfinished::keep(command, &sources, &shots, &left, error),
     }
     made
 }
@@ -97,14 +98,23 @@ struct Places<'a> {
     shown: &'a Shown,
 }
 
-/// Finds or reads the poses of images and writes the capture. Poses that are not believed are left in `unbelieved`.
+/// What a run without a capture leaves to those that go on from it.
+#[derive(Default)]
+struct Left {
+    /// Poses that were found and not believed.
+    unbelieved: Option<Posed>,
+    /// A camera was seen to stand still, which no other option changes than one that says that it moves.
+    stands_still: bool,
+}
+
+/// Finds or reads the poses of images and writes the capture; fills `left` where it cannot.
 fn make(
     command: &Capture,
     shots: &mut [Shot],
     places: &Places<'_>,
     hooks: &Hooks<'_>,
     notes: &mut Notes,
-    unbelieved: &mut Option<Posed>,
+    left: &mut Left,
 ) -> Result<(), Error> {
     if let Some(path) = &command.times {
         times::apply(&times::read(path)?, path, shots)?;
@@ -124,7 +134,7 @@ fn make(
             let from = format!("{tool} ({})", path.display());
             Posed { poses, from, verdict: None, metres_known, up_known }
         }
-        None => find(command, shots, masks.as_ref(), places, hooks, notes)?,
+        None => find(command, shots, masks.as_ref(), places, hooks, notes, left)?,
     };
     places.shown.clear();
     for note in notes.iter() {
@@ -133,7 +143,7 @@ fn make(
     if let Some(verdict) = posed.verdict.as_ref().filter(|verdict| !verdict.is_good()) {
         if !command.accept {
             let error = report::not_believed(command, verdict, shots.len());
-            *unbelieved = Some(posed);
+            left.unbelieved = Some(posed);
             return Err(error);
         }
         eprintln!("warning: the verdict says no, and the capture is written because of --accept:\n{verdict}");
@@ -171,9 +181,13 @@ fn find(
     places: &Places<'_>,
     hooks: &Hooks<'_>,
     notes: &mut Notes,
+    left: &mut Left,
 ) -> Result<Posed, Error> {
     let fixed = is_fixed(command, shots);
-    frames::check(shots, fixed, notes)?;
+    let mut seen_still = |error: &cif_capture::Error| {
+        left.stands_still = matches!(error, cif_capture::Error::StandsStill { .. })
+    };
+    frames::check(shots, fixed, notes).inspect_err(&mut seen_still)?;
     let mut solved: Vec<Shot> = shots.to_vec();
     if fixed {
         let mut seen = BTreeSet::new();
@@ -187,7 +201,8 @@ fn find(
     let black = left_out(command, &solved, masks, places.scratch, hooks)?;
     let work = work_folder(places)?;
     let request = request(command, &solved, black.as_deref(), fixed, (&work, places.kept));
-    let Found { mut poses, verdict, setting, tried } = structure::find(&request, hooks)?;
+    let Found { mut poses, verdict, setting, tried } =
+        structure::find(&request, hooks).inspect_err(seen_still)?;
     notes.extend(tried.into_iter().map(|tried| format!("not believed: {tried}")));
     if fixed {
         poses.images = all_frames(&poses, &solved, shots);

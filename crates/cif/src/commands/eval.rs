@@ -26,9 +26,12 @@ use crate::{endings, interrupt, output};
 PSNR and SSIM are means over images (SSIM: 11 x 11 window, zero padding). The co-visible PSNR is that of
 the pixels, seen so many percent of all, whose place training views show too: their point, at the depth that
 the scene renders, lies inside a tenth of the training views (at least 5; 64 are asked where there are more)
-and at most 5 % behind what the scene renders there. It leaves out what no training image shows. Instance scores are
-percent over labelled pixels: mAcc-pix per frame, mAcc-inst per instance, mIoU per pair of instance
-and frame. A scene of another head (`cif train --head`) is scored by what that head decodes per pixel
+and at most 5 % behind what the scene renders there. It leaves out what no training image shows.
+
+Instance scores are percent. PQ and IoU take pixels without a label as background, so that what an object spills onto
+it counts: PQ is panoptic quality (Kirillov et al. 2019), IoU the mean over pairs of instance and frame. Where masks
+leave objects unlabelled, these are too low. The paper's protocol looks at labelled pixels alone: mAcc-pix per frame,
+mAcc-inst per instance, mIoU per pair of instance and frame. A scene of another head (`cif train --head`) is scored by what that head decodes per pixel
 (JSON: labels_by). The JSON also has the other definitions in use, and values per frame and per instance.
 n/a (JSON null) means that there is nothing to measure.
 
@@ -162,8 +165,19 @@ fn panel(view: &FrameView<'_>) -> Picture {
 }
 
 fn print_table(evaluation: &Evaluation, field: &Field) {
-    let mut table =
-        super::table(["", "frames", "PSNR", "co-visible", "seen", "SSIM", "mAcc-pix", "mAcc-inst", "mIoU"]);
+    let mut table = super::table([
+        "",
+        "frames",
+        "PSNR",
+        "co-visible",
+        "seen",
+        "SSIM",
+        "PQ",
+        "IoU",
+        "mAcc-pix",
+        "mAcc-inst",
+        "mIoU",
+    ]);
     let overall = std::iter::once(("all", &evaluation.overall));
     for (name, scores) in
         overall.chain(evaluation.groups.iter().map(|(name, scores)| (name.as_str(), scores)))
@@ -175,6 +189,8 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
             number(scores.psnr_covisible, 2),
             scores.covisible.map_or("n/a".to_owned(), |percent| format!("{percent:.0} %")),
             number(scores.ssim, 4),
+            number(scores.panoptic.quality, 2),
+            number(scores.panoptic.iou, 2),
             number(scores.instance.macc_pix, 2),
             number(scores.instance.macc_inst, 2),
             number(scores.instance.miou, 2),
@@ -182,12 +198,14 @@ fn print_table(evaluation: &Evaluation, field: &Field) {
     }
     println!("{table}");
     if !evaluation.overall.instance.instances.is_empty() {
-        let mut table = super::table(["id", "instance", "frames", "IoU", "accuracy", "tube IoU", "switches"]);
+        let mut table =
+            super::table(["id", "instance", "frames", "IoU", "mIoU", "accuracy", "tube IoU", "switches"]);
         for score in &evaluation.overall.instance.instances {
             table.add_row([
                 score.id.to_string(),
                 label_of(field, score.id),
                 score.frames.to_string(),
+                number(evaluation.overall.panoptic.instances.get(&score.id).copied(), 2),
                 number(score.iou, 2),
                 number(score.accuracy, 2),
                 number(score.tube_iou, 2),

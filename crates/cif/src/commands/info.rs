@@ -80,6 +80,7 @@ fn capture_facts(dataset: &Dataset) -> Result<Facts, Error> {
     let points = Bounds::around(dataset.points.positions.iter().map(|p| DVec3::from(p.map(f64::from))));
     let source = match &dataset.points.source {
         PointSource::File(path) => path.display().to_string(),
+        PointSource::Triangulated => "its own images".to_owned(),
         PointSource::Random => "random, in the box that the cameras see".to_owned(),
     };
     Ok(vec![

@@ -6,9 +6,11 @@ use std::path::{Path, PathBuf};
 use cif_dataset::{Dataset, OpenOptions};
 use cif_field::Checkpoint;
 use clap::{Args, Parser};
+use serde_json::json;
 
 use super::{Arguments, command_line, dispatch};
 use crate::error::Error;
+use crate::report::OnlyReport;
 
 /// The file that objects leave in: USD, where this build writes it.
 const STAGE: (&str, &str) =
@@ -57,11 +59,20 @@ pub(super) struct Make {
     /// Settings file of the training
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    #[command(flatten)]
+    report: OnlyReport,
     #[arg(from_global)]
     quiet: bool,
 }
 
 pub(super) fn run(command: &Make) -> Result<(), Error> {
+    command.report.check([])?;
+    if command.report.to_stdout() {
+        return Err(Error::usage(
+            "the steps of cif make print to stdout, where the report cannot be all that is printed",
+            "name the file that it is to be written to: --json make.json",
+        ));
+    }
     // Hours before it is needed.
     #[cfg(feature = "usd")]
     cif_usd::usd_version().map_err(Error::plain)?;
@@ -71,12 +82,19 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
     let (flag, name) = STAGE;
     let stage = command.output.join(name);
     if !is_made(&stage, &[&scene])? {
-        step(vec!["export".into(), scene.into(), flag.into(), stage.clone().into(), "--check".into()], None)?;
+        step(
+            vec!["export".into(), scene.clone().into(), flag.into(), stage.clone().into(), "--check".into()],
+            None,
+        )?;
     }
-    let stage = stage.display().to_string();
-    println!("made: {stage}");
-    println!("next: {}", command_line(&["query", &stage, "--label", "*"]));
-    Ok(())
+    let report = json!({ "capture": capture, "masks": masks, "scene": scene, "stage": stage });
+    command.report.give(
+        || report,
+        || {
+            println!("made: {}", stage.display());
+            println!("next: {}", command_line(&["query", &stage.display().to_string(), "--label", "*"]));
+        },
+    )
 }
 
 impl Make {

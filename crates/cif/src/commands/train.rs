@@ -19,7 +19,7 @@ use crate::error::Error;
 use crate::output::Outputs;
 use crate::progress::Progress;
 use crate::settings::Layers;
-use crate::{endings, interrupt, training};
+use crate::{endings, interrupt, starting_points, training};
 
 /// Train a scene on a capture
 #[derive(Debug, Args)]
@@ -258,6 +258,14 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     let phase = phases.enter(Phase::Open, 0);
     let mut dataset = capture.open(&command.capture)?;
     drop(phase);
+    // A scene that is begun with has its Gaussians; a run that goes on has the points that it began with.
+    let is_wanted = match (&checkpoint, &source) {
+        (Some(checkpoint), _) => cif_train::metrics::training_config(&checkpoint.field),
+        (None, Some(_)) => None,
+        (None, None) => Some(resolve(command, None, layout, None)?),
+    }
+    .is_some_and(|config| config.model.triangulate);
+    let is_found = !is_wanted || starting_points::find(&mut dataset, &phases)?;
     print_warnings(&dataset);
 
     let mut trainer = match checkpoint {
@@ -271,6 +279,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
             };
             let mut config = resolve(command, base.as_ref(), dataset.layout, plan.as_ref())?;
             command.goals.prepare(&mut config);
+            config.model.triangulate &= is_found;
             if source.is_none() {
                 let preset = TrainConfig::preset(config.preset, dataset.layout);
                 let (goals, options) = (&command.goals, &command.capture_options);

@@ -155,7 +155,8 @@ impl Goals {
         if reopened {
             let options = CaptureOptions { downscale: config.downscale, ..capture.clone() };
             let _phase = phases.enter(Phase::Open, 0);
-            return options.open(&dataset.root);
+            // Points that were triangulated are no files of the capture.
+            return Ok(Dataset { points: dataset.points, ..options.open(&dataset.root)? });
         }
         Ok(dataset)
     }

@@ -8,20 +8,14 @@ use cif_capture::structure::{self, Order};
 use cif_capture::unfinished::{Unfinished, keep as keep_unfinished};
 
 use super::options::{LensesName, OrderName, UpName};
-use super::{Capture, Posed};
+use super::{Capture, Left};
 use crate::commands::command_line;
 use crate::error::Error;
 
-/// Keeps frames of videos, and poses that were not believed, and says how to go on with them and with the features
+/// Keeps frames of videos, and poses that are `left`, and says how to go on with them and with the features
 /// found so far, after `error`.
-pub(super) fn keep(
-    command: &Capture,
-    sources: &[Source],
-    shots: &[Shot],
-    unbelieved: Option<&Posed>,
-    error: &Error,
-) {
-    let poses = unbelieved.map(|posed| (&posed.poses, posed.from.as_str()));
+pub(super) fn keep(command: &Capture, sources: &[Source], shots: &[Shot], left: &Left, error: &Error) {
+    let poses = left.unbelieved.as_ref().map(|posed| (&posed.poses, posed.from.as_str()));
     let kept = keep_unfinished(sources, shots, poses, &command.output).unwrap_or_else(|error| {
         eprintln!("warning: frames and poses found so far could not be kept: {error}");
         None
@@ -59,8 +53,14 @@ pub(super) fn keep(
         again.extend(choice_of_images(command));
     }
     let again = command_line(&again);
-    let options =
-        if matches!(error, Error::Interrupted { .. }) { Vec::new() } else { other_options(command) };
+    let options = match error {
+        Error::Interrupted { .. } => Vec::new(),
+        _ if left.stands_still && command.inputs.len() > 1 => {
+            vec!["--fixed (all cameras stand still)", "--moving (it moves all the same)"]
+        }
+        _ if left.stands_still => vec!["--moving (it moves all the same)"],
+        _ => other_options(command),
+    };
     if options.is_empty() {
         eprintln!("next:\n  {again}");
     } else {
