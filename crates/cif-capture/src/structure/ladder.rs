@@ -332,7 +332,7 @@ mod tests {
         assert_eq!(of([Some(0.03), Some(0.06), None, Some(0.0), Some(0.0005)]), Some("b"));
         assert_eq!(of([Some(0.03), Some(0.0005), Some(0.04), Some(0.0), None]), None);
         let words = |cameras: &[&str]| match stands_still("a", cameras) {
-            Error::Refused { problem, fix } => (problem, fix),
+            Error::StandsStill { problem, fix } => (problem, fix),
             other => panic!("{other}"),
         };
         let (problem, fix) = words(&["a", "a"]);

@@ -293,7 +293,8 @@ mod tests {
         // Around a table, once.
         let camera = |k: usize| {
             let turn = glam::DMat3::from_rotation_y(std::f64::consts::TAU * k as f64 / 40.0);
-            let world_from_camera = RigidTransform { rotation: turn, translation: turn * -3.0 * glam::DVec3::Z };
+            let world_from_camera =
+                RigidTransform { rotation: turn, translation: turn * -3.0 * glam::DVec3::Z };
             PinholeCamera {
                 width: 64,
                 height: 48,

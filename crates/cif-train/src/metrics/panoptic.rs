@@ -100,7 +100,7 @@ mod tests {
         let truth = [0, 0, 0, 0, 1, 1, 1, 1, 1, 1, 1, 1];
         // All of the image, which is right on every labelled pixel.
         let scores = panoptic_metrics(&[frame(truth, [1; 12])]);
-        assert_eq!(scores.iou, Some(100.0 * 8.0 / 12.0));
+        assert_eq!(scores.iou, Some(100.0 * (8.0 / 12.0)));
         assert_eq!((scores.recognition, scores.quality), (Some(100.0), scores.segmentation));
         let exact = panoptic_metrics(&[frame(truth, truth)]);
         assert_eq!((exact.quality, exact.iou), (Some(100.0), Some(100.0)));

@@ -81,7 +81,8 @@ mod tests {
         for frame in &mut dataset.frames {
             frame.camera.camera_from_world.translation *= size;
             let camera = &frame.camera;
-            let reach = |k: usize| (camera.centre() + camera.forward() * depth * (1.0 + k as f64)).as_vec3();
+            let reach =
+                |k: usize| (camera.centre() + camera.forward() * depth * (1.0 + 1e-3 * k as f64)).as_vec3();
             if frame.split == cif_dataset::Split::Train {
                 positions.extend((0..40).map(|k| reach(k).to_array()));
             }

@@ -29,6 +29,7 @@ fn guided() -> TrainConfig {
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (100, 300, 60);
     (config.motion.guidance, config.motion.stillness, config.motion.rehearsal) = (10.0, 1.0, 100);
     config.motion.gaussians = 100;
+    config.model.time_resolution = 12;
     config.densify.max_gaussians = 1_500;
     config
 }
