@@ -227,9 +227,7 @@ def simulate(
     model = builder.finalize(device="cpu")
     bodies = {Sdf.Path(str(path)): index for path, index in loaded["path_body_map"].items()}
     driven = {path: index for path, index in bodies.items() if is_kinematic(stage, path)}
-    missing = [path for path in falling if path not in bodies]
-    if missing:
-        sys.exit(f"{missing[0]}: Newton made no body of it; does it have a collider?")
+    falling = [body for path in falling for body in bodies_of(path, bodies)]
     print(f"{len(bodies)} bodies, {len(driven)} of them on tracks, {model.shape_count} shapes")
     solver = newton.solvers.SolverXPBD(model, iterations=8)
     pipeline = newton.CollisionPipeline(model)
@@ -281,6 +279,14 @@ def simulate(
     return recorded, drift
 
 
+def bodies_of(path: Sdf.Path, bodies: dict[Sdf.Path, int]) -> list[Sdf.Path]:
+    """The bodies of an instance: itself, or its parts where joints tie them."""
+    found = [path] if path in bodies else [body for body in bodies if body.HasPrefix(path)]
+    if not found:
+        sys.exit(f"{path}: Newton made no body of it; does it have a collider?")
+    return found
+
+
 def is_kinematic(stage: Usd.Stage, path: Sdf.Path) -> bool:
     """Whether a body follows its recorded motion."""
     return bool(UsdPhysics.RigidBodyAPI(stage.GetPrimAtPath(path)).GetKinematicEnabledAttr().Get())
@@ -317,8 +323,8 @@ def write_poses(stage: Usd.Stage, prim: Usd.Prim, poses: Poses, first: int) -> N
 
 
 def lowest(stage: Usd.Stage, path: Sdf.Path, up: int, frame: int) -> float:
-    """Height of the lowest corner of an instance's colliders at a frame."""
-    hulls = colliders(stage).get(path, [])
+    """Height of the lowest corner of the colliders of an instance, or of its part, at a frame."""
+    hulls = [mesh for meshes in colliders(stage).values() for mesh in meshes if mesh.GetPath().HasPrefix(path)]
     return min(float(world_points(mesh, "points", Usd.TimeCode(frame))[:, up].min()) for mesh in hulls)
 
 

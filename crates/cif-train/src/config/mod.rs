@@ -271,6 +271,9 @@ pub struct IdentityConfig {
     pub neighbour_distance: f32,
     /// Occupancy of unseen Gaussians without neighbours, default 0.005.
     pub unseen_occupancy: f32,
+    /// Rounds of expectation maximisation, after the instance stage, for how much of each Gaussian is an instance's
+    /// rather than of the unlabelled rest, default 4; 0, as in `paper`, leaves what was counted.
+    pub share_rounds: u32,
     /// Estimates again every so many steps of the instance stage, folding calibration in; default 0: once
     /// (A16).
     pub refresh_every: u32,

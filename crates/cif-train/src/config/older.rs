@@ -10,8 +10,12 @@ fn removed() -> [(&'static str, Value); 2] {
 }
 
 /// Settings that there were not, with the value that runs went by.
-fn added() -> [(&'static str, Value); 2] {
-    [("/resample/weakness", "occupancy".into()), ("/model/triangulate", false.into())]
+fn added() -> [(&'static str, Value); 3] {
+    [
+        ("/resample/weakness", "occupancy".into()),
+        ("/model/triangulate", false.into()),
+        ("/identity/share_rounds", 0.into()),
+    ]
 }
 
 /// The table that holds a setting, and its key.

@@ -91,6 +91,7 @@ fn paper(layout: Layout) -> TrainConfig {
         ..config.densify
     };
     config.instance.geometry = super::InstanceGeometry::Full;
+    config.identity.share_rounds = 0;
     config.resample = ResampleConfig {
         from: 100,
         until: 2_500,
@@ -286,6 +287,7 @@ impl Default for IdentityConfig {
             neighbours: 8,
             neighbour_distance: 0.05,
             unseen_occupancy: 0.005,
+            share_rounds: 4,
             refresh_every: 0,
         }
     }

@@ -2,8 +2,10 @@
 //! Source: Kirillov et al. 2019, with the ids of masks for segments.
 //!
 //! The paper's protocol ([`super::instance`]) looks at labelled pixels alone, where an object that is alone is right
-//! wherever it is drawn at all. Here a pixel is predicted as an instance where the instances, as blended like colour,
-//! are more likely what is seen than the unlabelled rest ([`cif_render::InstanceImage::foreground`]).
+//! wherever it is drawn at all. Here an instance has those of its pixels whose expected intersection over union is
+//! largest, by the probability that what they show is an instance's
+//! ([`cif_render::InstanceImage::foreground`]): about those above one half, and more of what is thinner than the Gaussians
+//! that draw it, of which no pixel may be certain.
 
 use std::collections::BTreeMap;
 
@@ -15,8 +17,11 @@ use super::instance::FrameConfusion;
 /// Intersection over union from which on a predicted segment is the true one.
 const MATCHES: f64 = 0.5;
 
-/// Foreground from which on a pixel is an instance's.
-const INSTANCE: f32 = 0.5;
+/// Foreground below which no pixel is an instance's.
+const LEAST: f64 = 0.2;
+
+/// Rounds of Dinkelbach's method for the largest ratio; it converges faster than linearly.
+const ROUNDS: usize = 8;
 
 /// Panoptic scores of a set of frames, percent.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -33,12 +38,37 @@ pub struct PanopticMetrics {
     pub instances: BTreeMap<u16, f64>,
 }
 
-/// Mask ids where an instance is more likely what is seen than the background, and 0 elsewhere.
+/// Mask ids of the pixels that are an instance's rather than the background's, and 0 elsewhere.
+///
+/// Of an instance whose pixels are its own with the probabilities `p`, the set `O` has the expected ratio `sum_O p / (sum p
+/// + sum_O (1 - p))`, which is largest, with the value `v`, where `O` has the pixels with `p > v / (1 + v)`.
 #[must_use]
 pub fn with_background(predicted: &PixelGrid<u16>, foreground: &PixelGrid<f32>) -> PixelGrid<u16> {
-    let ids = predicted.pixels.iter().zip(&foreground.pixels);
-    let ids = ids.map(|(id, foreground)| if *foreground >= INSTANCE { *id } else { 0 }).collect();
+    let mut by_id: BTreeMap<u16, Vec<f64>> = BTreeMap::new();
+    let pixels = || predicted.pixels.iter().zip(&foreground.pixels);
+    for (id, foreground) in pixels() {
+        by_id.entry(*id).or_default().push(f64::from(*foreground));
+    }
+    let bounds: BTreeMap<u16, f64> = by_id.iter().map(|(id, own)| (*id, bound(own))).collect();
+    let is_own = |id: u16, foreground: f32| f64::from(foreground) > bounds[&id];
+    let ids = pixels().map(|(id, foreground)| if is_own(*id, *foreground) { *id } else { 0 }).collect();
     PixelGrid::from_pixels(predicted.width, predicted.height, ids)
+}
+
+/// Probability above which pixels belong to the set of the largest expected ratio.
+fn bound(probabilities: &[f64]) -> f64 {
+    let all: f64 = probabilities.iter().sum();
+    let mut bound = LEAST;
+    for _ in 0..ROUNDS {
+        let (mut own, mut others) = (0.0, 0.0);
+        for p in probabilities.iter().filter(|p| **p > bound) {
+            own += p;
+            others += 1.0 - p;
+        }
+        let ratio = if own > 0.0 { own / (all + others) } else { 0.0 };
+        bound = (ratio / (1.0 + ratio)).max(LEAST);
+    }
+    bound
 }
 
 /// Scores of frames whose predictions are those of [`with_background`].
@@ -128,8 +158,24 @@ mod tests {
 
     #[test]
     fn the_background_takes_what_is_more_likely_its_own() {
-        let predicted = PixelGrid::from_pixels(3, 1, vec![4, 4, 4]);
-        let foreground = PixelGrid::from_pixels(3, 1, vec![0.9, 0.5, 0.49]);
-        assert_eq!(with_background(&predicted, &foreground).pixels, [4, 4, 0]);
+        // An object that is seen well, and one so thin that none of its pixels shows it alone.
+        let predicted = PixelGrid::from_pixels(9, 1, vec![4, 4, 4, 4, 4, 7, 7, 7, 7]);
+        let foreground = PixelGrid::from_pixels(9, 1, vec![1.0, 1.0, 1.0, 0.4, 0.1, 0.45, 0.4, 0.1, 0.1]);
+        assert_eq!(with_background(&predicted, &foreground).pixels, [4, 4, 4, 0, 0, 7, 7, 0, 0]);
+        // Of nothing but traces, nothing is left.
+        let traces = PixelGrid::from_pixels(9, 1, vec![0.1; 9]);
+        assert_eq!(with_background(&predicted, &traces).pixels, [0; 9]);
+    }
+
+    #[test]
+    fn the_bound_gives_the_largest_expected_ratio() {
+        let probabilities = [0.95, 0.9, 0.7, 0.55, 0.45, 0.4, 0.3, 0.25, 0.1, 0.05];
+        let all: f64 = probabilities.iter().sum();
+        let ratio = |bound: f64| {
+            let set: Vec<f64> = probabilities.iter().copied().filter(|p| *p > bound).collect();
+            set.iter().sum::<f64>() / (all + set.iter().map(|p| 1.0 - p).sum::<f64>())
+        };
+        let best = (0..100).map(|k| ratio(0.01 * f64::from(k))).fold(0.0, f64::max);
+        assert!((ratio(bound(&probabilities)) - best).abs() < 1e-12);
     }
 }

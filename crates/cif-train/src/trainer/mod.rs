@@ -14,6 +14,7 @@
 //! | `guidance` | how travelling objects start on the paths that masks tell |
 //! | `objects`, `known` | which objects move as a whole, how they join the field, and what is kept of fits until then |
 //! | `identity` | how identity rows come about |
+//! | `shares` | how much of a Gaussian is of any instance |
 //! | `from_scene` | how a run begins with an earlier reconstruction |
 //! | `resume` | what is saved, and how a run resumes |
 //! | `evaluate` | what a run has reached, on a few frames |
@@ -65,6 +66,7 @@ mod run;
 mod saving;
 #[cfg(feature = "wgpu")]
 mod shape;
+mod shares;
 mod step;
 mod still;
 

@@ -121,6 +121,9 @@ impl Trainer {
                 }
                 fetched?;
                 self.finish_head(stage)?;
+                if stage == Stage::Instance {
+                    self.sharpen_shares()?;
+                }
             }
             let next = self.stages.after(&self.state.config, stage);
             let ends =
