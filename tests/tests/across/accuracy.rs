@@ -73,6 +73,29 @@ fn a_budget_says_what_it_buys_and_writes_the_settings_that_came_of_it() {
 }
 
 #[test]
+fn captures_without_points_say_what_they_start_from() {
+    let folder = capture::in_folder(8);
+    let path = folder.path();
+    fs::remove_file(path.join("table/points.npy")).unwrap();
+    let short = format!(
+        "{SMALL} --iterations-coarse 3 --iterations-fine 3 --iterations-instance 0 --set motion.rehearsal=1"
+    );
+    let told = cif(path, &format!("train table -o a.cif {short}")).succeeds().stderr;
+    // Which of the two depends on whether Python has pycolmap.
+    let found = told.contains("were triangulated from its images");
+    assert!(found != told.contains("points drawn at random"), "{told}");
+    let triangulates = |scene: &str| {
+        let settings: toml::Table =
+            fs::read_to_string(path.join(format!("{scene}.train.toml"))).unwrap().parse().unwrap();
+        settings["model"]["triangulate"].as_bool()
+    };
+    assert_eq!(triangulates("a"), Some(found), "a run that goes on starts from the same");
+    let plain = cif(path, &format!("train table -o b.cif --set model.triangulate=false {short}"));
+    assert!(!plain.succeeds().stderr.contains("triangulate"), "nothing is looked for");
+    assert_eq!(triangulates("b"), Some(false));
+}
+
+#[test]
 fn a_target_stops_a_run() {
     let folder = capture::in_folder(8);
     let path = folder.path();

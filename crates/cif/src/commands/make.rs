@@ -82,10 +82,13 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
     let (flag, name) = STAGE;
     let stage = command.output.join(name);
     if !is_made(&stage, &[&scene])? {
-        step(
-            vec!["export".into(), scene.clone().into(), flag.into(), stage.clone().into(), "--check".into()],
-            None,
-        )?;
+        let mut words: Vec<OsString> =
+            vec!["export".into(), scene.clone().into(), flag.into(), stage.clone().into()];
+        words.extend(["--check".into(), "--capture".into(), capture.clone().into()]);
+        if let Some(masks) = &masks {
+            words.extend(["--masks".into(), masks.clone().into()]);
+        }
+        step(words, None)?;
     }
     let report = json!({ "capture": capture, "masks": masks, "scene": scene, "stage": stage });
     command.report.give(
