@@ -559,14 +559,7 @@ impl Node {
         is_visible_at(&self.visibility, time_code)
     }
 
-    /// World box of what can be seen of the node at a time code: all but the outermost hundredth of what its splats show,
-    /// by opacity and area, on each side of each axis.
-    #[must_use]
-    pub fn seen_bounds(&self, time_code: f64) -> Bounds {
-        extent::seen_bounds(&self.splats_at(time_code), &self.splats.opacities)
-    }
-
-    /// World box of the 3-sigma ellipsoids at a time code, by which formats cull.
+    /// World box of the 3-sigma ellipsoids at a time code.
     #[must_use]
     pub fn bounds(&self, time_code: f64) -> Bounds {
         let world_from_local = self.world_transform(time_code);

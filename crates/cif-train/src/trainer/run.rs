@@ -121,9 +121,6 @@ impl Trainer {
                 }
                 fetched?;
                 self.finish_head(stage)?;
-                if stage == Stage::Instance {
-                    self.sharpen_shares()?;
-                }
             }
             let next = self.stages.after(&self.state.config, stage);
             let ends =
@@ -134,6 +131,10 @@ impl Trainer {
                     Err(TrainError::Stopped) if stage == Stage::Identity => {}
                     measured => measured?,
                 }
+            }
+            if stage == Stage::Instance {
+                // The last that may be stopped in this stage: it must not be done twice.
+                self.sharpen_shares()?;
             }
             self.enter(next)?;
             self.send_messages(observer, &mut requests);
