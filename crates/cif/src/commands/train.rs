@@ -31,9 +31,9 @@ written beside the scene as SCENE.train.toml, which --config accepts again.
   cif train captures/table -o table.cif --masks masks_tracker --iterations-fine 8000 --seed 3
   cif train captures/table -o table.cif --config mine.toml --set densify.max_gaussians=30000
 
-Measured: draft on examples/tabletop-mini (60 frames of 128 x 96) takes 56 s on two cores and reaches
-28.4 dB PSNR and 97 % mIoU on held-out frames (make demo);
-standard on a capture of 256 x 192 took six minutes on one core and reached 29.4 dB and 98 %; paper is
+Measured: draft on examples/tabletop-mini (60 frames of 128 x 96) takes 41 s on two cores and reaches
+29.2 dB PSNR and 97 % mIoU on held-out frames (make demo);
+standard on a capture of 256 x 192 took five minutes on two cores and reached 31.1 dB and 99 %; paper is
 not measured. `cif bench accuracy` measures this on your capture and machine.
 
 Other masks or variants on one reconstruction, without training it again (settings that are not typed
