@@ -50,6 +50,9 @@ PAIRS = 50
 FEW_MATCHES = 15
 MAX_ERROR_PX = 4.0
 
+# Models that the incremental mapper begins at most, each with another pair of images; the largest is taken.
+MODELS = 3
+
 # Tracks of every image that the global mapper solves for; the others are added to the poses afterwards. All of
 # them, five times as many, gave the same poses within 0.01 % in three times the time.
 TRACKS = 300
@@ -224,8 +227,9 @@ def reconstruct(pycolmap, job, database, mapper, seed):
         options = pycolmap.IncrementalPipelineOptions()
         # Small captures and rigs have few images.
         options.min_model_size = 3
-        # Its model is a check of the global mapper's. Further ones would be of the images that it leaves out.
-        options.multiple_models = False
+        # A model that begins with a bad pair of images may hold no more than these: others are begun then, but
+        # not one for every few images of a video that are left out.
+        options.max_num_models = MODELS
         options.extract_colors = False
         level, mapping, registered = pycolmap.logging.minloglevel, pycolmap.incremental_mapping, [0]
 
