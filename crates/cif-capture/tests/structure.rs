@@ -136,6 +136,21 @@ fn request<'a>(shots: &'a [Shot], work: &'a Path, kept: &'a Path) -> Request<'a>
     }
 }
 
+/// The cameras that rendered the pictures, without points.
+fn true_poses(shots: &[Shot], cameras: &[RigidTransform]) -> Poses {
+    let lens = Lens {
+        size: (WIDTH, HEIGHT),
+        focal_px: [FOCAL; 2],
+        principal_px: [0.5 * f64::from(WIDTH), 0.5 * f64::from(HEIGHT)],
+        distortion: LensDistortion::default(),
+    };
+    let pose = |(shot, camera): (&Shot, &RigidTransform)| {
+        (shot.name.clone(), Pose { lens: 0, world_from_camera: *camera, points: 0 })
+    };
+    let images = shots.iter().zip(cameras).map(pose).collect();
+    Poses { lenses: vec![lens], images, ..Poses::default() }
+}
+
 fn find(folder: &Path, shots: &[Shot], work: &str) -> Result<Found, Error> {
     let (work, kept) = (folder.join(work), folder.join(format!("{work}-kept")));
     let request = request(shots, &work, &kept);
@@ -178,17 +193,7 @@ fn more_points_are_seen_where_poses_are_known() {
     let mut shots = shots(folder.path());
     shots.iter_mut().for_each(|shot| shot.camera = shot.name.clone());
     let found = find(folder.path(), &shots, "moment").unwrap();
-    let lens = Lens {
-        size: (WIDTH, HEIGHT),
-        focal_px: [FOCAL; 2],
-        principal_px: [0.5 * f64::from(WIDTH), 0.5 * f64::from(HEIGHT)],
-        distortion: LensDistortion::default(),
-    };
-    let pose = |(shot, camera): (&Shot, &RigidTransform)| {
-        (shot.name.clone(), Pose { lens: 0, world_from_camera: *camera, points: 0 })
-    };
-    let images = shots.iter().zip(&cameras).map(pose).collect();
-    let poses = Poses { lenses: vec![lens], images, ..Poses::default() };
+    let poses = true_poses(&shots, &cameras);
     let (work, kept) = (folder.path().join("points"), folder.path().join("points-kept"));
     let request = request(&shots, &work, &kept);
     let before = found.poses.points.len();
@@ -211,15 +216,6 @@ fn captures_without_points_get_those_that_their_images_show() {
     let folder = tempfile::tempdir().unwrap();
     let cameras = cameras(10);
     photographs(folder.path(), &cameras);
-    let lens = Lens {
-        size: (WIDTH, HEIGHT),
-        focal_px: [FOCAL; 2],
-        principal_px: [0.5 * f64::from(WIDTH), 0.5 * f64::from(HEIGHT)],
-        distortion: LensDistortion::default(),
-    };
-    let pose = |(shot, camera): (&Shot, &RigidTransform)| {
-        (shot.name.clone(), Pose { lens: 0, world_from_camera: *camera, points: 0 })
-    };
     let mut counts = Vec::new();
     // A camera that walks, and a rig at one moment.
     for is_rig in [false, true] {
@@ -230,8 +226,7 @@ fn captures_without_points_get_those_that_their_images_show() {
                 (shot.camera, shot.name) = (format!("cam{k}"), format!("cam{k}/0.png"));
             }
         }
-        let images = shots.iter().zip(&cameras).map(pose).collect();
-        let poses = Poses { lenses: vec![lens.clone()], images, ..Poses::default() };
+        let poses = true_poses(&shots, &cameras);
         let capture = cif_capture::write::Capture {
             shots: &shots,
             poses: &poses,

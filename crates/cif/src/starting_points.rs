@@ -7,8 +7,8 @@ use cif_train::{Phase, Phases};
 
 use crate::error::Error;
 
-/// Fewest points that are better than ones drawn at random: as many as are looked at to know how the camera sees the
-/// scene, one for every image of a small rig and its neighbours.
+/// Fewest points that are taken instead of ones drawn at random. Of fewer most of a scene would start empty; the number is
+/// not measured.
 const FEWEST: usize = 100;
 
 /// Triangulates points of a capture that has none through pycolmap, and gives them to `dataset`; true where there are

@@ -60,7 +60,6 @@ impl Band {
     #[inline(always)]
     fn blur_along(&mut self, map: usize, around: usize, length: usize, value: impl Fn(usize) -> f32) {
         const MARGIN: usize = RADIUS * CHANNELS;
-        let taps = window_of_once();
         self.padded.resize(length + 2 * MARGIN, 0.0);
         for (k, padded) in self.padded[MARGIN..MARGIN + length].iter_mut().enumerate() {
             *padded = value(k);
@@ -68,17 +67,7 @@ impl Band {
         let out = &mut self.along[map];
         out.resize((BAND + 2 * RADIUS) * length, 0.0);
         let out = &mut out[around * length..(around + 1) * length];
-        let at = |tap: isize| &self.padded[(MARGIN as isize + tap * CHANNELS as isize) as usize..][..length];
-        let (a1, b1, a2, b2) = (at(-1), at(1), at(-2), at(2));
-        let (a3, b3, a4, b4, a5, b5, centre) = (at(-3), at(3), at(-4), at(4), at(-5), at(5), at(0));
-        for k in 0..length {
-            out[k] = taps[0] * centre[k]
-                + taps[1] * (a1[k] + b1[k])
-                + taps[2] * (a2[k] + b2[k])
-                + taps[3] * (a3[k] + b3[k])
-                + taps[4] * (a4[k] + b4[k])
-                + taps[5] * (a5[k] + b5[k]);
-        }
+        blurred(out, |tap| &self.padded[tap * CHANNELS..][..length]);
     }
 
     /// Sets a row outside the image to zero.
@@ -92,23 +81,29 @@ impl Band {
     /// Blurs the first maps across their rows.
     #[inline(always)]
     fn blur_across(&mut self, maps: usize, rows: usize, length: usize) {
-        let taps = window_of_once();
         for (out, along) in self.blurred[..maps].iter_mut().zip(&self.along) {
             out.resize(BAND * length, 0.0);
             for (row, out) in out.chunks_exact_mut(length).take(rows).enumerate() {
-                let at = |tap: usize| &along[(row + tap) * length..][..length];
-                let (a1, b1, a2, b2) = (at(4), at(6), at(3), at(7));
-                let (a3, b3, a4, b4, a5, b5, centre) = (at(2), at(8), at(1), at(9), at(0), at(10), at(5));
-                for k in 0..length {
-                    out[k] = taps[0] * centre[k]
-                        + taps[1] * (a1[k] + b1[k])
-                        + taps[2] * (a2[k] + b2[k])
-                        + taps[3] * (a3[k] + b3[k])
-                        + taps[4] * (a4[k] + b4[k])
-                        + taps[5] * (a5[k] + b5[k]);
-                }
+                blurred(out, |tap| &along[(row + tap) * length..][..length]);
             }
         }
+    }
+}
+
+/// Sums values under the window, `at` giving those that lie under each of its taps, from the first to the last.
+#[inline(always)]
+fn blurred<'a>(out: &mut [f32], at: impl Fn(usize) -> &'a [f32]) {
+    let taps = window_of_once();
+    let centre = at(RADIUS);
+    let [[a1, b1], [a2, b2], [a3, b3], [a4, b4], [a5, b5]] =
+        [1, 2, 3, 4, 5].map(|k| [at(RADIUS - k), at(RADIUS + k)]);
+    for k in 0..out.len() {
+        out[k] = taps[0] * centre[k]
+            + taps[1] * (a1[k] + b1[k])
+            + taps[2] * (a2[k] + b2[k])
+            + taps[3] * (a3[k] + b3[k])
+            + taps[4] * (a4[k] + b4[k])
+            + taps[5] * (a5[k] + b5[k]);
     }
 }
 
