@@ -79,7 +79,8 @@ fn scores(
 /// the scene was trained) say how to open. split is "val", the held-out frames, or "train".
 ///
 /// The answer has frames (their number), psnr, psnr_covisible and covisible (percent of pixels), ssim,
-/// macc_pix, macc_inst and miou (percent), variants (other definitions in use), instances (scores of each),
+/// panoptic (quality, segmentation, recognition and iou in percent, pixels without a label being background),
+/// macc_pix, macc_inst and miou (percent, over labelled pixels), variants (other definitions in use), instances (scores of each),
 /// groups, per_frame, motion (against known motion, where the capture has it), gaussians,
 /// render_ms_per_frame, train (of its run: wall_s, iterations and more), warnings, and seconds, which scoring
 /// took by the clock of the wall. None means that there is nothing to measure. Ctrl-C raises
