@@ -111,6 +111,9 @@ pub struct InstanceLabel {
     pub taxonomies: BTreeMap<String, String>,
 }
 
+/// Training frames of one time from which on their cameras are a rig: a third view checks what two agree on.
+const FEWEST_AT_ONCE: usize = 3;
+
 /// Where the initial points come from.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum PointSource {
@@ -214,6 +217,12 @@ impl Dataset {
             cameras.entry(frame.time_index).or_default().insert(&frame.camera_name);
         }
         cameras.values().map(BTreeSet::len).max().unwrap_or(0)
+    }
+
+    /// True where cameras took three or more training frames at one time, among which what moves stands still.
+    #[must_use]
+    pub fn is_rig(&self) -> bool {
+        self.images_at_once() >= FEWEST_AT_ONCE
     }
 
     /// Scene extent in metres: 1.1 times the largest distance of a training camera's centre from the mean of

@@ -11,6 +11,7 @@
 //! | [`lens`] | lens distortion and its removal |
 //! | [`grid`] | row-major pixel grids |
 //! | [`bounds`] | axis-aligned boxes |
+//! | [`overlap`] | which members make the set of the largest expected overlap |
 //!
 //! Conventions: right-handed world; camera frame x right, y down, z forward (OpenCV); pixel (i, j) has its
 //! centre at (i + 0.5, j + 0.5); quaternions are (w, x, y, z) in memory; matrices act on column vectors.
@@ -20,6 +21,7 @@ pub mod camera;
 pub mod capture_frame;
 pub mod grid;
 pub mod lens;
+pub mod overlap;
 pub mod quaternion;
 pub mod scalar;
 pub mod spherical_harmonics;

@@ -80,8 +80,8 @@ fn scores(
 ///
 /// The answer has frames (their number), psnr, psnr_covisible and covisible (percent of pixels), ssim,
 /// panoptic (quality, segmentation, recognition and iou in percent, pixels without a label being background),
-/// macc_pix, macc_inst and miou (percent, over labelled pixels), variants (other definitions in use), instances (scores of each),
-/// groups, per_frame, motion (against known motion, where the capture has it), gaussians,
+/// macc_pix, macc_inst and miou (percent, over labelled pixels), variants (other definitions in use),
+/// instances (scores of each), groups, per_frame, motion (against known motion, where the capture has it), gaussians,
 /// render_ms_per_frame, train (of its run: wall_s, iterations and more), warnings, and seconds, which scoring
 /// took by the clock of the wall. None means that there is nothing to measure. Ctrl-C raises
 /// KeyboardInterrupt between two frames.

@@ -64,6 +64,9 @@ fn a_budget_says_what_it_buys_and_writes_the_settings_that_came_of_it() {
         assert!(steps[stage].as_i64() > Some(0));
     }
     assert_eq!(facts["provenance"]["train"]["goals"]["budget"]["seconds"], 2.0);
+    // Of the phases that are told, those too short to be seen are left out; they count all the same.
+    let times = &facts["provenance"]["train"]["wall_s_by_phase"];
+    assert!(times["open"].as_f64() > Some(0.0) && times["fine"].as_f64() > Some(0.0), "{times}");
 
     cif(path, "train table -o b.cif --budget soon").fails(2, &["--budget"]);
     cif(path, "train table -o b.cif --budget 9s --iterations-fine 3").fails(2, &["--iterations-fine"]);

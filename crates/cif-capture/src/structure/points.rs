@@ -1,6 +1,7 @@
-//! Points that images with known poses see, of captures that come without any too. One moment of a rig gives few: most are seen by two cameras alone,
+//! Points that images with known poses see. One moment of a rig gives few: most are seen by two cameras alone,
 //! which mappers leave out because they have no poses yet to check them by. With poses, two views tell a place as
-//! well as more, and other moments show what people or things hid. Poses of other tools may come without any.
+//! well as more, and other moments show what people or things hid. Poses of other tools, and captures that are trained
+//! on as they are, may come without any.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -22,13 +23,10 @@ use crate::{Error, Hooks, Impression};
 /// Moments of the rig that are looked at; each adds about as many points, and takes as long, as the first.
 const MOMENTS: usize = 4;
 
-/// Images of a rig that are looked at, where its moments have fewer each.
+/// Images of a rig that are looked at at least, as far as it has moments, so that small rigs have enough of them.
 const IMAGES_OF_RIG: usize = 60;
 
-/// Images of one time from which on what moves stands still among them.
-const FEWEST_AT_ONCE: usize = 3;
-
-/// Images of cameras that take one at a time that are looked at.
+/// Most images that are looked at of cameras that take one at a time, spread evenly: their matches take half a minute.
 const IMAGES_OF_WALK: usize = 150;
 
 /// Each such image is matched with these of the others, from the one with the most similar view on: near ones show the
@@ -65,8 +63,7 @@ pub fn points_of_capture(
     hooks: &Hooks<'_>,
 ) -> Result<Vec<Point>, Error> {
     let train = dataset.train_frames();
-    let at_once = dataset.images_at_once();
-    let is_rig = at_once >= FEWEST_AT_ONCE;
+    let is_rig = dataset.is_rig();
     let count = if is_rig { train.len() } else { train.len().min(IMAGES_OF_WALK) };
     let frames: Vec<usize> = (0..count).map(|k| train[k * train.len() / count.max(1)]).collect();
     let (shots, poses) = known(dataset, &frames)?;
@@ -84,7 +81,8 @@ pub fn points_of_capture(
         threads,
     };
     if is_rig {
-        let (shots, pairs) = moments(&shots, &poses, MOMENTS.max(IMAGES_OF_RIG.div_ceil(at_once)));
+        let (shots, pairs) =
+            moments(&shots, &poses, MOMENTS.max(IMAGES_OF_RIG.div_ceil(dataset.images_at_once())));
         return points(&Request { shots: &shots, ..request }, &poses, &pairs, 2, hooks);
     }
     let cameras: Vec<PinholeCamera> = frames.iter().map(|index| dataset.frames[*index].camera).collect();

@@ -275,7 +275,7 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
         };
     }
     Err(Error::refused(
-        "poses are found by pycolmap, which needs Python, and there is none on the PATH",
+        "poses and points are found by pycolmap, which needs Python, and there is none on the PATH",
         format!(
             "install Python 3.10 to 3.13 and pycolmap (pip install pycolmap), and name it by {VARIABLE}; or give \
                  poses of another tool with --poses"
@@ -286,7 +286,9 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
 /// pycolmap cannot be imported.
 fn pycolmap_missing(problem: &str, python: &str, version: &str) -> Error {
     Error::refused(
-        format!("poses are found by pycolmap, which Python {version} ({python}) does not have: {problem}"),
+        format!(
+            "poses and points are found by pycolmap, which Python {version} ({python}) does not have: {problem}"
+        ),
         format!(
             "install it: {python} -m pip install 'cif4d[capture]', or pip install pycolmap; {VARIABLE} names another \
              Python; or give poses of another tool with --poses"

@@ -25,7 +25,7 @@
 //! Without identities everything is background.
 
 use cif_field::{Field, Owner};
-use cif_geometry::Bounds;
+use cif_geometry::{Bounds, overlap};
 use glam::DVec3;
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use rayon::prelude::*;
@@ -45,8 +45,6 @@ const SAME_OCCUPANCY: f32 = 1e-4;
 const LABELLED_SHARE: f32 = 0.5;
 /// Smallest share that may make an instance at all, however little of it there is.
 const LEAST_SHARE: f64 = 0.2;
-/// Rounds of Dinkelbach's method; it converges faster than linearly, and 8 agree to single precision.
-const RATIO_ROUNDS: usize = 8;
 
 /// Most probable instance of a Gaussian.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -154,26 +152,7 @@ fn needed_shares(field: &Field, visible: &[u32], candidates: &[Option<Identity>]
         let Some(identity) = identity else { continue };
         members[identity.index].push((image(field, row as usize), f64::from(identity.labelled_share)));
     }
-    members
-        .iter()
-        .map(|members| {
-            let labelled: f64 = members.iter().map(|(image, share)| image * share).sum();
-            let mut needed = 0.0;
-            for _ in 0..RATIO_ROUNDS {
-                let (mut inside, mut outside) = (0.0, 0.0);
-                for (image, share) in members.iter().filter(|(_, share)| *share > needed) {
-                    inside += image * share;
-                    outside += image * (1.0 - share);
-                }
-                let ratio = inside / (labelled + outside);
-                if ratio.is_nan() {
-                    break;
-                }
-                needed = ratio / (1.0 + ratio);
-            }
-            needed.max(LEAST_SHARE)
-        })
-        .collect()
+    members.iter().map(|members| overlap::bound(members).max(LEAST_SHARE)).collect()
 }
 
 /// Occupancies of the visible rows, or opacities where occupancy tells nothing.

@@ -3,6 +3,8 @@
 //! The five blurred maps of the similarity are made and used band by band, so that they stay in the cache of the thread
 //! that works on the band; only the three maps that the gradient blurs again are kept for the whole image.
 
+use std::sync::OnceLock;
+
 use cif_geometry::PixelGrid;
 use fearless_simd::{Level, dispatch};
 use rayon::prelude::*;
@@ -45,9 +47,12 @@ struct Band {
 
 /// Normalised taps from the centre outwards.
 pub(crate) fn window() -> [f32; RADIUS + 1] {
-    let tap = |k: usize| (-(k as f64 * k as f64) / (2.0 * SIGMA * SIGMA)).exp();
-    let sum = tap(0) + 2.0 * (1..=RADIUS).map(tap).sum::<f64>();
-    std::array::from_fn(|k| (tap(k) / sum) as f32)
+    static TAPS: OnceLock<[f32; RADIUS + 1]> = OnceLock::new();
+    *TAPS.get_or_init(|| {
+        let tap = |k: usize| (-(k as f64 * k as f64) / (2.0 * SIGMA * SIGMA)).exp();
+        let sum = tap(0) + 2.0 * (1..=RADIUS).map(tap).sum::<f64>();
+        std::array::from_fn(|k| (tap(k) / sum) as f32)
+    })
 }
 
 /// The row of a band with its surroundings: `None` above and below the image, which counts as zeros.
@@ -93,7 +98,7 @@ impl Band {
 /// Sums values under the window, `at` giving those that lie under each of its taps, from the first to the last.
 #[inline(always)]
 fn blurred<'a>(out: &mut [f32], at: impl Fn(usize) -> &'a [f32]) {
-    let taps = window_of_once();
+    let taps = window();
     let centre = at(RADIUS);
     let [[a1, b1], [a2, b2], [a3, b3], [a4, b4], [a5, b5]] =
         [1, 2, 3, 4, 5].map(|k| [at(RADIUS - k), at(RADIUS + k)]);
@@ -105,12 +110,6 @@ fn blurred<'a>(out: &mut [f32], at: impl Fn(usize) -> &'a [f32]) {
             + taps[4] * (a4[k] + b4[k])
             + taps[5] * (a5[k] + b5[k]);
     }
-}
-
-/// [`window`], computed once.
-fn window_of_once() -> [f32; RADIUS + 1] {
-    static TAPS: std::sync::OnceLock<[f32; RADIUS + 1]> = std::sync::OnceLock::new();
-    *TAPS.get_or_init(window)
 }
 
 impl SsimScratch {

@@ -9,9 +9,10 @@
 
 use std::collections::BTreeMap;
 
-use cif_geometry::PixelGrid;
+use cif_geometry::{PixelGrid, overlap};
 use serde::Serialize;
 
+use super::evaluate::mean;
 use super::instance::FrameConfusion;
 
 /// Intersection over union from which on a predicted segment is the true one.
@@ -19,9 +20,6 @@ const MATCHES: f64 = 0.5;
 
 /// Foreground below which no pixel is an instance's.
 const LEAST: f64 = 0.2;
-
-/// Rounds of Dinkelbach's method for the largest ratio; it converges faster than linearly.
-const ROUNDS: usize = 8;
 
 /// Panoptic scores of a set of frames, percent.
 #[derive(Clone, Debug, Default, PartialEq, Serialize)]
@@ -38,37 +36,19 @@ pub struct PanopticMetrics {
     pub instances: BTreeMap<u16, f64>,
 }
 
-/// Mask ids of the pixels that are an instance's rather than the background's, and 0 elsewhere.
-///
-/// Of an instance whose pixels are its own with the probabilities `p`, the set `O` has the expected ratio `sum_O p / (sum p
-/// + sum_O (1 - p))`, which is largest, with the value `v`, where `O` has the pixels with `p > v / (1 + v)`.
+/// Mask ids of the pixels that are an instance's rather than the background's, and 0 elsewhere; see [`overlap::bound`].
 #[must_use]
 pub fn with_background(predicted: &PixelGrid<u16>, foreground: &PixelGrid<f32>) -> PixelGrid<u16> {
-    let mut by_id: BTreeMap<u16, Vec<f64>> = BTreeMap::new();
+    let mut by_id: BTreeMap<u16, Vec<(f64, f64)>> = BTreeMap::new();
     let pixels = || predicted.pixels.iter().zip(&foreground.pixels);
     for (id, foreground) in pixels() {
-        by_id.entry(*id).or_default().push(f64::from(*foreground));
+        by_id.entry(*id).or_default().push((1.0, f64::from(*foreground)));
     }
-    let bounds: BTreeMap<u16, f64> = by_id.iter().map(|(id, own)| (*id, bound(own))).collect();
+    let bounds: BTreeMap<u16, f64> =
+        by_id.iter().map(|(id, own)| (*id, overlap::bound(own).max(LEAST))).collect();
     let is_own = |id: u16, foreground: f32| f64::from(foreground) > bounds[&id];
     let ids = pixels().map(|(id, foreground)| if is_own(*id, *foreground) { *id } else { 0 }).collect();
     PixelGrid::from_pixels(predicted.width, predicted.height, ids)
-}
-
-/// Probability above which pixels belong to the set of the largest expected ratio.
-fn bound(probabilities: &[f64]) -> f64 {
-    let all: f64 = probabilities.iter().sum();
-    let mut bound = LEAST;
-    for _ in 0..ROUNDS {
-        let (mut own, mut others) = (0.0, 0.0);
-        for p in probabilities.iter().filter(|p| **p > bound) {
-            own += p;
-            others += 1.0 - p;
-        }
-        let ratio = if own > 0.0 { own / (all + others) } else { 0.0 };
-        bound = (ratio / (1.0 + ratio)).max(LEAST);
-    }
-    bound
 }
 
 /// Scores of frames whose predictions are those of [`with_background`].
@@ -104,15 +84,15 @@ pub fn panoptic_metrics(frames: &[FrameConfusion]) -> PanopticMetrics {
     if there == 0 {
         return PanopticMetrics::default();
     }
-    let mean = |values: &[f64]| 100.0 * values.iter().sum::<f64>() / values.len() as f64;
+    let percent = |values: &[f64]| mean(values).map(|mean| 100.0 * mean);
     let all: Vec<f64> = overlaps.values().flatten().copied().collect();
     let segments = (there + predicted) as f64 / 2.0;
     PanopticMetrics {
         quality: Some(100.0 * overlap / segments),
         segmentation: (matched > 0).then(|| 100.0 * overlap / f64::from(matched)),
         recognition: Some(100.0 * f64::from(matched) / segments),
-        iou: Some(mean(&all)),
-        instances: overlaps.iter().map(|(id, overlaps)| (*id, mean(overlaps))).collect(),
+        iou: percent(&all),
+        instances: overlaps.iter().filter_map(|(id, overlaps)| Some((*id, percent(overlaps)?))).collect(),
     }
 }
 
@@ -165,17 +145,5 @@ mod tests {
         // Of nothing but traces, nothing is left.
         let traces = PixelGrid::from_pixels(9, 1, vec![0.1; 9]);
         assert_eq!(with_background(&predicted, &traces).pixels, [0; 9]);
-    }
-
-    #[test]
-    fn the_bound_gives_the_largest_expected_ratio() {
-        let probabilities = [0.95, 0.9, 0.7, 0.55, 0.45, 0.4, 0.3, 0.25, 0.1, 0.05];
-        let all: f64 = probabilities.iter().sum();
-        let ratio = |bound: f64| {
-            let set: Vec<f64> = probabilities.iter().copied().filter(|p| *p > bound).collect();
-            set.iter().sum::<f64>() / (all + set.iter().map(|p| 1.0 - p).sum::<f64>())
-        };
-        let best = (0..100).map(|k| ratio(0.01 * f64::from(k))).fold(0.0, f64::max);
-        assert!((ratio(bound(&probabilities)) - best).abs() < 1e-12);
     }
 }

@@ -166,6 +166,7 @@ mod tests {
         let mut config = small_config();
         (config.stages.coarse, config.stages.fine, config.stages.instance) = (60, 200, 10);
         (config.motion.rigid, config.effects.still_every) = (false, 0);
+        // With more nodes than the images tell apart, what rests trembles more than is allowed.
         config.model.time_resolution = 8;
         // What rests is held, so that the network has nothing to gain there.
         (config.motion.guidance, config.motion.stillness, config.motion.rehearsal) = (10.0, 1.0, 50);

@@ -22,10 +22,10 @@ const VIEWS: usize = 100;
 /// Shares are kept this far from 0 and 1, where no evidence moves them any more.
 const LIMIT: f32 = 1e-3;
 
-/// Sums of blending weights, in pixels, below which a Gaussian keeps its share.
+/// Evidence below which a Gaussian keeps its share, pixels: sums of what it is likely to have shown of them.
 const LEAST_PIXELS: f32 = 0.1;
 
-/// Parts of a pixel below this are nothing to divide by.
+/// Parts of a pixel below this are nothing to divide by, as where labels are counted (methods reference 5.1).
 const LEAST_PART: f32 = 1e-3;
 
 impl Trainer {

@@ -6,6 +6,7 @@ use std::time::Instant;
 use cif_dataset::{Dataset, Split};
 use cif_field::{Field, RecordedCamera};
 use cif_render::cpu::SimdLevel;
+use cif_scene::motion::loose::LOOSE_SPLATS;
 use cif_scene::{ExportOptions, ReadOptions, SceneGraph, time_in_field};
 use cif_train::metrics::Scores;
 use cif_train::metrics::round_trip::{HeldOutLoss, Likeness, SharedView, held_out_loss, likeness};
@@ -20,7 +21,7 @@ use crate::error::Error;
 use crate::output::Outputs;
 use crate::{formats, interrupt};
 
-/// Loss of a file, against images that were held out, from which on it is told what keeps more, dB: below, no one sees it.
+/// Loss of a file, against images that were held out, that an export by default should stay below, dB.
 const MUCH_DB: f64 = 0.2;
 
 /// Options of the check.
@@ -372,7 +373,7 @@ fn advice(lost: Option<f64>) -> Option<String> {
     Some(format!(
         "the file loses {lost:.2} dB: a smaller --tolerance keeps more of how objects move, a smaller \
          --appearance-tolerance more of how they change; a .usda file holds a path for every splat, a .glb file those of \
-         bodies and of the 200 splats that travel farthest, a .ply file one time"
+         bodies and of the {LOOSE_SPLATS} splats that travel farthest, a .ply file one time"
     ))
 }
 
