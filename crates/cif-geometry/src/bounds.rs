@@ -3,6 +3,8 @@
 use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
+use crate::RigidTransform;
+
 /// An axis-aligned box; empty when any `low > high`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Bounds {
@@ -38,6 +40,20 @@ impl Bounds {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         !(self.low.cmple(self.high).all())
+    }
+
+    /// The smallest box around this one after `transform`.
+    #[must_use]
+    pub fn transformed(&self, transform: &RigidTransform) -> Self {
+        if self.is_empty() {
+            return *self;
+        }
+        let centre = transform.apply(self.centre());
+        let half = self.size() / 2.0;
+        let rotation = transform.rotation;
+        let reach =
+            rotation.x_axis.abs() * half.x + rotation.y_axis.abs() * half.y + rotation.z_axis.abs() * half.z;
+        Self { low: centre - reach, high: centre + reach }
     }
 
     /// Edge lengths; zero when empty.

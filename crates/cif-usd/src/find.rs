@@ -12,6 +12,9 @@ use pyo3::prelude::*;
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, conventions, tokens};
 
+/// Boxes are those that models give of themselves, where they do: of what can be seen.
+pub(crate) const USE_EXTENTS_HINTS: bool = true;
+
 pub(crate) fn search(
     path: &Path,
     wanted: &ObjectQuery,
@@ -101,8 +104,9 @@ impl<'a, 'py> Search<'a, 'py> {
         };
         let purposes = vec![pxr.usd_geom.getattr("Tokens")?.getattr("default_")?];
         let transform_at = |time: &Bound<'py, PyAny>| pxr.usd_geom.getattr("XformCache")?.call1((time,));
-        let box_at =
-            |time: &Bound<'py, PyAny>| pxr.usd_geom.getattr("BBoxCache")?.call1((time, purposes.clone()));
+        let box_at = |time: &Bound<'py, PyAny>| {
+            pxr.usd_geom.getattr("BBoxCache")?.call1((time, purposes.clone(), USE_EXTENTS_HINTS))
+        };
         let times: Vec<_> = codes.iter().map(|at| code(Some(*at))).collect::<PyResult<_>>()?;
         Ok(Self {
             pxr,

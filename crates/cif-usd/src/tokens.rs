@@ -75,6 +75,10 @@ pub const KIND_COMPONENT: &str = "component";
 
 /// Schema of what no standard schema holds about an instance.
 pub const INSTANCE_API: &str = "CifInstanceAPI";
+/// Schema of [`EXTENTS_HINT`].
+pub const GEOM_MODEL_API: &str = "GeomModelAPI";
+/// Box of a model, for those who do not look at what is inside: `[low, high]`, local frame.
+pub const EXTENTS_HINT: &str = "extentsHint";
 /// Semantic labels in a taxonomy.
 pub const LABELS_API: &str = "SemanticsLabelsAPI";
 /// Properties of semantic labels, before the taxonomy.

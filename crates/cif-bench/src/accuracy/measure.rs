@@ -106,8 +106,9 @@ pub fn score(
         Ok(())
     })
     .map_err(|Failure(error)| error)?;
-    let Scores { psnr, ssim, instance, .. } = &evaluation.overall;
+    let Scores { psnr, ssim, instance, panoptic, .. } = &evaluation.overall;
     (record.psnr, record.ssim, record.miou) = (*psnr, *ssim, instance.miou);
+    (record.panoptic, record.iou) = (panoptic.quality, panoptic.iou);
     record.render_ms = Some(evaluation.render_ms_per_frame);
     Ok(())
 }

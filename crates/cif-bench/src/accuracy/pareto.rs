@@ -1,6 +1,6 @@
 //! Which rungs nothing else beats, and what the next dB costs.
 
-/// Gains below this count as none: dB, and points of mIoU.
+/// Gains below this count as none: dB, and points of IoU.
 const NOTHING: (f64, f64) = (0.02, 0.1);
 
 /// For each (cost, value), true when it is on the Pareto front: no other one costs no more and gives no less, and one
@@ -25,8 +25,8 @@ pub(super) struct Climb {
     pub cost: f64,
     /// Added PSNR, dB.
     pub psnr: Option<f64>,
-    /// Added mIoU, points.
-    pub miou: Option<f64>,
+    /// Added IoU over the whole image, points.
+    pub iou: Option<f64>,
 }
 
 /// In one sentence what a climb costs; `unit` is that of the cost.
@@ -45,10 +45,10 @@ pub(super) fn sentence(from: &str, to: &str, climb: &Climb, unit: &str) -> Strin
         })
     };
     let gains: Vec<String> =
-        [price(climb.psnr, NOTHING.0, "PSNR", "dB"), price(climb.miou, NOTHING.1, "mIoU", "points of mIoU")]
+        [price(climb.psnr, NOTHING.0, "PSNR", "dB"), price(climb.iou, NOTHING.1, "IoU", "points of IoU")]
             .into_iter()
             .flatten()
-            .map(|text| text.replace("per points of mIoU", "per point"))
+            .map(|text| text.replace("per points of IoU", "per point"))
             .collect();
     let cost = if climb.cost >= 0.0 {
         format!("costs {} more", amount(climb.cost, unit))
@@ -88,15 +88,15 @@ mod tests {
 
     #[test]
     fn climbs_are_told_in_one_sentence() {
-        let climb = |cost, psnr, miou| Climb { cost, psnr, miou };
+        let climb = |cost, psnr, iou| Climb { cost, psnr, iou };
         let text = sentence("a", "b", &climb(100.0, Some(0.5), Some(2.0)), "s");
         assert_eq!(
             text,
-            "From a to b: costs 100 s more and brings 0.50 dB, at 200 s per dB, and brings 2.00 points of mIoU, at \
+            "From a to b: costs 100 s more and brings 0.50 dB, at 200 s per dB, and brings 2.00 points of IoU, at \
              50.0 s per point."
         );
         let text = sentence("a", "b", &climb(-10.0, Some(-0.5), Some(0.05)), "s");
-        assert_eq!(text, "From a to b: saves 10.0 s and loses 0.50 dB, and leaves mIoU as it is.");
+        assert_eq!(text, "From a to b: saves 10.0 s and loses 0.50 dB, and leaves IoU as it is.");
         assert_eq!(sentence("a", "b", &climb(2e6, None, None), "B"), "From a to b: costs 2.00 MB more.");
         assert_eq!(amount(0.0123, "s"), "12.3 ms");
     }

@@ -21,7 +21,11 @@ pub struct Record {
     pub psnr: Option<f64>,
     /// Mean SSIM of the held-out frames.
     pub ssim: Option<f64>,
-    /// mIoU of the held-out frames, percent.
+    /// Panoptic quality of the held-out frames, percent.
+    pub panoptic: Option<f64>,
+    /// Mean IoU of the held-out frames over the whole image, percent: what spills onto the background counts.
+    pub iou: Option<f64>,
+    /// mIoU of the held-out frames over labelled pixels, percent.
     pub miou: Option<f64>,
     /// Gaussians.
     pub gaussians: Option<usize>,

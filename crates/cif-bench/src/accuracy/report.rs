@@ -79,7 +79,7 @@ struct Row<'a> {
     id: &'a str,
     label: &'a str,
     record: &'a Record,
-    /// On the front of PSNR, of mIoU.
+    /// On the front of PSNR, of IoU.
     front: [bool; 2],
     /// Cost and gain against the rung below, in words; `None` for the lowest.
     climb: Option<String>,
@@ -103,7 +103,7 @@ fn rows(measured: &Measured) -> Vec<Row<'_>> {
                 let climb = Climb {
                     cost: cost_now - cost_below,
                     psnr: gain(record.psnr, lower.psnr),
-                    miou: gain(record.miou, lower.miou),
+                    iou: gain(record.iou, lower.iou),
                 };
                 let mut text = sentence(from, label, &climb, unit);
                 if kind(ladder) == Kind::Export
@@ -124,7 +124,7 @@ fn rows(measured: &Measured) -> Vec<Row<'_>> {
 /// Marks the fronts of everything that was trained, each scene counted once.
 fn mark_fronts(rows: &mut [Row<'_>]) {
     let trained: Vec<usize> = (0..rows.len()).filter(|row| kind(rows[*row].ladder) == Kind::Train).collect();
-    let values: [fn(&Record) -> Option<f64>; 2] = [|record| record.psnr, |record| record.miou];
+    let values: [fn(&Record) -> Option<f64>; 2] = [|record| record.psnr, |record| record.iou];
     for (which, value) in values.iter().enumerate() {
         let points: Vec<(f64, Option<f64>)> =
             trained.iter().map(|row| (rows[*row].record.cpu_s, value(rows[*row].record))).collect();
@@ -168,7 +168,7 @@ fn json_of(subject: &Subject, rows: &[Row<'_>]) -> Value {
             value["rung"] = json!(row.label);
             value["id"] = json!(row.id);
             value["front_psnr"] = json!(row.front[0]);
-            value["front_miou"] = json!(row.front[1]);
+            value["front_iou"] = json!(row.front[1]);
             value["climb"] = json!(row.climb);
             value
         })
@@ -187,8 +187,8 @@ fn json_of(subject: &Subject, rows: &[Row<'_>]) -> Value {
 
 fn csv(rows: &[Row<'_>]) -> String {
     let mut text = String::from(
-        "ladder,rung,cpu_s,wall_s,psnr_db,ssim,miou_percent,gaussians,bytes,residual,psnr_to_exact_db,render_ms,\
-         front_psnr,front_miou\n",
+        "ladder,rung,cpu_s,wall_s,psnr_db,ssim,panoptic_percent,iou_percent,miou_percent,gaussians,bytes,residual,psnr_to_exact_db,render_ms,\
+         front_psnr,front_iou\n",
     );
     let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
     for row in rows {
@@ -196,12 +196,14 @@ fn csv(rows: &[Row<'_>]) -> String {
         let quoted = format!("\"{}\"", row.label.replace('"', "\"\""));
         let _ = writeln!(
             text,
-            "{},{quoted},{},{},{},{},{},{},{},{},{},{},{},{}",
+            "{},{quoted},{},{},{},{},{},{},{},{},{},{},{},{},{},{}",
             row.ladder.name,
             record.cpu_s,
             record.wall_s,
             number(record.psnr),
             number(record.ssim),
+            number(record.panoptic),
+            number(record.iou),
             number(record.miou),
             number(record.gaussians.map(|count| count as f64)),
             number(record.bytes.map(|count| count as f64)),
@@ -226,7 +228,7 @@ fn plots(measured: &Measured, rows: &[Row<'_>]) -> Vec<(String, String, String)>
     type Value = fn(&Record) -> Option<f64>;
     let overviews: [(&str, &str, Value, usize); 2] = [
         ("psnr", "PSNR of held-out frames, dB", |record| record.psnr, 0),
-        ("miou", "mIoU of held-out frames, %", |record| record.miou, 1),
+        ("iou", "IoU of held-out frames over the whole image, %", |record| record.iou, 1),
     ];
     for (name, axis, value, which) in overviews {
         let series: Vec<Series> = measured
@@ -386,7 +388,9 @@ fn page(
     }
     page::close(
         &mut page,
-        "PSNR and SSIM are means over the held-out frames; mIoU is over pairs of instance and frame. Processor time counts \
+        "PSNR and SSIM are means over the held-out frames; PQ is panoptic quality \
+         and IoU over pairs of instance and frame, both over the whole image; mIoU is IoU over labelled pixels, as papers \
+         count it. Processor time counts \
          all threads together and everything from the decoding of frames on, fits of objects too, but no measuring. Filled dots mark the fronts: no other trained rung is both cheaper and \
          better.",
     );
@@ -421,7 +425,7 @@ fn summary(rows: &[Row<'_>]) -> Vec<String> {
     let mut lines = Vec::new();
     type Value = fn(&Record) -> Option<f64>;
     let values: [(&str, &str, Value); 2] =
-        [("PSNR", "dB", |record| record.psnr), ("mIoU", "%", |record| record.miou)];
+        [("PSNR", "dB", |record| record.psnr), ("IoU", "%", |record| record.iou)];
     for (which, (name, unit, value)) in values.into_iter().enumerate() {
         let mut on_front: Vec<&Row<'_>> = rows.iter().filter(|row| row.front[which]).collect();
         on_front.sort_by(|a, b| a.record.cpu_s.total_cmp(&b.record.cpu_s));
@@ -463,7 +467,9 @@ fn table(page: &mut String, kind: Kind, rows: &[&Row<'_>]) {
             columns.push(("wall time, s", Box::new(|row| format!("{:.1}", row.record.wall_s))));
             columns.push(("PSNR, dB", Box::new(move |row| number(row.record.psnr, 2) + mark(row.front[0]))));
             columns.push(("SSIM", Box::new(move |row| number(row.record.ssim, 4))));
-            columns.push(("mIoU, %", Box::new(move |row| number(row.record.miou, 1) + mark(row.front[1]))));
+            columns.push(("PQ, %", Box::new(move |row| number(row.record.panoptic, 1))));
+            columns.push(("IoU, %", Box::new(move |row| number(row.record.iou, 1) + mark(row.front[1]))));
+            columns.push(("mIoU, %", Box::new(move |row| number(row.record.miou, 1))));
             columns.push((
                 "Gaussians",
                 Box::new(|row| row.record.gaussians.map_or("–".into(), |n| n.to_string())),
@@ -488,7 +494,7 @@ fn table(page: &mut String, kind: Kind, rows: &[&Row<'_>]) {
             ));
             columns.push(("PSNR, dB", Box::new(move |row| number(row.record.psnr, 3))));
             columns.push(("SSIM", Box::new(move |row| number(row.record.ssim, 4))));
-            columns.push(("mIoU, %", Box::new(move |row| number(row.record.miou, 2))));
+            columns.push(("IoU, %", Box::new(move |row| number(row.record.iou, 2))));
         }
         Kind::Frame => {
             columns.push(("processor time, ms", Box::new(|row| format!("{:.2}", 1e3 * row.record.cpu_s))));
@@ -573,7 +579,7 @@ mod tests {
             cpu_s: 1.0 + k as f64,
             wall_s: 1.0,
             psnr: Some(20.0 + (k as f64).sqrt()),
-            miou: Some(60.0 + k as f64),
+            iou: Some(60.0 + k as f64),
             bytes: Some(1_000 * (k as u64 + 1)),
             residual: Some(0.1 / (k + 1) as f64),
             ..Record::default()

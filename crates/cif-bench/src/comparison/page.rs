@@ -168,8 +168,9 @@ fn page(
     }
     close(
         &mut page,
-        "Accuracies and IoU are percent over labelled pixels of the held-out frames: mAcc-pix per frame, mAcc-inst per \
-         instance, mIoU per pair of instance and frame. Every row but Trace3D has the Gaussians of the same reconstruction, \
+        "Percent over the held-out frames. Over all pixels, what spills onto the background included: PQ, panoptic quality, \
+         and IoU, per pair of instance and frame. Over labelled pixels alone, as the papers count: mAcc-pix per frame, \
+         mAcc-inst per instance, mIoU per pair of instance and frame. Every row but Trace3D has the Gaussians of the same reconstruction, \
          the same masks and the same frames.",
     );
     Ok(page)
@@ -201,7 +202,7 @@ fn answers(page: &mut String, queries: &Queries) {
     page.push_str("</section>\n");
 }
 
-/// mIoU against processor time.
+/// IoU over the whole image against processor time.
 fn costs(subject: &Subject<'_>) -> Option<String> {
     let of = |name: &String| Series {
         name: title(name, subject.camera),
@@ -209,14 +210,17 @@ fn costs(subject: &Subject<'_>) -> Option<String> {
             .rows
             .iter()
             .filter(|row| row.head == *name)
-            .filter_map(|row| Some((row.seconds.max(1e-2), row.miou?, String::new())))
+            .filter_map(|row| Some((row.seconds.max(1e-2), row.iou?, String::new())))
             .collect(),
         line: false,
     };
     let series: Vec<Series> =
         subject.names.iter().map(of).filter(|series| !series.points.is_empty()).collect();
     svg(&Plot {
-        axes: ["processor time on top of the reconstruction, s", "mIoU of held-out frames, %"],
+        axes: [
+            "processor time on top of the reconstruction, s",
+            "IoU of held-out frames over the whole image, %",
+        ],
         log: true,
         series,
         front: Vec::new(),

@@ -14,11 +14,15 @@ pub struct Row {
     pub head: String,
     /// Seed.
     pub seed: u64,
-    /// Accuracy of pixels, percent.
+    /// Panoptic quality over the whole image, percent.
+    pub panoptic: Option<f64>,
+    /// Mean IoU over the whole image, percent: what spills onto the background counts.
+    pub iou: Option<f64>,
+    /// Accuracy of labelled pixels, percent.
     pub macc_pix: Option<f64>,
     /// Accuracy of instances, percent.
     pub macc_inst: Option<f64>,
-    /// Mean IoU, percent.
+    /// Mean IoU over labelled pixels, percent.
     pub miou: Option<f64>,
     /// Mean PSNR, dB.
     pub psnr: Option<f64>,

@@ -150,6 +150,8 @@ impl Subject<'_> {
                 capture: self.capture.to_owned(),
                 head: String::new(),
                 seed: config.seed,
+                panoptic: scores.panoptic.quality,
+                iou: scores.panoptic.iou,
                 macc_pix: scores.instance.macc_pix,
                 macc_inst: scores.instance.macc_inst,
                 miou: scores.instance.miou,

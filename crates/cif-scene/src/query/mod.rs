@@ -90,7 +90,7 @@ pub fn query(graph: &SceneGraph, query: &LabelQuery, place: &str) -> Result<Vec<
         let names = || [&node.label, &node.category, &node.name].into_iter().chain(node.taxonomies.values());
         if names().any(|name| matcher.matches(name)) {
             let rows = world::world_matrix(&graph.frame, &node.world_transform(time_code));
-            let (low, high) = corners(&world::world_bounds(&graph.frame, node.bounds(time_code)));
+            let (low, high) = corners(&world::world_bounds(&graph.frame, node.boxes().world(time_code)));
             found.push(LabelMatch {
                 path: format!("/World/{}", node.name),
                 class: node.category.clone(),

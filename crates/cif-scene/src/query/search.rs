@@ -233,7 +233,8 @@ fn describe(
         .into_iter()
         .filter(|code| node.is_visible(*code))
         .collect();
-    let bounds = visible.iter().fold(Bounds::EMPTY, |all, code| all.union(node.bounds(*code)));
+    let boxes = node.boxes();
+    let bounds = visible.iter().fold(Bounds::EMPTY, |all, code| all.union(boxes.world(*code)));
     let bounds = world::world_bounds(&graph.frame, bounds);
     if visible.is_empty() || !wanted.is_at(&bounds) {
         return None;

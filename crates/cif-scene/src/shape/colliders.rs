@@ -3,38 +3,25 @@
 //! Colliders enclose their splats: those of a node (of every part, where it has some) hold at least [`ENCLOSED`] of
 //! the opacity of its splats, and of what is seen of them (see [`Splats::importance`]), counted by their centres. The
 //! two measures differ where many small or faint splats lie around few broad ones; a simulation that shows an object
-//! outside its collider is wrong by either. Splats that stick out of the bulk are left out as far as that allows.
+//! outside its collider is wrong by either. Splats that stick out of the bulk are left out as far as that allows
+//! (see `body`).
 //!
-//! A collider is the hull of these centres and of the points one standard deviation along the axes of the opaque
-//! ones, as far as those stay in the bulk. A concave node can have several hulls: its splats are cut by planes, each
+//! A collider is the hull of these centres and of the ends of the axes of the opaque ones. A concave node can have several hulls: its splats are cut by planes, each
 //! time where that takes most off the summed volume.
 
-use cif_geometry::quaternion;
 use glam::DVec3;
 use nalgebra::Matrix3;
 
 use crate::motion::procrustes::weighted_quantile;
+use crate::shape::body::{Blob, Cloud, STRAYS};
 use crate::shape::convex_hull::{self, HullMesh};
-use crate::{ConvexHull, Motion, Node, Splats};
+use crate::{ConvexHull, Motion, Node};
 
 /// Share of the opacity, and of what is seen, that colliders hold at least: what strays and what few corners cut off
 /// share the rest.
 pub const ENCLOSED: f64 = (1.0 - STRAYS) * HELD;
-/// Share of the opacity, and of what is seen, that may be left out as straying.
-const STRAYS: f64 = 0.04;
 /// Share of the rest that every hull holds.
 const HELD: f64 = 0.99;
-/// Fainter splats count with their centres only, unless the node has little else.
-const OPAQUE: f32 = 0.5;
-/// Standard deviations that a hull reaches around a centre.
-const SIGMAS: f64 = 1.0;
-/// Weight that may stick out of the bulk in every direction.
-const TRIM: f64 = 0.01;
-/// Share of the bulk's width; splats that stick out further stray.
-const TRIM_MARGIN: f64 = 0.1;
-/// Splats at most that colliders are built from: of larger nodes every second, third, ..., which changes the shares
-/// above by a few thousandths.
-const SAMPLED: usize = 20_000;
 /// Splats at most that cuts are judged by.
 const JUDGED: usize = 400;
 /// A cut that takes less than this share off a piece's volume is not made: cutting a cloud in two always
@@ -42,15 +29,6 @@ const JUDGED: usize = 400;
 const MIN_GAIN: f64 = 0.15;
 /// Places where a cut is tried: quantiles of the weight along each principal axis.
 const CUTS: [f64; 7] = [0.1, 0.25, 0.4, 0.5, 0.6, 0.75, 0.9];
-
-/// A splat: its centre, the ends of its axes where it is opaque, its opacity, and how much it is seen.
-#[derive(Clone, Debug)]
-struct Blob {
-    centre: DVec3,
-    ends: Vec<DVec3>,
-    opacity: f64,
-    seen: f64,
-}
 
 /// Hulls of a node, `hulls` at most (every part has one at least), in its local frame or its parts' frames.
 #[must_use]
@@ -69,7 +47,7 @@ pub fn colliders(node: &Node, hulls: usize) -> Vec<ConvexHull> {
     ranges
         .into_iter()
         .flat_map(|(part, range)| {
-            let blobs = enclosed(blobs(&node.splats, &importance, range));
+            let blobs = Cloud::of(&node.splats, &importance, range).body();
             decompose(blobs, each).into_iter().filter_map(move |blobs| {
                 let mesh = hull(&blobs)?;
                 Some(ConvexHull {
@@ -80,110 +58,6 @@ pub fn colliders(node: &Node, hulls: usize) -> Vec<ConvexHull> {
             })
         })
         .collect()
-}
-
-/// The splats of a range.
-fn blobs(splats: &Splats, importance: &[f64], range: std::ops::Range<usize>) -> Vec<Blob> {
-    let opacities: Vec<f64> = splats.opacities[range.clone()].iter().map(|o| f64::from(*o)).collect();
-    // A glass has no opaque splats: then those of the better half are its body.
-    let half = weighted_quantile(&opacities, &importance[range.clone()], 0.5) as f32;
-    let opaque = OPAQUE.min(half);
-    let stride = range.len().div_ceil(SAMPLED).max(1);
-    range
-        .step_by(stride)
-        .map(|index| {
-            let centre = DVec3::from_array(splats.means[index].map(f64::from));
-            let end = |end: usize, rotation: &[[f64; 3]; 3]| {
-                let axis = end / 2;
-                let length = SIGMAS * f64::from(splats.scales[index][axis]);
-                let direction = DVec3::new(rotation[0][axis], rotation[1][axis], rotation[2][axis]);
-                centre + if end.is_multiple_of(2) { length } else { -length } * direction
-            };
-            let ends = if splats.opacities[index] >= opaque {
-                let rotation = quaternion::to_rotation(splats.orientations[index].map(f64::from));
-                (0..6).map(|k| end(k, &rotation)).collect()
-            } else {
-                Vec::new()
-            };
-            Blob { centre, ends, opacity: f64::from(splats.opacities[index]), seen: importance[index] }
-        })
-        .collect()
-}
-
-/// A pair of planes that the bulk lies between.
-struct Slab {
-    axis: DVec3,
-    low: f64,
-    high: f64,
-}
-
-impl Slab {
-    /// Distance of a point from the slab; 0 or less inside.
-    fn excess(&self, point: DVec3) -> f64 {
-        let along = self.axis.dot(point);
-        (self.low - along).max(along - self.high)
-    }
-}
-
-/// The bulk between two planes along each of 13 axes: faces, edges and corners of a cube.
-fn bulk(blobs: &[Blob]) -> Vec<Slab> {
-    let seen: Vec<f64> = blobs.iter().map(|blob| blob.seen).collect();
-    (14..27)
-        .map(|code| {
-            let axis =
-                DVec3::new(f64::from(code % 3 - 1), f64::from(code / 3 % 3 - 1), f64::from(code / 9 - 1))
-                    .normalize();
-            let along: Vec<f64> = blobs.iter().map(|blob| axis.dot(blob.centre)).collect();
-            let low = weighted_quantile(&along, &seen, TRIM);
-            let high = weighted_quantile(&along, &seen, 1.0 - TRIM);
-            let sigmas: Vec<f64> = blobs
-                .iter()
-                .map(|blob| blob.ends.iter().map(|end| axis.dot(*end - blob.centre)).fold(0.0, f64::max))
-                .collect();
-            let reach = weighted_quantile(&sigmas, &seen, 0.5);
-            let margin = TRIM_MARGIN * (high - low) + reach;
-            Slab { axis, low: low - margin, high: high + margin }
-        })
-        .collect()
-}
-
-/// Splats that a collider is to enclose: leaves out those that stick out of the bulk, the furthest first, as far as
-/// [`STRAYS`] allows, and pulls in ends that do.
-fn enclosed(mut blobs: Vec<Blob>) -> Vec<Blob> {
-    let slabs = bulk(&blobs);
-    let excess = |point: DVec3| slabs.iter().map(|slab| slab.excess(point)).fold(f64::NEG_INFINITY, f64::max);
-    let mut straying: Vec<(usize, f64)> = blobs
-        .iter()
-        .enumerate()
-        .map(|(index, blob)| (index, excess(blob.centre)))
-        .filter(|(_, excess)| *excess > 0.0)
-        .collect();
-    straying.sort_by(|a, b| b.1.total_cmp(&a.1).then(a.0.cmp(&b.0)));
-    let sum = |weight: fn(&Blob) -> f64| blobs.iter().map(weight).sum::<f64>();
-    let (mut opacity, mut seen) = (STRAYS * sum(|blob| blob.opacity), STRAYS * sum(|blob| blob.seen));
-    let mut keep = vec![true; blobs.len()];
-    for (index, _) in straying {
-        let blob = &blobs[index];
-        if blob.opacity <= opacity && blob.seen <= seen {
-            opacity -= blob.opacity;
-            seen -= blob.seen;
-            keep[index] = false;
-        }
-    }
-    let mut kept = keep.into_iter();
-    blobs.retain(|_| kept.next().unwrap_or(true));
-    for blob in &mut blobs {
-        let centre = blob.centre;
-        blob.ends.retain_mut(|end| {
-            let mut shorter = 1.0;
-            while shorter > 0.1 && excess(centre + shorter * (*end - centre)) > 0.0 {
-                shorter *= 0.7;
-            }
-            *end = centre + shorter * (*end - centre);
-            shorter > 0.1
-        });
-    }
-    blobs
 }
 
 fn hull(blobs: &[Blob]) -> Option<HullMesh> {

@@ -1,5 +1,6 @@
 //! Solids and points around what a node shows.
 
+pub(crate) mod body;
 pub mod colliders;
 pub mod convex_hull;
 pub mod extent;

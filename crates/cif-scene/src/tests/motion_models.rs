@@ -127,7 +127,7 @@ fn articulated_bodies_become_their_parts() {
     assert_eq!(names, ["part_00", "part_01", "part_02"]);
     // Every part has its hull, in its own frame.
     assert_eq!(node.colliders.iter().map(|hull| hull.part).collect::<Vec<_>>(), [Some(0), Some(1), Some(2)]);
-    assert!(node.bounds(8.0).size().min_element() > 0.0);
+    assert!(node.boxes().world(8.0).size().min_element() > 0.0);
 }
 
 #[test]
@@ -276,8 +276,8 @@ fn dense_samples_are_few_and_inside_the_tolerance() {
     assert_eq!((dense.samples[0].time_code, dense.samples[dense.samples.len() - 1].time_code), (0.0, 8.0));
     let found = decisive(&graph, node, &source);
     assert!(found <= node.report.tolerance && found > 0.0, "{found} {:?}", node.report);
-    let between = node.bounds(6.5).size();
-    assert!((between - node.bounds(8.0).size()).length() < 0.05, "{between}");
+    let between = node.boxes().world(6.5).size();
+    assert!((between - node.boxes().world(8.0).size()).length() < 0.05, "{between}");
 }
 
 #[test]

@@ -290,13 +290,22 @@ impl Trainer {
             }
             if self.left_out.contains(&label) {
                 // That was said.
-            } else if self.told(label) == Some(ObjectMotion::Rigid) {
-                let message = format!("{name} is set to be rigid, but its masks do not show its poses");
-                self.messages.push(TrainEvent::warning(message));
             } else if self.nowhere.contains(&label) {
                 self.messages.push(TrainEvent::warning(format!(
                     "{name}: depth uncertain: one camera sees it, and nothing that it stands on is known, so its size \
-                     and distance are guesses"
+                     and distance are guesses{}",
+                    match self.told(label) {
+                        Some(ObjectMotion::Rigid) =>
+                            "; it is set to be rigid, but without them it has no poses: a second camera would show them",
+                        _ => "",
+                    }
+                )));
+            } else if self.told(label) == Some(ObjectMotion::Rigid) {
+                self.messages.push(TrainEvent::warning(format!(
+                    "{name} is set to be rigid, but its poses were not found, so that the deformation network moves it: no \
+                     motion along what objects stand on, and none followed from image to image, explains its masks and \
+                     colours. What is turned in a hand before one camera is not found yet; several cameras at once, or \
+                     larger masks without gaps, show more"
                 )));
             }
             return false;

@@ -216,7 +216,7 @@ fn an_object_of_which_nothing_tells_the_distance_is_named() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = guided();
     (config.stages.coarse, config.stages.fine, config.stages.instance) = (2, 2, 0);
-    let told = |dataset: Dataset| {
+    let told = |dataset: Dataset, config: &TrainConfig| {
         let mut told = Vec::new();
         let mut trainer = Trainer::new(dataset, config.clone()).unwrap();
         let outcome = trainer.run(&mut |event, _| {
@@ -232,8 +232,15 @@ fn an_object_of_which_nothing_tells_the_distance_is_named() {
     // A camera that goes round would tell it.
     let camera = dataset.frames[0].camera;
     dataset.frames.iter_mut().for_each(|frame| frame.camera = camera);
-    let found = told(dataset);
+    let found = told(dataset.clone(), &config);
     assert!(found.iter().any(|message| message.starts_with("ball 9: depth uncertain")), "{found:?}");
+    assert!(found.iter().all(|message| !message.contains("rigid")), "{found:?}");
+    config.motion.of.insert("ball 9".to_owned(), ObjectMotion::Rigid);
+    let found = told(dataset, &config);
+    assert!(
+        found.iter().any(|message| message.contains("a second camera")),
+        "says what is missing: {found:?}"
+    );
 }
 
 #[test]

@@ -1,11 +1,12 @@
 //! One prim per instance: labels, our schema, variants, and where its arrays are kept.
 
-use cif_scene::{Motion, Node, NodeKind, PartsMotion};
+use cif_scene::{Motion, Node, NodeKind, PartsMotion, extent};
 use pyo3::prelude::*;
 
 use super::levels::{LEVELS, Level};
 use super::{Scene, UNIFORM, VARYING, hulls, levels, metadata, physics, proxies, splats, transforms};
 use crate::layer::{Layer, Prim, child};
+use crate::pxr::Pxr;
 use crate::tokens::{self, instance, variants};
 
 pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) -> PyResult<()> {
@@ -16,7 +17,7 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
     let taxonomy = |name: &str| format!("{}:{name}", tokens::LABELS_API);
     let mut schemas = vec![taxonomy(tokens::TAXONOMY_CLASS), taxonomy(tokens::TAXONOMY_INSTANCE)];
     schemas.extend(node.taxonomies.keys().map(|name| taxonomy(name)));
-    schemas.push(tokens::INSTANCE_API.to_owned());
+    schemas.extend([tokens::GEOM_MODEL_API, tokens::INSTANCE_API].map(str::to_owned));
     prim.apply(&schemas.iter().map(String::as_str).collect::<Vec<_>>())?;
     // Both words find the object: the class ("mug") and what a person calls it ("red mug").
     let mut class = vec![node.category.as_str()];
@@ -36,6 +37,7 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, node: &Node) 
     }
     properties(scene, &prim, node)?;
     visibility(&prim, node)?;
+    extents_hint(pxr, &prim, node)?;
     transforms::order(pxr, &prim)?;
     for (index, part) in parts(node).map_or(&[][..], |motion| &motion.parts).iter().enumerate() {
         let inside = layer.define(&child(prim.path(), &part.name), "Xform")?;
@@ -105,6 +107,28 @@ fn visibility(prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
         attribute.sample(sample.time_code, token(sample.visible))?;
     }
     Ok(())
+}
+
+/// Box of what can be seen of an instance, without strays, whose own prims hold all their splats. A viewer frames it, and
+/// boxes are asked for without loading payloads.
+fn extents_hint(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
+    if node.kind == NodeKind::Background {
+        return Ok(());
+    }
+    let boxes = node.boxes();
+    let at = |time_code: f64| pxr.vec3f_array(&extent::outward(&boxes.local(time_code)));
+    let mut codes: Vec<f64> = match &node.motion {
+        Motion::Static | Motion::Rigid(_) => Vec::new(),
+        Motion::Parts(motion) => {
+            motion.parts.iter().flat_map(|part| &part.track).map(|sample| sample.time_code).collect()
+        }
+        Motion::Dense(dense) => dense.samples.iter().map(|sample| sample.time_code).collect(),
+    };
+    codes.sort_unstable_by(f64::total_cmp);
+    codes.dedup();
+    let at_rest = at(codes.first().copied().unwrap_or(0.0))?;
+    let hint = prim.set(tokens::EXTENTS_HINT, "Float3Array", VARYING, at_rest)?;
+    codes.iter().try_for_each(|code| hint.sample(*code, at(*code)?))
 }
 
 /// Splats, proxies and colliders: in the root layer or in a payload; splats once per level of detail.

@@ -7,6 +7,7 @@ use cif_scene::{LabelMatch, LabelPattern, LabelQuery};
 use pyo3::prelude::*;
 
 use super::open::open;
+use crate::find::USE_EXTENTS_HINTS;
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, conventions, tokens};
 
@@ -38,7 +39,7 @@ fn search<'py>(
     let labels_api = pxr.usd_semantics.getattr("LabelsAPI")?;
     let transforms = pxr.usd_geom.getattr("XformCache")?.call1((&time,))?;
     let purposes = vec![pxr.usd_geom.getattr("Tokens")?.getattr("default_")?];
-    let boxes = pxr.usd_geom.getattr("BBoxCache")?.call1((&time, purposes))?;
+    let boxes = pxr.usd_geom.getattr("BBoxCache")?.call1((&time, purposes, USE_EXTENTS_HINTS))?;
     // A query caches what it has seen: one per taxonomy.
     let mut queries: BTreeMap<String, Bound<'py, PyAny>> = BTreeMap::new();
     let (mut found, mut known) = (Vec::new(), Vec::new());

@@ -13,7 +13,7 @@ use cif_render::wgpu::Gpu;
 use cif_train::metrics::training_config;
 #[cfg(feature = "wgpu")]
 use cif_train::wgpu::floors::StepShape;
-use cif_train::{InstancePass, Stage, StepTimes, TrainConfig, Trainer};
+use cif_train::{InstancePass, Stage, StepTimes, Stop, TrainConfig, Trainer};
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::{Map, Value, json};
 
@@ -22,6 +22,7 @@ use crate::error::Error;
 use crate::output::Outputs;
 use crate::report::Report as JsonReport;
 use crate::settings::Layers;
+use crate::{interrupt, starting_points};
 
 /// Measure what a training step, an export or accuracy costs, how hard captures fare and how the method compares
 #[derive(Debug, Args)]
@@ -151,9 +152,12 @@ fn step(command: &Step) -> Result<(), Error> {
         layout,
     )?
     .downscale);
-    let dataset = capture.open(&command.capture)?;
-    print_warnings(&dataset);
+    let mut dataset = capture.open(&command.capture)?;
     let config = resolve(command, field.as_ref(), dataset.layout)?;
+    if field.is_none() && config.model.triangulate {
+        starting_points::find(&mut dataset, &Stop::when(interrupt::requested).into())?;
+    }
+    print_warnings(&dataset);
     let report = measure(command, &dataset, &config, field, stage)?;
     command.report.give(|| report.json(), || report.print())
 }

@@ -612,6 +612,7 @@ fn told(record: &Record) -> String {
     });
     let mut add = |value: Option<f64>, text: &dyn Fn(f64) -> String| parts.extend(value.map(text));
     add(record.psnr, &|value| format!("{value:.2} dB"));
+    add(record.iou, &|value| format!("IoU {value:.1} %"));
     add(record.miou, &|value| format!("mIoU {value:.1} %"));
     add(record.bytes.map(|bytes| bytes as f64 / 1e6), &|value| format!("{value:.2} MB"));
     if record.curve.is_none() {

@@ -39,12 +39,15 @@ impl Subject<'_> {
     /// Every run as CSV.
     #[must_use]
     pub fn csv(&self) -> String {
-        let mut text =
-            String::from("capture,head,seed,macc_pix,macc_inst,miou,psnr,ssim,gaussians,seconds\n");
+        let mut text = String::from(
+            "capture,head,seed,panoptic,iou,macc_pix,macc_inst,miou,psnr,ssim,gaussians,seconds\n",
+        );
         for row in self.rows {
             let capture = csv_text(&row.capture);
-            let scores =
-                [row.macc_pix, row.macc_inst, row.miou, row.psnr, row.ssim].map(csv_number).join(",");
+            let panoptic = [row.panoptic, row.iou];
+            let of_labelled = [row.macc_pix, row.macc_inst, row.miou];
+            let scores = panoptic.into_iter().chain(of_labelled).chain([row.psnr, row.ssim]).map(csv_number);
+            let scores = scores.collect::<Vec<_>>().join(",");
             let _ = writeln!(
                 text,
                 "{capture},{},{},{scores},{},{}",

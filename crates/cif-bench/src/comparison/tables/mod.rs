@@ -63,7 +63,9 @@ pub struct Measure {
 }
 
 /// Measures in the order of columns.
-pub const MEASURES: [Measure; 7] = [
+pub const MEASURES: [Measure; 9] = [
+    Measure { name: "PQ %", digits: 2, of: |row| row.panoptic, published: |_| None, has_best: true },
+    Measure { name: "IoU %", digits: 2, of: |row| row.iou, published: |_| None, has_best: true },
     Measure {
         name: "mAcc-pix %",
         digits: 2,

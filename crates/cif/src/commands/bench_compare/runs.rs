@@ -189,7 +189,9 @@ fn draw(view: &FrameView<'_>) -> Vec<(&'static str, Picture)> {
 fn told(record: &Record) -> String {
     let row = &record.row;
     format!(
-        "mAcc-pix {} %, mIoU {} %, {} dB, {} Gaussians, {:.1} s",
+        "PQ {} %, IoU {} %, mAcc-pix {} %, mIoU {} %, {} dB, {} Gaussians, {:.1} s",
+        number(row.panoptic, 2),
+        number(row.iou, 2),
         number(row.macc_pix, 2),
         number(row.miou, 2),
         number(row.psnr, 2),

@@ -103,9 +103,9 @@ pub(super) fn run(command: &Propagate) -> Result<(), Error> {
         ));
     }
     let cameras = cameras(&dataset);
+    interrupt::watch();
     let points = Points::new(command.scene.as_deref(), &dataset, &cameras, &painted)?;
     let writer = MaskWriter::create(&command.output).map_err(Error::plain)?;
-    interrupt::watch();
     let mut work = Work {
         dataset: &dataset,
         painted: &painted,

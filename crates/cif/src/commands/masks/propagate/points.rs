@@ -7,10 +7,12 @@ use cif_dataset::{Dataset, PointSource};
 use cif_field::Field;
 use cif_geometry::RigidTransform;
 use cif_masks::Keyframe;
+use cif_train::Stop;
 use glam::DVec3;
 
 use crate::commands::scene;
 use crate::error::Error;
+use crate::{interrupt, messages, starting_points};
 
 /// Opacity from which a Gaussian of a scene is a point that carries ids.
 const SOLID: f32 = 0.5;
@@ -58,18 +60,15 @@ impl Points {
         if without.is_empty() {
             return Ok(Self::None);
         }
-        if dataset.points.source == PointSource::Random {
-            return Err(Error::failed(
-                format!(
-                    "{} {} no keyframe, and the capture has no points that could bring ids from other cameras",
-                    without.join(", "),
-                    if without.len() == 1 { "has" } else { "have" }
-                ),
-                "paint a frame of each camera, or train a scene without masks and give it with --scene",
-            ));
-        }
+        let triangulated;
+        let positions = if dataset.points.source == PointSource::Random {
+            triangulated = triangulate(dataset, &without)?;
+            &triangulated
+        } else {
+            &dataset.points.positions
+        };
         let point = |point: &[f32; 3]| DVec3::from_array(point.map(f64::from));
-        Ok(Self::Still(dataset.points.positions.iter().map(point).collect()))
+        Ok(Self::Still(positions.iter().map(point).collect()))
     }
 
     /// World positions at a normalised time, metres.
@@ -107,4 +106,28 @@ fn same_pose(a: &RigidTransform, b: &RigidTransform) -> bool {
     let apart = (a.translation - b.translation).length();
     apart <= SAME_POSE * a.translation.length().max(f64::MIN_POSITIVE)
         && a.rotation.abs_diff_eq(b.rotation, SAME_POSE)
+}
+
+/// Points of a capture that has none, by its own images; `without` names the cameras that have no keyframe.
+fn triangulate(dataset: &Dataset, without: &[&str]) -> Result<Vec<[f32; 3]>, Error> {
+    let mut dataset = dataset.clone();
+    let is_found = starting_points::find(&mut dataset, &Stop::when(interrupt::requested).into())?;
+    if is_found && dataset.points.source == PointSource::Triangulated {
+        messages::note!(
+            "{} points from the images of the capture bring ids to {}",
+            dataset.points.positions.len(),
+            without.join(", ")
+        );
+        return Ok(dataset.points.positions);
+    }
+    Err(Error::failed(
+        format!(
+            "{} {} no keyframe, and the capture has no points that could bring ids from other cameras, nor could any be \
+             triangulated from its images",
+            without.join(", "),
+            if without.len() == 1 { "has" } else { "have" }
+        ),
+        "paint a frame of each camera, or train a scene without masks and give it with --scene; pip install \
+         'cif4d[capture]' brings pycolmap, which finds points",
+    ))
 }
