@@ -43,8 +43,9 @@ pub enum Split {
 /// Options for opening a capture.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct OpenOptions {
-    /// Mask folder: a name inside the capture (`masks_tracker`) or a path; `None` takes `masks` where present, in the
-    /// layout of Dynamic 3D Gaussians else `seg`.
+    /// Mask folder: a name inside the capture (`masks_tracker`) or a path, relative to the current folder; `None` takes the
+    /// masks that the capture names for its frames, else its own folder `masks`, in the layout of Dynamic 3D Gaussians
+    /// else `seg`.
     pub masks: Option<PathBuf>,
     /// Ignore masks altogether.
     pub without_masks: bool,

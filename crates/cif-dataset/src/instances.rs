@@ -1,7 +1,7 @@
 //! Labels of instances: `instances.json` or `class_mapping.json`, completed from the masks.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use serde::Deserialize;
 
@@ -127,7 +127,9 @@ pub(crate) fn foreground(id: u16) -> InstanceLabel {
 /// The file of labels for a capture's masks: in the mask folder, else in the nearest folder of the capture above it.
 pub(crate) fn file_for(root: &Path, mask_folder: Option<&Path>) -> Option<PathBuf> {
     let above = |folder: &Path| {
-        let inside = folder.strip_prefix(root).map(Path::components).map_or(0, Iterator::count);
+        let below = folder.strip_prefix(root).unwrap_or(Path::new(""));
+        let leaves = below.components().any(|part| !matches!(part, Component::Normal(_)));
+        let inside = if leaves { 0 } else { below.components().count() };
         folder.ancestors().take(inside.max(1)).map(Path::to_owned).collect::<Vec<_>>()
     };
     mask_folder

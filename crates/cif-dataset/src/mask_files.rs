@@ -18,12 +18,31 @@ pub(crate) const DEFAULT_FOLDER: &str = "masks";
 /// The mask folder of Dynamic 3D Gaussians: white where the foreground is, mostly of one bit per pixel.
 pub(crate) const SEGMENTS: &str = "seg";
 
-/// The mask folder of a capture that nobody named.
-pub(crate) fn default_folder(root: &Path, layout: Layout) -> &'static Path {
-    let segments = layout == Layout::DynamicGaussians
-        && !root.join(DEFAULT_FOLDER).is_dir()
-        && root.join(SEGMENTS).is_dir();
-    Path::new(if segments { SEGMENTS } else { DEFAULT_FOLDER })
+/// A folder of masks, as one named it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct MaskFolder {
+    /// A name inside the capture, or a path.
+    pub(crate) name: PathBuf,
+    /// Path of the folder.
+    pub(crate) path: PathBuf,
+}
+
+impl MaskFolder {
+    /// The folder that somebody asked for: a name inside the capture, else a path, relative to the current folder.
+    pub(crate) fn asked(root: &Path, name: &Path) -> Self {
+        let inside = root.join(name);
+        let path = if inside.is_dir() || !name.is_dir() { inside } else { name.to_owned() };
+        Self { name: name.to_owned(), path }
+    }
+
+    /// The folder that nobody named, which is one of the capture and of no other place.
+    pub(crate) fn of_capture(root: &Path, layout: Layout) -> Self {
+        let segments = layout == Layout::DynamicGaussians
+            && !root.join(DEFAULT_FOLDER).is_dir()
+            && root.join(SEGMENTS).is_dir();
+        let name = if segments { SEGMENTS } else { DEFAULT_FOLDER };
+        Self { name: name.into(), path: root.join(name) }
+    }
 }
 
 /// Folder of confidences inside a mask folder.
@@ -85,13 +104,15 @@ pub(crate) struct MaskListing {
     pub(crate) confidences: Vec<Option<PathBuf>>,
     /// Folder of these masks, which may hold labels of its own; of several, the one of the first training frame.
     pub(crate) folder: Option<PathBuf>,
+    /// The folder in messages.
+    pub(crate) place: String,
     /// PNG and EXR files in the folders that belong to no frame.
     pub(crate) strangers: usize,
     /// True when files belong to frames by their numbers instead of their names.
     pub(crate) numbered: bool,
 }
 
-/// Finds the masks of a folder: a name inside the capture, or a path.
+/// Finds the masks of a folder.
 ///
 /// Looked for, in this order: `<camera>/<folder>/<stem>.png` (Neu3D), `<folder>/<frame>.png`,
 /// `<folder>/<frame>.<image extension>.png`, where stems are unique `<folder>/<stem>.png`, and the folder beside the
@@ -99,10 +120,8 @@ pub(crate) struct MaskListing {
 /// capture was made of, one for each, are those of its frames. Where none fits, EXR files that are bare numbers count
 /// the frames from 0, as renderers number them, and masks of an LLFF sequence belong to the images of their numbers
 /// (`frame-000012.mask.png` to `000012.png`).
-pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Path) -> MaskListing {
-    let inside = root.join(folder);
-    // A path relative to the working folder, where the capture has no such folder.
-    let base = if inside.is_dir() || !folder.is_dir() { inside } else { folder.to_owned() };
+pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &MaskFolder) -> MaskListing {
+    let MaskFolder { name: folder, path: base } = folder;
     let stems: Vec<String> = frames.iter().map(|frame| listing::stem(&frame.image)).collect();
     let mut occurrences: BTreeMap<&str, usize> = BTreeMap::new();
     for stem in &stems {
@@ -136,32 +155,68 @@ pub(crate) fn locate(root: &Path, layout: Layout, frames: &[Frame], folder: &Pat
             })
         })
         .collect();
-    let of_videos = of_videos(&base, frames, &mut paths);
+    let of_videos = of_videos(base, frames, &mut paths);
     let numbered = paths.iter().all(Option::is_none)
-        && (number(&base, &mut paths) || layout == Layout::Llff && by_number(&base, &stems, &mut paths));
+        && (number(base, &mut paths) || layout == Layout::Llff && by_number(base, &stems, &mut paths));
     let found: BTreeSet<&Path> = paths.iter().flatten().map(PathBuf::as_path).collect();
     // Masks of a folder may lie in subfolders, those of cameras and splits in folders of their own.
     let mut folders: BTreeSet<&Path> =
-        found.iter().filter(|path| !path.starts_with(&base)).filter_map(|path| path.parent()).collect();
-    let of_training = || {
-        let trained = frames.iter().zip(&paths).filter(|(frame, _)| frame.split == Split::Train);
-        trained.filter_map(|(_, path)| path.as_deref()?.parent()).next().map(Path::to_owned)
+        found.iter().filter(|path| !path.starts_with(base)).filter_map(|path| path.parent()).collect();
+    let (folder_of_masks, place) = if base.is_dir() {
+        (Some(base.clone()), base.display().to_string())
+    } else {
+        let beside = format!("{}: {}/ beside the images", root.display(), folder.display());
+        (folder_of_training(frames, &paths), beside)
     };
-    let folder_of_masks = if base.is_dir() { Some(base.clone()) } else { of_training() };
-    folders.insert(&base);
+    folders.insert(base);
     let confidences = |folder: &Path| folder.join(CONFIDENCE_FOLDER);
     let files: usize = folders
         .iter()
         .map(|folder| count_files(folder).saturating_sub(count_files(&confidences(folder))))
         .sum();
     let strangers = files.saturating_sub(found.len() + of_videos);
-    let folder_of_confidences = confidences(&base);
+    let folder_of_confidences = confidences(base);
     let confidence = |(frame, mask): (&Frame, &Option<PathBuf>)| {
         let path = folder_of_confidences.join(format!("{}.png", frame.name));
         mask.as_ref().map(|_| path).filter(|path| listing::is_there(path))
     };
     let confidences = frames.iter().zip(&paths).map(confidence).collect();
-    MaskListing { paths, confidences, folder: folder_of_masks, strangers, numbered }
+    MaskListing { paths, confidences, folder: folder_of_masks, place, strangers, numbered }
+}
+
+/// Folder of the mask of the first training frame that has one.
+fn folder_of_training(frames: &[Frame], paths: &[Option<PathBuf>]) -> Option<PathBuf> {
+    let trained = frames.iter().zip(paths).filter(|(frame, _)| frame.split == Split::Train);
+    trained.filter_map(|(_, path)| path.as_deref()?.parent()).next().map(Path::to_owned)
+}
+
+impl MaskListing {
+    /// Lets the masks that frames name themselves go first. Those of the folder go to the other frames where the named
+    /// ones lie in it too; else they count ids of their own, so that none of them is taken, and the files left out are
+    /// counted.
+    pub(crate) fn after_named(self, folder: &MaskFolder, frames: &[Frame]) -> (Self, usize) {
+        let named: BTreeSet<&Path> =
+            frames.iter().filter_map(|frame| frame.mask.as_deref()?.parent()).collect();
+        if named.is_empty() {
+            return (self, 0);
+        }
+        let real = folder.path.canonicalize();
+        let inside = |named: &&Path| {
+            let named = named.canonicalize();
+            real.as_ref().is_ok_and(|real| named.is_ok_and(|named| named.starts_with(real)))
+        };
+        if named.iter().all(inside) {
+            let paths = frames.iter().zip(self.paths).map(|(frame, found)| frame.mask.clone().or(found));
+            return (Self { paths: paths.collect(), numbered: false, ..self }, 0);
+        }
+        let left_out = self.paths.iter().flatten().count();
+        let paths: Vec<_> = frames.iter().map(|frame| frame.mask.clone()).collect();
+        let folder =
+            folder_of_training(frames, &paths).or_else(|| named.first().map(|path| path.to_path_buf()));
+        let place = folder.as_deref().map(|folder| folder.display().to_string()).unwrap_or_default();
+        let confidences = vec![None; paths.len()];
+        (Self { paths, confidences, folder, place, strangers: 0, numbered: false }, left_out)
+    }
 }
 
 /// The number in a name that has one.
@@ -240,17 +295,8 @@ fn count_files(folder: &Path) -> usize {
     if !folder.is_dir() {
         return 0;
     }
-    let entries = listing::entries(folder).unwrap_or_default();
-    entries
-        .iter()
-        .map(|path| {
-            if path.is_dir() {
-                count_files(path)
-            } else {
-                usize::from(listing::has_extension(path, &EXTENSIONS))
-            }
-        })
-        .sum()
+    let files = listing::below(folder).unwrap_or_default();
+    files.iter().filter(|path| listing::has_extension(path, &EXTENSIONS)).count()
 }
 
 /// Folders of a capture that could hold masks, for messages.

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use crate::files::{image, json, listing};
 use crate::formats::{self, Draft, Source, some_of};
 use crate::load::{centred, reduced_size};
+use crate::mask_files::MaskFolder;
 use crate::{
     CaptureFrame, Dataset, Error, Frame, Layout, OpenOptions, PointCloud, PointSource, Split, camera_check,
     cryptomatte, instances, layout, mask_files, points,
@@ -123,7 +124,8 @@ impl Dataset {
     /// # Errors
     /// When the folder holds no mask of this capture.
     pub fn mask_paths(&self, folder: &Path) -> Result<Vec<Option<PathBuf>>, Error> {
-        let listing = mask_files::locate(&self.root, self.layout, &self.frames, folder);
+        let asked = MaskFolder::asked(&self.root, folder);
+        let listing = mask_files::locate(&self.root, self.layout, &self.frames, &asked);
         if listing.paths.iter().all(Option::is_none) {
             let known = mask_files::folders_like_masks(&self.root);
             let known = if known.is_empty() {
@@ -214,15 +216,29 @@ impl Dataset {
     /// Gives frames their masks and finds the instances in them; files that belong to no frame go to `unused`.
     fn attach_masks(
         &mut self,
-        folder: Option<&Path>,
+        asked: Option<&Path>,
         keyframes: bool,
         stored_sizes: &[(u32, u32)],
         unused: &mut Vec<String>,
     ) -> Result<(), Error> {
-        let name = folder.unwrap_or_else(|| mask_files::default_folder(&self.root, self.layout));
-        let listing = mask_files::locate(&self.root, self.layout, &self.frames, name);
-        if folder.is_some() {
+        let folder = match asked {
+            Some(name) => MaskFolder::asked(&self.root, name),
+            None => MaskFolder::of_capture(&self.root, self.layout),
+        };
+        let mut listing = mask_files::locate(&self.root, self.layout, &self.frames, &folder);
+        if let Some(name) = asked {
             self.mask_paths(name)?;
+        } else {
+            let (after_named, left_out) = listing.after_named(&folder, &self.frames);
+            listing = after_named;
+            if left_out > 0 {
+                self.warnings.push(format!(
+                    "{}: not used: the capture names the masks of its frames, and they are not in it ({}); to take \
+                     these, name it as the folder of masks",
+                    folder.path.display(),
+                    listing.place
+                ));
+            }
         }
         if listing.paths.iter().any(Option::is_some) {
             for ((frame, path), confidence) in
@@ -233,7 +249,7 @@ impl Dataset {
         } else if listing.folder.is_some() && listing.strangers > 0 {
             self.warnings.push(format!(
                 "{}: none of its {} files is named as a frame, e.g. {}.png",
-                self.root.join(name).display(),
+                folder.path.display(),
                 listing.strangers,
                 self.frames[0].name
             ));
@@ -243,7 +259,7 @@ impl Dataset {
                 return Err(Error::MissingFile {
                     path: mask.clone(),
                     fix: format!(
-                        "it is named as the mask of frame {}; restore it or remove mask_path",
+                        "it is named as the mask of frame {}; restore it, remove mask_path, or name a folder of masks",
                         frame.name
                     ),
                 });
@@ -263,11 +279,7 @@ impl Dataset {
             (frames.iter().filter(|index| self.frames[**index].mask.is_some()).count(), frames.len())
         };
         let ((train, all_train), (val, all_val)) = (masked_of(Split::Train), masked_of(Split::Val));
-        let place = match self.root.join(name) {
-            folder if folder.is_dir() => folder.display().to_string(),
-            _ if name.is_dir() => name.display().to_string(),
-            _ => format!("{}: {}/ beside the images", self.root.display(), name.display()),
-        };
+        let place = listing.place;
         if train < all_train && !keyframes {
             self.warnings.push(format!("{place}: {masked} of {} frames have a mask", self.frames.len()));
         } else if val < all_val && !keyframes {
@@ -280,7 +292,7 @@ impl Dataset {
             unused.push(format!(
                 "{} mask files in {} that belong to no frame",
                 listing.strangers,
-                name.display()
+                folder.name.display()
             ));
         }
         if listing.numbered {
@@ -318,25 +330,27 @@ impl Dataset {
         self.mask_objects = cryptomatte::ObjectIds::new();
         if !manifests.is_empty() {
             let explicit = cryptomatte::explicit(listing.folder.as_deref())?;
-            let place = self.root.join(name);
-            self.mask_objects =
-                cryptomatte::assign(&manifests, &explicit, &mut named, &place, &mut self.warnings)?;
+            self.mask_objects = cryptomatte::assign(
+                &manifests,
+                &explicit,
+                &mut named,
+                Path::new(&place),
+                &mut self.warnings,
+            )?;
         }
         let counts = mask_files::count_pixels(&self.frames, &self.mask_objects)?;
         let found: BTreeSet<u16> =
             counts.iter().flatten().flat_map(|(counts, _)| counts.keys().copied()).collect();
         if found.is_empty() {
-            self.warnings.push(format!(
-                "{}: the masks hold no labelled pixel; only colour can be trained",
-                self.root.join(name).display()
-            ));
+            self.warnings
+                .push(format!("{place}: the masks hold no labelled pixel; only colour can be trained"));
         } else if let (1, Some(&id)) = (found.len(), found.first())
-            && (id == instances::WHITE || name == Path::new(mask_files::SEGMENTS))
+            && (id == instances::WHITE || folder.name == Path::new(mask_files::SEGMENTS))
             && !named.contains_key(&id)
         {
             named.insert(id, instances::foreground(id));
             let what = format!("{place}: one value apart from 0 ({id}): taken as one instance, foreground");
-            if name == Path::new(mask_files::SEGMENTS) {
+            if folder.name == Path::new(mask_files::SEGMENTS) {
                 self.notes.push(what);
             } else {
                 self.warnings.push(format!(

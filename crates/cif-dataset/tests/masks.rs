@@ -234,3 +234,99 @@ fn feature_maps_are_read_at_the_size_of_images_and_belong_to_training_frames() {
     let told = cif_dataset::feature_maps(&dataset, &maps).unwrap_err().to_string();
     holds(&told, &["maps", &format!("{name}.npy"), "has no feature map"]);
 }
+
+/// Masks of one id for the frames of `nerfstudio`.
+fn write_ids(folder: &Path, frames: std::ops::Range<usize>, id: u8) {
+    for k in frames {
+        write_mask(&folder.join(format!("{k:04}.png")), WIDTH, HEIGHT, |_, _| id);
+    }
+}
+
+fn ids(dataset: &Dataset) -> Vec<u16> {
+    dataset.instances.iter().map(|instance| instance.id).collect()
+}
+
+fn masked(dataset: &Dataset) -> usize {
+    dataset.frames.iter().filter(|frame| frame.mask.is_some()).count()
+}
+
+#[test]
+fn masks_of_the_current_folder_belong_to_no_capture_unless_asked_for() {
+    const CAPTURE: &str = "CIF_DATASET_TEST_CAPTURE";
+    if let Some(capture) = std::env::var_os(CAPTURE) {
+        let dataset = Dataset::open(&capture, &OpenOptions::default()).unwrap();
+        assert_eq!((masked(&dataset), ids(&dataset)), (0, vec![]));
+        let asked = OpenOptions { masks: Some("masks".into()), ..OpenOptions::default() };
+        let dataset = Dataset::open(&capture, &asked).unwrap();
+        assert_eq!((masked(&dataset), ids(&dataset)), (3, vec![7]));
+        return;
+    }
+    let (capture, current) = (nerfstudio(3), tempfile::tempdir().unwrap());
+    write_ids(&current.path().join("masks"), 0..3, 7);
+    // The current folder is one for the whole process.
+    let child = std::process::Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "masks_of_the_current_folder_belong_to_no_capture_unless_asked_for"])
+        .env(CAPTURE, capture.path())
+        .current_dir(current.path())
+        .output()
+        .unwrap();
+    assert!(child.status.success(), "{}", String::from_utf8_lossy(&child.stdout));
+}
+
+#[test]
+fn masks_that_frames_name_go_before_a_folder_that_is_there() {
+    let folder = nerfstudio(4);
+    let root = folder.path();
+    edit_json(&root.join("transforms.json"), |value| {
+        for k in 0..4 {
+            value["frames"][k]["mask_path"] = json!(format!("segm/{k:04}.png"));
+        }
+    });
+    write_ids(&root.join("segm"), 0..4, 3);
+    // As many, or one only; its names are not those of the other folder's ids.
+    for count in [4, 1] {
+        let _ = std::fs::remove_dir_all(root.join("masks"));
+        write_ids(&root.join("masks"), 0..count, 7);
+        write_json(&root.join("masks/instances.json"), &json!([{"id": 3, "label": "of others"}]));
+        let dataset = open(&folder);
+        assert_eq!((masked(&dataset), ids(&dataset)), (4, vec![3]));
+        assert_eq!(dataset.instances[0].label, "instance_3");
+        assert!(warns(&dataset, &["masks: not used", "segm"]), "{:?}", dataset.warnings);
+        let asked = OpenOptions { masks: Some("masks".into()), ..OpenOptions::default() };
+        let dataset = Dataset::open(root, &asked).unwrap();
+        assert_eq!((masked(&dataset), ids(&dataset)), (count, vec![7]));
+        assert_eq!(ids(&open(&folder).with_masks(Path::new("masks")).unwrap()), [7]);
+    }
+    // Frames that name none have none of another numbering.
+    edit_json(&root.join("transforms.json"), |value| {
+        value["frames"][1].as_object_mut().unwrap().remove("mask_path");
+    });
+    write_ids(&root.join("masks"), 0..4, 7);
+    let dataset = open(&folder);
+    assert_eq!((masked(&dataset), ids(&dataset)), (3, vec![3]));
+    // In the folder itself, the rest of its files is of the same numbering.
+    edit_json(&root.join("transforms.json"), |value| {
+        for k in [0, 2, 3] {
+            value["frames"][k]["mask_path"] = json!(format!("./masks/{k:04}.png"));
+        }
+    });
+    write_ids(&root.join("masks"), 0..4, 5);
+    let dataset = open(&folder);
+    assert_eq!((masked(&dataset), ids(&dataset)), (4, vec![5]));
+    assert!(!warns(&dataset, &["not used"]), "{:?}", dataset.warnings);
+}
+
+#[cfg(unix)]
+#[test]
+fn links_in_a_folder_of_masks_are_not_walked_in_circles() {
+    let folder = nerfstudio(3);
+    let masks = folder.path().join("masks");
+    write_ids(&masks, 0..4, 2);
+    for link in ["a", "b"] {
+        std::os::unix::fs::symlink(".", masks.join(link)).unwrap();
+    }
+    let dataset = open(&folder);
+    assert_eq!((masked(&dataset), ids(&dataset)), (3, vec![2]));
+    assert!(notes(&dataset, &["1 mask files in masks"]), "{:?}", dataset.notes);
+    assert_eq!(cif_dataset::masks::found_masks(&dataset, &masks).unwrap().concat().len(), 3);
+}

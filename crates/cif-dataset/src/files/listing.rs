@@ -20,6 +20,39 @@ pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, Error> {
     Ok(found)
 }
 
+/// Files of a folder and the folders below it, in order of their paths, without hidden ones.
+///
+/// A link to a folder is followed unless it leads up, to a folder that it lies in, or lies itself in a folder that was
+/// reached by a link: so no folder is walked more than once per link.
+///
+/// # Errors
+/// When a folder cannot be read.
+pub(crate) fn below(folder: &Path) -> Result<Vec<PathBuf>, Error> {
+    let mut files = Vec::new();
+    let mut folders = vec![(folder.to_owned(), false)];
+    while let Some((current, linked)) = folders.pop() {
+        for path in entries(&current)? {
+            if !path.is_dir() {
+                files.push(path);
+            } else if !path.is_symlink() {
+                folders.push((path, linked));
+            } else if !linked && !leads_up(&path, &current) {
+                folders.push((path, true));
+            }
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// True where a link leads to the folder that it lies in, or above.
+fn leads_up(link: &Path, folder: &Path) -> bool {
+    match (link.canonicalize(), folder.canonicalize()) {
+        (Ok(to), Ok(folder)) => folder.starts_with(to),
+        _ => true,
+    }
+}
+
 /// Image files (png, jpg, jpeg) of a folder in name order; empty when there is no such folder.
 ///
 /// # Errors
@@ -83,4 +116,36 @@ pub(crate) fn with_image_extension(path: &Path) -> Option<PathBuf> {
             PathBuf::from(name)
         })
         .find(|candidate| is_there(candidate))
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use std::os::unix::fs::symlink;
+
+    use super::*;
+
+    #[test]
+    fn walks_follow_links_but_no_loops() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path();
+        for name in ["a/0.png", "b/c/1.png", ".hidden/2.png"] {
+            std::fs::create_dir_all(root.join(name).parent().unwrap()).unwrap();
+            std::fs::write(root.join(name), "").unwrap();
+        }
+        // Up in one step or several, and round between two folders.
+        for (to, link) in [
+            (".", "self"),
+            (".", "again"),
+            ("../..", "b/c/up"),
+            ("../b", "a/other"),
+            ("../a", "b/other"),
+            ("a", "d"),
+        ] {
+            symlink(to, root.join(link)).unwrap();
+        }
+        let found = below(root).unwrap();
+        let names: Vec<_> =
+            found.iter().map(|path| path.strip_prefix(root).unwrap().to_str().unwrap()).collect();
+        assert_eq!(names, ["a/0.png", "a/other/c/1.png", "b/c/1.png", "b/other/0.png", "d/0.png"]);
+    }
 }

@@ -60,8 +60,8 @@ pub(crate) fn files_of_frames(
     for (stem, index) in stems {
         names.entry(stem).or_insert(index);
     }
-    let mut files = Vec::new();
-    collect(folder, ending, &mut files)?;
+    let mut files = listing::below(folder)?;
+    files.retain(|path| listing::has_extension(path, &[ending]));
     let mut of_frames = vec![Vec::new(); dataset.frames.len()];
     for file in &files {
         let inside = file.strip_prefix(folder).unwrap_or(file).with_extension("");
@@ -71,18 +71,6 @@ pub(crate) fn files_of_frames(
         }
     }
     Ok((of_frames, files.len()))
-}
-
-/// Files of a folder and its subfolders with an ending, in order of their names.
-fn collect(folder: &Path, ending: &str, files: &mut Vec<PathBuf>) -> Result<(), Error> {
-    for path in listing::entries(folder)? {
-        if path.is_dir() {
-            collect(&path, ending, files)?;
-        } else if listing::has_extension(&path, &[ending]) {
-            files.push(path);
-        }
-    }
-    Ok(())
 }
 
 /// The frame with the longest name that a path begins with, up to a separator.

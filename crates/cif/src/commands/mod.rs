@@ -231,7 +231,8 @@ fn dispatch(command: Command) -> Result<(), Error> {
 #[derive(Clone, Debug, Args)]
 struct CaptureOptions {
     /// Mask folder: a name inside the capture, such as masks_tracker, or a path; it holds PNG files of ids
-    /// or EXR files with a Cryptomatte, whose objects are matched with the labels of instances.json [default: masks]
+    /// or EXR files with a Cryptomatte, whose objects are matched with the labels of instances.json [default: those
+    /// that the capture names for its frames, else its folder masks]
     #[arg(long, value_name = "NAME")]
     masks: Option<std::path::PathBuf>,
     /// Read no masks
