@@ -153,6 +153,20 @@ def test_files_that_are_no_stages(tmp_path: Path) -> None:
         read.read_scene(empty)
 
 
+def test_damaged_values_are_one_clear_error(path: Path) -> None:
+    text = path.read_text()
+    changed, count = re.subn(r"token\[\] semantics:labels:class = .*", "double semantics:labels:class = 3", text)
+    assert count
+    path.write_text(changed)
+    with pytest.raises(read.StageError, match=r"small\.usda: it is damaged"):
+        read.read_scene(path)
+    changed, count = re.subn(rb'semantics:labels:class = \["\w+', lambda found: found[0] + bytes([255, 254]), text.encode())
+    assert count
+    path.with_name("text.usda").write_bytes(changed)
+    with pytest.raises(read.StageError, match=r"text\.usda"):
+        read.read_scene(path.with_name("text.usda"))
+
+
 def test_colour_curves_are_inverse() -> None:
     values = np.linspace(0, 2, 41)
     np.testing.assert_allclose(color.display_from_linear(color.linear_from_display(values)), values, atol=1e-9)

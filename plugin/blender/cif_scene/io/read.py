@@ -62,7 +62,19 @@ def home(stage: Usd.Stage) -> Usd.Prim | None:
 
 
 def read_scene(path: str | Path, harmonics: bool = True, arrays: bool = True) -> Scene:
-    """Read a stage; without `harmonics` only degree 0, without `arrays` no splats but poses and labels."""
+    """Read a stage; without `harmonics` only degree 0, without `arrays` no splats but poses and labels.
+
+    Raises `StageError` for all that cannot be shown, whatever USD or numpy say of it.
+    """
+    try:
+        return _scene(path, harmonics, arrays)
+    except StageError:
+        raise
+    except (TypeError, ValueError, RuntimeError) as error:  # values of other types, text that is no Unicode
+        raise StageError(f"{path}: it is damaged ({error}); export it again") from error
+
+
+def _scene(path: str | Path, harmonics: bool, arrays: bool) -> Scene:
     stage = open_stage(path)
     warnings: list[str] = []
     splats = [prim for prim in stage.Traverse() if prim.GetTypeName() == SPLAT_TYPE]
