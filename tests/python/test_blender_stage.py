@@ -155,12 +155,14 @@ def test_files_that_are_no_stages(tmp_path: Path) -> None:
 
 def test_damaged_values_are_one_clear_error(path: Path) -> None:
     text = path.read_text()
-    changed, count = re.subn(r"token\[\] semantics:labels:class = .*", "double semantics:labels:class = 3", text)
+    number = "double semantics:labels:class = 3"
+    changed, count = re.subn(r"token\[\] semantics:labels:class = .*", number, text)
     assert count
     path.write_text(changed)
     with pytest.raises(read.StageError, match=r"small\.usda: it is damaged"):
         read.read_scene(path)
-    changed, count = re.subn(rb'semantics:labels:class = \["\w+', lambda found: found[0] + bytes([255, 254]), text.encode())
+    label = rb'semantics:labels:class = \["\w+'
+    changed, count = re.subn(label, lambda found: found[0] + bytes([255, 254]), text.encode())
     assert count
     path.with_name("text.usda").write_bytes(changed)
     with pytest.raises(read.StageError, match=r"text\.usda"):
