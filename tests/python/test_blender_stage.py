@@ -153,6 +153,16 @@ def test_files_that_are_no_stages(tmp_path: Path) -> None:
         read.read_scene(empty)
 
 
+def test_stand_ins_and_guides_are_left_out(path: Path) -> None:
+    whole = by_name(read.read_scene(path))
+    text = path.read_text()
+    head = 'def ParticleField3DGaussianSplat "Splats"'
+    for purpose, count in (("proxy", len(whole) - 1), ("guide", len(whole) - 1), ("render", len(whole))):
+        at = text.index("{", text.index(head)) + 1
+        path.write_text(f'{text[:at]}\nuniform token purpose = "{purpose}"\n{text[at:]}')
+        assert len(read.read_scene(path).instances) == count, purpose
+
+
 def test_damaged_values_are_one_clear_error(path: Path) -> None:
     text = path.read_text()
     number = "double semantics:labels:class = 3"

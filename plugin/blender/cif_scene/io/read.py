@@ -77,7 +77,7 @@ def read_scene(path: str | Path, harmonics: bool = True, arrays: bool = True) ->
 def _scene(path: str | Path, harmonics: bool, arrays: bool) -> Scene:
     stage = open_stage(path)
     warnings: list[str] = []
-    splats = [prim for prim in stage.Traverse() if prim.GetTypeName() == SPLAT_TYPE]
+    splats = [prim for prim in stage.Traverse() if prim.GetTypeName() == SPLAT_TYPE and _is_drawn(prim)]
     if not splats:
         raise StageError(f"{path}: holds no {SPLAT_TYPE} prims; was it written by `cif export`?")
     owned: dict[Sdf.Path, list[Usd.Prim]] = {}
@@ -112,6 +112,16 @@ def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode | None = None) -> objec
     if value is None and attribute.GetNumTimeSamples():
         value = attribute.Get(attribute.GetTimeSamples()[0])
     return value
+
+
+def _is_drawn(prim: Usd.Prim) -> bool:
+    """False for stand-ins and guides: the purpose of a prim is its own, else that of the nearest above it."""
+    while prim and not prim.IsPseudoRoot():
+        purpose = prim.GetAttribute("purpose")
+        if purpose and purpose.HasAuthoredValue():
+            return str(purpose.Get()) not in ("proxy", "guide")
+        prim = prim.GetParent()
+    return True
 
 
 def _labels(prim: Usd.Prim, name: str) -> list[str]:
