@@ -153,6 +153,32 @@ def test_files_that_are_no_stages(tmp_path: Path) -> None:
         read.read_scene(empty)
 
 
+def test_stand_ins_and_guides_are_left_out(path: Path) -> None:
+    whole = by_name(read.read_scene(path))
+    text = path.read_text()
+    head = 'def ParticleField3DGaussianSplat "Splats"'
+    for purpose, count in (("proxy", len(whole) - 1), ("guide", len(whole) - 1), ("render", len(whole))):
+        at = text.index("{", text.index(head)) + 1
+        path.write_text(f'{text[:at]}\nuniform token purpose = "{purpose}"\n{text[at:]}')
+        assert len(read.read_scene(path).instances) == count, purpose
+
+
+def test_damaged_values_are_one_clear_error(path: Path) -> None:
+    text = path.read_text()
+    number = "double semantics:labels:class = 3"
+    changed, count = re.subn(r"token\[\] semantics:labels:class = .*", number, text)
+    assert count
+    path.write_text(changed)
+    with pytest.raises(read.StageError, match=r"small\.usda: it is damaged"):
+        read.read_scene(path)
+    label = rb'semantics:labels:class = \["\w+'
+    changed, count = re.subn(label, lambda found: found[0] + bytes([255, 254]), text.encode())
+    assert count
+    path.with_name("text.usda").write_bytes(changed)
+    with pytest.raises(read.StageError, match=r"text\.usda"):
+        read.read_scene(path.with_name("text.usda"))
+
+
 def test_colour_curves_are_inverse() -> None:
     values = np.linspace(0, 2, 41)
     np.testing.assert_allclose(color.display_from_linear(color.linear_from_display(values)), values, atol=1e-9)

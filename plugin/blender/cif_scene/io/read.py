@@ -62,10 +62,22 @@ def home(stage: Usd.Stage) -> Usd.Prim | None:
 
 
 def read_scene(path: str | Path, harmonics: bool = True, arrays: bool = True) -> Scene:
-    """Read a stage; without `harmonics` only degree 0, without `arrays` no splats but poses and labels."""
+    """Read a stage; without `harmonics` only degree 0, without `arrays` no splats but poses and labels.
+
+    Raises `StageError` for all that cannot be shown, whatever USD or numpy say of it.
+    """
+    try:
+        return _scene(path, harmonics, arrays)
+    except StageError:
+        raise
+    except (TypeError, ValueError, RuntimeError) as error:  # values of other types, text that is no Unicode
+        raise StageError(f"{path}: it is damaged ({error}); export it again") from error
+
+
+def _scene(path: str | Path, harmonics: bool, arrays: bool) -> Scene:
     stage = open_stage(path)
     warnings: list[str] = []
-    splats = [prim for prim in stage.Traverse() if prim.GetTypeName() == SPLAT_TYPE]
+    splats = [prim for prim in stage.Traverse() if prim.GetTypeName() == SPLAT_TYPE and _is_drawn(prim)]
     if not splats:
         raise StageError(f"{path}: holds no {SPLAT_TYPE} prims; was it written by `cif export`?")
     owned: dict[Sdf.Path, list[Usd.Prim]] = {}
@@ -100,6 +112,16 @@ def _value(prim: Usd.Prim, name: str, time: Usd.TimeCode | None = None) -> objec
     if value is None and attribute.GetNumTimeSamples():
         value = attribute.Get(attribute.GetTimeSamples()[0])
     return value
+
+
+def _is_drawn(prim: Usd.Prim) -> bool:
+    """False for stand-ins and guides: the purpose of a prim is its own, else that of the nearest above it."""
+    while prim and not prim.IsPseudoRoot():
+        purpose = prim.GetAttribute("purpose")
+        if purpose and purpose.HasAuthoredValue():
+            return str(purpose.Get()) not in ("proxy", "guide")
+        prim = prim.GetParent()
+    return True
 
 
 def _labels(prim: Usd.Prim, name: str) -> list[str]:
