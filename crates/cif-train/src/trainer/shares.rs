@@ -11,7 +11,7 @@ use cif_render::cpu::{Renderer, SimdLevel};
 use cif_render::{BlendRequest, Blending, UNLABELLED};
 
 use super::Trainer;
-use crate::config::HeadName;
+use crate::config::{HeadName, IdentityConfig};
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::phase::Phase;
@@ -22,9 +22,6 @@ const VIEWS: usize = 100;
 /// Shares are kept this far from 0 and 1, where no evidence moves them any more.
 const LIMIT: f32 = 1e-3;
 
-/// Evidence below which a Gaussian keeps its share, pixels: sums of what it is likely to have shown of them.
-const LEAST_PIXELS: f32 = 0.1;
-
 /// Parts of a pixel below this are nothing to divide by, as where labels are counted (methods reference 5.1).
 const LEAST_PART: f32 = 1e-3;
 
@@ -34,7 +31,7 @@ impl Trainer {
     /// # Errors
     /// When a frame cannot be read, or the run is to stop; nothing has changed then.
     pub(super) fn sharpen_shares(&mut self) -> Result<(), TrainError> {
-        let rounds = self.state.config.identity.share_rounds;
+        let IdentityConfig { share_rounds: rounds, min_mass, .. } = self.state.config.identity;
         let is_own = self.state.config.head.name == HeadName::Cif;
         let Some(identities) = self.state.field.identities.as_ref().filter(|_| is_own && rounds > 0) else {
             return Ok(());
@@ -49,7 +46,8 @@ impl Trainer {
             let sums = self.evidence(&mut renderer, &views, &shares)?;
             for (share, sums) in shares.iter_mut().zip(sums.chunks_exact(2)) {
                 let (own, others) = (*share * sums[0], (1.0 - *share) * sums[1]);
-                if own + others > LEAST_PIXELS {
+                // What it is likely to have shown, pixels.
+                if own + others > min_mass {
                     *share = (own / (own + others)).clamp(LIMIT, 1.0 - LIMIT);
                 }
             }
