@@ -47,7 +47,15 @@ fn damaged_coco_is_refused_by_entry() {
     let folder = hypernerf(3);
     let path = folder.path().join("coco.json");
     type Edit = fn(&mut serde_json::Value);
-    let cases: [(Edit, &[&str]); 7] = [
+    let cases: [(Edit, &[&str]); 8] = [
+        (
+            |v| {
+                v["images"].as_array_mut().unwrap().iter_mut().for_each(|image| {
+                    (image["width"], image["height"]) = (json!(9 * WIDTH), json!(9 * HEIGHT));
+                })
+            },
+            &["000000.jpg", "288 x 216 = 62208 pixels", "64 times", "32 x 24", "(49152)"],
+        ),
         (
             |v| v["annotations"][1]["segmentation"]["counts"][1] = json!(999_999),
             &["annotation 2", "broken run-length"],

@@ -8,6 +8,8 @@ use std::time::Duration;
 
 use pyo3::prelude::*;
 
+use crate::process;
+
 /// Longest time between two looks at signals.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
@@ -37,6 +39,7 @@ pub(crate) fn run<T: Send, Q: Send, A: Send>(
     mut answer: impl FnMut(Q) -> PyResult<A>,
     work: impl FnOnce(Questions<Q, A>) -> T + Send,
 ) -> PyResult<T> {
+    process::enter()?;
     thread::scope(|scope| {
         let (sender, inbox) = channel();
         let worker = thread::Builder::new()

@@ -7,11 +7,10 @@ use pyo3::exceptions::PyIndexError;
 use pyo3::prelude::*;
 use pyo3::types::{PyDict, PyList};
 
-use crate::arrays;
 use crate::camera::Camera;
 use crate::error::cif_error;
 use crate::picture::Picture;
-use crate::{picture, tables};
+use crate::{arrays, picture, process, tables};
 
 /// A capture, understood: frames, cameras, times, masks, instances, initial points.
 #[pyclass(frozen, module = "cif")]
@@ -34,7 +33,7 @@ pub(crate) fn open_dataset(
     downscale: Option<u32>,
 ) -> PyResult<Dataset> {
     let options = cif_dataset::OpenOptions { masks, downscale, ..cif_dataset::OpenOptions::default() };
-    let inner = py.detach(|| cif_dataset::Dataset::open(&path, &options)).map_err(cif_error)?;
+    let inner = process::detach(py, || cif_dataset::Dataset::open(&path, &options))?.map_err(cif_error)?;
     Ok(Dataset { inner, downscale })
 }
 
@@ -124,7 +123,7 @@ impl Dataset {
     ) -> PyResult<Bound<'py, PyDict>> {
         self.frame_at(index)?;
         let background = [background.0, background.1, background.2];
-        let data = py.detach(|| self.inner.load_frame(index, background)).map_err(cif_error)?;
+        let data = process::detach(py, || self.inner.load_frame(index, background))?.map_err(cif_error)?;
         let out = PyDict::new(py);
         out.set_item("image", arrays::color_image(py, data.image)?)?;
         out.set_item("mask", data.mask.map(|mask| arrays::image(py, mask)).transpose()?)?;

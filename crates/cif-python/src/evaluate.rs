@@ -18,7 +18,7 @@ use serde_json::{Value, json};
 use crate::error::cif_error;
 use crate::field::Field;
 use crate::train::Capture;
-use crate::{arrays, beside};
+use crate::{arrays, beside, process};
 
 /// A scene, loaded or by its file.
 #[derive(FromPyObject)]
@@ -105,7 +105,7 @@ pub(crate) fn evaluate<'py>(
         Scene::Field(field) => (&field.inner, None),
         Scene::File(path) => {
             let load = || load_with_head(path).map_err(|error| error.with_help());
-            loaded = py.detach(load).map_err(cif_error)?;
+            loaded = process::detach(py, load)?.map_err(cif_error)?;
             (&loaded.0, loaded.1.as_ref())
         }
     };

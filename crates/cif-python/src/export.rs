@@ -9,9 +9,9 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays;
 use crate::error::cif_error;
 use crate::field::Field;
+use crate::{arrays, process};
 
 /// Motion from a Python function `time -> (means, quaternions)`. The first error stops the export.
 struct CallableMotion<'a> {
@@ -93,10 +93,10 @@ fn build(
     motion: Option<Bound<'_, PyAny>>,
 ) -> PyResult<SceneGraph> {
     let Some(function) = motion else {
-        return py.detach(|| cif_scene::build(&field.inner, options)).map_err(cif_error);
+        return process::detach(py, || cif_scene::build(&field.inner, options))?.map_err(cif_error);
     };
     let mut source = CallableMotion { field: &field.inner, function: function.unbind(), error: None };
-    let graph = py.detach(|| cif_scene::build_from(&field.inner, &mut source, options));
+    let graph = process::detach(py, || cif_scene::build_from(&field.inner, &mut source, options))?;
     match source.error {
         Some(error) => Err(error),
         None => graph.map_err(cif_error),
@@ -118,7 +118,7 @@ pub(crate) fn export<'py>(
     let scene = scene_options(py, scene)?;
     format.check_target(path, &writing).map_err(cif_error)?;
     let graph = build(py, field, &format.held(&scene), motion)?;
-    let summary = py.detach(|| format.write(&graph, path, &writing)).map_err(cif_error)?;
+    let summary = process::detach(py, || format.write(&graph, path, &writing))?.map_err(cif_error)?;
     let out = PyDict::new(py);
     out.set_item("path", summary.path)?;
     out.set_item("files", summary.files)?;

@@ -19,7 +19,7 @@ use crate::camera::Camera;
 use crate::error::cif_error;
 use crate::from_arrays::FromArrays;
 use crate::picture::{Picture, View};
-use crate::{arrays, export, objects, picture, tables};
+use crate::{arrays, export, objects, picture, process, tables};
 
 /// A dynamic Gaussian field with instances: N Gaussians, K instances, T captured times.
 ///
@@ -43,7 +43,7 @@ impl Field {
             let options = SceneOptions { proxy_points: 0, hulls_per_instance: 0, ..SceneOptions::default() };
             cif_scene::build(&self.inner, &options).map_err(|error| error.to_string())
         };
-        py.detach(|| self.graph.get_or_init(build)).as_ref().map_err(cif_error)
+        process::detach(py, || self.graph.get_or_init(build))?.as_ref().map_err(cif_error)
     }
 
     /// A view of the field with all its layers.
@@ -53,11 +53,11 @@ impl Field {
         camera: &Camera,
         time: f64,
         channels: Channels,
-    ) -> RenderedImage {
+    ) -> PyResult<RenderedImage> {
         let settings = RenderSettings::of_field(&self.inner);
         let instances = channels.instances && self.inner.identities.is_some();
         let channels = Channels { instances, ..channels };
-        py.detach(|| {
+        process::detach(py, || {
             Renderer::new(SimdLevel::Auto).render(&self.inner, &camera.inner, time, &settings, channels)
         })
     }
@@ -68,13 +68,13 @@ impl Field {
     /// Read a .cif file.
     #[staticmethod]
     fn load(py: Python<'_>, path: PathBuf) -> PyResult<Self> {
-        let inner = py.detach(|| cif_field::Field::load(&path)).map_err(cif_error)?;
+        let inner = process::detach(py, || cif_field::Field::load(&path))?.map_err(cif_error)?;
         Ok(Self::new(inner))
     }
 
     /// Write a .cif file, replacing an older one only once the new one is complete.
     fn save(&self, py: Python<'_>, path: PathBuf) -> PyResult<()> {
-        py.detach(|| self.inner.save(&path)).map_err(cif_error)
+        process::detach(py, || self.inner.save(&path))?.map_err(cif_error)
     }
 
     /// Make a static field.
@@ -231,7 +231,7 @@ impl Field {
     /// Return means, scales, quaternions and opacities as they are at a normalised time.
     fn at<'py>(&self, py: Python<'py>, time: f64) -> PyResult<Bound<'py, PyDict>> {
         check_time(time)?;
-        let moved = py.detach(|| Renderer::new(SimdLevel::Auto).deform(&self.inner, time));
+        let moved = process::detach(py, || Renderer::new(SimdLevel::Auto).deform(&self.inner, time))?;
         let out = PyDict::new(py);
         out.set_item("means", arrays::matrix(py, &moved.means)?)?;
         out.set_item("scales", arrays::matrix(py, &scales_of(&moved))?)?;
@@ -256,7 +256,7 @@ impl Field {
         instances: bool,
     ) -> PyResult<Bound<'py, PyDict>> {
         check_time(time)?;
-        let image = self.draw(py, &camera, time, Channels { depth, instances });
+        let image = self.draw(py, &camera, time, Channels { depth, instances })?;
         let out = PyDict::new(py);
         out.set_item("color", arrays::color_image(py, image.color)?)?;
         out.set_item("alpha", arrays::image(py, image.alpha)?)?;
@@ -298,7 +298,7 @@ impl Field {
         check_time(time)?;
         let points: Vec<DVec3> =
             arrays::rows::<f64, 3>("points", &points)?.into_iter().map(DVec3::from_array).collect();
-        let answers = py.detach(|| self.inner.query(&points, time));
+        let answers = process::detach(py, || self.inner.query(&points, time))?;
         let instances = self.inner.instances.len();
         let mut probabilities = vec![0.0_f64; answers.len() * instances];
         for (answer, row) in answers.iter().zip(probabilities.chunks_exact_mut(instances.max(1))) {

@@ -6,9 +6,9 @@ use cif::formats;
 use cif_scene::ReadOptions;
 use pyo3::prelude::*;
 
-use crate::arrays;
 use crate::error::cif_error;
 use crate::field::Field;
+use crate::{arrays, process};
 
 fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
@@ -28,18 +28,17 @@ pub(crate) fn import_scene<'py>(
     force_base: bool,
 ) -> PyResult<(Field, Bound<'py, PyAny>)> {
     let base = base.as_deref();
-    let (inner, changes) = py
-        .detach(|| {
-            let graph = formats::read(&path, ReadOptions::default()).map_err(|error| error.to_string())?;
-            let source = name_of(&path);
-            match base {
-                Some(base) => cif_scene::import_edits(&base.inner, &graph, &source, force_base)
-                    .map(|(field, changes)| (field, Some(changes))),
-                None => cif_scene::field_from_graph(&graph, &source).map(|field| (field, None)),
-            }
-            .map_err(|error| error.to_string())
-        })
-        .map_err(cif_error)?;
+    let (inner, changes) = process::detach(py, || {
+        let graph = formats::read(&path, ReadOptions::default()).map_err(|error| error.to_string())?;
+        let source = name_of(&path);
+        match base {
+            Some(base) => cif_scene::import_edits(&base.inner, &graph, &source, force_base)
+                .map(|(field, changes)| (field, Some(changes))),
+            None => cif_scene::field_from_graph(&graph, &source).map(|field| (field, None)),
+        }
+        .map_err(|error| error.to_string())
+    })?
+    .map_err(cif_error)?;
     Ok((Field::new(inner), arrays::to_python(py, &changes)?))
 }
 
@@ -49,12 +48,11 @@ pub(crate) fn import_scene<'py>(
 /// visibility, and counts of splats; unchanged counts the others.
 #[pyfunction]
 pub(crate) fn diff<'py>(py: Python<'py>, before: PathBuf, after: PathBuf) -> PyResult<Bound<'py, PyAny>> {
-    let changes = py
-        .detach(|| {
-            formats::read_both(&before, &after)
-                .map(|[before, after]| cif_scene::diff::diff(&before, &after))
-                .map_err(|error| error.to_string())
-        })
-        .map_err(cif_error)?;
+    let changes = process::detach(py, || {
+        formats::read_both(&before, &after)
+            .map(|[before, after]| cif_scene::diff::diff(&before, &after))
+            .map_err(|error| error.to_string())
+    })?
+    .map_err(cif_error)?;
     arrays::to_python(py, &changes)
 }

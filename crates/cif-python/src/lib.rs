@@ -14,6 +14,7 @@
 //! | `export` | scenes as files |
 //! | `import` | files as scenes, edits coming home, differences |
 //! | `train` | training with a callback |
+//! | `process` | that work runs in the process that began it |
 //! | `error` | `cif.CifError` |
 //!
 //! Doc comments of what Python sees are its docstrings, and are written for its users: `make stubs` takes them into
@@ -32,6 +33,7 @@ mod from_arrays;
 mod import;
 mod objects;
 mod picture;
+mod process;
 mod tables;
 mod train;
 
@@ -69,7 +71,7 @@ fn run(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
 fn main(py: Python<'_>, arguments: Vec<OsString>) -> PyResult<i32> {
     name_python(py)?;
     cif::own_process();
-    Ok(py.detach(|| cif::run(arguments)))
+    process::detach(py, || cif::run(arguments))
 }
 
 #[pymodule]

@@ -8,9 +8,9 @@ use numpy::PyArray1;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use crate::arrays;
 use crate::error::cif_error;
 use crate::field::Field;
+use crate::{arrays, process};
 
 /// Name of a field in errors.
 const PLACE: &str = "the field";
@@ -85,6 +85,7 @@ pub(crate) fn query_stage<'py>(
 ) -> PyResult<Bound<'py, PyAny>> {
     let query = LabelQuery { pattern: label, time_code };
     let format = formats::format_of(&path).map_err(|error| cif_error(error.with_help()))?;
-    let found = format.query(&path, &query, ReadOptions { follow_external }).map_err(cif_error)?;
+    let read = || format.query(&path, &query, ReadOptions { follow_external });
+    let found = process::detach(py, read)?.map_err(cif_error)?;
     arrays::to_python(py, &found)
 }

@@ -11,11 +11,11 @@ use pyo3::exceptions::{PyIndexError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyBytes;
 
-use crate::arrays;
 use crate::camera::Camera;
 use crate::dataset::Dataset;
 use crate::error::cif_error;
 use crate::field::Field;
+use crate::{arrays, process};
 
 /// An 8-bit RGB picture, as drawn by `show`; notebooks show it.
 #[pyclass(frozen, module = "cif")]
@@ -43,8 +43,8 @@ impl Picture {
     }
 
     fn _repr_png_<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyBytes>> {
-        let bytes =
-            py.detach(|| png_bytes(&self.inner).map_err(|error| error.with_help())).map_err(cif_error)?;
+        let bytes = process::detach(py, || png_bytes(&self.inner).map_err(|error| error.with_help()))?
+            .map_err(cif_error)?;
         Ok(PyBytes::new(py, &bytes))
     }
 
@@ -89,7 +89,7 @@ pub(crate) fn of_field(
     if what != "rgb" && !channels.depth && !channels.instances {
         return Err(unknown(what, "rgb, instance-color or depth-color"));
     }
-    let image = field.draw(py, &camera, time.unwrap_or(own), channels);
+    let image = field.draw(py, &camera, time.unwrap_or(own), channels)?;
     let inner = match (&image.instances, &image.depth) {
         (Some(layers), _) => instance_picture(&mask_ids(&field.inner, &layers.label), &layers.foreground),
         (None, Some(depth)) => depth_picture(depth),
@@ -107,7 +107,7 @@ pub(crate) fn of_frame(py: Python<'_>, dataset: &Dataset, index: usize, what: &s
     if !matches!(what, "rgb" | "instance-color") {
         return Err(unknown(what, "rgb or instance-color"));
     }
-    let data = py.detach(|| dataset.inner.load_frame(index, [1.0; 3])).map_err(cif_error)?;
+    let data = process::detach(py, || dataset.inner.load_frame(index, [1.0; 3]))?.map_err(cif_error)?;
     if what == "rgb" {
         return Ok(Picture { inner: data.image });
     }

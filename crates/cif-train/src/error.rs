@@ -18,6 +18,11 @@ pub enum TrainError {
     /// The deformation network cannot be made.
     #[error("settings under `model`: {0}")]
     Deformation(#[from] cif_field::deformation::ConfigError),
+    /// The deformation network takes more memory than is free.
+    #[error(
+        "settings under `model`: {0}; take a smaller spatial_resolution, fewer channels, or fewer or smaller multipliers"
+    )]
+    Memory(#[from] cif_system::memory::TooLittle),
     /// The initial points are not usable.
     #[error("the initial points of the capture: {0}")]
     Points(#[from] cif_field::FieldError),

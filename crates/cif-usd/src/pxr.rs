@@ -1,8 +1,10 @@
 //! The Python modules of usd-core, and arrays handed over as buffers.
 
+use std::path::PathBuf;
+
 use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyList, PySlice};
 
 use crate::{UsdError, conventions, tokens};
 
@@ -22,7 +24,28 @@ pub(crate) struct Pxr<'py> {
 
 /// Runs `body` with usd-core; attaches to the interpreter.
 pub(crate) fn with<T>(body: impl FnOnce(&Pxr<'_>) -> Result<T, UsdError>) -> Result<T, UsdError> {
-    Python::try_attach(|py| body(&Pxr::import(py)?)).unwrap_or(Err(UsdError::NoInterpreter))
+    Python::try_attach(|py| body(&without_current_folder(py, || Pxr::import(py))?))
+        .unwrap_or(Err(UsdError::NoInterpreter))
+}
+
+/// Imports modules of where packages are installed: relative entries of the search path, which are the current folder, are
+/// left out meanwhile.
+pub(crate) fn without_current_folder<T>(
+    py: Python<'_>,
+    import: impl FnOnce() -> Result<T, UsdError>,
+) -> Result<T, UsdError> {
+    let python = |error: PyErr| UsdError::Python { reason: reason(py, &error) };
+    let path = py.import("sys").and_then(|sys| sys.getattr("path")).map_err(python)?;
+    let before: Vec<Bound<'_, PyAny>> = path.extract().map_err(python)?;
+    let set = |entries: Vec<Bound<'_, PyAny>>| {
+        path.set_item(PySlice::full(py), PyList::new(py, entries)?).map_err(PyErr::from)
+    };
+    let is_absolute =
+        |entry: &Bound<'_, PyAny>| entry.extract::<PathBuf>().is_ok_and(|entry| entry.is_absolute());
+    set(before.iter().filter(|entry| is_absolute(entry)).cloned().collect()).map_err(python)?;
+    let imported = import();
+    set(before).map_err(python)?;
+    imported
 }
 
 /// Message of a Python error, without the source locations of usd-core's messages.

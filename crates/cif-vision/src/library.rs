@@ -2,7 +2,7 @@
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::Stdio;
 
 use crate::Error;
 
@@ -23,7 +23,9 @@ pub fn find(pythons: &[OsString]) -> Result<PathBuf, Error> {
 
 fn find_named(named: Option<OsString>, pythons: &[OsString]) -> Result<PathBuf, Error> {
     if let Some(named) = named.filter(|name| !name.is_empty()) {
-        let path = PathBuf::from(named);
+        // A name alone would be looked for among the libraries of the system.
+        let named = PathBuf::from(named);
+        let path = std::path::absolute(&named).unwrap_or(named);
         cif_input::check(&path).map_err(|error| {
             Error::refused(
                 format!("{VARIABLE} names {}: {error}", path.display()),
@@ -49,10 +51,11 @@ fn find_named(named: Option<OsString>, pythons: &[OsString]) -> Result<PathBuf, 
 
 /// Folder of the Python package.
 fn package(python: &OsString) -> Option<PathBuf> {
-    let asked = Command::new(python).args(["-c", SCRIPT]).stdin(Stdio::null()).stderr(Stdio::null()).output();
+    let asked =
+        cif_system::python::script(python, SCRIPT).stdin(Stdio::null()).stderr(Stdio::null()).output();
     let output = asked.ok().filter(|output| output.status.success())?.stdout;
-    let folder = String::from_utf8(output).ok()?;
-    (!folder.is_empty()).then(|| PathBuf::from(folder))
+    let folder = PathBuf::from(String::from_utf8(output).ok()?);
+    folder.is_absolute().then_some(folder)
 }
 
 /// The library in a folder: `libonnxruntime.so.1.23.0` and alike, not those of its providers.
@@ -89,6 +92,30 @@ mod tests {
             std::fs::remove_file(path).unwrap();
         }
         assert_eq!(library_in(&folder.path().join("nowhere")), None);
+    }
+
+    #[test]
+    fn a_package_of_the_current_folder_is_not_taken() {
+        const FOLDER: &str = "CIF_VISION_TEST_FOLDER";
+        let python = std::env::var_os("PYO3_PYTHON").unwrap_or_else(|| "python3".into());
+        if let Some(folder) = std::env::var_os(FOLDER) {
+            let found = package(&python);
+            assert!(!found.as_ref().is_some_and(|found| found.starts_with(folder)), "{found:?}");
+            return;
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let capi = folder.path().join("onnxruntime/capi");
+        std::fs::create_dir_all(&capi).unwrap();
+        std::fs::write(capi.join("../__init__.py"), "").unwrap();
+        std::fs::write(capi.join("libonnxruntime.so.9"), "").unwrap();
+        // The current folder is one for the whole process.
+        let child = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--exact", "library::tests::a_package_of_the_current_folder_is_not_taken"])
+            .env(FOLDER, folder.path().canonicalize().unwrap())
+            .current_dir(folder.path())
+            .output()
+            .unwrap();
+        assert!(child.status.success(), "{}", String::from_utf8_lossy(&child.stdout));
     }
 
     #[test]

@@ -6,10 +6,11 @@ use std::process::Command;
 use serde_json::Value;
 
 /// Row of every crate; 0 is the lowest.
-const ROWS: [(&str, u32); 18] = [
+const ROWS: [(&str, u32); 19] = [
     ("cif-geometry", 0),
     ("cif-output", 0),
     ("cif-input", 0),
+    ("cif-system", 0),
     ("cif-dataset", 1),
     ("cif-field", 1),
     ("cif-vision", 1),

@@ -4,7 +4,6 @@
 use std::collections::BTreeMap;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 use std::sync::OnceLock;
 
 use cif_geometry::{LensDistortion, RigidTransform};
@@ -240,8 +239,7 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
     input.push(b'\n');
     let programs = pythons();
     for program in &programs {
-        let mut command = Command::new(program);
-        command.args(["-c", SCRIPT]);
+        let mut command = cif_system::python::script(program, SCRIPT);
         // A thread of one library must not start a thread per processor in another.
         command.env("OMP_NUM_THREADS", job.threads.to_string());
         // Where logs of COLMAP go that do not go to the standard error.

@@ -30,16 +30,12 @@ Threads finish in any order; images and features of the second kind are written 
 poses are the same at every call, whatever was kept before.
 """
 
+import json
+import os
+import signal
 import sys
-
-# Without the folder that the command runs in: a file there must not stand in for a module.
-sys.path[:] = [path for path in sys.path if path]
-
-import json  # noqa: E402
-import os  # noqa: E402
-import signal  # noqa: E402
-import threading  # noqa: E402
-from pathlib import Path  # noqa: E402
+import threading
+from pathlib import Path
 
 # Images of every thread whose features are found at a time, and pairs that are matched at a time: what an
 # interruption loses at most. Fewer would leave threads without work at the end of each part.

@@ -1,6 +1,6 @@
 //! NumPy arrays of numbers: `.npy` files and members of `.npz` archives.
 
-use std::io::{Cursor, Read};
+use std::io::{BufReader, Cursor, Read};
 use std::path::Path;
 
 use npyz::{Deserialize, NpyFile, Order};
@@ -12,12 +12,15 @@ use crate::Error;
 /// Longest header text accepted; NumPy writes about 120 bytes.
 const MAX_HEADER: usize = 4096;
 
+/// Most elements of a packed array: a few bytes of an archive can stand for many, which are then all in memory.
+const MAX_PACKED: u64 = 1 << 27;
+
 /// An array of any number of dimensions.
-pub(crate) struct Array {
+pub(crate) struct Array<T = f64> {
     /// Lengths of the dimensions.
     pub(crate) shape: Vec<usize>,
     /// Values in C order: the last dimension varies fastest.
-    pub(crate) values: Vec<f64>,
+    pub(crate) values: Vec<T>,
 }
 
 /// A matrix, row by row.
@@ -55,17 +58,23 @@ pub(crate) fn read_matrix(path: &Path) -> Result<Matrix, Error> {
 /// As [`read_matrix`], for any number of dimensions.
 pub(crate) fn read_floats(path: &Path) -> Result<Array, Error> {
     let bytes = cif_input::read(path).map_err(Error::read(path))?;
-    parse(&bytes, Elements::Floats).map_err(|problem| Error::invalid(path, problem))
+    parse(&*bytes, bytes.len() as u64, Elements::Floats, Ok).map_err(|problem| Error::invalid(path, problem))
 }
 
-/// Reads an array of integers: a `.npy` file, or a `.npz` archive that holds one array.
+/// Reads an array of ids, integers of 0 to 65 535: a `.npy` file, or a `.npz` archive that holds one array.
 ///
 /// # Errors
-/// When the file is damaged, of other elements, or an archive of several arrays.
-pub(crate) fn read_integers(path: &Path) -> Result<Array, Error> {
+/// When the file is damaged, of other elements, or an archive of several arrays, or an id is outside of the range.
+pub(crate) fn read_ids(path: &Path) -> Result<Array<u16>, Error> {
+    let id = |value: f64| {
+        let fits = (0.0..=65_535.0).contains(&value);
+        fits.then_some(value as u16)
+            .ok_or_else(|| format!("id {value} is outside 0 to 65535; give the object a smaller one"))
+    };
     if !super::listing::has_extension(path, &["npz"]) {
         let bytes = cif_input::read(path).map_err(Error::read(path))?;
-        return parse(&bytes, Elements::Integers).map_err(|problem| Error::invalid(path, problem));
+        return parse(&*bytes, bytes.len() as u64, Elements::Integers, id)
+            .map_err(|problem| Error::invalid(path, problem));
     }
     let mut archive = Archive::open(path)?;
     let names: Vec<String> = archive
@@ -74,7 +83,7 @@ pub(crate) fn read_integers(path: &Path) -> Result<Array, Error> {
         .map(|name| name.map_or_else(|_| "?".to_owned(), |name| name.into_owned()))
         .collect();
     match names.as_slice() {
-        [name] => archive.array(name.strip_suffix(".npy").unwrap_or(name), Elements::Integers),
+        [name] => archive.read(name.strip_suffix(".npy").unwrap_or(name), Elements::Integers, id),
         _ => Err(Error::invalid(
             path,
             format!("{} arrays where one of ids is expected: {}", names.len(), names.join(", ")),
@@ -109,34 +118,54 @@ impl<'a> Archive<'a> {
     /// # Errors
     /// When the archive lacks it, or it is damaged or of other elements.
     pub(crate) fn array(&mut self, name: &str, elements: Elements) -> Result<Array, Error> {
+        self.read(name, elements, Ok)
+    }
+
+    fn read<T: Copy>(
+        &mut self,
+        name: &str,
+        elements: Elements,
+        into: impl Fn(f64) -> Result<T, String>,
+    ) -> Result<Array<T>, Error> {
         let path = self.path;
         let invalid = |problem: String| Error::invalid(path, format!("array `{name}`: {problem}"));
         let damaged = |error: &dyn std::fmt::Display| invalid(format!("damaged ({error}); copy it again"));
         let index = self.zip.index_for_name(&format!("{name}.npy"));
         let index = index.ok_or_else(|| invalid("missing; write the file with numpy.savez again".into()))?;
         let member = self.zip.by_index(index).map_err(|error| damaged(&error))?;
-        let mut bytes = Vec::new();
-        member.take(self.limit).read_to_end(&mut bytes).map_err(|error| damaged(&error))?;
-        parse(&bytes, elements).map_err(invalid)
+        // Unpacked while it is read: the bytes are never all in memory.
+        let size = member.size().min(self.limit);
+        let mut reader = BufReader::new(member.take(self.limit));
+        let array = parse(&mut reader, size, elements, into).map_err(invalid)?;
+        // The end has the check sum of all.
+        std::io::copy(&mut reader, &mut std::io::sink()).map_err(|error| damaged(&error))?;
+        Ok(array)
     }
 }
 
-/// Reads the bytes of a `.npy` file; the error is the problem alone.
-fn parse(bytes: &[u8], elements: Elements) -> Result<Array, String> {
-    check_header(bytes)?;
-    let file = NpyFile::new(bytes).map_err(|error| format!("not a NumPy array ({error})"))?;
+/// Reads a `.npy` file of so many bytes at the most; the error is the problem alone.
+fn parse<T: Copy>(
+    mut reader: impl Read,
+    size: u64,
+    elements: Elements,
+    into: impl Fn(f64) -> Result<T, String>,
+) -> Result<Array<T>, String> {
+    let head = read_header(&mut reader, size)?;
+    let file = NpyFile::new(Cursor::new(head).chain(reader))
+        .map_err(|error| format!("not a NumPy array ({error})"))?;
     let shape: Vec<usize> = file.shape().iter().map(|length| *length as usize).collect();
     let order = file.order();
     let values = match elements {
-        Elements::Floats => values::<f64>(file, |v| v).or_else(|file| values::<f32>(file, f64::from)),
-        Elements::Integers => values::<i64>(file, |v| v as f64)
-            .or_else(|file| values::<u64>(file, |v| v as f64))
-            .or_else(|file| values::<i32>(file, f64::from))
-            .or_else(|file| values::<u32>(file, f64::from))
-            .or_else(|file| values::<i16>(file, f64::from))
-            .or_else(|file| values::<u16>(file, f64::from))
-            .or_else(|file| values::<i8>(file, f64::from))
-            .or_else(|file| values::<u8>(file, f64::from)),
+        Elements::Floats => values::<f64, _, _>(file, |v| into(v))
+            .or_else(|file| values::<f32, _, _>(file, |v| into(v.into()))),
+        Elements::Integers => values::<i64, _, _>(file, |v| into(v as f64))
+            .or_else(|file| values::<u64, _, _>(file, |v| into(v as f64)))
+            .or_else(|file| values::<i32, _, _>(file, |v| into(v.into())))
+            .or_else(|file| values::<u32, _, _>(file, |v| into(v.into())))
+            .or_else(|file| values::<i16, _, _>(file, |v| into(v.into())))
+            .or_else(|file| values::<u16, _, _>(file, |v| into(v.into())))
+            .or_else(|file| values::<i8, _, _>(file, |v| into(v.into())))
+            .or_else(|file| values::<u8, _, _>(file, |v| into(v.into()))),
     };
     let values = values.unwrap_or_else(|file| {
         let expected = match elements {
@@ -150,17 +179,17 @@ fn parse(bytes: &[u8], elements: Elements) -> Result<Array, String> {
 }
 
 /// The values of an array whose elements are of a type; the file itself where they are of another.
-fn values<T: Deserialize>(
-    file: NpyFile<&[u8]>,
-    as_float: fn(T) -> f64,
-) -> Result<Result<Vec<f64>, String>, NpyFile<&[u8]>> {
-    let data = file.try_data::<T>()?;
-    let values = data.map(|value| value.map(as_float)).collect::<Result<_, _>>();
-    Ok(values.map_err(|error| format!("cut short or damaged ({error}); copy it again")))
+fn values<E: Deserialize, R: Read, T>(
+    file: NpyFile<R>,
+    into: impl Fn(E) -> Result<T, String>,
+) -> Result<Result<Vec<T>, String>, NpyFile<R>> {
+    let data = file.try_data::<E>()?;
+    let damaged = |error: std::io::Error| format!("cut short or damaged ({error}); copy it again");
+    Ok(data.map(|value| into(value.map_err(damaged)?)).collect())
 }
 
 /// Values whose first dimension varies fastest, so that the last one does.
-fn in_c_order(shape: &[usize], values: &[f64]) -> Vec<f64> {
+fn in_c_order<T: Copy>(shape: &[usize], values: &[T]) -> Vec<T> {
     let mut index = vec![0; shape.len()];
     (0..values.len())
         .map(|_| {
@@ -177,33 +206,47 @@ fn in_c_order(shape: &[usize], values: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-/// Rejects headers that would make the parser allocate, recurse or overflow.
-fn check_header(bytes: &[u8]) -> Result<(), String> {
-    let short = || "cut short: no NumPy header; copy it again".to_owned();
-    if bytes.get(..6) != Some(b"\x93NUMPY".as_slice()) {
+/// The bytes of the header, up to the first element. Headers that would make the parser allocate, recurse or overflow are
+/// refused.
+fn read_header(reader: &mut impl Read, size: u64) -> Result<Vec<u8>, String> {
+    let mut head = Vec::new();
+    let mut more = |head: &mut Vec<u8>, length: usize| {
+        let from = head.len();
+        reader
+            .by_ref()
+            .take(length as u64)
+            .read_to_end(head)
+            .map_err(|error| format!("damaged ({error}); copy it again"))?;
+        if head.len() < from + length {
+            return Err("cut short: no NumPy header; copy it again".to_owned());
+        }
+        Ok(())
+    };
+    let magic = b"\x93NUMPY";
+    more(&mut head, magic.len() + 2).map_err(|_| "not a NumPy array (.npy)".to_owned())?;
+    if !head.starts_with(magic) {
         return Err("not a NumPy array (.npy)".to_owned());
     }
-    let (start, length) = match bytes.get(6).ok_or_else(short)? {
-        1 => (
-            10,
-            usize::from(u16::from_le_bytes([
-                *bytes.get(8).ok_or_else(short)?,
-                *bytes.get(9).ok_or_else(short)?,
-            ])),
-        ),
+    let length = match head[6] {
+        1 => {
+            more(&mut head, 2)?;
+            usize::from(u16::from_le_bytes([head[8], head[9]]))
+        }
         _ => {
-            let size = bytes.get(8..12).ok_or_else(short)?;
-            (12, u32::from_le_bytes([size[0], size[1], size[2], size[3]]) as usize)
+            more(&mut head, 4)?;
+            u32::from_le_bytes([head[8], head[9], head[10], head[11]]) as usize
         }
     };
     if length > MAX_HEADER {
         return Err(format!("header of {length} bytes; a plain array of floats is expected"));
     }
-    let header = bytes.get(start..start + length).ok_or_else(short)?;
+    let start = head.len();
+    more(&mut head, length)?;
+    let header = &head[start..];
     if header.iter().filter(|c| b"([{".contains(c)).count() > 8 {
         return Err("structured array; a plain array of floats is expected".to_owned());
     }
-    // Every number in the header, shape included, times the others must stay below the file size: the product
+    // Every number in the header, shape included, times the others must stay below the size: the product
     // of the shape is then safe too. Item sizes are single digits.
     let text = String::from_utf8_lossy(header);
     let shape = text.split("'shape'").nth(1).unwrap_or("").split(')').next().unwrap_or("");
@@ -212,10 +255,17 @@ fn check_header(bytes: &[u8]) -> Result<(), String> {
         let value: u64 = number.parse().map_err(|_| format!("dimension {number} is too large"))?;
         product = product
             .checked_mul(value.max(1))
-            .filter(|product| *product <= bytes.len() as u64)
+            .filter(|product| *product <= size)
             .ok_or_else(|| "its header claims more elements than the file holds; copy it again".to_owned())?;
     }
-    Ok(())
+    if product > MAX_PACKED {
+        let shape = shape.trim_start_matches([':', ' ', '(']);
+        return Err(format!(
+            "[{shape}] = {product} elements, more than {MAX_PACKED} at once; save them as several files, such as one per \
+             frame"
+        ));
+    }
+    Ok(head)
 }
 
 #[cfg(test)]
@@ -232,12 +282,16 @@ mod tests {
         bytes
     }
 
+    fn parsed(bytes: &[u8], elements: Elements) -> Result<Array, String> {
+        parse(bytes, bytes.len() as u64, elements, Ok)
+    }
+
     #[test]
     fn arrays_of_three_dimensions_are_read_in_either_order() {
         let data: Vec<u8> = (0..12).flat_map(|k| (k as f32).to_le_bytes()).collect();
-        let c = parse(&file("<f4", "False", "(2, 3, 2)", &data), Elements::Floats).unwrap();
+        let c = parsed(&file("<f4", "False", "(2, 3, 2)", &data), Elements::Floats).unwrap();
         assert_eq!((c.shape, c.values), (vec![2, 3, 2], (0..12).map(f64::from).collect()));
-        let f = parse(&file("<f4", "True", "(2, 3, 2)", &data), Elements::Floats).unwrap();
+        let f = parsed(&file("<f4", "True", "(2, 3, 2)", &data), Elements::Floats).unwrap();
         // Element (i, j, k) lies at i + 2 (j + 3 k).
         let expected = [0.0, 6.0, 2.0, 8.0, 4.0, 10.0, 1.0, 7.0, 3.0, 9.0, 5.0, 11.0];
         assert_eq!((f.shape, f.values), (vec![2, 3, 2], expected.to_vec()));
@@ -252,19 +306,28 @@ mod tests {
             ("<u2", 7_u16.to_le_bytes().to_vec()),
             ("|u1", vec![7]),
         ] {
-            let array = parse(&file(descr, "False", "(1,)", &data), Elements::Integers).unwrap();
+            let array = parsed(&file(descr, "False", "(1,)", &data), Elements::Integers).unwrap();
             assert_eq!((array.shape, array.values), (vec![1], vec![7.0]), "{descr}");
         }
         let floats = file("<f8", "False", "(1,)", &7_f64.to_le_bytes());
-        let told = parse(&floats, Elements::Integers).err().unwrap();
+        let told = parsed(&floats, Elements::Integers).err().unwrap();
         assert!(told.contains("integers are expected"), "{told}");
     }
 
     #[test]
     fn short_files_are_refused() {
-        let told = parse(&file("<f8", "False", "(2, 1)", &[0; 12]), Elements::Floats).err().unwrap();
+        let told = parsed(&file("<f8", "False", "(2, 1)", &[0; 12]), Elements::Floats).err().unwrap();
         assert!(told.contains("cut short"), "{told}");
-        let told = parse(&file("<f8", "False", "(2, 100000)", &[0; 12]), Elements::Floats).err().unwrap();
+        let told = parsed(&file("<f8", "False", "(2, 100000)", &[0; 12]), Elements::Floats).err().unwrap();
         assert!(told.contains("more elements than the file holds"), "{told}");
+    }
+
+    #[test]
+    fn packed_arrays_are_refused_by_what_they_would_take() {
+        // 600 frames of zeros: 1032 times smaller when they are packed.
+        let header = file("|u1", "False", "(600, 1024, 1024)", &[]);
+        let size = header.len() as u64 + 600 * (1 << 20);
+        let told = parse(header.chain(std::io::repeat(0)), size, Elements::Integers, Ok).err().unwrap();
+        assert!(told.contains("[600, 1024, 1024] = 629145600 elements"), "{told}");
     }
 }

@@ -47,6 +47,9 @@ struct StoredPixel {
 }
 
 impl Stored {
+    /// Bytes of a pixel.
+    pub(crate) const BYTES_PER_PIXEL: usize = size_of::<StoredPixel>();
+
     pub(crate) fn new(belief: &Belief) -> Self {
         let pixels = belief.shares.par_chunks(belief.classes).zip(&belief.reliability);
         let store = |(shares, reliability): (&[f32], &f32)| {

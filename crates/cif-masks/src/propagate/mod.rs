@@ -24,6 +24,7 @@ use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
 use cif_geometry::PixelGrid;
+use cif_system::memory::Need;
 
 use crate::Error;
 use crate::appearance::{Features, Forest, Samples};
@@ -37,6 +38,13 @@ const LONGEST_SIDE: usize = 640;
 
 /// Bytes that flows and looks of a window may take.
 const WINDOW_BYTES: usize = 1 << 28;
+
+/// Bytes that images may take while they are read and reduced, all threads together; at least one is read at a time.
+const READ_BYTES: usize = 1 << 30;
+
+/// Bytes that a pixel of an image takes meanwhile: decoded (4), in floats before and after a reduction (24), as it is handed
+/// over (3), and in planes (12).
+const READ_BYTES_PER_PIXEL: usize = 43;
 
 /// Most frames of a window.
 const WINDOW_FRAMES: usize = 32;
@@ -100,8 +108,10 @@ pub fn propagate(
         return Err(Error::NoObject);
     }
     let image = (clip.image)(*clip.keyframes.keys().next().ok_or(Error::NoObject)?)?;
-    let run = Run::new(clip, classes, (image.width as usize, image.height as usize))?;
+    let full = (image.width as usize, image.height as usize);
     let keys: Vec<usize> = clip.keyframes.keys().copied().collect();
+    memory_of_beliefs(&keys, classes.ids.len(), size_to_follow(full.0, full.1)).check()?;
+    let run = Run::new(clip, classes, full)?;
     for key in &keys {
         done(*key, run.keyframe_mask(*key))?;
     }
@@ -111,6 +121,23 @@ pub fn propagate(
         run.between(pair[0], pair[1], done)?;
     }
     run.one_way(last, last + 1..clip.frames, done)
+}
+
+/// Memory that beliefs take: of a frame about all classes, and of the frames between two keyframes about the few that are
+/// kept.
+fn memory_of_beliefs(keys: &[usize], classes: usize, (width, height): (usize, usize)) -> Need {
+    /// Beliefs at a time, of a float per class: both ways, their blend, and that after neighbours were asked.
+    const BELIEFS: u64 = 4;
+    let gap = keys.windows(2).map(|pair| pair[1] - pair[0]).max().unwrap_or(0) as u64;
+    let [pixels, classes] = [width * height, classes].map(|number| number as u64);
+    let kept = Stored::BYTES_PER_PIXEL as u64;
+    Need {
+        bytes: pixels * (BELIEFS * classes * 4 + gap * kept),
+        arithmetic: format!(
+            "{width} x {height} pixels x ({BELIEFS} beliefs x {classes} classes x 4 bytes + {gap} frames between \
+             keyframes x {kept} bytes)"
+        ),
+    }
 }
 
 /// Ids as consecutive classes.
@@ -237,7 +264,9 @@ impl<'a> Run<'a> {
 
     fn window(&self, frames: RangeInclusive<usize>, forest: &Forest) -> Result<Window, Error> {
         self.go_on()?;
-        Window::new(self.clip, frames, self.size, forest)
+        let image = READ_BYTES_PER_PIXEL * self.full.0 * self.full.1;
+        let at_once = (READ_BYTES / image.max(1)).max(1);
+        Window::new(self.clip, frames, at_once, self.size, forest)
     }
 
     fn step(&self, window: &Window, from: usize, to: usize, known: &Belief) -> Result<Belief, Error> {
@@ -318,5 +347,18 @@ impl<'a> Run<'a> {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn memory_of_beliefs_grows_with_classes_and_with_frames_between_keyframes() {
+        assert_eq!(Stored::BYTES_PER_PIXEL, 10);
+        let need = memory_of_beliefs(&[0, 30, 130, 131], 65, (640, 360));
+        assert_eq!(need.bytes, 640 * 360 * (16 * 65 + 100 * 10));
+        assert!(need.arithmetic.contains("65 classes") && need.arithmetic.contains("100 frames"), "{need:?}");
     }
 }

@@ -72,29 +72,32 @@ pub(super) struct Seen {
 }
 
 impl Window {
-    /// Prepares frames, in parallel, at a size.
+    /// Prepares frames, so many of them in parallel, at a size.
     ///
     /// # Errors
     /// When an image cannot be read.
     pub(super) fn new(
         clip: &Clip<'_>,
         frames: RangeInclusive<usize>,
+        at_once: usize,
         (width, height): (usize, usize),
         forest: &Forest,
     ) -> Result<Self, Error> {
         let first = *frames.start();
-        let mut prepared: Vec<Prepared> = frames
-            .into_par_iter()
-            .map(|frame| {
-                if (clip.stop)() {
-                    return Err(Error::Stopped);
-                }
-                let picture = Picture::new(&(clip.image)(frame)?, width, height);
-                let looks = forest.classify(&Features::new(&picture));
-                let lab = picture.lab.each_ref().map(|plane| plane.blurred(COLOR_BLUR));
-                Ok(Prepared { pyramid: Pyramid::new(picture.brightness), lab, looks })
-            })
-            .collect::<Result<_, Error>>()?;
+        let prepare = |frame: &usize| {
+            if (clip.stop)() {
+                return Err(Error::Stopped);
+            }
+            let picture = Picture::new(&(clip.image)(*frame)?, width, height);
+            let looks = forest.classify(&Features::new(&picture));
+            let lab = picture.lab.each_ref().map(|plane| plane.blurred(COLOR_BLUR));
+            Ok(Prepared { pyramid: Pyramid::new(picture.brightness), lab, looks })
+        };
+        let frames: Vec<usize> = frames.collect();
+        let mut prepared: Vec<Prepared> = Vec::with_capacity(frames.len());
+        for some in frames.chunks(at_once) {
+            prepared.extend(some.par_iter().map(prepare).collect::<Result<Vec<_>, Error>>()?);
+        }
         let ways = prepared
             .par_windows(2)
             .map(|pair| {

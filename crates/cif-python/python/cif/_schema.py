@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -28,14 +30,26 @@ def register() -> None:
     known = [path for path in os.environ.get(_VARIABLE, "").split(os.pathsep) if path]
     if str(FOLDER) not in known:
         os.environ[_VARIABLE] = os.pathsep.join([*known, str(FOLDER)])
-    if "pxr" not in sys.modules and not _is_old():
-        return
-    try:
-        from pxr import Plug, Usd
-    except ImportError:
-        return
+    with _without_current_folder():
+        if "pxr" not in sys.modules and not _is_old():
+            return
+        try:
+            from pxr import Plug, Usd
+        except ImportError:
+            return
     folders = [FOLDER, SPLATS] if Usd.GetVersion()[1:] < _HAS_SPLATS else [FOLDER]
     Plug.Registry().RegisterPlugins([str(folder) for folder in folders])
+
+
+@contextmanager
+def _without_current_folder() -> Iterator[None]:
+    """Import what is installed: relative entries of the search path are the current folder."""
+    before = sys.path[:]
+    sys.path[:] = [entry for entry in before if Path(entry).is_absolute()]
+    try:
+        yield
+    finally:
+        sys.path[:] = before
 
 
 def _is_old() -> bool:

@@ -9,7 +9,23 @@ from __future__ import annotations
 
 import sys
 import warnings
+from itertools import pairwise
 from pathlib import Path
+
+
+def _leave_current_folder() -> None:
+    """Take no modules from the current folder where Python runs the command itself, as ``python -m cif``.
+
+    Python searches that folder first then. Programs that import the module have a search path of their own.
+    """
+    words = pairwise(sys.orig_argv)
+    is_command = any(option == "-m" and module in ("cif", "cif4d") for option, module in words)
+    current = Path.cwd()
+    if is_command and sys.path[:1] == [str(current)] and Path(__file__).parent.parent != current:
+        del sys.path[0]
+
+
+_leave_current_folder()
 
 #: The file of the module that both distributions have.
 _SHARED = Path(__file__).parent.parent / "cif" / "__init__.py"

@@ -3,6 +3,7 @@
 use cif_dataset::{Dataset, Split};
 use cif_field::{Deformation, DeformationConfig, Field, Gaussians, Instance, RecordedCamera, Timeline};
 use cif_geometry::scalar::logit;
+use cif_system::memory::Need;
 use glam::DVec3;
 
 use crate::config::TrainConfig;
@@ -29,6 +30,10 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
     let (positions, colors) = initial_points(dataset, config);
     if positions.is_empty() {
         return Err(TrainError::NoPoints { root: dataset.root.clone() });
+    }
+    if dataset.times.len() > 1 && config.effects.motion && config.stages.fine > 0 {
+        // The fine stage will make it: settings that cannot work are told before the first step.
+        deformation_shape(dataset, config)?;
     }
     let mut gaussians = Gaussians::from_points(&positions, &colors)?;
     shrink_outliers(&mut gaussians, dataset);
@@ -92,6 +97,21 @@ pub(super) fn initial_deformation(
     dataset: &Dataset,
     config: &TrainConfig,
 ) -> Result<Deformation, TrainError> {
+    let shape = deformation_shape(dataset, config)?;
+    // Outliers are moved as the nearest face of the box is; a box around them would leave the planes no resolution.
+    let bounds = dataset.points.thinned(config.model.max_initial_points as usize).core_bounds();
+    let seed = derive(config.seed, Purpose::Deformation, 0);
+    Ok(Deformation::new(shape, bounds, dataset.extent(), seed, config.model.zero_initial_heads)?)
+}
+
+/// The shape of a deformation by the settings.
+///
+/// # Errors
+/// When there is no such deformation, or memory cannot hold it in training.
+pub(super) fn deformation_shape(
+    dataset: &Dataset,
+    config: &TrainConfig,
+) -> Result<DeformationConfig, TrainError> {
     let model = &config.model;
     let time_resolution = match model.time_resolution {
         0 => automatic_time_nodes(dataset.times.len(), dataset.train_frames().len()),
@@ -106,10 +126,25 @@ pub(super) fn initial_deformation(
         heads: model.heads,
         time_encoding: model.time_encoding,
     };
-    // Outliers are moved as the nearest face of the box is; a box around them would leave the planes no resolution.
-    let bounds = dataset.points.thinned(config.model.max_initial_points as usize).core_bounds();
-    let seed = derive(config.seed, Purpose::Deformation, 0);
-    Ok(Deformation::new(shape, bounds, dataset.extent(), seed, model.zero_initial_heads)?)
+    shape.validate()?;
+    memory_of_planes(&shape).check()?;
+    Ok(shape)
+}
+
+/// Memory that the planes of a deformation take in training.
+fn memory_of_planes(shape: &DeformationConfig) -> Need {
+    /// Copies in training: values, gradients and two moments.
+    const COPIES: u64 = 4;
+    let floats = shape.plane_layout().1 as u64;
+    let [x, y, z] = shape.spatial_resolution;
+    Need {
+        bytes: 4 * COPIES * floats,
+        arithmetic: format!(
+            "{floats} floats of planes of {x} x {y} x {z} nodes and {} in time, multiplied by {:?}, with {} channels, x \
+             {COPIES} copies (values, gradients, two moments) x 4 bytes",
+            shape.time_resolution, shape.multipliers, shape.channels
+        ),
+    }
 }
 
 /// Nodes of the time planes where the settings leave them to the capture: as many as its training images tell apart, and
@@ -129,6 +164,27 @@ fn initial_points(dataset: &Dataset, config: &TrainConfig) -> (Vec<[f32; 3]>, Ve
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn memory_of_planes_counts_their_copies() {
+        let shape = DeformationConfig {
+            spatial_resolution: [1024; 3],
+            time_resolution: 8,
+            multipliers: vec![1, 2],
+            channels: 128,
+            width: 64,
+            heads: TrainConfig::default().model.heads,
+            time_encoding: Default::default(),
+        };
+        // Three planes in space at 1024 and 2048 nodes, and their three in time, of which 5 rows are stored.
+        let floats = 128 * 3 * (1024 * 1024 + 2048 * 2048 + (1024 + 2048) * 5);
+        let need = memory_of_planes(&shape);
+        assert_eq!(need.bytes, 16 * floats);
+        assert!(
+            need.arithmetic.contains(&format!("{floats} floats of planes of 1024 x 1024 x 1024 nodes")),
+            "{need:?}"
+        );
+    }
 
     #[test]
     fn time_nodes_are_as_many_as_images_tell_apart() {

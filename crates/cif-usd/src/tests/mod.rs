@@ -10,6 +10,7 @@ mod outputs;
 mod round_trip;
 mod scenes;
 mod schema;
+mod search_path;
 
 use std::path::Path;
 

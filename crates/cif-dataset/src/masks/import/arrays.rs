@@ -65,22 +65,9 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
 
 /// Pictures of a file.
 fn read(path: &Path, name: String, alone: bool) -> Result<Vec<Ids>, Error> {
-    let array = npy::read_integers(path)?;
-    let ids: Vec<u16> = array
-        .values
-        .iter()
-        .map(|value| {
-            if (0.0..=65_535.0).contains(value) {
-                return Ok(*value as u16);
-            }
-            Err(Error::invalid(
-                path,
-                format!("id {value} is outside 0 to 65535; give the object a smaller one"),
-            ))
-        })
-        .collect::<Result<_, _>>()?;
+    let npy::Array { shape, values: ids } = npy::read_ids(path)?;
     let side = |length: usize| u32::try_from(length).unwrap_or(u32::MAX);
-    match *array.shape {
+    match *shape {
         [height, width] => Ok(vec![(name, Place::file(path), (side(width), side(height)), ids)]),
         [_, height, width] if alone && height * width > 0 => {
             let picture = |(k, ids): (usize, &[u16])| {
@@ -98,7 +85,7 @@ fn read(path: &Path, name: String, alone: bool) -> Result<Vec<Ids>, Error> {
             format!(
                 "shape {:?}; ids as [height, width] in a file per frame, or [frames, height, width] in one file, are \
                  expected",
-                array.shape
+                shape
             ),
         )),
     }

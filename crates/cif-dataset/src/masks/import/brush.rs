@@ -5,6 +5,8 @@
 //! repeated, 2 that choose the counter, the count less 1, and the value or values. Values are those of red, green, blue
 //! and opacity, pixel by pixel and row by row.
 
+use super::coverage::Coverage;
+
 /// Bits of a code, the highest of every byte first.
 struct Bits<'a> {
     bytes: &'a [u8],
@@ -23,11 +25,12 @@ impl Bits<'_> {
     }
 }
 
-/// Places of the pixels that the brush covered, row by row, ascending.
+/// Adds the pixels that the brush covered.
 ///
 /// # Errors
 /// When the code is cut short, or for another number of pixels.
-pub(super) fn covered(bytes: &[u8], (width, height): (u32, u32)) -> Result<Vec<u32>, String> {
+pub(super) fn cover(bytes: &[u8], coverage: &mut Coverage) -> Result<(), String> {
+    let (width, height) = (coverage.width, coverage.height);
     let mut bits = Bits { bytes, at: 0 };
     let values = u64::from(bits.read(32)?);
     let pixels = u64::from(width) * u64::from(height);
@@ -42,11 +45,10 @@ pub(super) fn covered(bytes: &[u8], (width, height): (u32, u32)) -> Result<Vec<u
     for length in &mut lengths {
         *length = bits.read(4)? + 1;
     }
-    let mut found = Vec::new();
     // The pixel of a value, where the value is opacity and not 0.
     let mut paint = |value: u64, opacity: u32| {
         if opacity != 0 && value % 4 == 3 {
-            found.push((value / 4) as u32);
+            coverage.add(value / 4..value / 4 + 1);
         }
     };
     let mut at = 0;
@@ -67,5 +69,5 @@ pub(super) fn covered(bytes: &[u8], (width, height): (u32, u32)) -> Result<Vec<u
         }
         at = end;
     }
-    Ok(found)
+    Ok(())
 }

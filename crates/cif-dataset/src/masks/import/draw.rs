@@ -1,13 +1,15 @@
 //! Which object a pixel belongs to.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use cif_geometry::PixelGrid;
 
+use super::coverage::Coverage;
 use super::mattes::Matte;
 use super::tracker::Table;
-use super::{Drawn, Picture, Place, check_aspect, check_size, mattes, polygon, runs, tracker};
+use super::{Drawn, Picture, Place, check_aspect, check_size, check_stated, mattes, polygon, runs, tracker};
 use crate::Error;
 use crate::files::{exr_header, mask};
 
@@ -69,7 +71,8 @@ pub(super) fn draw(picture: &Picture, frame: (u32, u32), ids: &[u16]) -> Result<
             }
             let size = size.unwrap_or(frame);
             check_aspect(&picture.place, size, frame)?;
-            draw_pieces(pieces, size, ids)?
+            check_stated(&picture.place, size, frame)?;
+            draw_pieces(pieces, size, ids, KEPT_BYTES)?
         }
     };
     let size = (drawn.width, drawn.height);
@@ -87,50 +90,146 @@ fn size_of(shape: &Shape) -> Result<Option<(u32, u32)>, Error> {
     })
 }
 
-/// Pixels that a piece covers, as places in the picture row by row, ascending.
-fn covered(piece: &Piece, size: (u32, u32)) -> Result<Vec<u32>, Error> {
-    let of_grid = |grid: PixelGrid<bool>| -> Result<Vec<u32>, Error> {
+/// Adds the pixels that a piece covers.
+fn cover(piece: &Piece, coverage: &mut Coverage) -> Result<(), Error> {
+    let size = (coverage.width, coverage.height);
+    let add = |grid: &PixelGrid<bool>, coverage: &mut Coverage| {
         check_size(&piece.place, (grid.width, grid.height), size)?;
-        Ok((0..).zip(&grid.pixels).filter(|(_, covered)| **covered).map(|(at, _)| at).collect())
+        for (at, _) in (0..).zip(&grid.pixels).filter(|(_, covered)| **covered) {
+            coverage.add(at..at + 1);
+        }
+        Ok(())
     };
     match &piece.shape {
-        Shape::Polygons(outlines) => Ok(polygon::fill(outlines, size)),
+        Shape::Polygons(outlines) => {
+            polygon::cover(outlines, coverage);
+            Ok(())
+        }
         Shape::Runs(code, stated) => {
             if let Some(stated) = stated {
                 check_size(&piece.place, *stated, size)?;
             }
-            runs::covered(code, size).map_err(|problem| piece.place.error(problem))
+            runs::cover(code, coverage).map_err(|problem| piece.place.error(problem))
         }
-        Shape::File(path) => of_grid(mask::decode_matte(path)?),
-        Shape::Matte(matte) => of_grid(mattes::decode(matte)?),
+        Shape::File(path) => add(&mask::decode_matte(path)?, coverage),
+        Shape::Matte(matte) => add(&mattes::decode(matte)?, coverage),
     }
 }
 
-fn draw_pieces(pieces: &[Piece], size: (u32, u32), ids: &[u16]) -> Result<(PixelGrid<u16>, u64), Error> {
-    // Pieces of one object are one thing on their layer: their sizes add up.
-    let mut things: Vec<(i64, usize, Vec<u32>)> = Vec::new();
-    for piece in pieces {
-        let pixels = covered(piece, size)?;
-        match things.iter_mut().find(|(layer, object, _)| (*layer, *object) == (piece.layer, piece.object)) {
-            Some((_, _, known)) => {
-                known.extend(pixels);
-                known.sort_unstable();
-                known.dedup();
+/// Bytes of coverages that are kept until they are drawn; of more objects, those beyond are decoded a second time.
+const KEPT_BYTES: u64 = 1 << 27;
+
+/// Pieces of one object on one layer.
+struct Thing<'a> {
+    layer: i64,
+    object: usize,
+    pieces: Vec<&'a Piece>,
+    pixels: u64,
+    coverage: Option<Coverage>,
+}
+
+impl<'a> Thing<'a> {
+    fn cover(&self, coverage: &mut Coverage) -> Result<(), Error> {
+        coverage.clear();
+        self.pieces.iter().try_for_each(|piece| cover(piece, coverage))
+    }
+
+    /// The things of a picture, in the order of their first pieces.
+    fn of(pieces: &'a [Piece]) -> Vec<Self> {
+        let mut things: Vec<Self> = Vec::new();
+        let mut known: BTreeMap<(i64, usize), usize> = BTreeMap::new();
+        for piece in pieces {
+            let (layer, object) = (piece.layer, piece.object);
+            let place = *known.entry((layer, object)).or_insert(things.len());
+            if place == things.len() {
+                things.push(Self { layer, object, pieces: Vec::new(), pixels: 0, coverage: None });
             }
-            None => things.push((piece.layer, piece.object, pixels)),
+            things[place].pieces.push(piece);
+        }
+        things
+    }
+}
+
+/// Ids of the pixels of a picture, and how many several objects claim; coverages of up to `left` bytes are kept.
+fn draw_pieces(
+    pieces: &[Piece],
+    size: (u32, u32),
+    ids: &[u16],
+    mut left: u64,
+) -> Result<(PixelGrid<u16>, u64), Error> {
+    let mut things = Thing::of(pieces);
+    let mut scratch = Coverage::none(size);
+    for thing in &mut things {
+        thing.cover(&mut scratch)?;
+        thing.pixels = scratch.count();
+        let bytes = u64::from(size.0) * u64::from(size.1) / 8;
+        if bytes <= left {
+            left -= bytes;
+            thing.coverage = Some(std::mem::replace(&mut scratch, Coverage::none(size)));
         }
     }
     // Stable: of equal ones the later is drawn later.
-    things.sort_by_key(|(layer, _, pixels)| (*layer, std::cmp::Reverse(pixels.len())));
+    things.sort_by_key(|thing| (thing.layer, std::cmp::Reverse(thing.pixels)));
     let mut grid = PixelGrid::filled(size.0, size.1, 0_u16);
-    let mut disputed = vec![false; grid.pixels.len()];
-    for (_, object, pixels) in things {
-        for at in pixels {
-            let pixel = &mut grid.pixels[at as usize];
-            disputed[at as usize] |= *pixel != 0 && *pixel != ids[object];
-            *pixel = ids[object];
+    let mut disputed = Coverage::none(size);
+    for thing in things {
+        let coverage = match &thing.coverage {
+            Some(coverage) => coverage,
+            None => {
+                thing.cover(&mut scratch)?;
+                &scratch
+            }
+        };
+        let id = ids[thing.object];
+        for at in coverage.places() {
+            let pixel = &mut grid.pixels[at];
+            if *pixel != 0 && *pixel != id {
+                disputed.add(at as u64..at as u64 + 1);
+            }
+            *pixel = id;
         }
     }
-    let disputed = disputed.iter().filter(|disputed| **disputed).count() as u64;
-    Ok((grid, disputed))
+    Ok((grid, disputed.count()))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    /// A rectangle of an object.
+    fn piece(object: usize, layer: i64, [left, top, right, bottom]: [f64; 4]) -> Piece {
+        let corners = vec![[left, top], [right, top], [right, bottom], [left, bottom]];
+        Piece {
+            object,
+            layer,
+            place: Place::file(Path::new("made.json")),
+            shape: Shape::Polygons(vec![corners]),
+        }
+    }
+
+    #[test]
+    fn objects_that_are_decoded_twice_are_drawn_as_those_that_are_kept() {
+        let size = (70, 40);
+        let mut pieces = vec![piece(0, 0, [0.0, 0.0, 60.0, 40.0]), piece(1, 0, [10.0, 10.0, 30.0, 30.0])];
+        // Thousands of pieces of one object are one thing, over what is larger and under the higher layer.
+        pieces.extend((0..5000).map(|k| {
+            let (x, y) = (f64::from(k % 25), f64::from(k % 20));
+            piece(2, 0, [20.0 + x, 5.0 + y, 21.0 + x, 6.0 + y])
+        }));
+        pieces.push(piece(3, 1, [0.0, 0.0, 5.0, 5.0]));
+        let ids = [7, 8, 9, 10];
+        let kept = draw_pieces(&pieces, size, &ids, KEPT_BYTES).unwrap();
+        let (grid, disputed) = &kept;
+        assert_eq!(
+            [(1, 1), (12, 12), (20, 5), (55, 35), (65, 1)].map(|(x, y)| *grid.at(x, y)),
+            [10, 8, 9, 7, 0]
+        );
+        let pixels = |id: u16| grid.pixels.iter().filter(|found| **found == id).count();
+        assert_eq!((pixels(9), pixels(10)), (100, 25));
+        assert_eq!(*disputed, 400 + 25 + 100 - 30);
+        assert_eq!(draw_pieces(&pieces, size, &ids, 0).unwrap(), kept);
+        assert_eq!(draw_pieces(&pieces, size, &ids, 800).unwrap(), kept);
+    }
 }

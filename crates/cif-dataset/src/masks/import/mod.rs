@@ -6,6 +6,7 @@
 //! | `frames` | which frame of the capture a picture of the source shows |
 //! | `objects` | which objects there are, and which ids and labels they get |
 //! | `draw` | which object a pixel belongs to, where several claim it |
+//! | `coverage` | which pixels one object covers |
 //! | `runs`, `polygon`, `brush` | which pixels a run-length code, a polygon or a brush covers |
 //! | `tracker`, `files`, `mattes`, `arrays`, `coco`, `youtube_vis`, `label_studio`, `cvat` | what a source holds, one file each |
 //!
@@ -14,6 +15,7 @@
 mod arrays;
 mod brush;
 mod coco;
+mod coverage;
 mod cvat;
 mod draw;
 mod files;
@@ -38,6 +40,7 @@ use self::draw::Content;
 use self::frames::FrameNames;
 pub use self::kind::SourceKind;
 use self::objects::Objects;
+use crate::files::listing;
 use crate::load::same_aspect;
 use crate::{Dataset, Error, InstanceLabel};
 
@@ -208,6 +211,27 @@ fn check_aspect(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<()
     )))
 }
 
+/// Most pixels of a source for one of its frame: captures are kept reduced by 8 at the most, along both sides.
+const MOST_PIXELS: u64 = 64;
+
+/// Refuses a size that a source only states, where drawing it would take far more memory than its frame.
+fn check_stated(place: &Place, size: (u32, u32), frame: (u32, u32)) -> Result<(), Error> {
+    let pixels = |(width, height): (u32, u32)| u64::from(width) * u64::from(height);
+    let most = pixels(frame).saturating_mul(MOST_PIXELS);
+    if pixels(size) <= most {
+        return Ok(());
+    }
+    Err(place.error(format!(
+        "it states {} x {} = {} pixels, more than {MOST_PIXELS} times the {} x {} of its frame ({most}); export the masks \
+         at the size of the images or of their video",
+        size.0,
+        size.1,
+        pixels(size),
+        frame.0,
+        frame.1
+    )))
+}
+
 /// Refuses a part of a picture that has another size.
 fn check_size(place: &Place, size: (u32, u32), picture: (u32, u32)) -> Result<(), Error> {
     if size == picture {
@@ -222,21 +246,14 @@ fn check_size(place: &Place, size: (u32, u32), picture: (u32, u32)) -> Result<()
 /// Files of a folder and its folders with one of these endings, by their path inside without ending, in order of names.
 fn files_below(folder: &Path, endings: &[&str]) -> Result<BTreeMap<String, PathBuf>, Error> {
     let mut found = BTreeMap::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(current) = folders.pop() {
-        for path in crate::files::listing::entries(&current)? {
-            if path.is_dir() {
-                folders.push(path);
-            } else if crate::files::listing::has_extension(&path, endings) {
-                let inside = path.strip_prefix(folder).unwrap_or(&path).with_extension("");
-                let name = inside.to_string_lossy().replace('\\', "/");
-                if let Some(other) = found.insert(name, path.clone()) {
-                    return Err(Error::invalid(
-                        &path,
-                        format!("{} has the same name; keep one of the two", other.display()),
-                    ));
-                }
-            }
+    for path in listing::below(folder)?.into_iter().filter(|path| listing::has_extension(path, endings)) {
+        let inside = path.strip_prefix(folder).unwrap_or(&path).with_extension("");
+        let name = inside.to_string_lossy().replace('\\', "/");
+        if let Some(other) = found.insert(name, path.clone()) {
+            return Err(Error::invalid(
+                &path,
+                format!("{} has the same name; keep one of the two", other.display()),
+            ));
         }
     }
     Ok(without_common_folder(found))

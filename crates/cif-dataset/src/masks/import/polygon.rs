@@ -1,14 +1,21 @@
 //! Pixels inside polygons.
 
-/// Places, row by row and ascending, of the pixels whose centres lie inside any of the outlines, by the even-odd rule for
-/// each. Corners are in pixels from the top left corner of the picture; what lies outside of the picture is left out.
-pub(super) fn fill(outlines: &[Vec<[f64; 2]>], (width, height): (u32, u32)) -> Vec<u32> {
-    let mut found = Vec::new();
+use super::coverage::Coverage;
+
+/// Adds the pixels whose centres lie inside any of the outlines, by the even-odd rule for each. Corners are in pixels from
+/// the top left corner of the picture; what lies outside of the picture is left out.
+pub(super) fn cover(outlines: &[Vec<[f64; 2]>], coverage: &mut Coverage) {
+    let (width, height) = (coverage.width, coverage.height);
     let mut crossings = Vec::new();
-    for y in 0..height {
-        let line = f64::from(y) + 0.5;
-        let start = found.len();
-        for outline in outlines {
+    for outline in outlines {
+        let (top, bottom) =
+            outline.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(top, bottom), corner| {
+                (top.min(corner[1]), bottom.max(corner[1]))
+            });
+        // Centres of rows from the first corner on, up to the last.
+        let row = |y: f64| (y - 0.5).ceil().clamp(0.0, f64::from(height)) as u32;
+        for y in row(top)..row(bottom) {
+            let line = f64::from(y) + 0.5;
             crossings.clear();
             for (k, a) in outline.iter().enumerate() {
                 let b = outline[(k + 1) % outline.len()];
@@ -17,18 +24,14 @@ pub(super) fn fill(outlines: &[Vec<[f64; 2]>], (width, height): (u32, u32)) -> V
                 }
             }
             crossings.sort_by(f64::total_cmp);
+            let start = u64::from(y) * u64::from(width);
             for pair in crossings.chunks_exact(2) {
                 // Centres from the first crossing on, before the second.
-                let column = |x: f64| (x - 0.5).ceil().clamp(0.0, f64::from(width)) as u32;
-                found.extend((column(pair[0])..column(pair[1])).map(|x| y * width + x));
+                let column = |x: f64| (x - 0.5).ceil().clamp(0.0, f64::from(width)) as u64;
+                coverage.add(start + column(pair[0])..start + column(pair[1]));
             }
         }
-        if outlines.len() > 1 {
-            found[start..].sort_unstable();
-        }
     }
-    found.dedup();
-    found
 }
 
 /// The corners of a list x, y, x, y, ...

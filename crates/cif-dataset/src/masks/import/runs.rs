@@ -3,7 +3,10 @@
 //! Sources: the mask API of COCO (`maskApi.c`) for column-wise runs and their text form; the XML format of CVAT 1.1 for
 //! row-wise runs inside a box. Both begin with the pixels that are not covered.
 
+use std::ops::Range;
+
 use super::brush;
+use super::coverage::Coverage;
 
 /// Run-length codes in the forms of several tools.
 pub(super) enum Code {
@@ -15,37 +18,49 @@ pub(super) enum Code {
     Brush(Vec<u8>),
 }
 
-/// Places of the covered pixels in a picture of a size, row by row, ascending.
+/// Adds the pixels that a code covers.
 ///
 /// # Errors
 /// When the runs are fewer or more than the pixels.
-pub(super) fn covered(code: &Code, (width, height): (u32, u32)) -> Result<Vec<u32>, String> {
+pub(super) fn cover(code: &Code, coverage: &mut Coverage) -> Result<(), String> {
+    let (width, height) = (u64::from(coverage.width), u64::from(coverage.height));
     match code {
         Code::Columns(counts) => {
-            let columns = places(counts, u64::from(width) * u64::from(height))?;
-            let mut rows: Vec<u32> = columns.iter().map(|at| at % height * width + at / height).collect();
-            rows.sort_unstable();
-            Ok(rows)
+            for run in runs(counts, width * height)? {
+                for at in run {
+                    let place = at % height * width + at / height;
+                    coverage.add(place..place + 1);
+                }
+            }
+            Ok(())
         }
         Code::Box { left, top, width: box_width, height: box_height, counts } => {
-            let fits = |start: u32, length: u32, whole: u32| {
-                start.checked_add(length).is_some_and(|end| end <= whole)
-            };
-            if !fits(*left, *box_width, width) || !fits(*top, *box_height, height) {
+            let [left, top, box_width, box_height] = [*left, *top, *box_width, *box_height].map(u64::from);
+            if left + box_width > width || top + box_height > height {
                 return Err(format!(
                     "its box of {box_width} x {box_height} pixels at ({left}, {top}) leaves the picture of {width} x \
                      {height}"
                 ));
             }
-            let inside = places(counts, u64::from(*box_width) * u64::from(*box_height))?;
-            Ok(inside.iter().map(|at| (top + at / box_width) * width + left + at % box_width).collect())
+            for run in runs(counts, box_width * box_height)? {
+                // Row by row of the box.
+                let mut at = run.start;
+                while at < run.end {
+                    let (x, y) = (at % box_width, at / box_width);
+                    let length = (box_width - x).min(run.end - at);
+                    let place = (top + y) * width + left + x;
+                    coverage.add(place..place + length);
+                    at += length;
+                }
+            }
+            Ok(())
         }
-        Code::Brush(bytes) => brush::covered(bytes, (width, height)),
+        Code::Brush(bytes) => brush::cover(bytes, coverage),
     }
 }
 
-/// Places of the pixels of every other run, from the second on.
-fn places(counts: &[u64], pixels: u64) -> Result<Vec<u32>, String> {
+/// Every other run, from the second on, which are covered.
+fn runs(counts: &[u64], pixels: u64) -> Result<impl Iterator<Item = Range<u64>>, String> {
     let total = counts.iter().try_fold(0_u64, |sum, count| sum.checked_add(*count));
     if total != Some(pixels) {
         let total = total.map_or_else(|| "too many".to_owned(), |total| total.to_string());
@@ -53,15 +68,12 @@ fn places(counts: &[u64], pixels: u64) -> Result<Vec<u32>, String> {
             "broken run-length code: its runs add up to {total} pixels, the picture has {pixels}"
         ));
     }
-    let mut found = Vec::new();
-    let mut at = 0_u64;
-    for (k, count) in counts.iter().enumerate() {
-        if k % 2 == 1 {
-            found.extend((at..at + count).map(|place| place as u32));
-        }
+    let mut at = 0;
+    let all = counts.iter().enumerate().map(move |(k, count)| {
         at += count;
-    }
-    Ok(found)
+        (k, at - count..at)
+    });
+    Ok(all.filter(|(k, _)| k % 2 == 1).map(|(_, run)| run))
 }
 
 /// Runs from the text form of COCO: groups of five bits, low ones first, each in a letter from `0` on; from the fourth
