@@ -81,6 +81,15 @@ impl Field {
         (0..self.len()).map(|row| deformation.is_still(row) || is_exempt(row)).collect()
     }
 
+    /// Time code of every captured frame, `[T]`, ascending: its number, or that of the file that the field was imported
+    /// from.
+    #[must_use]
+    pub fn time_codes(&self) -> Vec<f64> {
+        let frames = self.timeline.times.len();
+        let recorded = self.record.frame_codes.as_ref().and_then(|codes| codes.codes(frames));
+        recorded.unwrap_or_else(|| (0..frames).map(|frame| frame as f64).collect())
+    }
+
     /// True when Gaussians move or deform over time, by learning or by record.
     #[must_use]
     pub fn moves(&self) -> bool {

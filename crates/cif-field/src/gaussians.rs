@@ -27,6 +27,10 @@ const NEIGHBOURS: usize = 3;
 /// Log-scales are clamped to this range when activated, as the renderer does (methods reference 7, row 14).
 pub const LOG_SCALE_RANGE: (f32, f32) = (-20.0, 10.0);
 
+/// Log-scales below this are those of an imported splat that is flat along the axis: its scale is 0, of which the
+/// logarithm of the smallest normal number (-87.34) stands for the logarithm.
+pub const FLAT_LOG_SCALE: f32 = -87.0;
+
 /// Logit beyond that of the smallest positive number in single precision: its sigmoid is 0, and that of its
 /// opposite 1.
 const SATURATED_LOGIT: f64 = 104.0;

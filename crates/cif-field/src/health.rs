@@ -14,7 +14,7 @@ use cif_geometry::{Bounds, quaternion};
 use glam::DVec3;
 use serde::Serialize;
 
-use crate::gaussians::LOG_SCALE_RANGE;
+use crate::gaussians::{FLAT_LOG_SCALE, LOG_SCALE_RANGE};
 use crate::parameters::Activation;
 use crate::{Field, FieldError, Gaussians, Identities};
 
@@ -267,7 +267,9 @@ fn check_shapes(g: &Gaussians, found: &mut Findings) {
     let (low, high) = LOG_SCALE_RANGE;
     let clamped = |row: &usize| {
         let scales = g.log_scales[*row];
-        scales.iter().all(|s| s.is_finite()) && !scales.iter().all(|s| (low..=high).contains(s))
+        // Flat splats of files are meant to be flat.
+        scales.iter().all(|s| s.is_finite())
+            && !scales.iter().all(|s| *s < FLAT_LOG_SCALE || (low..=high).contains(s))
     };
     found.rows(
         "degenerate",
@@ -408,7 +410,8 @@ fn clamp_scales(g: &mut Gaussians) -> usize {
     let (low, high) = LOG_SCALE_RANGE;
     let mut changed = 0;
     for scales in &mut g.log_scales {
-        let clamped = scales.map(|s| if s.is_finite() { s.clamp(low, high) } else { s });
+        let is_kept = |s: f32| !s.is_finite() || s < FLAT_LOG_SCALE;
+        let clamped = scales.map(|s| if is_kept(s) { s } else { s.clamp(low, high) });
         changed += usize::from(
             clamped.iter().zip(&*scales).any(|(a, b)| a.to_bits() != b.to_bits() && b.is_finite()),
         );
@@ -529,6 +532,16 @@ mod tests {
         assert_eq!(field.gaussians.log_scales[3], [10.0, -3.0, -20.0]);
         assert!(repair(&mut field).unwrap().is_empty(), "a repaired field is sound");
         assert!(check(&field, None).iter().all(|finding| finding.severity == Severity::Odd));
+    }
+
+    #[test]
+    fn flat_splats_of_files_are_sound() {
+        let mut field = testing::field(10, 1);
+        field.gaussians.log_scales[4][1] = f32::MIN_POSITIVE.ln();
+        assert!(check(&field, None).iter().all(|finding| finding.severity == Severity::Odd));
+        let before = field.gaussians.clone();
+        assert!(repair(&mut field).unwrap().is_empty());
+        assert_eq!(field.gaussians, before);
     }
 
     #[test]

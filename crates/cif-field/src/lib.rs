@@ -86,7 +86,7 @@ pub use identity::{Identities, Owner};
 pub use instance::Instance;
 pub use parameters::Parameter;
 pub use query::{FieldAtTime, QueryResult};
-pub use record::{Drawing, Record, RecordError, Run};
+pub use record::{Declared, Drawing, FrameCodes, Record, RecordError, Run};
 pub use timeline::{RecordedCamera, Timeline};
 pub use tracks::{Joint, JointKind, RotationEvidence, TrackGroup, Tracks};
 pub use validate::FieldError;

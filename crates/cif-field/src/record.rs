@@ -7,7 +7,7 @@
 
 use std::collections::BTreeMap;
 
-use cif_geometry::CaptureFrame;
+use cif_geometry::{CaptureFrame, UpAxis};
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -21,6 +21,10 @@ pub struct Record {
     pub drawing: Drawing,
     /// Where its coordinates lie in the world of its capture, or of the file that it was imported from.
     pub frame: CaptureFrame,
+    /// Unit and up axis that the file declared that it was imported from; exports declare the same.
+    pub declared: Option<Declared>,
+    /// Time codes of its frames in that file; `None` where frame `f` is time code `f`.
+    pub frame_codes: Option<FrameCodes>,
     /// Name of the capture that it was trained on.
     pub capture: Option<String>,
     /// A sentence on what is not known of the world of that capture, its unit or its up axis; exports warn with it.
@@ -37,6 +41,56 @@ pub struct Record {
     pub edits: Vec<Value>,
     /// Everything else: versions, counts of the capture, the imported file. No behaviour reads it.
     pub notes: Map<String, Value>,
+}
+
+/// Unit and up axis of the world of a file.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Declared {
+    /// Which axis points up.
+    pub up_axis: UpAxis,
+    /// Metres per world unit; above 0.
+    pub meters_per_unit: f64,
+}
+
+/// Time codes of the frames of a field.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum FrameCodes {
+    /// That of frame 0; one more for every further frame.
+    From(f64),
+    /// One per frame, ascending.
+    Each(Vec<f64>),
+}
+
+impl FrameCodes {
+    /// The shortest form of the codes; `None` where frame `f` is time code `f`.
+    #[must_use]
+    pub fn of(codes: &[f64]) -> Option<Self> {
+        let first = codes.first().copied().filter(|first| first.is_finite())?;
+        let even = codes.iter().enumerate().all(|(frame, code)| *code == first + frame as f64);
+        match (even, first == 0.0) {
+            (true, true) => None,
+            (true, false) => Some(Self::From(first)),
+            (false, _) => Some(Self::Each(codes.to_vec())),
+        }
+    }
+
+    /// One time code per frame; `None` where these do not fit to so many frames.
+    pub(crate) fn codes(&self, frames: usize) -> Option<Vec<f64>> {
+        match self {
+            Self::From(first) => Some((0..frames).map(|frame| first + frame as f64).collect()),
+            Self::Each(codes) => Some(codes.clone()).filter(|codes| codes.len() == frames),
+        }
+    }
+
+    fn is_valid(&self) -> bool {
+        match self {
+            Self::From(first) => first.is_finite(),
+            Self::Each(codes) => {
+                codes.iter().all(|code| code.is_finite()) && codes.windows(2).all(|pair| pair[0] < pair[1])
+            }
+        }
+    }
 }
 
 /// Settings by which a renderer shows a field as it was trained.
@@ -105,6 +159,9 @@ const DRAWING: &str = "drawing";
 const EMBEDDINGS: &str = "embeddings";
 const NAME: &str = "name";
 const FRAME: &str = "frame";
+const UP_AXIS: &str = "up_axis";
+const UNIT: &str = "meters_per_unit";
+const TIME_CODES: &str = "time_codes";
 const UNKNOWN: &str = "unknown";
 const EXPOSURES: &str = "exposures";
 
@@ -125,6 +182,21 @@ impl Record {
         let capture = notes.get_mut(CAPTURE).and_then(Value::as_object_mut);
         (record.capture, record.unknown) =
             capture.map_or((None, None), |of| (take(of, NAME), take(of, UNKNOWN)));
+        let imported = notes.get(IMPORTED);
+        let of_file = imported.and_then(|of| serde_json::from_value::<Declared>(of.clone()).ok());
+        record.declared = of_file.filter(|of| of.meters_per_unit.is_finite() && of.meters_per_unit > 0.0);
+        let codes = imported.and_then(|of| of.get(TIME_CODES)).cloned();
+        record.frame_codes = codes.and_then(|codes| serde_json::from_value(codes).ok());
+        record.frame_codes = record.frame_codes.take().filter(FrameCodes::is_valid);
+        if let Some(imported) = notes.get_mut(IMPORTED).and_then(Value::as_object_mut) {
+            let typed = [
+                (record.declared.is_some(), &[UP_AXIS, UNIT][..]),
+                (record.frame_codes.is_some(), &[TIME_CODES]),
+            ];
+            for (_, keys) in typed.into_iter().filter(|(is_typed, _)| *is_typed) {
+                keys.iter().for_each(|key| drop(imported.remove(*key)));
+            }
+        }
         record.run = take(&mut notes, RUN);
         record.settings = notes.remove(SETTINGS);
         record.curve = notes.remove(CURVE);
@@ -149,8 +221,12 @@ impl Record {
     #[must_use]
     pub fn to_json(&self) -> Value {
         let mut json = self.notes.clone();
-        let place =
-            if json.contains_key(IMPORTED) && !json.contains_key(CAPTURE) { IMPORTED } else { CAPTURE };
+        let place = if (json.contains_key(IMPORTED) || self.declared.is_some()) && !json.contains_key(CAPTURE)
+        {
+            IMPORTED
+        } else {
+            CAPTURE
+        };
         let mut put = |object: &str, key: &str, value: Value| {
             if let Value::Object(members) = json.entry(object).or_insert_with(|| json!({})) {
                 members.insert(key.to_owned(), value);
@@ -164,6 +240,13 @@ impl Record {
         }
         if !self.frame.is_identity() {
             put(place, FRAME, json!(self.frame));
+        }
+        if let Some(declared) = self.declared {
+            put(IMPORTED, UP_AXIS, json!(declared.up_axis));
+            put(IMPORTED, UNIT, json!(declared.meters_per_unit));
+        }
+        if let Some(codes) = &self.frame_codes {
+            put(IMPORTED, TIME_CODES, json!(codes));
         }
         let run = self.run.as_ref().map(|run| json!(run));
         let edits = (!self.edits.is_empty()).then(|| json!(self.edits));
@@ -313,6 +396,25 @@ mod tests {
         let record = Record::from_json(json.clone()).unwrap();
         assert_eq!(record.frame, frame);
         assert_eq!(record.to_json(), json);
+    }
+
+    #[test]
+    fn unit_axis_and_time_codes_of_a_file_come_back() {
+        let json = json!({ "imported": {
+            "file": "a.usda", "up_axis": "y", "meters_per_unit": 0.01, "time_codes": 101.0,
+        } });
+        let record = Record::from_json(json.clone()).unwrap();
+        assert_eq!(record.declared, Some(Declared { up_axis: UpAxis::Y, meters_per_unit: 0.01 }));
+        assert_eq!(record.frame_codes, FrameCodes::of(&[101.0, 102.0]));
+        assert_eq!(record.to_json(), json);
+        let uneven = FrameCodes::of(&[0.0, 2.5, 4.0]).unwrap();
+        assert_eq!((uneven.codes(3).unwrap(), uneven.codes(4)), (vec![0.0, 2.5, 4.0], None));
+        assert_eq!(FrameCodes::of(&[0.0, 1.0]), None);
+        let wrong =
+            json!({ "imported": { "up_axis": "x", "meters_per_unit": -1.0, "time_codes": [2.0, 1.0] } });
+        let record = Record::from_json(wrong.clone()).unwrap();
+        assert_eq!((record.declared, record.frame_codes.clone()), (None, None));
+        assert_eq!(record.to_json(), wrong, "stays a note");
     }
 
     #[test]

@@ -9,6 +9,7 @@
 //! | [`camera`] | ideal pinhole cameras |
 //! | [`capture_frame`] | where coordinates lie in the world of a capture |
 //! | [`lens`] | lens distortion and its removal |
+//! | [`up_axis`] | which axis of a world points up |
 //! | [`grid`] | row-major pixel grids |
 //! | [`bounds`] | axis-aligned boxes |
 //! | [`overlap`] | which members make the set of the largest expected overlap |
@@ -26,6 +27,7 @@ pub mod quaternion;
 pub mod scalar;
 pub mod spherical_harmonics;
 pub mod transform;
+pub mod up_axis;
 
 pub use bounds::Bounds;
 pub use camera::PinholeCamera;
@@ -34,3 +36,4 @@ pub use grid::PixelGrid;
 pub use lens::LensDistortion;
 pub use scalar::Real;
 pub use transform::RigidTransform;
+pub use up_axis::UpAxis;

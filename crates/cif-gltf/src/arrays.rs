@@ -31,6 +31,8 @@ pub(crate) enum Array<'a> {
     Shares(&'a [IdentityShares]),
     /// Keys of animations.
     Keys(Vec<f32>),
+    /// Keys of animations that are true or false.
+    Flags(Vec<bool>),
 }
 
 impl Array<'_> {
@@ -46,6 +48,7 @@ impl Array<'_> {
             Self::Ids(values) => (values.len(), 8),
             Self::Shares(values) => (values.len(), 16),
             Self::Keys(values) => (values.len(), 4),
+            Self::Flags(values) => (values.len().div_ceil(4), 4),
         };
         count as u64 * size
     }
@@ -59,6 +62,11 @@ impl Array<'_> {
             }
             Self::Numbers(values) => blocks(out, values, |v| [v.to_le_bytes()]),
             Self::Keys(values) => blocks(out, values, |v| [v.to_le_bytes()]),
+            Self::Flags(values) => {
+                let mut bytes: Vec<u8> = values.iter().map(|value| u8::from(*value)).collect();
+                bytes.resize(bytes.len().next_multiple_of(4), 0);
+                out.write_all(&bytes)
+            }
             Self::Rows(values) => blocks(out, values, |v| [v.to_le_bytes()]),
             Self::Ids(values) => blocks(out, values, |v| {
                 let [a, b, c, d] = v.map(|entry| entry.id.to_le_bytes());

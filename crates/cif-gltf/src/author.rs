@@ -15,7 +15,7 @@ use crate::arrays::Array;
 use crate::document::{self, Document};
 use crate::extras::{self, Cif, Extras};
 use crate::rotation_keys::{self, Inserted, SamplerExtras};
-use crate::{EXTENSION, GENERATOR, GltfError, conventions, loose};
+use crate::{EXTENSION, GENERATOR, GltfError, POINTER, VISIBILITY, conventions, loose};
 
 /// A document and the arrays that follow each other in its only buffer.
 pub(crate) struct Authored<'a> {
@@ -113,6 +113,7 @@ impl<'a> Author<'a> {
             translation: Some(single(first.translation)),
             rotation: Some(conventions::gltf_quaternion(first.rotation)),
             scale: hidden.then_some([conventions::HIDDEN_SCALE; 3]),
+            extensions: visibility(&node.visibility),
             extras: Some(Extras { cif: object_extras(node) }),
             ..document::Node::default()
         });
@@ -362,7 +363,7 @@ impl<'a> Author<'a> {
         Ok(())
     }
 
-    /// A stepped scale that hides the node.
+    /// Steps of the visibility of the node, and of its scale for players that know no visibility.
     fn visibility_channel(
         &mut self,
         node: usize,
@@ -378,6 +379,11 @@ impl<'a> Author<'a> {
         let scales = samples.iter().flat_map(|sample| [scale(sample); 3]).collect();
         let output = self.accessor(Array::Keys(scales), document::FLOAT, "VEC3", samples.len());
         self.channel(node, "scale", input, output, "STEP");
+        let flags = samples.iter().map(|sample| sample.visible).collect();
+        let output = self.accessor(Array::Flags(flags), document::UNSIGNED_BYTE, "SCALAR", samples.len());
+        let pointer = json!({ "pointer": format!("/nodes/{node}/extensions/{VISIBILITY}/visible") });
+        let extensions = BTreeMap::from([(POINTER, pointer)]);
+        self.drive(document::Target { node: None, path: "pointer", extensions }, input, output, "STEP");
         Ok(())
     }
 
@@ -389,9 +395,14 @@ impl<'a> Author<'a> {
         output: usize,
         interpolation: &'static str,
     ) {
+        let target = document::Target { node: Some(node), path, extensions: BTreeMap::new() };
+        self.drive(target, input, output, interpolation);
+    }
+
+    fn drive(&mut self, target: document::Target, input: usize, output: usize, interpolation: &'static str) {
         let sampler = self.samplers.len();
         self.samplers.push(document::Sampler { input, output, interpolation, extras: None });
-        self.channels.push(document::Channel { sampler, target: document::Target { node, path } });
+        self.channels.push(document::Channel { sampler, target });
     }
 
     /// Key times, seconds.
@@ -451,6 +462,9 @@ impl<'a> Author<'a> {
         self.document.scenes = vec![document::Scene { nodes: vec![world] }];
         self.document.asset = document::Asset { version: "2.0", generator: GENERATOR.to_owned() };
         self.document.extensions_used = vec![EXTENSION];
+        if self.document.nodes.iter().any(|node| !node.extensions.is_empty()) {
+            self.document.extensions_used.extend([VISIBILITY, POINTER]);
+        }
         self.document.buffers = vec![document::Buffer { uri: None, byte_length: self.bytes }];
         if !self.channels.is_empty() {
             self.document.animations = vec![document::Animation {
@@ -489,6 +503,7 @@ impl<'a> Author<'a> {
             times: codes.times.clone(),
             background_color: graph.background_color,
             sort_metric: graph.sort_metric,
+            antialiased: graph.antialiased,
             omitted: graph.omitted.clone(),
             warnings: graph.warnings.clone(),
             field_fingerprint: graph.origin.field_fingerprint.clone(),
@@ -506,6 +521,11 @@ impl<'a> Author<'a> {
             ..document::Node::default()
         })
     }
+}
+
+/// Visibility of a node at first; nothing for one that is always visible.
+fn visibility(samples: &[VisibilitySample]) -> BTreeMap<&'static str, Value> {
+    samples.first().map(|first| (VISIBILITY, json!({ "visible": first.visible }))).into_iter().collect()
 }
 
 fn single(translation: DVec3) -> document::Translation {

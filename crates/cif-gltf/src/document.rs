@@ -12,6 +12,8 @@ use crate::rotation_keys::SamplerExtras;
 
 /// `componentType` float.
 pub(crate) const FLOAT: u32 = 5126;
+/// `componentType` unsigned byte.
+pub(crate) const UNSIGNED_BYTE: u32 = 5121;
 /// `componentType` unsigned short.
 pub(crate) const UNSIGNED_SHORT: u32 = 5123;
 /// `target` of buffer views that hold vertex attributes.
@@ -64,6 +66,8 @@ pub(crate) struct Node {
     pub(crate) rotation: Option<[f32; 4]>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) scale: Option<[f32; 3]>,
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub(crate) extensions: BTreeMap<&'static str, Value>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub(crate) extras: Option<Extras>,
 }
@@ -129,8 +133,12 @@ pub(crate) struct Channel {
 
 #[derive(Serialize)]
 pub(crate) struct Target {
-    pub(crate) node: usize,
+    /// `None` for a target that an extension points to.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub(crate) node: Option<usize>,
     pub(crate) path: &'static str,
+    #[serde(skip_serializing_if = "BTreeMap::is_empty")]
+    pub(crate) extensions: BTreeMap<&'static str, Value>,
 }
 
 #[derive(Serialize)]

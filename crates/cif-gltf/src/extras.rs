@@ -47,6 +47,9 @@ pub(crate) struct World {
     pub(crate) times: Vec<f64>,
     pub(crate) background_color: [f32; 3],
     pub(crate) sort_metric: SortMetric,
+    /// True when the splats are drawn antialiased.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) antialiased: Option<bool>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub(crate) omitted: Vec<String>,
     #[serde(default, skip_serializing_if = "Vec::is_empty")]

@@ -228,7 +228,7 @@ fn quantised_attributes_are_decoded() {
     let read = &graph.nodes[0].splats;
     assert_eq!(read.means, [[1.0, 2.0, -3.0], [0.0, 0.0, 127.0]]);
     assert_eq!(read.scales[0], [1.0, 2.0, 3.0]);
-    assert!(read.scales[1][0] > 0.0 && read.scales[1][0] < 1e-6, "a flat splat keeps some thickness");
+    assert_eq!(read.scales[1][0], 0.0, "a flat splat stays flat");
     assert_eq!(read.opacities, [1.0, 0.2]);
     let half = std::f32::consts::FRAC_1_SQRT_2;
     assert!((read.orientations[0][0] - half).abs() < 1e-6 && (read.orientations[0][3] - half).abs() < 1e-6);
@@ -541,7 +541,7 @@ fn damaged_files_say_what_is_wrong() {
     }
     let values: [(&str, &str, Vec<f32>, &str); 5] = [
         ("ROTATION", "VEC4", vec![0.0; 12], "no length"),
-        ("SCALE", "VEC3", vec![0.1, 0.1, -0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1], "splat 0 is negative"),
+        ("SCALE", "VEC3", vec![0.1, 0.1, -0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1], "1 of 9 values are negative"),
         ("OPACITY", "SCALAR", vec![0.5, 0.5, 1.5], "splat 2 is not between 0 and 1"),
         ("OPACITY", "SCALAR", vec![0.5, f32::NAN, 0.5], "splat 1"),
         ("SH_DEGREE_0_COEF_0", "VEC3", vec![f32::INFINITY; 9], "not finite"),
@@ -626,4 +626,116 @@ fn files_full_of_noise_do_not_panic() {
         }
         drop(read_bytes(noisy.as_bytes()));
     }
+}
+
+#[test]
+fn far_places_of_nodes_are_kept_to_a_millimetre() {
+    let splats = splats(3, 0);
+    let at = DVec3::new(500_123.251, 215.377, -4_649_776.129);
+    for value in [
+        json!({ "mesh": 0, "translation": at.to_array() }),
+        json!({ "mesh": 0, "matrix": [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, at.x, at.y, at.z, 1] }),
+    ] {
+        let mut file = File::with(&splats);
+        file.json["nodes"] = json!([value]);
+        let graph = file.read().unwrap();
+        assert!(!graph.frame.is_identity() && graph.warnings[0].contains("origin"), "{:?}", graph.warnings);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("back.glb");
+        crate::export(&graph, &path, crate::ExportOptions::default()).unwrap();
+        for graph in [graph, read_scene(&path).unwrap()] {
+            for (mean, before) in graph.nodes[0].splats_at(0.0).means.iter().zip(&splats.means) {
+                let found = graph.frame.capture_from_dataset(*mean);
+                let expected = at + DVec3::from_array(before.map(f64::from));
+                assert!((found - expected).length() < 1e-4, "{found} {expected}");
+            }
+        }
+    }
+}
+
+#[test]
+fn visibility_by_pointer_is_read() {
+    let hidden = || {
+        let mut file = File::with(&splats(2, 0));
+        let extensions = json!({ "KHR_node_visibility": { "visible": false } });
+        file.json["nodes"] = json!([{ "mesh": 0, "extensions": extensions }]);
+        file
+    };
+    assert!(!hidden().read().unwrap().nodes[0].is_visible(0.0));
+    let mut file = hidden();
+    let input = file.floats(&[0.0, 0.25, 0.5], "SCALAR");
+    let output = file.accessor(&[1, 0, 1, 0], 5121, "SCALAR", 3, false);
+    let pointer = |pointer: &str| json!({ "path": "pointer", "extensions": { "KHR_animation_pointer": { "pointer": pointer } } });
+    let visible = pointer("/nodes/0/extensions/KHR_node_visibility/visible");
+    let shift = file.floats(&[0.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 4.0, 0.0], "VEC3");
+    file.json["animations"] = json!([{
+        "samplers": [
+            { "input": input, "output": output, "interpolation": "STEP" },
+            { "input": input, "output": shift, "interpolation": "LINEAR" },
+        ],
+        "channels": [
+            { "sampler": 0, "target": visible },
+            { "sampler": 1, "target": pointer("/nodes/0/translation") },
+            { "sampler": 1, "target": pointer("/materials/0/alphaCutoff") },
+        ],
+    }]);
+    file.json["extensionsRequired"] = json!(["KHR_animation_pointer"]);
+    file.json["extensionsUsed"].as_array_mut().unwrap().push(json!("KHR_animation_pointer"));
+    let graph = file.read().unwrap();
+    for frame in 0..=12 {
+        assert_eq!(graph.nodes[0].is_visible(f64::from(frame)), !(6..12).contains(&frame), "{frame}");
+    }
+    assert!((graph.nodes[0].world_transform(6.0).translation - DVec3::Y * 2.0).length() < 1e-6);
+    file.json["animations"][0]["channels"][0]["target"] =
+        pointer("/nodes/7/extensions/KHR_node_visibility/visible");
+    file.fails(&["channel 0", "is not in the file"]);
+}
+
+#[test]
+fn logarithmic_scales_of_drafts_are_read_or_named() {
+    let splats = splats(3, 0);
+    let set = |file: &mut File, values: &[f32]| {
+        let accessor = file.floats(values, "VEC3");
+        file.attributes()[format!("{EXTENSION}:SCALE")] = json!(accessor);
+    };
+    let logs: Vec<f32> = splats.scales.iter().flatten().map(|scale| scale.ln()).collect();
+    let mut file = File::with(&splats);
+    set(&mut file, &logs);
+    let graph = file.read().unwrap();
+    assert!(graph.warnings[0].contains("logarithms"), "{:?}", graph.warnings);
+    let scales = graph.nodes[0].splats.scales.as_flattened().iter().zip(splats.scales.as_flattened());
+    assert!(scales.into_iter().all(|(a, b)| (a - b).abs() < 1e-5 * b));
+    // All of them above a metre: only the program that wrote them tells.
+    let large = [0.5, 1.0, 1.5, 0.5, 1.0, 1.5, 0.5, 1.0, 1.5];
+    for (generator, expected) in [
+        ("splat-transform 2.6.0", 0.5_f32.exp()),
+        ("splat-transform v1.10.2", 0.5_f32.exp()),
+        ("splat-transform 2.6.1", 0.5),
+        ("another 1.0.0", 0.5),
+    ] {
+        let mut file = File::with(&splats);
+        file.json["asset"]["generator"] = json!(generator);
+        set(&mut file, &large);
+        let found = file.read().unwrap().nodes[0].splats.scales[0][0];
+        assert!((found - expected).abs() < 1e-6, "{generator}: {found}");
+    }
+    let mut file = File::with(&splats);
+    let attributes = file.attributes().as_object_mut().unwrap();
+    for name in ["ROTATION", "SCALE"] {
+        let accessor = attributes.remove(&format!("{EXTENSION}:{name}")).unwrap();
+        attributes.insert(format!("_{name}"), accessor);
+    }
+    file.fails(&["early draft"]);
+}
+
+#[test]
+fn flat_splats_stay_flat() {
+    let mut splats = splats(3, 0);
+    splats.scales.iter_mut().for_each(|scale| scale[1] = 0.0);
+    let graph = File::with(&splats).read().unwrap();
+    assert_eq!(graph.nodes[0].splats.scales, splats.scales);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("back.glb");
+    crate::export(&graph, &path, crate::ExportOptions::default()).unwrap();
+    assert_eq!(read_scene(&path).unwrap().nodes[0].splats.scales, splats.scales);
 }

@@ -53,6 +53,10 @@ pub use write::{check_target, export};
 
 /// The extension that holds the splats.
 pub const EXTENSION: &str = "KHR_gaussian_splatting";
+/// The extension by which a node is hidden.
+pub const VISIBILITY: &str = "KHR_node_visibility";
+/// The extension by which animations show and hide nodes.
+pub const POINTER: &str = "KHR_animation_pointer";
 /// Most expensive motion that a file can hold: build graphs for glTF with no more than this. Some splats
 /// ([`cif_scene::LOOSE_SPLATS`]) may have paths of their own nevertheless.
 pub const MOST_EXPENSIVE_MOTION: MotionModel = MotionModel::Parts;

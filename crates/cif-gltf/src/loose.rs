@@ -47,8 +47,9 @@ pub(crate) fn path(motion: &DenseMotion, splat: usize, own: &Splats) -> (Vec<Pos
     one_hemisphere(&mut poses);
     let first = own.scales[splat];
     let size = |scales: &Vec<[f32; 3]>| {
-        let ratio: f32 = (0..3).map(|axis| scales[splat][axis] / first[axis]).product();
-        [ratio.cbrt(); 3]
+        let thick = || (0..3).filter(|axis| first[*axis] > 0.0);
+        let ratio: f32 = thick().map(|axis| scales[splat][axis] / first[axis]).product();
+        [ratio.powf(1.0 / thick().count().max(1) as f32); 3]
     };
     let sizes: Option<Vec<[f32; 3]>> =
         motion.samples.iter().map(|sample| sample.scales.as_ref().map(size)).collect();

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use cif_scene::{CaptureFrame, Motion, NodeKind, PoseSample, SceneGraph, UpAxis};
+use cif_scene::{CaptureFrame, Motion, NodeKind, PoseSample, SceneGraph, UpAxis, VisibilitySample};
 use glam::{DMat3, DVec3};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -109,6 +109,35 @@ fn edit_file(path: &Path, edit: impl FnOnce(&mut Value)) {
 
 fn node_index(json: &Value, name: &str) -> usize {
     json["nodes"].as_array().unwrap().iter().position(|node| node["name"] == name).unwrap()
+}
+
+#[test]
+fn hidden_objects_say_so_by_the_extensions_of_visibility() {
+    let mut graph = scene(recipe());
+    let codes = graph.time_codes.samples.clone();
+    let sample = |code: usize, visible| VisibilitySample { time_code: codes[code], visible };
+    graph.nodes[0].visibility = vec![sample(0, false), sample(2, true)];
+    let mut used = Vec::new();
+    // A player that knows only the extensions, not the scale that stands in for them.
+    let by_extensions = edited(&graph, |json| {
+        used = json["extensionsUsed"].as_array().unwrap().clone();
+        let index = node_index(json, &graph.nodes[0].name);
+        let node = json["nodes"][index].as_object_mut().unwrap();
+        assert_eq!(node["extensions"], json!({ "KHR_node_visibility": { "visible": false } }));
+        node.remove("scale").unwrap();
+        let channels = json["animations"][0]["channels"].as_array_mut().unwrap();
+        channels.retain(|channel| channel["target"]["path"] != "scale");
+        let pointers = channels.iter().filter(|channel| channel["target"]["path"] == "pointer");
+        assert!(pointers.clone().all(|channel| channel["target"].get("node").is_none()));
+        let pointed = format!("/nodes/{index}/extensions/KHR_node_visibility/visible");
+        let named = |channel: &Value| {
+            channel["target"]["extensions"]["KHR_animation_pointer"]["pointer"] == json!(pointed)
+        };
+        assert_eq!(pointers.filter(|channel| named(channel)).count(), 1);
+    });
+    assert!(used.contains(&json!("KHR_node_visibility")) && used.contains(&json!("KHR_animation_pointer")));
+    assert_eq!(by_extensions.unwrap().nodes[0].visibility, graph.nodes[0].visibility);
+    assert_same(&graph, &round_trip(&graph, "scene.glb"));
 }
 
 #[test]
@@ -245,12 +274,12 @@ fn viewers_that_do_not_slerp_turn_objects_as_the_file_says() {
     let animation = &json["animations"][0];
     let (mut checked, mut inserted) = (0, 0);
     for channel in animation["channels"].as_array().unwrap() {
-        let name =
-            json["nodes"][channel["target"]["node"].as_u64().unwrap() as usize]["name"].as_str().unwrap();
-        let Some(node) = graph.nodes.iter().find(|node| node.name == name) else { continue };
         if channel["target"]["path"] != "rotation" {
             continue;
         }
+        let name =
+            json["nodes"][channel["target"]["node"].as_u64().unwrap() as usize]["name"].as_str().unwrap();
+        let Some(node) = graph.nodes.iter().find(|node| node.name == name) else { continue };
         let sampler = &animation["samplers"][channel["sampler"].as_u64().unwrap() as usize];
         inserted += sampler["extras"]["cif"]["inserted"].as_array().map_or(0, Vec::len);
         let times = floats(&json, &bytes, &sampler["input"]);

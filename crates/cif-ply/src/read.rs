@@ -3,18 +3,19 @@
 use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
 
-use cif_geometry::quaternion;
-use cif_geometry::spherical_harmonics::coefficient_count;
-use cif_scene::assemble::{AssembleError, Prim, Prims, assemble};
+use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
+use cif_geometry::{Bounds, quaternion};
+use cif_scene::assemble::{Prim, Prims, assemble, color_range, origin_of};
 use cif_scene::files::FileError;
 use cif_scene::{CaptureFrame, SceneGraph, Splats};
+use glam::DVec3;
 use ply_rs_bw::parser::{ParseError, Parser, Reader};
 use ply_rs_bw::ply::{
     ElementDef, Encoding, Property, PropertyAccess, PropertyAccessResult, PropertyType, ScalarType,
 };
 
 use crate::PlyError;
-use crate::write::{WORLD_OFFSET, WORLD_SCALE};
+use crate::write::{RENDER_MODE, RENDER_MODE_MIP, WORLD_OFFSET, WORLD_SCALE};
 
 /// Positions of what is read in a row.
 const POSITION: usize = 0;
@@ -42,8 +43,10 @@ impl PropertyAccess for Ignored {
 }
 
 /// Reads splats: INRIA layout, ASCII or binary of either byte order, properties in any order, spherical harmonics
-/// of degree 0 to 3. They become one still object that carries the file's name, occupied and certain of its
-/// identity, in the axes of the file; `rows` count the splats of the file.
+/// of degree 0 to 3, or colours `red`, `green`, `blue`; two scales are those of flat splats (2D Gaussian Splatting).
+/// They become one still object that carries the file's name, occupied and certain of its identity, in the axes of the
+/// file; `rows` count the splats of the file. Splats far from the origin get one of their own in double precision, which
+/// [`SceneGraph::frame`] records. The comment `SplatRenderMode` says whether they are drawn antialiased.
 ///
 /// # Errors
 /// No PLY, cut off, or without what a splat needs; the message says what is missing.
@@ -75,13 +78,16 @@ pub fn read(path: &Path) -> Result<SceneGraph, PlyError> {
             continue;
         }
         let columns = Columns::of(element, header.encoding).map_err(invalid)?;
-        let (splats, left_out) = columns
+        let collected = columns
             .read(reader.get_mut(), element.count)
             .map_err(|what| invalid(format!("{what}; copy it again")))?;
-        if splats.is_empty() {
+        if collected.centres.is_empty() {
             return Err(invalid(format!("none of its {} splats can be drawn", element.count)));
         }
-        return scene(path, splats, left_out, frame).map_err(|error| invalid(error.to_string()));
+        let mut warnings = columns.notes();
+        let antialiased = render_mode(&header.comments, &mut warnings);
+        let scene = collected.scene(path, frame, warnings);
+        return assemble(Prims { antialiased, ..scene }).map_err(|error| invalid(error.to_string()));
     }
     Err(invalid("it has no element `vertex`; splats are expected".to_owned()))
 }
@@ -113,6 +119,31 @@ fn frame(comments: &[String]) -> Result<CaptureFrame, String> {
     Ok(frame)
 }
 
+/// True for splats that were trained antialiased, as the last comment of Brush (`SplatRenderMode: mip`) or Postshot
+/// (`antialiased 1`) tells; `None` where none does.
+fn render_mode(comments: &[String], warnings: &mut Vec<String>) -> Option<bool> {
+    let mut antialiased = None;
+    for comment in comments {
+        let lower = comment.trim().to_lowercase();
+        if let Some(mode) = lower.strip_prefix(&RENDER_MODE.to_lowercase()) {
+            match mode.trim() {
+                RENDER_MODE_MIP => antialiased = Some(true),
+                "default" | "2dgs" => antialiased = Some(false),
+                other => warnings.push(format!(
+                    "its render mode '{other}' is not known; its splats are drawn as usual ones"
+                )),
+            }
+        } else if let Some(flag) = lower.strip_prefix("antialiased ") {
+            antialiased = match flag.trim() {
+                "0" => Some(false),
+                "1" => Some(true),
+                _ => antialiased,
+            };
+        }
+    }
+    antialiased
+}
+
 /// Where in an element the values of a splat stand.
 struct Columns {
     encoding: Encoding,
@@ -120,6 +151,19 @@ struct Columns {
     properties: Vec<(ScalarType, usize, Option<usize>)>,
     row_bytes: usize,
     degree: u8,
+    /// Values of white of colours that stand in place of coefficients.
+    colors: Option<White>,
+    /// True for splats with two scales.
+    flat: bool,
+}
+
+/// The value that is full light in a colour.
+#[derive(Clone, Copy)]
+enum White {
+    /// That of the type of the property.
+    Known(f32),
+    /// By the range of the values.
+    ByRange,
 }
 
 impl Columns {
@@ -133,14 +177,18 @@ impl Columns {
         }
         let required = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"];
         let numbered = ["scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"];
-        let missing: Vec<&str> = required.into_iter().chain(numbered).filter(|name| !has(name)).collect();
+        let colors = white(element).filter(|_| !has("f_dc_0"));
+        let replaced = |name: &str| name.starts_with("f_dc_") && colors.is_some();
+        let missing = |name: &&str| !has(name) && !replaced(name);
+        let missing: Vec<&str> = required.into_iter().chain(numbered).filter(missing).collect();
+        let flat = missing == ["scale_2"];
         if missing.len() > 10 && has("x") {
             return Err(
                 "it is a point cloud without splats; scale_*, rot_*, opacity and f_dc_* are expected"
                     .to_owned(),
             );
         }
-        if !missing.is_empty() {
+        if !missing.is_empty() && !flat {
             return Err(format!("its splats have no {}; export them whole", missing.join(", ")));
         }
         let rest = (0..).take_while(|k| has(&format!("f_rest_{k}"))).count();
@@ -163,16 +211,31 @@ impl Columns {
             let PropertyType::Scalar(scalar) = &property.data_type else {
                 return Err(format!("the property {name} of its splats is a list; remove it"));
             };
-            properties.push((scalar.clone(), row_bytes, slot(name, rest)));
+            let color = || COLORS.iter().position(|color| color == name).map(|channel| COLOR + channel);
+            let slot = slot(name, rest).or_else(|| colors.and_then(|_| color()));
+            properties.push((scalar.clone(), row_bytes, slot));
             row_bytes += scalar_size(scalar);
         }
-        Ok(Self { encoding, properties, row_bytes, degree })
+        Ok(Self { encoding, properties, row_bytes, degree, colors, flat })
+    }
+
+    /// Sentences on what is not read as it stands.
+    fn notes(&self) -> Vec<String> {
+        let flat = self.flat.then(|| {
+            "its splats have two scales, as those of 2D Gaussian Splatting: they are read as flat, without thickness \
+             along their third axis"
+                .to_owned()
+        });
+        flat.into_iter().collect()
     }
 
     /// Splats, and how many could not be used.
-    fn read(&self, input: &mut impl BufRead, count: usize) -> Result<(Splats, usize), String> {
-        let mut collected = Collected::new(self.degree, count.min(FIRST_ROWS));
-        let mut slots = [0.0_f32; SLOTS];
+    fn read(&self, input: &mut impl BufRead, count: usize) -> Result<Collected, String> {
+        let mut collected = Collected::new(self, count.min(FIRST_ROWS));
+        let mut slots = [0.0_f64; SLOTS];
+        if self.flat {
+            slots[SCALE + 2] = f64::NEG_INFINITY;
+        }
         let mut bytes = vec![0_u8; self.row_bytes];
         let mut line = String::new();
         for number in 0..count {
@@ -191,10 +254,10 @@ impl Columns {
             }
             collected.push(number as u32, &slots);
         }
-        Ok((collected.splats, collected.left_out))
+        Ok(collected)
     }
 
-    fn parse(&self, line: &str, slots: &mut [f32; SLOTS]) -> Result<(), String> {
+    fn parse(&self, line: &str, slots: &mut [f64; SLOTS]) -> Result<(), String> {
         let mut words = line.split_ascii_whitespace();
         for (_, _, slot) in &self.properties {
             let word =
@@ -209,7 +272,7 @@ impl Columns {
         Ok(())
     }
 
-    fn decode(&self, row: &[u8], slots: &mut [f32; SLOTS]) {
+    fn decode(&self, row: &[u8], slots: &mut [f64; SLOTS]) {
         let swapped = self.encoding == Encoding::BinaryBigEndian;
         for (scalar, offset, slot) in &self.properties {
             if let Some(slot) = slot {
@@ -217,6 +280,19 @@ impl Columns {
             }
         }
     }
+}
+
+/// Names of colours in place of coefficients.
+const COLORS: [&str; 3] = ["red", "green", "blue"];
+
+/// White of the colours of an element, where it has some.
+fn white(element: &ElementDef) -> Option<White> {
+    let type_of = |name: &str| element.properties.get(name).map(|property| &property.data_type);
+    COLORS.iter().all(|name| type_of(name).is_some()).then(|| match type_of(COLORS[0]) {
+        Some(PropertyType::Scalar(ScalarType::UChar)) => White::Known(255.0),
+        Some(PropertyType::Scalar(ScalarType::UShort)) => White::Known(65_535.0),
+        _ => White::ByRange,
+    })
 }
 
 /// Slot of a property; that of `f_rest_*` counts coefficients first and channels last, as ours do.
@@ -251,7 +327,7 @@ fn scalar_size(scalar: &ScalarType) -> usize {
     }
 }
 
-fn number(bytes: &[u8], scalar: &ScalarType, swapped: bool) -> f32 {
+fn number(bytes: &[u8], scalar: &ScalarType, swapped: bool) -> f64 {
     fn take<const N: usize>(bytes: &[u8], swapped: bool) -> [u8; N] {
         let mut taken: [u8; N] = std::array::from_fn(|k| bytes[k]);
         if swapped {
@@ -260,14 +336,14 @@ fn number(bytes: &[u8], scalar: &ScalarType, swapped: bool) -> f32 {
         taken
     }
     match scalar {
-        ScalarType::Char => f32::from(bytes[0] as i8),
-        ScalarType::UChar => f32::from(bytes[0]),
-        ScalarType::Short => f32::from(i16::from_le_bytes(take(bytes, swapped))),
-        ScalarType::UShort => f32::from(u16::from_le_bytes(take(bytes, swapped))),
-        ScalarType::Int => i32::from_le_bytes(take(bytes, swapped)) as f32,
-        ScalarType::UInt => u32::from_le_bytes(take(bytes, swapped)) as f32,
-        ScalarType::Float => f32::from_le_bytes(take(bytes, swapped)),
-        ScalarType::Double => f64::from_le_bytes(take(bytes, swapped)) as f32,
+        ScalarType::Char => f64::from(bytes[0] as i8),
+        ScalarType::UChar => f64::from(bytes[0]),
+        ScalarType::Short => f64::from(i16::from_le_bytes(take(bytes, swapped))),
+        ScalarType::UShort => f64::from(u16::from_le_bytes(take(bytes, swapped))),
+        ScalarType::Int => f64::from(i32::from_le_bytes(take(bytes, swapped))),
+        ScalarType::UInt => f64::from(u32::from_le_bytes(take(bytes, swapped))),
+        ScalarType::Float => f64::from(f32::from_le_bytes(take(bytes, swapped))),
+        ScalarType::Double => f64::from_le_bytes(take(bytes, swapped)),
     }
 }
 
@@ -285,59 +361,81 @@ fn smallest_size(element: &ElementDef, ascii: bool) -> u64 {
 
 /// Splats as they are collected, in post-activation form.
 struct Collected {
+    /// Without centres.
     splats: Splats,
+    centres: Vec<[f64; 3]>,
+    colors: Option<White>,
     left_out: usize,
 }
 
 impl Collected {
-    fn new(degree: u8, rows: usize) -> Self {
-        let mut splats = Splats { sh_degree: degree, ..Splats::default() };
-        splats.means.reserve(rows);
+    fn new(columns: &Columns, rows: usize) -> Self {
+        let mut splats = Splats { sh_degree: columns.degree, ..Splats::default() };
         splats.orientations.reserve(rows);
         splats.scales.reserve(rows);
-        splats.sh_coefficients.reserve(rows * 3 * coefficient_count(degree));
-        Self { splats, left_out: 0 }
+        splats.sh_coefficients.reserve(rows * 3 * coefficient_count(columns.degree));
+        Self { splats, centres: Vec::with_capacity(rows), colors: columns.colors, left_out: 0 }
     }
 
-    fn push(&mut self, row: u32, slots: &[f32; SLOTS]) {
+    fn push(&mut self, row: u32, slots: &[f64; SLOTS]) {
         let splats = &mut self.splats;
-        let three = |at: usize| [slots[at], slots[at + 1], slots[at + 2]];
-        let mean = three(POSITION);
-        let scale = three(SCALE).map(|log| log.exp().max(f32::MIN_POSITIVE));
-        let rotation: [f32; 4] = std::array::from_fn(|k| slots[ROTATION + k]);
-        let harmonics = &slots[COLOR..COLOR + 3 * coefficient_count(splats.sh_degree)];
+        let single = slots.map(|value| value as f32);
+        let three = |at: usize| [single[at], single[at + 1], single[at + 2]];
+        // Of no thickness where the logarithm is that of 0.
+        let scale = three(SCALE).map(f32::exp).map(|scale| if scale.is_subnormal() { 0.0 } else { scale });
+        let rotation = std::array::from_fn(|k| single[ROTATION + k]);
+        let harmonics = &single[COLOR..COLOR + 3 * coefficient_count(splats.sh_degree)];
         let finite = |values: &[f32]| values.iter().all(|value| value.is_finite());
-        let usable = finite(&mean) && finite(&scale) && finite(harmonics) && !slots[OPACITY].is_nan();
+        let usable =
+            finite(&three(POSITION)) && finite(&scale) && finite(harmonics) && !single[OPACITY].is_nan();
         let Some(rotation) = quaternion::try_normalize(rotation).filter(|_| usable) else {
             self.left_out += 1;
             return;
         };
-        splats.means.push(mean);
+        self.centres.push([slots[POSITION], slots[POSITION + 1], slots[POSITION + 2]]);
         splats.orientations.push(rotation);
         splats.scales.push(scale);
-        splats.opacities.push(1.0 / (1.0 + (-slots[OPACITY]).exp()));
+        splats.opacities.push(1.0 / (1.0 + (-single[OPACITY]).exp()));
         splats.sh_coefficients.extend_from_slice(harmonics);
         splats.occupancies.push(1.0);
         splats.identity_probabilities.push(1.0);
         splats.rows.push(row);
     }
-}
 
-/// A still scene of one object, labelled by the name of the file.
-fn scene(
-    path: &Path,
-    splats: Splats,
-    left_out: usize,
-    frame: CaptureFrame,
-) -> Result<SceneGraph, AssembleError> {
-    let label =
-        path.file_stem().map_or_else(|| "splats".to_owned(), |stem| stem.to_string_lossy().into_owned());
-    let mut warnings = Vec::new();
-    if left_out > 0 {
-        warnings.push(format!(
-            "{left_out} splats with values that are not finite, or without a rotation, were left out"
-        ));
+    /// A still scene of one object, labelled by the name of the file.
+    fn scene(self, path: &Path, mut frame: CaptureFrame, mut warnings: Vec<String>) -> Prims {
+        let Self { mut splats, centres, colors, left_out } = self;
+        let label =
+            path.file_stem().map_or_else(|| "splats".to_owned(), |stem| stem.to_string_lossy().into_owned());
+        if left_out > 0 {
+            warnings.push(format!(
+                "{left_out} splats with values that are not finite, or without a rotation, were left out"
+            ));
+        }
+        if frame.is_identity() {
+            let bounds = Bounds::around(centres.iter().copied().map(DVec3::from_array));
+            if let Some(origin) = origin_of(&bounds, 1.0, &mut warnings) {
+                frame.offset = origin.to_array();
+            }
+            let offset = DVec3::from(frame.offset);
+            let near =
+                centres.iter().map(|centre| (DVec3::from_array(*centre) - offset).as_vec3().to_array());
+            splats.means = near.collect();
+        } else {
+            splats.means = centres.iter().map(|centre| centre.map(|value| value as f32)).collect();
+        }
+        if let Some(white) = colors {
+            let stride = 3 * coefficient_count(splats.sh_degree);
+            let base = || splats.sh_coefficients.chunks_exact(stride).flat_map(|sh| &sh[..3]);
+            let white = match white {
+                White::Known(white) => white,
+                White::ByRange => color_range(base().copied(), &path.display().to_string(), &mut warnings),
+            };
+            for sh in splats.sh_coefficients.chunks_exact_mut(stride) {
+                sh[..3].iter_mut().for_each(|value| *value = (*value / white - 0.5) / BAND_0 as f32);
+            }
+        }
+        let prims = vec![Prim::still(path.display().to_string(), label, splats)];
+        Prims { frame, prims, warnings, ..Prims::default() }
     }
-    let prims = vec![Prim::still(path.display().to_string(), label, splats)];
-    assemble(Prims { frame, prims, warnings, ..Prims::default() })
 }

@@ -308,3 +308,116 @@ fn far_scenes_stay_precise_and_say_where_they_are() {
     // Others may write what they like.
     assert!(with("comment made elsewhere\ncomment world offset 1 2\n").unwrap().frame.is_identity());
 }
+
+/// A binary file of splats whose properties are all doubles but for colours of a type of their own.
+fn doubles(rows: &[Vec<f64>], names: &[&str]) -> Vec<u8> {
+    let mut text = format!("ply\nformat binary_little_endian 1.0\nelement vertex {}\n", rows.len());
+    for name in names {
+        text += &format!("property double {name}\n");
+    }
+    let mut bytes = (text + "end_header\n").into_bytes();
+    bytes.extend(rows.iter().flatten().flat_map(|value| value.to_le_bytes()));
+    bytes
+}
+
+const PLAIN: [&str; 14] = [
+    "x", "y", "z", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3", "f_dc_0",
+    "f_dc_1", "f_dc_2",
+];
+
+fn plain(place: [f64; 3], color: [f64; 3]) -> Vec<f64> {
+    [&place[..], &[1.0, -2.0, -3.0, -4.0, 1.0, 0.0, 0.0, 0.0], &color].concat()
+}
+
+#[test]
+fn surveyed_coordinates_stay_exact_there_and_back() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, back) = (folder.path().join("utm.ply"), folder.path().join("back.ply"));
+    for middle in [DVec3::new(500_123.25, 4_649_776.0, 215.0), DVec3::new(-2.7e6, 4.29e6, 3.86e6)] {
+        let places: Vec<DVec3> =
+            (0..9).map(|k| middle + 0.1377 * f64::from(k) * DVec3::new(1.0, -2.0, 0.7)).collect();
+        let rows: Vec<_> = places.iter().map(|place| plain(place.to_array(), [0.1; 3])).collect();
+        std::fs::write(&path, doubles(&rows, &PLAIN)).unwrap();
+        let graph = read(&path).unwrap();
+        assert!(graph.warnings.iter().any(|warning| warning.contains("origin")), "{:?}", graph.warnings);
+        export(&graph, &back, ExportOptions::default()).unwrap();
+        for graph in [graph, read(&back).unwrap()] {
+            for (mean, place) in graph.nodes[0].splats.means.iter().zip(&places) {
+                let found = graph.frame.capture_from_dataset(DVec3::from_array(mean.map(f64::from)));
+                assert!((found - place).length() < 1e-4, "{found} {place}");
+            }
+        }
+    }
+    // Near ones stay as they are.
+    std::fs::write(&path, doubles(&[plain([1.5, 2.0, -700.0], [0.1; 3])], &PLAIN)).unwrap();
+    let graph = read(&path).unwrap();
+    assert!(graph.frame.is_identity() && graph.warnings.is_empty(), "{:?}", graph.warnings);
+    assert_eq!(graph.nodes[0].splats.means, [[1.5, 2.0, -700.0]]);
+}
+
+#[test]
+fn antialiased_splats_are_told_by_a_comment() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    let whole = String::from_utf8(ascii(&splats(2, 0), &[])).unwrap();
+    let head = "ply\nformat ascii 1.0\n";
+    let with = |comment: &str| {
+        std::fs::write(&path, whole.replacen(head, &format!("{head}comment {comment}\n"), 1)).unwrap();
+        read(&path).unwrap()
+    };
+    assert_eq!(with("Exported from elsewhere").antialiased, None);
+    assert_eq!(with("SplatRenderMode: default").antialiased, Some(false));
+    assert_eq!(with("antialiased 1").antialiased, Some(true));
+    let odd = with("SplatRenderMode: other");
+    assert!(odd.antialiased.is_none() && odd.warnings[0].contains("'other'"), "{:?}", odd.warnings);
+    let mip = with("SplatRenderMode: mip");
+    assert_eq!((mip.antialiased, mip.warnings.len()), (Some(true), 0));
+    let back = folder.path().join("back.ply");
+    export(&mip, &back, ExportOptions::default()).unwrap();
+    assert_eq!(read(&back).unwrap().antialiased, Some(true));
+    assert!(
+        String::from_utf8_lossy(&std::fs::read(&back).unwrap()).contains("comment SplatRenderMode: mip\n")
+    );
+}
+
+#[test]
+fn flat_splats_are_read_and_written_as_flat_as_they_are() {
+    let folder = tempfile::tempdir().unwrap();
+    let (path, back) = (folder.path().join("flat.ply"), folder.path().join("back.ply"));
+    let row = |scale: f64| {
+        let mut row = plain([1.0, 2.0, 3.0], [0.1; 3]);
+        row[6] = scale;
+        row
+    };
+    std::fs::write(&path, doubles(&[row(f64::NEG_INFINITY), row(-5.0)], &PLAIN)).unwrap();
+    let graph = read(&path).unwrap();
+    assert_eq!((graph.nodes[0].splats.scales[0][2], graph.warnings.len()), (0.0, 0));
+    export(&graph, &back, ExportOptions::default()).unwrap();
+    assert_eq!(read(&back).unwrap().nodes[0].splats.scales, graph.nodes[0].splats.scales);
+    // 2D Gaussian Splatting has no third scale.
+    let names: Vec<&str> = PLAIN.into_iter().filter(|name| *name != "scale_2").collect();
+    let mut two = row(0.0);
+    two.remove(6);
+    std::fs::write(&path, doubles(&[two], &names)).unwrap();
+    let graph = read(&path).unwrap();
+    let [a, b, c] = graph.nodes[0].splats.scales[0];
+    assert!(a > 0.0 && b > 0.0 && c == 0.0);
+    assert!(graph.warnings[0].contains("2D Gaussian Splatting"), "{:?}", graph.warnings);
+}
+
+#[test]
+fn colours_in_place_of_coefficients_are_told_by_their_range() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("a.ply");
+    let names: Vec<&str> = PLAIN[..11].iter().copied().chain(["red", "green", "blue"]).collect();
+    for (white, notes) in [(1.0, 0), (255.0, 1), (65_535.0, 1)] {
+        let rows = [[1.0, 0.2, 0.0], [0.5, 0.5, 0.5]].map(|color| plain([0.0; 3], color.map(|v| v * white)));
+        std::fs::write(&path, doubles(&rows, &names)).unwrap();
+        let graph = read(&path).unwrap();
+        let colors = graph.nodes[0].splats.base_colors();
+        let expected = [[1.0, 0.2, 0.0], [0.5, 0.5, 0.5_f32]];
+        let off = colors.as_flattened().iter().zip(expected.as_flattened()).map(|(a, b)| (a - b).abs());
+        assert!(off.fold(0.0, f32::max) < 1e-5, "{colors:?}");
+        assert_eq!(graph.warnings.len(), notes, "{:?}", graph.warnings);
+    }
+}

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_output::{NewFile, inside};
 use cif_scene::files::{FileError, existing_folder, folder_of, target_of};
-use cif_scene::{CaptureFrame, Node, SceneGraph, Splats};
+use cif_scene::{Node, SceneGraph, Splats};
 
 use crate::pose::world_splats;
 use crate::{ExportOptions, ExportSummary, PlyError};
@@ -22,6 +22,10 @@ const MARK: &str = concat!("comment cif ", env!("CARGO_PKG_VERSION"));
 pub(crate) const WORLD_OFFSET: &str = "world offset";
 /// See [`WORLD_OFFSET`].
 pub(crate) const WORLD_SCALE: &str = "world scale";
+/// Comment by which Brush and others tell how splats are drawn.
+pub(crate) const RENDER_MODE: &str = "SplatRenderMode:";
+/// Of [`RENDER_MODE`]: footprints are widened and their opacity lowered in turn (Mip-Splatting).
+pub(crate) const RENDER_MODE_MIP: &str = "mip";
 const MARK_PREFIX: &[u8] = b"ply\nformat binary_little_endian 1.0\ncomment cif ";
 
 fn is_ply(path: &Path) -> bool {
@@ -73,7 +77,7 @@ fn is_ours(path: &Path) -> bool {
 struct Job<'a> {
     path: PathBuf,
     time_code: f64,
-    frame: CaptureFrame,
+    graph: &'a SceneGraph,
     nodes: Vec<&'a Node>,
 }
 
@@ -131,12 +135,12 @@ fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> io::
                 let name =
                     if options.sequence { format!("{}/{number}", node.name) } else { node.name.clone() };
                 let path = inside(path, &name, "ply")?;
-                jobs.push(Job { path, time_code: code, frame: graph.frame, nodes: vec![node] });
+                jobs.push(Job { path, time_code: code, graph, nodes: vec![node] });
             }
         } else {
             let path = if options.sequence { inside(path, &number, "ply")? } else { path.to_owned() };
             let nodes = graph.nodes.iter().filter(visible(code)).collect();
-            jobs.push(Job { path, time_code: code, frame: graph.frame, nodes });
+            jobs.push(Job { path, time_code: code, graph, nodes });
         }
     }
     Ok(jobs)
@@ -148,7 +152,7 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     let mut out = BufWriter::with_capacity(1 << 16, new.file());
     let degree = job.nodes.iter().map(|node| node.splats.sh_degree).max().unwrap_or(0);
     let count = job.nodes.iter().map(|node| node.splats.len()).sum();
-    out.write_all(header(count, degree, job.time_code, &job.frame).as_bytes())?;
+    out.write_all(header(count, degree, job.time_code, job.graph).as_bytes())?;
     for node in &job.nodes {
         rows(&mut out, &world_splats(node, job.time_code), degree)?;
     }
@@ -159,8 +163,12 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     Ok(bytes)
 }
 
-fn header(count: usize, degree: u8, time_code: f64, frame: &CaptureFrame) -> String {
+fn header(count: usize, degree: u8, time_code: f64, graph: &SceneGraph) -> String {
+    let frame = &graph.frame;
     let mut header = format!("ply\nformat binary_little_endian 1.0\n{MARK}\ncomment time code {time_code}\n");
+    if graph.antialiased == Some(true) {
+        header.push_str(&format!("comment {RENDER_MODE} {RENDER_MODE_MIP}\n"));
+    }
     if !frame.is_identity() {
         // The shortest texts that are read back as the same numbers.
         let [x, y, z] = frame.offset;
@@ -203,7 +211,7 @@ fn rows(out: &mut impl Write, splats: &Splats, degree: u8) -> io::Result<()> {
             }
         }
         put(logit(splats.opacities[k]));
-        splats.scales[k].into_iter().map(|scale| scale.max(f32::MIN_POSITIVE).ln()).for_each(&mut put);
+        splats.scales[k].into_iter().map(f32::ln).for_each(&mut put);
         splats.orientations[k].into_iter().for_each(&mut put);
         out.write_all(&row)?;
     }

@@ -38,6 +38,9 @@ pub struct SceneGraph {
     pub background_color: [f32; 3],
     /// Order in which the splats were blended in training.
     pub sort_metric: cif_field::SortMetric,
+    /// True when the splats are drawn antialiased: footprints widened, and their opacity lowered in turn; `None` where
+    /// that is not known, which means not.
+    pub antialiased: Option<bool>,
     /// Labels of instances that no visible Gaussian belongs to, so that they have no node.
     pub omitted: Vec<String>,
     /// Warnings for the user, one sentence each.
@@ -356,7 +359,7 @@ pub struct Splats {
     pub means: Vec<[f32; 3]>,
     /// Unit quaternions (w, x, y, z).
     pub orientations: Vec<[f32; 4]>,
-    /// Standard deviations along the axes, above 0, world units.
+    /// Standard deviations along the axes, world units; 0 along an axis in which a splat is flat.
     pub scales: Vec<[f32; 3]>,
     /// Opacities in [0, 1].
     pub opacities: Vec<f32>,

@@ -82,7 +82,7 @@ pub use motion::loose::LOOSE_SPLATS;
 pub use motion::placement::PlacedSplats;
 pub use motion::velocity::Velocity;
 pub use motion_scores::{InstanceMotion, MotionErrors, MotionScores, motion_scores};
-pub use options::{FrameRange, SceneOptions, Tolerance, UpAxis};
+pub use options::{FrameRange, SceneOptions, Tolerance};
 pub use query::label_pattern::LabelPattern;
 pub use query::search::{self, ObjectMatch, ObjectQuery, VolumeOf, When, search};
 pub use query::trajectory::{Trajectory, TrajectorySample, trajectories};
@@ -95,3 +95,5 @@ pub use world::frame_of;
 /// Where coordinates lie in the world of the capture; see [`world`].
 pub use cif_dataset::CaptureFrame;
 pub use cif_dataset::meant::known_names;
+/// The axis of a world that points up.
+pub use cif_geometry::UpAxis;

@@ -4,30 +4,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{MotionModel, SceneError};
-
-/// Which world axis points up. The data is not turned: the axis is only declared.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum UpAxis {
-    /// +y.
-    Y,
-    /// +z.
-    #[default]
-    Z,
-}
-
-impl FromStr for UpAxis {
-    type Err = SceneError;
-
-    fn from_str(text: &str) -> Result<Self, SceneError> {
-        match text {
-            "y" | "Y" => Ok(Self::Y),
-            "z" | "Z" => Ok(Self::Z),
-            _ => Err(SceneError::Option { option: "up axis", value: text.to_owned(), expected: "y or z" }),
-        }
-    }
-}
+use crate::{MotionModel, SceneError, UpAxis};
 
 /// Largest deviation of a simplified motion from the trained one.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -145,10 +122,12 @@ pub struct SceneOptions {
     pub frames: Option<FrameRange>,
     /// Every how many frames motion and cameras are sampled; the last frame is always kept. Default 1.
     pub frame_step: usize,
-    /// Declared up axis. Default z.
-    pub up_axis: UpAxis,
-    /// Metres per world unit. Default 1.
-    pub meters_per_unit: f64,
+    /// Declared up axis. Default `None`: that of the file that the field was imported from, else z.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub up_axis: Option<UpAxis>,
+    /// Metres per world unit. Default `None`: that of the file that the field was imported from, else 1.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub meters_per_unit: Option<f64>,
     /// Most points of a node's proxy; 0 leaves proxies out. Default 2000.
     pub proxy_points: usize,
 }
@@ -168,8 +147,8 @@ impl Default for SceneOptions {
             background_hulls: 0,
             frames: None,
             frame_step: 1,
-            up_axis: UpAxis::default(),
-            meters_per_unit: 1.0,
+            up_axis: None,
+            meters_per_unit: None,
             proxy_points: 2000,
         }
     }
@@ -217,10 +196,10 @@ impl SceneOptions {
                 expected: "1 or more",
             });
         }
-        if !(self.meters_per_unit.is_finite() && self.meters_per_unit > 0.0) {
+        if let Some(unit) = self.meters_per_unit.filter(|unit| !(unit.is_finite() && *unit > 0.0)) {
             return Err(SceneError::Option {
                 option: "meters_per_unit",
-                value: self.meters_per_unit.to_string(),
+                value: unit.to_string(),
                 expected: "above 0",
             });
         }
@@ -256,7 +235,7 @@ mod tests {
             SceneOptions { max_parts: 1, ..SceneOptions::default() },
             SceneOptions { frame_step: 0, ..SceneOptions::default() },
             SceneOptions { min_opacity: f32::NAN, ..SceneOptions::default() },
-            SceneOptions { meters_per_unit: 0.0, ..SceneOptions::default() },
+            SceneOptions { meters_per_unit: Some(0.0), ..SceneOptions::default() },
             SceneOptions { tolerance: Tolerance::Percent(-1.0), ..SceneOptions::default() },
             SceneOptions { appearance_tolerance: f64::NAN, ..SceneOptions::default() },
         ];

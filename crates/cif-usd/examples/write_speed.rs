@@ -107,6 +107,7 @@ fn scene(count: usize, samples: usize) -> SceneGraph {
         cameras: Vec::new(),
         background_color: [0.0; 3],
         sort_metric: cif_field::SortMetric::Z,
+        antialiased: None,
         omitted: Vec::new(),
         warnings: Vec::new(),
         origin: Origin::default(),

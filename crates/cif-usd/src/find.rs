@@ -10,6 +10,9 @@ use glam::{DMat4, DVec3};
 use pyo3::prelude::*;
 
 use crate::pxr::{self, Pxr, reason};
+use crate::read::labels::{DirectLabels, all_prims};
+use crate::read::open::open_for_labels;
+use crate::read::query::drawn;
 use crate::{ReadOptions, UsdError, conventions, tokens};
 
 /// Boxes are those that models give of themselves, where they do: of what can be seen.
@@ -23,15 +26,14 @@ pub(crate) fn search(
     let label_query = wanted.label_query();
     let matcher = label_query.as_ref().map(LabelQuery::matcher);
     pxr::with(|pxr| {
-        let stage = crate::read::open::open(pxr, path, options)?;
+        let (stage, instances) = open_for_labels(pxr, path, options)?;
         let python =
             |error: PyErr| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) };
         let search = Search::new(pxr, &stage, wanted).map_err(python)?;
         let (mut known, mut labelled, mut found) = (Vec::new(), false, Vec::new());
-        let prims = stage.call_method0("Traverse").and_then(|prims| prims.try_iter()).map_err(python)?;
-        for prim in prims {
+        for prim in all_prims(pxr, &stage, instances).map_err(python)? {
             let prim = prim.map_err(python)?;
-            let by_taxonomy = search.labels(&prim).map_err(python)?;
+            let by_taxonomy = search.labels.of(&prim).map_err(python)?;
             let counted =
                 by_taxonomy.iter().filter(|(taxonomy, labels)| wanted.counts(taxonomy) && !labels.is_empty());
             let labels: Vec<String> = counted.flat_map(|(_, labels)| labels.clone()).collect();
@@ -73,8 +75,7 @@ pub(crate) fn code_range(path: &Path, options: ReadOptions) -> Result<CodeRange,
 struct Search<'a, 'py> {
     pxr: &'a Pxr<'py>,
     labels_api: Bound<'py, PyAny>,
-    /// Time code or interval that label queries are made for.
-    span: Bound<'py, PyAny>,
+    labels: DirectLabels<'a, 'py>,
     time: Bound<'py, PyAny>,
     /// Caches of transforms and boxes at every sampled time code.
     codes: Vec<f64>,
@@ -84,8 +85,6 @@ struct Search<'a, 'py> {
     transform: Bound<'py, PyAny>,
     bounds: Bound<'py, PyAny>,
     codes_per_second: f64,
-    /// A label query caches what it has seen: one per taxonomy.
-    queries: std::cell::RefCell<BTreeMap<String, Bound<'py, PyAny>>>,
 }
 
 impl<'a, 'py> Search<'a, 'py> {
@@ -102,7 +101,7 @@ impl<'a, 'py> Search<'a, 'py> {
             When::Over(first, last) => pxr.gf.getattr("Interval")?.call1((first, last))?,
             _ => time.clone(),
         };
-        let purposes = vec![pxr.usd_geom.getattr("Tokens")?.getattr("default_")?];
+        let purposes = drawn(pxr)?;
         let transform_at = |time: &Bound<'py, PyAny>| pxr.usd_geom.getattr("XformCache")?.call1((time,));
         let box_at = |time: &Bound<'py, PyAny>| {
             pxr.usd_geom.getattr("BBoxCache")?.call1((time, purposes.clone(), USE_EXTENTS_HINTS))
@@ -118,43 +117,11 @@ impl<'a, 'py> Search<'a, 'py> {
             },
             transform: transform_at(&time)?,
             bounds: box_at(&time)?,
-            span,
+            labels: DirectLabels::new(pxr, span)?,
             time,
             codes,
             codes_per_second: number("GetTimeCodesPerSecond")?,
-            queries: std::cell::RefCell::default(),
         })
-    }
-
-    /// Direct labels of a prim by taxonomy, sorted.
-    fn labels(&self, prim: &Bound<'py, PyAny>) -> PyResult<BTreeMap<String, Vec<String>>> {
-        let taxonomies: Vec<String> = self
-            .labels_api
-            .call_method1("GetDirectTaxonomies", (prim,))?
-            .try_iter()?
-            .map(|taxonomy| taxonomy?.str()?.extract())
-            .collect::<PyResult<_>>()?;
-        let mut by_taxonomy = BTreeMap::new();
-        for taxonomy in taxonomies {
-            let known = self.queries.borrow().get(&taxonomy).cloned();
-            let query = match known {
-                Some(query) => query,
-                None => {
-                    let class = self.pxr.usd_semantics.getattr("LabelsQuery")?;
-                    let query = class.call1((&taxonomy, &self.span))?;
-                    self.queries.borrow_mut().insert(taxonomy.clone(), query.clone());
-                    query
-                }
-            };
-            let mut labels: Vec<String> = query
-                .call_method1("ComputeUniqueDirectLabels", (prim,))?
-                .try_iter()?
-                .map(|label| label?.str()?.extract())
-                .collect::<PyResult<_>>()?;
-            labels.sort();
-            by_taxonomy.insert(taxonomy, labels);
-        }
-        Ok(by_taxonomy)
     }
 
     /// The prim, unless it is elsewhere or hidden throughout.

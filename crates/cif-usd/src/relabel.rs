@@ -8,6 +8,8 @@ use pyo3::BoundObject;
 use pyo3::prelude::*;
 
 use crate::pxr::{self, Pxr, reason};
+use crate::read::labels;
+use crate::read::open::Instances;
 use crate::{Relabelled, UsdError, tokens};
 
 /// Mask value of an instance.
@@ -50,7 +52,7 @@ pub(crate) fn relabel(
     let done = pxr::with(|pxr| {
         let python =
             |error: PyErr| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) };
-        crate::read::open::check_size(pxr, path)?;
+        let instances = crate::read::open::check_size(pxr, path)?;
         let stage = pxr
             .usd
             .getattr("Stage")
@@ -66,7 +68,7 @@ pub(crate) fn relabel(
                 output.display()
             )));
         }
-        let (prims, known) = find(pxr, &stage, object).map_err(python)?;
+        let (prims, known) = find(pxr, (&stage, instances), object).map_err(python)?;
         let [prim] = prims.as_slice() else {
             return Err(refused(match prims.len() {
                 0 => {
@@ -95,15 +97,14 @@ fn has_references(layer: &Bound<'_, PyAny>) -> PyResult<bool> {
 /// The prims that an object is, by mask value, unique name or path; and what could be meant.
 fn find<'py>(
     pxr: &Pxr<'py>,
-    stage: &Bound<'py, PyAny>,
+    (stage, instances): (&Bound<'py, PyAny>, Instances),
     object: &str,
 ) -> PyResult<(Vec<Bound<'py, PyAny>>, Vec<String>)> {
-    let labels_api = pxr.usd_semantics.getattr("LabelsAPI")?;
     let (mut found, mut known) = (Vec::new(), Vec::new());
-    for prim in stage.call_method0("Traverse")?.try_iter()? {
+    for prim in labels::all_prims(pxr, stage, instances)? {
         let prim = prim?;
         let path: String = prim.call_method0("GetPath")?.str()?.extract()?;
-        if labels_api.call_method1("GetDirectTaxonomies", (&prim,))?.len()? == 0 && path != object {
+        if labels::taxonomies(&prim)?.is_empty() && path != object {
             continue;
         }
         let name: String = prim.call_method0("GetName")?.extract()?;
@@ -122,17 +123,34 @@ fn find<'py>(
     Ok((found, known))
 }
 
+/// The prim where its own opinions count: instances that hold it become copies of their own.
+fn outside_of_instances<'py>(prim: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    let is = |prim: &Bound<'py, PyAny>, what: &str| prim.call_method0(what).and_then(|is| is.is_truthy());
+    let (stage, path) = (prim.call_method0("GetStage")?, prim.call_method0("GetPath")?);
+    let mut prim = prim.clone();
+    while is(&prim, "IsInstanceProxy")? {
+        let mut above = prim.call_method0("GetParent")?;
+        while is(&above, "IsInstanceProxy")? {
+            above = above.call_method0("GetParent")?;
+        }
+        above.call_method1("SetInstanceable", (false,))?;
+        prim = stage.call_method1("GetPrimAtPath", (&path,))?;
+    }
+    Ok(prim)
+}
+
 /// Writes label and class wherever a stage of ours has them.
-fn edit(pxr: &Pxr<'_>, prim: &Bound<'_, PyAny>, label: &str, category: Option<&str>) -> PyResult<Relabelled> {
+fn edit<'py>(
+    pxr: &Pxr<'py>,
+    prim: &Bound<'py, PyAny>,
+    label: &str,
+    category: Option<&str>,
+) -> PyResult<Relabelled> {
+    let prim = &outside_of_instances(prim)?;
+    let old = labels::in_taxonomy(pxr, prim, tokens::TAXONOMY_CLASS)?;
     let labels_api = pxr.usd_semantics.getattr("LabelsAPI")?;
     let class = labels_api.call_method1("Apply", (prim, tokens::TAXONOMY_CLASS))?;
     let attribute = class.call_method0("CreateLabelsAttr")?;
-    let old: Vec<String> = match attribute.call_method0("Get")? {
-        value if value.is_truthy()? => {
-            value.try_iter()?.map(|label| label?.str()?.extract()).collect::<PyResult<_>>()?
-        }
-        _ => Vec::new(),
-    };
     let user = prim.call_method1("GetAttribute", (tokens::USER_LABEL,))?;
     let old_label = if user.is_truthy()? {
         user.call_method0("Get")?.extract::<Option<String>>()?
@@ -152,6 +170,9 @@ fn edit(pxr: &Pxr<'_>, prim: &Bound<'_, PyAny>, label: &str, category: Option<&s
         labels.push(label.to_owned());
     }
     set(&attribute, labels)?;
+    for older in labels::older(prim)?.into_iter().filter(|older| older.taxonomy == tokens::TAXONOMY_CLASS) {
+        set(&older.attribute, category.as_str())?;
+    }
     let string = pxr.sdf.getattr("ValueTypeNames")?.getattr("String")?;
     let user = prim.call_method1("CreateAttribute", (tokens::USER_LABEL, string, true))?;
     set(&user, label)?;

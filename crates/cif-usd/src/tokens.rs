@@ -40,6 +40,9 @@ pub const OPTIONS: &str = "options";
 /// Order in which the splats were blended, in `customLayerData`.
 pub const SORT: &str = "sort";
 
+/// True when the splats are drawn antialiased, in `customLayerData`; left out where that is not known.
+pub const ANTIALIASED: &str = "antialiased";
+
 /// Default prim.
 pub const WORLD: &str = "/World";
 /// Scope of the cameras.
@@ -83,6 +86,12 @@ pub const EXTENTS_HINT: &str = "extentsHint";
 pub const LABELS_API: &str = "SemanticsLabelsAPI";
 /// Properties of semantic labels, before the taxonomy.
 pub const LABELS: &str = "semantics:labels";
+/// Properties of labels by the `SemanticsAPI` of earlier tools, before the name of the label.
+pub const OLDER_LABELS: &str = "semantic";
+/// Ends of the properties of [`OLDER_LABELS`] that hold a label.
+pub const OLDER_LABEL: [&str; 2] = [":params:semanticData", ":params:semanticLabel"];
+/// End of the property of [`OLDER_LABELS`] that holds its taxonomy.
+pub const OLDER_TAXONOMY: &str = ":params:semanticType";
 /// Taxonomy of category and human label.
 pub const TAXONOMY_CLASS: &str = "class";
 /// Taxonomy of the unique instance name.

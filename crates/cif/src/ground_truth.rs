@@ -173,6 +173,7 @@ mod tests {
             cameras: Vec::new(),
             background_color: [1.0; 3],
             sort_metric: cif_field::SortMetric::Z,
+            antialiased: None,
             omitted: Vec::new(),
             warnings: Vec::new(),
             origin: cif_scene::Origin::default(),

@@ -11,7 +11,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use cif_field::Timeline;
+use cif_field::Field;
 use cif_scene::CodeRange;
 
 use crate::error::Error;
@@ -82,9 +82,10 @@ impl<'a> Frames<'a> {
     }
 
     /// Those of a field, which its stage has as time codes.
-    pub(crate) fn of(timeline: &Timeline, place: &'a str) -> Self {
-        let last = timeline.times.len().saturating_sub(1) as f64;
-        Self::new(CodeRange { ends: Some((0.0, last)), per_second: timeline.frames_per_second }, place)
+    pub(crate) fn of(field: &Field, place: &'a str) -> Self {
+        let codes = field.time_codes();
+        let ends = codes.first().copied().zip(codes.last().copied()).unwrap_or_default();
+        Self::new(CodeRange { ends: Some(ends), per_second: field.timeline.frames_per_second }, place)
     }
 
     /// Time code of a moment, inside the range.

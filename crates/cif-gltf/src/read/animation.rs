@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use glam::{DQuat, DVec3, DVec4};
 use gltf::json::accessor::ComponentType::{F32, I8, I16, U8, U16};
-use gltf::json::animation::{Interpolation, Property};
+use gltf::json::animation::{Interpolation, Property, Sampler};
 use gltf::json::validation::Checked;
 
 use super::accessor::Expected;
 use super::hierarchy::{Local, vector};
+use super::pointers::Pointed;
 use super::source::Source;
 use crate::rotation_keys::{SamplerExtras, drop_inserted};
 use crate::{GltfError, conventions};
@@ -39,17 +40,43 @@ pub(crate) struct NodeCurves {
     pub(crate) translation: Option<Curve>,
     pub(crate) rotation: Option<Curve>,
     pub(crate) scale: Option<Curve>,
+    pub(crate) visibility: Option<Steps>,
 }
 
 impl NodeCurves {
     /// Keys of all curves together.
     pub(crate) fn keys(&self) -> usize {
-        [&self.translation, &self.rotation, &self.scale]
-            .into_iter()
-            .flatten()
-            .map(|curve| curve.times.len())
-            .sum()
+        let curves = [&self.translation, &self.rotation, &self.scale].into_iter().flatten();
+        let steps = self.visibility.as_ref().map_or(0, |steps| steps.times.len());
+        curves.map(|curve| curve.times.len()).sum::<usize>() + steps
     }
+}
+
+/// Shown or hidden over time; a key holds until the next.
+pub(crate) struct Steps {
+    /// Seconds, ascending.
+    pub(crate) times: Vec<f32>,
+    /// One value per time.
+    visible: Vec<bool>,
+}
+
+impl Steps {
+    /// True when it can be seen at a time; before the first key as at that.
+    pub(crate) fn at(&self, seconds: f32) -> bool {
+        self.visible[self.times.partition_point(|time| *time <= seconds).saturating_sub(1)]
+    }
+}
+
+/// Key times of a sampler.
+fn key_times(source: &Source, object: &str, sampler: &Sampler) -> Result<Vec<f32>, GltfError> {
+    let expected = Expected { object, count: None, types: &[(F32, false)] };
+    let times: Vec<f32> = source.numbers::<1>(sampler.input.value(), &expected)?.into_flattened();
+    let ascending = times.windows(2).all(|pair| pair[0] < pair[1]);
+    if times.is_empty() || !ascending || !times.iter().all(|time| time.is_finite() && *time >= 0.0) {
+        let what = "its key times must be finite, ascending and not before 0";
+        return Err(source.invalid(object.to_owned(), what));
+    }
+    Ok(times)
 }
 
 /// Curves of the first animation, by node.
@@ -110,6 +137,20 @@ impl Curves {
                 return Err(source.invalid(object(), format!("{} is animated twice", source.node_name(node))));
             }
         }
+        for &Pointed { channel, sampler, node } in &source.pointed {
+            let object = format!("animation 0, channel {channel}");
+            let Some(sampler) = animation.samplers.get(sampler).filter(|_| node < locals.len()) else {
+                return Err(
+                    source.invalid(object, "its sampler, or the node that it points to, is not in the file")
+                );
+            };
+            let times = key_times(source, &object, sampler)?;
+            let types = [(U8, false), (F32, false)];
+            let expected = Expected { object: &object, count: Some(times.len()), types: &types };
+            let values = source.numbers::<1>(sampler.output.value(), &expected)?;
+            let visible = values.into_flattened().into_iter().map(|value| value != 0.0).collect();
+            curves.entry(node).or_default().visibility = Some(Steps { times, visible });
+        }
         Ok(Self(curves))
     }
 
@@ -135,32 +176,20 @@ impl Curves {
 }
 
 /// Keys that our writer put between those of a track.
-fn inserted(sampler: &gltf::json::animation::Sampler) -> Vec<usize> {
+fn inserted(sampler: &Sampler) -> Vec<usize> {
     let extras = sampler.extras.as_ref().map(|extras| serde_json::from_str::<SamplerExtras>(extras.get()));
     extras.and_then(Result::ok).map_or_else(Vec::new, |extras| extras.cif.inserted)
 }
 
 impl Curve {
-    fn read(
-        source: &Source,
-        object: &str,
-        sampler: &gltf::json::animation::Sampler,
-        path: Path,
-    ) -> Result<Self, GltfError> {
+    fn read(source: &Source, object: &str, sampler: &Sampler, path: Path) -> Result<Self, GltfError> {
         let is_rotation = path == Path::Rotation;
         let Checked::Valid(interpolation) = sampler.interpolation else {
             return Err(
                 source.invalid(object.to_owned(), "its interpolation is none of LINEAR, STEP, CUBICSPLINE")
             );
         };
-        let expected = Expected { object, count: None, types: &[(F32, false)] };
-        let mut times: Vec<f32> = source.numbers::<1>(sampler.input.value(), &expected)?.into_flattened();
-        let ascending = times.windows(2).all(|pair| pair[0] < pair[1]);
-        if times.is_empty() || !ascending || !times.iter().all(|time| time.is_finite() && *time >= 0.0) {
-            return Err(
-                source.invalid(object.to_owned(), "its key times must be finite, ascending and not before 0")
-            );
-        }
+        let mut times = key_times(source, object, sampler)?;
         let per_key = if interpolation == Interpolation::CubicSpline { 3 } else { 1 };
         let count = Some(times.len() * per_key);
         let signed = [(F32, false), (I8, true), (U8, true), (I16, true), (U16, true)];

@@ -6,7 +6,7 @@ use serde_json::Value;
 
 use super::source::Source;
 use crate::extras::{Cif, Extras};
-use crate::{GltfError, conventions};
+use crate::{GltfError, VISIBILITY, conventions};
 
 /// Transform of a node in its parent.
 #[derive(Clone, Copy, Debug)]
@@ -116,7 +116,10 @@ fn local(source: &Source, index: usize) -> Result<Local, GltfError> {
         if !finite(matrix) {
             return Err(wrong("its matrix is not finite; reset its transform"));
         }
-        let matrix = DMat4::from_cols_array(&matrix.map(f64::from));
+        let mut matrix = DMat4::from_cols_array(&matrix.map(f64::from));
+        if let Some(place) = source.places.get(&index) {
+            matrix.w_axis = DVec3::from_array(*place).extend(1.0);
+        }
         return Ok(Local::Matrix(DAffine3::from_mat4(matrix)));
     }
     let translation = node.translation.unwrap_or_default();
@@ -127,7 +130,9 @@ fn local(source: &Source, index: usize) -> Result<Local, GltfError> {
     let rotation = node.rotation.map_or([0.0, 0.0, 0.0, 1.0], |rotation| rotation.0.map(f64::from));
     let rotation = conventions::rotation(rotation)
         .ok_or_else(|| wrong("its rotation has no length; give it (0, 0, 0, 1)"))?;
-    Ok(Local::Parts(vector(translation), rotation, vector(scale)))
+    let translation =
+        source.places.get(&index).map_or(vector(translation), |place| DVec3::from_array(*place));
+    Ok(Local::Parts(translation, rotation, vector(scale)))
 }
 
 pub(crate) fn vector(values: [f32; 3]) -> DVec3 {
@@ -154,7 +159,7 @@ fn ours(source: &Source, index: usize, warnings: &mut Vec<String>) -> Option<Cif
 pub(crate) fn is_hidden(source: &Source, index: usize) -> bool {
     let extensions = source.root.nodes[index].extensions.as_ref();
     extensions
-        .and_then(|extensions| extensions.others.get("KHR_node_visibility"))
+        .and_then(|extensions| extensions.others.get(VISIBILITY))
         .and_then(|extension| extension.get("visible"))
         .and_then(Value::as_bool)
         == Some(false)

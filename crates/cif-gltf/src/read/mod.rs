@@ -6,6 +6,7 @@
 //! | `accessor` | the numbers of an accessor |
 //! | `hierarchy` | nodes and their transforms |
 //! | `animation` | curves over time |
+//! | `pointers` | animations of properties by pointers |
 //! | `motion` | poses of chains of nodes |
 //! | `splats` | splats of meshes |
 //! | `objects` | which nodes are objects, and who they are |
@@ -35,6 +36,7 @@ mod cameras;
 mod hierarchy;
 mod motion;
 mod objects;
+mod pointers;
 mod source;
 mod splats;
 
@@ -139,6 +141,7 @@ pub fn read_scene(path: &Path) -> Result<SceneGraph, GltfError> {
             frame: world.frame,
             background_color: world.background_color,
             sort_metric: world.sort_metric,
+            antialiased: world.antialiased,
             omitted: world.omitted,
             warnings: world.warnings.into_iter().chain(warnings).collect(),
             origin: Origin { field_fingerprint: world.field_fingerprint, options: world.options },

@@ -156,9 +156,29 @@ impl Stage<'_> {
         let keys = poses.iter().filter_map(|(time, pose)| Some((*pose)?.pose(self.clock.code(*time))));
         let mut keys: Vec<PoseSample> = keys.collect();
         one_hemisphere(&mut keys);
-        let mut visibility: Vec<VisibilitySample> = scales
+        // What hides nodes besides their size.
+        let shown = |seconds: f32| {
+            chain.nodes.iter().all(|&node| {
+                let steps = self.curves.of(node).and_then(|curves| curves.visibility.as_ref());
+                steps.map_or_else(|| !is_hidden(self.source, node), |steps| steps.at(seconds))
+            })
+        };
+        let mut steps: Vec<f32> = curves
             .iter()
-            .map(|(time, d)| VisibilitySample { time_code: self.clock.code(*time), visible: visible(d) })
+            .filter_map(|curves| curves.visibility.as_ref())
+            .flat_map(|steps| steps.times.clone())
+            .collect();
+        let is_stepped = !steps.is_empty();
+        steps.extend(&scale_times);
+        steps.sort_by(f32::total_cmp);
+        steps.dedup();
+        let is_sized = |seconds: f32| scale_times.is_empty() || visible(&self.at(chain, seconds));
+        let mut visibility: Vec<VisibilitySample> = steps
+            .iter()
+            .map(|&time| VisibilitySample {
+                time_code: self.clock.code(time),
+                visible: is_sized(time) && shown(time),
+            })
             .collect();
         if !chain.ours {
             visibility.dedup_by_key(|sample| sample.visible);
@@ -166,7 +186,7 @@ impl Stage<'_> {
                 visibility.clear();
             }
         }
-        let hidden = chain.nodes.iter().any(|&node| is_hidden(self.source, node));
+        let hidden = !is_stepped && !shown(start);
         if hidden || (always_hidden && visibility.is_empty()) {
             visibility = vec![VisibilitySample { time_code: self.start, visible: false }];
         }

@@ -10,11 +10,12 @@ use cif_scene::files::{FileError, folder_of};
 use gltf::json;
 use serde_json::Value;
 
-use crate::{EXTENSION, GltfError};
+use super::pointers::{self, Pointed};
+use crate::{EXTENSION, GltfError, POINTER, VISIBILITY};
 
 /// Extensions that may be required: they are understood, or change nothing that is read.
-const UNDERSTOOD: [&str; 4] =
-    [EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_lights_punctual"];
+const UNDERSTOOD: [&str; 5] =
+    [EXTENSION, "KHR_mesh_quantization", VISIBILITY, POINTER, "KHR_lights_punctual"];
 /// Families of extensions about surfaces, of which splats have none.
 const SURFACES: [&str; 4] = ["KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_"];
 
@@ -22,6 +23,10 @@ const SURFACES: [&str; 4] = ["KHR_materials_", "KHR_texture_", "EXT_texture_", "
 pub(crate) struct Source {
     pub(crate) path: PathBuf,
     pub(crate) root: json::Root,
+    /// Channels of the first animation that show and hide nodes.
+    pub(crate) pointed: Vec<Pointed>,
+    /// Places of nodes that single precision does not hold, as they are written.
+    pub(crate) places: BTreeMap<usize, [f64; 3]>,
     buffers: Vec<Option<Buffer>>,
     /// Bytes of all files together.
     pub(crate) bytes: u64,
@@ -44,9 +49,12 @@ impl Source {
         check_version(path, &value)?;
         check_extensions(path, &value)?;
         rename_attributes(&mut value);
+        let pointed = pointers::take(&mut value);
+        let places = places(&value);
         let root: json::Root = serde_json::from_value(value)
             .map_err(|error| unreadable(path, &format!("its JSON does not follow glTF 2.0 ({error})")))?;
-        let mut source = Self { path: path.to_owned(), root, buffers: Vec::new(), bytes: bytes.len() as u64 };
+        let (buffers, size) = (Vec::new(), bytes.len() as u64);
+        let mut source = Self { path: path.to_owned(), root, pointed, places, buffers, bytes: size };
         source.load_buffers(Rc::new(bytes), binary)?;
         Ok(source)
     }
@@ -162,6 +170,15 @@ impl Source {
         GltfError::Invalid { path: self.path.clone(), object, what: what.into() }
     }
 
+    /// True of files of a splat-transform whose scales are logarithms: that before 2.6.1.
+    pub(crate) fn has_logarithmic_scales(&self) -> bool {
+        let generator = self.root.asset.generator.as_deref().unwrap_or_default();
+        let Some(version) = generator.trim().strip_prefix("splat-transform ") else { return false };
+        let numbers: Vec<u32> =
+            version.trim_start_matches('v').split('.').map_while(|n| n.parse().ok()).collect();
+        matches!(numbers[..], [_, _, _]) && numbers[..] <= [2, 6, 0][..]
+    }
+
     /// `node 3 "mug"`.
     pub(crate) fn node_name(&self, index: usize) -> String {
         named("node", index, self.root.nodes.get(index).and_then(|node| node.name.as_deref()))
@@ -182,6 +199,26 @@ fn named(kind: &str, index: usize, name: Option<&str>) -> String {
 
 fn unreadable(path: &Path, reason: &str) -> GltfError {
     GltfError::Unreadable { path: path.to_owned(), reason: reason.to_owned() }
+}
+
+/// Translations of nodes and of their matrices that are farther from a number of single precision than rounding of
+/// ordinary places.
+fn places(value: &Value) -> BTreeMap<usize, [f64; 3]> {
+    /// Metres.
+    const ROUNDING: f64 = 1e-6;
+    let number = |value: Option<&Value>| value.and_then(Value::as_f64);
+    let place = |node: &Value| -> Option<[f64; 3]> {
+        let (values, first) = match node.get("matrix") {
+            Some(matrix) => (matrix, 12),
+            None => (node.get("translation")?, 0),
+        };
+        let [x, y, z] = [0, 1, 2].map(|axis| number(values.get(first + axis)));
+        Some([x?, y?, z?])
+    };
+    let rounded = |value: &f64| (f64::from(*value as f32) - value).abs() > ROUNDING;
+    let nodes = value.get("nodes").and_then(Value::as_array).into_iter().flatten().enumerate();
+    let places = nodes.filter_map(|(index, node)| Some((index, place(node)?)));
+    places.filter(|(_, place)| place.iter().any(rounded)).collect()
 }
 
 /// Ranges of the JSON and of the buffer in a `.glb`.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_geometry::quaternion;
-use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
+use cif_scene::assemble::ColorEncoding;
 use cif_scene::{IdentityShare, IdentityShares, Splats};
 use gltf::json::accessor::ComponentType::{F32, I8, I16, U8, U16};
 use gltf::json::mesh::{Mode, Primitive, Semantic};
@@ -12,10 +12,7 @@ use serde_json::Value;
 
 use super::accessor::{ANY, Expected};
 use super::source::{Source, unknown_extension};
-use crate::{EXTENSION, GltfError, conventions};
-
-/// Standard deviation in place of 0: a splat of no thickness cannot be inverted.
-const THINNEST: f32 = 1e-9;
+use crate::{EXTENSION, GltfError};
 
 /// The extension object of a primitive.
 pub(crate) fn extension(primitive: &Primitive) -> Option<&Value> {
@@ -88,12 +85,8 @@ impl Reader<'_> {
         }
         drop(quaternions);
         let mut scales: Vec<[f32; 3]> = self.extended("SCALE", n, &unsigned)?;
+        self.linear(&mut scales, warnings)?;
         self.check("SCALE", &scales, "is negative or not finite", |v| v.is_finite() && v >= 0.0)?;
-        for scale in scales.as_flattened_mut() {
-            if *scale < f32::MIN_POSITIVE {
-                *scale = THINNEST;
-            }
-        }
         let opacities: Vec<[f32; 1]> = self.extended("OPACITY", n, &shares)?;
         self.check("OPACITY", &opacities, "is not between 0 and 1", |v| (-1e-3..=1.001).contains(&v))?;
         let opacities = opacities.into_flattened().into_iter().map(|v| v.clamp(0.0, 1.0)).collect();
@@ -112,7 +105,7 @@ impl Reader<'_> {
                 "{}: its colours are linear; they were brought to display values to first order",
                 self.object
             ));
-            display_from_linear(&mut splats);
+            ColorEncoding::LINEAR.bring_to_display(&mut splats.sh_coefficients, splats.sh_degree);
         }
         let share = |name: &str| -> Result<Vec<f32>, GltfError> {
             match self.accessor(&format!("_{name}")) {
@@ -137,6 +130,31 @@ impl Reader<'_> {
         Ok(splats)
     }
 
+    /// Scales of drafts of the extension, and of what exported by them, are logarithms.
+    fn linear(&self, scales: &mut [[f32; 3]], warnings: &mut Vec<String>) -> Result<(), GltfError> {
+        let values = scales.as_flattened_mut();
+        let below = values.iter().filter(|value| **value < 0.0).count();
+        let by_draft = self.source.has_logarithmic_scales();
+        if below == 0 && !by_draft {
+            return Ok(());
+        }
+        // Splats are mostly smaller than a metre.
+        if !by_draft && 2 * below < values.len() {
+            let what = format!(
+                "{below} of {} values are negative: they are damaged, or logarithms as in drafts of {EXTENSION}; \
+                 export linear scales",
+                values.len()
+            );
+            return Err(self.invalid("SCALE", what));
+        }
+        warnings.push(format!(
+            "{}: its scales are logarithms, as in drafts of {EXTENSION}; they were read as such",
+            self.object
+        ));
+        values.iter_mut().for_each(|value| *value = value.exp());
+        Ok(())
+    }
+
     /// The instances that every splat may belong to; empty where the file does not tell.
     fn identities(&self, n: usize) -> Result<Vec<IdentityShares>, GltfError> {
         let accessors = (self.accessor(crate::INSTANCE_IDS), self.accessor(crate::INSTANCE_SHARES));
@@ -159,6 +177,19 @@ impl Reader<'_> {
             let packed = settings.get("extensions").and_then(Value::as_object);
             if let Some((name, _)) = packed.and_then(|packed| packed.iter().next()) {
                 return Err(unknown_extension(&self.source.path, name));
+            }
+        }
+        if self.accessor(&format!("_{EXTENSION}:SCALE")).is_none() && self.accessor("_SCALE").is_some() {
+            let what = format!(
+                "its attributes are those of an early draft of {EXTENSION} (_ROTATION, _SCALE), in which their \
+                 meaning changed; export it again by the ratified extension"
+            );
+            return Err(self.source.invalid(self.object.clone(), what));
+        }
+        for key in ["kernel", "colorSpace"] {
+            if settings.get(key).and_then(Value::as_str).is_none() {
+                let taken = if key == "kernel" { "ellipse" } else { "srgb_rec709_display" };
+                warnings.push(format!("{}: it has no {key}; taken as '{taken}'", self.object));
             }
         }
         let known = [
@@ -285,21 +316,5 @@ impl Reader<'_> {
             }
         }
         Ok((highest as u8, coefficients))
-    }
-}
-
-/// Brings linear colours to display values: the mean colour exactly, what depends on the view by the slope of the
-/// transfer function there.
-fn display_from_linear(splats: &mut Splats) {
-    let stride = 3 * coefficient_count(splats.sh_degree);
-    let band_0 = BAND_0 as f32;
-    for row in splats.sh_coefficients.chunks_exact_mut(stride) {
-        for channel in 0..3 {
-            let (display, slope) = conventions::srgb_from_linear(0.5 + band_0 * row[channel]);
-            row[channel] = (display - 0.5) / band_0;
-            for coefficient in row[3..].iter_mut().skip(channel).step_by(3) {
-                *coefficient *= slope;
-            }
-        }
     }
 }

@@ -128,8 +128,9 @@ class SceneOptions(TypedDict, total=False):
     frame_step: int
     """Every how many frames motion is sampled."""
     up_axis: Literal["y", "z"]
-    """Axis to declare; the data is not turned."""
+    """Axis to declare; the data is not turned. By default that of the imported file, else z."""
     meters_per_unit: float
+    """Metres per world unit; by default that of the imported file, else 1."""
     proxy_points: int
     """Most points of the stand-in of an object; 0 for none."""
 

@@ -20,7 +20,7 @@ pub(crate) fn of_rows(field: &Field, rows: &[u32]) -> Vec<VisibilitySample> {
         groups.iter().flat_map(|group| steps(group).iter().map(|step| step.time)).collect();
     times.sort_by(f64::total_cmp);
     times.dedup();
-    let codes = TimeMap::of_field(&field.timeline);
+    let codes = TimeMap::of_field(field);
     let visible = |time: f64| groups.iter().flatten().any(|&group| tracks.groups[group].is_visible(time));
     let mut samples: Vec<VisibilitySample> = Vec::new();
     for time in times {

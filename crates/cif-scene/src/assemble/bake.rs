@@ -138,7 +138,7 @@ impl Bake {
                 if let Some(turn) = turn {
                     *orientation = quaternion::multiply(turn, q).map(|value| value as f32);
                 }
-                *scale = scale.map(|value| ((f64::from(value) * factor) as f32).max(f32::MIN_POSITIVE));
+                *scale = scale.map(|value| (f64::from(value) * factor) as f32);
                 continue;
             }
             let rotation = DMat3::from_quat(DQuat::from_xyzw(q[1], q[2], q[3], q[0]).normalize());
@@ -149,7 +149,13 @@ impl Bake {
             // Axes have no sign; a turn has.
             let q = quaternion_of(to_glam(&u));
             *orientation = [q.w, q.x, q.y, q.z].map(|value| value as f32);
-            *scale = [0, 1, 2].map(|axis| (svd.singular_values[axis] as f32).max(f32::MIN_POSITIVE));
+            // A flat splat stays flat: what is left of its thickness is rounding.
+            let flat = scale.iter().filter(|scale| **scale == 0.0).count();
+            let mut sizes = [0, 1, 2].map(|axis| svd.singular_values[axis] as f32);
+            let mut thinnest = [0, 1, 2];
+            thinnest.sort_by(|a, b| sizes[*a].total_cmp(&sizes[*b]));
+            thinnest[..flat].iter().for_each(|axis| sizes[*axis] = 0.0);
+            *scale = sizes;
         }
     }
 

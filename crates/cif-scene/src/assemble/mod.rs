@@ -5,8 +5,10 @@
 //! frame of the scene. Only the `conventions.rs` of a format swaps axes, before anything comes here.
 
 mod bake;
+mod colors;
 mod identify;
 mod node;
+mod origin;
 #[cfg(test)]
 mod tests;
 mod track;
@@ -17,6 +19,8 @@ use cif_field::{Embedding, SortMetric};
 use glam::DVec3;
 
 pub use bake::{Bake, Decomposed, is_identity, uniform};
+pub use colors::{ColorEncoding, color_range};
+pub use origin::origin_of;
 pub use track::{Placement, Track, one_hemisphere};
 
 use crate::graph::{Motion, VisibilitySample};
@@ -48,6 +52,8 @@ pub struct Prims {
     pub background_color: [f32; 3],
     /// Order in which the splats are blended.
     pub sort_metric: SortMetric,
+    /// True when the splats are drawn antialiased; `None` where the file does not say.
+    pub antialiased: Option<bool>,
     /// Labels of instances without a node.
     pub omitted: Vec<String>,
     /// Warnings, one sentence each.
@@ -75,6 +81,7 @@ impl Default for Prims {
             cameras: Vec::new(),
             background_color: [0.0; 3],
             sort_metric: SortMetric::default(),
+            antialiased: None,
             omitted: Vec::new(),
             warnings: Vec::new(),
             origin: Origin::default(),
@@ -275,8 +282,13 @@ pub struct AssembleError {
 ///
 /// # Errors
 /// More instances than ids.
-pub fn assemble(found: Prims) -> Result<SceneGraph, AssembleError> {
+pub fn assemble(mut found: Prims) -> Result<SceneGraph, AssembleError> {
     let mut warnings = found.warnings;
+    let is_foreign = found.origin.field_fingerprint.is_none();
+    if is_foreign && found.frame.is_identity() {
+        let (unit, cameras) = (found.meters_per_unit, &mut found.cameras);
+        found.frame = origin::take_off(&mut found.prims, cameras, unit, &mut warnings);
+    }
     let kinds = identify::kinds(&found.prims, &found.reserved, found.copies, &mut warnings)?;
     let mut names = naming::Names::default();
     let mut frames = Vec::with_capacity(found.prims.len());
@@ -312,6 +324,7 @@ pub fn assemble(found: Prims) -> Result<SceneGraph, AssembleError> {
         cameras,
         background_color: found.background_color,
         sort_metric: found.sort_metric,
+        antialiased: found.antialiased,
         omitted: found.omitted,
         warnings,
         origin: found.origin,

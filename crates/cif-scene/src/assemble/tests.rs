@@ -194,3 +194,70 @@ fn recorded_pivots_and_reports_count_while_they_hold() {
     let kept = one(at(0.2), true);
     assert_eq!((kept.pivot, kept.track().len(), kept.report.seconds), (pivot, 1, 7.0));
 }
+
+/// World places of the splats of a graph at a time code.
+fn places(graph: &SceneGraph, time_code: f64) -> Vec<DVec3> {
+    let splats = graph.nodes.iter().flat_map(|node| node.splats_at(time_code).means);
+    splats.map(|mean| graph.frame.capture_from_dataset(mean)).collect()
+}
+
+#[test]
+fn far_objects_get_an_origin_of_their_own() {
+    let at = DVec3::new(500_123.25, 4_649_776.125, 215.5);
+    let far = |time_code: f64, x: f64| PoseSample {
+        time_code,
+        translation: at + DVec3::X * x,
+        rotation: DQuat::from_rotation_z(0.5 * time_code),
+    };
+    let tracks =
+        [Track { rest: far(0.0, 0.0), samples: Vec::new() }, moving(vec![far(0.0, 0.0), far(1.0, 0.3)])];
+    let below = |map| {
+        let mut found = prim("below", Identity::New);
+        found.pieces[0].placement = map;
+        found
+    };
+    let mut prims: Vec<Prim> =
+        tracks.into_iter().map(|track| Prim { track, ..prim("above", Identity::New) }).collect();
+    prims.push(below(Placement::still(Some(DAffine3::from_translation(at)))));
+    prims.push(below(Placement::Rigid { track: moving(vec![far(0.0, 0.0), far(1.0, 0.3)]), baked: None }));
+    for prim in prims {
+        let map = |code: f64| {
+            let pose = prim.track.at(code);
+            let map = DAffine3::from_rotation_translation(pose.rotation, pose.translation);
+            map * prim.pieces[0].placement.at(code)
+        };
+        let in_parts =
+            matches!(&prim.pieces[0].placement, Placement::Rigid { track, .. } if !track.is_identity());
+        let expected: Vec<Vec<DVec3>> = [0.0, 1.0]
+            .map(|code| (0..2).map(|k| map(code).transform_point3(DVec3::X * f64::from(k))).collect())
+            .to_vec();
+        let graph = assemble(Prims { prims: vec![Prim { in_parts, ..prim }], ..Prims::default() }).unwrap();
+        assert!(!graph.frame.is_identity() && graph.warnings[0].contains("origin"), "{:?}", graph.warnings);
+        for (code, expected) in [0.0, 1.0].into_iter().zip(expected) {
+            for (found, place) in places(&graph, code).iter().zip(&expected) {
+                assert!((*found - *place).length() < 1e-5, "{found} {place}");
+            }
+        }
+    }
+    // Near ones, those of files of ours, and what is as large as far away stay where they are.
+    let rest = PoseSample { time_code: 0.0, translation: DVec3::X * 900.0, rotation: DQuat::IDENTITY };
+    let track = Track { rest, samples: Vec::new() };
+    assert!(graph(vec![Prim { track, ..prim("a", Identity::New) }]).frame.is_identity());
+    let track = Track { rest: far(0.0, 0.0), samples: Vec::new() };
+    let prims = vec![Prim { track: track.clone(), ..prim("a", Identity::New) }, prim("b", Identity::New)];
+    assert!(graph(prims).frame.is_identity());
+    let origin = Origin { field_fingerprint: Some("f".to_owned()), options: None };
+    let prims = vec![Prim { track, ..prim("a", Identity::New) }];
+    assert!(assemble(Prims { prims, origin, ..Prims::default() }).unwrap().frame.is_identity());
+}
+
+#[test]
+fn flat_splats_stay_flat_below_uneven_scales() {
+    let mut found = prim("a", Identity::New);
+    found.pieces[0].splats.scales = vec![[0.1, 0.2, 0.0]; 2];
+    found.pieces[0].splats.orientations = vec![[0.8, 0.6, 0.0, 0.0]; 2];
+    let stretch = glam::DMat3::from_diagonal(DVec3::new(1.0, 3.0, 0.5));
+    found.pieces[0].placement = Placement::still(Some(DAffine3::from_mat3(stretch)));
+    let scales = graph(vec![found]).nodes[0].splats.scales[0];
+    assert_eq!(scales.iter().filter(|scale| **scale == 0.0).count(), 1, "{scales:?}");
+}

@@ -23,8 +23,8 @@ use crate::graph::{Node, NodeKind, Origin, SceneGraph, TimeCodes};
 use crate::joint::{ToldParts, jointed_groups};
 use crate::motion::choose::{self, Chosen};
 use crate::motion::loose::{self, Change};
-use crate::motion::{MovingGroup, trimmed_box, vector};
-use crate::shape::{colliders, proxy};
+use crate::motion::{MovingGroup, trimmed_box};
+use crate::shape::{colliders, flat, proxy};
 use crate::{MotionModel, MotionSource, SceneError, SceneOptions, naming, world};
 
 /// Share of an instance's weight that may be outliers when a motion model is chosen.
@@ -52,8 +52,9 @@ pub fn build_from(
     options.validate()?;
     check_consistency(field)?;
     let frames = sampled_frames(field, options)?;
+    let codes = field.time_codes();
     let time_codes = TimeCodes {
-        samples: frames.iter().map(|&frame| frame as f64).collect(),
+        samples: frames.iter().map(|&frame| codes[frame]).collect(),
         times: frames.iter().map(|&frame| field.timeline.times[frame]).collect(),
         frames_per_second: field.timeline.frames_per_second,
     };
@@ -143,16 +144,19 @@ pub fn build_from(
         warnings.push(format!("no visible Gaussian belongs to: {}", told.join(", ")));
     }
     let code_of =
-        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then_some(index as f64);
+        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then(|| codes[index]);
+    let declared = field.record.declared;
+    let unit = options.meters_per_unit.or(declared.map(|of| of.meters_per_unit));
     Ok(SceneGraph {
-        up_axis: options.up_axis,
-        meters_per_unit: options.meters_per_unit,
+        up_axis: options.up_axis.or(declared.map(|of| of.up_axis)).unwrap_or_default(),
+        meters_per_unit: unit.unwrap_or(1.0),
         frame: world::frame_of(field)?,
         cameras: camera_tracks::camera_tracks(&field.cameras, code_of),
         time_codes,
         nodes,
         background_color: field.background,
         sort_metric: field.sort_metric,
+        antialiased: field.record.drawing.antialiased,
         omitted,
         warnings,
         origin: Origin { field_fingerprint: Some(field.fingerprint()), options: Some(options.clone()) },
@@ -245,8 +249,8 @@ fn visible_rows(
     let (mut invalid, mut invisible) = (0, 0);
     let visible: Vec<u32> = (0..gaussians.len())
         .filter(|&row| {
-            let scales = gaussians.log_scales[row].map(f32::exp);
-            let usable = scales.iter().all(|scale| scale.is_normal())
+            // The logarithm of no thickness is a number below all others.
+            let usable = gaussians.log_scales[row].iter().all(|log| log.exp().is_finite())
                 && gaussians.means[row].iter().all(|value| value.is_finite())
                 && gaussians.sh_coefficients[row].iter().all(|value| value.is_finite())
                 && quaternion::try_normalize(gaussians.quaternions[row]).is_some()
@@ -355,8 +359,7 @@ fn moving_groups(
             .iter()
             .map(|&row| {
                 let row = row as usize;
-                let size = (vector(reference.log_scales[row]).element_sum() / 3.0).exp();
-                f64::from(opacities[row]) * size
+                f64::from(opacities[row]) * flat::size(reference.log_scales[row].map(f64::from))
             })
             .collect();
         let (low, high) = trimmed_box(&rows, &weights, &reference.means);

@@ -14,11 +14,10 @@ use crate::graph::{
     SHARES_PER_SPLAT, Splats,
 };
 use crate::motion::choose::Chosen;
-use crate::motion::dense::positive_scales;
 use crate::motion::{MeanShape, MovingGroup, ResidualSum, add_turns_between, trimmed_box, vector};
 use crate::naming;
 use crate::report::{MotionReport, ResidualStatistics};
-use crate::shape::extent;
+use crate::shape::{extent, flat};
 
 /// Kind, names and class of a node.
 pub(crate) struct Naming {
@@ -153,7 +152,7 @@ pub(crate) fn node(input: &NodeInput<'_>, naming: Naming, group: &MovingGroup, c
 fn take_shape(splats: &mut Splats, shape: &MeanShape) {
     splats.means.extend(shape.means.iter().map(|mean| mean.to_array().map(|v| v as f32)));
     splats.orientations.extend(shape.orientations.iter().map(|q| q.map(|v| v as f32)));
-    splats.scales.extend(shape.log_scales.iter().map(|log| positive_scales(log.to_array())));
+    splats.scales.extend(shape.log_scales.iter().map(|log| log.to_array().map(flat::scale)));
 }
 
 /// Highest degree of spherical harmonics, up to `highest`, that any of the rows has: bands of zeros are not written.

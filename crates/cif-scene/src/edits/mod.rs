@@ -27,8 +27,9 @@ use glam::DVec3;
 use crate::diff::splats::{SplatPairs, coefficients, is_faded, is_recoloured, is_resized, pair};
 use crate::diff::units::{Unit, delta, key_codes, matching, step};
 use crate::diff::{Pair, SceneDiff, diff, pairs, same_rows, visibility_differs};
-use crate::field_from_graph::{InstanceTable, NodeRows, log_scale, logit, rows_of};
+use crate::field_from_graph::{InstanceTable, NodeRows, logit, rows_of};
 use crate::motion::time_map::TimeMap;
+use crate::shape::flat::log_scale;
 use crate::{Node, NodeKind, SceneError, SceneGraph, build, naming};
 use identities::{Owner, RowIdentity, unseen_members};
 use parts::subset;
@@ -184,7 +185,7 @@ impl<'a> Plan<'a> {
             }
         }
         Ok(Self {
-            times: TimeMap::of_field(&base.timeline),
+            times: TimeMap::of_field(base),
             reference: exported.time_codes.start(),
             base,
             exported,

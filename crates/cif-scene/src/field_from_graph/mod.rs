@@ -14,7 +14,8 @@ use cif_field::tracks::{
     DenseTrack, Joint, NO_GROUP, Samples, TrackGroup, TrackPose, Tracks, VisibilityStep,
 };
 use cif_field::{
-    Embeddings, Field, Gaussians, Identities, Instance, Owner, Record, RecordedCamera, Timeline,
+    Declared, Drawing, Embeddings, Field, FrameCodes, Gaussians, Identities, Instance, Owner, Record,
+    RecordedCamera, Timeline,
 };
 use cif_geometry::spherical_harmonics::{HarmonicsRotation, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
@@ -24,6 +25,7 @@ use crate::graph::{
     AppearanceSample, DenseMotion, Motion, Node, NodeKind, PartsMotion, PoseSample, SceneGraph, pose_at,
 };
 use crate::motion::time_map::TimeMap;
+use crate::shape::flat::log_scale;
 use crate::{CameraTrack, SceneError};
 
 /// Turns below this leave spherical harmonics as they are, radians.
@@ -76,8 +78,6 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
     let degrees = graph.nodes.iter().map(|node| node.splats.sh_degree);
     let imported = serde_json::json!({
         "file": source,
-        "up_axis": graph.up_axis,
-        "meters_per_unit": graph.meters_per_unit,
         "first_time_code": reference,
         "exported_from": graph.origin.field_fingerprint,
         "cif": env!("CARGO_PKG_VERSION"),
@@ -99,7 +99,10 @@ pub fn field_from_graph(graph: &SceneGraph, source: &str) -> Result<Field, Scene
         background: graph.background_color.map(|channel| channel.clamp(0.0, 1.0)),
         sort_metric: graph.sort_metric,
         record: Record {
+            drawing: Drawing { antialiased: graph.antialiased, ..Drawing::default() },
             frame: graph.frame,
+            declared: Some(Declared { up_axis: graph.up_axis, meters_per_unit: graph.meters_per_unit }),
+            frame_codes: FrameCodes::of(times.codes()),
             embeddings: embeddings(graph, &owners, &instances.entries),
             notes: imported,
             ..Record::default()
@@ -484,11 +487,6 @@ pub(crate) fn rows_of(rotation: DQuat) -> [[f32; 3]; 3] {
     DMat3::from_quat(rotation).transpose().to_cols_array_2d().map(|row| row.map(|value| value as f32))
 }
 
-/// Raw log-scale of a standard deviation above 0.
-pub(crate) fn log_scale(scale: f32) -> f32 {
-    f64::from(scale).ln() as f32
-}
-
 /// Raw logit of a probability in single precision.
 pub(crate) fn logit(probability: f32) -> f32 {
     saturated_logit(f64::from(probability))
@@ -548,8 +546,8 @@ pub(crate) fn check(node: &Node) -> Result<(), SceneError> {
     if !in_range(&splats.opacities) || !in_range(&splats.occupancies) {
         return wrong("an opacity or occupancy is outside 0 to 1".to_owned());
     }
-    if splats.scales.as_flattened().iter().any(|scale| !(scale.is_finite() && *scale > 0.0)) {
-        return wrong("a scale is not above 0".to_owned());
+    if splats.scales.as_flattened().iter().any(|scale| !(scale.is_finite() && *scale >= 0.0)) {
+        return wrong("a scale is below 0 or not finite".to_owned());
     }
     let ascend = |track: &[PoseSample]| {
         track.windows(2).all(|pair| pair[0].time_code < pair[1].time_code)
@@ -605,8 +603,8 @@ pub(crate) fn check(node: &Node) -> Result<(), SceneError> {
                     ));
                 }
                 let scales = sample.scales.as_deref().unwrap_or_default().as_flattened();
-                if scales.iter().any(|scale| !(scale.is_finite() && *scale > 0.0)) {
-                    return wrong("a sampled scale is not above 0".to_owned());
+                if scales.iter().any(|scale| !(scale.is_finite() && *scale >= 0.0)) {
+                    return wrong("a sampled scale is below 0 or not finite".to_owned());
                 }
             }
             if dense.samples.windows(2).any(|pair| pair[0].time_code >= pair[1].time_code) {

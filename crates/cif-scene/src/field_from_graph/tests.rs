@@ -83,6 +83,60 @@ fn a_graph_keeps_its_place_in_the_world() {
 }
 
 #[test]
+fn flat_splats_stay_flat() {
+    let mut graph = build(&recorded_field(3, 5), &options()).unwrap();
+    for node in &mut graph.nodes {
+        node.splats.scales.iter_mut().for_each(|scale| scale[1] = 0.0);
+        if let Motion::Dense(dense) = &mut node.motion {
+            let sampled = dense.samples.iter_mut().filter_map(|sample| sample.scales.as_mut());
+            sampled.flatten().for_each(|scale| scale[1] = 0.0);
+        }
+    }
+    let back = field_from_graph(&graph, "flat.usda").unwrap();
+    back.validate().unwrap();
+    let again = build(&back, &options()).unwrap();
+    let third = build(&field_from_graph(&again, "flat.usda").unwrap(), &options()).unwrap();
+    assert!(!again.warnings.iter().any(|warning| warning.contains("left out")), "{:?}", again.warnings);
+    assert_same(&again, &third);
+    let scales = || again.nodes.iter().flat_map(|node| &node.splats.scales);
+    assert!(scales().count() > 0 && scales().all(|scale| scale[1] == 0.0 && scale[0] > 0.0));
+}
+
+#[test]
+fn unit_axis_and_time_codes_of_a_file_are_those_of_its_exports() {
+    let mut graph = build(&recorded_field(2, 5), &options()).unwrap();
+    (graph.up_axis, graph.meters_per_unit) = (crate::UpAxis::Y, 0.01);
+    for (first, step) in [(101.0, 1.0), (-20.0, 1.0), (0.5, 2.5)] {
+        let mut graph = graph.clone();
+        let code = |code: f64| first + step * code;
+        let codes = &mut graph.time_codes;
+        codes.samples.iter_mut().for_each(|sample| *sample = code(*sample));
+        for node in &mut graph.nodes {
+            node.visibility.iter_mut().for_each(|sample| sample.time_code = code(sample.time_code));
+            if let Motion::Rigid(track) = &mut node.motion {
+                track.iter_mut().for_each(|pose| pose.time_code = code(pose.time_code));
+            }
+        }
+        for sample in graph.cameras.iter_mut().flat_map(|track| &mut track.samples) {
+            sample.time_code = code(sample.time_code);
+        }
+        let back = field_from_graph(&graph, "a.usda").unwrap();
+        let again = build(&back, &options()).unwrap();
+        assert_eq!((again.up_axis, again.meters_per_unit), (crate::UpAxis::Y, 0.01));
+        assert_eq!(again.time_codes.samples, graph.time_codes.samples);
+        assert_eq!(again.cameras, graph.cameras);
+        for (a, b) in graph.nodes.iter().zip(&again.nodes) {
+            assert_eq!(a.visibility, b.visibility);
+            let codes = |node: &Node| node.track().iter().map(|pose| pose.time_code).collect::<Vec<_>>();
+            assert_eq!(codes(a), codes(b), "{}", a.name);
+        }
+        let asked = SceneOptions { up_axis: Some(crate::UpAxis::Z), meters_per_unit: Some(1.0), ..options() };
+        let asked = build(&back, &asked).unwrap();
+        assert_eq!((asked.up_axis, asked.meters_per_unit), (crate::UpAxis::Z, 1.0));
+    }
+}
+
+#[test]
 fn a_graph_comes_back_as_the_graph_it_was() {
     for seed in 0..6 {
         let field = recorded_field(1 + seed as usize, seed);
@@ -220,7 +274,7 @@ fn broken_graphs_are_refused_by_name() {
     type Break = fn(&mut SceneGraph);
     let breaks: [(&str, Break); 9] = [
         ("thing_0_002", |graph| drop(graph.nodes[0].splats.scales.split_off(3))),
-        ("scale is not above 0", |graph| graph.nodes[0].splats.scales[2][1] = 0.0),
+        ("scale is below 0", |graph| graph.nodes[0].splats.scales[2][1] = -1.0),
         ("opacity", |graph| graph.nodes[0].splats.opacities[2] = f32::NAN),
         ("degree 4", |graph| graph.nodes[0].splats.sh_degree = 4),
         ("means", |graph| graph.nodes[0].splats.means[0][0] = f32::INFINITY),

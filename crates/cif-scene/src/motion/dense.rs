@@ -8,6 +8,7 @@ use crate::motion::keys;
 use crate::motion::placement::{angle_between, normalized_lerp};
 use crate::motion::{MovingGroup, dot, quaternion_of, trimmed_rms, vector};
 use crate::shape::extent;
+use crate::shape::flat;
 use crate::shape::proxy::systematic;
 
 /// Relative change of a scale over time that makes scales sampled.
@@ -43,15 +44,10 @@ pub(crate) fn sample(
             None => before.unwrap_or([1.0, 0.0, 0.0, 0.0]),
         };
         orientations.push(orientation);
-        scales.push(positive_scales(gaussians.log_scales[row].map(f64::from)));
+        scales.push(gaussians.log_scales[row].map(|log| flat::scale(log.into())));
     }
     let extent = extent::ellipsoid_bounds(&RigidTransform::IDENTITY, &means, &orientations, &scales);
     DenseSample { time_code, means, orientations, scales: Some(scales), extent }
-}
-
-/// exp of log-scales, kept inside the positive range of f32.
-pub(crate) fn positive_scales(log_scales: [f64; 3]) -> [f32; 3] {
-    log_scales.map(|log| (log.exp() as f32).clamp(f32::MIN_POSITIVE, f32::MAX))
 }
 
 /// Scales that never change need no samples.

@@ -1,6 +1,6 @@
 //! Time codes to frames and normalised times, and back.
 
-use cif_field::Timeline;
+use cif_field::Field;
 
 use crate::{SceneError, TimeCodes};
 
@@ -17,10 +17,9 @@ pub(crate) struct TimeMap {
 }
 
 impl TimeMap {
-    /// The timeline of a field, whose frame `f` is time code `f`.
-    pub(crate) fn of_field(timeline: &Timeline) -> Self {
-        let codes = (0..timeline.times.len()).map(|frame| frame as f64).collect();
-        Self { codes, times: timeline.times.clone() }
+    /// The timeline of a field.
+    pub(crate) fn of_field(field: &Field) -> Self {
+        Self { codes: field.time_codes(), times: field.timeline.times.clone() }
     }
 
     /// A timeline that holds every sampled time code, and whole codes between them where the samples are whole.
@@ -68,7 +67,6 @@ impl TimeMap {
     }
 
     /// Time codes of all frames.
-    #[cfg(test)]
     pub(crate) fn codes(&self) -> &[f64] {
         &self.codes
     }

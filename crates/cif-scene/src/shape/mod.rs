@@ -4,5 +4,6 @@ pub(crate) mod body;
 pub mod colliders;
 pub mod convex_hull;
 pub mod extent;
+pub(crate) mod flat;
 pub mod level_of_detail;
 pub mod proxy;

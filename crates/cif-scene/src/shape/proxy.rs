@@ -1,6 +1,7 @@
 //! A light point cloud standing in for the splats.
 
 use super::extent::SIGMAS;
+use super::flat;
 use crate::{PointProxy, Splats};
 
 /// Picks at most `count` splats, spread over the node and denser where the splats are more important.
@@ -22,8 +23,7 @@ pub fn point_proxy(splats: &Splats, count: usize) -> PointProxy {
     let widths = indices
         .iter()
         .map(|&index| {
-            let [x, y, z] = splats.scales[index as usize].map(f64::from);
-            let sigma = (x * y * z).cbrt();
+            let sigma = flat::size(splats.scales[index as usize].map(|scale| f64::from(scale).ln()));
             (2.0 * sigma * growth.min(SIGMAS)) as f32
         })
         .collect();

@@ -83,6 +83,9 @@ fn metadata(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, role: &str, default_pr
             ours.set_item(key, pxr.vt.call_method1("StringArray", (values.clone(),))?)?;
         }
         ours.set_item(tokens::SORT, splats::sorting(graph.sort_metric))?;
+        if let Some(antialiased) = graph.antialiased {
+            ours.set_item(tokens::ANTIALIASED, antialiased)?;
+        }
         if !graph.frame.is_identity() {
             ours.set_item(tokens::CAPTURE_OFFSET, pxr.vec3d(graph.frame.offset.into())?)?;
             ours.set_item(tokens::CAPTURE_SCALE, graph.frame.scale)?;

@@ -1,11 +1,14 @@
 //! Names, labels, recorded identity and visibility of prims.
 
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 
 use cif_field::{Embedding, RotationEvidence};
 use cif_scene::{MotionModel, VisibilitySample, naming};
 use pyo3::prelude::*;
+use pyo3::types::PyIterator;
 
+use super::open::Instances;
 use super::values::{attribute, plain, samples, text, value};
 use crate::pxr::Pxr;
 use crate::tokens::{self, instance};
@@ -66,20 +69,123 @@ pub(crate) fn embedding<'py>(pxr: &Pxr<'py>, prim: &Bound<'py, PyAny>) -> PyResu
     Ok(embedding.filter(Embedding::is_valid))
 }
 
+/// Semantic labels of prims by taxonomy, at a time code or over an interval: those of `SemanticsLabelsAPI`, and of the
+/// `SemanticsAPI` that came before it.
+pub(crate) struct DirectLabels<'a, 'py> {
+    pxr: &'a Pxr<'py>,
+    api: Bound<'py, PyAny>,
+    /// Time code, or interval.
+    span: Bound<'py, PyAny>,
+    /// A label query caches what it has seen: one per taxonomy.
+    queries: RefCell<BTreeMap<String, Bound<'py, PyAny>>>,
+}
+
+impl<'a, 'py> DirectLabels<'a, 'py> {
+    pub(crate) fn new(pxr: &'a Pxr<'py>, span: Bound<'py, PyAny>) -> PyResult<Self> {
+        let api = pxr.usd_semantics.getattr("LabelsAPI")?;
+        Ok(Self { pxr, api, span, queries: RefCell::default() })
+    }
+
+    /// Labels of a prim itself, sorted.
+    pub(crate) fn of(&self, prim: &Bound<'py, PyAny>) -> PyResult<BTreeMap<String, Vec<String>>> {
+        let mut by_taxonomy = BTreeMap::new();
+        for taxonomy in self.api.call_method1("GetDirectTaxonomies", (prim,))?.try_iter()? {
+            let taxonomy = text(&taxonomy?)?;
+            let known = self.queries.borrow().get(&taxonomy).cloned();
+            let query = match known {
+                Some(query) => query,
+                None => {
+                    let class = self.pxr.usd_semantics.getattr("LabelsQuery")?;
+                    let query = class.call1((&taxonomy, &self.span))?;
+                    self.queries.borrow_mut().insert(taxonomy.clone(), query.clone());
+                    query
+                }
+            };
+            let labels = query.call_method1("ComputeUniqueDirectLabels", (prim,))?;
+            let labels: Vec<String> =
+                labels.try_iter()?.map(|label| text(&label?)).collect::<PyResult<_>>()?;
+            by_taxonomy.insert(taxonomy, labels);
+        }
+        for Older { taxonomy, label, .. } in older(prim)? {
+            by_taxonomy.entry(taxonomy).or_default().push(label);
+        }
+        for labels in by_taxonomy.values_mut() {
+            labels.sort();
+            labels.dedup();
+        }
+        Ok(by_taxonomy)
+    }
+}
+
+/// A label of the schema `SemanticsAPI` of earlier tools, of which a prim may have several:
+/// `semantic:NAME:params:semanticType` is the taxonomy, `semanticData` or `semanticLabel` beside it the label.
+pub(crate) struct Older<'py> {
+    pub(crate) taxonomy: String,
+    pub(crate) label: String,
+    /// Attribute that holds the label.
+    pub(crate) attribute: Bound<'py, PyAny>,
+}
+
+/// Labels of a prim by the schema of earlier tools, in the order of their names.
+pub(crate) fn older<'py>(prim: &Bound<'py, PyAny>) -> PyResult<Vec<Older<'py>>> {
+    let mut found = Vec::new();
+    for property in
+        prim.call_method1("GetAuthoredPropertiesInNamespace", (tokens::OLDER_LABELS,))?.try_iter()?
+    {
+        let property = property?;
+        let name = text(&property.call_method0("GetName")?)?;
+        let ends = tokens::OLDER_LABEL.iter().find_map(|end| name.strip_suffix(end));
+        let Some(attribute) = ends.map(|_| prim.call_method1("GetAttribute", (&name,))).transpose()? else {
+            continue;
+        };
+        let value = attribute.call_method0("Get")?;
+        if value.is_none() {
+            continue;
+        }
+        let label = text(&value)?;
+        let kind = format!("{}{}", ends.unwrap_or_default(), tokens::OLDER_TAXONOMY);
+        let kind = prim.call_method1("GetAttribute", (kind,))?;
+        let kind = if kind.is_truthy()? { kind.call_method0("Get")? } else { kind };
+        let taxonomy = if kind.is_truthy()? { text(&kind)? } else { tokens::TAXONOMY_CLASS.to_owned() };
+        if !label.is_empty() {
+            found.push(Older { taxonomy, label, attribute });
+        }
+    }
+    Ok(found)
+}
+
+/// Prims of a stage; those inside of instances too where these count each time.
+pub(crate) fn all_prims<'py>(
+    pxr: &Pxr<'py>,
+    stage: &Bound<'py, PyAny>,
+    instances: Instances,
+) -> PyResult<Bound<'py, PyIterator>> {
+    match instances {
+        Instances::Once => stage.call_method0("Traverse")?.try_iter(),
+        Instances::Each => {
+            let predicate = pxr.usd.call_method1("TraverseInstanceProxies", ())?;
+            stage.call_method1("Traverse", (predicate,))?.try_iter()
+        }
+    }
+}
+
 /// Semantic labels of a prim in a taxonomy.
-pub(super) fn in_taxonomy<'py>(
+pub(crate) fn in_taxonomy<'py>(
     pxr: &Pxr<'py>,
     prim: &Bound<'py, PyAny>,
     taxonomy: &str,
 ) -> PyResult<Vec<String>> {
     let name = format!("{}:{taxonomy}", tokens::LABELS);
-    let Some(labels) = value(prim, &name, &pxr.earliest()?)? else { return Ok(Vec::new()) };
-    let Ok(labels) = labels.try_iter() else { return Ok(Vec::new()) };
-    labels.map(|label| text(&label?)).collect()
+    let labels = value(prim, &name, &pxr.earliest()?)?;
+    if let Some(Ok(labels)) = labels.map(|labels| labels.try_iter()) {
+        return labels.map(|label| text(&label?)).collect();
+    }
+    let older = older(prim)?.into_iter().filter(|older| older.taxonomy == taxonomy);
+    Ok(older.map(|older| older.label).collect())
 }
 
 /// Taxonomies that a prim has labels in, in order of their names.
-pub(super) fn taxonomies(prim: &Bound<'_, PyAny>) -> PyResult<Vec<String>> {
+pub(crate) fn taxonomies(prim: &Bound<'_, PyAny>) -> PyResult<Vec<String>> {
     let properties = prim.call_method1("GetAuthoredPropertiesInNamespace", (tokens::LABELS,))?;
     let mut taxonomies = Vec::new();
     for property in properties.try_iter()? {
@@ -88,7 +194,9 @@ pub(super) fn taxonomies(prim: &Bound<'_, PyAny>) -> PyResult<Vec<String>> {
             name.strip_prefix(tokens::LABELS).and_then(|rest| rest.strip_prefix(':')).map(str::to_owned),
         );
     }
+    taxonomies.extend(older(prim)?.into_iter().map(|older| older.taxonomy));
     taxonomies.sort();
+    taxonomies.dedup();
     Ok(taxonomies)
 }
 

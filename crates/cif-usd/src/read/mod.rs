@@ -2,6 +2,7 @@
 
 mod arrays;
 mod cameras;
+mod colors;
 mod expansion;
 mod frames;
 mod joints;

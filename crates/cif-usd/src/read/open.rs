@@ -30,12 +30,27 @@ pub(crate) fn open<'py>(
     open_with_layers(pxr, path, options, Instances::Once).map(|(stage, _)| stage)
 }
 
-/// Refuses a stage whose prims are more, or nested deeper, than usd-core can take, wherever its layers lie.
-pub(crate) fn check_size(pxr: &Pxr<'_>, path: &Path) -> Result<(), UsdError> {
+/// A stage whose labels are looked for, after the same look, and whether also inside of instances: where these hold more
+/// prims than usd-core can take, each as often as it is placed, they are not looked into.
+pub(crate) fn open_for_labels<'py>(
+    pxr: &Pxr<'py>,
+    path: &Path,
+    options: ReadOptions,
+) -> Result<(Bound<'py, PyAny>, Instances), UsdError> {
+    let mut walk = Walk::new(pxr, path, options)?;
+    let layers = walk.visit(&path.to_string_lossy())?;
+    let instances = walk.check_labels()?;
+    let stage = open_unchecked(pxr, path)?;
+    drop(layers);
+    Ok((stage, instances))
+}
+
+/// As [`open_for_labels`], without opening; layers may lie anywhere, or not exist.
+pub(crate) fn check_size(pxr: &Pxr<'_>, path: &Path) -> Result<Instances, UsdError> {
     let mut walk = Walk::new(pxr, path, ReadOptions { follow_external: true })?;
     walk.skip_missing = true;
     walk.visit(&path.to_string_lossy())?;
-    walk.check_size(Instances::Once)
+    walk.check_labels()
 }
 
 /// A stage, whatever it is made of.
@@ -141,6 +156,13 @@ impl<'a, 'py> Walk<'a, 'py> {
 
     fn too_deep(&self, layer: &str, what: String) -> UsdError {
         UsdError::TooDeep { path: self.path.to_owned(), layer: layer.to_owned(), what, limit: MAX_LEVELS }
+    }
+
+    fn check_labels(&self) -> Result<Instances, UsdError> {
+        match self.check_size(Instances::Each) {
+            Ok(()) => Ok(Instances::Each),
+            Err(_) => self.check_size(Instances::Once).map(|()| Instances::Once),
+        }
     }
 
     /// Refuses what usd-core would be busy with for hours, or end the process over.

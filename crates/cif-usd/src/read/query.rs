@@ -6,7 +6,8 @@ use std::path::Path;
 use cif_scene::{LabelMatch, LabelPattern, LabelQuery};
 use pyo3::prelude::*;
 
-use super::open::open;
+use super::labels::{DirectLabels, all_prims};
+use super::open::{Instances, open_for_labels};
 use crate::find::USE_EXTENTS_HINTS;
 use crate::pxr::{self, Pxr, reason};
 use crate::{ReadOptions, UsdError, conventions, tokens};
@@ -18,8 +19,8 @@ pub(crate) fn query(
 ) -> Result<Vec<LabelMatch>, UsdError> {
     let matcher = query.matcher();
     pxr::with(|pxr| {
-        let stage = open(pxr, path, options)?;
-        let (found, known) = search(pxr, &stage, query, &matcher)
+        let (stage, instances) = open_for_labels(pxr, path, options)?;
+        let (found, known) = search(pxr, (&stage, instances), query, &matcher)
             .map_err(|error| UsdError::Unusable { path: path.to_owned(), reason: reason(pxr.py, &error) })?;
         if found.is_empty() {
             return Err(query.unknown(&path.display().to_string(), known).into());
@@ -31,50 +32,31 @@ pub(crate) fn query(
 /// Matching prims, and all labels of the stage.
 fn search<'py>(
     pxr: &Pxr<'py>,
-    stage: &Bound<'py, PyAny>,
+    (stage, instances): (&Bound<'py, PyAny>, Instances),
     query: &LabelQuery,
     matcher: &LabelPattern,
 ) -> PyResult<(Vec<LabelMatch>, Vec<String>)> {
     let time = pxr.time_code(query.time_code)?;
     let labels_api = pxr.usd_semantics.getattr("LabelsAPI")?;
     let transforms = pxr.usd_geom.getattr("XformCache")?.call1((&time,))?;
-    let purposes = vec![pxr.usd_geom.getattr("Tokens")?.getattr("default_")?];
-    let boxes = pxr.usd_geom.getattr("BBoxCache")?.call1((&time, purposes, USE_EXTENTS_HINTS))?;
-    // A query caches what it has seen: one per taxonomy.
-    let mut queries: BTreeMap<String, Bound<'py, PyAny>> = BTreeMap::new();
+    let boxes = pxr.usd_geom.getattr("BBoxCache")?.call1((&time, drawn(pxr)?, USE_EXTENTS_HINTS))?;
+    let labels = DirectLabels::new(pxr, time.clone())?;
     let (mut found, mut known) = (Vec::new(), Vec::new());
-    for prim in stage.call_method0("Traverse")?.try_iter()? {
+    for prim in all_prims(pxr, stage, instances)? {
         let prim = prim?;
-        let taxonomies: Vec<String> = labels_api
-            .call_method1("GetDirectTaxonomies", (&prim,))?
-            .try_iter()?
-            .map(|taxonomy| taxonomy?.str()?.extract())
-            .collect::<PyResult<_>>()?;
-        let mut by_taxonomy: BTreeMap<String, Vec<String>> = BTreeMap::new();
-        for taxonomy in taxonomies {
-            let labels_query = match queries.get(&taxonomy) {
-                Some(labels_query) => labels_query.clone(),
-                None => {
-                    let class = pxr.usd_semantics.getattr("LabelsQuery")?;
-                    let labels_query = class.call1((&taxonomy, &time))?;
-                    queries.insert(taxonomy.clone(), labels_query.clone());
-                    labels_query
-                }
-            };
-            let mut labels: Vec<String> = labels_query
-                .call_method1("ComputeUniqueDirectLabels", (&prim,))?
-                .try_iter()?
-                .map(|label| label?.str()?.extract())
-                .collect::<PyResult<_>>()?;
-            labels.sort();
-            by_taxonomy.insert(taxonomy, labels);
-        }
+        let by_taxonomy = labels.of(&prim)?;
         if by_taxonomy.values().flatten().any(|label| matcher.matches(label)) {
             found.push(describe(&prim, &by_taxonomy, &time, &labels_api, &transforms, &boxes)?);
         }
         known.extend(by_taxonomy.into_values().flatten());
     }
     Ok((found, known))
+}
+
+/// The purposes that renderers draw.
+pub(crate) fn drawn<'py>(pxr: &Pxr<'py>) -> PyResult<Vec<Bound<'py, PyAny>>> {
+    let tokens = pxr.usd_geom.getattr("Tokens")?;
+    ["default_", "render"].into_iter().map(|purpose| tokens.getattr(purpose)).collect()
 }
 
 fn describe<'py>(

@@ -1,11 +1,12 @@
 //! Splats of one prim: single or half precision, checked.
 
 use cif_geometry::spherical_harmonics::{BAND_0, COEFFICIENTS, coefficient_count};
-use cif_scene::assemble::Shape;
+use cif_scene::assemble::{Shape, color_range};
 use cif_scene::{IdentityShare, IdentityShares, Splats};
 use pyo3::prelude::*;
 
 use super::arrays::ArrayError;
+use super::colors;
 use super::stage::Reading;
 use super::values::{attribute, plain, samples, value};
 use crate::{UsdError, primvars, tokens};
@@ -193,10 +194,9 @@ impl<'py> SplatPrim<'py> {
         {
             return Err(bad(
                 format!("scale {index} {:?} is no standard deviation", scales[index]),
-                "scales are linear and above 0; exp of log-scales",
+                "scales are linear, 0 or more; exp of log-scales",
             ));
         }
-        let scales = scales.iter().map(|scale| scale.map(|value| value.max(f32::MIN_POSITIVE))).collect();
         Ok(Shape { means, orientations, scales })
     }
 
@@ -365,7 +365,7 @@ impl<'py> SplatPrim<'py> {
         let bad = |problem: String, fix| reading.prim_error(&self.path, problem, fix);
         let name = tokens::SH_COEFFICIENTS;
         let read = self.read(reading, name, at, |value| reading.arrays.triples(value))?;
-        let Some(coefficients) = read else { return Ok((0, Vec::new())) };
+        let Some(mut coefficients) = read else { return Ok((0, Vec::new())) };
         let size = self.source(name).map_err(python)?.map(|attribute| element_size(&attribute)).transpose();
         let size = size.map_err(python)?.flatten();
         let authored = plain::<i64>(&self.prim, tokens::SH_DEGREE, at).map_err(python)?;
@@ -400,7 +400,24 @@ impl<'py> SplatPrim<'py> {
             return Err(bad(problem, "remove that splat"));
         }
         debug_assert!(count <= COEFFICIENTS);
+        self.to_display(reading, self.source(name).map_err(python)?.as_ref(), degree, &mut coefficients)?;
         Ok((degree, coefficients))
+    }
+
+    /// Brings coefficients from the colour space of an attribute to display values.
+    fn to_display(
+        &self,
+        reading: &Reading<'_, 'py>,
+        attribute: Option<&Bound<'py, PyAny>>,
+        degree: u8,
+        coefficients: &mut [f32],
+    ) -> Result<(), UsdError> {
+        let Some(attribute) = attribute else { return Ok(()) };
+        let encoding = colors::encoding(reading, &self.path, attribute);
+        if let Some(encoding) = encoding.map_err(|error| reading.python(&error))? {
+            encoding.bring_to_display(coefficients, degree);
+        }
+        Ok(())
     }
 
     /// Display colours take the place of the DC coefficients where they were changed, or where there are none.
@@ -438,8 +455,18 @@ impl<'py> SplatPrim<'py> {
             let problem = format!("display colour {index} is not finite");
             return Err(reading.prim_error(&self.path, problem, "give it a colour"));
         }
-        if !missing && written.is_some_and(|written| written == primvars::checksum(&colors)) {
+        if written.is_some_and(|written| written == primvars::checksum(&colors)) && !missing {
             return Ok(());
+        }
+        if missing {
+            let mut warnings = Vec::new();
+            let white = color_range(colors.as_flattened().iter().copied(), &self.path, &mut warnings);
+            warnings.into_iter().for_each(|warning| reading.warn(warning));
+            for (sh, color) in coefficients.iter_mut().zip(colors.as_flattened()) {
+                *sh = ((f64::from(color / white) - 0.5) / BAND_0) as f32;
+            }
+            let attribute = attribute(&self.prim, tokens::DISPLAY_COLOR).map_err(python)?;
+            return self.to_display(reading, attribute.as_ref(), 0, coefficients);
         }
         let before = primvars::base_colors(coefficients, *degree);
         let stride = 3 * coefficient_count(*degree);
@@ -455,7 +482,7 @@ impl<'py> SplatPrim<'py> {
                 }
             }
         }
-        if !missing && changed > 0 {
+        if changed > 0 {
             reading.warn(format!("{}: {changed} splats were recoloured", self.path));
         }
         Ok(())

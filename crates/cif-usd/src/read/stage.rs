@@ -43,7 +43,11 @@ impl Reading<'_, '_> {
     }
 
     pub(super) fn warn(&self, warning: String) {
-        self.warnings.borrow_mut().push(warning);
+        let mut warnings = self.warnings.borrow_mut();
+        // Samples over time say the same again.
+        if !warnings.contains(&warning) {
+            warnings.push(warning);
+        }
     }
 }
 
@@ -61,6 +65,7 @@ struct Mark {
     omitted: Vec<String>,
     warnings: Vec<String>,
     sort: Option<String>,
+    antialiased: Option<bool>,
     frame: CaptureFrame,
     origin: Origin,
 }
@@ -142,8 +147,10 @@ fn read<'py>(
         let problem = format!("metersPerUnit is {meters_per_unit}");
         return Err(reading.prim_error("/", problem, "set it to the metres of one unit, for example 1"));
     }
-    let rate = info::<f64>(stage, "timeCodesPerSecond").map_err(failed)?;
-    let frames_per_second = rate.filter(|rate| rate.is_finite() && *rate > 0.0).unwrap_or(FRAMES_PER_SECOND);
+    // As USD plays it: the time codes per second that it says, else its frames per second, else 24.
+    let rate: f64 =
+        stage.call_method0("GetTimeCodesPerSecond").and_then(|rate| rate.extract()).map_err(failed)?;
+    let frames_per_second = if rate.is_finite() && rate > 0.0 { rate } else { FRAMES_PER_SECOND };
     let sort = match &mark.sort {
         Some(sort) => Some(sort.clone()),
         None => plain(&owners[0].splats[0].prim, "sortingModeHint", &reading.pxr.earliest().map_err(failed)?)
@@ -167,6 +174,7 @@ fn read<'py>(
             Some(tokens::SORT_CAMERA_DISTANCE) => SortMetric::Distance,
             _ => SortMetric::Z,
         },
+        antialiased: mark.antialiased,
         omitted: mark.omitted,
         warnings,
         origin: mark.origin,
@@ -252,6 +260,7 @@ fn mark(stage: &Bound<'_, PyAny>) -> PyResult<Mark> {
             omitted: strings(tokens::OMITTED)?,
             warnings: strings(tokens::WARNINGS)?,
             sort: string(tokens::SORT)?,
+            antialiased: get(tokens::ANTIALIASED)?.and_then(|value| value.extract().ok()),
             frame,
             origin: Origin {
                 field_fingerprint: string(tokens::FIELD_FINGERPRINT)?,
@@ -268,11 +277,10 @@ fn survey<'py>(
     stage: &Bound<'py, PyAny>,
 ) -> PyResult<(Vec<Owner<'py>>, Vec<Bound<'py, PyAny>>)> {
     let pxr = reading.pxr;
-    let predicate = pxr.usd.call_method1("TraverseInstanceProxies", ())?;
     let (mut found, mut cameras) = (Vec::new(), Vec::new());
     // Prototypes below a point instancer are not drawn where they stand.
     let mut instancer: Option<String> = None;
-    for prim in stage.call_method1("Traverse", (predicate,))?.try_iter()? {
+    for prim in labels::all_prims(pxr, stage, Instances::Each)? {
         let prim = prim?;
         let path = values::path(&prim)?;
         if instancer.as_ref().is_some_and(|above| path.starts_with(above.as_str())) {
@@ -293,8 +301,13 @@ fn survey<'py>(
         } else if type_name == "Camera" {
             cameras.push(prim);
         } else if type_name == tokens::GAUSSIAN_SPLAT {
+            let purpose =
+                pxr.usd_geom.getattr("Imageable")?.call1((&prim,))?.call_method0("ComputePurpose")?;
+            let purpose = text(&purpose)?;
             let splats = SplatPrim { path, prim };
-            if splats.has_positions()? {
+            if [tokens::PURPOSE_PROXY, tokens::PURPOSE_GUIDE].contains(&purpose.as_str()) {
+                reading.warn(format!("{}: its purpose is {purpose}, so that it is not read", splats.path));
+            } else if splats.has_positions()? {
                 found.push(splats);
             } else {
                 reading.warn(format!("{}: no positions, left out", splats.path));

@@ -285,7 +285,7 @@ fn copies_of_copies_are_counted_before_they_are_made() {
     let error = read_scene(&instances).unwrap_err();
     let UsdError::TooManyPrims { written: 91, prims, limit: 250_000, .. } = error else { panic!("{error}") };
     assert!(prims > 200_000_000, "{prims}");
-    // A query does not look into instances, which usd-core composes once.
+    // A query does not look into so many instances, which usd-core composes once.
     assert!(search(&instances, &ObjectQuery::default(), ReadOptions::default()).unwrap().is_empty());
     let copies = write("copies.usda", 8, false);
     let error = search(&copies, &ObjectQuery::default(), ReadOptions::default()).unwrap_err();

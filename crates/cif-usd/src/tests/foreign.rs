@@ -1,11 +1,11 @@
 //! Stages that others wrote.
 
-use cif_scene::{Motion, NodeKind, SceneGraph, Splats, UpAxis};
+use cif_scene::{LabelQuery, Motion, NodeKind, ObjectQuery, SceneGraph, Splats, UpAxis};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::damaged::stage_with;
 use super::session;
-use crate::read_scene;
+use crate::{ExportOptions, ReadOptions, export, query, read_scene, relabel, search};
 
 fn read(change: &str) -> SceneGraph {
     let folder = tempfile::tempdir().unwrap();
@@ -229,5 +229,174 @@ splats.CreateDisplayColorPrimvar('constant').Set([(1, 0.5, 0)])
     let colors = graph.nodes[0].splats.base_colors();
     for color in colors {
         assert!(color.iter().zip([1.0, 0.5, 0.0]).all(|(a, b)| (a - b).abs() < 1e-6), "{color:?}");
+    }
+}
+
+#[test]
+fn stages_are_played_at_the_rate_that_usd_plays_them_at() {
+    let _session = session();
+    let keys = "
+op = thing.AddTranslateOp()
+for t in (101, 131):
+    op.Set(Gf.Vec3d(t, 0, 0), t)
+";
+    for (says, expected) in [
+        ("", 24.0),
+        ("stage.SetFramesPerSecond(60)", 60.0),
+        ("stage.SetTimeCodesPerSecond(48)\nstage.SetFramesPerSecond(60)", 48.0),
+    ] {
+        let graph = read(&format!("{keys}{says}"));
+        assert_eq!(graph.time_codes.frames_per_second, expected, "{says}");
+        assert_eq!(graph.time_codes.samples, [101.0, 131.0]);
+        let field = cif_scene::field_from_graph(&graph, "a.usda").unwrap();
+        let back = cif_scene::build(&field, &cif_scene::SceneOptions::default()).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("b.usda");
+        export(&back, &path, ExportOptions::default()).unwrap();
+        let again = read_scene(&path).unwrap();
+        assert_eq!((again.time_codes.start(), again.time_codes.end()), (101.0, 131.0));
+        assert!((again.nodes[0].bounds(131.0).low.x - graph.nodes[0].bounds(131.0).low.x).abs() < 1e-4);
+    }
+}
+
+#[test]
+fn stand_ins_and_guides_are_no_objects() {
+    let _session = session();
+    let graph = read(
+        "
+for name, purpose in [('Drawn', 'render'), ('Light', 'proxy'), ('Help', 'guide')]:
+    group = UsdGeom.Xform.Define(stage, '/World/' + name)
+    group.CreatePurposeAttr(purpose)
+    Sdf.CopySpec(stage.GetRootLayer(), '/World/Thing/Cloud', stage.GetRootLayer(), f'/World/{name}/Cloud')
+",
+    );
+    assert_eq!(graph.nodes.len(), 2);
+    assert!(graph.nodes.iter().all(|node| node.splats.len() == 2));
+    let told: Vec<&String> = graph.warnings.iter().filter(|warning| warning.contains("purpose")).collect();
+    assert_eq!(told.len(), 2, "{:?}", graph.warnings);
+    assert!(told[0].starts_with("/World/Light/Cloud: its purpose is proxy"), "{told:?}");
+}
+
+#[test]
+fn colours_of_other_spaces_become_display_values() {
+    let _session = session();
+    let color = |graph: &SceneGraph| graph.nodes[0].splats.base_colors()[0];
+    let linear = "sh.Set([((v - 0.5) / 0.28209479,) * 3 for v in (0.2, 0.5)])\n";
+    let api = |prim: &str, space: &str| {
+        format!("Usd.ColorSpaceAPI.Apply({prim}).CreateColorSpaceNameAttr('{space}')\n")
+    };
+    let cases = [
+        (String::new(), 0.2, 0),
+        (api("prim", "lin_rec709_scene"), 0.484_529, 1),
+        (api("world.GetPrim()", "lin_rec709_scene"), 0.484_529, 1),
+        ("sh.SetColorSpace('lin_rec2020_scene')\n".to_owned(), 0.484_529, 1),
+        (api("prim", "srgb_rec709_scene"), 0.2, 0),
+        (api("prim", "raw"), 0.2, 0),
+        (api("prim", "my_own"), 0.2, 1),
+    ];
+    for (says, expected, told) in cases {
+        let graph = read(&format!("{linear}{says}"));
+        let found = color(&graph);
+        assert!(found.iter().all(|value| (value - expected).abs() < 1e-4), "{says}: {found:?}");
+        let warnings = graph.warnings.iter().filter(|warning| warning.contains("colour")).count();
+        assert_eq!(warnings, told, "{says}: {:?}", graph.warnings);
+    }
+    // Another primary is another colour, and colours of any numbers are taken by their range.
+    let graph =
+        read(&format!("{linear}sh.Set([(1.0, -1.0, -1.0)] * 2)\n{}", api("prim", "lin_rec2020_scene")));
+    let [red, green, _] = color(&graph);
+    assert!(red > 0.95 && green < 0.5, "{red} {green}");
+    let graph = read("sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(255, 51, 0)])\n");
+    assert!(color(&graph).iter().zip([1.0, 0.2, 0.0]).all(|(a, b)| (a - b).abs() < 1e-5));
+    assert!(graph.warnings[0].contains("up to 255"), "{:?}", graph.warnings);
+    let half = format!("sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(0.2, 0.2, 0.2)])\n");
+    let graph = read(&(half + &api("prim", "lin_rec709_scene")));
+    assert!((color(&graph)[0] - 0.484_529).abs() < 1e-4);
+}
+
+#[test]
+fn labels_inside_of_instances_and_of_earlier_tools_are_found() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let path = stage_with(
+        folder.path(),
+        "
+shared = stage.CreateClassPrim('/_shared')
+Sdf.CopySpec(stage.GetRootLayer(), '/World/Thing', stage.GetRootLayer(), '/_shared/Mug')
+stage.RemovePrim('/World/Thing')
+UsdSemantics.LabelsAPI.Apply(stage.GetPrimAtPath('/_shared/Mug'), 'class').CreateLabelsAttr(['mug'])
+for k in range(3):
+    copy = UsdGeom.Xform.Define(stage, f'/World/Copy{k}')
+    copy.AddTranslateOp().Set(Gf.Vec3d(3 * k, 0, 0))
+    copy.GetPrim().GetReferences().AddInternalReference('/_shared')
+    copy.GetPrim().SetInstanceable(True)
+for k, key in enumerate(['semanticData', 'semanticLabel']):
+    Sdf.CopySpec(stage.GetRootLayer(), '/_shared/Mug/Cloud', stage.GetRootLayer(), f'/World/Old{k}')
+    old = stage.GetPrimAtPath(f'/World/Old{k}')
+    for end, value in (('semanticType', 'class'), (key, 'cup')):
+        old.CreateAttribute(f'semantic:Semantics_{k}:params:{end}', Sdf.ValueTypeNames.String).Set(value)
+",
+    );
+    let labelled = |path: &std::path::Path, label: &str| -> Vec<String> {
+        let asked = LabelQuery { pattern: label.to_owned(), time_code: None };
+        let found = query(path, &asked, ReadOptions::default()).unwrap();
+        let wanted = ObjectQuery { label: Some(label.to_owned()), ..ObjectQuery::default() };
+        let searched = search(path, &wanted, ReadOptions::default()).unwrap();
+        let paths: Vec<String> = found.into_iter().map(|object| object.path).collect();
+        assert_eq!(paths, searched.into_iter().map(|object| object.found.path).collect::<Vec<_>>());
+        paths
+    };
+    assert_eq!(labelled(&path, "mug"), ["/World/Copy0/Mug", "/World/Copy1/Mug", "/World/Copy2/Mug"]);
+    assert_eq!(labelled(&path, "cup"), ["/World/Old0", "/World/Old1"]);
+    let labels = |path: &std::path::Path| -> Vec<String> {
+        read_scene(path).unwrap().nodes.into_iter().map(|node| node.label).collect()
+    };
+    assert_eq!(labels(&path), ["mug", "mug", "mug", "cup", "cup"]);
+    relabel(&path, &path, "/World/Copy1/Mug", "jug", None).unwrap();
+    let done = relabel(&path, &path, "/World/Old0", "glass", None).unwrap();
+    assert_eq!(done.before, "cup");
+    assert_eq!(labels(&path), ["mug", "jug", "mug", "glass", "cup"]);
+    assert_eq!(labelled(&path, "jug"), ["/World/Copy1/Mug"]);
+    assert_eq!(labelled(&path, "cup"), ["/World/Old1"]);
+}
+
+#[test]
+fn a_stage_far_from_its_origin_keeps_its_places() {
+    let _session = session();
+    let at = DVec3::new(500_123.25, 4_649_776.125, 215.5);
+    let place = format!("Gf.Vec3d({}, {}, {})", at.x, at.y, at.z);
+    let matrix = "Gf.Matrix4d(1).SetTranslate";
+    for far in [
+        format!("world.AddTranslateOp().Set({place})"),
+        format!("UsdGeom.Xformable(prim).AddTransformOp().Set({matrix}({place}))"),
+        format!("thing.AddTransformOp().Set({matrix}({place}))\nUsd.ModelAPI(thing).SetKind('component')"),
+    ] {
+        let graph = read(&far);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("b.usda");
+        export(&graph, &path, ExportOptions::default()).unwrap();
+        for graph in [graph, read_scene(&path).unwrap()] {
+            let (mean, _) = world(&graph, 0, 1, 0.0);
+            let found = graph.frame.capture_from_dataset(mean);
+            let expected = at + DVec3::new(1.0, 2.0, 3.0);
+            assert!((found - expected).length() < 1e-5, "{far}: {found} {expected}");
+        }
+    }
+}
+
+#[test]
+fn flat_splats_of_a_stage_stay_flat() {
+    let _session = session();
+    let graph = read("splats.GetScalesAttr().Set([(0.1, 0.2, 0), (0.3, 0, 0.1)])");
+    let scales = [[0.1, 0.2, 0.0], [0.3, 0.0, 0.1]];
+    assert_eq!(graph.nodes[0].splats.scales, scales);
+    let field = cif_scene::field_from_graph(&graph, "a.usda").unwrap();
+    let back = cif_scene::build(&field, &cif_scene::SceneOptions::default()).unwrap();
+    assert!(!back.warnings.iter().any(|warning| warning.contains("left out")), "{:?}", back.warnings);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("b.usda");
+    export(&back, &path, ExportOptions::default()).unwrap();
+    for (a, b) in read_scene(&path).unwrap().nodes[0].splats.scales.iter().zip(scales) {
+        assert!(a.iter().zip(b).all(|(a, b)| (a - b).abs() <= 1e-6 * b), "{a:?} {b:?}");
     }
 }

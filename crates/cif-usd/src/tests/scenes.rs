@@ -342,6 +342,7 @@ impl Maker {
             cameras: vec![self.camera("hand_held", true), self.camera("tripod", false)],
             background_color: [0.1, 0.2, 0.3],
             sort_metric: cif_field::SortMetric::Distance,
+            antialiased: Some(true),
             omitted: vec!["ghost".to_owned()],
             warnings: vec!["colours change".to_owned()],
             origin: Origin {

@@ -64,12 +64,12 @@ pub(super) struct Export {
     /// Sample every N-th frame
     #[arg(long, default_value_t = 1, value_name = "N")]
     frame_step: usize,
-    /// Up axis to declare; the data is not turned
-    #[arg(long, default_value = "z", value_name = "AXIS")]
-    up_axis: UpAxis,
-    /// Metres per world unit
-    #[arg(long, default_value_t = 1.0, value_name = "METRES")]
-    meters_per_unit: f64,
+    /// Up axis to declare; the data is not turned [default: that of the imported file, else z]
+    #[arg(long, value_name = "AXIS")]
+    up_axis: Option<UpAxis>,
+    /// Metres per world unit [default: that of the imported file, else 1]
+    #[arg(long, value_name = "METRES")]
+    meters_per_unit: Option<f64>,
     /// Leave out splats below this opacity [default: 1/255]
     #[arg(long, value_name = "OPACITY")]
     min_opacity: Option<f32>,

@@ -67,7 +67,7 @@ pub(super) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &
     }
     let [x, y, z] = frame.offset;
     note!(
-        "the capture was read in a frame of its own, around ({x}, {y}, {z}), lengths times {}; the root of a stage \
+        "the scene is in a frame of its own, around ({x}, {y}, {z}), lengths times {}; the root of a stage \
          or glTF file places the scene there",
         frame.scale
     );
@@ -88,7 +88,6 @@ pub(super) fn trained_downscale(field: &Field) -> Option<u32> {
 pub(super) fn time(field: &Field, place: &str, flag: &str, moment: Moment) -> Result<f64, Error> {
     note_fraction(flag, moment);
     let times = &field.timeline.times;
-    let code = Frames::of(&field.timeline, place).code(flag, moment)?;
-    let codes: Vec<f64> = (0..times.len()).map(|frame| frame as f64).collect();
-    Ok(code_at(&codes, times, code))
+    let code = Frames::of(field, place).code(flag, moment)?;
+    Ok(code_at(&field.time_codes(), times, code))
 }
