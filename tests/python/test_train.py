@@ -140,6 +140,9 @@ def test_wrong_arguments_are_named(dataset: cif.Dataset, tmp_path: Path) -> None
         cif.train(dataset, backend="abacus")
     with pytest.raises(cif.CifError, match=r"iteratons.*did you mean"):
         cif.train(dataset, settings={"stages.iteratons": 3})
+    for settings in ({"rates.opacity": float("nan")}, {"rates": {"opacity": float("inf")}}):
+        with pytest.raises(ValueError, match=r"rates.*opacity is (nan|inf)"):
+            cif.train(dataset, settings=settings)
     with pytest.raises(ValueError, match="opened"):
         cif.train(dataset, settings={"downscale": 2})
     with pytest.raises(ValueError, match="output"):

@@ -155,6 +155,7 @@ mod tests {
                 file,
                 time: None,
                 size: (640, 480),
+                turned: cif_dataset::orientation::Orientation::NoTransforms,
                 impression: Impression::of(&board(50, 0)),
                 source: None,
             });

@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use cif_dataset::VideoFrame;
 use cif_dataset::masks::files_of_video;
+use cif_dataset::{Turn, VideoFrame};
 use cif_geometry::PixelGrid;
 use image::GrayImage;
 
@@ -33,7 +33,7 @@ impl Masks {
     /// When the mask cannot be read or has another aspect than its image.
     pub fn ids(&self, shot: &Shot) -> Result<Option<PixelGrid<u16>>, Error> {
         let Some(path) = self.files.get(&shot.name) else { return Ok(None) };
-        Ok(Some(cif_dataset::masks::read_ids_at(path, &shot.file, shot.size)?))
+        Ok(Some(cif_dataset::masks::read_ids_at(path, &shot.file, shot.size, Turn::upright(shot.turned))?))
     }
 
     /// The file of labels: in the folder of masks, else beside it, as captures have it.
@@ -175,6 +175,7 @@ mod tests {
                 file: "none.png".into(),
                 time: Some(k as f64),
                 size: (32, 24),
+                turned: cif_dataset::orientation::Orientation::NoTransforms,
                 impression: Impression::of(&board(50, 0)),
                 source: Some(FrameSource {
                     file: "walk.mp4".to_owned(),

@@ -3,6 +3,7 @@
 use std::io::{self, BufReader, BufWriter};
 use std::path::Path;
 
+use cif_dataset::orientation::Orientation;
 use image::codecs::jpeg::JpegEncoder;
 use image::codecs::png::PngEncoder;
 use image::{DynamicImage, ImageDecoder, ImageEncoder, ImageFormat};
@@ -19,16 +20,18 @@ const BLOCK: usize = 20;
 /// Quality of reduced JPEG files, of 100: above it files grow faster than what is lost shrinks.
 const JPEG_QUALITY: u8 = 95;
 
-/// An image file, decoded.
+/// An image file, decoded and turned upright.
 pub(crate) struct Photograph {
     pub(crate) image: DynamicImage,
+    /// How it was turned.
+    pub(crate) turned: Orientation,
     format: ImageFormat,
     exif: Option<Vec<u8>>,
     color_profile: Option<Vec<u8>>,
 }
 
 impl Photograph {
-    /// Decodes a file.
+    /// Decodes a file, and turns the image as its EXIF says.
     ///
     /// # Errors
     /// When it is no image.
@@ -48,13 +51,16 @@ impl Photograph {
         let mut limits = image::Limits::default();
         limits.reserve(decoder.total_bytes()).map_err(refused)?;
         decoder.set_limits(limits).map_err(refused)?;
-        let exif = decoder.exif_metadata().ok().flatten();
+        let mut exif = decoder.exif_metadata().ok().flatten();
+        let turned = exif.as_mut().and_then(|exif| Orientation::remove_from_exif_chunk(exif));
+        let turned = turned.unwrap_or(Orientation::NoTransforms);
         let color_profile = decoder.icc_profile().ok().flatten();
-        let image = DynamicImage::from_decoder(decoder).map_err(refused)?;
-        Ok(Self { image, format, exif, color_profile })
+        let mut image = DynamicImage::from_decoder(decoder).map_err(refused)?;
+        image.apply_orientation(turned);
+        Ok(Self { image, turned, format, exif, color_profile })
     }
 
-    /// Width and height of the image of a file, which is not decoded.
+    /// Width and height of the image of a file as it is stored; it is not decoded.
     ///
     /// # Errors
     /// When it is no image.

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use cif_geometry::{LensDistortion, RigidTransform};
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 
 /// A lens that images share.
 #[derive(Clone, Debug, PartialEq)]
@@ -28,6 +28,71 @@ impl Lens {
             focal_px: [self.focal_px[0] * x, self.focal_px[1] * y],
             principal_px: [self.principal_px[0] * x, self.principal_px[1] * y],
             distortion: self.distortion,
+        }
+    }
+
+    /// The lens of the image turned clockwise by a quarter; without skew.
+    fn turned(&self) -> Self {
+        let [p1, p2] = self.distortion.tangential;
+        Self {
+            size: (self.size.1, self.size.0),
+            focal_px: [self.focal_px[1], self.focal_px[0]],
+            principal_px: [f64::from(self.size.1) - self.principal_px[1], self.principal_px[0]],
+            // (p2, p1) is a direction in the image, and turns with it.
+            distortion: LensDistortion { tangential: [p2, -p1], ..self.distortion },
+        }
+    }
+}
+
+/// Lens and place of a camera, in the world, for its image turned clockwise by quarters: the same rays.
+pub(crate) fn turned(
+    lens: &Lens,
+    world_from_camera: RigidTransform,
+    quarters: u32,
+) -> (Lens, RigidTransform) {
+    // What was right of the image is below, what was below is left.
+    let stored_from_turned = DMat3::from_cols(-DVec3::Y, DVec3::X, DVec3::Z);
+    (0..quarters).fold((lens.clone(), world_from_camera), |(lens, pose), _| {
+        (lens.turned(), RigidTransform { rotation: pose.rotation * stored_from_turned, ..pose })
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use glam::DVec2;
+
+    use super::*;
+
+    #[test]
+    fn a_turned_camera_sees_the_turned_image() {
+        let lens = Lens {
+            size: (64, 48),
+            focal_px: [60.0, 55.0],
+            principal_px: [30.0, 25.0],
+            distortion: LensDistortion {
+                radial: [-0.1, 0.02, 0.0, 0.0],
+                tangential: [0.01, -0.02],
+                skew_px: 0.0,
+            },
+        };
+        let place = RigidTransform {
+            rotation: DMat3::from_rotation_y(0.3) * DMat3::from_rotation_x(0.2),
+            translation: DVec3::new(1.0, 2.0, 3.0),
+        };
+        let pixel = |(lens, place): &(Lens, RigidTransform), point: DVec3| {
+            let p = place.inverse().apply(point);
+            let p = lens.distortion.distort(DVec2::new(p.x, p.y) / p.z);
+            p * DVec2::from_array(lens.focal_px) + DVec2::from_array(lens.principal_px)
+        };
+        let point = place.apply(DVec3::new(0.3, -0.2, 1.5));
+        let stored = pixel(&turned(&lens, place, 0), point);
+        for (quarters, expected) in [
+            (1, DVec2::new(48.0 - stored.y, stored.x)),
+            (2, DVec2::new(64.0 - stored.x, 48.0 - stored.y)),
+            (3, DVec2::new(stored.y, 64.0 - stored.x)),
+        ] {
+            let found = pixel(&turned(&lens, place, quarters), point);
+            assert!((found - expected).length() < 1e-9, "{quarters}: {found} {expected}");
         }
     }
 }

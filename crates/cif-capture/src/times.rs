@@ -12,11 +12,11 @@ use crate::frames::Shot;
 /// # Errors
 /// When the file cannot be read, or a line does not hold a name and a number.
 pub fn read(path: &Path) -> Result<BTreeMap<String, f64>, Error> {
-    let text = cif_input::read(path).map_err(Error::io("read", path))?;
+    let text = cif_input::read_text(path).map_err(Error::io("read", path))?;
     let text = String::from_utf8_lossy(&text);
     let mut times = BTreeMap::new();
     for (number, line) in text.lines().enumerate() {
-        let line = line.trim().trim_start_matches('\u{feff}');
+        let line = line.trim();
         if line.is_empty() || line.starts_with('#') {
             continue;
         }

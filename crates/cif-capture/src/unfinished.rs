@@ -142,6 +142,7 @@ mod tests {
                     file,
                     time: Some(f64::from(n) / 3.0),
                     size: (64, 48),
+                    turned: cif_dataset::orientation::Orientation::NoTransforms,
                     impression: Impression::of(&board(50, usize::from(n))),
                     source: Some(FrameSource {
                         file: format!("{}.mp4", source.camera),

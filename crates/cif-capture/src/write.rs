@@ -1,10 +1,11 @@
 //! The capture as a folder in nerfstudio's layout, which `cif train` and other tools take.
 
 use std::fs;
-use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use cif_dataset::Turn;
 use cif_dataset::masks::{NewFolder, read_ids, read_ids_at, write_ids};
+use cif_geometry::Bounds;
 use serde_json::{Map, Value, json};
 
 use crate::frames::Shot;
@@ -114,7 +115,7 @@ fn write_mask(from: &Path, shot: &Shot, to: &Path) -> Result<(), Error> {
     if (stored.width, stored.height) == shot.size {
         return copy(from, to);
     }
-    Ok(write_ids(to, &read_ids_at(from, &shot.file, shot.size)?)?)
+    Ok(write_ids(to, &read_ids_at(from, &shot.file, shot.size, Turn::upright(shot.turned))?)?)
 }
 
 /// Name of the mask of an image.
@@ -178,20 +179,30 @@ fn frames_per_second(shots: &[Shot]) -> Option<f64> {
     Some((1e3 / median).round() / 1e3)
 }
 
-/// Points as a binary PLY file.
+/// Distance from the origin, in sizes of the cloud, from which on floats are more than a hundred thousandth of that apart.
+const FAR: f64 = 100.0;
+
+/// Points as a binary PLY file, in double precision where they lie far from the origin, as those of surveyors do.
 fn ply(points: &[Point]) -> Vec<u8> {
+    let bounds = Bounds::around(points.iter().map(|point| point.position));
+    let largest = bounds.low.abs().max(bounds.high.abs()).max_element();
+    let is_far = largest > FAR * bounds.size().length();
+    let kind = if is_far { "double" } else { "float" };
     let mut bytes = format!(
-        "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty float x\nproperty float y\n\
-         property float z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
+        "ply\nformat binary_little_endian 1.0\nelement vertex {}\nproperty {kind} x\nproperty {kind} y\n\
+         property {kind} z\nproperty uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n",
         points.len()
     )
     .into_bytes();
     for point in points {
         for value in point.position.to_array() {
-            bytes.extend((value as f32).to_le_bytes());
+            if is_far {
+                bytes.extend(value.to_le_bytes());
+            } else {
+                bytes.extend((value as f32).to_le_bytes());
+            }
         }
-        // Writing to memory does not fail.
-        let _ = bytes.write_all(&point.color);
+        bytes.extend(point.color);
     }
     bytes
 }
@@ -204,6 +215,7 @@ mod tests {
     use super::*;
     use crate::picture::Impression;
     use crate::picture::tests::board;
+    use crate::similarity::Similarity;
     use crate::similarity::tests::arc;
 
     /// Images and poses of an arc.
@@ -219,6 +231,7 @@ mod tests {
                     file,
                     time: times.then_some(0.25 + 0.1 * k as f64),
                     size: (64, 48),
+                    turned: cif_dataset::orientation::Orientation::NoTransforms,
                     impression: Impression::of(&board(50, k)),
                     source: Some(FrameSource {
                         file: "walk.mp4".to_owned(),
@@ -280,6 +293,18 @@ mod tests {
             assert!((frame.camera.focal_px.x - 60.0).abs() < 1e-9, "{}", frame.camera.focal_px);
         }
         assert!(write(&capture, &place, &Hooks::silent()).unwrap_err().to_string().contains("already"));
+        // Far from the origin nothing is lost.
+        let far = DVec3::new(500_123.25, 4_649_776.5, 215.75);
+        let mut moved = poses.clone();
+        moved.transform(&Similarity { translation: far, ..Similarity::IDENTITY });
+        moved.points.iter_mut().enumerate().for_each(|(k, p)| p.position.x += 0.001 * k as f64);
+        let place = folder.path().join("far");
+        write(&Capture { poses: &moved, ..capture }, &place, &Hooks::silent()).unwrap();
+        let dataset = Dataset::open(&place, &OpenOptions::default()).unwrap();
+        for (point, position) in moved.points.iter().zip(&dataset.points.positions) {
+            let found = dataset.frame.capture_from_dataset(DVec3::from(position.map(f64::from)));
+            assert!((found - point.position).length() < 1e-6, "{found} {point:?}");
+        }
         // Images without times have none in the file.
         let mut untimed = shots.clone();
         untimed[3].time = None;

@@ -8,7 +8,7 @@ use glam::DVec3;
 use serde::{Deserialize, Serialize};
 
 use crate::cryptomatte::ObjectIds;
-use crate::{CaptureFrame, FrameSource};
+use crate::{CaptureFrame, FrameSource, Turn};
 
 /// The layouts that can be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -89,6 +89,8 @@ pub struct Frame {
     pub group: Option<String>,
     /// Image file.
     pub image: PathBuf,
+    /// How the pixels of its files are turned when they are loaded.
+    pub turn: Turn,
     /// Image of a recording that it was made of, where the capture says so.
     pub source: Option<FrameSource>,
     /// Mask file, where this frame has one.

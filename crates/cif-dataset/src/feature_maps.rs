@@ -72,7 +72,8 @@ impl Dataset {
                 ));
             }
         };
-        if !same_aspect((stored_width, stored_height), (width, height)) {
+        let seen = frame.turn.seen_size((stored_width, stored_height), (width, height));
+        if !same_aspect(seen, (width, height)) {
             return Err(Error::invalid(
                 path,
                 format!(
@@ -91,6 +92,7 @@ impl Dataset {
         };
         let pixels = array.values.chunks_exact(CHANNELS).map(feature).collect();
         let stored = PixelGrid::from_pixels(stored_width, stored_height, pixels);
+        let stored = frame.turn.seen(stored, (width, height));
         let map = mask::nearest_resize(&stored, width, height);
         Ok(if frame.lens.is_identity() { map } else { undistort_mask(&map, &frame.camera, &frame.lens) })
     }

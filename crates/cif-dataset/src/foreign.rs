@@ -1,17 +1,17 @@
 //! Cameras out of the files of other tools, whose images may lie elsewhere.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use cif_geometry::{LensDistortion, RigidTransform};
 use glam::DVec2;
 
 use crate::files::{listing, ply};
-use crate::formats::{DraftCamera, DraftFocal, colmap_cameras, transforms_cameras};
+use crate::formats::{DraftCamera, DraftFocal, colmap_cameras, colmap_model_in, transforms_cameras};
 use crate::points::{GREY, RawPoints};
 use crate::{Error, camera_check};
 
 /// Points: position and colour.
-pub type ColoredPoints = Vec<([f32; 3], [u8; 3])>;
+pub type ColoredPoints = Vec<([f64; 3], [u8; 3])>;
 
 /// The camera of an image, as a file tells it.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,6 +30,12 @@ pub struct NamedCamera {
     pub camera_from_world: RigidTransform,
     /// Time, in the unit of the file.
     pub time: Option<f64>,
+}
+
+/// The COLMAP model that a folder is, or holds in `sparse`, with a sentence on others that it holds: that with most images.
+#[must_use]
+pub fn find_colmap(path: &Path) -> Option<(PathBuf, Option<String>)> {
+    colmap_model_in(path).map(|chosen| (chosen.folder, chosen.note))
 }
 
 /// Cameras and points of a COLMAP model: a folder with cameras, images and points3D, text or binary.
@@ -52,7 +58,7 @@ pub fn read_transforms(path: &Path) -> Result<(Vec<NamedCamera>, ColoredPoints),
     let folder = cif_output::folder_of(path);
     let points = match ply_file.map(|name| folder.join(name)).filter(|path| listing::is_there(path)) {
         Some(path) => ply::read_points(&path)?,
-        None => RawPoints { positions: Vec::new(), colors: None },
+        None => RawPoints { positions: Vec::new(), colors: None, note: None },
     };
     Ok((cameras.collect::<Result<_, _>>()?, colored(points)))
 }
@@ -96,6 +102,6 @@ fn named(name: String, camera: DraftCamera, time: Option<f64>) -> Result<NamedCa
 
 fn colored(points: RawPoints) -> ColoredPoints {
     let colors = points.colors.unwrap_or_else(|| vec![GREY; points.positions.len()]);
-    let finite = |point: &([f32; 3], [u8; 3])| point.0.iter().all(|value| value.is_finite());
+    let finite = |point: &([f64; 3], [u8; 3])| point.0.iter().all(|value| value.is_finite());
     points.positions.into_iter().zip(colors).filter(finite).collect()
 }

@@ -55,7 +55,7 @@ impl Layout {
                 has("poses_bounds.npy") && !formats::has_rig(root) && formats::has_image_folder(root)
             }
             Self::DNerf => has("transforms_train.json") || has("transforms_test.json"),
-            Self::Colmap => formats::colmap_sparse_folder(root).is_some(),
+            Self::Colmap => formats::colmap_sparse_model(root).is_some(),
         }
     }
 

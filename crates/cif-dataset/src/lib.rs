@@ -49,6 +49,7 @@ pub mod masks;
 pub mod meant;
 pub mod motion_truth;
 mod open;
+pub mod orientation;
 mod placement;
 mod points;
 mod summary;
@@ -62,5 +63,7 @@ pub use dataset::{
 pub use error::Error;
 pub use feature_maps::feature_maps;
 pub use frame_source::{FrameSource, VideoFrame};
+pub use load::same_aspect;
 pub use motion_truth::{MotionTruth, TrueMotion};
+pub use orientation::Turn;
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

@@ -11,7 +11,7 @@ use crate::{Dataset, Error, Frame, FrameData, mask_files};
 impl Dataset {
     /// Loads image and mask of a frame.
     ///
-    /// The image is decoded, its alpha composited on `background` (display-referred, 0 to 1), reduced to the
+    /// The image is decoded and turned upright, its alpha composited on `background` (display-referred, 0 to 1), reduced to the
     /// size of the frame's camera by area averages, and freed of lens distortion and skew by bilinear
     /// resampling. The mask goes the same way by nearest neighbour only, with its original ids.
     ///
@@ -62,7 +62,7 @@ impl Dataset {
 
     fn reduced_image(&self, index: usize, background: [f32; 3]) -> Result<PixelGrid<[f32; 3]>, Error> {
         let frame = &self.frames[index];
-        let stored = image::composite(&image::decode(&frame.image)?, background);
+        let stored = image::composite(&image::decode(&frame.image, frame.turn)?, background);
         Ok(image::box_resize(&stored, frame.camera.width, frame.camera.height))
     }
 
@@ -88,7 +88,7 @@ impl Dataset {
         let frame = &self.frames[index];
         let Some(path) = &frame.confidence else { return Ok(None) };
         let (width, height) = (frame.camera.width, frame.camera.height);
-        let stored = confidence::decode(path, (width, height))?;
+        let stored = confidence::decode(path, (width, height), frame.turn)?;
         let values = without_lens(mask::nearest_resize(&stored, width, height), frame);
         Ok(Some(values.map(|value| *value as u8)))
     }
@@ -129,8 +129,8 @@ impl Dataset {
 
     fn resized_mask(&self, index: usize, path: &Path) -> Result<PixelGrid<u16>, Error> {
         let frame = &self.frames[index];
-        let stored = mask_files::decode(path, &self.mask_objects)?;
         let (width, height) = (frame.camera.width, frame.camera.height);
+        let stored = frame.turn.seen(mask_files::decode(path, &self.mask_objects)?, (width, height));
         if !same_aspect((stored.width, stored.height), (width, height)) {
             return Err(Error::MaskSize {
                 mask: path.to_owned(),
@@ -149,7 +149,8 @@ fn without_lens(values: PixelGrid<u16>, frame: &Frame) -> PixelGrid<u16> {
 }
 
 /// True when two sizes have one aspect, up to the rounding of either to whole pixels.
-pub(crate) fn same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
+#[must_use]
+pub fn same_aspect(a: (u32, u32), b: (u32, u32)) -> bool {
     let [aw, ah, bw, bh] = [a.0, a.1, b.0, b.1].map(f64::from);
     let slack = 1.0 / aw.min(ah).max(1.0) + 1.0 / bw.min(bh).max(1.0);
     ((aw * bh) / (ah * bw)).ln().abs() <= slack.min(0.1)

@@ -332,7 +332,7 @@ pub(crate) struct ResizedMasks {
     pub(crate) image_size: (u32, u32),
 }
 
-/// Checks the headers of all masks and confidences against the sizes of the images as stored.
+/// Checks the headers of all masks and confidences against the sizes of the images in their files, once upright.
 ///
 /// # Errors
 /// When a mask is no PNG, a colour image, or has another aspect than its image; when a confidence is no 8-bit grey PNG or
@@ -343,11 +343,11 @@ pub(crate) fn check_headers(frames: &[Frame], stored_sizes: &[(u32, u32)]) -> Re
     let mut result = MaskHeaders { largest_id: 0, resized: None };
     for ((frame, header), stored) in frames.iter().zip(headers).zip(stored_sizes) {
         if let Some(path) = &frame.confidence {
-            confidence::check(path, *stored)?;
+            confidence::check(path, *stored, frame.turn)?;
         }
         let (Some(header), Some(path)) = (header, &frame.mask) else { continue };
         let header = header?;
-        let size = (header.width, header.height);
+        let size = frame.turn.seen_size((header.width, header.height), *stored);
         if size.0 == 0 || size.1 == 0 || !same_aspect(size, *stored) {
             return Err(Error::MaskSize {
                 mask: path.clone(),

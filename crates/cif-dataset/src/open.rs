@@ -11,8 +11,8 @@ use crate::formats::{self, Draft, Source, some_of};
 use crate::load::{centred, reduced_size};
 use crate::mask_files::MaskFolder;
 use crate::{
-    CaptureFrame, Dataset, Error, Frame, Layout, OpenOptions, PointCloud, PointSource, Split, camera_check,
-    cryptomatte, instances, layout, mask_files, points,
+    CaptureFrame, Dataset, Error, Frame, Layout, OpenOptions, PointCloud, PointSource, Split, Turn,
+    camera_check, cryptomatte, instances, layout, mask_files, placement, points,
 };
 
 impl OpenOptions {
@@ -44,6 +44,7 @@ impl Dataset {
         draft.leave_out(root, &options.without_cameras)?;
         warnings.extend(draft.warnings.iter().cloned());
         warnings.extend(draft.unknown.clone());
+        notes.append(&mut draft.notes);
         let (frames, has_alpha, stored_sizes) = frames(root, &draft, options, &mut warnings)?;
 
         let mut times: Vec<f64> = frames.iter().map(|frame| frame.time).collect();
@@ -86,7 +87,6 @@ impl Dataset {
         }
         dataset.points = dataset.initial_points(draft.points, draft.random_box)?;
         dataset.warnings.extend(points::unseen_warning(&dataset));
-        dataset.enter_own_frame();
         Ok(dataset)
     }
 
@@ -102,7 +102,7 @@ impl Dataset {
         let sizes = dataset
             .frames
             .iter()
-            .map(|frame| image::probe(&frame.image).map(|header| (header.width, header.height)))
+            .map(|frame| image::probe(&frame.image).map(|header| header.size_in(frame.turn)))
             .collect::<Result<Vec<_>, _>>()?;
         dataset.attach_masks(Some(folder), false, &sizes, &mut Vec::new())?;
         Ok(dataset)
@@ -376,45 +376,60 @@ impl Dataset {
         Ok(())
     }
 
-    /// Points of the capture, else random ones; colours are sampled from the images where the source has none.
+    /// Points of the capture, else random ones; colours are sampled from the images where the source has none. Cameras
+    /// and points enter the frame of the dataset.
     fn initial_points(
         &mut self,
         file: Option<(points::RawPoints, PathBuf)>,
         random_box: Option<f64>,
     ) -> Result<PointCloud, Error> {
-        if let Some((mut raw, path)) = file {
-            let dropped = raw.retain_finite();
-            if dropped > 0 {
-                self.warnings
-                    .push(format!("{}: {dropped} points are not finite and are left out", path.display()));
+        let (mut positions, colors, source) = match self.measured_points(file) {
+            Some((raw, path)) => (raw.positions, raw.colors, PointSource::File(path)),
+            None => {
+                let cameras: Vec<PinholeCamera> =
+                    self.train_frames().into_iter().map(|index| self.frames[index].camera).collect();
+                (points::draw(&cameras, random_box), None, PointSource::Random)
             }
-            if raw.positions.is_empty() {
-                self.warnings.push(format!("{}: it holds no point; random ones are taken", path.display()));
-            } else if points::are_made_up(&raw) {
-                self.notes.push(format!(
-                    "{}: its {} points were drawn at random (they fill a box evenly, and colours do not depend on places), \
-                     not measured; they count as none",
-                    path.display(),
-                    raw.positions.len()
-                ));
-            } else {
-                let colors = match raw.colors {
-                    Some(colors) => colors,
-                    None => points::sample_colors(self, &raw.positions)?,
-                };
-                return Ok(PointCloud { positions: raw.positions, colors, source: PointSource::File(path) });
-            }
+        };
+        self.enter_own_frame_with(&mut positions);
+        let positions = placement::singles(positions);
+        let colors = match colors {
+            Some(colors) => colors,
+            None => points::sample_colors(self, &positions)?,
+        };
+        Ok(PointCloud { positions, colors, source })
+    }
+
+    /// The points of a file, where there are any and they were measured.
+    fn measured_points(
+        &mut self,
+        file: Option<(points::RawPoints, PathBuf)>,
+    ) -> Option<(points::RawPoints, PathBuf)> {
+        let (mut raw, path) = file?;
+        let place = path.display();
+        let dropped = raw.retain_finite();
+        if dropped > 0 {
+            self.warnings.push(format!("{place}: {dropped} points are not finite and are left out"));
         }
-        let cameras: Vec<PinholeCamera> =
-            self.train_frames().into_iter().map(|index| self.frames[index].camera).collect();
-        let positions = points::draw(&cameras, random_box);
-        let colors = points::sample_colors(self, &positions)?;
-        Ok(PointCloud { positions, colors, source: PointSource::Random })
+        if raw.positions.is_empty() {
+            self.warnings.push(format!("{place}: it holds no point; random ones are taken"));
+            return None;
+        }
+        if points::are_made_up(&raw) {
+            self.notes.push(format!(
+                "{place}: its {} points were drawn at random (they fill a box evenly, and colours do not depend on places), \
+                 not measured; they count as none",
+                raw.positions.len()
+            ));
+            return None;
+        }
+        self.notes.extend(raw.note.take().map(|note| format!("{place}: {note}")));
+        Some((raw, path))
     }
 }
 
 /// Frames with checked cameras in order of camera, time and name; whether any image has alpha; the sizes of the
-/// images as stored, in the same order.
+/// images in their files, once turned, in the same order.
 #[allow(clippy::type_complexity, reason = "one caller")]
 fn frames(
     root: &Path,
@@ -472,8 +487,10 @@ fn frames(
         let header = header?;
         has_alpha |= header.has_alpha;
         let stored = (header.width, header.height);
-        let loaded = reduced_size(header.width, header.height, reduction);
-        let (camera, lens) = camera_check::finish(&frame.camera, &frame.name, stored, loaded)?;
+        let turn = Turn::for_camera(header.orientation, stored, frame.camera.size, draft.of_stored_pixels);
+        let upright = header.size_in(turn);
+        let loaded = reduced_size(upright.0, upright.1, reduction);
+        let (camera, lens) = camera_check::finish(&frame.camera, &frame.name, upright, loaded)?;
         let camera = if options.centre_principal_point { centred(camera) } else { camera };
         if !lens.is_identity() && !camera_check::lens_covers_image(&camera, &lens) {
             uncovered.push(frame.name.as_str());
@@ -490,11 +507,12 @@ fn frames(
                 split: frame.split,
                 group: None,
                 image: frame.image.clone(),
+                turn,
                 source: draft.sources.get(&frame.name).cloned(),
                 mask: frame.mask.clone(),
                 confidence: None,
             },
-            stored,
+            upright,
         ));
     }
     if !uncovered.is_empty() {

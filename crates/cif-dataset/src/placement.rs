@@ -35,9 +35,17 @@ fn own_frame(middle: DVec3, size: f64) -> CaptureFrame {
 
 impl Dataset {
     /// Puts cameras and points into a frame of their own where the capture is far from its origin or in units far
-    /// from metres, notes it in [`Dataset::frame`] and tells it. [`Dataset::open`] does it; ordinary captures keep
-    /// their coordinates.
+    /// from metres, notes it in [`Dataset::frame`] and tells it. [`Dataset::open`] does it, before points lose precision;
+    /// ordinary captures keep their coordinates.
     pub fn enter_own_frame(&mut self) {
+        let mut points: Vec<[f64; 3]> =
+            self.points.positions.iter().map(|position| position.map(f64::from)).collect();
+        self.enter_own_frame_with(&mut points);
+        self.points.positions = singles(points);
+    }
+
+    /// The same with points that are not yet those of the dataset.
+    pub(crate) fn enter_own_frame_with(&mut self, points: &mut [[f64; 3]]) {
         let train = self.train_frames();
         let of_all: Vec<usize> = (0..self.frames.len()).collect();
         let frames = if train.is_empty() { of_all } else { train };
@@ -45,7 +53,7 @@ impl Dataset {
         let middle = centres.iter().sum::<DVec3>() / centres.len().max(1) as f64;
         // A hand-held camera hardly moves, so how far it looks counts as well.
         let mut distances: Vec<f64> =
-            self.points.positions.iter().map(|p| place(*p).distance(middle)).collect();
+            points.iter().map(|point| DVec3::from_array(*point).distance(middle)).collect();
         distances.sort_by(f64::total_cmp);
         let looks = distances.get(distances.len() / 2).copied().unwrap_or_default();
         let size = self.camera_spread().max(looks);
@@ -56,8 +64,8 @@ impl Dataset {
         for record in &mut self.frames {
             record.camera = frame.camera(&record.camera);
         }
-        for position in &mut self.points.positions {
-            *position = frame.dataset_from_capture(place(*position)).as_vec3().to_array();
+        for point in points {
+            *point = frame.dataset_from_capture(DVec3::from_array(*point)).to_array();
         }
         let mut what = Vec::new();
         if frame.offset != [0.0; 3] {
@@ -81,8 +89,9 @@ impl Dataset {
     }
 }
 
-fn place(position: [f32; 3]) -> DVec3 {
-    DVec3::from_array(position.map(f64::from))
+/// Positions in single precision.
+pub(crate) fn singles(positions: Vec<[f64; 3]>) -> Vec<[f32; 3]> {
+    positions.into_iter().map(|position| position.map(|value| value as f32)).collect()
 }
 
 #[cfg(test)]

@@ -261,7 +261,17 @@ fn sequences_take_the_points_of_their_reconstruction_where_it_is_theirs() {
     let mut poses = llff_poses(4, [WIDTH, HEIGHT], FOCAL);
     poses.chunks_exact_mut(17).for_each(|row| row[3] += 0.5);
     write(&folder.path().join("poses_bounds.npy"), npy(4, 17, &poses));
-    assert_eq!(open(&folder).points.source, PointSource::Random);
+    let dataset = open(&folder);
+    assert!(notes(&dataset, &["sparse/0", "2 points are moved", "4 cameras"]), "{:?}", dataset.notes);
+    let moved = [[1.0, -0.25, 1.0], [0.5, 0.0, 0.0]];
+    let near = |(a, b): (&[f32; 3], &[f32; 3])| a.iter().zip(b).all(|(a, b)| (a - b).abs() < 1e-5);
+    assert!(dataset.points.positions.iter().zip(&moved).all(near), "{:?}", dataset.points.positions);
+    // Other cameras.
+    poses[3] += 0.2;
+    write(&folder.path().join("poses_bounds.npy"), npy(4, 17, &poses));
+    let dataset = open(&folder);
+    assert_eq!(dataset.points.source, PointSource::Random);
+    assert!(notes(&dataset, &["sparse/0", "not taken"]), "{:?}", dataset.notes);
 }
 
 #[test]

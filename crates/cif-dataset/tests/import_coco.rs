@@ -5,7 +5,7 @@ mod support;
 
 use std::path::Path;
 
-use cif_dataset::masks::SourceKind;
+use cif_dataset::masks::{Import, SourceKind};
 use serde_json::json;
 use support::imports::*;
 use support::*;
@@ -43,6 +43,21 @@ fn coco_objects_go_by_their_tracks_and_share_a_category() {
 }
 
 #[test]
+fn boxes_without_a_mask_are_left_out_and_named() {
+    let folder = hypernerf(3);
+    let path = folder.path().join("coco.json");
+    for nothing in [json!([]), json!(null)] {
+        coco(&path, |v| v["annotations"][1]["segmentation"] = nothing);
+        let (_, _, frames) = imported(&folder, &path);
+        assert_eq!(frames[0], Some([1, 0, 0]));
+        std::fs::remove_dir_all(folder.path().join("imported")).unwrap();
+        let import = Import::open(&path, None, None, &open(&folder)).unwrap();
+        let note = import.notes.iter().find(|note| note.contains("no segmentation")).unwrap();
+        assert!(note.starts_with("1 annotations") && note.ends_with(": 2"), "{note}");
+    }
+}
+
+#[test]
 fn damaged_coco_is_refused_by_entry() {
     let folder = hypernerf(3);
     let path = folder.path().join("coco.json");
@@ -57,13 +72,22 @@ fn damaged_coco_is_refused_by_entry() {
             &["000000.jpg", "288 x 216 = 62208 pixels", "64 times", "32 x 24", "(49152)"],
         ),
         (
+            |v| {
+                v["annotations"]
+                    .as_array_mut()
+                    .unwrap()
+                    .iter_mut()
+                    .for_each(|a| a["segmentation"] = json!([]))
+            },
+            &["none of its", "segmentation", "boxes"],
+        ),
+        (
             |v| v["annotations"][1]["segmentation"]["counts"][1] = json!(999_999),
             &["annotation 2", "broken run-length"],
         ),
         (|v| v["annotations"][1]["segmentation"]["counts"] = json!("~~"), &["annotation 2", "no letter"]),
         (|v| v["annotations"][0]["category_id"] = json!(8), &["annotation 1", "category_id 8"]),
         (|v| v["annotations"][0]["image_id"] = json!(99), &["annotation 1", "image_id 99"]),
-        (|v| v["annotations"][0]["segmentation"] = json!([]), &["annotation 1", "no segmentation"]),
         (|v| v["images"][2]["width"] = json!(64), &["000002.jpg", "64 x 24", "32 x 24", "another aspect"]),
         (
             |v| v["annotations"].as_array_mut().unwrap().iter_mut().for_each(|a| a["track_id"] = json!(null)),

@@ -4,6 +4,7 @@
 //! |---|---|
 //! | [`scalar`] | which number type a formula runs in (`f32` or `f64`) |
 //! | [`transform`] | rigid transforms `a_from_b` |
+//! | [`similarity`] | similarities between worlds, and the one that fits places best |
 //! | [`quaternion`] | rotation of a (w, x, y, z) quaternion, with derivative |
 //! | [`spherical_harmonics`] | view-dependent colour basis, degrees 0 to 3, with derivative and rotation |
 //! | [`camera`] | ideal pinhole cameras |
@@ -25,6 +26,7 @@ pub mod lens;
 pub mod overlap;
 pub mod quaternion;
 pub mod scalar;
+pub mod similarity;
 pub mod spherical_harmonics;
 pub mod transform;
 pub mod up_axis;
@@ -35,5 +37,6 @@ pub use capture_frame::CaptureFrame;
 pub use grid::PixelGrid;
 pub use lens::LensDistortion;
 pub use scalar::Real;
+pub use similarity::Similarity;
 pub use transform::RigidTransform;
 pub use up_axis::UpAxis;

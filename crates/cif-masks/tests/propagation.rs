@@ -296,6 +296,7 @@ fn wall(x: f64) -> (Frame, PixelGrid<[u8; 3]>, PixelGrid<u16>) {
         split: Split::Train,
         group: None,
         image: "image.png".into(),
+        turn: cif_dataset::Turn::NONE,
         source: None,
         mask: None,
         confidence: None,

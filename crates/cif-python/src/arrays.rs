@@ -6,7 +6,7 @@ use numpy::{
 };
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyDict, PyFloat, PyList};
 
 /// Rows of an `[N, C]` array; other shapes are refused by name.
 pub(crate) fn rows<T: Element + Copy, const C: usize>(
@@ -75,11 +75,30 @@ pub(crate) fn to_python<'py>(py: Python<'py>, value: &impl serde::Serialize) -> 
     py.import("json")?.call_method1("loads", (text,))
 }
 
+/// Refuses numbers that JSON does not have, by their keys.
+fn check_finite(name: &str, value: &Bound<'_, PyAny>) -> PyResult<()> {
+    if let Ok(dictionary) = value.cast::<PyDict>() {
+        return dictionary
+            .iter()
+            .try_for_each(|(key, value)| check_finite(&format!("{name}: {key}"), &value));
+    }
+    if let Ok(list) = value.cast::<PyList>() {
+        return list.iter().try_for_each(|value| check_finite(name, &value));
+    }
+    match value.cast::<PyFloat>() {
+        Ok(number) if !number.value().is_finite() => {
+            Err(PyValueError::new_err(format!("{name} is {number}; a finite number is expected")))
+        }
+        _ => Ok(()),
+    }
+}
+
 /// A dictionary as a value.
 pub(crate) fn from_python<T: serde::de::DeserializeOwned>(
     name: &str,
     dictionary: &Bound<'_, PyDict>,
 ) -> PyResult<T> {
+    check_finite(name, dictionary.as_any())?;
     let text: String = dictionary.py().import("json")?.call_method1("dumps", (dictionary,))?.extract()?;
     serde_json::from_str(&text).map_err(|error| PyValueError::new_err(format!("{name}: {error}")))
 }

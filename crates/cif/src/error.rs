@@ -4,6 +4,8 @@ use std::path::{Path, PathBuf};
 
 use miette::{Diagnostic, NamedSource, SourceSpan};
 
+use crate::messages::plain;
+
 /// Any failure of a command.
 #[derive(Debug, thiserror::Error, Diagnostic)]
 #[non_exhaustive]
@@ -101,17 +103,17 @@ pub struct TextError {
 impl Error {
     /// A failure with advice.
     pub fn failed(message: impl Into<String>, help: impl Into<String>) -> Self {
-        Self::Failed { message: message.into(), help: Some(help.into()) }
+        Self::Failed { message: plain(&message.into()).into_owned(), help: Some(help.into()) }
     }
 
     /// A failure whose message carries its own advice.
     pub fn plain(error: impl std::fmt::Display) -> Self {
-        Self::Failed { message: error.to_string(), help: None }
+        Self::Failed { message: plain(&error.to_string()).into_owned(), help: None }
     }
 
     /// Arguments that do not fit together.
     pub fn usage(message: impl Into<String>, help: impl Into<String>) -> Self {
-        Self::Usage { message: message.into(), help: Some(help.into()) }
+        Self::Usage { message: plain(&message.into()).into_owned(), help: Some(help.into()) }
     }
 
     /// Turns an I/O error into one that names the file.

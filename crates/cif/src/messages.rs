@@ -1,6 +1,7 @@
 //! What a command says on stderr besides its answer: notes and outcomes, which `--quiet` leaves out, and warnings,
 //! which stay. Answers go to stdout.
 
+use std::borrow::Cow;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// True while a command runs that shall be quiet. One per process, as stderr is.
@@ -17,11 +18,24 @@ pub(crate) fn is_quiet() -> bool {
     QUIET.load(Ordering::Relaxed)
 }
 
+/// A text without control characters, which names of files may hold and terminals obey: they are written as in `\u{1b}`.
+pub(crate) fn plain(text: &str) -> Cow<'_, str> {
+    let is_odd = |letter: char| letter.is_control() && letter != '\n' && letter != '\t';
+    if !text.contains(is_odd) {
+        return Cow::Borrowed(text);
+    }
+    let mut shown = String::with_capacity(text.len());
+    for letter in text.chars() {
+        if is_odd(letter) { shown.extend(letter.escape_default()) } else { shown.push(letter) }
+    }
+    Cow::Owned(shown)
+}
+
 /// Prints a line on stderr unless the command is quiet: what was done, and what comes next.
 macro_rules! outcome {
     ($($message:tt)*) => {
         if !$crate::messages::is_quiet() {
-            eprintln!($($message)*);
+            eprintln!("{}", $crate::messages::plain(&format!($($message)*)));
         }
     };
 }
@@ -30,9 +44,29 @@ macro_rules! outcome {
 macro_rules! note {
     ($($message:tt)*) => {
         if !$crate::messages::is_quiet() {
-            eprintln!("note: {}", format_args!($($message)*));
+            eprintln!("note: {}", $crate::messages::plain(&format!($($message)*)));
         }
     };
 }
 
-pub(crate) use {note, outcome};
+/// Prints a warning on stderr.
+macro_rules! warning {
+    ($($message:tt)*) => {
+        eprintln!("warning: {}", $crate::messages::plain(&format!($($message)*)))
+    };
+}
+
+pub(crate) use {note, outcome, warning};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_do_not_command_terminals() {
+        assert_eq!(plain("walk \u{1b}[31m.jpg\nnext\tline"), "walk \\u{1b}[31m.jpg\nnext\tline");
+        assert!(matches!(plain("tasse é.jpg"), Cow::Borrowed(_)));
+        let told = crate::Error::plain("a\u{7}.jpg: damaged").to_string();
+        assert_eq!(told, "a\\u{7}.jpg: damaged");
+    }
+}

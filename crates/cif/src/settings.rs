@@ -123,6 +123,13 @@ impl<T: Serialize + DeserializeOwned> Layers<T> {
     fn assign(&mut self, key: &str, value: Value) -> Result<(), Rejected> {
         let known = keys(&self.table, "");
         let unknown = !known.iter().any(|name| name == key);
+        if let Some(number) = not_finite(&value).filter(|_| !unknown) {
+            return Err(Rejected {
+                unknown: false,
+                message: format!("`{key}` is {number}; a finite number is expected"),
+                help: None,
+            });
+        }
         let mut table = self.table.clone();
         let changed = insert(&mut table, key, value)
             .then(|| Value::Table(table.clone()).try_into::<T>().map_err(|error| error.message().to_owned()));
@@ -209,6 +216,16 @@ fn plain(value: &Spanned<DeValue<'_>>) -> Value {
             .replace('_', "")
             .parse()
             .map_or_else(|_| Value::String(number.as_str().to_owned()), Value::Float),
+    }
+}
+
+/// A number in a value that is none, or infinite.
+fn not_finite(value: &Value) -> Option<f64> {
+    match value {
+        Value::Float(number) => (!number.is_finite()).then_some(*number),
+        Value::Array(values) => values.iter().find_map(not_finite),
+        Value::Table(table) => table.values().find_map(not_finite),
+        _ => None,
     }
 }
 
@@ -380,6 +397,10 @@ mod tests {
         let error = layers.assignment("fine.itertions=1").unwrap_err();
         assert!(error.to_string().starts_with("--set fine.itertions: unknown key"), "{error}");
         assert!(layers.assignment("fine.iterations").is_err());
+        for value in ["nan", "-inf"] {
+            let error = layers.assignment(&format!("rate={value}")).unwrap_err().to_string();
+            assert!(error.starts_with("--set rate: ") && error.contains("finite"), "{error}");
+        }
         let config = layers.finish();
         assert_eq!(
             (config.fine.iterations, config.fine.mode, config.limit),

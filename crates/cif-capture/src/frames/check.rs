@@ -118,6 +118,7 @@ mod tests {
             file: name.into(),
             time: None,
             size,
+            turned: cif_dataset::orientation::Orientation::NoTransforms,
             impression: Impression::of(&board(side, shift)),
             source: None,
         }

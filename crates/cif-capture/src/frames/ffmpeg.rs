@@ -37,13 +37,14 @@ pub(super) fn run<T: Send>(
 ) -> Result<T, Error> {
     let Pass { program, source, filter, output } = *pass;
     let shown = source.path.display();
+    let name = cif_input::for_ffmpeg(&source.path).map_err(Error::io("read", &source.path))?;
     // `-fps_mode` is known from 5.1 on, `-vsync` until 7.
     for mode in ["-fps_mode", "-vsync"] {
         let mut command = Command::new(program);
         // Levels of lines tell errors from the rest; colours of terminals would be in the way.
         command.env("AV_LOG_FORCE_NOCOLOR", "1").env_remove("AV_LOG_FORCE_COLOR");
         command.args(["-nostdin", "-hide_banner", "-nostats", "-loglevel", "level+info", "-i"]);
-        command.arg(&source.path).args(["-an", "-sn", "-dn", "-vf", filter, mode, "passthrough"]);
+        command.arg(&name).args(["-an", "-sn", "-dn", "-vf", filter, mode, "passthrough"]);
         command.args(output).arg("-");
         let mut errors = Vec::new();
         let lines = |text: &str| {

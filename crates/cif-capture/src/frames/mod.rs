@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 pub use check::{Notes, check, is_fixed};
 pub use choose::Choice;
 use cif_dataset::FrameSource;
+use cif_dataset::orientation::Orientation;
 pub(crate) use photographs::remember;
 
 use crate::picture::Impression;
@@ -32,6 +33,8 @@ pub struct Shot {
     pub time: Option<f64>,
     /// Width and height, pixels.
     pub size: (u32, u32),
+    /// How the pixels of a photograph were turned to be upright, by its EXIF.
+    pub turned: Orientation,
     /// Its looks from afar.
     pub impression: Impression,
     /// Photograph, or frame of a video, that it was made of; `None` where it is not known.

@@ -1,9 +1,11 @@
-//! Photographs, which keep their names.
+//! Photographs, which keep their names. All that follows sees them upright, so that poses, masks and other tools are of
+//! the same pixels whether they know EXIF or not.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use cif_dataset::FrameSource;
+use cif_dataset::orientation::Orientation;
 use rayon::prelude::*;
 
 use super::{Choice, Notes, Shot};
@@ -12,7 +14,7 @@ use crate::source::Source;
 use crate::{Error, Hooks};
 
 /// The photographs of a camera in name order; such that show nothing are left out. Larger ones than wanted are reduced
-/// below `folder`, all others stay where they are.
+/// and those that lie on their side turned upright below `folder`, all others stay where they are.
 pub(super) fn read(
     source: &Source,
     files: &[PathBuf],
@@ -40,13 +42,15 @@ pub(super) fn read(
     let read: Vec<_> = files.par_iter().map(|file| read_one(file, choice.max_side, &into, hooks)).collect();
     let mut shots = Vec::new();
     let mut empty = Vec::new();
+    let mut upright = 0;
     for read in read {
-        let Read { name, file, size, stored, impression } = read?;
+        let Read { name, file, size, turned, whole, impression } = read?;
         if impression.is_empty() {
             empty.push(name);
             continue;
         }
-        let own = |file: &String| FrameSource { file: file.clone(), size: stored, video: None };
+        upright += usize::from(turned != Orientation::NoTransforms);
+        let own = |file: &String| FrameSource { file: file.clone(), size: whole, video: None };
         shots.push(Shot {
             camera: source.camera.clone(),
             source: Some(known.remove(&name).unwrap_or_else(|| own(&name))),
@@ -54,8 +58,16 @@ pub(super) fn read(
             file,
             time: None,
             size,
+            turned,
             impression,
         });
+    }
+    if upright > 0 {
+        notes.push(format!(
+            "{}: {upright} of {} photographs are turned upright, as their EXIF says",
+            source.path.display(),
+            files.len()
+        ));
     }
     if !empty.is_empty() {
         notes.push(format!(
@@ -104,28 +116,43 @@ fn remembered(folder: &Path) -> Result<BTreeMap<String, FrameSource>, Error> {
 /// A photograph as it is taken.
 struct Read {
     name: String,
-    /// The photograph, or its reduction.
+    /// The photograph, or what was made of it.
     file: PathBuf,
     size: (u32, u32),
-    /// Width and height of the photograph.
-    stored: [u32; 2],
+    /// How its pixels were turned.
+    turned: Orientation,
+    /// Width and height of the photograph, upright.
+    whole: [u32; 2],
     impression: Impression,
 }
 
 fn read_one(file: &Path, max_side: Option<u32>, into: &Path, hooks: &Hooks<'_>) -> Result<Read, Error> {
     hooks.go_on()?;
     let name = file.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    cif_output::check_name(&name).map_err(|problem| {
+        Error::refused(
+            format!(
+                "{}: the name of the photograph {name:?} {problem}",
+                cif_output::folder_of(file).display()
+            ),
+            "rename it: its name becomes part of those of other files",
+        )
+    })?;
     let mut photograph = Photograph::read(file)?;
-    let stored = [photograph.image.width(), photograph.image.height()];
+    let whole = [photograph.image.width(), photograph.image.height()];
     let impression = Impression::of_image(&photograph.image);
-    let mut taken = file.to_owned();
-    if let Some(side) = max_side.filter(|side| stored[0].max(stored[1]) > *side) {
+    let turned = photograph.turned;
+    let too_large = max_side.filter(|side| whole[0].max(whole[1]) > *side);
+    if let Some(side) = too_large {
         photograph.reduce(side);
+    }
+    let mut taken = file.to_owned();
+    if too_large.is_some() || turned != Orientation::NoTransforms {
         taken = into.join(&name);
         photograph.write(&taken)?;
     }
     let size = (photograph.image.width(), photograph.image.height());
-    Ok(Read { name, file: taken, size, stored, impression })
+    Ok(Read { name, file: taken, size, turned, whole, impression })
 }
 
 #[cfg(test)]
@@ -134,6 +161,54 @@ mod tests {
     use image::{ImageDecoder, ImageEncoder, ImageReader, Rgb, RgbImage};
 
     use super::*;
+
+    /// Facts of EXIF with an orientation alone.
+    fn orientation(exif: u8) -> Vec<u8> {
+        let mut facts = b"II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0".to_vec();
+        facts.extend([exif, 0, 0, 0, 0, 0, 0, 0]);
+        facts
+    }
+
+    #[test]
+    fn photographs_are_taken_upright() {
+        let folder = tempfile::tempdir().unwrap();
+        let photos = folder.path().join("photos");
+        std::fs::create_dir(&photos).unwrap();
+        let path = photos.join("a.jpg");
+        // A quarter clockwise shows what is white on the left above.
+        let stored = RgbImage::from_fn(64, 48, |x, _| if x < 32 { Rgb([250; 3]) } else { Rgb([5; 3]) });
+        let mut encoder = JpegEncoder::new_with_quality(std::fs::File::create(&path).unwrap(), 95);
+        encoder.set_exif_metadata(orientation(6)).unwrap();
+        stored.write_with_encoder(encoder).unwrap();
+        let source = Source { camera: "walk".into(), path: photos, photographs: None };
+        let mut notes = Notes::new();
+        let into = folder.path().join("frames");
+        let files = [path.clone()];
+        let shots =
+            read(&source, &files, "", &Choice::default(), &into, &Hooks::silent(), &mut notes).unwrap();
+        assert_eq!((shots[0].size, shots[0].turned), ((48, 64), Orientation::Rotate90));
+        assert_eq!(shots[0].source.as_ref().unwrap().size, [48, 64]);
+        assert!(notes.iter().any(|note| note.contains("1 of 1") && note.contains("upright")), "{notes:?}");
+        let mut taken = ImageReader::open(&shots[0].file).unwrap().into_decoder().unwrap();
+        assert_eq!(taken.orientation().unwrap(), Orientation::NoTransforms, "turned once, not twice");
+        let upright = image::open(&shots[0].file).unwrap().into_rgb8();
+        assert_eq!(upright.dimensions(), (48, 64));
+        assert!(upright.get_pixel(24, 3)[0] > 200 && upright.get_pixel(24, 60)[0] < 60);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn names_with_control_characters_are_refused_and_shown_safely() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a\u{1b}[31m.png");
+        RgbImage::new(8, 8).save(&path).unwrap();
+        let source = Source { camera: "walk".into(), path: folder.path().into(), photographs: None };
+        let into = folder.path().join("frames");
+        let read = read(&source, &[path], "", &Choice::default(), &into, &Hooks::silent(), &mut Notes::new());
+        let told = read.unwrap_err().to_string();
+        assert!(told.contains("control characters") && told.contains("\\u{1b}"), "{told}");
+        assert!(!told.contains('\u{1b}'), "{told:?}");
+    }
 
     #[test]
     fn larger_photographs_are_reduced_and_keep_their_facts() {

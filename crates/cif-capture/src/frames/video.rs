@@ -5,6 +5,7 @@ use std::io::{self, BufReader, Read};
 use std::path::Path;
 use std::sync::{Mutex, PoisonError, mpsc};
 
+use cif_dataset::orientation::Orientation;
 use cif_dataset::{FrameSource, VideoFrame};
 use image::ImageEncoder;
 use image::codecs::png::PngEncoder;
@@ -90,6 +91,7 @@ fn read_with(
             file: into.join(name),
             time: Some(seen[*k].time - start),
             size: written,
+            turned: Orientation::NoTransforms,
             impression: seen[*k].impression.clone(),
             source: Some(FrameSource {
                 file: source.file_name(),

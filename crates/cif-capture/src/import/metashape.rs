@@ -5,6 +5,9 @@
 //! Axes and unit are those of the chunk's reference, the origin is that of its transform: georeferenced worlds
 //! begin in the middle of the earth. Whether the unit is a metre and +z is up, the file does not tell for
 //! certain.
+//!
+//! Of a rig, the master camera has a pose at each moment, and the sensors of the others have a rotation and a location in
+//! it, the same at all moments.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -47,18 +50,41 @@ pub(super) fn read(path: &Path) -> Result<Imported, Error> {
         .filter(|node| node.has_tag_name("sensor"))
         .filter_map(|node| Some((node.attribute("id")?, node)))
         .collect();
+    let nodes: Vec<Node<'_, '_>> = chunk.descendants().filter(|node| node.has_tag_name("camera")).collect();
+    let by_id: BTreeMap<&str, Node<'_, '_>> =
+        nodes.iter().filter_map(|node| Some((node.attribute("id")?, *node))).collect();
     let mut cameras = Vec::new();
-    for node in chunk.descendants().filter(|node| node.has_tag_name("camera")) {
-        let Some(camera) = camera(node, &sensors).map_err(&refused)? else { continue };
-        cameras.push(camera);
+    let mut unplaced = Vec::new();
+    for node in nodes.iter().filter(|node| !is_off(**node)) {
+        match camera(*node, &sensors, &by_id).map_err(&refused)? {
+            Some(camera) => cameras.push(camera),
+            None => unplaced.extend(node.attribute("label")),
+        }
+    }
+    let mut notes = Vec::new();
+    if !unplaced.is_empty() {
+        notes.push(format!(
+            "{}: {} cameras were not aligned and have no pose, the first is {}",
+            path.display(),
+            unplaced.len(),
+            unplaced[0]
+        ));
     }
     let worlds = worlds(chunk).map_err(&refused)?;
     // Components without a place in the world have nothing to do with each other.
     let largest = largest(&cameras);
+    let aligned = cameras.len();
     cameras.retain(|camera| {
         camera.component == largest
             || (world_of(&worlds, camera.component).is_some() && world_of(&worlds, largest).is_some())
     });
+    if cameras.len() < aligned {
+        notes.push(format!(
+            "{}: {} of {aligned} cameras belong to other components than most, and are left out",
+            path.display(),
+            aligned - cameras.len()
+        ));
+    }
     let origin = world_of(&worlds, largest).map_or(DVec3::ZERO, |world| world.translation);
     let mut poses = Poses::default();
     for camera in cameras {
@@ -74,33 +100,94 @@ pub(super) fn read(path: &Path) -> Result<Imported, Error> {
     if poses.images.is_empty() {
         return Err(refused("none of its cameras is enabled and aligned".to_owned()));
     }
-    Ok(Imported { poses, times: BTreeMap::new(), tool: "Metashape", metres_known: false, up_known: false })
+    Ok(Imported {
+        poses,
+        times: BTreeMap::new(),
+        tool: "Metashape",
+        metres_known: false,
+        up_known: false,
+        of_stored_pixels: true,
+        notes,
+    })
 }
 
-/// A camera; `None` where it is switched off or was not aligned.
+fn is_off(camera: Node<'_, '_>) -> bool {
+    matches!(camera.attribute("enabled"), Some("0" | "false" | "False"))
+}
+
+/// A camera; `None` where neither it nor, in a rig, its master was aligned.
 fn camera<'a>(
     node: Node<'a, 'a>,
     sensors: &BTreeMap<&str, Node<'a, 'a>>,
+    cameras: &BTreeMap<&str, Node<'a, 'a>>,
 ) -> Result<Option<Camera<'a>>, String> {
     let Some(label) = node.attribute("label") else { return Ok(None) };
-    let is_off = matches!(node.attribute("enabled"), Some("0" | "false" | "False"));
-    let (false, Some(transform)) = (is_off, child(node, "transform")) else { return Ok(None) };
     let of_camera = |problem: String| format!("camera {label}: {problem}");
-    let m = numbers::<16>(transform).map_err(of_camera)?;
+    let sensor_of = |node: Node<'a, 'a>| {
+        node.attribute("sensor_id")
+            .and_then(|id| sensors.get(id).copied())
+            .ok_or_else(|| of_camera("its sensor is not in the file".to_owned()))
+    };
+    let component = |node: Node<'a, 'a>| node.attribute("component_id");
+    if let Some(transform) = child(node, "transform") {
+        let chunk_from_camera = pose(transform).map_err(of_camera)?;
+        return Ok(Some(Camera {
+            label,
+            sensor: sensor_of(node)?,
+            component: component(node),
+            chunk_from_camera,
+        }));
+    }
+    let master = node.attribute("master_id").filter(|id| node.attribute("id") != Some(id));
+    let Some(master) = master else { return Ok(None) };
+    let master = cameras
+        .get(master)
+        .copied()
+        .ok_or_else(|| of_camera(format!("the master of its rig, {master}, is not in the file")))?;
+    let Some(transform) = child(master, "transform") else { return Ok(None) };
+    let sensor = sensor_of(node)?;
+    let master_from_camera = place_in_rig(sensor).map_err(of_camera)?;
+    let chunk_from_master = pose(transform).map_err(of_camera)?;
+    Ok(Some(Camera {
+        label,
+        sensor,
+        component: component(node).or(component(master)),
+        chunk_from_camera: chunk_from_master.compose(&master_from_camera),
+    }))
+}
+
+/// The pose of a camera in the chunk.
+fn pose(transform: Node<'_, '_>) -> Result<RigidTransform, String> {
+    let m = numbers::<16>(transform)?;
     // Rows; the camera has x right, y down, z forwards.
     let column = |c: usize| DVec3::new(m[c], m[4 + c], m[8 + c]);
-    let chunk_from_camera = RigidTransform {
+    let pose = RigidTransform {
         rotation: DMat3::from_cols(column(0), column(1), column(2)),
         translation: column(3),
     };
-    if chunk_from_camera.orthonormality_error() > 1e-3 {
-        return Err(of_camera("its pose is no rigid transform".to_owned()));
+    if pose.orthonormality_error() > 1e-3 {
+        return Err("its pose is no rigid transform".to_owned());
     }
-    let sensor = node
-        .attribute("sensor_id")
-        .and_then(|id| sensors.get(id))
-        .ok_or_else(|| of_camera("its sensor is not in the file".to_owned()))?;
-    Ok(Some(Camera { label, sensor: *sensor, component: node.attribute("component_id"), chunk_from_camera }))
+    Ok(pose)
+}
+
+/// Where a sensor lies in the master of its rig.
+fn place_in_rig(sensor: Node<'_, '_>) -> Result<RigidTransform, String> {
+    let has_numbers = |node: &Node<'_, '_>| node.text().is_some_and(|text| !text.trim().is_empty());
+    let of = |name: &str| child(sensor, name).filter(has_numbers);
+    let (Some(rotation), Some(location)) = (of("rotation"), of("location")) else {
+        return Err(
+            "its sensor has no rotation and location in its rig; let Metashape estimate both".to_owned()
+        );
+    };
+    let place = RigidTransform {
+        rotation: DMat3::from_cols_array(&numbers::<9>(rotation)?).transpose(),
+        translation: DVec3::from_array(numbers::<3>(location)?),
+    };
+    if place.orthonormality_error() > 1e-3 {
+        return Err("the rotation of its sensor in the rig is none".to_owned());
+    }
+    Ok(place)
 }
 
 /// The component with most cameras, of equal ones the first.
@@ -289,6 +376,33 @@ mod tests {
             assert!(near(pose.translation, DVec3::new(2.0, -6.0, 4.0)), "{pose:?}");
             assert!(near(pose.rotation * -DVec3::Y, DVec3::Z), "{pose:?}");
         }
+    }
+
+    #[test]
+    fn cameras_of_a_rig_are_placed_in_their_master() {
+        // A slave half a unit right of the master, turned to its right.
+        let slave = SENSOR.replace("id=\"0\"", "id=\"1\" master_id=\"0\"").replace(
+            "</sensor>",
+            "<rotation>0 0 1 0 1 0 -1 0 0</rotation><location>0.5 0 0</location></sensor>",
+        );
+        let cameras = [
+            r#"<camera id="1" sensor_id="0" label="left.jpg"><transform>"#,
+            POSE,
+            r#"</transform></camera><camera id="2" sensor_id="1" master_id="1" label="right.jpg"/>"#,
+            r#"<camera id="3" sensor_id="0" label="lost.jpg"/>"#,
+            r#"<camera id="4" sensor_id="1" master_id="3" label="lost too.jpg"/>"#,
+        ];
+        let text = document(&format!("{SENSOR}{slave}"), "", &cameras.concat());
+        let found = read_text(&text).unwrap();
+        assert_eq!(found.poses.images.keys().collect::<Vec<_>>(), ["left.jpg", "right.jpg"]);
+        let [master, slave] =
+            ["left.jpg", "right.jpg"].map(|name| found.poses.images[name].world_from_camera);
+        assert!(near(slave.translation, master.apply(DVec3::new(0.5, 0.0, 0.0))), "{slave:?}");
+        assert!(near(slave.rotation * DVec3::Z, master.rotation * DVec3::X), "it looks to the right");
+        assert!(found.notes[0].contains("2 cameras were not aligned"), "{:?}", found.notes);
+        let told = read_text(&text.replace("<location>0.5 0 0</location>", "<location fixed=\"true\"/>"));
+        let told = told.unwrap_err().to_string();
+        assert!(told.contains("right.jpg") && told.contains("location"), "{told}");
     }
 
     #[test]

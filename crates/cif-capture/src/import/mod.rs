@@ -4,10 +4,14 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use cif_dataset::foreign::{self, NamedCamera};
+use cif_dataset::orientation::{Orientation, turned_size};
+use cif_dataset::{Turn, same_aspect};
+use cif_geometry::RigidTransform;
+use glam::DVec2;
 
 use crate::Error;
 use crate::frames::Shot;
-use crate::poses::{Lens, Point, Pose, Poses};
+use crate::poses::{Lens, Point, Pose, Poses, turned};
 use crate::times::entry;
 
 mod metashape;
@@ -29,6 +33,11 @@ pub struct Imported {
     pub metres_known: bool,
     /// True where +z is up.
     pub up_known: bool,
+    /// True where poses are of the pixels as files store them, unless the sizes of the cameras tell otherwise; false where
+    /// the tool turns photographs upright, as their EXIF says.
+    pub of_stored_pixels: bool,
+    /// What was left out, and how images were turned, one sentence each.
+    pub notes: Vec<String>,
 }
 
 /// Reads poses for images, whose sizes some tools do not write.
@@ -38,18 +47,15 @@ pub struct Imported {
 pub fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
     let is_there = |name: &str| path.join(name).exists();
     let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
-    if let Some(folder) = ["", "0", "sparse/0", "sparse", "colmap/sparse/0"]
-        .iter()
-        .map(|name| path.join(name))
-        .find(|folder| ["cameras.bin", "cameras.txt"].iter().any(|name| folder.join(name).is_file()))
-    {
+    if let Some((folder, note)) = foreign::find_colmap(path) {
         let (cameras, points) = foreign::read_colmap(&folder)?;
-        return imported(cameras, points, "COLMAP");
+        let found = imported(cameras, points, "COLMAP", true)?;
+        return Ok(Imported { notes: note.into_iter().collect(), ..found });
     }
     if is_there("transforms.json") || ending.as_deref() == Some("json") {
         let file = if path.is_dir() { path.join("transforms.json") } else { path.to_owned() };
         let (cameras, points) = foreign::read_transforms(&file)?;
-        return imported(cameras, points, "nerfstudio");
+        return imported(cameras, points, "nerfstudio", false);
     }
     if let Some(cameras) = polycam::folder(path) {
         return polycam::read(&cameras);
@@ -71,8 +77,9 @@ pub fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
 /// Cameras and points as this crate has them.
 fn imported(
     cameras: Vec<NamedCamera>,
-    points: Vec<([f32; 3], [u8; 3])>,
+    points: Vec<([f64; 3], [u8; 3])>,
     tool: &'static str,
+    of_stored_pixels: bool,
 ) -> Result<Imported, Error> {
     let mut poses = Poses::default();
     let mut times = BTreeMap::new();
@@ -92,16 +99,15 @@ fn imported(
         times.extend(camera.time.map(|time| (camera.name.clone(), time)));
         add(&mut poses, camera.name, lens, camera.camera_from_world.inverse());
     }
-    let point = |(position, color): ([f32; 3], [u8; 3])| Point {
-        position: glam::DVec3::from(position.map(f64::from)),
-        color,
-    };
+    let point =
+        |(position, color): ([f64; 3], [u8; 3])| Point { position: glam::DVec3::from(position), color };
     poses.points = points.into_iter().map(point).collect();
-    Ok(Imported { poses, times, tool, metres_known: false, up_known: false })
+    let (metres_known, up_known) = (false, false);
+    Ok(Imported { poses, times, tool, metres_known, up_known, of_stored_pixels, notes: Vec::new() })
 }
 
 /// Adds a camera; equal lenses are one.
-fn add(poses: &mut Poses, name: String, lens: Lens, world_from_camera: cif_geometry::RigidTransform) {
+fn add(poses: &mut Poses, name: String, lens: Lens, world_from_camera: RigidTransform) {
     let number = poses.lenses.iter().position(|known| *known == lens).unwrap_or_else(|| {
         poses.lenses.push(lens);
         poses.lenses.len() - 1
@@ -110,20 +116,30 @@ fn add(poses: &mut Poses, name: String, lens: Lens, world_from_camera: cif_geome
 }
 
 impl Imported {
-    /// The same poses under the names of the images of a capture, with times where the file has them and the
-    /// images do not.
+    /// The same poses under the names of the images of a capture, which are upright, with times where the file has them and
+    /// the images do not.
     ///
     /// # Errors
-    /// When no image has a pose.
-    pub fn matched(self, path: &Path, shots: &mut [Shot]) -> Result<Self, Error> {
-        let mut images = BTreeMap::new();
+    /// When no image has a pose, or a camera is of another aspect than its image.
+    pub fn matched(mut self, path: &Path, shots: &mut [Shot]) -> Result<Self, Error> {
+        let mut matched = Poses::default();
+        let mut turned = 0;
         for shot in shots.iter_mut() {
             if let Some(pose) = entry(&self.poses.images, &shot.name) {
-                images.insert(shot.name.clone(), *pose);
+                let (lens, place, quarters) =
+                    self.upright(pose, shot).map_err(|problem| of_image(path, shot, problem))?;
+                turned += usize::from(quarters > 0);
+                add(&mut matched, shot.name.clone(), lens, place);
                 shot.time = shot.time.or_else(|| entry(&self.times, &shot.name).copied());
             }
         }
-        if images.is_empty() {
+        if turned > 0 {
+            self.notes.push(format!(
+                "{}: its cameras are of the pixels as {turned} photographs store them, and are turned with these",
+                path.display()
+            ));
+        }
+        if matched.images.is_empty() {
             let (image, known) = (
                 shots.first().map(|shot| shot.name.as_str()).unwrap_or_default(),
                 self.poses.images.keys().next().map(String::as_str).unwrap_or_default(),
@@ -133,6 +149,39 @@ impl Imported {
                 "give the images that these poses were found with, under the same names",
             ));
         }
-        Ok(Self { poses: Poses { images, ..self.poses }, ..self })
+        matched.points = self.poses.points;
+        Ok(Self { poses: matched, ..self })
     }
+
+    /// Lens and place of an image that is upright, and the quarters by which they were turned.
+    fn upright(&self, pose: &Pose, shot: &Shot) -> Result<(Lens, RigidTransform, u32), String> {
+        let lens = &self.poses.lenses[pose.lens];
+        let stored = turned_size(shot.turned, shot.size);
+        let (width, height) = lens.size;
+        let size = DVec2::new(f64::from(width), f64::from(height));
+        let turn = Turn::for_camera(shot.turned, stored, Some(size), self.of_stored_pixels);
+        let quarters = match shot.turned {
+            _ if turn.image == shot.turned => 0,
+            Orientation::Rotate90 => 1,
+            Orientation::Rotate180 => 2,
+            Orientation::Rotate270 => 3,
+            _ => return Err("its EXIF mirrors it, and its pose is of the image as it is stored".to_owned()),
+        };
+        let (lens, place) = turned(lens, pose.world_from_camera, quarters);
+        if !same_aspect(lens.size, shot.size) {
+            let (seen_width, seen_height) = shot.size;
+            return Err(format!(
+                "its camera is for {width} x {height} pixels, the image has {seen_width} x {seen_height}: another aspect"
+            ));
+        }
+        Ok((lens, place, quarters))
+    }
+}
+
+/// The error of an image whose pose does not fit it.
+fn of_image(path: &Path, shot: &Shot, problem: String) -> Error {
+    Error::refused(
+        format!("{}: {}: {problem}", path.display(), shot.name),
+        "give the images that these poses were found with, neither cropped nor turned, or correct the size of the camera",
+    )
 }

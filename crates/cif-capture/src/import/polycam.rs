@@ -42,7 +42,7 @@ pub(super) fn read(folder: &Path) -> Result<Imported, Error> {
     files.sort();
     let (mut poses, mut times) = (Poses::default(), BTreeMap::new());
     for file in &files {
-        let text = cif_input::read(file).map_err(Error::io("read", file))?;
+        let text = cif_input::read_text(file).map_err(Error::io("read", file))?;
         let damaged = |problem: String| {
             Error::refused(format!("{}: {problem}", file.display()), "export the scan again, with raw data")
         };
@@ -79,7 +79,15 @@ pub(super) fn read(folder: &Path) -> Result<Imported, Error> {
             "export the scan again, with raw data",
         ));
     }
-    Ok(Imported { poses, times, tool: "Polycam", metres_known: true, up_known: true })
+    Ok(Imported {
+        poses,
+        times,
+        tool: "Polycam",
+        metres_known: true,
+        up_known: true,
+        of_stored_pixels: true,
+        notes: Vec::new(),
+    })
 }
 
 #[cfg(test)]

@@ -17,11 +17,10 @@ use crate::times::entry;
 const FILM_MM: f64 = 36.0;
 
 pub(super) fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
-    let bytes = cif_input::read(path).map_err(Error::io("read", path))?;
+    let bytes = cif_input::read_text(path).map_err(Error::io("read", path))?;
     let text = String::from_utf8_lossy(&bytes);
     let mut lines = text.lines().enumerate().filter(|(_, line)| !line.trim().is_empty());
-    let heading =
-        lines.next().map(|(_, line)| line.trim().trim_start_matches('\u{feff}')).unwrap_or_default();
+    let heading = lines.next().map(|(_, line)| line.trim()).unwrap_or_default();
     let columns: Vec<&str> = heading.split(',').map(str::trim).collect();
     let refused = |problem: String| {
         Error::refused(
@@ -85,6 +84,8 @@ pub(super) fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
         tool: "RealityCapture",
         metres_known: false,
         up_known: true,
+        of_stored_pixels: false,
+        notes: Vec::new(),
     })
 }
 
@@ -108,6 +109,7 @@ mod tests {
             file: name.into(),
             time: None,
             size: (1000, 500),
+            turned: cif_dataset::orientation::Orientation::NoTransforms,
             impression: Impression::of(&board(50, 0)),
             source: None,
         };

@@ -16,6 +16,7 @@ fn shot(name: &str) -> Shot {
         file: name.into(),
         time: None,
         size: (64, 48),
+        turned: Orientation::NoTransforms,
         impression: Impression::of(&board(50, 0)),
         source: None,
     }
@@ -80,4 +81,55 @@ fn what_is_of_no_tool_is_refused_with_those_that_are_known() {
         problem.contains("no poses") && fix.contains("COLMAP") && fix.contains("Polycam"),
         "{problem} {fix}"
     );
+}
+
+/// Where the pose of the only camera of a COLMAP model sees a point, in an image of this size that was turned so.
+fn seen(
+    root: &Path,
+    size: (u32, u32),
+    turned: Orientation,
+) -> Result<((u32, u32), [f64; 2], Vec<String>), Error> {
+    let mut shots = [Shot { size, turned, ..shot("one.png") }];
+    let found = read(root, &shots)?.matched(root, &mut shots)?;
+    let pose = found.poses.images["one.png"];
+    let lens = found.poses.lenses[pose.lens].scaled(size);
+    // 0.25 right of, 0.5 below and 2 before the camera of the model.
+    let point = DVec3::new(-1.0 + 0.25, -2.0 + 0.5, -3.0 + 2.0);
+    let p = pose.world_from_camera.inverse().apply(point);
+    let pixel = [0, 1].map(|k| lens.focal_px[k] * p[k] / p.z + lens.principal_px[k]);
+    Ok((lens.size, pixel, found.notes))
+}
+
+#[test]
+fn poses_of_stored_pixels_turn_with_their_photographs() {
+    let root = tempfile::tempdir().unwrap();
+    let camera = |text: &str| fs::write(root.path().join("cameras.txt"), text).unwrap();
+    fs::write(root.path().join("images.txt"), "1 1 0 0 0 1 2 3 1 one.jpg\n\n").unwrap();
+    // Seen in the stored image, of 64 x 48, at (30, 20) + 40 * (0.125, 0.25) = (35, 30).
+    camera("1 PINHOLE 64 48 40 40 30 20\n");
+    for (turned, size, pixel) in [
+        (Orientation::NoTransforms, (64, 48), [35.0, 30.0]),
+        (Orientation::Rotate90, (48, 64), [18.0, 35.0]),
+        (Orientation::Rotate180, (64, 48), [29.0, 18.0]),
+        (Orientation::Rotate270, (48, 64), [30.0, 29.0]),
+    ] {
+        let (of, found, notes) = seen(root.path(), size, turned).unwrap();
+        assert_eq!(of, size);
+        assert!((0..2).all(|k| (found[k] - pixel[k]).abs() < 1e-9), "{turned:?}: {found:?}");
+        assert_eq!(notes.len(), usize::from(turned != Orientation::NoTransforms), "{notes:?}");
+    }
+    let told = seen(root.path(), (48, 64), Orientation::Rotate90FlipH).unwrap_err().to_string();
+    assert!(told.contains("one.png") && told.contains("mirrors"), "{told}");
+    // Of photographs that were turned upright before.
+    camera("1 PINHOLE 96 128 80 80 50 60\n");
+    let (_, found, notes) = seen(root.path(), (48, 64), Orientation::Rotate90).unwrap();
+    assert!(
+        (0..2).all(|k| (found[k] - [30.0, 40.0][k]).abs() < 1e-9) && notes.is_empty(),
+        "{found:?} {notes:?}"
+    );
+    for turned in [Orientation::NoTransforms, Orientation::Rotate90] {
+        camera("1 PINHOLE 60 60 80 80 30 30\n");
+        let told = seen(root.path(), (48, 64), turned).unwrap_err().to_string();
+        assert!(told.contains("60 x 60") && told.contains("48 x 64") && told.contains("aspect"), "{told}");
+    }
 }

@@ -4,9 +4,10 @@
 //! on as they are, may come without any.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use cif_dataset::Dataset;
+use cif_dataset::orientation::Orientation;
+use cif_dataset::{Dataset, Frame};
 use cif_geometry::PinholeCamera;
 use rayon::prelude::*;
 
@@ -66,7 +67,7 @@ pub fn points_of_capture(
     let is_rig = dataset.is_rig();
     let count = if is_rig { train.len() } else { train.len().min(IMAGES_OF_WALK) };
     let frames: Vec<usize> = (0..count).map(|k| train[k * train.len() / count.max(1)]).collect();
-    let (shots, poses) = known(dataset, &frames)?;
+    let (shots, poses) = known(dataset, &frames, work)?;
     let kept = work.join("kept");
     std::fs::create_dir_all(&kept).map_err(Error::io("create", &kept))?;
     let request = Request {
@@ -89,15 +90,29 @@ pub fn points_of_capture(
     points(&request, &poses, &neighbours(&cameras), SEEN_AT_TIMES, hooks)
 }
 
+/// The image of a frame as COLMAP is to read it, which knows no EXIF, and its size: turned ones are written below `work`.
+fn image_of(frame: &Frame, index: usize, work: &Path) -> Result<(PathBuf, (u32, u32)), Error> {
+    if frame.turn.image == Orientation::NoTransforms {
+        return Ok((frame.image.clone(), Photograph::size(&frame.image)?));
+    }
+    let folder = work.join("upright");
+    std::fs::create_dir_all(&folder).map_err(Error::io("create", &folder))?;
+    let ending = frame.image.extension().unwrap_or_default();
+    let file = folder.join(index.to_string()).with_extension(ending);
+    let photograph = Photograph::read(&frame.image)?;
+    photograph.write(&file)?;
+    Ok((file, (photograph.image.width(), photograph.image.height())))
+}
+
 /// Frames of a capture as images with poses, by the names of the frames.
-fn known(dataset: &Dataset, frames: &[usize]) -> Result<(Vec<Shot>, Poses), Error> {
+fn known(dataset: &Dataset, frames: &[usize], work: &Path) -> Result<(Vec<Shot>, Poses), Error> {
     let mut poses = Poses::default();
     let mut shots = Vec::with_capacity(frames.len());
-    let sizes: Vec<(u32, u32)> = frames
+    let images: Vec<(PathBuf, (u32, u32))> = frames
         .par_iter()
-        .map(|index| Photograph::size(&dataset.frames[*index].image))
+        .map(|index| image_of(&dataset.frames[*index], *index, work))
         .collect::<Result<_, _>>()?;
-    for (index, size) in frames.iter().zip(sizes) {
+    for (index, (file, size)) in frames.iter().zip(images) {
         let frame = &dataset.frames[*index];
         let lens = Lens {
             size: (frame.camera.width, frame.camera.height),
@@ -114,9 +129,10 @@ fn known(dataset: &Dataset, frames: &[usize]) -> Result<(Vec<Shot>, Poses), Erro
         shots.push(Shot {
             camera: frame.camera_name.clone(),
             name: frame.name.clone(),
-            file: frame.image.clone(),
+            file,
             time: Some(frame.time),
             size,
+            turned: frame.turn.image,
             impression: Impression::unknown(),
             source: None,
         });
@@ -257,6 +273,7 @@ mod tests {
                     name,
                     time: *time,
                     size: (64, 48),
+                    turned: cif_dataset::orientation::Orientation::NoTransforms,
                     impression: Impression::of(&board(50, k)),
                     source: None,
                 });

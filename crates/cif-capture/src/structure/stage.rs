@@ -115,6 +115,7 @@ mod tests {
                     time: None,
                     source: None,
                     size: (64, 48),
+                    turned: cif_dataset::orientation::Orientation::NoTransforms,
                     impression: Impression::of(&board(50, 0)),
                 }
             })

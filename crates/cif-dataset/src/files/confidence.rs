@@ -8,12 +8,13 @@ use png::{BitDepth, ColorType};
 use super::mask;
 use crate::Error;
 use crate::load::same_aspect;
+use crate::orientation::Turn;
 
 /// Checks the header of a confidence against the size of its image.
 ///
 /// # Errors
 /// When the file is missing, no 8-bit grey PNG, or has another aspect than its image.
-pub(crate) fn check(path: &Path, image_size: (u32, u32)) -> Result<(), Error> {
+pub(crate) fn check(path: &Path, image_size: (u32, u32), turn: Turn) -> Result<(), Error> {
     let refused = |problem: String| Err(Error::Confidence { path: path.to_owned(), problem });
     let reader = mask::open_png(path).map_err(of_confidence)?;
     let info = reader.info();
@@ -21,7 +22,7 @@ pub(crate) fn check(path: &Path, image_size: (u32, u32)) -> Result<(), Error> {
         return refused("it is not 8-bit grey".to_owned());
     }
     let (width, height) = (info.width, info.height);
-    if width == 0 || height == 0 || !same_aspect((width, height), image_size) {
+    if width == 0 || height == 0 || !same_aspect(turn.seen_size((width, height), image_size), image_size) {
         let (image_width, image_height) = image_size;
         return refused(format!(
             "it has {width} x {height} pixels, its image {image_width} x {image_height}: another aspect"
@@ -30,13 +31,13 @@ pub(crate) fn check(path: &Path, image_size: (u32, u32)) -> Result<(), Error> {
     Ok(())
 }
 
-/// Decodes a confidence: the stored value of every pixel, 0 to 255.
+/// Decodes a confidence: the value of every pixel of the image, 0 to 255.
 ///
 /// # Errors
 /// As [`check`], and when the file is truncated.
-pub(crate) fn decode(path: &Path, image_size: (u32, u32)) -> Result<PixelGrid<u16>, Error> {
-    check(path, image_size)?;
-    mask::decode(path).map_err(of_confidence)
+pub(crate) fn decode(path: &Path, image_size: (u32, u32), turn: Turn) -> Result<PixelGrid<u16>, Error> {
+    check(path, image_size, turn)?;
+    Ok(turn.seen(mask::decode(path).map_err(of_confidence)?, image_size))
 }
 
 /// The error of a mask file, told of a confidence.

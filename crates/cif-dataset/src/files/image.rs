@@ -9,13 +9,23 @@ use image::{DynamicImage, ImageDecoder, ImageReader};
 
 use super::MAX_DEFLATE_RATIO;
 use crate::Error;
+use crate::orientation::{Orientation, Turn, turned_size};
 
-/// Size of an image, and whether it has alpha, from its header.
+/// Size of an image as it is stored, how it is to be turned, and whether it has alpha, from its header.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct ImageHeader {
     pub(crate) width: u32,
     pub(crate) height: u32,
     pub(crate) has_alpha: bool,
+    /// Of its EXIF facts.
+    pub(crate) orientation: Orientation,
+}
+
+impl ImageHeader {
+    /// Width and height of the image of a frame that turns it.
+    pub(crate) fn size_in(&self, turn: Turn) -> (u32, u32) {
+        turned_size(turn.image, (self.width, self.height))
+    }
 }
 
 fn problem(path: &Path) -> impl Fn(image::ImageError) -> Error + '_ {
@@ -34,7 +44,7 @@ fn open(path: &Path) -> Result<ImageReader<BufReader<File>>, Error> {
 pub(crate) fn probe(path: &Path) -> Result<ImageHeader, Error> {
     let reader = open(path)?;
     let png = reader.format() == Some(image::ImageFormat::Png);
-    let decoder = reader.into_decoder().map_err(problem(path))?;
+    let mut decoder = reader.into_decoder().map_err(problem(path))?;
     let (width, height) = decoder.dimensions();
     if width == 0 || height == 0 {
         return Err(Error::Image { path: path.to_owned(), problem: "it has no pixels".to_owned() });
@@ -49,9 +59,11 @@ pub(crate) fn probe(path: &Path) -> Result<ImageHeader, Error> {
     }
     if png && !ends_with_iend(path)? {
         // Bytes after the end are legal, so that only decoding can tell.
-        decode(path)?;
+        open(path)?.decode().map_err(problem(path))?;
     }
-    Ok(ImageHeader { width, height, has_alpha })
+    // EXIF that cannot be read says nothing.
+    let orientation = decoder.orientation().unwrap_or(Orientation::NoTransforms);
+    Ok(ImageHeader { width, height, has_alpha, orientation })
 }
 
 /// True when a PNG file ends with its IEND chunk.
@@ -64,12 +76,14 @@ fn ends_with_iend(path: &Path) -> Result<bool, Error> {
     Ok(tail.starts_with(b"IEND"))
 }
 
-/// Decodes an image.
+/// Decodes the image of a frame.
 ///
 /// # Errors
 /// When the file is missing, truncated or no image.
-pub(crate) fn decode(path: &Path) -> Result<DynamicImage, Error> {
-    open(path)?.decode().map_err(problem(path))
+pub(crate) fn decode(path: &Path, turn: Turn) -> Result<DynamicImage, Error> {
+    let mut image = open(path)?.decode().map_err(problem(path))?;
+    image.apply_orientation(turn.image);
+    Ok(image)
 }
 
 /// Linear RGB triples in 0..255 of display-referred values, alpha composited on `background` (0 to 1).

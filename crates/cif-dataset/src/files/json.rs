@@ -18,7 +18,7 @@ pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<T, Error> {
     if size > MAX_BYTES {
         return Err(Error::invalid(path, format!("{size} bytes are too many for a JSON file of a capture")));
     }
-    let text = cif_input::read(path).map_err(Error::read(path))?;
+    let text = cif_input::read_text(path).map_err(Error::read(path))?;
     serde_json::from_slice(&text).map_err(|error| Error::Json {
         path: path.to_owned(),
         line: error.line(),

@@ -8,18 +8,29 @@ use ply_rs_bw::ply::{
     ElementDef, Encoding, Property, PropertyAccess, PropertyAccessResult, PropertyType, ScalarType,
 };
 
-use super::super::points::RawPoints;
+use super::super::points::{RawPoints, by_range};
 use crate::Error;
 
 #[derive(Clone, Copy)]
 struct Vertex {
-    position: [f32; 3],
-    color: [u8; 3],
+    position: [f64; 3],
+    color: [f64; 3],
+}
+
+/// A number of any type.
+fn number(value: &Property) -> Option<f64> {
+    match value {
+        Property::Double(value) => Some(*value),
+        Property::Int(value) => Some(f64::from(*value)),
+        Property::UInt(value) => Some(f64::from(*value)),
+        // Floats hold all smaller types exactly.
+        other => other.to_f32_lossy().map(f64::from),
+    }
 }
 
 impl PropertyAccess for Vertex {
     fn new() -> Self {
-        Self { position: [f32::NAN; 3], color: [128; 3] }
+        Self { position: [f64::NAN; 3], color: [0.0; 3] }
     }
 
     fn set_property(&mut self, name: &str, value: Property) -> PropertyAccessResult {
@@ -34,13 +45,13 @@ impl PropertyAccess for Vertex {
                     "blue" | "b" | "diffuse_blue" => 2,
                     _ => return PropertyAccessResult::Ignored,
                 };
-                if let Some(value) = value.to_u8_color_lossy() {
+                if let Some(value) = number(&value) {
                     self.color[channel] = value;
                 }
                 return PropertyAccessResult::Set;
             }
         };
-        if let Some(value) = value.to_f32_lossy() {
+        if let Some(value) = number(&value) {
             self.position[position] = value;
         }
         PropertyAccessResult::Set
@@ -77,20 +88,44 @@ pub(crate) fn read_points(path: &Path) -> Result<RawPoints, Error> {
             parser.read_payload_for_element(&mut reader, element, &header).map_err(damaged)?;
             continue;
         }
-        let has = |wanted: &[&str]| wanted.iter().any(|wanted| element.properties.contains_key(*wanted));
+        let kind = |wanted: &[&str]| {
+            let property = wanted.iter().find_map(|wanted| element.properties.get(*wanted))?;
+            Some(property.data_type.clone())
+        };
+        let has = |wanted: &[&str]| kind(wanted).is_some();
         if !(has(&["x"]) && has(&["y"]) && has(&["z"])) {
             return Err(Error::invalid(path, "its vertices have no x, y and z"));
         }
-        let colored = has(&["red", "r", "diffuse_red"])
-            && has(&["green", "g", "diffuse_green"])
-            && has(&["blue", "b", "diffuse_blue"]);
+        let red = kind(&["red", "r", "diffuse_red"]);
+        let colored = has(&["green", "g", "diffuse_green"]) && has(&["blue", "b", "diffuse_blue"]);
         let vertices = parser.read_payload_for_element(&mut reader, element, &header).map_err(damaged)?;
+        let colors = red.filter(|_| colored).map(|kind| {
+            let values: Vec<[f64; 3]> = vertices.iter().map(|vertex| vertex.color).collect();
+            colors(&values, &kind)
+        });
+        let (colors, note) = colors.unzip();
         return Ok(RawPoints {
             positions: vertices.iter().map(|vertex| vertex.position).collect(),
-            colors: colored.then(|| vertices.iter().map(|vertex| vertex.color).collect()),
+            colors,
+            note: note.flatten(),
         });
     }
     Err(Error::invalid(path, "it has no element `vertex`; a point cloud is expected"))
+}
+
+/// Colours of the numbers of a type, and how they were taken where it is not the one of bytes.
+fn colors(values: &[[f64; 3]], kind: &PropertyType) -> (Vec<[u8; 3]>, Option<String>) {
+    use ScalarType::{Char, Double, Float, UChar};
+    let (PropertyType::Scalar(scalar) | PropertyType::List(_, scalar)) = kind;
+    if matches!(scalar, Char | UChar) {
+        // Bytes that were declared with a sign.
+        let byte = |value: f64| if value < 0.0 { value + 256.0 } else { value } as u8;
+        return (values.iter().map(|color| color.map(byte)).collect(), None);
+    }
+    let is_fraction = matches!(scalar, Float | Double);
+    let (colors, end) = by_range(values, !is_fraction);
+    let what = if is_fraction { "fractions" } else { "whole numbers" };
+    (colors, Some(format!("its colours are {what} up to {end}")))
 }
 
 /// Fewest bytes that one element can take.

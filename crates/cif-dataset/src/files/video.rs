@@ -75,13 +75,15 @@ fn frames_with(
     };
     let output = Command::new(ffmpeg)
         .args(["-nostdin", "-v", "error", "-i"])
-        .arg(video)
+        .arg(cif_input::for_ffmpeg(video).map_err(Error::read(video))?)
         .args(["-frames:v", &wanted.most.to_string()])
         .args(wanted.size.iter().flat_map(|[width, height]| {
             ["-vf".to_owned(), format!("scale='min(iw,{width})':'min(ih,{height})':flags=area")]
         }))
         .args(["-start_number", "0"])
-        .arg(partial.join("%04d.png"))
+        // Numbers are put wherever the name has a `%`, the folders included: these are left out of it.
+        .arg("%04d.png")
+        .current_dir(&partial)
         .output();
     let output = match output {
         Ok(output) => output,
@@ -168,6 +170,29 @@ mod tests {
         let wanted = Extraction { most: 300, size: None };
         let error = frames_with(program.as_os_str(), root.path(), &video, root.path(), wanted).unwrap_err();
         assert!(error.to_string().ends_with("moov atom not found; Invalid data"), "{error}");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn names_of_videos_and_folders_have_no_meaning_of_their_own() {
+        use std::os::unix::fs::PermissionsExt;
+
+        let outer = tempfile::tempdir().unwrap();
+        let program = outer.path().join("stand-in");
+        let script = "#!/bin/sh\nfor last; do :; done\necho \"$@\" > 0000.png\necho \"$last\" > 0001.png\n";
+        std::fs::write(&program, script).unwrap();
+        std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+        let root = outer.path().join("50%d");
+        std::fs::create_dir(&root).unwrap();
+        let wanted = Extraction { most: 3, size: None };
+        for name in ["-cam.mp4", "cam:0.mp4", "100%03d.mp4"] {
+            let video = root.join(name);
+            std::fs::write(&video, b"no video").unwrap();
+            let found = frames_with(program.as_os_str(), &root, &video, &root, wanted).unwrap();
+            let text = |path: &Path| std::fs::read_to_string(path).unwrap();
+            assert!(text(&found[0]).contains(&format!("-i file:{}", video.display())), "{}", text(&found[0]));
+            assert_eq!(text(&found[1]).trim(), "%04d.png", "no folder is part of the pattern");
+        }
     }
 
     #[cfg(unix)]

@@ -61,7 +61,8 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
             });
         }
     }
-    for (frame, time) in frames.iter_mut().zip(transforms::normalised_times(&train, &times)?) {
+    let times = transforms::times(&train, &times)?;
+    for (frame, time) in frames.iter_mut().zip(times.normalised) {
         frame.time = time;
     }
     Ok(Draft {
@@ -69,7 +70,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         stored_reduction: 1,
         points: customary_points(root)?,
         random_box: Some(BOX),
-        frames_per_second,
+        frames_per_second: frames_per_second.or(times.per_second),
         warnings,
         unused,
         ..Draft::default()

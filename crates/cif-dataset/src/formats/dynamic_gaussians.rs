@@ -14,7 +14,7 @@ use serde::Deserialize;
 use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, customary_points, transforms};
 use crate::files::npy::{Archive, Elements};
 use crate::files::{json, listing};
-use crate::points::RawPoints;
+use crate::points::{RawPoints, by_range};
 use crate::{Error, Split};
 
 /// A file of cameras: `[times][images]`.
@@ -204,11 +204,14 @@ fn points(root: &Path) -> Result<Option<(RawPoints, PathBuf)>, Error> {
         }
     };
     let rows = || array.values.chunks_exact(columns);
-    let color = |value: f64| (255.0 * value).round().clamp(0.0, 255.0) as u8;
+    let colors: Vec<[f64; 3]> = rows().map(|row| [row[3], row[4], row[5]]).collect();
+    let (colors, end) = by_range(&colors, false);
+    let note = (end > 1.0).then(|| format!("its colours go to {end}, not 1, and are taken so"));
     Ok(Some((
         RawPoints {
-            positions: rows().map(|row| [row[0] as f32, row[1] as f32, row[2] as f32]).collect(),
-            colors: Some(rows().map(|row| [color(row[3]), color(row[4]), color(row[5])]).collect()),
+            positions: rows().map(|row| [row[0], row[1], row[2]]).collect(),
+            colors: Some(colors),
+            note,
         },
         path,
     )))

@@ -11,7 +11,7 @@ use cif_geometry::LensDistortion;
 use glam::{DMat3, DVec2, DVec3};
 use serde::Deserialize;
 
-use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, customary_points, some_of, world_to_camera};
+use super::{Draft, DraftCamera, DraftFocal, DraftFrame, Source, colmap, some_of, world_to_camera};
 use crate::files::{json, listing};
 use crate::{Error, Split};
 
@@ -95,7 +95,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let frames_per_second =
         if listing::is_there(&extra_path) { json::read::<Extra>(&extra_path)?.fps } else { None };
     let mut frames = Vec::with_capacity(splits.len());
-    let mut last_warp = 0;
+    let (mut first_warp, mut last_warp) = (u64::MAX, 0);
     let mut without_image = Vec::new();
     for (id, split) in &splits {
         let entry = metadata.get(id).ok_or_else(|| {
@@ -107,7 +107,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         let warp = entry.warp_id.ok_or_else(|| {
             Error::invalid(&metadata_path, format!("frame {id} has no warp_id, which gives its time; add it"))
         })?;
-        last_warp = last_warp.max(warp);
+        (first_warp, last_warp) = (first_warp.min(warp), last_warp.max(warp));
         let camera_path = root.join("camera").join(format!("{id}.json"));
         let image = listing::with_image_extension(&images.join(id));
         let image = match (image, listing::is_there(&camera_path)) {
@@ -129,6 +129,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         frames.push(DraftFrame {
             name: id.clone(),
             camera_name: format!("camera_{}", entry.camera_id),
+            // Shifted and scaled below, once the first and last are known.
             time: warp as f64,
             split: *split,
             image,
@@ -137,7 +138,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         });
     }
     for frame in &mut frames {
-        frame.time /= last_warp.max(1) as f64;
+        frame.time = (frame.time - first_warp as f64) / (last_warp - first_warp).max(1) as f64;
     }
     if !without_image.is_empty() {
         warnings.push(format!(
@@ -153,12 +154,15 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         let folder = images.strip_prefix(root).unwrap_or(&images);
         unused.push(format!("{unlisted} images in {} that dataset.json does not list", folder.display()));
     }
+    let mut notes = Vec::new();
+    let points = colmap::points_beside(root, &frames, &mut notes, &mut warnings)?;
     Ok(Draft {
         frames,
         stored_reduction: reduction,
-        points: customary_points(root)?,
+        points,
         frames_per_second,
         warnings,
+        notes,
         unused,
         ..Draft::default()
     })

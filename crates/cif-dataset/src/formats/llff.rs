@@ -10,7 +10,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::{Draft, DraftCamera, DraftFrame, Source, colmap, customary_points, poses_bounds, some_of};
+use super::{Draft, DraftCamera, DraftFrame, Source, colmap, poses_bounds, some_of};
 use crate::files::{image, listing};
 use crate::{Error, Split};
 
@@ -100,15 +100,10 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         })
         .collect();
     let mut warnings = Vec::new();
-    let points = match customary_points(root)? {
-        Some(points) => Some(points),
-        None => colmap::points_among(root, &frames).unwrap_or_else(|error| {
-            warnings.push(format!("{error}; the points of the reconstruction are not used"));
-            None
-        }),
-    };
+    let mut notes = Vec::new();
+    let points = colmap::points_beside(root, &frames, &mut notes, &mut warnings)?;
     frames.extend(seen_by_others);
-    Ok(Draft { frames, stored_reduction, points, warnings, unused, ..Draft::default() })
+    Ok(Draft { frames, stored_reduction, points, warnings, notes, unused, ..Draft::default() })
 }
 
 /// Place of every image in the sequence: numbers that outgrow their leading zeros come last.

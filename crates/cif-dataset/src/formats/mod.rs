@@ -16,7 +16,9 @@ mod neu3d;
 mod poses_bounds;
 mod transforms;
 
-pub(crate) use colmap::{named_cameras as colmap_cameras, sparse_folder as colmap_sparse_folder};
+pub(crate) use colmap::{
+    model_in as colmap_model_in, named_cameras as colmap_cameras, sparse_model as colmap_sparse_model,
+};
 pub(crate) use llff::has_image_folder;
 pub(crate) use neu3d::has_rig;
 pub(crate) use transforms::named_cameras as transforms_cameras;
@@ -51,10 +53,14 @@ pub(crate) struct Draft {
     /// Cameras of [`OpenOptions::without_cameras`] that the reader left out itself.
     pub(crate) left_out: Vec<String>,
     pub(crate) warnings: Vec<String>,
+    /// Findings and decisions of the reader.
+    pub(crate) notes: Vec<String>,
     /// Parts of the capture that are left out, such as "12 images that dataset.json does not list".
     pub(crate) unused: Vec<String>,
     /// Recordings that frames were made of, by the name of the frame, where they are known.
     pub(crate) sources: BTreeMap<String, FrameSource>,
+    /// Cameras are of the pixels as image files store them, where sizes do not tell that they are of upright ones.
+    pub(crate) of_stored_pixels: bool,
     /// Facts of its world that the capture does not know.
     pub(crate) unknown: Option<String>,
 }

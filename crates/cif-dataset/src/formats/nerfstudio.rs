@@ -21,10 +21,10 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let folder = transforms::common_folder(inner.iter().map(PathBuf::as_path));
     let folders: BTreeSet<PathBuf> = file.frames.iter().map(|entry| folder_of(&entry.file_path)).collect();
     let times: Vec<Option<f64>> = file.frames.iter().map(|entry| entry.time).collect();
-    let times = transforms::normalised_times(&path, &times)?;
+    let times = transforms::times(&path, &times)?;
     let mut frames = Vec::with_capacity(file.frames.len());
     let mut sources = BTreeMap::new();
-    for ((entry, inner), time) in file.frames.iter().zip(&inner).zip(times) {
+    for ((entry, inner), time) in file.frames.iter().zip(&inner).zip(times.normalised) {
         let inner = inner.strip_prefix(&folder).unwrap_or(inner);
         let name = transforms::frame_name(inner);
         if let Some(source) = &entry.cif {
@@ -90,7 +90,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         frames,
         stored_reduction: 1,
         points,
-        frames_per_second: file.fps,
+        frames_per_second: file.fps.or(times.per_second),
         unused,
         sources,
         unknown: file.cif.and_then(unknown),

@@ -9,8 +9,8 @@ use cif_geometry::LensDistortion;
 use glam::{DMat3, DVec2, DVec3};
 
 use super::{DraftCamera, DraftFocal, world_to_camera};
-use crate::Error;
 use crate::files::{image, npy};
+use crate::{Error, Turn};
 
 /// The file's name.
 pub(super) const NAME: &str = "poses_bounds.npy";
@@ -78,11 +78,13 @@ fn camera(path: &Path, row: &[f64], opengl: bool) -> DraftCamera {
 pub(super) fn stored_reduction(camera: &DraftCamera, path: &Path) -> Result<u32, Error> {
     let Some(captured) = camera.size else { return Ok(1) };
     let header = image::probe(path)?;
-    let factor = (captured.x / f64::from(header.width)).round();
+    let stored = (header.width, header.height);
+    let (width, height) = header.size_in(Turn::for_camera(header.orientation, stored, Some(captured), false));
+    let factor = (captured.x / f64::from(width)).round();
     if !(1.0..=64.0).contains(&factor) {
         return Ok(1);
     }
     let rounded = |captured: f64, stored: u32| (captured / factor - f64::from(stored)).abs() <= 1.0;
-    let fits = rounded(captured.x, header.width) && rounded(captured.y, header.height);
+    let fits = rounded(captured.x, width) && rounded(captured.y, height);
     Ok(if fits { factor as u32 } else { 1 })
 }

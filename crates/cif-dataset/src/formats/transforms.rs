@@ -215,25 +215,81 @@ pub(super) fn camera(path: &Path, file: &TransformsFile, entry: &FrameEntry) -> 
     })
 }
 
-/// Normalises times to [0, 1] by the largest: `t = time / max time`; all zero when the capture has no times.
+/// Times of frames, of a clock that may begin anywhere.
+pub(super) struct Times {
+    /// From 0 for the first to 1 for the last, `[frames]`; all zero when the capture has no times.
+    pub(super) normalised: Vec<f64>,
+    /// Moments per second, where the times are seconds: those that end beyond 1 and are not whole, as numbers of frames are.
+    pub(super) per_second: Option<f64>,
+}
+
+/// Normalises times: `t = (time - first) / (last - first)`.
 ///
 /// # Errors
-/// When only some frames have a time, or one is negative or not finite.
-pub(super) fn normalised_times(path: &Path, times: &[Option<f64>]) -> Result<Vec<f64>, Error> {
+/// When only some frames have a time, or one is not finite.
+pub(super) fn times(path: &Path, times: &[Option<f64>]) -> Result<Times, Error> {
     if times.iter().all(Option::is_none) {
-        return Ok(vec![0.0; times.len()]);
+        return Ok(Times { normalised: vec![0.0; times.len()], per_second: None });
     }
     let values: Vec<f64> = times
         .iter()
         .map(|time| {
-            time.filter(|time| time.is_finite() && *time >= 0.0).ok_or_else(|| {
+            time.filter(|time| time.is_finite()).ok_or_else(|| {
                 Error::invalid(
                     path,
-                    "some frames have no `time`, or one that is negative; give every frame a time from 0 on, or none",
+                    "some frames have no `time`, or one that is not finite; give every frame a time, or none",
                 )
             })
         })
         .collect::<Result<_, _>>()?;
-    let last = values.iter().copied().fold(0.0, f64::max);
-    Ok(values.iter().map(|time| if last > 0.0 { time / last } else { 0.0 }).collect())
+    let mut moments = values.clone();
+    moments.sort_by(f64::total_cmp);
+    moments.dedup();
+    let (first, last) = (moments[0], moments[moments.len() - 1]);
+    let span = last - first;
+    if span <= 0.0 || !span.is_finite() {
+        return Ok(Times { normalised: vec![0.0; times.len()], per_second: None });
+    }
+    let is_clock = (first < 0.0 || last > 1.0) && moments.iter().any(|moment| moment.fract() != 0.0);
+    let per_second = is_clock.then(|| {
+        // Clocks of days have microseconds left in double precision.
+        ((moments.len() - 1) as f64 / span * 1e3).round() / 1e3
+    });
+    Ok(Times {
+        normalised: values.iter().map(|time| (time - first) / span).collect(),
+        per_second: per_second.filter(|rate| *rate > 0.0),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn of(values: &[f64]) -> Times {
+        let values: Vec<Option<f64>> = values.iter().copied().map(Some).collect();
+        times(Path::new("transforms.json"), &values).unwrap()
+    }
+
+    #[test]
+    fn clocks_may_begin_anywhere() {
+        for start in [0.0, 100.0, -3.0, 1.7e9] {
+            let values: Vec<f64> = (0..12).map(|k| start + 0.1 * f64::from(k)).collect();
+            let found = of(&values);
+            for (k, time) in found.normalised.iter().enumerate() {
+                assert!((time - k as f64 / 11.0).abs() < 1e-6, "{start}: {time}");
+            }
+            assert_eq!((found.normalised[0], found.normalised[11]), (0.0, 1.0));
+            assert_eq!(found.per_second, Some(10.0), "{start}");
+        }
+    }
+
+    #[test]
+    fn numbers_of_frames_and_shares_are_no_seconds() {
+        let numbers = of(&[500.0, 505.0, 510.0]);
+        assert_eq!((numbers.normalised, numbers.per_second), (vec![0.0, 0.5, 1.0], None));
+        let shares = of(&[0.0, 0.25, 1.0]);
+        assert_eq!((shares.normalised, shares.per_second), (vec![0.0, 0.25, 1.0], None));
+        let one = of(&[7.5, 7.5]);
+        assert_eq!((one.normalised, one.per_second), (vec![0.0; 2], None));
+    }
 }

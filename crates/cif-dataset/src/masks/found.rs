@@ -101,7 +101,7 @@ impl Dataset {
         let (width, height) = (frame.camera.width, frame.camera.height);
         let mut found = PixelGrid::filled(width, height, false);
         for path in files {
-            let stored = mask::decode_binary(path)?;
+            let stored = frame.turn.seen(mask::decode_binary(path)?, (width, height));
             if !same_aspect((stored.width, stored.height), (width, height)) {
                 return Err(Error::MaskSize {
                     mask: path.clone(),

@@ -32,7 +32,8 @@ pub fn read_ids(path: &std::path::Path) -> Result<cif_geometry::PixelGrid<u16>, 
     crate::files::mask::decode(path)
 }
 
-/// The ids of a mask, a PNG file, at the size of an image: of any other size of that aspect by nearest neighbour.
+/// The ids of a mask, a PNG file, at the size of an image: of any other size of that aspect by nearest neighbour. Masks of
+/// the pixels as the file of the image stores them turn as it did.
 ///
 /// # Errors
 /// When the file is missing, truncated, no mask, or of another aspect.
@@ -40,8 +41,9 @@ pub fn read_ids_at(
     path: &std::path::Path,
     image: &std::path::Path,
     size: (u32, u32),
+    turn: crate::Turn,
 ) -> Result<cif_geometry::PixelGrid<u16>, crate::Error> {
-    let ids = crate::files::mask::decode(path)?;
+    let ids = turn.seen(crate::files::mask::decode(path)?, size);
     if !crate::load::same_aspect((ids.width, ids.height), size) {
         return Err(crate::Error::MaskSize {
             mask: path.to_owned(),

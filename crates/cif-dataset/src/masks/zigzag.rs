@@ -143,8 +143,9 @@ pub fn write_zigzag(dataset: &Dataset, out_dir: &Path, order: ViewOrder) -> Resu
         .par_iter()
         .zip(&sequence)
         .map(|(entry, (_, index))| {
-            let stored = image::decode(&dataset.frames[*index].image)?;
-            let colors = image::to_bytes(&image::composite(&stored, [1.0; 3]));
+            let frame = &dataset.frames[*index];
+            let upright = image::decode(&frame.image, frame.turn)?;
+            let colors = image::to_bytes(&image::composite(&upright, [1.0; 3]));
             let bytes = colors.pixels.as_flattened();
             image::write_rgb(&folder.path().join(&entry.image), bytes, colors.width, colors.height)
         })

@@ -34,8 +34,7 @@ const DEVIATIONS: f64 = 7.0;
 /// or one for all.
 pub(crate) fn are_made_up(points: &RawPoints) -> bool {
     let step = points.positions.len().div_ceil(MOST).max(1);
-    let positions: Vec<[f64; 3]> =
-        points.positions.iter().step_by(step).map(|position| position.map(f64::from)).collect();
+    let positions: Vec<[f64; 3]> = points.positions.iter().step_by(step).copied().collect();
     let per_side = ((positions.len() / PER_CELL) as f64).cbrt().floor() as usize;
     if per_side < FEWEST_CELLS {
         return false;
@@ -138,7 +137,12 @@ mod tests {
                 (position(place), color(place, hue))
             })
             .unzip();
-        RawPoints { positions, colors: Some(colors) }
+        let positions: Vec<[f32; 3]> = positions;
+        RawPoints {
+            positions: positions.into_iter().map(|position| position.map(f64::from)).collect(),
+            colors: Some(colors),
+            note: None,
+        }
     }
 
     fn cube(unit: [f32; 3]) -> [f32; 3] {
@@ -191,8 +195,9 @@ mod tests {
         };
         assert!(!are_made_up(&drawn(2_000, 9, ball, random_color)), "a ball");
         let grid = RawPoints {
-            positions: (0..4_096).map(|k| [k % 16, k / 16 % 16, k / 256].map(|v| v as f32)).collect(),
+            positions: (0..4_096_u32).map(|k| [k % 16, k / 16 % 16, k / 256].map(f64::from)).collect(),
             colors: None,
+            note: None,
         };
         assert!(!are_made_up(&grid), "a regular grid");
         assert!(!are_made_up(&drawn(300, 10, cube, random_color)), "too few to tell");

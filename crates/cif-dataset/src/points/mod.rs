@@ -11,7 +11,7 @@ use std::path::Path;
 use cif_geometry::Bounds;
 use glam::DVec3;
 
-pub(crate) use color::sample_colors;
+pub(crate) use color::{by_range, sample_colors};
 pub(crate) use made_up::are_made_up;
 pub(crate) use random::draw;
 pub(crate) use sight::unseen_warning;
@@ -33,8 +33,11 @@ pub(crate) const GREY: [u8; 3] = [128; 3];
 
 /// Points of a file.
 pub(crate) struct RawPoints {
-    pub(crate) positions: Vec<[f32; 3]>,
+    /// In double precision: worlds of surveyors begin so far away that floats are half a metre apart.
+    pub(crate) positions: Vec<[f64; 3]>,
     pub(crate) colors: Option<Vec<[u8; 3]>>,
+    /// How numbers of an unusual type were taken as colours.
+    pub(crate) note: Option<String>,
 }
 
 /// Reads `points.npy`: `[P, 3]` world positions.
@@ -50,15 +53,17 @@ pub(crate) fn read_npy(path: &Path) -> Result<RawPoints, Error> {
         ));
     }
     Ok(RawPoints {
-        positions: matrix.values.chunks_exact(3).map(|p| [p[0] as f32, p[1] as f32, p[2] as f32]).collect(),
+        positions: matrix.values.chunks_exact(3).map(|p| [p[0], p[1], p[2]]).collect(),
         colors: None,
+        note: None,
     })
 }
 
 impl RawPoints {
-    /// Drops points that are not finite, and says how many.
+    /// Drops points that are not finite in single precision, and says how many.
     pub(crate) fn retain_finite(&mut self) -> usize {
-        let keep: Vec<bool> = self.positions.iter().map(|p| p.iter().all(|v| v.is_finite())).collect();
+        let keep: Vec<bool> =
+            self.positions.iter().map(|p| p.iter().all(|v| (*v as f32).is_finite())).collect();
         let dropped = keep.iter().filter(|keep| !**keep).count();
         if dropped > 0 {
             let mut flags = keep.iter();
@@ -240,8 +245,9 @@ mod tests {
     #[test]
     fn non_finite_points_are_dropped_with_their_colors() {
         let mut points = RawPoints {
-            positions: vec![[0.0; 3], [f32::NAN, 0.0, 0.0], [2.0; 3]],
+            positions: vec![[0.0; 3], [f64::NAN, 0.0, 0.0], [2.0; 3]],
             colors: Some(vec![[1; 3], [2; 3], [3; 3]]),
+            note: None,
         };
         assert_eq!(points.retain_finite(), 1);
         assert_eq!(points.positions, vec![[0.0; 3], [2.0; 3]]);

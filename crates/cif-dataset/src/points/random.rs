@@ -22,7 +22,7 @@ const SEED: u64 = 0x5eed;
 /// With `half_edge`, 2 000 points in the box of that half edge around the origin, as synthetic captures have
 /// it. Otherwise 10 000 points in a box around the place that the cameras look at, as wide as what they see
 /// there. Fewer when the cameras see little of the box; the whole box when they see nothing of it.
-pub(crate) fn draw(cameras: &[PinholeCamera], half_edge: Option<f64>) -> Vec<[f32; 3]> {
+pub(crate) fn draw(cameras: &[PinholeCamera], half_edge: Option<f64>) -> Vec<[f64; 3]> {
     let (centre, half, count) = match half_edge {
         Some(half) => (DVec3::ZERO, half, IN_BOX),
         None => {
@@ -42,11 +42,11 @@ pub(crate) fn draw(cameras: &[PinholeCamera], half_edge: Option<f64>) -> Vec<[f3
         }
         let point = uniform();
         if cameras.iter().any(|camera| camera.pixel_of(point).is_some()) {
-            points.push(point.as_vec3().to_array());
+            points.push(point.to_array());
         }
     }
     if points.is_empty() {
-        points.extend((0..count).map(|_| uniform().as_vec3().to_array()));
+        points.extend((0..count).map(|_| uniform().to_array()));
     }
     points
 }
@@ -119,8 +119,7 @@ mod tests {
         assert_eq!(points.len(), IN_VIEW);
         assert_eq!(points, draw(&cameras, None));
         for p in &points {
-            let point = DVec3::new(f64::from(p[0]), f64::from(p[1]), f64::from(p[2]));
-            assert!((point - target).abs().max_element() < 2.0 + 1e-5);
+            assert!((DVec3::from_array(*p) - target).abs().max_element() < 2.0 + 1e-5);
         }
     }
 

@@ -51,7 +51,7 @@ mod tests {
     use glam::{DMat3, DVec2};
 
     use super::*;
-    use crate::{CaptureFrame, Frame, Layout, PointCloud, Split};
+    use crate::{CaptureFrame, Frame, Layout, PointCloud, Split, Turn};
 
     /// A camera at the origin that looks along +z, and points around `(0, 0, depth)`.
     fn dataset(depth: f32) -> Dataset {
@@ -72,6 +72,7 @@ mod tests {
             split,
             group: None,
             image: "none.png".into(),
+            turn: Turn::NONE,
             source: None,
             mask: None,
             confidence: None,

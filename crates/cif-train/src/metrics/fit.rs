@@ -226,6 +226,7 @@ mod tests {
             split: if index % 3 == 1 { Split::Val } else { Split::Train },
             group: None,
             image: "none.png".into(),
+            turn: cif_dataset::Turn::NONE,
             source: None,
             mask: None,
             confidence: None,

@@ -198,6 +198,7 @@ pub(crate) fn capture(folder: &Path, scene: Scene) -> Dataset {
                 split: if held_out { Split::Val } else { Split::Train },
                 group: None,
                 image,
+                turn: cif_dataset::Turn::NONE,
                 source: None,
                 mask,
                 confidence: None,

@@ -126,8 +126,9 @@ fn make(
     let known = scale::Known::of(command, masks.as_ref())?;
     let mut posed = match &command.poses {
         Some(path) => {
-            let Imported { mut poses, tool, metres_known, up_known, .. } =
+            let Imported { mut poses, tool, metres_known, up_known, notes: of_poses, .. } =
                 import::read(path, shots)?.matched(path, shots)?;
+            notes.extend(of_poses);
             if poses.points.is_empty() {
                 poses.points = points(command, shots, masks.as_ref(), &poses, places, hooks, notes)?;
             }
@@ -146,7 +147,9 @@ fn make(
             left.unbelieved = Some(posed);
             return Err(error);
         }
-        eprintln!("warning: the verdict says no, and the capture is written because of --accept:\n{verdict}");
+        crate::messages::warning!(
+            "the verdict says no, and the capture is written because of --accept:\n{verdict}"
+        );
     }
     let lines = scale::settle(command, &known, shots, masks.as_ref(), &mut posed, hooks)?;
     let capture = Written {

@@ -18,7 +18,7 @@ pub(super) fn measure(
     truth: &MotionTruth,
 ) -> Result<Option<Motion>, Error> {
     let measured = motion_of(field, dataset, truth)?;
-    Ok(measured.inspect_err(|reason| eprintln!("warning: motion is not measured: {reason}")).ok())
+    Ok(measured.inspect_err(|reason| crate::messages::warning!("motion is not measured: {reason}")).ok())
 }
 
 /// Headings of [`Motion::rows`].

@@ -114,7 +114,7 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     let options = held.max_by_key(|held| held.most_expensive_motion).unwrap_or_else(|| asked.clone());
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
     for warning in &graph.warnings {
-        eprintln!("warning: {warning}");
+        crate::messages::warning!("{warning}");
     }
     let place = command.scene.display().to_string();
     let writing = command.writing.options(command.force, &Frames::new(graph.time_codes.range(), &place))?;

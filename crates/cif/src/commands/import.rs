@@ -65,7 +65,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
     let base = command.base.as_deref().map(scene::load).transpose()?;
     let graph = formats::read(&command.file, ReadOptions { follow_external: command.follow_external })?;
     for warning in &graph.warnings {
-        eprintln!("warning: {warning}");
+        crate::messages::warning!("{warning}");
     }
     let mut edits = None;
     let field = match &base {

@@ -159,7 +159,7 @@ fn split(
         },
     )?;
     if !report.without_mask.is_empty() {
-        eprintln!("warning: the tracker wrote no mask for {}", report.without_mask.join(", "));
+        crate::messages::warning!("the tracker wrote no mask for {}", report.without_mask.join(", "));
     }
     Ok(())
 }

@@ -339,10 +339,10 @@ impl CaptureOptions {
 /// Prints the notes of a capture, and its oddities.
 fn print_warnings(dataset: &cif_dataset::Dataset) {
     for note in &dataset.notes {
-        eprintln!("note: {note}");
+        eprintln!("note: {}", messages::plain(note));
     }
     for warning in &dataset.warnings {
-        eprintln!("warning: {warning}");
+        crate::messages::warning!("{warning}");
     }
 }
 
@@ -358,7 +358,7 @@ fn print_misfits(field: &cif_field::Field, dataset: &cif_dataset::Dataset, split
     use cif_train::metrics::fit::{Severity, misfits};
     for misfit in misfits(field, dataset, split) {
         match misfit.severity {
-            Severity::Warning => eprintln!("warning: {}", misfit.message),
+            Severity::Warning => crate::messages::warning!("{}", misfit.message),
             Severity::Note => messages::note!("{}", misfit.message),
         }
     }

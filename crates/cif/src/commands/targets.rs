@@ -201,7 +201,7 @@ impl Target {
     /// Tells what was written.
     pub(super) fn tell(&self, summary: &ExportSummary) {
         for lost in &summary.not_held {
-            eprintln!("warning: {} does not hold everything of {lost}", self.format.about().name);
+            crate::messages::warning!("{} does not hold everything of {lost}", self.format.about().name);
         }
         let files = match summary.files.len() {
             0 | 1 => String::new(),

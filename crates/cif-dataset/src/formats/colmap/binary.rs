@@ -3,6 +3,7 @@
 //! Counts in the files are never trusted with memory: every read is checked against the bytes that are there.
 
 use std::collections::BTreeMap;
+use std::io::Read;
 use std::path::Path;
 
 use super::model::MODELS;
@@ -54,15 +55,27 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
         let mut cursor = Cursor { path: &points_path, bytes: &bytes };
         for _ in 0..cursor.u64()? {
             cursor.u64()?;
-            positions.push([cursor.f64()? as f32, cursor.f64()? as f32, cursor.f64()? as f32]);
+            positions.push([cursor.f64()?, cursor.f64()?, cursor.f64()?]);
             colors.push(cursor.take::<3>()?);
             cursor.f64()?;
             let track = cursor.u64()?;
             cursor.skip(track, 8)?;
         }
     }
-    let points = RawPoints { positions, colors: Some(colors) };
+    let points = RawPoints { positions, colors: Some(colors), note: None };
     Ok(Reconstruction { cameras, cameras_path, images, images_path, points, points_path })
+}
+
+/// How many images a model says that it has.
+///
+/// # Errors
+/// When its list of images is missing or cut short.
+pub(super) fn count_images(folder: &Path) -> Result<u64, Error> {
+    let path = folder.join("images.bin");
+    let mut head = Vec::new();
+    let file = cif_input::open(&path).map_err(Error::read(&path))?;
+    file.take(8).read_to_end(&mut head).map_err(Error::read(&path))?;
+    Cursor { path: &path, bytes: &head }.u64()
 }
 
 fn load(path: &Path) -> Result<Vec<u8>, Error> {

@@ -1,4 +1,5 @@
-//! COLMAP reconstructions: `sparse/0` with text or binary files, and `images/`.
+//! COLMAP reconstructions: `sparse/0` with text or binary files, and `images/`. Where the mapper could not join all images
+//! it made several models, `sparse/0`, `sparse/1`, ..., each in a place of its own.
 //!
 //! Static: all times are 0. Every eighth image in name order is held out. Poses are world-to-camera, as here;
 //! pixel (0, 0) has its centre at (0.5, 0.5), as here.
@@ -10,10 +11,13 @@ mod text;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use cif_geometry::{Bounds, RigidTransform};
+use cif_geometry::transform::angle_between;
+use cif_geometry::{Bounds, RigidTransform, Similarity};
 use glam::{DMat3, DQuat, DVec3};
 
-use super::{Draft, DraftCamera, DraftFrame, Source, hold_out_every_eighth, transforms};
+use super::{
+    Draft, DraftCamera, DraftFrame, Source, customary_points, hold_out_every_eighth, some_of, transforms,
+};
 use crate::files::listing;
 use crate::points::RawPoints;
 use crate::{Error, Split};
@@ -44,22 +48,79 @@ struct Reconstruction {
     points_path: PathBuf,
 }
 
-/// Folder with the reconstruction, where the capture has one.
-pub(crate) fn sparse_folder(root: &Path) -> Option<PathBuf> {
-    ["sparse/0", "sparse", "colmap/sparse/0"]
-        .iter()
-        .map(|name| root.join(name))
-        .find(|folder| {
-            listing::is_there(&folder.join("cameras.bin")) || listing::is_there(&folder.join("cameras.txt"))
-        })
+/// The model that is read of those that the mapper made, and what is told of the others.
+pub(crate) struct Chosen {
+    pub(crate) folder: PathBuf,
+    pub(crate) note: Option<String>,
+}
+
+fn is_model(folder: &Path) -> bool {
+    ["cameras.bin", "cameras.txt"].iter().any(|name| listing::is_there(&folder.join(name)))
+}
+
+/// Folders of models in a folder: those that are called by numbers, as the mapper numbers them, and it itself.
+fn models(parent: &Path) -> Vec<PathBuf> {
+    let number = |path: &PathBuf| path.file_name()?.to_str()?.parse::<u32>().ok();
+    let mut numbered: Vec<(u32, PathBuf)> = listing::entries(parent)
+        .unwrap_or_default()
+        .into_iter()
+        .filter(|path| is_model(path))
+        .filter_map(|path| Some((number(&path)?, path)))
+        .collect();
+    numbered.sort();
+    let itself = is_model(parent).then(|| parent.to_owned());
+    numbered.into_iter().map(|(_, path)| path).chain(itself).collect()
+}
+
+/// Images of a model; 0 where that cannot be read, which reading it tells.
+fn registered(folder: &Path) -> u64 {
+    let count = if listing::is_there(&folder.join("cameras.bin")) {
+        binary::count_images(folder)
+    } else {
+        text::count_images(folder)
+    };
+    count.unwrap_or(0)
+}
+
+/// The model with most images, of equal ones the first, of the first of `parents` that holds any.
+fn largest_model(parents: impl IntoIterator<Item = PathBuf>) -> Option<Chosen> {
+    let found = parents.into_iter().map(|parent| models(&parent)).find(|models| !models.is_empty())?;
+    let mut counted: Vec<(u64, PathBuf)> =
+        found.into_iter().map(|folder| (registered(&folder), folder)).collect();
+    counted.sort_by_key(|(images, _)| std::cmp::Reverse(*images));
+    let (images, folder) = counted.remove(0);
+    let others: Vec<String> =
+        counted.iter().map(|(images, folder)| format!("{} ({images})", folder.display())).collect();
+    let note = (!others.is_empty()).then(|| {
+        format!(
+            "{}: of {} models it has most images, {images}, and is read; others, in places of their own, are not: {}",
+            folder.display(),
+            others.len() + 1,
+            some_of(others.iter().map(String::as_str))
+        )
+    });
+    Some(Chosen { folder, note })
+}
+
+/// The reconstruction of a capture, where it has one.
+pub(crate) fn sparse_model(root: &Path) -> Option<Chosen> {
+    largest_model(["sparse", "colmap/sparse"].map(|name| root.join(name)))
         // A folder without cameras still marks the layout, so that the reader can say what is missing.
-        .or_else(|| Some(root.join("sparse/0")).filter(|folder| folder.is_dir()))
+        .or_else(|| {
+            let folder = Some(root.join("sparse/0")).filter(|folder| folder.is_dir())?;
+            Some(Chosen { folder, note: None })
+        })
+}
+
+/// The reconstruction that a folder is, or holds.
+pub(crate) fn model_in(path: &Path) -> Option<Chosen> {
+    largest_model(["", "sparse", "colmap/sparse"].map(|name| path.join(name)))
 }
 
 pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let root = source.root;
     let missing = |path: PathBuf, fix: &str| Error::MissingFile { path, fix: fix.to_owned() };
-    let folder = sparse_folder(root)
+    let Chosen { folder, note } = sparse_model(root)
         .ok_or_else(|| missing(root.join("sparse/0"), "a COLMAP capture keeps its reconstruction there"))?;
     let reconstruction = reconstruction(&folder)?;
     let Reconstruction { images, images_path, .. } = &reconstruction;
@@ -103,7 +164,9 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         frames,
         stored_reduction: 1,
         points: (!points.positions.is_empty()).then_some((points, points_path)),
+        notes: note.into_iter().collect(),
         unused,
+        of_stored_pixels: true,
         ..Draft::default()
     })
 }
@@ -142,38 +205,107 @@ pub(crate) fn named_cameras(folder: &Path) -> Result<(Vec<(String, DraftCamera)>
     Ok((cameras.collect::<Result<_, _>>()?, reconstruction.points))
 }
 
-/// Largest distance of camera centres that are one, in sizes of what all centres span.
+/// The customary points of a capture, else those of the reconstruction beside it, whose damage is a warning.
+///
+/// # Errors
+/// When the file of customary points is damaged.
+pub(super) fn points_beside(
+    root: &Path,
+    frames: &[DraftFrame],
+    notes: &mut Vec<String>,
+    warnings: &mut Vec<String>,
+) -> Result<Option<(RawPoints, PathBuf)>, Error> {
+    if let Some(points) = customary_points(root)? {
+        return Ok(Some(points));
+    }
+    Ok(points_among(root, frames, notes).unwrap_or_else(|error| {
+        warnings.push(format!("{error}; the points of the reconstruction are not used"));
+        None
+    }))
+}
+
+/// Largest distance of camera centres that are one, in sizes of what all centres span; chosen.
 const SAME_PLACE: f64 = 1e-3;
 
-/// Points of the reconstruction of a capture, where its cameras stand where those of the frames do: then its points
-/// and the frames share their coordinates. Images belong to frames by the stems of their names.
+/// The same once a similarity brings them together: poses may have been refined since; chosen.
+const FITTING_PLACE: f64 = 1e-2;
+
+/// Largest angle then between two orientations of a camera, radians (1 degree); chosen.
+const FITTING_ANGLE: f64 = 0.0175;
+
+/// Fewest cameras that a similarity is fitted to: two leave a turn open, three check themselves.
+const FEWEST: usize = 4;
+
+/// Points of the reconstruction beside a capture, in its coordinates: where its cameras stand where those of the frames do,
+/// as they are, else by the similarity that brings the cameras together, which `notes` tell. Images belong to frames by
+/// the stems of their names.
 ///
 /// # Errors
 /// As the files of the reconstruction are damaged.
-pub(super) fn points_among(
+fn points_among(
     root: &Path,
     frames: &[DraftFrame],
+    notes: &mut Vec<String>,
 ) -> Result<Option<(RawPoints, PathBuf)>, Error> {
-    let found = sparse_folder(root).map(|folder| reconstruction(&folder)).transpose()?;
-    let Some(found) = found.filter(|found| !found.points.positions.is_empty()) else { return Ok(None) };
-    let centre = |pose: &RigidTransform| -(pose.rotation.transpose() * pose.translation);
-    let of_images: BTreeMap<String, DVec3> = found
+    let Some(model) = largest_model(["sparse", "colmap/sparse", "colmap"].map(|name| root.join(name))) else {
+        return Ok(None);
+    };
+    let mut found = reconstruction(&model.folder)?;
+    if found.points.positions.is_empty() {
+        return Ok(None);
+    }
+    let of_images: BTreeMap<String, RigidTransform> = found
         .images
         .iter()
-        .filter_map(|image| Some((listing::stem(Path::new(&image.name)), centre(&pose(image)?))))
+        .filter_map(|image| Some((listing::stem(Path::new(&image.name)), pose(image)?.inverse())))
         .collect();
-    let pairs: Vec<[DVec3; 2]> = frames
+    let pairs: Vec<[RigidTransform; 2]> = frames
         .iter()
         .filter_map(|frame| {
             let theirs = of_images.get(&listing::stem(&frame.image))?;
-            Some([*theirs, centre(&frame.camera.camera_from_world)])
+            Some([*theirs, frame.camera.camera_from_world.inverse()])
         })
         .collect();
-    let size = Bounds::around(pairs.iter().map(|[_, ours]| *ours)).size().length();
-    let is_one = |[theirs, ours]: &[DVec3; 2]| theirs.distance(*ours) <= SAME_PLACE * size;
+    let [theirs, ours] =
+        [0, 1].map(|side| pairs.iter().map(|pair| pair[side].translation).collect::<Vec<_>>());
+    let size = Bounds::around(ours.iter().copied()).size().length();
+    let farthest = |places: &mut dyn Iterator<Item = DVec3>| {
+        places.zip(&ours).map(|(theirs, ours)| theirs.distance(*ours)).fold(0.0, f64::max)
+    };
     // One camera has no size to measure distances in.
-    let same = pairs.len() > 1 && pairs.iter().all(is_one);
-    Ok(same.then_some((found.points, found.points_path)))
+    if pairs.len() > 1 && farthest(&mut theirs.iter().copied()) <= SAME_PLACE * size {
+        notes.extend(model.note);
+        return Ok(Some((found.points, found.points_path)));
+    }
+    let shown = model.folder.display();
+    let similarity = Similarity::fitting(&theirs, &ours).filter(|_| pairs.len() >= FEWEST);
+    let fits = |similarity: &Similarity| {
+        let angle = |[theirs, ours]: &[RigidTransform; 2]| {
+            angle_between(&(similarity.rotation * theirs.rotation), &ours.rotation)
+        };
+        farthest(&mut theirs.iter().map(|place| similarity.apply(*place))) <= FITTING_PLACE * size
+            && pairs.iter().map(angle).fold(0.0, f64::max) <= FITTING_ANGLE
+    };
+    let Some(similarity) = similarity.filter(fits) else {
+        notes.push(format!(
+            "{shown}: its points are not taken: its cameras are not those of the capture ({} images have the names of \
+             frames), however they are moved, turned and scaled together",
+            pairs.len()
+        ));
+        return Ok(None);
+    };
+    for position in &mut found.points.positions {
+        *position = similarity.apply(DVec3::from_array(*position)).to_array();
+    }
+    notes.extend(model.note);
+    notes.push(format!(
+        "{shown}: its {} points are moved, turned and scaled by {:.6} into the coordinates of the capture, as {} cameras \
+         that both have tell",
+        found.points.positions.len(),
+        similarity.scale,
+        pairs.len()
+    ));
+    Ok(Some((found.points, found.points_path)))
 }
 
 /// The camera of an image.

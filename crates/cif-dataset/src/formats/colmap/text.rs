@@ -27,28 +27,8 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
             return Err(words.problem(&format!("camera {id} is listed twice")));
         }
     }
-    let mut images = Vec::new();
-    let rows = lines(&images_path)?;
-    let mut rows = rows.iter().skip_while(|(_, line)| line.is_empty());
-    while let Some((number, line)) = rows.next() {
-        if line.is_empty() {
-            continue;
-        }
-        let mut words = Words { path: &images_path, number: *number, words: line.split_whitespace() };
-        let _: u32 = words.next("IMAGE_ID")?;
-        let rotation = [words.next("QW")?, words.next("QX")?, words.next("QY")?, words.next("QZ")?];
-        let translation = [words.next("TX")?, words.next("TY")?, words.next("TZ")?];
-        let camera = words.next("CAMERA_ID")?;
-        let name = words.words.collect::<Vec<_>>().join(" ");
-        if name.is_empty() {
-            let words = Words { path: &images_path, number: *number, words: "".split_whitespace() };
-            return Err(words.problem("NAME is missing"));
-        }
-        images.push(Image { name, rotation, translation, camera });
-        // The second line of an image holds its 2D points, and may be empty.
-        rows.next();
-    }
-    let mut points = RawPoints { positions: Vec::new(), colors: Some(Vec::new()) };
+    let images = images(&images_path)?;
+    let mut points = RawPoints { positions: Vec::new(), colors: Some(Vec::new()), note: None };
     if listing::is_there(&points_path) {
         for (number, line) in lines(&points_path)?.iter().filter(|(_, line)| !line.is_empty()) {
             let mut words = Words { path: &points_path, number: *number, words: line.split_whitespace() };
@@ -61,6 +41,47 @@ pub(super) fn read(folder: &Path) -> Result<Reconstruction, Error> {
         }
     }
     Ok(Reconstruction { cameras, cameras_path, images, images_path, points, points_path })
+}
+
+/// How many images a model has.
+///
+/// # Errors
+/// As its list of images is missing or does not parse.
+pub(super) fn count_images(folder: &Path) -> Result<u64, Error> {
+    images(&folder.join("images.txt")).map(|images| images.len() as u64)
+}
+
+/// The rows of `images.txt`.
+fn images(path: &Path) -> Result<Vec<Image>, Error> {
+    let mut images = Vec::new();
+    let rows = lines(path)?;
+    let mut rows = rows.iter().skip_while(|(_, line)| line.is_empty()).peekable();
+    while let Some((number, line)) = rows.next() {
+        if line.is_empty() {
+            continue;
+        }
+        let mut words = Words { path, number: *number, words: line.split_whitespace() };
+        let _: u32 = words.next("IMAGE_ID")?;
+        let rotation = [words.next("QW")?, words.next("QX")?, words.next("QY")?, words.next("QZ")?];
+        let translation = [words.next("TX")?, words.next("TY")?, words.next("TZ")?];
+        let camera = words.next("CAMERA_ID")?;
+        let name = words.words.collect::<Vec<_>>().join(" ");
+        if name.is_empty() {
+            let words = Words { path, number: *number, words: "".split_whitespace() };
+            return Err(words.problem("NAME is missing"));
+        }
+        images.push(Image { name, rotation, translation, camera });
+        // The second line of an image holds its 2D points, and may be empty; people who write one by hand leave it out.
+        rows.next_if(|(_, line)| are_points(line));
+    }
+    Ok(images)
+}
+
+/// True for a line of 2D points: threes of numbers (X, Y, POINT3D_ID), or nothing. The row of an image has ten words and
+/// a name that is no number, or, with a number for a name, ten.
+fn are_points(line: &str) -> bool {
+    let words = line.split_whitespace();
+    words.clone().count().is_multiple_of(3) && words.into_iter().all(|word| word.parse::<f64>().is_ok())
 }
 
 /// Lines without comments, with their numbers from 1; empty lines are kept.

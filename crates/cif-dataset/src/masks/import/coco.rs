@@ -13,6 +13,7 @@ use super::draw::{Content, Piece, Shape};
 use super::{Listing, Picture, Place, polygon, runs};
 use crate::Error;
 use crate::files::json;
+use crate::formats::some_of;
 
 #[derive(Deserialize)]
 struct File {
@@ -75,7 +76,12 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     }
     let mut pieces: Vec<Vec<Piece>> = file.images.iter().map(|_| Vec::new()).collect();
     let mut untracked = BTreeSet::new();
+    let mut boxes = Vec::new();
     for annotation in &file.annotations {
+        if is_without_mask(&annotation.segmentation) {
+            boxes.push(annotation.id.to_string());
+            continue;
+        }
         let place = Place::entry(source, format!("annotation {}", annotation.id));
         let unknown =
             |what: &str, id: &Value| place.error(format!("its {what} {id} is not in the list of the file"));
@@ -110,6 +116,7 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
         let shape = shape_of(&annotation.segmentation).map_err(|problem| place.error(problem))?;
         pieces[image].push(Piece { object, layer: 0, place, shape });
     }
+    result.notes.extend(note_of_boxes(source, &boxes, file.annotations.len())?);
     for (image, pieces) in file.images.into_iter().zip(pieces) {
         let place = Place::entry(source, format!("image {}", image.file_name));
         let size = image.width.zip(image.height);
@@ -117,6 +124,32 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
         result.pictures.push(Picture { name: image.file_name, place, size, content });
     }
     Ok(result)
+}
+
+/// True where there is a box at most.
+pub(super) fn is_without_mask(segmentation: &Value) -> bool {
+    segmentation.is_null() || segmentation.as_array().is_some_and(Vec::is_empty)
+}
+
+/// What is said of annotations without a mask, of `all`.
+///
+/// # Errors
+/// When there are no others.
+pub(super) fn note_of_boxes(source: &Path, boxes: &[String], all: usize) -> Result<Option<String>, Error> {
+    if boxes.is_empty() {
+        return Ok(None);
+    }
+    if boxes.len() == all {
+        let problem = format!(
+            "none of its {all} annotations has a segmentation, perhaps boxes only; export masks or polygons"
+        );
+        return Err(Error::invalid(source, problem));
+    }
+    Ok(Some(format!(
+        "{} annotations have no segmentation, perhaps boxes only, and were left out: {}",
+        boxes.len(),
+        some_of(boxes.iter().map(String::as_str))
+    )))
 }
 
 /// The pixels of a segmentation: outlines, or a run-length code by columns, as numbers or text.
@@ -145,6 +178,6 @@ pub(super) fn shape_of(segmentation: &Value) -> Result<Shape, String> {
             };
             Ok(Shape::Runs(runs::Code::Columns(counts), Some((size[1], size[0]))))
         }
-        _ => Err("it has no segmentation, perhaps a box only; export masks or polygons".to_owned()),
+        _ => Err(EXPECTED.to_owned()),
     }
 }

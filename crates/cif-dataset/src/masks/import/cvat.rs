@@ -1,7 +1,8 @@
 //! XML of CVAT 1.1: pictures with polygons and masks, and videos with tracks of them.
 //!
 //! In pictures, objects are told apart by the attribute `track_id`, which CVAT adds for tracks; without, the label is
-//! the object. Tracks of videos are objects. Source: the XML annotation format of CVAT, version 1.1.
+//! the object. Tracks of videos are objects, and frames have the numbers of the video; a task may take every `step`th of
+//! them from `start_frame` on. Source: the XML annotation format of CVAT, version 1.1.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -9,6 +10,7 @@ use std::path::Path;
 use roxmltree::{Document, Node};
 
 use super::draw::{Content, Piece, Shape};
+use super::frames::Task;
 use super::{Listing, Picture, Place, polygon, runs};
 use crate::Error;
 
@@ -39,12 +41,39 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
         }
     } else {
         file.tracks(root, &tracks)?;
+        file.result.task = task(root).map_err(|problem| Error::invalid(source, problem))?;
     }
     for (kind, count) in file.left_out {
         let note = format!("{count} shapes of kind {kind} are no masks and were left out");
         file.result.notes.push(note);
     }
     Ok(file.result)
+}
+
+/// The frames of its video that a task took; `None` where it took all, or the file is of a job alone, which does not say
+/// where its task begins, or of several tasks.
+fn task(root: Node<'_, '_>) -> Result<Option<Task>, String> {
+    let tasks: Vec<Node<'_, '_>> = root.descendants().filter(|node| node.has_tag_name("task")).collect();
+    let [task] = tasks[..] else { return Ok(None) };
+    let text = |name: &str| {
+        let node = task.children().find(|node| node.has_tag_name(name));
+        node.and_then(|node| node.text()).map(str::trim).filter(|text| !text.is_empty())
+    };
+    let number = |name: &str, text: &str| {
+        text.parse::<u64>()
+            .map_err(|_| format!("<{name}> of its task is {text:?}, where a whole number is expected"))
+    };
+    let start = text("start_frame").map_or(Ok(0), |text| number("start_frame", text))?;
+    let step = match text("frame_filter") {
+        None => 1,
+        Some(filter) => match filter.strip_prefix("step=") {
+            Some(step) => number("frame_filter", step.trim())?.max(1),
+            None => {
+                return Err(format!("<frame_filter> of its task is {filter:?}, where step=N is expected"));
+            }
+        },
+    };
+    Ok(((start, step) != (0, 1)).then_some(Task { start, step }))
 }
 
 struct File<'a, 'input> {

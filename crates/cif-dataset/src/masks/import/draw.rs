@@ -12,6 +12,7 @@ use super::tracker::Table;
 use super::{Drawn, Picture, Place, check_aspect, check_size, check_stated, mattes, polygon, runs, tracker};
 use crate::Error;
 use crate::files::{exr_header, mask};
+use crate::orientation::Turn;
 
 /// What a picture consists of.
 pub(super) enum Content {
@@ -50,9 +51,10 @@ pub(super) enum Shape {
 ///
 /// # Errors
 /// When a file is damaged, has another aspect than the frame, or parts of the picture differ in size.
-pub(super) fn draw(picture: &Picture, frame: (u32, u32), ids: &[u16]) -> Result<Drawn, Error> {
+pub(super) fn draw(picture: &Picture, frame: (u32, u32), turn: Turn, ids: &[u16]) -> Result<Drawn, Error> {
+    let check = |size| check_aspect(&picture.place, turn.seen_size(size, frame), frame);
     if let Some(stated) = picture.size {
-        check_aspect(&picture.place, stated, frame)?;
+        check(stated)?;
     }
     let (drawn, disputed) = match &picture.content {
         Content::Values(path, table) => {
@@ -70,13 +72,14 @@ pub(super) fn draw(picture: &Picture, frame: (u32, u32), ids: &[u16]) -> Result<
                 size = size.map_or_else(|| size_of(&piece.shape), |size| Ok(Some(size)))?;
             }
             let size = size.unwrap_or(frame);
-            check_aspect(&picture.place, size, frame)?;
+            check(size)?;
             check_stated(&picture.place, size, frame)?;
             draw_pieces(pieces, size, ids, KEPT_BYTES)?
         }
     };
     let size = (drawn.width, drawn.height);
-    check_aspect(&picture.place, size, frame)?;
+    check(size)?;
+    let drawn = turn.seen(drawn, frame);
     Ok(Drawn { ids: mask::nearest_resize(&drawn, frame.0, frame.1), disputed, size })
 }
 

@@ -31,6 +31,21 @@ struct OfCamera {
     video: Option<(String, u64)>,
 }
 
+/// Frames that a task of another tool took of a video: every `step`th from `start` on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Task {
+    pub(super) start: u64,
+    pub(super) step: u64,
+}
+
+impl Task {
+    /// Place of a frame of the video among those of the task.
+    fn place(self, number: u64) -> Option<u64> {
+        let after = number.checked_sub(self.start)?;
+        after.is_multiple_of(self.step).then_some(after / self.step)
+    }
+}
+
 /// Frames of pictures.
 pub(super) struct Matched {
     /// `[pictures]`.
@@ -135,6 +150,51 @@ impl FrameNames {
             names.first().copied().unwrap_or_default(),
             self.example
         )))
+    }
+
+    /// The frames of pictures whose names are numbers of frames of a video of which a task took a part: of the video that
+    /// the capture was made of where it knows that, else those whose names are such numbers where all frames of the
+    /// capture are, else the frames of the capture in order, as those of the task.
+    ///
+    /// # Errors
+    /// When the numbers are no frames of the task, or the capture has fewer frames or several cameras.
+    pub(super) fn of_task(&self, names: &[&str], task: Task) -> Result<Matched, String> {
+        let Task { start, step } = task;
+        if self.cameras.values().all(|camera| camera.video.is_some())
+            && let Some(matched) = self.of_videos(names, Some(0))?
+        {
+            return Ok(matched);
+        }
+        let of_task = |number: &Option<u64>| number.is_some_and(|number| task.place(number).is_some());
+        if self.numbers.len() > 1
+            && self.numbers.iter().all(of_task)
+            && let Some(matched) = self.by_number(names)
+        {
+            return Ok(matched);
+        }
+        let count = self.numbers.len();
+        let words = format!("its task took every frame of a video whose number is {start} + {step} k");
+        if self.cameras.len() > 1 {
+            return Err(format!(
+                "{words}, and the capture has {} cameras; give the masks of each camera in a folder of its name",
+                self.cameras.len()
+            ));
+        }
+        let place = |name: &&str| {
+            let number: u64 = name.parse().map_err(|_| format!("{name:?} is no number of a frame"))?;
+            let place =
+                task.place(number).ok_or_else(|| format!("{words}, and frame {number} is none of them"))?;
+            usize::try_from(place).ok().filter(|place| *place < count).ok_or_else(|| {
+                format!(
+                    "{words}: frame {number} is number {} of them, and the capture has {count}; give the capture that these \
+                     frames are of",
+                    place + 1
+                )
+            })
+        };
+        let frames = names.iter().map(|name| place(name).map(Some)).collect::<Result<_, String>>()?;
+        let note = format!("{words}: these are the frames of the capture in order");
+        Ok(Matched { frames, of_video: false, note: Some(note) })
     }
 
     /// Every name by the number that it ends in, as the number of a frame of the video of its camera; `None` where the

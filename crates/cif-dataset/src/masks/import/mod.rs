@@ -37,7 +37,7 @@ use std::path::{Path, PathBuf};
 use cif_geometry::PixelGrid;
 
 use self::draw::Content;
-use self::frames::FrameNames;
+use self::frames::{FrameNames, Task};
 pub use self::kind::SourceKind;
 use self::objects::Objects;
 use crate::files::listing;
@@ -84,6 +84,8 @@ impl Place {
 struct Listing {
     objects: Objects,
     pictures: Vec<Picture>,
+    /// The frames of a video that numbers of pictures count, where they are not all of them.
+    task: Option<Task>,
     notes: Vec<String>,
 }
 
@@ -149,8 +151,11 @@ impl Import {
             ));
         }
         let stated: Vec<&str> = listing.pictures.iter().map(|picture| picture.name.as_str()).collect();
-        let matched =
-            names.resolve(&stated, first_number).map_err(|problem| Error::invalid(source, problem))?;
+        let matched = match listing.task.filter(|_| first_number.is_none()) {
+            Some(task) => names.of_task(&stated, task),
+            None => names.resolve(&stated, first_number),
+        };
+        let matched = matched.map_err(|problem| Error::invalid(source, problem))?;
         listing.notes.extend(matched.note);
         let mut pictures: Vec<Option<Picture>> = dataset.frames.iter().map(|_| None).collect();
         let mut strangers = Vec::new();
@@ -193,9 +198,9 @@ impl Import {
     /// When there is no frame `frame`, or the capture is another one.
     pub fn draw(&self, dataset: &Dataset, frame: usize) -> Result<Option<Drawn>, Error> {
         let Some(picture) = &self.pictures[frame] else { return Ok(None) };
-        let camera = &dataset.frames[frame].camera;
-        let size = (camera.width, camera.height);
-        draw::draw(picture, size, &self.ids).map(Some)
+        let frame = &dataset.frames[frame];
+        let size = (frame.camera.width, frame.camera.height);
+        draw::draw(picture, size, frame.turn, &self.ids).map(Some)
     }
 }
 

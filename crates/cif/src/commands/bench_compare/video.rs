@@ -198,7 +198,7 @@ fn start(program: &OsStr, first: &Picture, partial: &PathBuf) -> Result<Child, E
         .arg(format!("{}x{}", first.width, first.height))
         .args(["-r", RATE, "-i", "pipe:0", "-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264"])
         .args(["-pix_fmt", "yuv420p", "-crf", "20", "-threads", "1", "-movflags", "+faststart"])
-        .arg(partial)
+        .arg(cif_input::for_ffmpeg(partial).map_err(Error::io("write", partial))?)
         .stdin(Stdio::piped())
         .stdout(Stdio::null())
         .stderr(Stdio::piped())

@@ -17,7 +17,7 @@ use crate::error::Error;
 pub(super) fn keep(command: &Capture, sources: &[Source], shots: &[Shot], left: &Left, error: &Error) {
     let poses = left.unbelieved.as_ref().map(|posed| (&posed.poses, posed.from.as_str()));
     let kept = keep_unfinished(sources, shots, poses, &command.output).unwrap_or_else(|error| {
-        eprintln!("warning: frames and poses found so far could not be kept: {error}");
+        crate::messages::warning!("frames and poses found so far could not be kept: {error}");
         None
     });
     if let Some(kept) = &kept {

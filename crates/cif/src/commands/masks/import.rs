@@ -205,11 +205,11 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
         crate::messages::note!("{} pixels were claimed by several objects", found.disputed);
     }
     if let Some(first) = without.first() {
-        eprintln!("warning: {} frames have no mask, the first is {first}", without.len());
+        crate::messages::warning!("{} frames have no mask, the first is {first}", without.len());
     }
     if !empty.is_empty() {
         let names: Vec<&str> = empty.iter().map(|instance| instance.label.as_str()).collect();
-        eprintln!("warning: no pixel shows {}; left out of instances.json", names.join(", "));
+        crate::messages::warning!("no pixel shows {}; left out of instances.json", names.join(", "));
     }
     Ok(())
 }

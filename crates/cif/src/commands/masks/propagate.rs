@@ -152,7 +152,7 @@ fn open(command: &Propagate) -> Result<Dataset, Error> {
     };
     let dataset = Dataset::open(&command.capture, &options).map_err(Error::plain)?;
     for warning in &dataset.warnings {
-        eprintln!("warning: {warning}");
+        crate::messages::warning!("{warning}");
     }
     Ok(dataset)
 }
