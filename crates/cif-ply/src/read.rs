@@ -7,14 +7,15 @@ use cif_geometry::quaternion;
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_scene::assemble::{AssembleError, Prim, Prims, assemble};
 use cif_scene::files::FileError;
-use cif_scene::{CaptureFrame, SceneGraph, Splats};
+use cif_scene::{CaptureFrame, SceneGraph, Splats, UpAxis};
 use ply_rs_bw::parser::{ParseError, Parser, Reader};
 use ply_rs_bw::ply::{
     ElementDef, Encoding, Property, PropertyAccess, PropertyAccessResult, PropertyType, ScalarType,
 };
 
 use crate::PlyError;
-use crate::write::{WORLD_OFFSET, WORLD_SCALE};
+use crate::pose::turn_up;
+use crate::write::{TURNED, WORLD_OFFSET, WORLD_SCALE};
 
 /// Positions of what is read in a row.
 const POSITION: usize = 0;
@@ -43,7 +44,7 @@ impl PropertyAccess for Ignored {
 
 /// Reads splats: INRIA layout, ASCII or binary of either byte order, properties in any order, spherical harmonics
 /// of degree 0 to 3. They become one still object that carries the file's name, occupied and certain of its
-/// identity, in the axes of the file; `rows` count the splats of the file.
+/// identity, in the axes of the file, or as captured where we turned them; `rows` count the splats of the file.
 ///
 /// # Errors
 /// No PLY, cut off, or without what a splat needs; the message says what is missing.
@@ -75,9 +76,14 @@ pub fn read(path: &Path) -> Result<SceneGraph, PlyError> {
             continue;
         }
         let columns = Columns::of(element, header.encoding).map_err(invalid)?;
-        let (splats, left_out) = columns
+        let (mut splats, left_out) = columns
             .read(reader.get_mut(), element.count)
             .map_err(|what| invalid(format!("{what}; copy it again")))?;
+        match turned(&header.comments) {
+            Some(UpAxis::Y) => turn_up(&mut splats, UpAxis::Y, UpAxis::Z),
+            Some(UpAxis::Z) => turn_up(&mut splats, UpAxis::Z, UpAxis::Y),
+            None => {}
+        }
         if splats.is_empty() {
             return Err(invalid(format!("none of its {} splats can be drawn", element.count)));
         }
@@ -86,10 +92,21 @@ pub fn read(path: &Path) -> Result<SceneGraph, PlyError> {
     Err(invalid("it has no element `vertex`; splats are expected".to_owned()))
 }
 
+/// True where the file is one of ours.
+fn is_ours(comments: &[String]) -> bool {
+    comments.first().is_some_and(|comment| comment.trim_start().starts_with("cif "))
+}
+
+/// The axis that one of our files was turned to.
+fn turned(comments: &[String]) -> Option<UpAxis> {
+    let mut ours = comments.iter().filter(|_| is_ours(comments));
+    ours.find_map(|comment| comment.trim().strip_prefix(TURNED)?.trim().parse().ok())
+}
+
 /// Where our comments place the scene in the world of its capture.
 fn frame(comments: &[String]) -> Result<CaptureFrame, String> {
     let mut frame = CaptureFrame::default();
-    if !comments.first().is_some_and(|comment| comment.trim_start().starts_with("cif ")) {
+    if !is_ours(comments) {
         return Ok(frame);
     }
     let numbers = |comment: &str, name: &str| -> Option<Option<Vec<f64>>> {

@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_output::{NewFile, inside};
 use cif_scene::files::{FileError, existing_folder, folder_of, target_of};
-use cif_scene::{CaptureFrame, Node, SceneGraph, Splats};
+use cif_scene::{CaptureFrame, Node, SceneGraph, Splats, UpAxis};
 
-use crate::pose::world_splats;
+use crate::pose::{turn_up, world_splats};
 use crate::{ExportOptions, ExportSummary, PlyError};
 
 /// First comment of our files; tells what may be replaced.
@@ -22,6 +22,8 @@ const MARK: &str = concat!("comment cif ", env!("CARGO_PKG_VERSION"));
 pub(crate) const WORLD_OFFSET: &str = "world offset";
 /// See [`WORLD_OFFSET`].
 pub(crate) const WORLD_SCALE: &str = "world scale";
+/// Comment of files that were turned about the origin of the file so that y is up, from z, or the other way round.
+pub(crate) const TURNED: &str = "turned up";
 const MARK_PREFIX: &[u8] = b"ply\nformat binary_little_endian 1.0\ncomment cif ";
 
 fn is_ply(path: &Path) -> bool {
@@ -74,6 +76,8 @@ struct Job<'a> {
     path: PathBuf,
     time_code: f64,
     frame: CaptureFrame,
+    /// The axis that is up as captured, and in the file.
+    up: (UpAxis, UpAxis),
     nodes: Vec<&'a Node>,
 }
 
@@ -122,6 +126,7 @@ pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result
 fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> io::Result<Vec<Job<'a>>> {
     let at = options.time_code.unwrap_or_else(|| graph.time_codes.start());
     let codes = if options.sequence { graph.time_codes.samples.clone() } else { vec![at] };
+    let up = (graph.up_axis, options.turn_up.unwrap_or(graph.up_axis));
     let visible = |code: f64| move |node: &&Node| node.is_visible(code) && !node.splats.is_empty();
     let mut jobs = Vec::new();
     for code in codes {
@@ -131,12 +136,12 @@ fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> io::
                 let name =
                     if options.sequence { format!("{}/{number}", node.name) } else { node.name.clone() };
                 let path = inside(path, &name, "ply")?;
-                jobs.push(Job { path, time_code: code, frame: graph.frame, nodes: vec![node] });
+                jobs.push(Job { path, time_code: code, frame: graph.frame, up, nodes: vec![node] });
             }
         } else {
             let path = if options.sequence { inside(path, &number, "ply")? } else { path.to_owned() };
             let nodes = graph.nodes.iter().filter(visible(code)).collect();
-            jobs.push(Job { path, time_code: code, frame: graph.frame, nodes });
+            jobs.push(Job { path, time_code: code, frame: graph.frame, up, nodes });
         }
     }
     Ok(jobs)
@@ -148,9 +153,13 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     let mut out = BufWriter::with_capacity(1 << 16, new.file());
     let degree = job.nodes.iter().map(|node| node.splats.sh_degree).max().unwrap_or(0);
     let count = job.nodes.iter().map(|node| node.splats.len()).sum();
-    out.write_all(header(count, degree, job.time_code, &job.frame).as_bytes())?;
+    out.write_all(header(count, degree, job).as_bytes())?;
     for node in &job.nodes {
-        rows(&mut out, &world_splats(node, job.time_code), degree)?;
+        let mut splats = world_splats(node, job.time_code);
+        if job.up.0 != job.up.1 {
+            turn_up(&mut splats, job.up.0, job.up.1);
+        }
+        rows(&mut out, &splats, degree)?;
     }
     out.flush()?;
     drop(out);
@@ -159,7 +168,8 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     Ok(bytes)
 }
 
-fn header(count: usize, degree: u8, time_code: f64, frame: &CaptureFrame) -> String {
+fn header(count: usize, degree: u8, job: &Job<'_>) -> String {
+    let (time_code, frame) = (job.time_code, &job.frame);
     let mut header = format!("ply\nformat binary_little_endian 1.0\n{MARK}\ncomment time code {time_code}\n");
     if !frame.is_identity() {
         // The shortest texts that are read back as the same numbers.
@@ -168,6 +178,11 @@ fn header(count: usize, degree: u8, time_code: f64, frame: &CaptureFrame) -> Str
             "comment {WORLD_OFFSET} {x} {y} {z}\ncomment {WORLD_SCALE} {}\n",
             frame.scale
         ));
+    }
+    match job.up {
+        (UpAxis::Z, UpAxis::Y) => header.push_str(&format!("comment {TURNED} y\n")),
+        (UpAxis::Y, UpAxis::Z) => header.push_str(&format!("comment {TURNED} z\n")),
+        (UpAxis::Y, UpAxis::Y) | (UpAxis::Z, UpAxis::Z) => {}
     }
     header.push_str(&format!("element vertex {count}\n"));
     let rest = 3 * (coefficient_count(degree) - 1);

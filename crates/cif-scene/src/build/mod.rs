@@ -13,6 +13,7 @@ use cif_field::{Field, Gaussians};
 use cif_geometry::quaternion;
 use glam::DVec3;
 
+use crate::appearance::blur::Blur;
 use crate::appearance::visibility;
 use crate::appearance::{self, Opacities, Thinning};
 use crate::build::assignment::Identity;
@@ -107,6 +108,14 @@ pub fn build_from(
         nodes.push(node::node(&input, naming, group, chosen));
     }
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
+    let code_of =
+        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then_some(index as f64);
+    let cameras = camera_tracks::camera_tracks(&field.cameras, code_of);
+    let antialiased = field.record.drawing.antialiased.unwrap_or_default();
+    let blur = options.bake_blur.then(|| Blur::of(&cameras, antialiased)).flatten();
+    if options.bake_blur && blur.is_none() {
+        warnings.push("no camera is recorded, so that the blur of pixels could not be baked".into());
+    }
     for (node, group) in nodes.iter_mut().zip(&groups) {
         node.source_frames = (frames[0], frames[frames.len() - 1]);
         node.visibility = visibility::of_rows(field, &node.splats.rows);
@@ -126,6 +135,9 @@ pub fn build_from(
             node.proxy = Some(proxy::point_proxy(&node.splats, options.proxy_points));
         }
         add_colliders(node, options, &mut warnings);
+        if let Some(blur) = &blur {
+            blur.bake(node);
+        }
     }
     let omitted: Vec<String> = (0..field.instances.len())
         .filter(|index| !group_owners.contains(&Some(*index)))
@@ -142,13 +154,11 @@ pub fn build_from(
             .collect();
         warnings.push(format!("no visible Gaussian belongs to: {}", told.join(", ")));
     }
-    let code_of =
-        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then_some(index as f64);
     Ok(SceneGraph {
         up_axis: options.up_axis,
         meters_per_unit: options.meters_per_unit,
         frame: world::frame_of(field)?,
-        cameras: camera_tracks::camera_tracks(&field.cameras, code_of),
+        cameras,
         time_codes,
         nodes,
         background_color: field.background,
