@@ -18,18 +18,22 @@ PYTEST := pytest==9.2.0
 RUFF := ruff==0.17.5
 # A C compiler that links against the symbols of any glibc; the machine's own takes those of its own.
 ZIG := ziglang==0.17.1
+# The USD of the tests; any since 26.3 will do, see pyproject.toml.
+USD := usd-core==26.11
 # Its library runs the models of tests of cif-vision; nothing else of it is needed (17 MB).
 ONNXRUNTIME := onnxruntime==1.23.2
 
 # Tools that read what we write, each in an environment of its own: their versions of USD or Python differ from ours.
 MUJOCO := mujoco[usd]==4.0.0
+NEWTON := newton==1.8.0 newton-usd-schemas==0.6.0 warp-lang==1.19.0 usd-core==26.8 scipy numpy
+VALIDATOR := omniverse-asset-validator==1.18.0 usd-core==26.8
 PYCOLMAP := pycolmap==4.2.1
-BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13
+BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 bpy==5.3.0/python3.13
 
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs test test-wheel test-rust test-python test-mujoco test-blender test-capture fuzz lint format clean
+.PHONY: help build wheel demo plugin stubs test test-wheel test-rust test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -38,7 +42,8 @@ help:
 	@echo "make plugin  the Blender extension, into out/"
 	@echo "make test    all tests, Rust and Python"
 	@echo "make fuzz    damaged files for every reader, MINUTES=60 long; READER= picks one"
-	@echo "make test-mujoco, make test-blender   tests with these tools, which are downloaded (75 MB, 1.1 GB)"
+	@echo "make test-mujoco, test-newton, test-blender   tests with these tools, which are downloaded (75 MB, 300 MB, 1.5 GB)"
+	@echo "make test-validator   NVIDIA's validator on our stages, which is downloaded (50 MB)"
 	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
 	@echo "make stubs   docstrings of the Python module into its stub"
 	@echo "make lint    formatting and lints, as in CI"
@@ -100,7 +105,7 @@ test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	$(BIN)/maturin build --profile dev --interpreter $(BIN)/python --out $(TEST_WHEELS)
 	test -x $(TEST_BIN)/python || $(PYTHON) -m venv $(VENV)/tests
 	@$(TEST_BIN)/python -m pip uninstall -qq --yes cif
-	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check $(PYTEST) "$$(echo $(TEST_WHEELS)/*.whl)[usd]"
+	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check $(PYTEST) $(USD) "$$(echo $(TEST_WHEELS)/*.whl)[usd]"
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps $(ONNXRUNTIME)
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 
@@ -129,6 +134,18 @@ test-mujoco: test-wheel
 	$(VENV)/mujoco/bin/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 	CIF_TEST_MUJOCO=$(VENV)/mujoco/bin/python $(TEST_BIN)/python -m pytest tests/python/test_mujoco.py
 	$(VENV)/mujoco/bin/python -m pytest $(OLD_USD_TESTS)
+
+# What Newton makes of our files, then the example that simulates with it.
+test-newton: test-wheel
+	test -x $(VENV)/newton/bin/python || $(PYTHON) -m venv $(VENV)/newton
+	$(VENV)/newton/bin/python -m pip install --quiet --disable-pip-version-check $(NEWTON) $(PYTEST)
+	CIF_TEST_NEWTON=$(VENV)/newton/bin/python $(TEST_BIN)/python -m pytest tests/python/test_newton.py
+	$(VENV)/newton/bin/python -m pytest --noconftest tests/python/test_simulate.py
+
+test-validator: test-wheel
+	test -x $(VENV)/validator/bin/python || $(PYTHON) -m venv $(VENV)/validator
+	$(VENV)/validator/bin/python -m pip install --quiet --disable-pip-version-check $(VALIDATOR)
+	CIF_TEST_VALIDATOR=$(VENV)/validator/bin/python $(TEST_BIN)/python -m pytest tests/python/test_validator.py
 
 test-capture:
 	test -x $(VENV)/capture/bin/python || $(PYTHON) -m venv $(VENV)/capture

@@ -251,6 +251,57 @@ float physics:gravityMagnitude = 9.81
     return path
 
 
+def write_cabinet(path: Path) -> Path:
+    """A cabinet at height 0.5 whose door turns about z by 0.1 rad a frame and whose drawer slides, on joints.
+
+    Its parts lie 0.3 apart; the floor is a background at height 0.
+    """
+    codes = range(FRAMES)
+    floor = np.random.default_rng(4).uniform([-2, -2, -0.002], [2, 2, 0.002], (COUNT * 20, 3))
+    parts = (
+        _part("part_00", _pose((0, 0, 0), turned(0)), _splats(1))
+        + _part("part_01", _poses((f, (0.3, 0, 0), turned(0.1 * f)) for f in codes), _splats(2))
+        + _part("part_02", _poses((f, (0, 0.3 + 0.02 * f, 0), turned(0)) for f in codes), _splats(3))
+        + _joint("Revolute", "part_01", (0.3, 0, 0), "Z", 180 / np.pi * 0.1 * (FRAMES - 1))
+        + _joint("Prismatic", "part_02", (0, 0.3, 0), "Y", 0.02 * (FRAMES - 1))
+    )
+    body = [
+        _object("cabinet_004", ["cabinet"], 4, _pose((0, 0, 0.5), turned(0)), parts),
+        _object("background", ["background"], None, _pose((0, 0, 0), turned(0)), _flat(floor)),
+    ]
+    path.write_text(
+        f"""#usda 1.0
+(
+    defaultPrim = "World"
+    upAxis = "Z"
+    metersPerUnit = 1
+    timeCodesPerSecond = 12
+    framesPerSecond = 12
+    startTimeCode = 0
+    endTimeCode = {FRAMES - 1}
+)
+def Xform "World" (kind = "assembly")
+{{
+{"".join(body)}
+}}
+"""
+    )
+    return path
+
+
+def _joint(kind: str, part: str, place: tuple, axis: str, upper: float) -> str:
+    """A joint between the first part of the cabinet and another, at the origin of that."""
+    return f"""def Physics{kind}Joint "Joint_{part}" {{
+rel physics:body0 = </World/cabinet_004/part_00>
+rel physics:body1 = </World/cabinet_004/{part}>
+point3f physics:localPos0 = {_tuple(place)}
+uniform token physics:axis = "{axis}"
+float physics:lowerLimit = 0
+float physics:upperLimit = {upper:.9g}
+}}
+"""
+
+
 def _flat(places: np.ndarray) -> str:
     """A prim of round splats at the given places."""
     count = len(places)

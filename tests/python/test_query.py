@@ -68,7 +68,7 @@ def test_find_returns_prims(stage_path: Path) -> None:
     assert everything[0].GetStage() == stage
     assert names(cif.usd.find(stage, "car", taxonomy="class", time=3)) == ["toy_car_002"]
     assert cif.usd.find(stage, "car", taxonomy="instance") == []
-    assert "Splats" in names(cif.usd.find(stage, "mug", inherited=True))
+    assert "red_mug_001_splats" in names(cif.usd.find(stage, "mug", inherited=True))
     labels = cif.usd.labels(stage.GetPrimAtPath("/World/red_mug_001"))
     expected = {"class": ["mug", "red mug"], "instance": ["red_mug_001"], "wikidata_qcode": ["Q81727"]}
     assert labels == expected
@@ -202,7 +202,9 @@ def test_labels_are_edited_in_place(
         assert "unpack the package" in capfd.readouterr().err
         return
     old = Usd.Stage.Open(str(path))
-    before = np.array(old.GetPrimAtPath("/World/toy_car_002/Splats").GetAttribute("positions").Get(2))
+    before = np.array(
+        old.GetPrimAtPath("/World/toy_car_002/toy_car_002_splats").GetAttribute("positions").Get(2)
+    )
     del old
     assert cif.run(["label", str(path), "--instance", "1", "blue mug"]) == 0
     capfd.readouterr()
@@ -212,7 +214,7 @@ def test_labels_are_edited_in_place(
     assert cif.usd.labels(mug)["class"] == ["blue mug", "mug"]
     assert list(UsdSemantics.LabelsAPI(mug, "class").GetLabelsAttr().Get()) == ["mug", "blue mug"]
     assert (mug.GetDisplayName(), mug.GetAttribute("userProperties:label").Get()) == ("blue mug",) * 2
-    positions = stage.GetPrimAtPath("/World/toy_car_002/Splats").GetAttribute("positions").Get(2)
+    positions = stage.GetPrimAtPath("/World/toy_car_002/toy_car_002_splats").GetAttribute("positions").Get(2)
     assert np.array_equal(before, np.array(positions))
     (found,) = ask(capfd, path, "--label", "blue mug")
     assert (found["label"], found["class"], found["instance"]) == ("blue mug", "mug", "red_mug_001")

@@ -28,7 +28,7 @@ def stage(stage_path: Path) -> Usd.Stage:
 
 
 def splats_of(stage: Usd.Stage, name: str) -> Usd.Prim:
-    return stage.GetPrimAtPath(f"/World/{name}/Splats")
+    return stage.GetPrimAtPath(f"/World/{name}/{name}_splats")
 
 
 def rotations(xyzw: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@
 //! | `read` | files of any property order, ASCII and binary |
 //!
 //! PLY knows neither objects nor time: what moves leaves as one moment, or as a numbered sequence of moments, and
-//! objects leave as files of their own. Splats stand in the world as it was captured; nothing swaps its axes.
+//! objects leave as files of their own. Splats stand in the world as it was captured, or on request turned so that another
+//! axis is up, which a comment tells to readers.
 
 pub mod error;
 pub mod pose;
@@ -43,7 +44,7 @@ impl SceneFormat for Ply {
                 "splats of PLY files, which are single precision, stay in that frame; the comments `world offset` \
                  and `world scale` tell it: a place in the world is that in the file / scale + offset",
             ),
-            options: &["time_code"],
+            options: &["time_code", "turn_up"],
         };
         &ABOUT
     }

@@ -4,7 +4,7 @@ use cif_geometry::quaternion;
 use cif_geometry::spherical_harmonics::HarmonicsRotation;
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_scene::graph::pose_at;
-use cif_scene::{Motion, Node, PoseSample, Splats};
+use cif_scene::{Motion, Node, PoseSample, Splats, UpAxis};
 use glam::{DQuat, DVec3};
 use std::ops::Range;
 
@@ -50,6 +50,17 @@ pub fn world_splats(node: &Node, time_code: f64) -> Splats {
         }
     }
     splats
+}
+
+/// Turns a whole scene about the origin so that another of its axes is up.
+pub(crate) fn turn_up(splats: &mut Splats, from: UpAxis, to: UpAxis) {
+    let axis = |up| match up {
+        UpAxis::Y => DVec3::Y,
+        UpAxis::Z => DVec3::Z,
+    };
+    let rotation = DQuat::from_rotation_arc(axis(from), axis(to));
+    let all = 0..splats.len();
+    place(splats, all, &PoseSample { time_code: 0.0, translation: DVec3::ZERO, rotation });
 }
 
 /// Brings splats of a range into the frame that `pose` stands in.

@@ -7,7 +7,7 @@ use cif_geometry::spherical_harmonics::{BAND_0, coefficient_count};
 use cif_geometry::{Bounds, quaternion};
 use cif_scene::assemble::{Prim, Prims, assemble, color_range, origin_of};
 use cif_scene::files::FileError;
-use cif_scene::{CaptureFrame, SceneGraph, Splats};
+use cif_scene::{CaptureFrame, SceneGraph, Splats, UpAxis};
 use glam::DVec3;
 use ply_rs_bw::parser::{ParseError, Parser, Reader};
 use ply_rs_bw::ply::{
@@ -15,7 +15,8 @@ use ply_rs_bw::ply::{
 };
 
 use crate::PlyError;
-use crate::write::{RENDER_MODE, RENDER_MODE_MIP, WORLD_OFFSET, WORLD_SCALE};
+use crate::pose::turn_up;
+use crate::write::{RENDER_MODE, RENDER_MODE_MIP, TURNED, WORLD_OFFSET, WORLD_SCALE};
 
 /// Positions of what is read in a row.
 const POSITION: usize = 0;
@@ -45,8 +46,9 @@ impl PropertyAccess for Ignored {
 /// Reads splats: INRIA layout, ASCII or binary of either byte order, properties in any order, spherical harmonics
 /// of degree 0 to 3, or colours `red`, `green`, `blue`; two scales are those of flat splats (2D Gaussian Splatting).
 /// They become one still object that carries the file's name, occupied and certain of its identity, in the axes of the
-/// file; `rows` count the splats of the file. Splats far from the origin get one of their own in double precision, which
-/// [`SceneGraph::frame`] records. The comment `SplatRenderMode` says whether they are drawn antialiased.
+/// file, or as captured where we turned them; `rows` count the splats of the file. Splats far from the origin get one of
+/// their own in double precision, which [`SceneGraph::frame`] records. The comment `SplatRenderMode` says whether they are
+/// drawn antialiased.
 ///
 /// # Errors
 /// No PLY, cut off, or without what a splat needs; the message says what is missing.
@@ -86,16 +88,27 @@ pub fn read(path: &Path) -> Result<SceneGraph, PlyError> {
         }
         let mut warnings = columns.notes();
         let antialiased = render_mode(&header.comments, &mut warnings);
-        let scene = collected.scene(path, frame, warnings);
+        let scene = collected.scene(path, (frame, turned(&header.comments)), warnings);
         return assemble(Prims { antialiased, ..scene }).map_err(|error| invalid(error.to_string()));
     }
     Err(invalid("it has no element `vertex`; splats are expected".to_owned()))
 }
 
+/// True where the file is one of ours.
+fn is_ours(comments: &[String]) -> bool {
+    comments.first().is_some_and(|comment| comment.trim_start().starts_with("cif "))
+}
+
+/// The axis that one of our files was turned to.
+fn turned(comments: &[String]) -> Option<UpAxis> {
+    let mut ours = comments.iter().filter(|_| is_ours(comments));
+    ours.find_map(|comment| comment.trim().strip_prefix(TURNED)?.trim().parse().ok())
+}
+
 /// Where our comments place the scene in the world of its capture.
 fn frame(comments: &[String]) -> Result<CaptureFrame, String> {
     let mut frame = CaptureFrame::default();
-    if !comments.first().is_some_and(|comment| comment.trim_start().starts_with("cif ")) {
+    if !is_ours(comments) {
         return Ok(frame);
     }
     let numbers = |comment: &str, name: &str| -> Option<Option<Vec<f64>>> {
@@ -402,8 +415,14 @@ impl Collected {
         splats.rows.push(row);
     }
 
-    /// A still scene of one object, labelled by the name of the file.
-    fn scene(self, path: &Path, mut frame: CaptureFrame, mut warnings: Vec<String>) -> Prims {
+    /// A still scene of one object, labelled by the name of the file. A file of ours may have been turned so that an axis
+    /// is up; far scenes of ours have a frame already.
+    fn scene(
+        self,
+        path: &Path,
+        (mut frame, turned): (CaptureFrame, Option<UpAxis>),
+        mut warnings: Vec<String>,
+    ) -> Prims {
         let Self { mut splats, centres, colors, left_out } = self;
         let label =
             path.file_stem().map_or_else(|| "splats".to_owned(), |stem| stem.to_string_lossy().into_owned());
@@ -412,7 +431,7 @@ impl Collected {
                 "{left_out} splats with values that are not finite, or without a rotation, were left out"
             ));
         }
-        if frame.is_identity() {
+        if frame.is_identity() && turned.is_none() {
             let bounds = Bounds::around(centres.iter().copied().map(DVec3::from_array));
             if let Some(origin) = origin_of(&bounds, 1.0, &mut warnings) {
                 frame.offset = origin.to_array();
@@ -434,6 +453,11 @@ impl Collected {
             for sh in splats.sh_coefficients.chunks_exact_mut(stride) {
                 sh[..3].iter_mut().for_each(|value| *value = (*value / white - 0.5) / BAND_0 as f32);
             }
+        }
+        match turned {
+            Some(UpAxis::Y) => turn_up(&mut splats, UpAxis::Y, UpAxis::Z),
+            Some(UpAxis::Z) => turn_up(&mut splats, UpAxis::Z, UpAxis::Y),
+            None => {}
         }
         let prims = vec![Prim::still(path.display().to_string(), label, splats)];
         Prims { frame, prims, warnings, ..Prims::default() }

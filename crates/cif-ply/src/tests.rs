@@ -2,7 +2,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use cif_geometry::spherical_harmonics::{basis, coefficient_count};
-use cif_scene::{CaptureFrame, Motion, PoseSample, Splats};
+use cif_scene::{CaptureFrame, Motion, PoseSample, Splats, UpAxis};
 use glam::{DMat3, DQuat, DVec3};
 
 use super::*;
@@ -419,5 +419,34 @@ fn colours_in_place_of_coefficients_are_told_by_their_range() {
         let off = colors.as_flattened().iter().zip(expected.as_flattened()).map(|(a, b)| (a - b).abs());
         assert!(off.fold(0.0, f32::max) < 1e-5, "{colors:?}");
         assert_eq!(graph.warnings.len(), notes, "{:?}", graph.warnings);
+    }
+}
+
+#[test]
+fn files_for_viewers_with_another_axis_up_are_turned_and_come_back_as_captured() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("turned.ply");
+    let still = scene(&[splats(6, 2)]);
+    for (up_axis, turn_up, sign) in [(UpAxis::Z, UpAxis::Y, 1.0), (UpAxis::Y, UpAxis::Z, -1.0)] {
+        let graph = SceneGraph { up_axis, ..still.clone() };
+        let options = ExportOptions { force: true, turn_up: Some(turn_up), ..ExportOptions::default() };
+        export(&graph, &path, options).unwrap();
+        assert_close(&read(&path).unwrap().nodes[0].splats, &still.nodes[0].splats);
+        // Without our mark it is taken as it stands: what was up along one axis is up along the other.
+        let bytes = std::fs::read(&path).unwrap();
+        let mark = bytes.windows(12).position(|part| part == b"comment cif ").unwrap();
+        let mut others = bytes.clone();
+        others[mark + 8..mark + 11].copy_from_slice(b"abc");
+        std::fs::write(&path, others).unwrap();
+        let as_it_stands = read(&path).unwrap();
+        for ([x, y, z], turned) in still.nodes[0].splats.means.iter().zip(&as_it_stands.nodes[0].splats.means)
+        {
+            let expected = [*x, sign * z, -sign * y];
+            assert!(
+                expected.iter().zip(turned).all(|(a, b)| (a - b).abs() < 1e-5),
+                "{expected:?} {turned:?}"
+            );
+        }
+        std::fs::remove_file(&path).unwrap();
     }
 }

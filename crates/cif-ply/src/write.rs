@@ -10,9 +10,9 @@ use std::path::{Path, PathBuf};
 use cif_geometry::spherical_harmonics::coefficient_count;
 use cif_output::{NewFile, inside};
 use cif_scene::files::{FileError, existing_folder, folder_of, target_of};
-use cif_scene::{Node, SceneGraph, Splats};
+use cif_scene::{Node, SceneGraph, Splats, UpAxis};
 
-use crate::pose::world_splats;
+use crate::pose::{turn_up, world_splats};
 use crate::{ExportOptions, ExportSummary, PlyError};
 
 /// First comment of our files; tells what may be replaced.
@@ -26,6 +26,8 @@ pub(crate) const WORLD_SCALE: &str = "world scale";
 pub(crate) const RENDER_MODE: &str = "SplatRenderMode:";
 /// Of [`RENDER_MODE`]: footprints are widened and their opacity lowered in turn (Mip-Splatting).
 pub(crate) const RENDER_MODE_MIP: &str = "mip";
+/// Comment of files that were turned about the origin of the file so that y is up, from z, or the other way round.
+pub(crate) const TURNED: &str = "turned up";
 const MARK_PREFIX: &[u8] = b"ply\nformat binary_little_endian 1.0\ncomment cif ";
 
 fn is_ply(path: &Path) -> bool {
@@ -78,6 +80,8 @@ struct Job<'a> {
     path: PathBuf,
     time_code: f64,
     graph: &'a SceneGraph,
+    /// The axis that is up as captured, and in the file.
+    up: (UpAxis, UpAxis),
     nodes: Vec<&'a Node>,
 }
 
@@ -126,6 +130,7 @@ pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result
 fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> io::Result<Vec<Job<'a>>> {
     let at = options.time_code.unwrap_or_else(|| graph.time_codes.start());
     let codes = if options.sequence { graph.time_codes.samples.clone() } else { vec![at] };
+    let up = (graph.up_axis, options.turn_up.unwrap_or(graph.up_axis));
     let visible = |code: f64| move |node: &&Node| node.is_visible(code) && !node.splats.is_empty();
     let mut jobs = Vec::new();
     for code in codes {
@@ -135,12 +140,12 @@ fn jobs<'a>(graph: &'a SceneGraph, path: &Path, options: &ExportOptions) -> io::
                 let name =
                     if options.sequence { format!("{}/{number}", node.name) } else { node.name.clone() };
                 let path = inside(path, &name, "ply")?;
-                jobs.push(Job { path, time_code: code, graph, nodes: vec![node] });
+                jobs.push(Job { path, time_code: code, graph, up, nodes: vec![node] });
             }
         } else {
             let path = if options.sequence { inside(path, &number, "ply")? } else { path.to_owned() };
             let nodes = graph.nodes.iter().filter(visible(code)).collect();
-            jobs.push(Job { path, time_code: code, graph, nodes });
+            jobs.push(Job { path, time_code: code, graph, up, nodes });
         }
     }
     Ok(jobs)
@@ -152,9 +157,13 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     let mut out = BufWriter::with_capacity(1 << 16, new.file());
     let degree = job.nodes.iter().map(|node| node.splats.sh_degree).max().unwrap_or(0);
     let count = job.nodes.iter().map(|node| node.splats.len()).sum();
-    out.write_all(header(count, degree, job.time_code, job.graph).as_bytes())?;
+    out.write_all(header(count, degree, job).as_bytes())?;
     for node in &job.nodes {
-        rows(&mut out, &world_splats(node, job.time_code), degree)?;
+        let mut splats = world_splats(node, job.time_code);
+        if job.up.0 != job.up.1 {
+            turn_up(&mut splats, job.up.0, job.up.1);
+        }
+        rows(&mut out, &splats, degree)?;
     }
     out.flush()?;
     drop(out);
@@ -163,7 +172,8 @@ fn write(job: &Job<'_>) -> io::Result<u64> {
     Ok(bytes)
 }
 
-fn header(count: usize, degree: u8, time_code: f64, graph: &SceneGraph) -> String {
+fn header(count: usize, degree: u8, job: &Job<'_>) -> String {
+    let Job { time_code, graph, .. } = job;
     let frame = &graph.frame;
     let mut header = format!("ply\nformat binary_little_endian 1.0\n{MARK}\ncomment time code {time_code}\n");
     if graph.antialiased == Some(true) {
@@ -176,6 +186,11 @@ fn header(count: usize, degree: u8, time_code: f64, graph: &SceneGraph) -> Strin
             "comment {WORLD_OFFSET} {x} {y} {z}\ncomment {WORLD_SCALE} {}\n",
             frame.scale
         ));
+    }
+    match job.up {
+        (UpAxis::Z, UpAxis::Y) => header.push_str(&format!("comment {TURNED} y\n")),
+        (UpAxis::Y, UpAxis::Z) => header.push_str(&format!("comment {TURNED} z\n")),
+        (UpAxis::Y, UpAxis::Y) | (UpAxis::Z, UpAxis::Z) => {}
     }
     header.push_str(&format!("element vertex {count}\n"));
     let rest = 3 * (coefficient_count(degree) - 1);

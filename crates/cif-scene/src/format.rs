@@ -2,13 +2,14 @@
 //! command keeps the list of them.
 
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
 use cif_field::Field;
 use serde::Deserialize;
 
 use crate::{
-    CodeRange, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError, SceneError,
-    SceneGraph, SceneOptions, build, query, search,
+    CodeRange, DENSITY, LabelMatch, LabelQuery, MotionModel, ObjectMatch, ObjectQuery, QueryError,
+    SceneError, SceneGraph, SceneOptions, UpAxis, build, query, search,
 };
 
 /// Why a format refuses; the message names the file and what to do.
@@ -203,6 +204,37 @@ pub enum Payloads {
     SingleFile,
 }
 
+/// Plane on which simulators let things fall.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Ground {
+    /// None.
+    #[default]
+    None,
+    /// Where the objects stand: see [`crate::ground_height`].
+    Auto,
+    /// At a height along the up axis, world units.
+    At(f64),
+}
+
+impl FromStr for Ground {
+    type Err = SceneError;
+
+    /// `none`, `auto`, or a height such as `-0.02`.
+    fn from_str(text: &str) -> Result<Self, SceneError> {
+        match (text, text.parse::<f64>()) {
+            ("none", _) => Ok(Self::None),
+            ("auto", _) => Ok(Self::Auto),
+            (_, Ok(height)) if height.is_finite() => Ok(Self::At(height)),
+            _ => Err(SceneError::Option {
+                option: "ground",
+                value: text.to_owned(),
+                expected: "none, auto or a height in world units",
+            }),
+        }
+    }
+}
+
 /// Options for writing a graph. A format ignores those that it does not know.
 #[derive(Clone, Copy, Debug, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -213,6 +245,14 @@ pub struct ExportOptions {
     pub payloads: Payloads,
     /// USD: write the variants `half` and `quarter` of the set `lod` beside `full`.
     pub levels_of_detail: bool,
+    /// USD: a plane that simulators let things fall on. Default none.
+    pub ground: Ground,
+    /// USD: density of bodies over the volume that they fill (see [`crate::masses`]), kg/m^3. Default
+    /// [`crate::DENSITY`].
+    pub density: f64,
+    /// USD: fix bodies on recorded tracks to the world by joints, for simulators that let them fall (MuJoCo). Default
+    /// false.
+    pub weld_kinematic: bool,
     /// Formats of one moment: the time code that is written; `None` takes the first.
     pub time_code: Option<f64>,
     /// Formats of one moment: a file per object, in a folder.
@@ -220,6 +260,8 @@ pub struct ExportOptions {
     /// Formats of one moment: a file per sampled time code, numbered by it, in a folder; with `split`, in a folder
     /// per object.
     pub sequence: bool,
+    /// Formats of one moment: turn the scene so that this axis is up; `None` leaves it as captured.
+    pub turn_up: Option<UpAxis>,
 }
 
 impl Default for ExportOptions {
@@ -228,9 +270,13 @@ impl Default for ExportOptions {
             force: false,
             payloads: Payloads::default(),
             levels_of_detail: true,
+            ground: Ground::default(),
+            density: DENSITY,
+            weld_kinematic: false,
             time_code: None,
             split: false,
             sequence: false,
+            turn_up: None,
         }
     }
 }

@@ -18,10 +18,12 @@
 //! | [`motion::keys`] | fewer samples of a track inside an error bound |
 //! | [`motion::placement`] | where a node's splats are at any time |
 //! | [`motion::velocity`] | how fast a node moves |
-//! | [`appearance`] | opacities and colours that change over time, and when a node is hidden by them |
+//! | [`appearance`] | opacities and colours that change over time, when a node is hidden by them, and the filter of the renderer as part of splats |
 //! | [`shape::extent`] | boxes that hold the 3-sigma ellipsoids |
 //! | [`shape::convex_hull`] | convex hulls with few corners |
 //! | [`shape::colliders`] | one or several hulls around most of what a node shows |
+//! | [`shape::ground`] | where the surface is that objects stand on |
+//! | [`shape::mass`] | how heavy bodies are |
 //! | [`shape::level_of_detail`] | the most important splats of a node |
 //! | [`shape::proxy`] | a light point cloud standing in for the splats |
 //! | [`report`] | what the chosen motion models cost and miss |
@@ -70,7 +72,8 @@ pub use edits::import_edits;
 pub use error::SceneError;
 pub use field_from_graph::{field_from_graph, time_in_field};
 pub use format::{
-    About, Ending, ExportOptions, ExportSummary, FormatError, Payloads, ReadOptions, Relabelled, SceneFormat,
+    About, Ending, ExportOptions, ExportSummary, FormatError, Ground, Payloads, ReadOptions, Relabelled,
+    SceneFormat,
 };
 pub use graph::{
     Appearance, AppearanceSample, CameraSample, CameraTrack, CodeRange, ConvexHull, DenseMotion, DenseSample,
@@ -89,7 +92,9 @@ pub use query::trajectory::{Trajectory, TrajectorySample, trajectories};
 pub use query::{LabelMatch, LabelQuery, QueryError, query};
 pub use report::{MotionReport, ResidualStatistics};
 pub use shape::extent;
+pub use shape::ground::ground_height;
 pub use shape::level_of_detail::level_of_detail;
+pub use shape::mass::{DENSITY, masses};
 pub use world::frame_of;
 
 /// Where coordinates lie in the world of the capture; see [`world`].

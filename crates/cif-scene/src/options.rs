@@ -130,6 +130,10 @@ pub struct SceneOptions {
     pub meters_per_unit: Option<f64>,
     /// Most points of a node's proxy; 0 leaves proxies out. Default 2000.
     pub proxy_points: usize,
+    /// Make the low-pass filter of the renderer (0.3 px^2) part of the splats, at the distances from which the recorded
+    /// cameras see them, for viewers that have no such filter: thin parts vanish there. Viewers that have one then
+    /// filter twice. Default false.
+    pub bake_blur: bool,
 }
 
 impl Default for SceneOptions {
@@ -150,6 +154,7 @@ impl Default for SceneOptions {
             up_axis: None,
             meters_per_unit: None,
             proxy_points: 2000,
+            bake_blur: false,
         }
     }
 }

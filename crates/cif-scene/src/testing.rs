@@ -5,6 +5,11 @@ use cif_field::{Field, Gaussians, Identities, Instance, RecordedCamera, SortMetr
 use cif_geometry::{PinholeCamera, RigidTransform};
 use glam::{DMat3, DQuat, DVec2, DVec3};
 
+use crate::{
+    Appearance, CaptureFrame, Motion, MotionReport, Node, NodeKind, Origin, SceneGraph, Splats, TimeCodes,
+    UpAxis, extent,
+};
+
 /// Gaussians per object, and of the background.
 pub(crate) const MEMBERS: usize = 40;
 
@@ -187,4 +192,56 @@ pub(crate) fn learned_field(objects: usize, seed: u64) -> Field {
     }
     field.identities = Some(identities);
     field
+}
+
+/// An instance at rest whose splats lie at these places, all of one size.
+pub(crate) fn node_of(places: &[DVec3], scales: [f32; 3]) -> Node {
+    let count = places.len();
+    let splats = Splats {
+        means: places.iter().map(|place| place.to_array().map(|v| v as f32)).collect(),
+        orientations: vec![[1.0, 0.0, 0.0, 0.0]; count],
+        scales: vec![scales; count],
+        opacities: vec![0.9; count],
+        sh_coefficients: vec![0.5; 3 * count],
+        occupancies: vec![0.9; count],
+        identity_probabilities: vec![1.0; count],
+        rows: (0..count as u32).collect(),
+        ..Splats::default()
+    };
+    Node {
+        kind: NodeKind::Instance { id: 1, index: 0 },
+        name: "thing_001".to_owned(),
+        label: "thing".to_owned(),
+        category: "thing".to_owned(),
+        taxonomies: Default::default(),
+        embedding: None,
+        pivot: DVec3::ZERO,
+        motion: Motion::Static,
+        report: MotionReport::unfitted(&splats, &Motion::Static),
+        extent: extent::splat_bounds(&RigidTransform::IDENTITY, &splats, 0..count),
+        splats,
+        appearance: Appearance::default(),
+        proxy: None,
+        colliders: Vec::new(),
+        visibility: Vec::new(),
+        source_frames: (0, 0),
+        mean_occupancy: 0.9,
+    }
+}
+
+/// A scene of one moment.
+pub(crate) fn graph_of(nodes: Vec<Node>) -> SceneGraph {
+    SceneGraph {
+        up_axis: UpAxis::Z,
+        meters_per_unit: 1.0,
+        frame: CaptureFrame::default(),
+        time_codes: TimeCodes { samples: vec![0.0], times: vec![0.0], frames_per_second: 24.0 },
+        nodes,
+        cameras: Vec::new(),
+        background_color: [1.0; 3],
+        sort_metric: SortMetric::Z,
+        omitted: Vec::new(),
+        warnings: Vec::new(),
+        origin: Origin::default(),
+    }
 }

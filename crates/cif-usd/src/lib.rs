@@ -16,10 +16,10 @@
 //! Layout of a stage: `/World` (assembly) holds one `Xform` (component) per instance and one for the background,
 //! the scope `Cameras` and, where there are colliders, `PhysicsScene`. An instance has `translate` and `orient`,
 //! `SemanticsLabelsAPI` in the taxonomies `class` (category and human label) and `instance` (unique name) and in those
-//! of [`cif_scene::Node::taxonomies`], `CifInstanceAPI` (`schemas/cif`), and the children `Splats` (`ParticleField3DGaussianSplat`), `Proxy` (`Points`
+//! of [`cif_scene::Node::taxonomies`], `CifInstanceAPI` (`schemas/cif`), and the children `NAME_splats` (`ParticleField3DGaussianSplat`), `Proxy` (`Points`
 //! drawn by a `PointInstancer`, purpose proxy) and `Collider` (`Mesh`, purpose guide). Where it moves in parts, every
 //! part is an `Xform` under it with such children of its own. The variant set `lod` chooses how many splats are
-//! loaded, `physics` how simulators treat the instance. Arrays stand in the root layer or, by payload, in one layer
+//! loaded, `physics` how simulators treat the instance. `Ground` is there where it was asked for. Arrays stand in the root layer or, by payload, in one layer
 //! per instance.
 
 pub mod conventions;
@@ -86,7 +86,7 @@ impl SceneFormat for Usd {
             files: "One prim per object",
             most_expensive_motion: Some(MotionModel::Dense),
             note_on_place: None,
-            options: &["payloads", "levels_of_detail"],
+            options: &["payloads", "levels_of_detail", "ground", "density", "weld_kinematic"],
         };
         &ABOUT
     }

@@ -49,8 +49,11 @@ pub const WORLD: &str = "/World";
 pub const CAMERAS: &str = "/World/Cameras";
 /// Gravity.
 pub const PHYSICS_SCENE: &str = "/World/PhysicsScene";
-/// Splat prim of a node or part.
-pub const SPLATS: &str = "Splats";
+/// Plane that simulators let things fall on.
+pub const GROUND: &str = "/World/Ground";
+/// Ending of the name of the splat prim of a node or part, after the name of the node, so that importers that name
+/// what they make by the prim alone keep objects apart. Files of before have `Splats`: readers go by the type.
+pub const SPLATS: &str = "splats";
 /// Point proxy of a node or part.
 pub const PROXY: &str = "Proxy";
 /// The points below their proxy.
@@ -61,6 +64,10 @@ pub const JOINT: &str = "Joint";
 pub const REVOLUTE_JOINT: &str = "PhysicsRevoluteJoint";
 /// A part that slides along an axis of another.
 pub const PRISMATIC_JOINT: &str = "PhysicsPrismaticJoint";
+/// Joint that fixes a body to the world.
+pub const HOLD: &str = "Hold";
+/// Joint without freedom.
+pub const FIXED_JOINT: &str = "PhysicsFixedJoint";
 /// Convex hull of a node or part; further ones are numbered.
 pub const COLLIDER: &str = "Collider";
 /// Ending of the folder of payloads: `out.usda` has `out.payloads`, `out.usdc` has `out.usdc.payloads`.

@@ -88,6 +88,10 @@ fn checked(pxr: &Pxr<'_>, path: &Path, options: ExportOptions) -> Result<Target,
         (Payloads::Separate, _) | (Payloads::ByKind, Kind::Text) => true,
         (Payloads::SingleFile, _) | (Payloads::ByKind, _) => false,
     };
+    if !(options.density.is_finite() && options.density > 0.0) {
+        let reason = format!("a density of {} kg/m^3 is given; give one above 0", options.density);
+        return Err(UsdError::Write { path: path.to_owned(), reason });
+    }
     existing_folder(path)?;
     if path.is_dir() {
         return Err(UsdError::IsFolder { path: path.to_owned() });
@@ -190,7 +194,7 @@ fn write(
         payloads: payloads.as_deref().map(|folder| (folder, name)),
         levels: options.levels_of_detail,
     };
-    author::author(&Scene { pxr, graph, storage }, &root)?;
+    author::author(&Scene { pxr, graph, storage, options: &options }, &root)?;
     if target.kind != Kind::Package {
         return Ok(Written { root, payloads });
     }

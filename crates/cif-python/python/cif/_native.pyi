@@ -133,6 +133,8 @@ class SceneOptions(TypedDict, total=False):
     """Metres per world unit; by default that of the imported file, else 1."""
     proxy_points: int
     """Most points of the stand-in of an object; 0 for none."""
+    bake_blur: bool
+    """Widen splats by the filter of the renderer, for viewers without one; off by default."""
 
 class UsdOptions(TypedDict, total=False):
     """Options of USD files."""
@@ -141,12 +143,20 @@ class UsdOptions(TypedDict, total=False):
     """Where the arrays of objects go: beside the stage, into it, or (by-kind) beside .usda alone."""
     levels_of_detail: bool
     """Add variants with half and a quarter of the splats; on by default."""
+    ground: Literal["none", "auto"] | dict[Literal["at"], float]
+    """A plane for simulators: where the objects stand, or at a height; none by default."""
+    density: float
+    """Density of objects over the volume that their splats fill, kg/m3; 300 by default."""
+    weld_kinematic: bool
+    """Fix objects on recorded tracks to the world by joints, as MuJoCo needs; off by default."""
 
 class PlyOptions(TypedDict, total=False):
     """Options of PLY files."""
 
     time_code: float | None
     """The frame that is written; by default the first."""
+    turn_up: Literal["y", "z"] | None
+    """Turn the scene so that this axis is up; by default it stands as captured."""
 
 class Field:
     """A dynamic Gaussian field with instances: N Gaussians, K instances, T captured times.

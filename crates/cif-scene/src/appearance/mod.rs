@@ -5,6 +5,7 @@
 //! time. Where the trained ones leave them by more than [`crate::SceneOptions::appearance_tolerance`], samples stand
 //! beside them, no more than linear interpolation needs to stay inside the tolerance.
 
+pub(crate) mod blur;
 pub(crate) mod visibility;
 
 use cif_field::gaussians::SH_FLOATS;

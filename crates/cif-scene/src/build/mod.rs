@@ -13,6 +13,7 @@ use cif_field::{Field, Gaussians};
 use cif_geometry::quaternion;
 use glam::DVec3;
 
+use crate::appearance::blur::Blur;
 use crate::appearance::visibility;
 use crate::appearance::{self, Opacities, Thinning};
 use crate::build::assignment::Identity;
@@ -108,6 +109,14 @@ pub fn build_from(
         nodes.push(node::node(&input, naming, group, chosen));
     }
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
+    let code_of =
+        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then_some(index as f64);
+    let cameras = camera_tracks::camera_tracks(&field.cameras, code_of);
+    let antialiased = field.record.drawing.antialiased.unwrap_or_default();
+    let blur = options.bake_blur.then(|| Blur::of(&cameras, antialiased)).flatten();
+    if options.bake_blur && blur.is_none() {
+        warnings.push("no camera is recorded, so that the blur of pixels could not be baked".into());
+    }
     for (node, group) in nodes.iter_mut().zip(&groups) {
         node.source_frames = (frames[0], frames[frames.len() - 1]);
         node.visibility = visibility::of_rows(field, &node.splats.rows);
@@ -127,6 +136,9 @@ pub fn build_from(
             node.proxy = Some(proxy::point_proxy(&node.splats, options.proxy_points));
         }
         add_colliders(node, options, &mut warnings);
+        if let Some(blur) = &blur {
+            blur.bake(node);
+        }
     }
     let omitted: Vec<String> = (0..field.instances.len())
         .filter(|index| !group_owners.contains(&Some(*index)))
@@ -143,15 +155,13 @@ pub fn build_from(
             .collect();
         warnings.push(format!("no visible Gaussian belongs to: {}", told.join(", ")));
     }
-    let code_of =
-        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then(|| codes[index]);
     let declared = field.record.declared;
     let unit = options.meters_per_unit.or(declared.map(|of| of.meters_per_unit));
     Ok(SceneGraph {
         up_axis: options.up_axis.or(declared.map(|of| of.up_axis)).unwrap_or_default(),
         meters_per_unit: unit.unwrap_or(1.0),
         frame: world::frame_of(field)?,
-        cameras: camera_tracks::camera_tracks(&field.cameras, code_of),
+        cameras,
         time_codes,
         nodes,
         background_color: field.background,

@@ -5,5 +5,7 @@ pub mod colliders;
 pub mod convex_hull;
 pub mod extent;
 pub(crate) mod flat;
+pub mod ground;
 pub mod level_of_detail;
+pub mod mass;
 pub mod proxy;

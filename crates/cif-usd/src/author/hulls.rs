@@ -10,7 +10,8 @@ use crate::layer::{Layer, child};
 use crate::tokens;
 
 pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, node: &Node) -> PyResult<()> {
-    for (index, hull) in node.colliders.iter().enumerate() {
+    let masses = cif_scene::masses(node, scene.options.density, scene.graph.meters_per_unit);
+    for (index, (hull, mass)) in node.colliders.iter().zip(masses).enumerate() {
         let part = hull.part.zip(parts(node)).and_then(|(part, motion)| motion.parts.get(part));
         let place = part.map_or_else(|| place.to_owned(), |part| child(place, &part.name));
         // The number tells the order over all parts.
@@ -18,15 +19,23 @@ pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, 
             0 => tokens::COLLIDER.to_owned(),
             _ => format!("{}_{index:02}", tokens::COLLIDER),
         };
-        mesh(scene, layer, &child(&place, &name), hull)?;
+        mesh(scene, layer, &child(&place, &name), hull, mass)?;
     }
     Ok(())
 }
 
-fn mesh(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, path: &str, hull: &ConvexHull) -> PyResult<()> {
+/// A mesh with its mass in kg: MuJoCo reads masses of colliders alone.
+fn mesh(
+    scene: &Scene<'_, '_>,
+    layer: &Layer<'_, '_>,
+    path: &str,
+    hull: &ConvexHull,
+    mass: f64,
+) -> PyResult<()> {
     let pxr = scene.pxr;
     let prim = layer.define(path, "Mesh")?;
-    prim.apply(&["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI"])?;
+    prim.apply(&["PhysicsCollisionAPI", "PhysicsMeshCollisionAPI", "PhysicsMassAPI"])?;
+    prim.set("physics:mass", "Float", VARYING, mass)?;
     prim.set("purpose", "Token", UNIFORM, tokens::PURPOSE_GUIDE)?;
     prim.set("physics:approximation", "Token", UNIFORM, "convexHull")?;
     prim.set("subdivisionScheme", "Token", UNIFORM, "none")?;

@@ -189,9 +189,10 @@ fn splats_of(
     let kept = levels::kept(node, level);
     let some = |part| levels::selection(node, part, level, kept.as_deref());
     match parts(node) {
-        None => splats::author(scene, layer, place, &some(None)),
+        None => splats::author(scene, layer, place, &node.name, &some(None)),
         Some(motion) => motion.parts.iter().enumerate().try_for_each(|(index, part)| {
-            splats::author(scene, layer, &child(place, &part.name), &some(Some(index)))
+            let name = format!("{}_{}", node.name, part.name);
+            splats::author(scene, layer, &child(place, &part.name), &name, &some(Some(index)))
         }),
     }
 }

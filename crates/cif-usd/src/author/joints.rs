@@ -1,7 +1,9 @@
 //! Joints between the bodies of parts.
 
 use cif_field::JointKind;
-use cif_scene::{Node, PartJoint};
+use cif_scene::graph::pose_at;
+use cif_scene::world::world_from_graph;
+use cif_scene::{Node, Part, PartJoint, PoseSample};
 use glam::{DQuat, DVec3};
 use pyo3::prelude::*;
 
@@ -13,6 +15,15 @@ use crate::tokens;
 /// True where parts of a node are tied by joints.
 pub(super) fn has_joints(node: &Node) -> bool {
     parts(node).is_some_and(|motion| motion.parts.iter().any(|part| part.joint.is_some()))
+}
+
+/// True of a part that others are tied to and that is tied to none: the root of an articulation.
+pub(super) fn is_root(node: &Node, part: usize) -> bool {
+    parts(node).is_some_and(|motion| {
+        let joint = |part: &Part| part.joint;
+        motion.parts[part].joint.is_none()
+            && motion.parts.iter().filter_map(joint).any(|joint| joint.base == part)
+    })
 }
 
 /// Defines the joints of a node in `place`: the prim itself, or one of its variants. Their limits are the range that
@@ -39,6 +50,8 @@ pub(super) fn author(
         let prim = layer.define(&child(place.path(), &name), prim_type)?;
         if !enabled {
             prim.set("physics:jointEnabled", "Bool", VARYING, false)?;
+            // MuJoCo goes by this alone.
+            prim.set("physics:excludeFromArticulation", "Bool", UNIFORM, true)?;
         }
         prim.relate("physics:body0", &body(&base.name))?;
         prim.relate("physics:body1", &body(&part.name))?;
@@ -55,5 +68,30 @@ pub(super) fn author(
             prim.set("physics:upperLimit", "Float", VARYING, scale * high)?;
         }
     }
+    Ok(())
+}
+
+/// Fixes the body of a node, or of one of its parts, to the world where it is first, for simulators that make every
+/// body one that falls. `place` is its prim in a variant.
+pub(super) fn weld(
+    scene: &Scene<'_, '_>,
+    layer: &Layer<'_, '_>,
+    place: &Prim<'_, '_, '_>,
+    node: &Node,
+    part: Option<(usize, &Part)>,
+) -> PyResult<()> {
+    let pxr = scene.pxr;
+    let prim = layer.define(&child(place.path(), tokens::HOLD), tokens::FIXED_JOINT)?;
+    let whole = child(tokens::WORLD, &node.name);
+    prim.relate("physics:body1", &part.map_or_else(|| whole.clone(), |(_, part)| child(&whole, &part.name)))?;
+    let first = |track: &[PoseSample]| track.first().map_or(0.0, |sample| sample.time_code);
+    let mut pose = pose_at(node.track(), node.pivot, first(node.track())).transform();
+    if let Some((_, part)) = part {
+        pose = pose.compose(&pose_at(&part.track, part.pivot, first(&part.track)).transform());
+    }
+    let at = world_from_graph(&scene.graph.frame).transform_point3(pose.translation);
+    let turn = DQuat::from_mat3(&pose.rotation).normalize();
+    prim.set("physics:localPos0", "Point3f", VARYING, pxr.gf.call_method1("Vec3f", (at.x, at.y, at.z))?)?;
+    prim.set("physics:localRot0", "Quatf", VARYING, pxr.quatf(turn)?)?;
     Ok(())
 }

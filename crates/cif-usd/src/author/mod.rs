@@ -1,6 +1,7 @@
 //! Authoring of a stage from a scene graph.
 
 mod camera_prims;
+mod ground;
 mod hulls;
 mod instance;
 mod joints;
@@ -12,7 +13,7 @@ mod transforms;
 
 use std::path::Path;
 
-use cif_scene::SceneGraph;
+use cif_scene::{ExportOptions, SceneGraph};
 use pyo3::prelude::*;
 
 use crate::layer::{Layer, Variability};
@@ -33,6 +34,7 @@ pub(crate) struct Scene<'a, 'py> {
     pub(crate) pxr: &'a Pxr<'py>,
     pub(crate) graph: &'a SceneGraph,
     pub(crate) storage: Storage<'a>,
+    pub(crate) options: &'a ExportOptions,
 }
 
 /// Writes the stage whose root layer is the file `root`, which does not exist yet.
@@ -52,8 +54,12 @@ pub(crate) fn author(scene: &Scene<'_, '_>, root: &Path) -> PyResult<()> {
             camera_prims::author(scene.pxr, &layer, track, graph.meters_per_unit)?;
         }
     }
-    if graph.nodes.iter().any(|node| !node.colliders.is_empty()) {
+    let ground = ground::height(graph, scene.options.ground);
+    if ground.is_some() || graph.nodes.iter().any(|node| !node.colliders.is_empty()) {
         physics::gravity(scene, &layer)?;
+    }
+    if let Some(height) = ground {
+        ground::author(scene, &layer, height)?;
     }
     layer.save()
 }

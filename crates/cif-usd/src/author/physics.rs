@@ -2,7 +2,7 @@
 //!
 //! Bodies, masses and recorded tracks live inside the variants: an opinion on the prim itself would win over them.
 
-use cif_scene::{Motion, Node, PoseSample};
+use cif_scene::{ConvexHull, Motion, Node, Part, PoseSample};
 use pyo3::prelude::*;
 
 use super::instance::parts;
@@ -11,8 +11,6 @@ use crate::layer::{Layer, Prim};
 use crate::pxr::Pxr;
 use crate::tokens::{self, variants};
 
-/// Density that bodies are given, kg/m^3: water, which is what simulators assume where none is given.
-const DENSITY: f64 = 1000.0;
 /// Standard gravity, m/s^2.
 const GRAVITY: f64 = 9.81;
 
@@ -52,7 +50,7 @@ pub(super) fn author(
             poses(pxr, &inside, node, variant != variants::DYNAMIC)?;
         }
         match variant {
-            variants::KINEMATIC => kinematic(scene, &inside, node)?,
+            variants::KINEMATIC => kinematic(scene, layer, &inside, node)?,
             variants::DYNAMIC => dynamic(scene, &inside, node)?,
             _ => continue,
         }
@@ -73,27 +71,51 @@ fn poses(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, node: &Node, sampled: bool) -> 
     Ok(())
 }
 
-/// A body on its track; parts that have colliders of their own are bodies of their own.
-fn kinematic(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
-    bodies(prim, node)?.iter().try_for_each(|prim| body(scene, prim, true))
+/// Bodies on their tracks; parts that have colliders of their own are bodies of their own.
+fn kinematic(
+    scene: &Scene<'_, '_>,
+    layer: &Layer<'_, '_>,
+    prim: &Prim<'_, '_, '_>,
+    node: &Node,
+) -> PyResult<()> {
+    for of in bodies(node) {
+        let inside = of.prim(prim)?;
+        body(scene, &inside, node, of, true)?;
+        if scene.options.weld_kinematic {
+            joints::weld(scene, layer, &inside, node, of.part)?;
+        }
+    }
+    Ok(())
+}
+
+/// What of a node is a body: the whole, or one of its parts.
+#[derive(Clone, Copy)]
+struct Body<'a> {
+    part: Option<(usize, &'a Part)>,
+}
+
+impl Body<'_> {
+    /// Its prim, in that of the node or in a variant of it.
+    fn prim<'l, 'p, 'py>(self, node: &Prim<'l, 'p, 'py>) -> PyResult<Prim<'l, 'p, 'py>> {
+        self.part.map_or_else(|| Ok(node.same()), |(_, part)| node.child(&part.name))
+    }
 }
 
 /// The parts that have colliders of their own, where all colliders are theirs; else the whole.
-fn bodies<'l, 'p, 'py>(prim: &Prim<'l, 'p, 'py>, node: &Node) -> PyResult<Vec<Prim<'l, 'p, 'py>>> {
+fn bodies(node: &Node) -> Vec<Body<'_>> {
     let motion = parts(node).filter(|_| node.colliders.iter().all(|hull| hull.part.is_some()));
-    let Some(motion) = motion else { return Ok(vec![prim.same()]) };
+    let Some(motion) = motion else { return vec![Body { part: None }] };
     let has_collider = |index: usize| node.colliders.iter().any(|hull| hull.part == Some(index));
     let with = motion.parts.iter().enumerate().filter(|(index, _)| has_collider(*index));
-    with.map(|(_, part)| prim.child(&part.name)).collect()
+    with.map(|part| Body { part: Some(part) }).collect()
 }
 
 /// A body with the initial velocity; parts on joints are bodies of their own, which the joints hold.
 fn dynamic(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyResult<()> {
     if joints::has_joints(node) {
-        prim.apply(&["PhysicsArticulationRootAPI"])?;
-        return bodies(prim, node)?.iter().try_for_each(|prim| body(scene, prim, false));
+        return bodies(node).into_iter().try_for_each(|of| body(scene, &of.prim(prim)?, node, of, false));
     }
-    body(scene, prim, false)?;
+    body(scene, prim, node, Body { part: None }, false)?;
     let codes = &scene.graph.time_codes;
     let velocity = node.initial_velocity(codes.start(), codes.frames_per_second);
     let degrees = velocity.angular * 180.0 / std::f64::consts::PI;
@@ -104,10 +126,24 @@ fn dynamic(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, node: &Node) -> PyRes
     Ok(())
 }
 
-fn body(scene: &Scene<'_, '_>, prim: &Prim<'_, '_, '_>, kinematic: bool) -> PyResult<()> {
-    prim.apply(&["PhysicsRigidBodyAPI", "PhysicsMassAPI"])?;
+/// A body whose mass is that of its colliders.
+fn body(
+    scene: &Scene<'_, '_>,
+    prim: &Prim<'_, '_, '_>,
+    node: &Node,
+    of: Body<'_>,
+    kinematic: bool,
+) -> PyResult<()> {
+    let mut schemas = vec!["PhysicsRigidBodyAPI", "PhysicsMassAPI"];
+    // On the body itself: MuJoCo makes a body without mass of any other prim that is a root.
+    if !kinematic && of.part.is_some_and(|(part, _)| joints::is_root(node, part)) {
+        schemas.push("PhysicsArticulationRootAPI");
+    }
+    prim.apply(&schemas)?;
     prim.set("physics:kinematicEnabled", "Bool", VARYING, kinematic)?;
-    let density = DENSITY * scene.graph.meters_per_unit.powi(3);
-    prim.set("physics:density", "Float", VARYING, density)?;
+    let masses = cif_scene::masses(node, scene.options.density, scene.graph.meters_per_unit);
+    let is_of = |hull: &ConvexHull| of.part.is_none_or(|(part, _)| hull.part == Some(part));
+    let own = node.colliders.iter().zip(masses).filter(|(hull, _)| is_of(hull)).map(|(_, mass)| mass);
+    prim.set("physics:mass", "Float", VARYING, own.sum::<f64>())?;
     Ok(())
 }

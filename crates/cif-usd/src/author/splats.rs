@@ -31,10 +31,11 @@ pub(super) fn author(
     scene: &Scene<'_, '_>,
     layer: &Layer<'_, '_>,
     place: &str,
+    name: &str,
     selection: &Selection<'_>,
 ) -> PyResult<()> {
     let (pxr, splats) = (scene.pxr, selection.all());
-    let prim = layer.define(&child(place, tokens::SPLATS), tokens::GAUSSIAN_SPLAT)?;
+    let prim = layer.define(&child(place, &format!("{name}_{}", tokens::SPLATS)), tokens::GAUSSIAN_SPLAT)?;
     let means = selection.of(&splats.means);
     let turns = selection.of(&splats.orientations);
     let sizes = selection.of(&splats.scales);
@@ -111,7 +112,13 @@ fn instance_shares(pxr: &Pxr<'_>, prim: &Prim<'_, '_, '_>, identities: &[Identit
     let places = identities.iter().map(used).max().unwrap_or(0).max(1);
     let entries = || identities.iter().flat_map(|shares| &shares[..places]);
     let ids: Vec<i32> = entries().map(|entry| i32::from(entry.id)).collect();
-    let shares: Vec<f32> = entries().map(|entry| entry.share).collect();
+    let mut shares: Vec<f32> = entries().map(|entry| entry.share).collect();
+    if places == 1 {
+        // Validators ask for indices of whatever has one value per splat, and cannot tell of more.
+        let (unique, indices) = primvars::without_repetitions(shares.as_chunks::<1>().0);
+        shares = unique.into_flattened();
+        set_indices(pxr, prim, tokens::PRIMVAR_INSTANCE_SHARES, indices)?;
+    }
     let ids = prim.set(tokens::PRIMVAR_INSTANCE_IDS, "IntArray", VARYING, pxr.int_array(&ids)?)?;
     let shares =
         prim.set(tokens::PRIMVAR_INSTANCE_SHARES, "FloatArray", VARYING, pxr.float_array(&shares)?)?;

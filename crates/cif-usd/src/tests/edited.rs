@@ -191,7 +191,7 @@ source = stage.GetPrimAtPath('/World/red_mug_001')
 flat = stage.Flatten()
 Sdf.CreatePrimInLayer(layer, '/World')
 Sdf.CopySpec(flat, '/World/red_mug_001', layer, '/World/a_second_mug')
-colors = get('red_mug_016/Splats').GetAttribute('primvars:displayColor')
+colors = get('red_mug_016/red_mug_016_splats').GetAttribute('primvars:displayColor')
 primvar = UsdGeom.Primvar(colors)
 values = [Gf.Vec3f(c) for c in primvar.ComputeFlattened()]
 values[0] = Gf.Vec3f(0.25, 0.5, 0.75)
@@ -228,7 +228,7 @@ fn strangers_may_join() {
         "
 flat = stage.Flatten()
 Sdf.CreatePrimInLayer(layer, '/World')
-Sdf.CopySpec(flat, '/World/red_mug_001/Splats', layer, '/World/visitor')
+Sdf.CopySpec(flat, '/World/red_mug_001/red_mug_001_splats', layer, '/World/visitor')
 for name in ['primvars:cif:row', 'cif:displayColorChecksum']:
     spec = layer.GetPrimAtPath('/World/visitor')
     spec.RemoveProperty(spec.properties[name])

@@ -59,7 +59,8 @@ pub(super) fn run(command: &BenchExport) -> Result<(), Error> {
     let mut formats: Vec<&dyn SceneFormat> = if command.no_files { Vec::new() } else { moving.collect() };
     let mut rungs = Vec::new();
     for &tolerance in &command.tolerances {
-        let options = command.models.apply(&field, SceneOptions { tolerance, ..SceneOptions::default() });
+        let options =
+            command.models.apply(&field, None, SceneOptions { tolerance, ..SceneOptions::default() });
         let start = Instant::now();
         let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
         let mut rung = Rung::of(tolerance, start.elapsed().as_secs_f64(), &graph);

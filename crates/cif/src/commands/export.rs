@@ -4,18 +4,21 @@ use std::path::PathBuf;
 
 use cif_dataset::MotionTruth;
 use cif_field::Field;
-use cif_scene::{FrameRange, MotionModel, SceneFormat, SceneGraph, SceneOptions, Tolerance, UpAxis};
+use cif_scene::{FrameRange, MotionModel, Node, SceneFormat, SceneGraph, SceneOptions, Tolerance, UpAxis};
 use clap::{ArgGroup, Args};
+use serde::Serialize;
 use serde_json::json;
 
 use super::export_check::{Check, Finding};
 use super::model_options::ModelOptions;
+use super::preset::{Preferred, Preset};
 use super::targets::{FILES, Targets, Writing};
 use super::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::FORMATS;
 use crate::ground_truth::{self, MotionError};
 use crate::interrupt;
+use crate::messages::note;
 use crate::moment::Frames;
 use crate::output::Outputs;
 use crate::report::Report;
@@ -36,6 +39,7 @@ tolerance are left out. The table tells which motion was chosen, and what it mis
   cif export table.cif table.ply --ply-time 36          or 1.5s, or 50%
   cif export table.cif --ply frames --ply-sequence      a folder has no ending: its flag says the format
   cif export table.cif --report --ground-truth motion.json
+  cif export table.cif table.usda --for mujoco          or newton, isaac, blender, web: --help tells their flags
 
 --check reads every file back as `cif import` would and draws it beside the scene, from cameras that
 the scene recorded and, with --capture, from those of held-out images. PSNR of an object is over the
@@ -50,6 +54,9 @@ pub(super) struct Export {
     scene: PathBuf,
     #[command(flatten)]
     targets: Targets,
+    /// Options for the program that opens the files; flags that are given besides overrule it
+    #[arg(long = "for", value_name = "PROGRAM")]
+    preset: Option<Preset>,
     #[command(flatten)]
     writing: Writing,
     /// Largest error of a simplified motion: 0.2% of the object's size, or 0.002 in world units
@@ -79,6 +86,10 @@ pub(super) struct Export {
     /// Most points of an object's stand-in; 0 for none
     #[arg(long, value_name = "N")]
     proxy_points: Option<usize>,
+    /// Widen splats by the filter of the renderer (0.3 px2) as the recorded cameras see them, for viewers without one,
+    /// in which thin parts vanish; for viewers alone: cif and viewers with a filter would blur twice
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    bake_blur: Option<bool>,
     /// Print the motion table even when nothing is written
     #[arg(long)]
     report: bool,
@@ -101,15 +112,20 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     outputs.reads(&command.scene)?;
     command.ground_truth.as_deref().map_or(Ok(()), |truth| outputs.reads(truth))?;
     command.tables.check(&mut outputs)?;
-    command.targets.check(&command.writing, command.force, &mut outputs)?;
-    command.check.refuse(&command.targets, &command.writing)?;
+    let preferred = command.preset.map_or_else(Preferred::default, Preset::preferred);
+    command.targets.check(&command.writing, &preferred, command.force, &mut outputs)?;
+    let bakes_blur = command.bake_blur.or(preferred.bake_blur).unwrap_or_default();
+    command.check.refuse(&command.targets, &command.writing, &preferred, bakes_blur)?;
+    if let Some(preset) = command.preset {
+        note!("--for {} is {}; flags that are given besides overrule it", preset.name(), preset.flags());
+    }
     let truth = command.ground_truth.as_deref().map(MotionTruth::read).transpose().map_err(Error::plain)?;
     let field = scene::load(&command.scene)?;
     let checker = command.check.open(&field, &mut outputs)?;
     let notes = command.targets.iter().filter_map(|target| target.format.about().note_on_place);
     scene::note_frame(&scene::frame(&field)?, notes);
     // The graph is as rich as the richest of the formats.
-    let asked = options(command, &field);
+    let asked = SceneOptions { bake_blur: bakes_blur, ..options(command, &preferred, &field) };
     let held = command.targets.iter().map(|target| target.format.held(&asked));
     let options = held.max_by_key(|held| held.most_expensive_motion).unwrap_or_else(|| asked.clone());
     let graph = cif_scene::build(&field, &options).map_err(Error::plain)?;
@@ -117,7 +133,8 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         crate::messages::warning!("{warning}");
     }
     let place = command.scene.display().to_string();
-    let writing = command.writing.options(command.force, &Frames::new(graph.time_codes.range(), &place))?;
+    let frames = Frames::new(graph.time_codes.range(), &place);
+    let writing = command.writing.options(&preferred, command.force, &frames)?;
     let mut rebuilt: Vec<(&dyn SceneFormat, SceneGraph)> = Vec::new();
     let mut findings: Vec<Finding> = Vec::new();
     if checker.is_some() {
@@ -134,7 +151,8 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         rebuilt.extend(other.map(|graph| (target.format, graph)));
     }
     let errors = truth.map(|truth| ground_truth::compare(&graph, &truth));
-    let mut tables = json!({ "motion": graph.motion_table(), "ground_truth": errors });
+    let masses = masses(&graph, writing.density);
+    let mut tables = json!({ "motion": graph.motion_table(), "ground_truth": errors, "masses": masses });
     let simplifies = |most: MotionModel| most < MotionModel::Dense;
     for format in
         FORMATS.into_iter().filter(|format| format.about().most_expensive_motion.is_some_and(simplifies))
@@ -147,13 +165,13 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
         tables["check"] = findings.iter().map(|finding| finding.json(&field)).collect();
     }
     let print = || {
-        print_motion(&graph);
+        print_motion(&graph, &masses);
         for (format, graph) in &rebuilt {
             println!(
                 "motion in the {}, which holds splats with paths of their own only where these are few:",
                 format.about().name
             );
-            print_motion(graph);
+            print_motion(graph, &self::masses(graph, writing.density));
         }
         if let Some(errors) = &errors {
             print_errors(errors);
@@ -163,10 +181,28 @@ pub(super) fn run(command: &Export) -> Result<(), Error> {
     command.tables.give(|| tables.clone(), print)
 }
 
-fn options(command: &Export, field: &Field) -> SceneOptions {
+/// Mass of an object, in the order of the nodes.
+#[derive(Debug, Serialize)]
+struct Mass {
+    name: String,
+    /// `None` without a collider.
+    kilograms: Option<f64>,
+}
+
+fn masses(graph: &SceneGraph, density: f64) -> Vec<Mass> {
+    let mass = |node: &Node| Mass {
+        name: node.name.clone(),
+        kilograms: (!node.colliders.is_empty())
+            .then(|| cif_scene::masses(node, density, graph.meters_per_unit).iter().sum()),
+    };
+    graph.nodes.iter().map(mass).collect()
+}
+
+fn options(command: &Export, preferred: &Preferred, field: &Field) -> SceneOptions {
     let defaults = SceneOptions::default();
     command.models.apply(
         field,
+        preferred.hulls,
         SceneOptions {
             tolerance: command.tolerance,
             appearance_tolerance: command.appearance_tolerance,
@@ -176,17 +212,19 @@ fn options(command: &Export, field: &Field) -> SceneOptions {
             meters_per_unit: command.meters_per_unit,
             min_opacity: command.min_opacity.unwrap_or(defaults.min_opacity),
             background_threshold: command.background_threshold.unwrap_or(defaults.background_threshold),
-            proxy_points: command.proxy_points.unwrap_or(defaults.proxy_points),
+            proxy_points: command.proxy_points.or(preferred.proxy_points).unwrap_or(defaults.proxy_points),
             ..defaults
         },
     )
 }
 
-fn print_motion(graph: &SceneGraph) {
-    let mut table = super::table(["object", "label", "splats"].into_iter().chain(motion_table::HEADINGS));
-    for row in graph.motion_table() {
-        let object = [row.name.clone(), row.label.clone(), row.motion.gaussians.to_string()];
-        table.add_row(object.into_iter().chain(motion_table::cells(&row)));
+fn print_motion(graph: &SceneGraph, masses: &[Mass]) {
+    let mut table =
+        super::table(["object", "label", "splats", "kg"].into_iter().chain(motion_table::HEADINGS));
+    for (row, mass) in graph.motion_table().iter().zip(masses) {
+        let kilograms = mass.kilograms.map_or_else(String::new, |mass| format!("{mass:.3}"));
+        let object = [row.name.clone(), row.label.clone(), row.motion.gaussians.to_string(), kilograms];
+        table.add_row(object.into_iter().chain(motion_table::cells(row)));
     }
     println!("{table}");
 }

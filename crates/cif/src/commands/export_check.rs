@@ -14,6 +14,7 @@ use clap::Args;
 use serde_json::{Value, json};
 
 use super::eval::number;
+use super::preset::Preferred;
 use super::query::code_at;
 use super::targets::{Target, Targets, Writing};
 use super::{CaptureOptions, print_misfits, print_warnings, scene};
@@ -71,7 +72,13 @@ pub(super) struct Finding {
 
 impl Check {
     /// Checks that there is something to compare before the work starts.
-    pub(super) fn refuse(&self, targets: &Targets, writing: &Writing) -> Result<(), Error> {
+    pub(super) fn refuse(
+        &self,
+        targets: &Targets,
+        writing: &Writing,
+        preferred: &Preferred,
+        bakes_blur: bool,
+    ) -> Result<(), Error> {
         if !self.check {
             return Ok(());
         }
@@ -85,7 +92,13 @@ impl Check {
                 },
             ));
         }
-        let options = writing.without_moment(false);
+        if bakes_blur {
+            return Err(Error::usage(
+                "--check draws with the filter of the renderer, which would be there twice with the blur baked",
+                "leave --check out, or check with --bake-blur=false",
+            ));
+        }
+        let options = writing.without_moment(preferred, false);
         match targets.iter().find(|target| target.format.fills_folder(&options)) {
             None => Ok(()),
             Some(target) => Err(Error::usage(

@@ -28,6 +28,7 @@ mod motion_table;
 mod object_motion;
 mod painter;
 mod plan;
+mod preset;
 mod query;
 mod render;
 mod render_files;

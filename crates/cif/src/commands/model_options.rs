@@ -37,7 +37,8 @@ enum Motion {
 
 impl ModelOptions {
     /// Options of the scene graph of a field with these.
-    pub(super) fn apply(&self, field: &Field, options: SceneOptions) -> SceneOptions {
+    /// `hulls` is what is preferred where nobody says how many.
+    pub(super) fn apply(&self, field: &Field, hulls: Option<u16>, options: SceneOptions) -> SceneOptions {
         let has_physics = training_config(field).is_none_or(|config| config.effects.physics);
         SceneOptions {
             most_expensive_motion: match self.motion {
@@ -48,7 +49,7 @@ impl ModelOptions {
             },
             max_parts: usize::from(self.max_parts),
             reduce_keys: !self.no_reduce_keys,
-            hulls_per_instance: self.hulls.map_or(usize::from(has_physics), usize::from),
+            hulls_per_instance: self.hulls.or(hulls).map_or(usize::from(has_physics), usize::from),
             background_hulls: usize::from(self.background_hulls),
             ..options
         }

@@ -2,9 +2,10 @@
 
 use std::path::{Path, PathBuf};
 
-use cif_scene::{ExportOptions, ExportSummary, Payloads, SceneFormat};
+use cif_scene::{DENSITY, ExportOptions, ExportSummary, Ground, Payloads, SceneFormat, UpAxis};
 use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, value_parser};
 
+use super::preset::Preferred;
 use crate::endings;
 use crate::error::Error;
 use crate::formats::FORMATS;
@@ -103,6 +104,21 @@ pub(super) struct Writing {
     /// Leave out the variants with half and a quarter of the splats
     #[arg(long)]
     no_lod: bool,
+    /// A plane for simulators, on which things fall: auto (where the objects stand), none, or its height in world units
+    /// [default: none]
+    #[arg(long, value_name = "WHERE", allow_hyphen_values = true)]
+    ground: Option<Ground>,
+    /// Density of objects, kg/m3, over the volume that their splats fill: what lies between splats is full, the rest a
+    /// sheet as thick as its splats, and no more than the colliders. Masses are in the report
+    #[arg(long, value_name = "KG_PER_M3", default_value_t = DENSITY, value_parser = density)]
+    density: f64,
+    /// Fix objects on recorded tracks to the world by joints, for simulators that would let them fall (MuJoCo)
+    #[arg(long, value_name = "BOOL", num_args = 0..=1, require_equals = true, default_missing_value = "true")]
+    weld_kinematic: Option<bool>,
+    /// Turn a PLY so that this axis is up, for viewers that expect it; it is read back as captured [default: as
+    /// captured]
+    #[arg(long, value_name = "AXIS")]
+    ply_up: Option<UpAxis>,
     /// Moment of a PLY: a frame (36), seconds (1.5s) or a share (50%) [default: the first frame]
     #[arg(long, value_name = "TIME", conflicts_with = "ply_sequence", allow_hyphen_values = true)]
     ply_time: Option<Moment>,
@@ -114,22 +130,34 @@ pub(super) struct Writing {
     ply_sequence: bool,
 }
 
+fn density(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(density) if density.is_finite() && density > 0.0 => Ok(density),
+        _ => Err("a number of kg per cubic metre above 0 is expected".to_owned()),
+    }
+}
+
 impl Writing {
     /// Options, with the moment of formats that hold one.
     ///
     /// # Errors
     /// When the scene has no such moment.
-    pub(super) fn options(&self, force: bool, frames: &Frames<'_>) -> Result<ExportOptions, Error> {
+    pub(super) fn options(
+        &self,
+        preferred: &Preferred,
+        force: bool,
+        frames: &Frames<'_>,
+    ) -> Result<ExportOptions, Error> {
         let code = |moment| {
             note_fraction("--ply-time", moment);
             frames.code("--ply-time", moment)
         };
         let time_code = self.ply_time.map(code).transpose()?;
-        Ok(ExportOptions { time_code, ..self.without_moment(force) })
+        Ok(ExportOptions { time_code, ..self.without_moment(preferred, force) })
     }
 
     /// Options by which names and places are checked, which do not depend on the moment.
-    pub(super) fn without_moment(&self, force: bool) -> ExportOptions {
+    pub(super) fn without_moment(&self, preferred: &Preferred, force: bool) -> ExportOptions {
         let payloads = match (self.payloads, self.single_file) {
             (true, _) => Payloads::Separate,
             (_, true) => Payloads::SingleFile,
@@ -139,6 +167,10 @@ impl Writing {
             force,
             payloads,
             levels_of_detail: !self.no_lod,
+            ground: self.ground.or(preferred.ground).unwrap_or_default(),
+            density: self.density,
+            weld_kinematic: self.weld_kinematic.or(preferred.weld_kinematic).unwrap_or_default(),
+            turn_up: self.ply_up.or(preferred.ply_up),
             time_code: None,
             split: self.ply_split,
             sequence: self.ply_sequence,
@@ -152,11 +184,18 @@ impl Targets {
     }
 
     /// Checks names and places before the work starts.
-    pub(super) fn check(&self, writing: &Writing, force: bool, outputs: &mut Outputs) -> Result<(), Error> {
+    pub(super) fn check(
+        &self,
+        writing: &Writing,
+        preferred: &Preferred,
+        force: bool,
+        outputs: &mut Outputs,
+    ) -> Result<(), Error> {
         let of_ply = [
             ("--ply-time", writing.ply_time.is_some()),
             ("--ply-split", writing.ply_split),
             ("--ply-sequence", writing.ply_sequence),
+            ("--ply-up", writing.ply_up.is_some()),
         ];
         let has_ply = self.0.iter().any(|target| target.format.about().most_expensive_motion.is_none());
         if let Some((flag, _)) = of_ply.into_iter().find(|(_, is_given)| *is_given && !has_ply) {
@@ -165,7 +204,7 @@ impl Targets {
                 "add OUT.ply, or --ply OUT",
             ));
         }
-        let options = writing.without_moment(force);
+        let options = writing.without_moment(preferred, force);
         self.0.iter().try_for_each(|target| target.check(&options, outputs))
     }
 }
