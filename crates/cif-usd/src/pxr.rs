@@ -37,9 +37,7 @@ pub(crate) fn without_current_folder<T>(
     let python = |error: PyErr| UsdError::Python { reason: reason(py, &error) };
     let path = py.import("sys").and_then(|sys| sys.getattr("path")).map_err(python)?;
     let before: Vec<Bound<'_, PyAny>> = path.extract().map_err(python)?;
-    let set = |entries: Vec<Bound<'_, PyAny>>| {
-        path.set_item(PySlice::full(py), PyList::new(py, entries)?).map_err(PyErr::from)
-    };
+    let set = |entries: Vec<Bound<'_, PyAny>>| path.set_item(PySlice::full(py), PyList::new(py, entries)?);
     let is_absolute =
         |entry: &Bound<'_, PyAny>| entry.extract::<PathBuf>().is_ok_and(|entry| entry.is_absolute());
     set(before.iter().filter(|entry| is_absolute(entry)).cloned().collect()).map_err(python)?;

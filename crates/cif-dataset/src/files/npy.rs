@@ -151,13 +151,15 @@ fn parse<T: Copy>(
     into: impl Fn(f64) -> Result<T, String>,
 ) -> Result<Array<T>, String> {
     let head = read_header(&mut reader, size)?;
-    let file = NpyFile::new(Cursor::new(head).chain(reader))
-        .map_err(|error| format!("not a NumPy array ({error})"))?;
+    // Boxed, as the file is handed back by every type that does not fit.
+    let whole: Box<dyn Read + '_> = Box::new(Cursor::new(head).chain(reader));
+    let file = NpyFile::new(whole).map_err(|error| format!("not a NumPy array ({error})"))?;
     let shape: Vec<usize> = file.shape().iter().map(|length| *length as usize).collect();
     let order = file.order();
     let values = match elements {
-        Elements::Floats => values::<f64, _, _>(file, |v| into(v))
-            .or_else(|file| values::<f32, _, _>(file, |v| into(v.into()))),
+        Elements::Floats => {
+            values::<f64, _, _>(file, &into).or_else(|file| values::<f32, _, _>(file, |v| into(v.into())))
+        }
         Elements::Integers => values::<i64, _, _>(file, |v| into(v as f64))
             .or_else(|file| values::<u64, _, _>(file, |v| into(v as f64)))
             .or_else(|file| values::<i32, _, _>(file, |v| into(v.into())))
