@@ -8,7 +8,7 @@
 //! | LLFF sequences (NSFF, NVIDIA, NR-NeRF, EndoNeRF) | `poses_bounds.npy` with `images` | `mv_images`, else every eighth image from the second on |
 //! | D-NeRF, Blender | `transforms_train.json` | `transforms_test.json` |
 //! | nerfstudio, instant-ngp | `transforms.json` | its lists, else every eighth frame |
-//! | COLMAP | `sparse/0` | every eighth image |
+//! | COLMAP | `sparse/0`; of several models the largest | every eighth image |
 //!
 //! Masks are PNG files of instance ids, 0 for unlabelled, or EXR files with a [`cryptomatte`]; they lie in `masks`, in a
 //! folder of that name beside the images, or in `seg` (Dynamic 3D Gaussians). Labels come from `instances.json`, which
@@ -16,7 +16,8 @@
 //! (`{"1": "sphere_1"}`), or from the Cryptomatte. Points that a program drew at random count as none. [`masks::Import`] makes such a folder of what other tools write. A mask folder may hold
 //! `confidence/<frame>.png`: 8-bit grey, the probability that the id of a pixel is right in units of 1 / 255. Named groups of held-out frames
 //! come from `splits.json`, known motion from `motion.json` and `tracks.npz` (see [`motion_truth`]). All cameras are
-//! ideal pinholes in this project's axes once a frame is loaded; times are normalised to [0, 1].
+//! ideal pinholes in this project's axes once a frame is loaded; times are normalised to [0, 1], of the first and the last.
+//! Images are upright where their camera is (see [`orientation`]).
 //!
 //! ```no_run
 //! use cif_dataset::{Dataset, OpenOptions};

@@ -10,6 +10,7 @@ use crate::files::{image, json, listing};
 use crate::formats::{self, Draft, Source, some_of};
 use crate::load::{centred, reduced_size};
 use crate::mask_files::MaskFolder;
+use crate::orientation::Orientation;
 use crate::{
     CaptureFrame, Dataset, Error, Frame, Layout, OpenOptions, PointCloud, PointSource, Split, Turn,
     camera_check, cryptomatte, instances, layout, mask_files, placement, points,
@@ -71,6 +72,7 @@ impl Dataset {
                 .binary_search_by(|time| time.total_cmp(&frame.time))
                 .expect("times hold every time");
         }
+        dataset.note_turned_images();
         dataset.read_groups()?;
         dataset.note_poor_coverage();
         let mut unused = draft.unused;
@@ -146,6 +148,22 @@ impl Dataset {
             });
         }
         Ok(listing.paths)
+    }
+
+    /// Tells which way images lie whose EXIF turns them.
+    fn note_turned_images(&mut self) {
+        let root = self.root.display().to_string();
+        let of = |is: &dyn Fn(&Turn) -> bool| self.frames.iter().filter(|frame| is(&frame.turn)).count();
+        let turned = of(&|turn| turn.image != Orientation::NoTransforms);
+        let stored = of(&|turn| turn.image == Orientation::NoTransforms && *turn != Turn::NONE);
+        if turned > 0 {
+            self.notes.push(format!("{root}: {turned} images are turned upright, as their EXIF says"));
+        }
+        if stored > 0 {
+            self.notes.push(format!(
+                "{root}: {stored} images are read as they are stored, not upright as their EXIF says, since so their cameras are"
+            ));
+        }
     }
 
     /// Groups of `splits.json` (`interp`, `novel`, ...) for held-out frames.

@@ -87,6 +87,7 @@ fn photographs_and_masks_are_upright_where_cameras_are() {
         assert_eq!((frame.camera.width, frame.camera.height), (WIDTH, HEIGHT), "{exif}");
         assert_eq!(frame.camera.focal_px, DVec2::splat(FOCAL));
         shows(&dataset, 0, AS_SEEN);
+        assert!(notes(&dataset, &["3 images are turned upright"]), "{:?}", dataset.notes);
         let mask = dataset.load_mask(0).unwrap().unwrap();
         assert_eq!((*mask.at(3, 20), *mask.at(28, 3)), (1, 0), "{exif}: masks of the upright image stay");
         if is_turned {
@@ -254,6 +255,32 @@ fn images_of_a_model_written_by_hand_need_no_second_lines() {
 }
 
 #[test]
+fn quaternions_may_have_any_length() {
+    let folder = colmap_text(3);
+    let path = folder.path().join("sparse/0/images.txt");
+    let text = std::fs::read_to_string(&path).unwrap();
+    let before = open(&folder).frames[1].camera;
+    let shrink = |line: &str| {
+        let words: Vec<String> = line
+            .split(' ')
+            .enumerate()
+            .map(|(k, word)| match (k, word.parse::<f64>()) {
+                (1..=4, Ok(value)) => (value * 5e-7).to_string(),
+                _ => word.to_owned(),
+            })
+            .collect();
+        words.join(" ")
+    };
+    let rows = text.lines().map(|line| if line.ends_with(".png") { shrink(line) } else { line.to_owned() });
+    write(&path, rows.collect::<Vec<_>>().join("\n"));
+    let after = open(&folder).frames[1].camera;
+    assert!(
+        (before.forward() - after.forward()).length() < 1e-9
+            && before.centre().distance(after.centre()) < 1e-9
+    );
+}
+
+#[test]
 fn marks_of_byte_order_are_no_text() {
     let folder = nerfstudio(3);
     let path = folder.path().join("transforms.json");
@@ -325,6 +352,22 @@ fn frames_of_a_cvat_task_are_those_that_it_took() {
         write(&path, cvat(start, numbers));
         assert_eq!(shown(None).unwrap(), frames, "{start} {numbers:?}");
     }
+    // Cameras of a HyperNeRF capture count their frames together.
+    let cameras = |count: u32| {
+        edit_json(&folder.path().join("metadata.json"), |value| {
+            (0..20).for_each(|k| value[format!("{k:06}")]["camera_id"] = json!(k % count));
+        });
+    };
+    cameras(2);
+    write(&path, cvat(100, [100, 115]));
+    let mut both: Vec<String> = shown(None).unwrap().split(' ').map(str::to_owned).collect();
+    both.sort();
+    assert_eq!(both, ["000000", "000003"]);
+    cameras(1);
+    let rig = neu3d(2, 3);
+    write(&rig.path().join("annotations.xml"), cvat(100, [100, 105]));
+    let refused = Import::open(&rig.path().join("annotations.xml"), None, None, &open(&rig));
+    holds(&refused.err().unwrap().to_string(), &["annotations.xml", "2 cameras", "folder of its name"]);
     write(&path, cvat(0, [5, 10]));
     assert_eq!(shown(Some(0)).unwrap(), "000005 000010", "what people say counts");
     for numbers in [[3, 10], [0, 100]] {

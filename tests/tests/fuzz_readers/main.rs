@@ -6,6 +6,7 @@
 mod captures;
 mod mask_files;
 mod mutate;
+mod poses;
 mod readers;
 
 use std::collections::BTreeSet;

@@ -25,6 +25,7 @@ use serde_json::json;
 use crate::captures;
 use crate::mask_files;
 use crate::mutate::Form;
+use crate::poses;
 
 /// A reader and the file that is damaged for it.
 pub(crate) struct Reader {
@@ -136,6 +137,20 @@ pub(crate) fn all() -> Vec<Reader> {
                 fs::write(folder.join("annotations.xml"), mask_files::cvat()).unwrap();
             },
             read: |folder| mask_files::import(folder, "annotations.xml"),
+        },
+        poses::reader("poses-colmap", "images.txt", Form::Text, poses::colmap),
+        poses::reader("poses-transforms", "transforms.json", Form::Json, poses::transforms),
+        poses::reader("poses-polycam", "cameras/0.json", Form::Json, poses::polycam),
+        poses::reader("poses-reality-capture", "registration.csv", Form::Text, poses::reality_capture),
+        poses::reader("poses-metashape", "cameras.xml", Form::Text, poses::metashape),
+        Reader {
+            name: "times",
+            file: "times.csv",
+            form: Form::Text,
+            write: |folder| {
+                fs::write(folder.join("times.csv"), "name,seconds\n0.png,0.5\n1.png,1.25\n").unwrap()
+            },
+            read: |folder| shown(cif_capture::times::read(&folder.join("times.csv"))),
         },
         Reader {
             name: "settings",

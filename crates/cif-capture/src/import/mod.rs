@@ -49,13 +49,13 @@ pub fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
     let ending = path.extension().map(|ending| ending.to_string_lossy().to_lowercase());
     if let Some((folder, note)) = foreign::find_colmap(path) {
         let (cameras, points) = foreign::read_colmap(&folder)?;
-        let found = imported(cameras, points, "COLMAP", true)?;
+        let found = imported(&folder, cameras, points, "COLMAP", true)?;
         return Ok(Imported { notes: note.into_iter().collect(), ..found });
     }
     if is_there("transforms.json") || ending.as_deref() == Some("json") {
         let file = if path.is_dir() { path.join("transforms.json") } else { path.to_owned() };
         let (cameras, points) = foreign::read_transforms(&file)?;
-        return imported(cameras, points, "nerfstudio", false);
+        return imported(&file, cameras, points, "nerfstudio", false);
     }
     if let Some(cameras) = polycam::folder(path) {
         return polycam::read(&cameras);
@@ -76,6 +76,7 @@ pub fn read(path: &Path, shots: &[Shot]) -> Result<Imported, Error> {
 
 /// Cameras and points as this crate has them.
 fn imported(
+    path: &Path,
     cameras: Vec<NamedCamera>,
     points: Vec<([f64; 3], [u8; 3])>,
     tool: &'static str,
@@ -86,7 +87,7 @@ fn imported(
     for camera in cameras {
         let size = camera.size.ok_or_else(|| {
             Error::refused(
-                format!("{}: the file does not tell the size of its images", camera.name),
+                format!("{}: {}: the file does not tell the size of its images", path.display(), camera.name),
                 "add w and h to it",
             )
         })?;

@@ -67,7 +67,7 @@ fn a_transforms_file_brings_times_too() {
     }
     fs::write(&file, text.replace("\"w\": 64,", "")).unwrap();
     let error = read(&file, &shots).unwrap_err().to_string();
-    assert!(error.contains("size"), "{error}");
+    assert!(error.contains("size") && error.contains("transforms.json"), "{error}");
     fs::write(&file, text.replace("[1,0,0,1]", "[2,0,0,1]")).unwrap();
     let error = read(&file, &shots).unwrap_err().to_string();
     assert!(error.contains("one.jpg") && error.contains("rigid"), "{error}");

@@ -62,15 +62,17 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         }
     }
     let times = transforms::times(&train, &times)?;
-    for (frame, time) in frames.iter_mut().zip(times.normalised) {
-        frame.time = time;
+    for (frame, time) in frames.iter_mut().zip(&times.normalised) {
+        frame.time = *time;
     }
+    let unit = if frames_per_second.is_none() { times.note(&train) } else { None };
     Ok(Draft {
         frames,
         stored_reduction: 1,
         points: customary_points(root)?,
         random_box: Some(BOX),
         frames_per_second: frames_per_second.or(times.per_second),
+        notes: unit.into_iter().collect(),
         warnings,
         unused,
         ..Draft::default()

@@ -24,7 +24,7 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
     let times = transforms::times(&path, &times)?;
     let mut frames = Vec::with_capacity(file.frames.len());
     let mut sources = BTreeMap::new();
-    for ((entry, inner), time) in file.frames.iter().zip(&inner).zip(times.normalised) {
+    for ((entry, inner), time) in file.frames.iter().zip(&inner).zip(times.normalised.iter().copied()) {
         let inner = inner.strip_prefix(&folder).unwrap_or(inner);
         let name = transforms::frame_name(inner);
         if let Some(source) = &entry.cif {
@@ -86,10 +86,12 @@ pub(super) fn read(source: &Source<'_>) -> Result<Draft, Error> {
         }
         None => customary_points(root)?,
     };
+    let unit = if file.fps.is_none() { times.note(&path) } else { None };
     Ok(Draft {
         frames,
         stored_reduction: 1,
         points,
+        notes: unit.into_iter().collect(),
         frames_per_second: file.fps.or(times.per_second),
         unused,
         sources,

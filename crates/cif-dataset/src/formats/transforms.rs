@@ -219,8 +219,24 @@ pub(super) fn camera(path: &Path, file: &TransformsFile, entry: &FrameEntry) -> 
 pub(super) struct Times {
     /// From 0 for the first to 1 for the last, `[frames]`; all zero when the capture has no times.
     pub(super) normalised: Vec<f64>,
-    /// Moments per second, where the times are seconds: those that end beyond 1 and are not whole, as numbers of frames are.
+    /// Moments per second, where the times are seconds: those that end beyond 1 and are not whole, as numbers of frames are,
+    /// or are of a clock that counts from 1970.
     pub(super) per_second: Option<f64>,
+}
+
+/// Seconds since 1970 before which no clock of a computer stands (1973); no video has so many frames.
+const EARLIEST: f64 = 1e8;
+
+/// Seconds since 1970 after which none stands (the year 5138): such clocks count milliseconds or less.
+const LATEST: f64 = 1e11;
+
+impl Times {
+    /// A sentence on the unit, where frames per second come from the times.
+    pub(super) fn note(&self, path: &Path) -> Option<String> {
+        self.per_second.map(|rate| {
+            format!("{}: its times are taken as seconds: {rate} moments per second", path.display())
+        })
+    }
 }
 
 /// Normalises times: `t = (time - first) / (last - first)`.
@@ -250,7 +266,8 @@ pub(super) fn times(path: &Path, times: &[Option<f64>]) -> Result<Times, Error> 
     if span <= 0.0 || !span.is_finite() {
         return Ok(Times { normalised: vec![0.0; times.len()], per_second: None });
     }
-    let is_clock = (first < 0.0 || last > 1.0) && moments.iter().any(|moment| moment.fract() != 0.0);
+    let is_fraction = moments.iter().any(|moment| moment.fract() != 0.0);
+    let is_clock = (first < 0.0 || last > 1.0) && last < LATEST && (is_fraction || first > EARLIEST);
     let per_second = is_clock.then(|| {
         // Clocks of days have microseconds left in double precision.
         ((moments.len() - 1) as f64 / span * 1e3).round() / 1e3
@@ -287,6 +304,8 @@ mod tests {
     fn numbers_of_frames_and_shares_are_no_seconds() {
         let numbers = of(&[500.0, 505.0, 510.0]);
         assert_eq!((numbers.normalised, numbers.per_second), (vec![0.0, 0.5, 1.0], None));
+        assert_eq!(of(&[1.7e9, 1.7e9 + 2.0, 1.7e9 + 4.0]).per_second, Some(0.5), "a clock of whole seconds");
+        assert_eq!(of(&[1.7e12, 1.7e12 + 33.5]).per_second, None, "milliseconds");
         let shares = of(&[0.0, 0.25, 1.0]);
         assert_eq!((shares.normalised, shares.per_second), (vec![0.0, 0.25, 1.0], None));
         let one = of(&[7.5, 7.5]);

@@ -332,7 +332,8 @@ fn pose(image: &Image) -> Option<RigidTransform> {
     let [w, x, y, z] = image.rotation;
     let quaternion = DQuat::from_xyzw(x, y, z, w);
     let length = quaternion.length();
-    if !(length.is_finite() && length > 1e-6) {
+    // Any other length is taken out, as COLMAP does; squares of smaller numbers vanish.
+    if !(length.is_finite() && length > 1e-150) {
         return None;
     }
     Some(RigidTransform {

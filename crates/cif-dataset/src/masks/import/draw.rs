@@ -77,9 +77,9 @@ pub(super) fn draw(picture: &Picture, frame: (u32, u32), turn: Turn, ids: &[u16]
             draw_pieces(pieces, size, ids, KEPT_BYTES)?
         }
     };
-    let size = (drawn.width, drawn.height);
-    check(size)?;
+    check((drawn.width, drawn.height))?;
     let drawn = turn.seen(drawn, frame);
+    let size = (drawn.width, drawn.height);
     Ok(Drawn { ids: mask::nearest_resize(&drawn, frame.0, frame.1), disputed, size })
 }
 

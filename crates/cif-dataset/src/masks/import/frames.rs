@@ -174,12 +174,12 @@ impl FrameNames {
         }
         let count = self.numbers.len();
         let words = format!("its task took every frame of a video whose number is {start} + {step} k");
-        if self.cameras.len() > 1 {
-            return Err(format!(
+        let order = self.order().ok_or_else(|| {
+            format!(
                 "{words}, and the capture has {} cameras; give the masks of each camera in a folder of its name",
                 self.cameras.len()
-            ));
-        }
+            )
+        })?;
         let place = |name: &&str| {
             let number: u64 = name.parse().map_err(|_| format!("{name:?} is no number of a frame"))?;
             let place =
@@ -192,9 +192,23 @@ impl FrameNames {
                 )
             })
         };
-        let frames = names.iter().map(|name| place(name).map(Some)).collect::<Result<_, String>>()?;
+        let frames = names.iter().map(|name| Ok(Some(order[place(name)?]))).collect::<Result<_, String>>()?;
         let note = format!("{words}: these are the frames of the capture in order");
         Ok(Matched { frames, of_video: false, note: Some(note) })
+    }
+
+    /// The frames in the order of one recording: of one camera as they are, of several that count their frames together by
+    /// their numbers; `None` where cameras count for themselves.
+    fn order(&self) -> Option<Vec<usize>> {
+        let mut order: Vec<usize> = (0..self.numbers.len()).collect();
+        if self.cameras.len() > 1 {
+            let distinct: BTreeSet<u64> = self.numbers.iter().copied().collect::<Option<_>>()?;
+            if distinct.len() < order.len() {
+                return None;
+            }
+            order.sort_by_key(|frame| self.numbers[*frame]);
+        }
+        Some(order)
     }
 
     /// Every name by the number that it ends in, as the number of a frame of the video of its camera; `None` where the

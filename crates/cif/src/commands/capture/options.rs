@@ -32,7 +32,8 @@ the cameras were held, the metre from --length or --measured, and the capture te
 Cameras of a rig that stand still are told by their pictures; they are solved at one moment, and give the points of four.
 Frames of a video are called by their number in the stream (000123.png), and the capture remembers the video, so that
 masks of all its frames, at its size, fit the frames that were taken. HLG and PQ video, as phones record it, becomes the
-display values of sRGB. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
+display values of sRGB. Photographs become upright, as their EXIF says; poses and masks of their pixels as they are stored
+turn with them. Times are those of the stream, or of a table: one line per image with its name, a comma, and seconds.")]
 pub(in crate::commands) struct Capture {
     /// Videos and folders of photographs, one per camera
     #[arg(required = true, value_name = "INPUT")]
