@@ -84,11 +84,15 @@ impl TextEmbedder {
 fn embedding(session: &mut Session, inputs: Vec<(&str, Tensor)>) -> Result<Vec<f32>, Error> {
     let outputs = session.run(inputs)?;
     let answer = &outputs["embedding"];
-    let direction = answer.as_floats().filter(|_| answer.shape()[0] == 1).and_then(unit);
-    direction.ok_or_else(|| {
+    direction(answer).ok_or_else(|| {
         let problem = format!("{:?} came out, where one direction, [1, length], is expected", answer.shape());
         session.refuse("embedding", &problem)
     })
+}
+
+/// The direction of an answer of one row.
+fn direction(answer: &Tensor) -> Option<Vec<f32>> {
+    answer.as_floats().filter(|_| answer.shape().first() == Some(&1)).and_then(unit)
 }
 
 /// A vector of length 1 in the same direction; `None` where there is no direction.
@@ -97,4 +101,19 @@ pub fn unit(vector: &[f32]) -> Option<Vec<f32>> {
     let length = vector.iter().map(|value| f64::from(*value).powi(2)).sum::<f64>().sqrt();
     (length.is_finite() && length > 0.0)
         .then(|| vector.iter().map(|value| (f64::from(*value) / length) as f32).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_answer_is_one_direction() {
+        let answer = |shape: &[usize], values: &[f32]| direction(&Tensor::floats(shape, values.to_vec()));
+        assert_eq!(answer(&[1, 2], &[3.0, 4.0]), Some(vec![0.6, 0.8]));
+        // Not one row, or no direction.
+        assert_eq!(answer(&[], &[1.0]), None);
+        assert_eq!(answer(&[2, 1], &[1.0, 1.0]), None);
+        assert_eq!(answer(&[1, 2], &[0.0, 0.0]), None);
+    }
 }

@@ -1,6 +1,7 @@
 //! The library of ONNX Runtime: `ORT_DYLIB_PATH`, or the one in the Python package `onnxruntime`.
 
 use std::ffi::OsString;
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 
@@ -25,14 +26,19 @@ fn find_named(named: Option<OsString>, pythons: &[OsString]) -> Result<PathBuf, 
     if let Some(named) = named.filter(|name| !name.is_empty()) {
         // A name alone would be looked for among the libraries of the system.
         let named = PathBuf::from(named);
-        let path = std::path::absolute(&named).unwrap_or(named);
+        let path = std::path::absolute(&named).unwrap_or_else(|_| named.clone());
         cif_input::check(&path).map_err(|error| {
             Error::refused(
                 format!("{VARIABLE} names {}: {error}", path.display()),
                 "give the path of libonnxruntime.so, libonnxruntime.dylib or onnxruntime.dll",
             )
         })?;
-        return Ok(path);
+        return is_library(&path).then_some(path).ok_or_else(|| {
+            Error::refused(
+                format!("{VARIABLE} names {}, which is no library", named.display()),
+                "give the path of libonnxruntime.so, libonnxruntime.dylib or onnxruntime.dll",
+            )
+        });
     }
     pythons.iter().find_map(|python| library_in(&package(python)?.join("capi"))).ok_or_else(|| {
         let asked: Vec<_> = pythons.iter().map(|python| python.to_string_lossy()).collect();
@@ -47,6 +53,21 @@ fn find_named(named: Option<OsString>, pythons: &[OsString]) -> Result<PathBuf, 
             ),
         )
     })
+}
+
+/// True where a file begins as libraries of Linux, macOS or Windows do: ELF, Mach-O (of one processor or several), or PE.
+fn is_library(path: &Path) -> bool {
+    const BEGINNINGS: [&[u8]; 6] = [
+        b"\x7fELF",
+        b"\xcf\xfa\xed\xfe",
+        b"\xce\xfa\xed\xfe",
+        b"\xca\xfe\xba\xbe",
+        b"\xca\xfe\xba\xbf",
+        b"MZ",
+    ];
+    let mut start = [0; 4];
+    let read = std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut start));
+    read.is_ok() && BEGINNINGS.iter().any(|beginning| start.starts_with(beginning))
 }
 
 /// Folder of the Python package.
@@ -122,6 +143,13 @@ mod tests {
     fn pythons_without_the_package_are_told() {
         let named = find_named(Some("no/libonnxruntime.so".into()), &[]).unwrap_err().to_string();
         assert!(named.contains(VARIABLE) && named.contains("no/libonnxruntime.so"), "{named}");
+        let folder = tempfile::tempdir().unwrap();
+        let text = folder.path().join("libonnxruntime.so");
+        std::fs::write(&text, "root:x:0:0").unwrap();
+        let named = find_named(Some(text.clone().into()), &[]).unwrap_err().to_string();
+        assert!(named.contains(VARIABLE) && named.contains("is no library"), "{named}");
+        std::fs::write(&text, b"\x7fELF\x02").unwrap();
+        assert_eq!(find_named(Some(text.clone().into()), &[]).unwrap(), text);
         let error = find_named(None, &["no-such-python".into()]).unwrap_err();
         let Error::Refused { problem, fix } = error else { panic!("another error") };
         assert!(problem.contains("no-such-python"), "{problem}");

@@ -19,6 +19,8 @@ use crate::{Error, Picture, Tensor};
 const SIDE: u32 = 1024;
 /// Side of the masks that the decoder may start from, where the model does not say.
 const PREVIOUS: usize = 256;
+/// Largest side that is taken at its word: those of pictures. Another one does not fit then, and is told so.
+const MOST_PREVIOUS: usize = 4 * SIDE as usize;
 /// Labels of a box's first and second corner.
 const CORNERS: [i64; 2] = [2, 3];
 
@@ -93,7 +95,8 @@ impl Segmenter {
                 .collect();
             inputs.extend(self.prompts(scaled, (picture.width, picture.height)));
             let outputs = self.decoder.run(inputs)?;
-            let logits = self.best(&outputs["masks"], outputs.get("scores"))?;
+            let logits = best(&outputs["masks"], outputs.get("scores"));
+            let logits = logits.map_err(|problem| self.decoder.refuse("masks", &problem))?;
             let logits = if self.decoder.has_input("size") {
                 logits
             } else {
@@ -119,8 +122,10 @@ impl Segmenter {
         let decoder = &self.decoder;
         let has_box = decoder.has_input("boxes");
         let rank = |part| decoder.input_shape(part).len();
-        let side =
-            |axis: usize| decoder.input_shape("previous").get(axis).copied().flatten().unwrap_or(PREVIOUS);
+        let side = |axis: usize| {
+            let stated = decoder.input_shape("previous").get(axis).copied().flatten();
+            stated.filter(|side| *side <= MOST_PREVIOUS).unwrap_or(PREVIOUS)
+        };
         let mut prompts = Vec::new();
         if has_box {
             prompts.push(("boxes", Tensor::floats([1, 4], corners).with_rank(rank("boxes"))));
@@ -140,24 +145,26 @@ impl Segmenter {
         }
         prompts
     }
+}
 
-    /// Logits of the mask with the highest predicted IoU; of the first where none are predicted.
-    fn best(&self, masks: &Tensor, scores: Option<&Tensor>) -> Result<PixelGrid<f32>, Error> {
-        let shape = masks.shape();
-        let (&[height, width], batch) = (&shape[shape.len() - 2..], &shape[..shape.len() - 2]) else {
-            return Err(self.decoder.refuse("masks", "no pictures came out"));
-        };
-        let count: usize = batch.iter().product();
-        let area = height * width;
-        let scores = scores.and_then(Tensor::as_floats);
-        let fits = count > 0 && area > 0 && scores.is_none_or(|scores| scores.len() == count);
-        let (Some(values), true) = (masks.as_floats(), fits) else {
-            let problem = format!("{shape:?} came out, with {:?} scores", scores.map(<[f32]>::len));
-            return Err(self.decoder.refuse("masks", &problem));
-        };
-        let best = scores.map_or(0, highest);
-        Ok(PixelGrid::from_pixels(width as u32, height as u32, values[best * area..][..area].to_vec()))
-    }
+/// Logits of the mask with the highest predicted IoU; of the first where none are predicted.
+///
+/// # Errors
+/// When there is no mask, or another number of scores.
+fn best(masks: &Tensor, scores: Option<&Tensor>) -> Result<PixelGrid<f32>, String> {
+    let shape = masks.shape();
+    let &[ref batch @ .., height, width] = shape else {
+        return Err(format!("{shape:?} came out, where pictures, [.., height, width], are expected"));
+    };
+    let count: usize = batch.iter().product();
+    let area = height * width;
+    let scores = scores.and_then(Tensor::as_floats);
+    let fits = count > 0 && area > 0 && scores.is_none_or(|scores| scores.len() == count);
+    let (Some(values), true) = (masks.as_floats(), fits) else {
+        return Err(format!("{shape:?} came out, with {:?} scores", scores.map(<[f32]>::len)));
+    };
+    let best = scores.map_or(0, highest);
+    Ok(PixelGrid::from_pixels(width as u32, height as u32, values[best * area..][..area].to_vec()))
 }
 
 /// Index of the highest of some numbers, the first of several.
@@ -208,6 +215,19 @@ mod tests {
         assert_eq!(bilinear(&grid, (1, 2), (2, 4)).pixels, [0.0, 0.0, 0.5, 0.5, 1.5, 1.5, 2.0, 2.0]);
         let wide = PixelGrid::from_pixels(4, 1, vec![0.0, 2.0, 4.0, 8.0]);
         assert_eq!(bilinear(&wide, (4, 1), (2, 1)).pixels, [1.0, 6.0]);
+    }
+
+    #[test]
+    fn what_is_no_picture_is_refused() {
+        let masks = |shape: &[usize]| Tensor::floats(shape, vec![0.5; shape.iter().product()]);
+        for shape in [&[][..], &[4], &[0, 2, 2], &[2, 0, 2]] {
+            assert!(
+                best(&masks(shape), None).unwrap_err().contains(&format!("{shape:?} came out")),
+                "{shape:?}"
+            );
+        }
+        assert!(best(&masks(&[2, 1, 1]), Some(&masks(&[3]))).is_err());
+        assert_eq!(best(&masks(&[3, 2]), None).unwrap(), PixelGrid::filled(2, 3, 0.5));
     }
 
     #[test]

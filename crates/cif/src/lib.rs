@@ -56,20 +56,43 @@ pub mod words;
 
 use std::ffi::OsString;
 use std::io::IsTerminal;
+use std::path::PathBuf;
 
 use clap::Parser;
 use miette::{GraphicalReportHandler, GraphicalTheme};
 
-pub use cif_capture::structure::{pythons, set_python};
+pub use cif_capture::structure::pythons;
 pub use error::Error;
+
+/// Names the Python that this process is part of, which has the command as its module: programs of Python run in it, and so
+/// do models, each in a process of its own.
+pub fn set_python(program: PathBuf) {
+    cif_capture::structure::set_python(program.clone());
+    cif_vision::runtime::run_apart(move || {
+        let script = format!("import sys, cif4d; sys.argv = ['cif', '{RUN_MODEL}']; sys.exit(cif4d.main())");
+        cif_system::python::script(&program, &script)
+    });
+}
 
 /// From here on the process ends without a word when whatever reads its output has seen enough, as in
 /// `cif eval ... | head`, and signals stop the command. For processes that are nothing but the command: others would
 /// end with it, and lose their own handlers.
+///
+/// Models are run by the same program in processes of their own, unless [`set_python`] was called before.
 pub fn own_process() {
+    if let Ok(program) = std::env::current_exe() {
+        cif_vision::runtime::run_apart(move || {
+            let mut command = std::process::Command::new(&program);
+            command.arg(RUN_MODEL);
+            command
+        });
+    }
     sigpipe::reset();
     interrupt::own_process();
 }
+
+/// The subcommand that runs a model for another process.
+const RUN_MODEL: &str = "run-model";
 
 /// Runs a command line, the first argument being the name of the program, and returns the exit code:
 /// 0 done, 1 failed, 2 not understood, 130 interrupted. Errors are written to stderr.

@@ -375,6 +375,26 @@ fn a_scene_is_asked_in_words() {
     cif(path, &["query", "scene.cif", "--models", "models"]).fails(2, &["--prompt", "--text"]);
     cif(path, &["query", "scene.cif", "--text", "?"]).fails(2, &["no words"]);
     cif(path, &["query", "scene.cif", "--text", "red", "--label", "x"]).fails(2, &["--label"]);
+
+    // What ends the process that runs it is one error: here a panic of the library of tokenizers, which cannot cut texts
+    // to pieces that overlap by more than their length.
+    models::write(&path.join("models"));
+    let words = path.join("models/words.json");
+    let mut tokenizer: serde_json::Value = serde_json::from_slice(&fs::read(&words).unwrap()).unwrap();
+    tokenizer["truncation"] =
+        serde_json::json!({ "direction": "Right", "max_length": 3, "strategy": "LongestFirst", "stride": 5 });
+    fs::write(&words, tokenizer.to_string()).unwrap();
+    let prompt = ["query", "scene.cif", "--capture", "table", "--prompt", "blue ball", "--cache", "new"];
+    let text = ["query", "seen.cif", "--text", "blue ball"];
+    for asked in [&prompt[..], &text] {
+        let told = cif(path, &[asked, &["--models", "models"]].concat());
+        assert!(!told.stderr.contains("panicked"), "{}", told.stderr);
+        told.fails(1, &["words.json", "ended the process that ran it", "101"]);
+    }
+    // A file that is no library does not hold the command up.
+    let library = format!("ORT_DYLIB_PATH={}", words.display());
+    let ask = [&library, CIF, "query", "seen.cif", "--models", "models", "--text", "blue ball"];
+    run("env", path, ask).fails(1, &["ORT_DYLIB_PATH", "words.json", "no library"]);
 }
 
 #[test]

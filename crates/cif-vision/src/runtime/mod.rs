@@ -5,16 +5,39 @@ mod absent;
 #[cfg(feature = "onnx")]
 mod onnx;
 #[cfg(feature = "onnx")]
+mod place;
+#[cfg(feature = "onnx")]
+mod runner;
+#[cfg(feature = "onnx")]
 mod signature;
 #[cfg(feature = "onnx")]
 mod tokens;
+#[cfg(feature = "onnx")]
+mod worker;
 
+use std::process::Command;
+use std::sync::OnceLock;
+
+#[cfg(not(feature = "onnx"))]
+pub use absent::serve;
 #[cfg(not(feature = "onnx"))]
 pub(crate) use absent::{Session, Tokenizer};
 #[cfg(feature = "onnx")]
 pub(crate) use onnx::Session;
 #[cfg(feature = "onnx")]
 pub(crate) use tokens::Tokenizer;
+#[cfg(feature = "onnx")]
+pub use worker::serve;
+
+type Start = Box<dyn Fn() -> Command + Send + Sync>;
+
+static START: OnceLock<Start> = OnceLock::new();
+
+/// Runs every model and tokenizer in a process of its own from here on: files of others may end ONNX Runtime, and the
+/// process with it. The command has to do nothing but [`serve`] on its standard input and output; the first call counts.
+pub fn run_apart(start: impl Fn() -> Command + Send + Sync + 'static) {
+    let _ = START.set(Box::new(start));
+}
 
 /// True where this build can run models.
 pub const IS_BUILT: bool = cfg!(feature = "onnx");
@@ -40,6 +63,21 @@ impl<'a> Part<'a> {
     pub(crate) const fn known(name: &'a str, ranks: &'a [usize]) -> Self {
         Self { name, ranks, needed: false }
     }
+}
+
+/// A text as a tokenizer reads it, padding of its own included: an entry per token.
+#[cfg(feature = "onnx")]
+#[derive(Clone, Debug, Default, PartialEq, serde::Serialize, serde::Deserialize)]
+struct Reading {
+    ids: Vec<u32>,
+    types: Vec<u32>,
+    attention: Vec<u32>,
+    /// 1 for tokens that the tokenizer adds.
+    special: Vec<u32>,
+    /// Bytes of the text.
+    offsets: Vec<(usize, usize)>,
+    /// Number of the token that fills up.
+    padding: u32,
 }
 
 /// A text as numbers.

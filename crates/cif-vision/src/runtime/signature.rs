@@ -3,12 +3,14 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use serde::{Deserialize, Serialize};
+
 use super::Part;
 use crate::models::MANIFEST;
 use crate::{Error, Tensor};
 
 /// Type of the values of a tensor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(super) enum Element {
     Float,
     Int64,
@@ -19,7 +21,7 @@ pub(super) enum Element {
 }
 
 /// A tensor as a model declares it.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(super) struct Declared {
     pub(super) name: String,
     pub(super) element: Element,

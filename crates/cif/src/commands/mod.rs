@@ -117,6 +117,9 @@ enum Command {
     Bench(bench::Bench),
     Completions(completions::Completions),
     Man(man::Man),
+    /// Run a model for another process of cif, which asks on the standard input
+    #[command(hide = true)]
+    RunModel,
 }
 
 /// Use of the machine; results never depend on the number of threads.
@@ -225,6 +228,8 @@ fn dispatch(command: Command) -> Result<(), Error> {
         Command::Bench(command) => bench::run(&command),
         Command::Completions(command) => completions::run(&command),
         Command::Man(command) => man::run(&command),
+        Command::RunModel => cif_vision::runtime::serve(std::io::stdin().lock(), std::io::stdout().lock())
+            .map_err(|error| Error::plain(format!("no process asks for a model any more: {error}"))),
     }
 }
 
