@@ -370,6 +370,14 @@ fn a_stage_far_from_its_origin_keeps_its_places() {
         format!("world.AddTranslateOp().Set({place})"),
         format!("UsdGeom.Xformable(prim).AddTransformOp().Set({matrix}({place}))"),
         format!("thing.AddTransformOp().Set({matrix}({place}))\nUsd.ModelAPI(thing).SetKind('component')"),
+        format!(
+            "
+spec = stage.GetRootLayer().GetPrimAtPath('/World/Thing/Cloud')
+del spec.properties['positions']
+doubles = Sdf.AttributeSpec(spec, 'positions', Sdf.ValueTypeNames.Point3dArray)
+doubles.default = Vt.Vec3dArray([{place}, {place} + Gf.Vec3d(1, 2, 3)])
+"
+        ),
     ] {
         let graph = read(&far);
         let folder = tempfile::tempdir().unwrap();
