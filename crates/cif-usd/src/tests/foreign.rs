@@ -309,8 +309,8 @@ fn colours_of_other_spaces_become_display_values() {
     let graph = read("sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(255, 51, 0)])\n");
     assert!(color(&graph).iter().zip([1.0, 0.2, 0.0]).all(|(a, b)| (a - b).abs() < 1e-5));
     assert!(graph.warnings[0].contains("up to 255"), "{:?}", graph.warnings);
-    let half = format!("sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(0.2, 0.2, 0.2)])\n");
-    let graph = read(&(half + &api("prim", "lin_rec709_scene")));
+    let grey = "sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(0.2, 0.2, 0.2)])\n";
+    let graph = read(&format!("{grey}{}", api("prim", "lin_rec709_scene")));
     assert!((color(&graph)[0] - 0.484_529).abs() < 1e-4);
 }
 
