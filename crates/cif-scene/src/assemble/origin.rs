@@ -92,7 +92,14 @@ fn move_frame(prim: &mut Prim, place: DVec3) {
     prim.pivot = None;
     for piece in &mut prim.pieces {
         match &mut piece.placement {
-            Placement::Rigid { track, .. } => shift(track, -place),
+            Placement::Rigid { track, baked } => {
+                // What is baked into splats is rounded with them, so that it must not lead far away.
+                let far = baked.as_mut().map(|map| std::mem::take(&mut map.translation)).unwrap_or_default();
+                for pose in track.samples.iter_mut().chain([&mut track.rest]) {
+                    pose.translation += pose.rotation * far;
+                }
+                shift(track, -place);
+            }
             Placement::Sampled(maps) => maps.iter_mut().for_each(|(_, map)| map.translation -= place),
         }
         piece.pivot = piece.pivot.map(|pivot| pivot - place);

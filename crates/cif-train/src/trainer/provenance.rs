@@ -35,6 +35,9 @@ impl Trainer {
                 exposures: exposures.map(|(camera, exposure)| (camera.to_owned(), exposure)).collect(),
             },
             frame: dataset.frame,
+            // Those of the world of the capture, and of its frames.
+            declared: None,
+            frame_codes: None,
             capture: dataset.root.file_name().and_then(|name| name.to_str()).map(str::to_owned),
             unknown: dataset.unknown.clone(),
             run: Some(Run {

@@ -86,6 +86,15 @@ impl<'a, 'py> Arrays<'a, 'py> {
         Ok(flat.as_chunks::<C>().0.to_vec())
     }
 
+    /// Doubles in rows of three; `None` for an array of another type.
+    pub(super) fn doubles(&self, value: &Bound<'py, PyAny>) -> Result<Option<Vec<[f64; 3]>>, ArrayError> {
+        if value.get_type().name()? != "Vec3dArray" {
+            return Ok(None);
+        }
+        let flat: Vec<f64> = self.flat(value, 3, "float64")?;
+        Ok(Some(flat.as_chunks::<3>().0.to_vec()))
+    }
+
     /// Scalars.
     pub(super) fn scalars(&self, value: &Bound<'py, PyAny>) -> Result<Vec<f32>, ArrayError> {
         self.flat(value, 1, "float32")

@@ -2,7 +2,7 @@
 
 use cif_scene::assemble::{Identity, Piece, Placement, Prim, PrimName, Shape, Track};
 use cif_scene::{ConvexHull, MotionModel, MotionReport, PointProxy, Splats};
-use glam::DVec3;
+use glam::{DAffine3, DVec3};
 use pyo3::prelude::*;
 
 use super::joints::joints;
@@ -153,7 +153,9 @@ fn piece<'py>(
     placement: Placement,
 ) -> Result<Piece, UsdError> {
     let python = |error: PyErr| reading.python(&error);
-    let mut splats = prim.splats(reading)?;
+    let origin = prim.origin(reading)?;
+    let placement = from_origin(placement, origin);
+    let mut splats = prim.splats(reading, origin)?;
     if owner.recorded.background && !prim.has_identities().map_err(python)? {
         splats.identity_probabilities.fill(0.0);
     }
@@ -171,7 +173,7 @@ fn piece<'py>(
     }
     let mut shapes: Vec<Shape> = Vec::with_capacity(sampled.shape_codes.len());
     for &code in &sampled.shape_codes {
-        let shape = prim.shape(reading, Some(code))?;
+        let shape = prim.shape(reading, Some(code), origin)?;
         if shape.means.len() != count {
             return Err(reading.prim_error(
                 &prim.path,
@@ -189,6 +191,23 @@ fn piece<'py>(
         false => (String::new(), None),
     };
     Ok(Piece { name, splats, placement, pivot, joint: None, shapes, opacities, colors })
+}
+
+/// Where a piece is whose splats are given from a place in it on.
+fn from_origin(placement: Placement, origin: DVec3) -> Placement {
+    match placement {
+        Placement::Rigid { mut track, baked } => {
+            let place = baked.map_or(origin, |map| map.transform_vector3(origin));
+            for pose in track.samples.iter_mut().chain([&mut track.rest]) {
+                pose.translation += pose.rotation * place;
+            }
+            Placement::Rigid { track, baked }
+        }
+        Placement::Sampled(mut maps) => {
+            maps.iter_mut().for_each(|(_, map)| *map *= DAffine3::from_translation(origin));
+            Placement::Sampled(maps)
+        }
+    }
 }
 
 /// Origin of a part's frame at the reference time, where it is recorded and the part moves.

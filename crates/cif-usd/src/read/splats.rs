@@ -1,8 +1,10 @@
 //! Splats of one prim: single or half precision, checked.
 
+use cif_geometry::Bounds;
 use cif_geometry::spherical_harmonics::{BAND_0, COEFFICIENTS, coefficient_count};
-use cif_scene::assemble::{Shape, color_range};
+use cif_scene::assemble::{Shape, color_range, origin_of};
 use cif_scene::{IdentityShare, IdentityShares, Splats};
+use glam::DVec3;
 use pyo3::prelude::*;
 
 use super::arrays::ArrayError;
@@ -140,8 +142,25 @@ impl<'py> SplatPrim<'py> {
         }
     }
 
-    /// Centres, orientations and scales at a time, checked.
-    pub(super) fn shape(&self, reading: &Reading<'_, 'py>, time: Option<f64>) -> Result<Shape, UsdError> {
+    /// The place that its centres are read from on: that of the prim, unless they are doubles which single precision
+    /// does not hold.
+    pub(super) fn origin(&self, reading: &Reading<'_, 'py>) -> Result<DVec3, UsdError> {
+        let at = reading.pxr.earliest().map_err(|error| reading.python(&error))?;
+        let doubles =
+            |value: &Bound<'py, PyAny>| reading.arrays.doubles(value).map(Option::unwrap_or_default);
+        let centres = self.read(reading, "positions", &at, doubles)?.unwrap_or_default();
+        let bounds = Bounds::around(centres.into_iter().map(DVec3::from_array));
+        // The scene tells of its own origin, of which this becomes a part.
+        Ok(origin_of(&bounds, 1.0, &mut Vec::new()).unwrap_or_default())
+    }
+
+    /// Centres from `origin` on, orientations and scales at a time, checked.
+    pub(super) fn shape(
+        &self,
+        reading: &Reading<'_, 'py>,
+        time: Option<f64>,
+        origin: DVec3,
+    ) -> Result<Shape, UsdError> {
         let python = |error: PyErr| reading.python(&error);
         let at = match time {
             Some(time) => reading.pxr.time_code(Some(time)),
@@ -152,7 +171,13 @@ impl<'py> SplatPrim<'py> {
         let when = time.map_or(String::new(), |time| format!(" at time code {time}"));
         let bad = |problem: String, fix| reading.prim_error(&self.path, format!("{problem}{when}"), fix);
         let means: Vec<[f32; 3]> = self
-            .read(reading, "positions", &at, |value| arrays.floats(value))?
+            .read(reading, "positions", &at, |value| match arrays.doubles(value)? {
+                Some(centres) => {
+                    let near = |centre| (DVec3::from_array(centre) - origin).as_vec3().to_array();
+                    Ok(centres.into_iter().map(near).collect())
+                }
+                None => arrays.floats(value),
+            })?
             .ok_or_else(|| bad("no positions".into(), "author positions, or deactivate the prim"))?;
         let n = means.len();
         if let Some(index) = means.iter().position(|mean| !mean.iter().all(|value| value.is_finite())) {
@@ -200,10 +225,10 @@ impl<'py> SplatPrim<'py> {
         Ok(Shape { means, orientations, scales })
     }
 
-    /// Everything at the earliest time, checked.
-    pub(super) fn splats(&self, reading: &Reading<'_, 'py>) -> Result<Splats, UsdError> {
+    /// Everything at the earliest time, checked; centres from `origin` on.
+    pub(super) fn splats(&self, reading: &Reading<'_, 'py>, origin: DVec3) -> Result<Splats, UsdError> {
         let python = |error: PyErr| reading.python(&error);
-        let Shape { means, orientations, scales } = self.shape(reading, None)?;
+        let Shape { means, orientations, scales } = self.shape(reading, None, origin)?;
         let n = means.len();
         let at = reading.pxr.earliest().map_err(python)?;
         let arrays = &reading.arrays;

@@ -309,8 +309,8 @@ fn colours_of_other_spaces_become_display_values() {
     let graph = read("sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(255, 51, 0)])\n");
     assert!(color(&graph).iter().zip([1.0, 0.2, 0.0]).all(|(a, b)| (a - b).abs() < 1e-5));
     assert!(graph.warnings[0].contains("up to 255"), "{:?}", graph.warnings);
-    let half = format!("sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(0.2, 0.2, 0.2)])\n");
-    let graph = read(&(half + &api("prim", "lin_rec709_scene")));
+    let grey = "sh.Clear()\nsplats.CreateDisplayColorPrimvar('constant').Set([(0.2, 0.2, 0.2)])\n";
+    let graph = read(&format!("{grey}{}", api("prim", "lin_rec709_scene")));
     assert!((color(&graph)[0] - 0.484_529).abs() < 1e-4);
 }
 
@@ -370,6 +370,14 @@ fn a_stage_far_from_its_origin_keeps_its_places() {
         format!("world.AddTranslateOp().Set({place})"),
         format!("UsdGeom.Xformable(prim).AddTransformOp().Set({matrix}({place}))"),
         format!("thing.AddTransformOp().Set({matrix}({place}))\nUsd.ModelAPI(thing).SetKind('component')"),
+        format!(
+            "
+spec = stage.GetRootLayer().GetPrimAtPath('/World/Thing/Cloud')
+del spec.properties['positions']
+doubles = Sdf.AttributeSpec(spec, 'positions', Sdf.ValueTypeNames.Point3dArray)
+doubles.default = Vt.Vec3dArray([{place}, {place} + Gf.Vec3d(1, 2, 3)])
+"
+        ),
     ] {
         let graph = read(&far);
         let folder = tempfile::tempdir().unwrap();

@@ -218,7 +218,8 @@ impl Checker<'_> {
         clock: &Clock<'_>,
         moment: Option<f64>,
     ) -> Result<Option<Likeness>, Error> {
-        let code = |view: &RecordedCamera| moment.unwrap_or(view.time_index as f64);
+        let codes = self.field.time_codes();
+        let code = |view: &RecordedCamera| moment.unwrap_or(codes[view.time_index]);
         let held = self.views.iter().filter(|view| clock.holds(code(view)));
         let views = held.map(|view| {
             let RecordedCamera { name, time_index, camera, .. } = view;
@@ -265,21 +266,17 @@ impl Clock<'_> {
         (self.held.0..=self.held.1).contains(&code)
     }
 
-    /// Time code of a time in the scene, whose frames are the time codes.
+    /// Time code of a time in the scene.
     fn code(&self, time: f64) -> f64 {
-        code_at(&self.field.timeline.times, &self.frames(), time)
+        code_at(&self.field.timeline.times, &self.field.time_codes(), time)
     }
 
     fn in_field(&self, code: f64) -> f64 {
-        code_at(&self.frames(), &self.field.timeline.times, code)
+        code_at(&self.field.time_codes(), &self.field.timeline.times, code)
     }
 
     fn in_copy(&self, code: f64) -> Result<f64, Error> {
         time_in_field(self.read, code).map_err(Error::plain)
-    }
-
-    fn frames(&self) -> Vec<f64> {
-        (0..self.field.timeline.times.len()).map(|frame| frame as f64).collect()
     }
 }
 
