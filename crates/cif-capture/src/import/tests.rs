@@ -83,12 +83,11 @@ fn what_is_of_no_tool_is_refused_with_those_that_are_known() {
     );
 }
 
+/// Size of an image, the place of a point in it, and what was noted.
+type Seen = ((u32, u32), [f64; 2], Vec<String>);
+
 /// Where the pose of the only camera of a COLMAP model sees a point, in an image of this size that was turned so.
-fn seen(
-    root: &Path,
-    size: (u32, u32),
-    turned: Orientation,
-) -> Result<((u32, u32), [f64; 2], Vec<String>), Error> {
+fn seen(root: &Path, size: (u32, u32), turned: Orientation) -> Result<Seen, Error> {
     let mut shots = [Shot { size, turned, ..shot("one.png") }];
     let found = read(root, &shots)?.matched(root, &mut shots)?;
     let pose = found.poses.images["one.png"];
