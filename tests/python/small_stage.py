@@ -266,8 +266,14 @@ def write_cabinet(path: Path) -> Path:
         + _joint("Prismatic", "part_02", (0, 0.3, 0), "Y", 0.02 * (FRAMES - 1))
     )
     body = [
-        _object("cabinet_004", ["cabinet"], 4, _pose((0, 0, 0.5), turned(0)), parts),
-        _object("background", ["background"], None, _pose((0, 0, 0), turned(0)), _flat(floor)),
+        _object("cabinet_001", ["cabinet"], 1, _pose((0, 0, 0.5), turned(0)), parts),
+        _object(
+            "background",
+            ["background"],
+            None,
+            _pose((0, 0, 0), turned(0)),
+            'uniform token cif:kind = "background"\n' + _flat(floor),
+        ),
     ]
     path.write_text(
         f"""#usda 1.0
@@ -292,8 +298,8 @@ def Xform "World" (kind = "assembly")
 def _joint(kind: str, part: str, place: tuple, axis: str, upper: float) -> str:
     """A joint between the first part of the cabinet and another, at the origin of that."""
     return f"""def Physics{kind}Joint "Joint_{part}" {{
-rel physics:body0 = </World/cabinet_004/part_00>
-rel physics:body1 = </World/cabinet_004/{part}>
+rel physics:body0 = </World/cabinet_001/part_00>
+rel physics:body1 = </World/cabinet_001/{part}>
 point3f physics:localPos0 = {_tuple(place)}
 uniform token physics:axis = "{axis}"
 float physics:lowerLimit = 0

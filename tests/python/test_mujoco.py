@@ -126,12 +126,12 @@ def test_for_mujoco_nothing_falls_unasked(field: cif.Field, motion, tmp_path: Pa
 
 def test_parts_on_joints_stand_and_fall(cabinet: cif.Field, tmp_path: Path) -> None:
     path = exported(cabinet, tmp_path / "cabinet.usda", "--for", "mujoco")
-    bodies = {f"/World/cabinet_004/part_0{part}" for part in range(3)}
+    bodies = {f"/World/cabinet_001/part_0{part}" for part in range(3)}
     held = simulated(path, 500)
     assert set(held["bodies"]) == {*bodies, "world"} and held["joints"] == {}
     for body in bodies:
         np.testing.assert_allclose(held["end"][body], held["start"][body], atol=1e-9)
-    loose = simulated(path, 1000, dynamic=("/World/cabinet_004",))
+    loose = simulated(path, 1000, dynamic=("/World/cabinet_001",))
     assert set(loose["bodies"]) == {*bodies, "world"}
     assert len(loose["joints"]) == 2
     (door,) = (limits for name, limits in loose["joints"].items() if name.endswith("part_01"))

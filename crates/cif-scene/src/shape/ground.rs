@@ -67,10 +67,11 @@ fn corners(node: &Node, time_code: f64) -> impl Iterator<Item = DVec3> {
     node.colliders.iter().flat_map(move |hull| {
         let place: RigidTransform = match (&node.motion, hull.part) {
             (Motion::Parts(motion), Some(part)) => {
-                world_from_node.compose(&motion.parts[part].node_transform(time_code))
+                motion.parts.get(part).map(|part| part.node_transform(time_code))
             }
-            _ => world_from_node,
-        };
+            _ => None,
+        }
+        .map_or(world_from_node, |node_from_part| world_from_node.compose(&node_from_part));
         hull.points.iter().map(move |point| place.apply(DVec3::from_array(point.map(f64::from))))
     })
 }

@@ -10,7 +10,7 @@ use crate::layer::{Layer, child};
 use crate::tokens;
 
 pub(super) fn author(scene: &Scene<'_, '_>, layer: &Layer<'_, '_>, place: &str, node: &Node) -> PyResult<()> {
-    let masses = cif_scene::masses(node, scene.options.density, scene.graph.meters_per_unit);
+    let masses = cif_scene::masses(scene.graph, node, scene.options.density);
     for (index, (hull, mass)) in node.colliders.iter().zip(masses).enumerate() {
         let part = hull.part.zip(parts(node)).and_then(|(part, motion)| motion.parts.get(part));
         let place = part.map_or_else(|| place.to_owned(), |part| child(place, &part.name));

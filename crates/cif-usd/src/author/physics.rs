@@ -141,7 +141,7 @@ fn body(
     }
     prim.apply(&schemas)?;
     prim.set("physics:kinematicEnabled", "Bool", VARYING, kinematic)?;
-    let masses = cif_scene::masses(node, scene.options.density, scene.graph.meters_per_unit);
+    let masses = cif_scene::masses(scene.graph, node, scene.options.density);
     let is_of = |hull: &ConvexHull| of.part.is_none_or(|(part, _)| hull.part == Some(part));
     let own = node.colliders.iter().zip(masses).filter(|(hull, _)| is_of(hull)).map(|(_, mass)| mass);
     prim.set("physics:mass", "Float", VARYING, own.sum::<f64>())?;

@@ -192,8 +192,7 @@ struct Mass {
 fn masses(graph: &SceneGraph, density: f64) -> Vec<Mass> {
     let mass = |node: &Node| Mass {
         name: node.name.clone(),
-        kilograms: (!node.colliders.is_empty())
-            .then(|| cif_scene::masses(node, density, graph.meters_per_unit).iter().sum()),
+        kilograms: (!node.colliders.is_empty()).then(|| cif_scene::masses(graph, node, density).iter().sum()),
     };
     graph.nodes.iter().map(mass).collect()
 }
