@@ -44,6 +44,7 @@ mod instances;
 mod layout;
 mod lens_removal;
 mod load;
+mod made_from;
 mod mask_files;
 pub mod masks;
 pub mod meant;
@@ -62,5 +63,6 @@ pub use dataset::{
 pub use error::Error;
 pub use feature_maps::feature_maps;
 pub use frame_source::{FrameSource, VideoFrame};
+pub use made_from::MadeFrom;
 pub use motion_truth::{MotionTruth, TrueMotion};
 pub use summary::{CameraSummary, CaptureSummary, InstanceSummary, MaskSummary};

@@ -35,6 +35,8 @@ import sys
 # Without the folder that the command runs in: a file there must not stand in for a module.
 sys.path[:] = [path for path in sys.path if path]
 
+import contextlib  # noqa: E402
+import ctypes  # noqa: E402
 import json  # noqa: E402
 import os  # noqa: E402
 import signal  # noqa: E402
@@ -417,8 +419,16 @@ def end_with_caller():
     os._exit(1)
 
 
+def die_with_caller():
+    """Have the system kill this program with its caller, also while pycolmap lets no thread run; Linux can."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        # PR_SET_PDEATHSIG.
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
 def main():
     """Do the job."""
+    die_with_caller()
     # Ctrl-C reaches all programs of a terminal; the caller decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     answer = os.fdopen(os.dup(1), "w")
