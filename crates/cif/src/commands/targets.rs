@@ -8,7 +8,7 @@ use clap::{Arg, ArgAction, ArgMatches, Args, Command, FromArgMatches, value_pars
 use crate::endings;
 use crate::error::Error;
 use crate::formats::FORMATS;
-use crate::messages::outcome;
+use crate::messages::{note, outcome};
 use crate::moment::{Frames, Moment, note_fraction};
 use crate::output::{self, Outputs};
 
@@ -202,6 +202,9 @@ impl Target {
     pub(super) fn tell(&self, summary: &ExportSummary) {
         for lost in &summary.not_held {
             eprintln!("warning: {} does not hold everything of {lost}", self.format.about().name);
+        }
+        for kept in &summary.kept {
+            note!("{} is not of cif and was kept", kept.display());
         }
         let files = match summary.files.len() {
             0 | 1 => String::new(),
