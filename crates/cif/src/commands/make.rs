@@ -90,7 +90,8 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
     let stage = command.output.join(name);
     let mut made_from = version();
     made_from.files([("the scene".to_owned(), scene.clone())], record.known("stage"));
-    if !is_made(&record.state("stage", &stage, &made_from, &[&scene])?, &stage) {
+    let state = record.state("stage", &stage, &made_from, &[&scene])?;
+    if !is_made(&state, &stage) {
         record.begin("stage", &stage, made_from)?;
         let mut words: Vec<OsString> =
             vec!["export".into(), scene.clone().into(), flag.into(), stage.clone().into()];
@@ -98,6 +99,7 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
         if let Some(masks) = &masks {
             words.extend(["--masks".into(), masks.clone().into()]);
         }
+        words.extend(matches!(state, State::Stale(_)).then(|| "--force".into()));
         step(words, None)?;
         record.end("stage", &stage)?;
     }
