@@ -79,9 +79,10 @@ impl OnDevice {
         })
     }
 
-    /// Prints them as a table.
-    pub fn print(&self) {
-        println!(
+    /// As a table, with what it means.
+    #[must_use]
+    pub fn table(&self) -> String {
+        let speeds = format!(
             "\n{}: {:.1} GB/s by a copy, {:.1} GFLOP/s by multiplying and adding; subgroups are {}",
             self.name,
             self.speed.bytes_per_second / 1e9,
@@ -89,8 +90,8 @@ impl OnDevice {
             self.subgroups
         );
         let [here, processor] = self.step_ms;
-        if self.stages.is_empty() {
-            println!("it has no timestamps, so its stages are not timed");
+        let stages = if self.stages.is_empty() {
+            "it has no timestamps, so its stages are not timed".to_owned()
         } else {
             let heading = ["stage on the device", "ms", "floor ms", "of floor", "by", "MB", "MFLOP"];
             let mut table = comfy_table::Table::new();
@@ -117,18 +118,17 @@ impl OnDevice {
                 format!("{:.2}", sum(|row| row.bytes) / 1e6),
                 format!("{:.2}", sum(|row| row.flops) / 1e6),
             ]);
-            println!("{table}");
-            println!(
-                "the floor is what the stage has to move and to compute at the least, at the speeds above; steps wait \
+            format!(
+                "{table}\nthe floor is what the stage has to move and to compute at the least, at the speeds above; steps wait \
                  for the device here, which they do not in training"
-            );
-        }
+            )
+        };
         let (faster, times) =
             if here < processor { ("device", processor / here) } else { ("processor", here / processor) };
-        println!(
-            "the processor does such a step in {processor:.3} ms, the device in {here:.3}: the {faster} is \
+        format!(
+            "{speeds}\n{stages}\nthe processor does such a step in {processor:.3} ms, the device in {here:.3}: the {faster} is \
              {times:.1} times faster"
-        );
+        )
     }
 }
 

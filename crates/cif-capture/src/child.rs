@@ -1,7 +1,7 @@
 //! Programs that do part of the work: run to their end, or killed when the caller asks to stop.
 
 use std::io::{self, BufRead, BufReader, Read, Write};
-use std::process::{Command, Stdio};
+use std::process::{Command, ExitStatus, Stdio};
 use std::time::Duration;
 
 use crate::Error;
@@ -16,10 +16,28 @@ const KEPT_LINES: usize = 12;
 pub(crate) struct Answer<T = Vec<u8>> {
     /// Everything it wrote to standard output, or what a reader made of it.
     pub(crate) output: T,
-    /// True where it ended with exit code 0.
-    pub(crate) succeeded: bool,
+    /// How it ended.
+    pub(crate) status: ExitStatus,
     /// Its last lines on standard error.
     pub(crate) last_words: String,
+}
+
+impl<T> Answer<T> {
+    /// True where it ended with exit code 0.
+    pub(crate) fn succeeded(&self) -> bool {
+        self.status.success()
+    }
+}
+
+/// How a program ended, as the predicate of a sentence.
+pub(crate) fn ending(status: ExitStatus) -> String {
+    // `signal: 9 (SIGKILL)`, with `(core dumped)` where there is one.
+    let told = status.to_string();
+    match (status.code(), told.strip_prefix("signal: ")) {
+        (Some(code), _) => format!("ended with exit code {code}"),
+        (None, Some(signal)) => format!("was killed by signal {signal}"),
+        (None, None) => format!("ended: {told}"),
+    }
 }
 
 /// Runs a program with `input` on its standard input, which stays open until the program ends: where this process is
@@ -121,10 +139,26 @@ fn run_with<T: Send>(
             return Err(Error::Stopped);
         }
         let gone = || io::Error::other("its output could not be read");
-        let output = output.join().map_err(|_| lost(gone()))?.map_err(lost)?;
+        let output = output.join().map_err(|_| lost(gone()))?;
         let last_words = words.join().ok().flatten().unwrap_or_default();
-        Ok(Some(Answer { output, succeeded: status.success(), last_words }))
+        match output {
+            Ok(output) => Ok(Some(Answer { output, status, last_words })),
+            // What it wrote ends where it died.
+            Err(_) if !status.success() => Err(died(&name, status, &last_words)),
+            Err(error) => Err(lost(error)),
+        }
     })
+}
+
+/// The error of a program that died, with its last lines.
+pub(crate) fn died(name: &str, status: ExitStatus, last_words: &str) -> Error {
+    let words =
+        if last_words.is_empty() { "; it gave no reason".to_owned() } else { format!(":\n{last_words}") };
+    // Signal 9 on Linux is mostly the kernel's, for want of memory.
+    Error::refused(
+        format!("{name} {}{words}", ending(status)),
+        "try fewer or smaller images where memory may be short (signal 9); if it goes on, report it with these lines",
+    )
 }
 
 #[cfg(all(test, unix))]
@@ -143,7 +177,7 @@ mod tests {
                 .unwrap()
                 .unwrap();
         assert_eq!(answer.output, b"given");
-        assert!(!answer.succeeded);
+        assert_eq!(ending(answer.status), "ended with exit code 3");
         assert_eq!(answer.last_words, "one\ntwo");
         assert_eq!(lines, ["one", "two"]);
     }
@@ -157,7 +191,7 @@ mod tests {
             stdout.read_exact(&mut bytes).map(|()| bytes)
         };
         let answer = run_reading(&mut endless, b"", &|| false, |_| (), first).unwrap().unwrap();
-        assert_eq!((&answer.output, answer.succeeded), (b"line", false));
+        assert_eq!((&answer.output, answer.succeeded()), (b"line", false));
     }
 
     #[test]
@@ -173,6 +207,18 @@ mod tests {
         };
         assert_eq!(first(true).as_deref(), Some("late"));
         assert_eq!(first(false).as_deref(), Some("early"));
+    }
+
+    #[test]
+    fn a_program_that_dies_says_how() {
+        let mut shell = Command::new("sh");
+        shell.args(["-c", "echo half; echo out of room >&2; kill -9 $$"]);
+        let answer = run_attended(&mut shell, b"", &|| false, |_| ()).unwrap().unwrap();
+        assert_eq!(ending(answer.status), "was killed by signal 9 (SIGKILL)");
+        // The reader fails by what is missing, the program by what killed it.
+        let whole = |stdout: &mut dyn Read| stdout.read_exact(&mut [0; 100]);
+        let error = run_reading(&mut shell, b"", &|| false, |_| (), whole).err().unwrap().to_string();
+        assert!(error.contains("sh was killed by signal 9 (SIGKILL):\nout of room"), "{error}");
     }
 
     #[test]

@@ -149,6 +149,7 @@ pub fn export(graph: &SceneGraph, path: &Path, options: ExportOptions) -> Result
         samples: graph.time_codes.samples.len(),
         not_held: graph.nodes.iter().flat_map(cif_scene::appearance::lost_without_samples).collect(),
         library: None,
+        kept: Vec::new(),
     })
 }
 

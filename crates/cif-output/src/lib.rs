@@ -4,7 +4,9 @@
 //! |---|---|
 //! | `name` | which names of frames may become paths, and the path of such a name in a folder |
 //! | `place` | where an output goes once links are followed |
+//! | `shared` | files and folders of our names in places that others may write into |
 //! | `unfinished` | temporary files beside their outputs, which never outlive their process for long |
+//! | `workplace` | folders for temporary files, which do not either |
 //!
 //! Outputs are written to a temporary file in their own folder, which takes their name once it is on the disk.
 //! Temporary files begin with `.cif-tmp-`, have a random name and are locked by the process that writes them. They
@@ -13,8 +15,12 @@
 
 mod name;
 mod place;
+mod shared;
 mod unfinished;
+mod workplace;
 
 pub use name::{check_name, check_taxonomy, inside};
 pub use place::{Place, folder_of, place, target};
-pub use unfinished::{NewFile, Scratch, abandon, finish_all, probe, write};
+pub use shared::{check_private, open_own, private_folder};
+pub use unfinished::{NewFile, Removed, Scratch, abandon, finish_all, probe, write};
+pub use workplace::Workplace;

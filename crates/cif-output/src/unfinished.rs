@@ -14,10 +14,13 @@ const PREFIX: &str = ".cif-tmp-";
 
 /// Temporary files of this process, and the folders that were rid of those of dead ones. Whoever creates, renames or
 /// removes one holds the lock, so that [`abandon`] meets none in between.
-static LIVE: Mutex<Live> = Mutex::new(Live { files: BTreeSet::new(), swept: BTreeSet::new() });
+static LIVE: Mutex<Live> =
+    Mutex::new(Live { files: BTreeSet::new(), others: BTreeSet::new(), swept: BTreeSet::new() });
 
 struct Live {
     files: BTreeSet<PathBuf>,
+    /// Files and folders by other names that go with the process: [`Removed`].
+    others: BTreeSet<PathBuf>,
     swept: BTreeSet<PathBuf>,
 }
 
@@ -32,20 +35,60 @@ pub fn abandon() {
     for path in std::mem::take(&mut live.files) {
         remove(&path);
     }
+    for path in std::mem::take(&mut live.others) {
+        remove_other(&path);
+    }
     // Never unlocked again.
     std::mem::forget(live);
 }
 
-/// Checks that files can be created in `folder`.
+/// A file or folder of this process that is removed when this is dropped, and by [`abandon`].
+#[derive(Debug)]
+pub struct Removed(PathBuf);
+
+impl Removed {
+    /// From here on a path goes with the process.
+    #[must_use]
+    pub fn new(path: PathBuf) -> Self {
+        live().others.insert(path.clone());
+        Self(path)
+    }
+
+    /// The path.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.0
+    }
+}
+
+impl Drop for Removed {
+    fn drop(&mut self) {
+        let mut live = live();
+        if live.others.remove(&self.0) {
+            remove_other(&self.0);
+        }
+    }
+}
+
+/// Removes a file or folder, as far as the system lets it be.
+fn remove_other(path: &Path) {
+    let is_folder = fs::symlink_metadata(path).is_ok_and(|found| found.is_dir());
+    let _ = if is_folder { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+}
+
+/// Bytes that are written to see that a disk is not full: a block, for an empty file may need none.
+const BLOCK: [u8; 4096] = [0; 4096];
+
+/// Checks that files can be created and written in `folder`.
 ///
 /// # Errors
 /// Error of the system.
 pub fn probe(folder: &Path) -> io::Result<()> {
-    Unfinished::create(folder).map(drop)
+    Unfinished::create(folder)?.file.write_all(&BLOCK)
 }
 
 /// Writes a whole file. An existing file is replaced once the new one is on the disk, behind links that stay; streams
-/// are written to.
+/// are written to, and one whose reader has left is none's loss.
 ///
 /// # Errors
 /// When the file system refuses; what was there stays.
@@ -57,7 +100,10 @@ pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
             new.finish()
         }
         // Behind what is there: an open file may be a regular one that the shell writes to.
-        Place::Stream(stream) => OpenOptions::new().append(true).open(stream)?.write_all(bytes),
+        Place::Stream(stream) => match OpenOptions::new().append(true).open(stream)?.write_all(bytes) {
+            Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+            done => done,
+        },
     }
 }
 

@@ -307,6 +307,8 @@ pub struct ExportSummary {
     pub not_held: Vec<String>,
     /// Library that wrote it, with its version, e.g. `usd-core 26.11`; `None` for cif itself.
     pub library: Option<String>,
+    /// Files of others in a folder of the output, which stay there.
+    pub kept: Vec<PathBuf>,
 }
 
 /// Changes by a new label.

@@ -180,6 +180,14 @@ pub enum TrainError {
         /// Folder of the capture given.
         root: PathBuf,
     },
+    /// The checkpoint belongs to this capture as it was.
+    #[error("{} is no longer what the run was trained on: {difference}", root.display())]
+    ChangedCapture {
+        /// What has changed, a sentence.
+        difference: String,
+        /// Folder of the capture.
+        root: PathBuf,
+    },
 }
 
 impl TrainError {

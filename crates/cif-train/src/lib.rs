@@ -104,4 +104,4 @@ pub use stop::{Start, Stop};
 pub use times::{StepTimes, Work};
 #[cfg(feature = "wgpu")]
 pub use trainer::Probe;
-pub use trainer::{InstancePass, Trainer, TrainerView};
+pub use trainer::{InstancePass, Trainer, TrainerView, accept_changes};

@@ -107,6 +107,12 @@ fn checked(pxr: &Pxr<'_>, path: &Path, options: ExportOptions) -> Result<Target,
             reason: format!("{} is a link, which would be replaced; choose another name", payloads.display()),
         });
     }
+    if split && payloads.exists() && !payloads.is_dir() {
+        return Err(UsdError::Write {
+            path: path.to_owned(),
+            reason: format!("{} is a file, where a folder is to be; choose another name", payloads.display()),
+        });
+    }
     if split && payloads.exists() && !options.force && !is_folder_of_ours(pxr, &payloads) {
         return Err(FileError::Foreign { path: payloads }.into());
     }
@@ -130,6 +136,10 @@ pub(crate) fn export(
         let bytes = written.sync().map_err(system)?;
         let place = payloads_of(&target.path);
         let unneeded = written.payloads.is_none() && place.is_dir() && is_folder_of_ours(pxr, &place);
+        let kept = match &written.payloads {
+            Some(payloads) => keep_foreign(pxr, &place, payloads).map_err(system)?,
+            None => Vec::new(),
+        };
         let mut moves: Vec<(PathBuf, PathBuf)> = Vec::new();
         moves.extend(written.payloads.map(|payloads| (payloads, place.clone())));
         moves.push((written.root, target.path));
@@ -142,9 +152,48 @@ pub(crate) fn export(
             splats: graph.nodes.iter().map(|node| node.splats.len()).sum(),
             samples: graph.time_codes.samples.len(),
             library: Some(format!("usd-core {}", pxr.version)),
+            kept,
             ..ExportSummary::default()
         })
     })
+}
+
+/// Takes what is not ours of an old folder of payloads over into the new one, before that takes its place; where it was.
+///
+/// # Errors
+/// When the file system refuses, or a new file has the name of such a file.
+fn keep_foreign(pxr: &Pxr<'_>, old: &Path, new: &Path) -> std::io::Result<Vec<PathBuf>> {
+    let mut kept = Vec::new();
+    for entry in fs::read_dir(old).into_iter().flatten() {
+        let from = entry?.path();
+        let is_layer = from.extension().is_some_and(|extension| extension == "usdc");
+        if is_layer && !from.is_symlink() && is_ours(pxr, &from) {
+            continue;
+        }
+        let to = new.join(from.file_name().unwrap_or_default());
+        if to.exists() {
+            return Err(std::io::Error::other(format!(
+                "{} was not written by cif and has the name of a file of the scene; move it, or choose another name",
+                from.display()
+            )));
+        }
+        take_over(&from, &to)?;
+        kept.push(from);
+    }
+    kept.sort();
+    Ok(kept)
+}
+
+/// A second name of a file, or of all files of a folder; copies where the file system has no links.
+fn take_over(from: &Path, to: &Path) -> std::io::Result<()> {
+    if from.is_dir() && !from.is_symlink() {
+        fs::create_dir(to)?;
+        return fs::read_dir(from)?.try_for_each(|entry| {
+            let entry = entry?;
+            take_over(&entry.path(), &to.join(entry.file_name()))
+        });
+    }
+    fs::hard_link(from, to).or_else(|_| fs::copy(from, to).map(drop))
 }
 
 /// A finished stage in the scratch folder.

@@ -93,6 +93,11 @@ pub(crate) fn own_process() {
     end_cleanly();
 }
 
+/// True after [`own_process`].
+pub(crate) fn is_own_process() -> bool {
+    OWNED.load(Ordering::SeqCst)
+}
+
 /// Sets the message with which a signal ends the process before the command has something to save.
 pub fn set_last_words(message: &'static str) {
     *LAST_WORDS.lock().unwrap_or_else(PoisonError::into_inner) = message;
@@ -105,7 +110,7 @@ fn last_words() -> &'static str {
 /// From here on a signal asks the command to stop; the process ends 1.5 seconds later at the latest.
 pub fn watch() {
     // Elsewhere signals belong to others.
-    if !OWNED.load(Ordering::SeqCst) {
+    if !is_own_process() {
         return;
     }
     HANDLER.get_or_init(|| {

@@ -26,7 +26,12 @@
 //! | `moment` | times as they are typed |
 //! | `endings` | names of outputs, and what they may end in |
 //! | `messages` | notes and outcomes on stderr, and who wants none |
+//! | `streams` | stdout and stderr, whose readers may leave |
 //! | [`error`] | what is reported, and the exit code |
+
+// Its macros stand in for those of the standard library in all modules below.
+#[macro_use]
+mod streams;
 
 #[cfg(feature = "wgpu")]
 pub mod backend;
@@ -74,9 +79,9 @@ pub fn set_python(program: PathBuf) {
     });
 }
 
-/// From here on the process ends without a word when whatever reads its output has seen enough, as in
-/// `cif eval ... | head`, and signals stop the command. For processes that are nothing but the command: others would
-/// end with it, and lose their own handlers.
+/// From here on signals stop the command, and one that only prints ends without a word when whatever reads its output has
+/// seen enough, as in `cif query ... | head`. For processes that are nothing but the command: others would end with it,
+/// and lose their own handlers.
 ///
 /// Models are run by the same program in processes of their own, unless [`set_python`] was called before.
 pub fn own_process() {
@@ -87,7 +92,6 @@ pub fn own_process() {
             command
         });
     }
-    sigpipe::reset();
     interrupt::own_process();
 }
 
@@ -95,7 +99,8 @@ pub fn own_process() {
 const RUN_MODEL: &str = "run-model";
 
 /// Runs a command line, the first argument being the name of the program, and returns the exit code:
-/// 0 done, 1 failed, 2 not understood, 130 interrupted. Errors are written to stderr.
+/// 0 done, 1 failed, 2 not understood, 130 interrupted. Errors are written to stderr. A command that writes files goes on
+/// when a reader of its stdout or stderr leaves.
 pub fn run(arguments: Vec<OsString>) -> i32 {
     let words = report::join_files(arguments);
     let arguments = match commands::Arguments::try_parse_from(&words) {
@@ -109,7 +114,10 @@ pub fn run(arguments: Vec<OsString>) -> i32 {
             return error.exit_code();
         }
     };
-    match commands::run(arguments) {
+    if interrupt::is_own_process() && arguments.only_prints() {
+        streams::end_with_reader();
+    }
+    match commands::run(arguments).and_then(|()| streams::check()) {
         Ok(()) => 0,
         Err(error) => {
             report(&error);

@@ -1,16 +1,22 @@
 //! Locks on files to be written, so that two commands never write the same one at a time.
 
-use std::fs::{File, OpenOptions, TryLockError};
+use std::fs::{File, TryLockError};
 use std::io::{Read, Seek, Write};
-use std::path::{Path, PathBuf};
-use std::time::SystemTime;
+use std::path::Path;
+use std::time::{Duration, Instant, SystemTime};
 
-use cif_scene::files::folder_of;
+use cif_output::{Removed, folder_of};
 
 use crate::error::Error;
 
 /// Times that a lock file which another process is removing is opened again.
 const ATTEMPTS: usize = 16;
+
+/// Time that a short change of a file waits for others to end, which take seconds; chosen.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Pause between two tries.
+const PAUSE: Duration = Duration::from_millis(50);
 
 /// Longest line that is shown of a lock file.
 const LONGEST_LINE: u64 = 200;
@@ -19,9 +25,17 @@ const LONGEST_LINE: u64 = 200;
 /// `.NAME.lock` beside the file, which is removed in the end.
 #[derive(Debug)]
 pub struct Lock {
+    /// Removed while it is still locked, so that nobody else's is.
+    _removed: Removed,
     /// Open for as long as it is locked.
     _file: File,
-    path: PathBuf,
+}
+
+/// Ways in which a lock is not had.
+enum Busy {
+    /// Another process has it.
+    Held(Error),
+    Failed(Error),
 }
 
 impl Lock {
@@ -30,22 +44,36 @@ impl Lock {
     /// # Errors
     /// When another process holds it, which is named, or the lock file cannot be made.
     pub fn take(target: &Path) -> Result<Option<Self>, Error> {
+        Self::attempt(target).map_err(|(Busy::Held(error) | Busy::Failed(error))| error)
+    }
+
+    /// As [`Self::take`], waiting for other commands to end: for a file that is read, changed and written again, from before
+    /// it is read.
+    ///
+    /// # Errors
+    /// As [`Self::take`], when another process still holds it after half a minute.
+    pub fn wait(target: &Path) -> Result<Option<Self>, Error> {
+        let begun = Instant::now();
+        loop {
+            match Self::attempt(target) {
+                Err(Busy::Held(_)) if begun.elapsed() < PATIENCE => std::thread::sleep(PAUSE),
+                done => return done.map_err(|(Busy::Held(error) | Busy::Failed(error))| error),
+            }
+        }
+    }
+
+    fn attempt(target: &Path) -> Result<Option<Self>, Busy> {
         // By whatever name, a file is locked once.
         let real = if target.is_symlink() { target.canonicalize().ok() } else { None };
         let real = real.as_deref().unwrap_or(target);
         let name = real.file_name().unwrap_or_default().to_string_lossy();
         let path = folder_of(real).join(format!(".{name}.lock"));
         for _ in 0..ATTEMPTS {
-            let mut file = OpenOptions::new()
-                .create(true)
-                .read(true)
-                .write(true)
-                .truncate(false)
-                .open(&path)
-                .map_err(Error::io("create the lock file", &path))?;
+            let opened = cif_output::open_own(&path).map_err(Error::io("use the lock file", &path));
+            let mut file = opened.map_err(Busy::Failed)?;
             match file.try_lock() {
                 Ok(()) => {}
-                Err(TryLockError::WouldBlock) => return Err(held(target, &path, &mut file)),
+                Err(TryLockError::WouldBlock) => return Err(Busy::Held(held(target, &path, &mut file))),
                 Err(TryLockError::Error(error)) => {
                     eprintln!(
                         "note: the folder of {} has no file locks ({error}); a second run to the same file is \
@@ -66,23 +94,17 @@ impl Lock {
                 .and_then(|()| file.rewind())
                 .and_then(|()| file.write_all(holder.as_bytes()))
                 .and_then(|()| file.flush())
-                .map_err(Error::io("write the lock file", &path))?;
+                .map_err(Error::io("write the lock file", &path))
+                .map_err(Busy::Failed)?;
             // Whoever held it before may have removed the file since it was opened.
             if std::fs::read_to_string(&path).is_ok_and(|now| now == holder) {
-                return Ok(Some(Self { _file: file, path }));
+                return Ok(Some(Self { _removed: Removed::new(path), _file: file }));
             }
         }
-        Err(Error::failed(
+        Err(Busy::Held(Error::failed(
             format!("cannot lock {}: other commands keep starting and ending on it", target.display()),
             "try again when they are done",
-        ))
-    }
-}
-
-impl Drop for Lock {
-    fn drop(&mut self) {
-        // Still locked, so that nobody else's is removed.
-        let _ = std::fs::remove_file(&self.path);
+        )))
     }
 }
 
@@ -121,6 +143,36 @@ mod tests {
         std::fs::write(folder.path().join(".a.cif.lock"), "process 1, since long ago\n").unwrap();
         drop(Lock::take(&target).unwrap().unwrap());
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_planted_lock_file_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let precious = folder.path().join("precious");
+        std::fs::write(&precious, "precious").unwrap();
+        std::os::unix::fs::symlink(&precious, folder.path().join(".a.cif.lock")).unwrap();
+        let refused = Lock::take(&folder.path().join("a.cif")).unwrap_err().to_string();
+        assert!(refused.contains(".a.cif.lock") && refused.contains("it is a link"), "{refused}");
+        assert_eq!(std::fs::read_to_string(&precious).unwrap(), "precious");
+    }
+
+    #[test]
+    fn a_change_waits_for_another_to_end() {
+        let folder = tempfile::tempdir().unwrap();
+        let target = folder.path().join("count");
+        std::fs::write(&target, "0").unwrap();
+        std::thread::scope(|scope| {
+            for _ in 0..4 {
+                scope.spawn(|| {
+                    let _lock = Lock::wait(&target).unwrap().unwrap();
+                    let count: u32 = std::fs::read_to_string(&target).unwrap().parse().unwrap();
+                    std::thread::sleep(PAUSE);
+                    std::fs::write(&target, (count + 1).to_string()).unwrap();
+                });
+            }
+        });
+        assert_eq!(std::fs::read_to_string(&target).unwrap(), "4");
     }
 
     #[cfg(unix)]

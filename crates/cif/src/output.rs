@@ -202,6 +202,16 @@ pub fn check_folder(path: &Path, overwrite: bool) -> Result<(), Error> {
     probe(path)
 }
 
+/// Checks that a new folder can be made at `path`, which stays as it is: what its parent lacks is made when it is written.
+///
+/// # Errors
+/// When the nearest folder that is there refuses files.
+pub fn check_new_folder(path: &Path) -> Result<(), Error> {
+    let path = std::path::absolute(path).map_err(Error::io("find", path))?;
+    let parent = path.ancestors().skip(1).find(|ancestor| ancestor.exists());
+    parent.map_or(Ok(()), probe)
+}
+
 /// Writes a whole file; a failure leaves the old one, a link stays one, and streams are written to.
 ///
 /// # Errors

@@ -298,8 +298,10 @@ impl Progress {
             Log::Undecided(lines) => lines.push(line),
             Log::File(path, file) => {
                 if let Err(error) = writeln!(file, "{line}") {
+                    // The reader of a pipe may leave; the run is not its concern.
+                    let has_left = error.kind() == std::io::ErrorKind::BrokenPipe;
                     // Reported once, at the end: a full disk must not end the training.
-                    self.log_failure = Some(Error::io("write the log", path)(error));
+                    self.log_failure = (!has_left).then(|| Error::io("write the log", path)(error));
                     self.log = Log::Nowhere;
                 }
             }

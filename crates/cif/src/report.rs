@@ -77,16 +77,26 @@ impl Report {
             println!("{:#}", report());
             return Ok(());
         }
+        // First the file: the reader of the tables may have left.
+        let written = self
+            .file()
+            .map_or(Ok(()), |path| output::write_file(path, format!("{:#}\n", report()).as_bytes()));
         print();
-        self.file().map_or(Ok(()), |path| output::write_file(path, format!("{:#}\n", report()).as_bytes()))
+        written
     }
 
-    fn file(&self) -> Option<&Path> {
+    /// The file that is written; `None` where there is none, or it is stdout.
+    pub(crate) fn file(&self) -> Option<&Path> {
         self.json.as_deref().filter(|path| !output::is_stdout(path))
     }
 }
 
 impl OnlyReport {
+    /// The report alone.
+    pub(crate) fn report(&self) -> &Report {
+        &self.report
+    }
+
     /// Checks that the file can be written, and that it is none of those that the command reads.
     ///
     /// # Errors

@@ -21,9 +21,7 @@ pub fn find(dataset: &mut Dataset, phases: &Phases) -> Result<bool, Error> {
         return Ok(true);
     }
     let _phase = phases.enter(Phase::Points, 0);
-    let work = tempfile::Builder::new()
-        .prefix("cif-points-")
-        .tempdir()
+    let work = cif_output::Workplace::create("cif-points-")
         .map_err(Error::io("create a temporary folder in", &std::env::temp_dir()))?;
     let hooks = Hooks { should_stop: &|| phases.is_stopped(), progress: &|_| {} };
     let root = dataset.root.display().to_string();

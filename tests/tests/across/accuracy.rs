@@ -209,6 +209,13 @@ fn the_configuration_of_the_paper_is_a_ladder_of_its_own_with_what_there_is_time
         assert!(page.contains(part), "{part}");
     }
 
+    // An image that changes in place, under its name, makes all that was measured on it void.
+    let told = cif(path, &line).succeeds().stderr;
+    assert_eq!(told.matches(": kept, ").count(), 2, "{told}");
+    fs::copy(path.join("table/rgb/1x/000001.png"), path.join("table/rgb/1x/000000.png")).unwrap();
+    let told = cif(path, &line).succeeds().stderr;
+    assert_eq!(told.matches("measured again: the image of frame 000000 has changed").count(), 2, "{told}");
+
     cif(path, "bench accuracy table -o x --paper-share 0.5").fails(2, &["--paper-share", "--ladders paper"]);
     cif(path, "bench accuracy table -o x --ladders paper --paper-share 0").fails(2, &["above 0"]);
     cif(path, "bench accuracy table -o x --ladders paper --paper-set model.wdth=3").fails(1, &["model.wdth"]);

@@ -524,6 +524,67 @@ fn a_reader_that_leaves_is_no_fault() {
     assert_eq!(ended.status.signal(), Some(13), "{stderr}");
 }
 
+#[cfg(unix)]
+#[test]
+fn work_goes_on_when_the_reader_of_its_messages_leaves() {
+    let folder = with_capture();
+    let path = folder.path();
+    // Both streams are pipes without a reader, as when `tee` dies by the Ctrl-C of the terminal.
+    let unread = |line: &str| {
+        let (reader, writer) = std::io::pipe().expect("a pipe");
+        drop(reader);
+        let mut command = std::process::Command::new(CIF);
+        command.args(line.split_whitespace()).current_dir(path);
+        command.stdout(writer.try_clone().expect("a pipe")).stderr(writer);
+        command.status().expect("the command starts")
+    };
+    let tiny = "--iterations-coarse 2 --iterations-fine 2 --iterations-instance 2 \
+                --set model.spatial_resolution=[8,8,8]";
+    assert_eq!(unread(&format!("train table -o a.cif --log /dev/stderr {tiny}")).code(), Some(0));
+    assert!(Field::load(path.join("a.cif")).is_ok());
+    assert_eq!(unread("export a.cif --gltf a.glb --check").code(), Some(0));
+    assert!(path.join("a.glb").is_file());
+    // Reports in files are written, whoever reads the tables.
+    for line in
+        ["eval a.cif table --json eval.json", "info table --json info.json", "check a.cif --json check.json"]
+    {
+        assert_eq!(unread(line).code(), Some(0), "{line}");
+    }
+    for name in ["eval.json", "info.json", "check.json"] {
+        assert!(fs::read_to_string(path.join(name)).unwrap().starts_with('{'), "{name}");
+    }
+}
+
+#[test]
+fn an_output_that_cannot_be_written_is_refused_before_the_work() {
+    let folder = with_capture();
+    let path = folder.path();
+    fs::write(path.join("file"), "x").unwrap();
+    // Neither frames nor poses are looked for.
+    for line in [
+        "capture nowhere.mp4 -o file/table",
+        "make table -o file/out",
+        "masks propagate table --keyframes table/masks -o file/masks",
+    ] {
+        let run = cif(path, line);
+        assert_eq!(run.code, Some(1), "{line}: {}", run.stderr);
+        assert!(run.stderr.contains("cannot write to the folder"), "{line}: {}", run.stderr);
+    }
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn an_answer_that_is_lost_is_a_failure() {
+    let folder = with_capture();
+    let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("the device");
+    let mut command = std::process::Command::new(CIF);
+    command.args(["info", "table"]).current_dir(folder.path()).stdout(full);
+    let ended = command.output().expect("the command starts");
+    let stderr = String::from_utf8_lossy(&ended.stderr);
+    assert_eq!(ended.status.code(), Some(1), "{stderr}");
+    assert!(stderr.contains("cannot write to stdout") && !stderr.contains("panicked"), "{stderr}");
+}
+
 /// What a command told, a line each, of warnings or of notes.
 fn told<'a>(run: &'a Run, kind: &str) -> Vec<&'a str> {
     run.stderr.lines().filter(|line| line.starts_with(kind)).collect()

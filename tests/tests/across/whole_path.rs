@@ -206,8 +206,74 @@ fn all_steps_are_one_command_that_stops_where_frames_have_to_be_painted() {
     cif(path, "train table --masks out/masks -o out/scene.cif --config tiny.toml --force --stop-after 1 -q")
         .succeeds();
     assert!(cif(path, line).succeeds().stderr.contains("--resume"));
+
+    // What follows from a change is made again, with the reason.
     fs::copy(path.join("truth/000003.png"), path.join("out/keyframes/000003.png")).unwrap();
-    cif(path, line).fails(1, &["out/masks is older than out/keyframes/000003.png"]);
+    let told = cif(path, &line.replace(" --quiet", "")).succeeds().stderr;
+    assert!(told.contains("out/masks is made again: the keyframe file 000003.png is new"), "{told}");
+    for step in ["$ cif masks propagate table", "$ cif export out/scene.cif"] {
+        assert!(told.contains(step), "{step} in {told}");
+    }
+}
+
+#[test]
+fn results_of_other_inputs_are_not_passed_off() {
+    let folder = with_capture(4);
+    let path = folder.path();
+    for file in ["000000.png", "000001.png"] {
+        assert!(path.join("table/masks").join(file).is_file());
+    }
+    let settings = "[stages]\ncoarse = 3\nfine = 3\ninstance = 3\n[model]\nspatial_resolution = [8, 8, 8]\n\
+                    [motion]\nrigid = false\n";
+    fs::write(path.join("tiny.toml"), settings).unwrap();
+    let make = || cif(path, "make table -o out --config tiny.toml").succeeds().stderr;
+    make();
+    assert!(!make().contains('$'), "nothing is made again");
+    // In place, of the same size: another file's content, which is as long as it is padded to.
+    fs::write(path.join("tiny.toml"), settings.replace("coarse = 3", "coarse = 4")).unwrap();
+    let told = make();
+    assert!(told.contains("out/scene.cif is made again: the settings file has changed"), "{told}");
+    assert!(told.contains("$ cif train table") && told.contains("$ cif export out/scene.cif"), "{told}");
+    fs::copy(path.join("table/masks/000001.png"), path.join("table/masks/000000.png")).unwrap();
+    let told = make();
+    assert!(told.contains("out/scene.cif is made again: the mask of frame 000000 has changed"), "{told}");
+    // What is made by hand is not replaced, and what follows from it is.
+    cif(path, "label out/scene.cif --instance 3 other").succeeds();
+    let told = make();
+    assert!(!told.contains("$ cif train") && told.contains("is made again: the scene has changed"), "{told}");
+
+    // A run does not go on with other inputs than those it began with.
+    let tiny = "--config tiny.toml -q";
+    cif(path, &format!("train table -o run.cif {tiny} --stop-after 1")).succeeds();
+    fs::copy(path.join("table/masks/000002.png"), path.join("table/masks/000001.png")).unwrap();
+    let resume = "train table -o run.cif --resume -q";
+    cif(path, resume).fails(1, &["the mask of frame 000001 has changed", "--accept-changes", "--force"]);
+    cif(path, &format!("{resume} --accept-changes")).succeeds();
+}
+
+#[test]
+fn labels_given_at_once_are_all_kept() {
+    let folder = with_capture(4);
+    let path = folder.path();
+    let tiny = "--iterations-coarse 1 --iterations-fine 1 --iterations-instance 1 -q \
+                --set model.spatial_resolution=[8,8,8] --set motion.rigid=false";
+    cif(path, &format!("train table -o a.cif {tiny}")).succeeds();
+    let ids: Vec<u16> =
+        Checkpoint::load(path.join("a.cif")).unwrap().field.instances.iter().map(|i| i.id).collect();
+    for round in 0..3 {
+        std::thread::scope(|scope| {
+            for id in &ids {
+                scope.spawn(move || {
+                    cif(path, &format!("label a.cif --instance {id} round{round}of{id}")).succeeds()
+                });
+            }
+        });
+        let named = Checkpoint::load(path.join("a.cif")).unwrap().field.instances;
+        for instance in named {
+            assert_eq!(instance.label, format!("round{round}of{}", instance.id));
+        }
+    }
+    assert!(!path.join(".a.cif.lock").exists());
 }
 
 #[test]

@@ -1,8 +1,8 @@
 //! Record of a rung.
 
+use cif_dataset::MadeFrom;
 use cif_train::Curve;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 
 use crate::records::Measurement;
 
@@ -11,7 +11,7 @@ use crate::records::Measurement;
 #[serde(default)]
 pub struct Record {
     /// Everything that the measurement depends on: another value makes the record void.
-    pub fingerprint: Value,
+    pub fingerprint: MadeFrom,
     /// Processor time of training, all threads together, measuring not counted; of a frame or a file where
     /// nothing is trained; seconds.
     pub cpu_s: f64,
@@ -50,7 +50,7 @@ pub struct Record {
 impl Measurement for Record {
     const FOLDER: &'static str = "rungs";
 
-    fn fingerprint(&self) -> &Value {
+    fn fingerprint(&self) -> &MadeFrom {
         &self.fingerprint
     }
 

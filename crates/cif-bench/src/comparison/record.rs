@@ -1,7 +1,7 @@
 //! Record of a run, beside its pictures and its scene.
 
+use cif_dataset::MadeFrom;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 
 use crate::records::Measurement;
 
@@ -39,7 +39,7 @@ pub struct Row {
 #[serde(default)]
 pub struct Record {
     /// Everything that the run depends on: another value makes the record void.
-    pub fingerprint: Value,
+    pub fingerprint: MadeFrom,
     /// Scores.
     pub row: Row,
     /// Steps of the instance stage.
@@ -51,7 +51,7 @@ pub struct Record {
 impl Measurement for Record {
     const FOLDER: &'static str = "runs";
 
-    fn fingerprint(&self) -> &Value {
+    fn fingerprint(&self) -> &MadeFrom {
         &self.fingerprint
     }
 

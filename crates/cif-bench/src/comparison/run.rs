@@ -1,10 +1,9 @@
 //! A run of a comparison: the reconstruction of a capture with a seed, or a head on it.
 
-use cif_dataset::Dataset;
+use cif_dataset::{Dataset, MadeFrom};
 use cif_field::Checkpoint;
 use cif_train::metrics::{EvaluationError, EvaluationOptions, FrameView, evaluate, mask_ids};
 use cif_train::{HeadName, Stage, Start, Stop, TrainConfig, Trainer};
-use serde_json::json;
 
 use super::record::{Record, Row};
 use crate::accuracy::measure::{Draw, save, shown_frame};
@@ -67,10 +66,11 @@ impl Subject<'_> {
     ) -> Result<Option<Checkpoint>, Error> {
         let path = runs.file(&format!("{}.cif", self.id()));
         let known = runs.file(&format!("{}.settings.json", self.id()));
-        let masks = self.dataset.frames.iter().find_map(|frame| frame.mask.as_ref());
-        let settings =
-            json!({ "settings": self.config, "capture": self.dataset.root, "masks": masks }).to_string();
-        if path.is_file() && std::fs::read_to_string(&known).is_ok_and(|kept| kept == settings) {
+        let kept = std::fs::read(&known).ok().and_then(|text| serde_json::from_slice::<MadeFrom>(&text).ok());
+        let mut made_from = MadeFrom::new();
+        made_from.value("version", env!("CARGO_PKG_VERSION")).value("settings", self.config);
+        made_from.capture(self.dataset, kept.as_ref());
+        if path.is_file() && kept.as_ref() == Some(&made_from) {
             return Checkpoint::load(&path).map(Some).map_err(Error::plain);
         }
         let run = Run {
@@ -89,7 +89,8 @@ impl Subject<'_> {
         }
         let checkpoint = trainer.checkpoint(true);
         checkpoint.save(&path).map_err(Error::plain)?;
-        crate::error::write_file(&known, settings.as_bytes())?;
+        let text = serde_json::to_vec(&made_from).expect("plain data");
+        crate::error::write_file(&known, &text)?;
         Ok(Some(checkpoint))
     }
 

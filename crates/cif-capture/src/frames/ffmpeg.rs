@@ -59,11 +59,15 @@ pub(super) fn run<T: Send>(
                      of extracted frames",
                 )
             })?;
-        if answer.succeeded || enough(&answer.output) {
+        if answer.succeeded() || enough(&answer.output) {
             return Ok(answer.output);
         }
         if mode == "-fps_mode" && errors.iter().any(|error| error.contains("fps_mode")) {
             continue;
+        }
+        if errors.is_empty() {
+            errors.push(child::ending(answer.status));
+            errors.extend(answer.last_words.lines().last().map(str::to_owned));
         }
         return Err(failed(source, &errors));
     }
@@ -88,7 +92,7 @@ fn failed(source: &Source, errors: &[String]) -> Error {
             causes.push(error);
         }
     }
-    let words = if causes.is_empty() { "it gave no reason".to_owned() } else { causes.join("; ") };
+    let words = causes.join("; ");
     let holds_none = ["does not contain any stream", "matches no streams", "Invalid data found"];
     if holds_none.iter().any(|sign| words.contains(sign)) {
         Error::refused(

@@ -242,8 +242,8 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
         let mut command = cif_system::python::script(program, SCRIPT);
         // A thread of one library must not start a thread per processor in another.
         command.env("OMP_NUM_THREADS", job.threads.to_string());
-        // Where logs of COLMAP go that do not go to the standard error.
-        command.env("GLOG_log_dir", job.work);
+        // Logs of COLMAP go to the standard error alone, and whatever else is temporary goes with this run.
+        command.env("GLOG_logtostderr", "1").env("GLOG_log_dir", job.work).env("TMPDIR", job.work);
         let mut steps = 0;
         let line = |line: &str| {
             if let Some((done, total, words)) = counted(line) {
@@ -266,10 +266,7 @@ pub(super) fn run(job: &Job<'_>, hooks: &Hooks<'_>) -> Result<Outcome, Error> {
                 Err(pycolmap_missing(&problem, &python.unwrap_or_default(), &version.unwrap_or_default()))
             }
             Some(answer) => outcome(answer),
-            None => Err(Error::refused(
-                format!("pycolmap failed:\n{}", words_of(&answer.last_words)),
-                "try fewer or smaller images; if it goes on, report it with these lines",
-            )),
+            None => Err(child::died("pycolmap", answer.status, &words_of(&answer.last_words))),
         };
     }
     Err(Error::refused(

@@ -30,6 +30,8 @@ Threads finish in any order; images and features of the second kind are written 
 poses are the same at every call, whatever was kept before.
 """
 
+import contextlib
+import ctypes
 import json
 import os
 import signal
@@ -413,8 +415,16 @@ def end_with_caller():
     os._exit(1)
 
 
+def die_with_caller():
+    """Have the system kill this program with its caller, also while pycolmap lets no thread run; Linux can."""
+    with contextlib.suppress(AttributeError, OSError, TypeError):
+        # PR_SET_PDEATHSIG.
+        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
+
+
 def main():
     """Do the job."""
+    die_with_caller()
     # Ctrl-C reaches all programs of a terminal; the caller decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     answer = os.fdopen(os.dup(1), "w")

@@ -60,7 +60,8 @@ fn frames_with(
     let caches =
         [root.join(CACHE), std::env::temp_dir().join(format!("cif_frames_{:016x}", fingerprint(root)))];
     let changed = |path: &Path| std::fs::metadata(path).and_then(|data| data.modified()).ok();
-    for cache in &caches {
+    let is_trusted = |cache: &PathBuf| *cache == caches[0] || cif_output::check_private(cache).is_ok();
+    for cache in caches.iter().filter(|cache| is_trusted(cache)) {
         let folder = cache.join(&name);
         if folder.is_dir() && changed(&folder) >= changed(video) {
             let found = numbered(&folder)?;
@@ -71,7 +72,11 @@ fn frames_with(
     }
     let (cache, (scratch, partial)) = match begun(&caches[0]) {
         Ok(begun) => (&caches[0], begun),
-        Err(_) => (&caches[1], begun(&caches[1]).map_err(Error::write(&caches[1]))?),
+        Err(_) => {
+            // Others may have made it, with frames of theirs.
+            cif_output::private_folder(&caches[1]).map_err(Error::write(&caches[1]))?;
+            (&caches[1], begun(&caches[1]).map_err(Error::write(&caches[1]))?)
+        }
     };
     let output = Command::new(ffmpeg)
         .args(["-nostdin", "-v", "error", "-i"])
@@ -98,8 +103,8 @@ fn frames_with(
     if !output.status.success() {
         // The first lines are the cause, what follows its consequences.
         let causes: Vec<&str> = words.lines().filter(|line| !line.trim().is_empty()).take(3).collect();
-        let causes = if causes.is_empty() { "it gave no reason".to_owned() } else { causes.join("; ") };
-        return Err(failed(&causes));
+        let ended = format!("it gave no reason ({})", output.status);
+        return Err(failed(&if causes.is_empty() { ended } else { causes.join("; ") }));
     }
     if listing::images(&partial)?.is_empty() {
         return Err(failed("it holds no frame"));

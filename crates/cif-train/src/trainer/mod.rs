@@ -74,7 +74,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::Arc;
 
-use cif_dataset::Dataset;
+use cif_dataset::{Dataset, MadeFrom};
 use cif_field::Field;
 use cif_render::cpu::SimdLevel;
 use cif_render::{Gradients, UNLABELLED};
@@ -88,6 +88,7 @@ use self::known::KnownObjects;
 pub use self::measure::InstancePass;
 use self::pacing::Pacing;
 use self::resume::SavedHead;
+pub use self::resume::accept_changes;
 use self::saving::Saving;
 use crate::clock::{Clock, Seconds};
 use crate::config::{HeadName, TrainConfig};
@@ -175,6 +176,8 @@ pub struct Trainer {
     saving: Saving,
     /// Frames that the curve is measured on.
     measured_frames: MeasuredFrames,
+    /// Content of the capture.
+    inputs: MadeFrom,
     /// A budget that stages keep to.
     pacing: Option<Pacing>,
     /// Notes and warnings not sent yet.
@@ -281,6 +284,7 @@ impl Trainer {
             instance_pass: InstancePass::On,
             saving: Saving::default(),
             measured_frames,
+            inputs: resume::inputs_of(&dataset),
             pacing: None,
             messages,
             is_searched: false,

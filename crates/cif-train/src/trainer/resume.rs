@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use cif_dataset::{Dataset, Split};
+use cif_dataset::{Dataset, MadeFrom, Split};
 use cif_field::Field;
 use cif_field::checkpoint::{Checkpoint, StateTensor, TrainingState};
 use serde::de::Error as _;
@@ -55,6 +55,10 @@ pub(super) struct Capture {
     times: usize,
     image_size: [u32; 2],
     instance_ids: Vec<u16>,
+    /// Content of images, masks, cameras, points and labels; `None` in runs of older versions, which are not compared by
+    /// it, and where another capture is accepted.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    inputs: Option<MadeFrom>,
 }
 
 fn recorded<'de, D: Deserializer<'de>>(settings: D) -> Result<TrainConfig, D::Error> {
@@ -72,7 +76,7 @@ impl SavedState {
 }
 
 impl Capture {
-    pub(super) fn of(dataset: &Dataset) -> Self {
+    pub(super) fn of(dataset: &Dataset, inputs: &MadeFrom) -> Self {
         let first = dataset.frames.iter().find(|f| f.split == Split::Train);
         Self {
             layout: format!("{:?}", dataset.layout),
@@ -80,6 +84,7 @@ impl Capture {
             times: dataset.times.len(),
             image_size: first.map_or([0; 2], |frame| [frame.camera.width, frame.camera.height]),
             instance_ids: dataset.instances.iter().map(|instance| instance.id).collect(),
+            inputs: Some(inputs.clone()),
         }
     }
 
@@ -102,7 +107,12 @@ impl Capture {
         )?;
         differs("the number of times", frames(self.times), frames(found.times))?;
         differs("the image size", show(self.image_size), show(found.image_size))?;
-        differs("the list of instance ids", ids(&self.instance_ids), ids(&found.instance_ids))
+        differs("the list of instance ids", ids(&self.instance_ids), ids(&found.instance_ids))?;
+        let difference = self.inputs.as_ref().zip(found.inputs.as_ref());
+        match difference.and_then(|(before, now)| before.difference(now)) {
+            Some(difference) => Err(TrainError::ChangedCapture { difference, root: dataset.root.clone() }),
+            None => Ok(()),
+        }
     }
 }
 
@@ -119,6 +129,21 @@ pub(super) fn check_instances(field: &Field, dataset: &Dataset) -> Result<(), Tr
         found: format!("{found:?}"),
         root: dataset.root.clone(),
     })
+}
+
+/// The content of a capture, as a run keeps it.
+pub(super) fn inputs_of(dataset: &Dataset) -> MadeFrom {
+    // Without times of files, so that the same capture gives the same state.
+    MadeFrom::new().capture(dataset, None).by_content()
+}
+
+/// Lets a saved run go on with images, masks, cameras, points and labels that have changed since; frames, times, sizes and
+/// ids of instances must be the same all the same.
+pub fn accept_changes(checkpoint: &mut Checkpoint) {
+    let capture = checkpoint.training.as_mut().and_then(|training| training.json.get_mut("capture"));
+    if let Some(capture) = capture.and_then(Value::as_object_mut) {
+        capture.remove("inputs");
+    }
 }
 
 fn unusable(reason: impl Into<String>) -> TrainError {
@@ -185,7 +210,7 @@ impl Trainer {
             version: VERSION,
             config: self.state.config.clone(),
             progress: self.progress(),
-            capture: Capture::of(&self.state.dataset),
+            capture: Capture::of(&self.state.dataset, &self.inputs),
             head: self.state.head.name().to_owned(),
             objects,
             adam_steps,
@@ -206,7 +231,7 @@ impl Trainer {
         let state = SavedState::parse(json)?;
         state.config.validate()?;
         let measured_frames = MeasuredFrames::withhold(&mut dataset, &state.config);
-        state.capture.check(&Capture::of(&dataset), &dataset)?;
+        state.capture.check(&Capture::of(&dataset, &inputs_of(&dataset)), &dataset)?;
         let start = Start { dataset, phases: phases.clone() };
         let mut trainer =
             Self::assemble(start, measured_frames, state.config, checkpoint.field, Some(state.progress))?;

@@ -50,6 +50,30 @@ fn links_stay_and_their_targets_are_written() {
 }
 
 #[test]
+fn files_of_others_in_the_folder_of_payloads_stay() {
+    let _session = session();
+    let folder = tempfile::tempdir().unwrap();
+    let at = |name: &str| folder.path().join(name);
+    let scene = Maker::new(3).scene();
+    let options = ExportOptions { force: true, ..ExportOptions::default() };
+    export(&scene, &at("scene.usda"), options).unwrap();
+    let ours = names(&at("scene.payloads"));
+    fs::write(at("scene.payloads/notes.txt"), "mine").unwrap();
+    fs::create_dir(at("scene.payloads/textures")).unwrap();
+    fs::write(at("scene.payloads/textures/wood.png"), "mine").unwrap();
+    let summary = export(&scene, &at("scene.usda"), options).unwrap();
+    assert_eq!(summary.kept, ["notes.txt", "textures"].map(|name| at("scene.payloads").join(name)));
+    assert_eq!(fs::read_to_string(at("scene.payloads/notes.txt")).unwrap(), "mine");
+    assert_eq!(fs::read_to_string(at("scene.payloads/textures/wood.png")).unwrap(), "mine");
+    assert_eq!(names(&at("scene.payloads")).len(), ours.len() + 2);
+    assert_eq!(names(folder.path()), ["scene.payloads", "scene.usda"]);
+    // A file where the folder is to be.
+    fs::write(at("other.payloads"), "mine").unwrap();
+    assert!(export(&scene, &at("other.usda"), options).is_err());
+    assert_eq!(fs::read_to_string(at("other.payloads")).unwrap(), "mine");
+}
+
+#[test]
 fn payloads_behind_a_link_are_not_replaced() {
     let _session = session();
     let folder = tempfile::tempdir().unwrap();

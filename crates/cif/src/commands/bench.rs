@@ -538,7 +538,7 @@ impl Report {
         }
         #[cfg(feature = "wgpu")]
         if let Some(device) = &self.device {
-            device.print();
+            println!("{}", device.table());
         }
         if self.series.iter().all(|series| series.without.is_empty()) {
             return;

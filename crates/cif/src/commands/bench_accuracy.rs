@@ -10,8 +10,8 @@ use cif_bench::accuracy::record::Record;
 use cif_bench::accuracy::report::{self, Measured, Subject};
 use cif_bench::accuracy::time_limit::{QUICK_SECONDS, TimeLimit};
 use cif_bench::accuracy::{Rung, Work, ladders};
-use cif_bench::records::Records;
-use cif_dataset::{Dataset, Split};
+use cif_bench::records::{Kept, Records};
+use cif_dataset::{Dataset, MadeFrom, Split};
 use cif_field::Field;
 use cif_geometry::PinholeCamera;
 use cif_render::RenderedImage;
@@ -22,11 +22,12 @@ use cif_train::fit::stretched;
 use cif_train::metrics::{FrameView, trained_settings};
 use cif_train::{Preset, Stop, SystemClock, TrainConfig, Trainer};
 use clap::Args;
-use serde_json::{Value, json};
+use serde_json::json;
 
 use super::trajectories::Trajectories;
 use super::{CaptureOptions, eval_motion, print_warnings, train};
 use crate::error::Error;
+use crate::lock::Lock;
 use crate::pictures::{Picture, instance_picture, rgb_picture};
 use crate::settings::Layers;
 use crate::{interrupt, output, starting_points};
@@ -182,9 +183,14 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
             "it has a single time or no masks; leave --ladders away for those that fit",
         ));
     }
+    // Two at once would replace each other's records.
+    let _lock = Lock::take(&command.output.join("report.json"))?;
     let rungs = Records::inside(&command.output)?;
     measure::save_truth(&dataset, config.background, &rungs.file("truth.png"))?;
+    let mut inputs = MadeFrom::new();
+    inputs.value("version", env!("CARGO_PKG_VERSION")).capture(&dataset, rungs.known(BASE).as_ref());
     let mut bench = Bench {
+        inputs,
         capture: options,
         dataset,
         config,
@@ -210,7 +216,8 @@ pub(super) fn run(command: &BenchAccuracy) -> Result<(), Error> {
     let mut stopped = false;
     for (number, (ladder, rung)) in order.iter().enumerate() {
         let steps = bench.expected_steps(rung);
-        if bench.kept(rung).is_none() && limit.as_ref().is_some_and(|limit| !limit.has_time_for(steps)) {
+        if bench.find(rung).good().is_none() && limit.as_ref().is_some_and(|limit| !limit.has_time_for(steps))
+        {
             left_out.push(format!("{ladder}: {}", rung.label));
             continue;
         }
@@ -308,6 +315,8 @@ fn of_preset(
 /// A report under way.
 struct Bench {
     capture: CaptureOptions,
+    /// What all rungs are made from.
+    inputs: MadeFrom,
     /// Capture that everything is scored on.
     dataset: Dataset,
     config: TrainConfig,
@@ -325,9 +334,13 @@ impl Bench {
         if interrupt::requested() {
             return Ok(None);
         }
-        if let Some(record) = self.kept(rung) {
-            crate::messages::outcome!("{heading}: kept, {}", told(&record));
-            return Ok(Some(record));
+        match self.find(rung) {
+            Kept::Good(record) => {
+                crate::messages::outcome!("{heading}: kept, {}", told(&record));
+                return Ok(Some(record));
+            }
+            Kept::Void(why) => crate::messages::outcome!("{heading}: measured again: {why}"),
+            Kept::Missing => {}
         }
         let Some(mut record) = self.measure(rung, heading)? else { return Ok(None) };
         record.fingerprint = self.fingerprint(rung);
@@ -351,28 +364,24 @@ impl Bench {
     }
 
     /// Everything that a record depends on.
-    fn fingerprint(&self, rung: &Rung) -> Value {
+    fn fingerprint(&self, rung: &Rung) -> MadeFrom {
         let training = match &rung.work {
             Work::Train(_) | Work::Preset { .. } => {
                 self.settings(rung).map(|config| json!(config)).unwrap_or_default()
             }
             _ => json!(self.config),
         };
-        json!({
-            "version": env!("CARGO_PKG_VERSION"),
-            "capture": self.dataset.root.canonicalize().unwrap_or_else(|_| self.dataset.root.clone()),
-            "frames": self.dataset.frames.len(),
-            "masks": self.dataset.frames.iter().filter_map(|frame| frame.mask.as_ref()).next(),
-            "work": format!("{:?}", rung.work),
-            "settings": training,
-        })
+        let mut made_from = self.inputs.clone();
+        made_from.value("work", format!("{:?}", rung.work)).value("settings", training);
+        made_from
     }
 
     /// Record of a rung that an earlier run kept; of the base, also the scene must be there.
-    fn kept(&self, rung: &Rung) -> Option<Record> {
-        self.rungs
-            .find(&rung.id, &self.fingerprint(rung))
-            .filter(|_| rung.id != BASE || self.base_file().is_file())
+    fn find(&self, rung: &Rung) -> Kept<Record> {
+        if rung.id == BASE && !self.base_file().is_file() {
+            return Kept::Missing;
+        }
+        self.rungs.find(&rung.id, &self.fingerprint(rung))
     }
 
     /// Steps that a rung trains; none where it uses the scene of the base.

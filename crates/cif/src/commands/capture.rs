@@ -63,13 +63,13 @@ pub(super) fn run(command: &Capture) -> Result<(), Error> {
         ));
     }
     command.report.check([])?;
+    // Hours before it is written.
+    crate::output::check_new_folder(place)?;
     interrupt::watch();
     let shown = Shown::new(command.quiet);
     let progress = |progress: Progress<'_>| shown.show(progress);
     let hooks = Hooks { should_stop: &interrupt::requested, progress: &progress };
-    let scratch = tempfile::Builder::new()
-        .prefix("cif-capture-")
-        .tempdir()
+    let scratch = cif_output::Workplace::create("cif-capture-")
         .map_err(Error::io("create a temporary folder in", &std::env::temp_dir()))?;
     let sources = sources(&command.inputs)?;
     let mut notes = Notes::new();

@@ -40,12 +40,12 @@ pub(super) struct Check {
     scene: PathBuf,
     /// Write a repaired copy
     #[arg(long, value_name = "OUT.cif", value_parser = endings::scene())]
-    fix: Option<PathBuf>,
+    pub(super) fix: Option<PathBuf>,
     /// Replace an existing file
     #[arg(long)]
     force: bool,
     #[command(flatten)]
-    report: Report,
+    pub(super) report: Report,
 }
 
 pub(super) fn run(command: &Check) -> Result<(), Error> {
@@ -72,6 +72,7 @@ pub(super) fn run(command: &Check) -> Result<(), Error> {
 
     let mut repairs = Vec::new();
     if let Some(target) = &command.fix {
+        let _lock = crate::lock::Lock::wait(target)?;
         repairs = repair(&mut checkpoint).map_err(|reason| {
             Error::failed(
                 format!("{}: {reason}", command.scene.display()),

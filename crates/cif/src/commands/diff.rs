@@ -26,7 +26,7 @@ pub(super) struct Diff {
     #[arg(value_name = "AFTER")]
     after: PathBuf,
     #[command(flatten)]
-    report: OnlyReport,
+    pub(super) report: OnlyReport,
 }
 
 pub(super) fn run(command: &Diff) -> Result<(), Error> {

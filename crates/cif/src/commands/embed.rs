@@ -17,6 +17,7 @@ use super::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warni
 use crate::error::Error;
 use crate::formats;
 use crate::instance_views::{Coverage, cut_out};
+use crate::lock::Lock;
 use crate::messages::is_quiet;
 use crate::output::Outputs;
 use crate::progress::FrameProgress;
@@ -81,6 +82,9 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
     let name = models.embedder_name()?;
     let mut embedder = PictureEmbedder::open(&library::find(&crate::pythons())?, &models)?;
     // The whole file, so that a training state in it stays.
+    // From before it is read, so that no other change is lost.
+    let target = command.output.as_deref().unwrap_or(&command.path);
+    let _lock = Lock::wait(target)?;
     let mut checkpoint = Checkpoint::load(&command.path).map_err(Error::plain)?;
     let field = &checkpoint.field;
     if field.identities.is_none() {
@@ -110,7 +114,6 @@ pub(super) fn run(command: &Embed) -> Result<(), Error> {
         ));
     }
     checkpoint.field.record.embeddings = Some(Embeddings { model: name.to_owned(), of: embeddings });
-    let target = command.output.as_deref().unwrap_or(&command.path);
     checkpoint.save(target).map_err(Error::plain)?;
     let report = || {
         let views = views

@@ -11,6 +11,7 @@ use super::scene;
 use crate::endings;
 use crate::error::Error;
 use crate::formats;
+use crate::lock::Lock;
 use crate::messages::{note, outcome};
 use crate::output::Outputs;
 use crate::report::Report;
@@ -91,6 +92,7 @@ pub(super) fn run(command: &Import) -> Result<(), Error> {
             formats::field_of(&graph, &command.file)?
         }
     };
+    let _lock = Lock::wait(&command.output)?;
     field.save(&command.output).map_err(Error::plain)?;
     let report = || match &edits {
         Some(changes) => json!(changes),

@@ -34,7 +34,7 @@ pub(super) struct Info {
     #[arg(long, conflicts_with = "path")]
     gpu: bool,
     #[command(flatten)]
-    report: OnlyReport,
+    pub(super) report: OnlyReport,
     #[command(flatten)]
     capture_options: CaptureOptions,
 }

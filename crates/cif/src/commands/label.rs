@@ -10,6 +10,7 @@ use serde_json::json;
 
 use crate::error::Error;
 use crate::formats::Content;
+use crate::lock::Lock;
 use crate::output::Outputs;
 use crate::report::Report;
 
@@ -64,6 +65,8 @@ pub(super) fn run(command: &Label) -> Result<(), Error> {
     command.output.as_deref().map_or(Ok(()), |output| outputs.file(output))?;
     command.report.check(&mut outputs)?;
     let target = command.output.as_deref().unwrap_or(&command.path);
+    // From before it is read, so that no other change is lost.
+    let _lock = Lock::wait(target)?;
     let Renamed { object, before, label, category } = match content {
         Content::Field => in_scene(&command.path, target, &command.instance, label, category)?,
         Content::Graph(format) => {

@@ -1,13 +1,16 @@
 //! `cif make`: from videos or photographs to a stage, one command after the other.
 
+mod record;
+
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use cif_dataset::{Dataset, OpenOptions};
+use cif_dataset::{Dataset, MadeFrom, OpenOptions};
 use cif_field::Checkpoint;
 use clap::{Args, Parser};
 use serde_json::json;
 
+use self::record::{Record, State};
 use super::{Arguments, command_line, dispatch};
 use crate::error::Error;
 use crate::report::OnlyReport;
@@ -30,8 +33,10 @@ Every step is a command of its own, which is shown before it runs, and leaves it
   scene.cif    cif train             the trained scene
   scene.usda   cif export            one moving prim per object (scene.glb in builds without USD)
 
-The same command goes on where it stopped, also after Ctrl-C: what is there already is not made again. A step that needs
-other options can be run by hand into the same place, and what is to be made anew is removed first.
+The same command goes on where it stopped, also after Ctrl-C: what is there already is not made again unless something
+that it was made from has changed, be it a file, a setting or the version of cif; then it and all that follows is made
+again, and it says why. made.json tells what each step was made from. A step that needs other options can be run by hand
+into the same place: what is not as cif make left it is never replaced.
 
   cif make phone.mp4 -o table
   cif make left.mp4 right.mp4 -o rig --preset draft
@@ -76,19 +81,27 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
     // Hours before it is needed.
     #[cfg(feature = "usd")]
     cif_usd::usd_version().map_err(Error::plain)?;
-    let capture = command.capture()?;
-    let masks = command.masks(&capture)?;
-    let scene = command.train(&capture, masks.as_deref())?;
+    crate::output::check_new_folder(&command.output.join("capture"))?;
+    let mut record = Record::read(&command.output)?;
+    let capture = command.capture(&mut record)?;
+    let masks = command.masks(&capture, &mut record)?;
+    let scene = command.train(&capture, masks.as_deref(), &mut record)?;
     let (flag, name) = STAGE;
     let stage = command.output.join(name);
-    if !is_made(&stage, &[&scene])? {
+    let mut made_from = version();
+    made_from.files([("the scene".to_owned(), scene.clone())], record.known("stage"));
+    let state = record.state("stage", &stage, &made_from, &[&scene])?;
+    if !is_made(&state, &stage) {
+        record.begin("stage", &stage, made_from)?;
         let mut words: Vec<OsString> =
             vec!["export".into(), scene.clone().into(), flag.into(), stage.clone().into()];
         words.extend(["--check".into(), "--capture".into(), capture.clone().into()]);
         if let Some(masks) = &masks {
             words.extend(["--masks".into(), masks.clone().into()]);
         }
+        words.extend(matches!(state, State::Stale(_)).then(|| "--force".into()));
         step(words, None)?;
+        record.end("stage", &stage)?;
     }
     let report = json!({ "capture": capture, "masks": masks, "scene": scene, "stage": stage });
     command.report.give(
@@ -102,25 +115,49 @@ pub(super) fn run(command: &Make) -> Result<(), Error> {
 
 impl Make {
     /// The capture, made of the inputs unless they are one.
-    fn capture(&self) -> Result<PathBuf, Error> {
+    fn capture(&self, record: &mut Record) -> Result<PathBuf, Error> {
         if let [input] = self.inputs.as_slice()
             && OpenOptions::default().layout_of(Path::new(input)).is_ok()
         {
             return Ok(PathBuf::from(input));
         }
         let place = self.output.join("capture");
-        if !is_made(&place.join("transforms.json"), &[])? {
+        put_back(&place)?;
+        let mut made_from = version();
+        for (number, input) in self.inputs.iter().enumerate() {
+            // As `cif capture` takes them, a camera may have a name.
+            let text = input.to_string_lossy();
+            let (camera, file) = match text.split_once('=').filter(|_| !Path::new(input).exists()) {
+                Some((camera, file)) => (format!("{camera}="), PathBuf::from(file)),
+                None => (String::new(), PathBuf::from(input)),
+            };
+            let name = file.file_name().unwrap_or(file.as_os_str()).to_string_lossy();
+            let name = format!("input {} ({camera}{name})", number + 1);
+            let known = record.known("capture");
+            if file.is_dir() {
+                made_from.folder(&name, &file, known);
+            } else {
+                made_from.files([(name, file)], known);
+            }
+        }
+        let state = match place.join("transforms.json").exists() {
+            true => record.state("capture", &place, &made_from, &[])?,
+            false => State::Missing,
+        };
+        if !is_made(&state, &place) {
             std::fs::create_dir_all(&self.output).map_err(Error::io("create", &self.output))?;
+            record.begin("capture", &place, made_from)?;
             let mut words = vec!["capture".into()];
             words.extend(self.inputs.iter().cloned());
             words.extend(["-o".into(), place.clone().into()]);
-            step(self.quietly(words), STEP)?;
+            instead(&state, &place, || step(self.quietly(words), STEP))?;
+            record.end("capture", &place)?;
         }
         Ok(place)
     }
 
     /// The folder of masks; `None` where the capture has its own.
-    fn masks(&self, capture: &Path) -> Result<Option<PathBuf>, Error> {
+    fn masks(&self, capture: &Path, record: &mut Record) -> Result<Option<PathBuf>, Error> {
         if let Some(masks) = &self.masks {
             return std::path::absolute(masks).map(Some).map_err(Error::io("find", masks));
         }
@@ -133,15 +170,23 @@ impl Make {
             dataset.frames.iter().map(|frame| keyframes.join(format!("{}.png", frame.name))).collect();
         let painted: Vec<&Path> = masks.iter().map(PathBuf::as_path).filter(|file| file.is_file()).collect();
         let place = self.output.join("masks");
-        if !is_made(&place, &painted)? {
+        put_back(&place)?;
+        let mut made_from = version();
+        let known = record.known("masks");
+        made_from.capture(&dataset, known).folder("the keyframe file", &keyframes, known);
+        let state = record.state("masks", &place, &made_from, &painted)?;
+        if !is_made(&state, &place) {
             let asked = proposed(&dataset);
             let missing: Vec<usize> =
                 asked.iter().copied().filter(|frame| !masks[*frame].is_file()).collect();
             // Other frames than those asked for will do, if they are as many.
-            if painted.is_empty() || (painted.len() < asked.len() && !self.as_painted) {
+            let is_enough =
+                painted.len() >= asked.len() || self.as_painted || matches!(state, State::Stale(_));
+            if painted.is_empty() || !is_enough {
                 return Err(to_paint(&dataset, &missing, painted.len(), &keyframes, capture));
             }
             std::fs::create_dir_all(&self.output).map_err(Error::io("create", &self.output))?;
+            record.begin("masks", &place, made_from)?;
             let words = ["masks", "propagate"].map(OsString::from).into_iter().chain([
                 capture.into(),
                 "--keyframes".into(),
@@ -149,15 +194,23 @@ impl Make {
                 "-o".into(),
                 place.clone().into(),
             ]);
-            step(self.quietly(words.collect()), STEP)?;
+            instead(&state, &place, || step(self.quietly(words.collect()), STEP))?;
+            record.end("masks", &place)?;
         }
         std::path::absolute(&place).map(Some).map_err(Error::io("find", &place))
     }
 
     /// The trained scene; a run that was interrupted goes on.
-    fn train(&self, capture: &Path, masks: Option<&Path>) -> Result<PathBuf, Error> {
+    fn train(&self, capture: &Path, masks: Option<&Path>, record: &mut Record) -> Result<PathBuf, Error> {
         let scene = self.output.join("scene.cif");
-        let begun = is_made(&scene, masks.as_slice())?;
+        let options = OpenOptions { masks: masks.map(Path::to_owned), ..OpenOptions::default() };
+        let dataset = Dataset::open(capture, &options).map_err(Error::plain)?;
+        let mut made_from = version();
+        made_from.capture(&dataset, record.known("scene")).value("preset", &self.preset);
+        let config = self.config.iter().map(|file| ("the settings file".to_owned(), file.clone()));
+        made_from.files(config, record.known("scene"));
+        let state = record.state("scene", &scene, &made_from, masks.as_slice())?;
+        let begun = is_made(&state, &scene);
         if begun && Checkpoint::load(&scene).map_err(Error::plain)?.training.is_none() {
             return Ok(scene);
         }
@@ -168,14 +221,18 @@ impl Make {
             words.extend(["--masks".into(), masks.into()]);
         }
         if begun {
+            record.go_on("scene", made_from)?;
             words.push("--resume".into());
         } else {
+            record.begin("scene", &scene, made_from)?;
             let of = |name: &str, value: Option<OsString>| value.map(|value| [name.into(), value]);
             let preset = of("--preset", self.preset.as_ref().map(OsString::from));
             let config = of("--config", self.config.as_ref().map(OsString::from));
             words.extend(preset.into_iter().chain(config).flatten());
+            words.extend(matches!(state, State::Stale(_)).then(|| "--force".into()));
         }
         step(self.quietly(words), None)?;
+        record.end("scene", &scene)?;
         Ok(scene)
     }
 
@@ -185,20 +242,46 @@ impl Make {
     }
 }
 
-/// True where a result is there.
-///
-/// # Errors
-/// When it is older than something that it was made of.
-fn is_made(result: &Path, of: &[&Path]) -> Result<bool, Error> {
-    let changed = |path: &Path| std::fs::metadata(path).and_then(|data| data.modified()).ok();
-    let Some(made) = changed(result) else { return Ok(false) };
-    let newer = of.iter().find(|path| changed(path).is_some_and(|changed| changed > made));
-    newer.map_or(Ok(true), |newer| {
-        Err(Error::failed(
-            format!("{} is older than {}, of which it was made", result.display(), newer.display()),
-            format!("remove it, and what was made of it, to make it again: {}", result.display()),
-        ))
-    })
+/// True where a result is there and good; tells why it is made again.
+fn is_made(state: &State, result: &Path) -> bool {
+    if let State::Stale(why) = state {
+        crate::messages::note!("{} is made again: {why}", result.display());
+    }
+    matches!(state, State::Good)
+}
+
+/// Where the folder that a step makes anew waits until that has succeeded.
+fn aside(place: &Path) -> PathBuf {
+    let name = place.file_name().unwrap_or_default().to_string_lossy();
+    place.with_file_name(format!(".{name}.old"))
+}
+
+/// Puts a folder back whose step was killed before it had made another one.
+fn put_back(place: &Path) -> Result<(), Error> {
+    let aside = aside(place);
+    if !aside.exists() {
+        Ok(())
+    } else if place.exists() {
+        std::fs::remove_dir_all(&aside).map_err(Error::io("remove", &aside))
+    } else {
+        std::fs::rename(&aside, place).map_err(Error::io("put back", place))
+    }
+}
+
+/// Runs a step that makes a folder; a stale one, which is as a step left it, is put aside until that has succeeded.
+fn instead(state: &State, place: &Path, step: impl FnOnce() -> Result<(), Error>) -> Result<(), Error> {
+    if !matches!(state, State::Stale(_)) {
+        return step();
+    }
+    std::fs::rename(place, aside(place)).map_err(Error::io("put aside", place))?;
+    let done = step();
+    put_back(place)?;
+    done
+}
+
+/// What every step depends on.
+fn version() -> MadeFrom {
+    MadeFrom::new().value("version", env!("CARGO_PKG_VERSION")).clone()
 }
 
 /// Tells a command not to say what comes next, which is told here.

@@ -180,6 +180,23 @@ impl From<Simd> for SimdLevel {
     }
 }
 
+impl Arguments {
+    /// True for a command that does nothing but print, so that it has nothing left to do once its reader has left. Files
+    /// that it would write too are work.
+    pub(crate) fn only_prints(&self) -> bool {
+        let writes = |report: &report::Report| report.file().is_some();
+        match &self.command {
+            Command::Plan(command) => !writes(command.report.report()),
+            Command::Info(command) => !writes(command.report.report()),
+            Command::Diff(command) => !writes(command.report.report()),
+            Command::Query(command) => !writes(&command.report) && !command.writes_trajectory(),
+            Command::Check(command) => !writes(&command.report) && command.fix.is_none(),
+            Command::Completions(_) => true,
+            _ => false,
+        }
+    }
+}
+
 /// Runs one command.
 ///
 /// # Errors

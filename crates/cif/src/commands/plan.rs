@@ -23,7 +23,7 @@ pub(super) struct Plan {
     /// Folder of the capture
     capture: PathBuf,
     #[command(flatten)]
-    report: OnlyReport,
+    pub(super) report: OnlyReport,
     /// Named settings that the capture would be trained with: draft, standard or paper
     #[arg(long, value_name = "NAME", default_value = "standard")]
     preset: String,

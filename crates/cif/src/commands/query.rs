@@ -137,12 +137,19 @@ pub(super) struct Query {
     )]
     trajectory: Option<PathBuf>,
     #[command(flatten)]
-    report: Report,
+    pub(super) report: Report,
     /// Replace an existing file of --json or --trajectory
     #[arg(long)]
     force: bool,
     #[command(flatten)]
     by_masks: by_masks::ByMasks,
+}
+
+impl Query {
+    /// True where paths go into a file.
+    pub(super) fn writes_trajectory(&self) -> bool {
+        self.trajectory.as_deref().is_some_and(|file| !crate::output::is_stdout(file))
+    }
 }
 
 pub(super) fn run(command: &Query) -> Result<(), Error> {

@@ -9,7 +9,7 @@ use super::preset::Preferred;
 use crate::endings;
 use crate::error::Error;
 use crate::formats::FORMATS;
-use crate::messages::outcome;
+use crate::messages::{note, outcome};
 use crate::moment::{Frames, Moment, note_fraction};
 use crate::output::{self, Outputs};
 
@@ -241,6 +241,9 @@ impl Target {
     pub(super) fn tell(&self, summary: &ExportSummary) {
         for lost in &summary.not_held {
             crate::messages::warning!("{} does not hold everything of {lost}", self.format.about().name);
+        }
+        for kept in &summary.kept {
+            note!("{} is not of cif and was kept", kept.display());
         }
         let files = match summary.files.len() {
             0 | 1 => String::new(),

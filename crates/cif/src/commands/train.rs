@@ -72,6 +72,9 @@ pub(super) struct Train {
     /// Go on where SCENE.cif was interrupted; settings come from it
     #[arg(long, conflicts_with_all = ["force", "preset", "config", "set"], conflicts_with = "settings")]
     resume: bool,
+    /// Go on although images, masks, cameras, points or labels of the capture have changed since the run began
+    #[arg(long, requires = "resume")]
+    accept_changes: bool,
     /// Begin with the Gaussians and the motion of a trained scene of this capture: only identities and
     /// instances are trained
     #[arg(long, value_name = "SCENE.cif", conflicts_with_all = ["resume", "no_masks", "iterations_coarse",
@@ -226,7 +229,10 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
     check_outputs(command)?;
     let existing = if command.force || command.resume { Existing::Replace } else { Existing::Keep };
     let mut destination = Destination::open(&command.output, existing)?;
-    let checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
+    let mut checkpoint = command.resume.then(|| load_state(&command.output)).transpose()?;
+    if command.accept_changes {
+        checkpoint.iter_mut().for_each(cif_train::accept_changes);
+    }
     if command.resume {
         interrupt::set_last_words("interrupted; the saved state is as it was");
     }
@@ -307,6 +313,10 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
         TrainError::Stopped => {
             Error::Interrupted { message: "interrupted; nothing was saved".to_owned(), help: None }
         }
+        error @ TrainError::ChangedCapture { .. } => Error::failed(
+            format!("{}: {error}", command.output.display()),
+            "put it back; or train again with --force; or go on with what is there now: --accept-changes",
+        ),
         error => Error::plain(error),
     })?;
     trainer.set_simd(command.simd.into());

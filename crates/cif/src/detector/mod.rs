@@ -7,9 +7,9 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use cif_dataset::Dataset;
+use cif_output::Workplace;
 use cif_vision::Models;
 use cif_vision::grounding::FoundBox;
-use tempfile::TempDir;
 
 use crate::error::Error;
 use crate::mask_query::FoundMasks;
@@ -41,7 +41,7 @@ pub struct Detected {
     pub masks: FoundMasks,
     /// Boxes by frame, where models found them; a command tells of none.
     pub boxes: BTreeMap<String, Vec<FoundBox>>,
-    _folder: Option<TempDir>,
+    _folder: Option<Workplace>,
 }
 
 impl Detector {
@@ -58,7 +58,6 @@ impl Detector {
 }
 
 /// A folder for temporary files.
-fn temporary() -> Result<TempDir, Error> {
-    let made = tempfile::Builder::new().prefix("cif-detect-").tempdir();
-    made.map_err(Error::io("create a temporary folder in", &std::env::temp_dir()))
+fn temporary() -> Result<Workplace, Error> {
+    Workplace::create("cif-detect-").map_err(Error::io("create a temporary folder in", &std::env::temp_dir()))
 }

@@ -14,8 +14,8 @@ mod notes;
 
 use std::collections::BTreeSet;
 
+use cif_dataset::MadeFrom;
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 
 pub(super) use self::forms::{PUBLISHED_HEADING, shown};
 use super::published::{PUBLISHED, PublishedAnswer};
@@ -82,7 +82,7 @@ pub struct Answer {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Answers {
     /// Everything that they depend on: another value makes them void.
-    pub fingerprint: Value,
+    pub fingerprint: MadeFrom,
     /// By question, then by way.
     pub answers: Vec<Answer>,
 }
@@ -90,7 +90,7 @@ pub struct Answers {
 impl Measurement for Answers {
     const FOLDER: &'static str = "answers";
 
-    fn fingerprint(&self) -> &Value {
+    fn fingerprint(&self) -> &MadeFrom {
         &self.fingerprint
     }
 

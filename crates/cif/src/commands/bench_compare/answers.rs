@@ -6,7 +6,8 @@ use std::path::Path;
 use cif_bench::comparison::queries::{Answer, Answers, Queries, Way};
 use cif_bench::comparison::record::{Record, Row};
 use cif_bench::comparison::tables::Missing;
-use cif_bench::records::Records;
+use cif_bench::records::{Kept, Records};
+use cif_dataset::MadeFrom;
 use cif_field::{Checkpoint, Field};
 use cif_render::InstanceImage;
 use cif_render::cpu::{Renderer, SimdLevel};
@@ -15,7 +16,6 @@ use cif_train::heads::Decoder;
 use cif_train::metrics::{EvaluationOptions, evaluate, mask_ids};
 use cif_vision::grounding::Thresholds;
 use cif_vision::{Models, Prompter};
-use serde_json::{Value, json};
 
 use super::Capture;
 use super::questions::{OfOneCapture, Question};
@@ -66,10 +66,14 @@ pub(super) fn ask(
             let name = id(&row.capture, row.seed, &row.head);
             let fingerprint = fingerprint(&run, of, stamp);
             let heading = format!("{}, seed {}: {}", row.capture, row.seed, row.head);
-            if let Some(known) = kept.find(&name, &fingerprint) {
-                bench.show(&format!("{heading}: questions: kept, {}", told(&known.answers)), true);
-                queries.answers.extend(known.answers);
-                continue;
+            match kept.find(&name, &fingerprint) {
+                Kept::Good(known) => {
+                    bench.show(&format!("{heading}: questions: kept, {}", told(&known.answers)), true);
+                    queries.answers.extend(known.answers);
+                    continue;
+                }
+                Kept::Void(why) => bench.show(&format!("{heading}: questions: asked again: {why}"), true),
+                Kept::Missing => {}
             }
             let answers = match bench.begins() {
                 true => {
@@ -108,12 +112,10 @@ fn without_maps(questions: &[OfOneCapture], heads: &[HeadName]) -> Vec<String> {
 }
 
 /// Everything that the answers of a run depend on.
-fn fingerprint(run: &Record, of: &OfOneCapture, models: Option<u128>) -> Value {
-    json!({
-        "run": run.fingerprint,
-        "questions": of.questions,
-        "models": models.map(|stamp| format!("{stamp:032x}")),
-    })
+fn fingerprint(run: &Record, of: &OfOneCapture, models: Option<u128>) -> MadeFrom {
+    let mut made_from = run.fingerprint.clone();
+    made_from.value("questions", &of.questions).value("models", models.map(|stamp| format!("{stamp:032x}")));
+    made_from
 }
 
 /// A scene and the questions about its capture.

@@ -198,6 +198,8 @@ pub(super) fn run(command: &BenchCompare) -> Result<(), Error> {
     if command.video {
         video::check()?;
     }
+    // Two at once would replace each other's records.
+    let _lock = crate::lock::Lock::take(&command.output.join("report.json"))?;
     let runs = Records::inside(&command.output)?;
     interrupt::watch();
     let mut bench = Bench::new(runs, command.iterations, command.budget, maps);

@@ -2,19 +2,18 @@
 
 use std::collections::BTreeMap;
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use cif_bench::comparison::Contender;
 use cif_bench::comparison::record::Record;
 use cif_bench::comparison::run::{Subject, settings};
 use cif_bench::comparison::tables::Missing;
-use cif_bench::records::Records;
-use cif_dataset::Dataset;
+use cif_bench::records::{Kept, Records};
+use cif_dataset::MadeFrom;
 use cif_geometry::PixelGrid;
 use cif_train::metrics::FrameView;
 use cif_train::{HeadName, Stop, TrainConfig};
-use serde_json::json;
 
 use super::Iterations;
 use crate::commands::eval::number;
@@ -70,22 +69,26 @@ impl Bench {
         let stop = Stop::when(interrupt::requested);
         let heading = format!("{}, seed {}", subject.capture, subject.config.seed);
         let mut base = None;
+        let inputs = self.inputs(subject, contenders);
         for contender in contenders {
             let Some(config) = self.settings(subject, *contender) else { continue };
             let id = id(subject.capture, config.seed, contender.name());
-            let masks = |of: &Dataset| of.frames.iter().find_map(|frame| frame.mask.clone());
-            let fingerprint = json!({
-                "version": env!("CARGO_PKG_VERSION"),
-                "capture": subject.dataset.root,
-                "masks": masks(subject.dataset),
-                "scored": masks(subject.scored),
-                "base": subject.config,
-                "settings": config,
-            });
-            if let Some(record) = self.runs.find(&id, &fingerprint) {
-                self.show(&format!("{heading}: {}: kept, {}", contender.name(), told(&record)), true);
-                self.records.push(record);
-                continue;
+            let mut fingerprint = inputs.clone();
+            fingerprint.value("base", subject.config).value("settings", &config);
+            if config.head.name == HeadName::LangSplat {
+                let known = self.runs.known(&id);
+                fingerprint.folder("feature map", Path::new(&config.head.maps), known.as_ref());
+            }
+            match self.runs.find(&id, &fingerprint) {
+                Kept::Good(record) => {
+                    self.show(&format!("{heading}: {}: kept, {}", contender.name(), told(&record)), true);
+                    self.records.push(record);
+                    continue;
+                }
+                Kept::Void(why) => {
+                    self.show(&format!("{heading}: {}: measured again: {why}", contender.name()), true);
+                }
+                Kept::Missing => {}
             }
             if base.is_none() && self.begins() {
                 let tell = &mut |done, whole| self.show_share(&heading, "reconstruction", done, whole);
@@ -119,6 +122,18 @@ impl Bench {
             self.records.push(record);
         }
         Ok(())
+    }
+
+    /// What all runs on a capture with a seed are made from.
+    fn inputs(&self, subject: &Subject<'_>, contenders: &[Contender]) -> MadeFrom {
+        let id = |contender: &Contender| id(subject.capture, subject.config.seed, contender.name());
+        let known = contenders.iter().find_map(|contender| self.runs.known(&id(contender)));
+        let mut inputs = MadeFrom::new();
+        inputs.value("version", env!("CARGO_PKG_VERSION")).capture(subject.dataset, known.as_ref());
+        let mut scored = MadeFrom::new();
+        scored.capture(subject.scored, known.as_ref());
+        inputs.extend(&scored, " in what is scored");
+        inputs
     }
 
     /// Settings of a run; those of the steps of the method hold for the method. `None` where the capture has not what a

@@ -85,6 +85,7 @@ impl From<cif_masks::Error> for Error {
 
 pub(super) fn run(command: &Propagate) -> Result<(), Error> {
     command.report.check([command.capture.as_path(), command.keyframes.as_path()])?;
+    crate::output::check_new_folder(&command.output)?;
     let dataset = open(command)?;
     check_ids(&dataset, &command.keyframes)?;
     let mut painted = BTreeMap::new();
