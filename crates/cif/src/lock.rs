@@ -85,11 +85,7 @@ impl Lock {
                     return Ok(None);
                 }
             }
-            let holder = format!(
-                "process {}, since {}\n",
-                std::process::id(),
-                humantime::format_rfc3339_micros(SystemTime::now())
-            );
+            let holder = format!("process {}, since {}\n", std::process::id(), written(SystemTime::now()));
             file.set_len(0)
                 .and_then(|()| file.rewind())
                 .and_then(|()| file.write_all(holder.as_bytes()))
@@ -106,6 +102,12 @@ impl Lock {
             "try again when they are done",
         )))
     }
+}
+
+/// A time as lock files have it; clocks that are set outside of the years 1970 to 9999 read as the nearest of these.
+fn written(time: SystemTime) -> String {
+    let last = SystemTime::UNIX_EPOCH + Duration::from_secs(253_402_300_799);
+    humantime::format_rfc3339_micros(time.clamp(SystemTime::UNIX_EPOCH, last)).to_string()
 }
 
 /// Another process holds the lock.
@@ -128,6 +130,13 @@ fn held(target: &Path, path: &Path, file: &mut File) -> Error {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn clocks_may_be_set_to_any_year() {
+        let century = Duration::from_secs(100 * 365 * 86_400);
+        assert_eq!(written(SystemTime::UNIX_EPOCH - century), "1970-01-01T00:00:00.000000Z");
+        assert!(written(SystemTime::UNIX_EPOCH + 90 * century).starts_with("9999-12-31"));
+    }
 
     #[test]
     fn a_file_is_locked_once_and_nothing_is_left() {

@@ -110,7 +110,7 @@ pub fn build_from(
     }
     node::measure(&mut nodes, &groups, &mut frames_of, &time_codes.samples);
     let code_of =
-        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then_some(index as f64);
+        |index: usize| (frames[0]..=frames[frames.len() - 1]).contains(&index).then(|| codes[index]);
     let cameras = camera_tracks::camera_tracks(&field.cameras, code_of);
     let antialiased = field.record.drawing.antialiased.unwrap_or_default();
     let blur = options.bake_blur.then(|| Blur::of(&cameras, antialiased)).flatten();
