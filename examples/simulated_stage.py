@@ -41,9 +41,12 @@ def layer_over(base: Path, out: Path, generator: str) -> tuple[Sdf.Layer, Usd.St
 def save(layer: Sdf.Layer, out: Path) -> None:
     """Write the layer with a path to the stage that is relative to it."""
     base = layer.subLayerPaths[0]
-    layer.subLayerPaths[0] = "./" + Path(os.path.relpath(base, out.resolve().parent)).as_posix()
+    # A copy: the stage that is open would look for the relative path where it has no place.
+    finished = Sdf.Layer.CreateAnonymous(out.suffix)
+    finished.TransferContent(layer)
+    finished.subLayerPaths[0] = "./" + Path(os.path.relpath(base, out.resolve().parent)).as_posix()
     scratch = out.with_name(f".{out.name}.part{out.suffix}")
-    layer.Export(str(scratch))
+    finished.Export(str(scratch))
     scratch.replace(out)
 
 
