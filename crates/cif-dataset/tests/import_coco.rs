@@ -55,6 +55,12 @@ fn boxes_without_a_mask_are_left_out_and_named() {
         let note = import.notes.iter().find(|note| note.contains("no segmentation")).unwrap();
         assert!(note.starts_with("1 annotations") && note.ends_with(": 2"), "{note}");
     }
+    // An image with a box alone gets no mask, rather than an empty one.
+    coco(&path, |v| {
+        v["annotations"].as_array_mut().unwrap().remove(1);
+        v["annotations"][0]["segmentation"] = json!([]);
+    });
+    assert_eq!(imported(&folder, &path).2, [None, BOTH, BOTH]);
 }
 
 #[test]

@@ -76,10 +76,11 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
     }
     let mut pieces: Vec<Vec<Piece>> = file.images.iter().map(|_| Vec::new()).collect();
     let mut untracked = BTreeSet::new();
-    let mut boxes = Vec::new();
+    let (mut boxes, mut boxed) = (Vec::new(), BTreeSet::new());
     for annotation in &file.annotations {
         if is_without_mask(&annotation.segmentation) {
             boxes.push(annotation.id.to_string());
+            boxed.extend(place_of.get(&text_of(&annotation.image_id)).copied());
             continue;
         }
         let place = Place::entry(source, format!("annotation {}", annotation.id));
@@ -117,7 +118,10 @@ pub(super) fn list(source: &Path) -> Result<Listing, Error> {
         pieces[image].push(Piece { object, layer: 0, place, shape });
     }
     result.notes.extend(note_of_boxes(source, &boxes, file.annotations.len())?);
-    for (image, pieces) in file.images.into_iter().zip(pieces) {
+    // An image of boxes alone does not say that it shows nothing.
+    let drawn =
+        |(index, (_, pieces)): &(usize, (Image, Vec<Piece>))| !pieces.is_empty() || !boxed.contains(index);
+    for (_, (image, pieces)) in file.images.into_iter().zip(pieces).enumerate().filter(drawn) {
         let place = Place::entry(source, format!("image {}", image.file_name));
         let size = image.width.zip(image.height);
         let content = Content::Pieces(pieces);
