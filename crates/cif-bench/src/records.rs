@@ -21,7 +21,7 @@ pub trait Measurement: Serialize + DeserializeOwned {
     fn files(&self, id: &str) -> Vec<String>;
 }
 
-/// What is known of a measurement.
+/// State of a measurement.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Kept<M> {
     /// It is there, and nothing that it depends on has changed.
@@ -85,7 +85,7 @@ impl<M: Measurement> Records<M> {
         }
     }
 
-    /// What the measurement of this name was made from: known stamps of files spare reading them.
+    /// Inputs that the measurement of this name was made from: known stamps of files spare reading them.
     #[must_use]
     pub fn known(&self, id: &str) -> Option<MadeFrom> {
         let text = std::fs::read_to_string(self.file(&format!("{id}.json"))).ok()?;

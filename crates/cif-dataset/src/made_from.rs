@@ -1,4 +1,4 @@
-//! What a product was made from: content of files, and settings. One notion for every product that is kept, be it a step
+//! Inputs that a product was made from: content of files, and settings. One notion for every product that is kept, be it a step
 //! of `cif make`, a run that goes on, or a measurement: it is good for as long as nothing that it was made from differs.
 //!
 //! Files are known by their content (XXH3, 128 bits), which is read only where size or times differ from those that were
@@ -23,7 +23,7 @@ const PIECE: usize = 1 << 18;
 /// Longest value that is told, characters.
 const LONGEST_VALUE: usize = 60;
 
-/// What a product was made from.
+/// Inputs that a product was made from.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct MadeFrom {
     /// Files and parts of captures by what they are, as a subject of a sentence: `the mask of frame 000003`.
@@ -146,7 +146,7 @@ impl MadeFrom {
         self.inputs.insert(name, Stamp { content: format!("{:032x}", xxh3_128(&text)), seen: None });
     }
 
-    /// What differs from `now`, as a sentence without a full stop that names it; `None` where nothing does.
+    /// The difference from `now`, as a sentence without a full stop that names it; `None` where nothing does.
     #[must_use]
     pub fn difference(&self, now: &Self) -> Option<String> {
         let mut found = Vec::new();

@@ -1,4 +1,4 @@
-//! What cameras and other tools write in ways of their own.
+//! Conventions of cameras and of other tools.
 #![allow(clippy::unwrap_used)] // Helpers of tests.
 
 mod support;

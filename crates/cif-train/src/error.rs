@@ -183,7 +183,7 @@ pub enum TrainError {
     /// The checkpoint belongs to this capture as it was.
     #[error("{} is no longer what the run was trained on: {difference}", root.display())]
     ChangedCapture {
-        /// What has changed, a sentence.
+        /// The change, a sentence.
         difference: String,
         /// Folder of the capture.
         root: PathBuf,

@@ -36,7 +36,7 @@ pub struct Imported {
     /// True where poses are of the pixels as files store them, unless the sizes of the cameras tell otherwise; false where
     /// the tool turns photographs upright, as their EXIF says.
     pub of_stored_pixels: bool,
-    /// What was left out, and how images were turned, one sentence each.
+    /// Notes on images that were left out or turned, one sentence each.
     pub notes: Vec<String>,
 }
 

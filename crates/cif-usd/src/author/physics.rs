@@ -88,7 +88,7 @@ fn kinematic(
     Ok(())
 }
 
-/// What of a node is a body: the whole, or one of its parts.
+/// The part of a node that is a body: the whole, or one of its parts.
 #[derive(Clone, Copy)]
 struct Body<'a> {
     part: Option<(usize, &'a Part)>,

@@ -176,7 +176,7 @@ impl Worker {
     /// Asks, and waits for the answer.
     ///
     /// # Errors
-    /// What the process says, or that it has ended, in words.
+    /// Message of the process, or that it has ended, in words.
     pub(super) fn ask(
         &mut self,
         question: &Question,

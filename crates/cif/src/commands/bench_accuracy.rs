@@ -315,7 +315,7 @@ fn of_preset(
 /// A report under way.
 struct Bench {
     capture: CaptureOptions,
-    /// What all rungs are made from.
+    /// Inputs that all rungs are made from.
     inputs: MadeFrom,
     /// Capture that everything is scored on.
     dataset: Dataset,

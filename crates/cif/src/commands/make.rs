@@ -279,7 +279,7 @@ fn instead(state: &State, place: &Path, step: impl FnOnce() -> Result<(), Error>
     done
 }
 
-/// What every step depends on.
+/// Inputs of every step.
 fn version() -> MadeFrom {
     MadeFrom::new().value("version", env!("CARGO_PKG_VERSION")).clone()
 }

@@ -135,7 +135,7 @@ pub(super) fn is_without_mask(segmentation: &Value) -> bool {
     segmentation.is_null() || segmentation.as_array().is_some_and(Vec::is_empty)
 }
 
-/// What is said of annotations without a mask, of `all`.
+/// The note on annotations without a mask, of `all`.
 ///
 /// # Errors
 /// When there are no others.

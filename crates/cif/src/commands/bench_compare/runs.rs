@@ -124,7 +124,7 @@ impl Bench {
         Ok(())
     }
 
-    /// What all runs on a capture with a seed are made from.
+    /// Inputs that all runs on a capture with a seed are made from.
     fn inputs(&self, subject: &Subject<'_>, contenders: &[Contender]) -> MadeFrom {
         let id = |contender: &Contender| id(subject.capture, subject.config.seed, contender.name());
         let known = contenders.iter().find_map(|contender| self.runs.known(&id(contender)));

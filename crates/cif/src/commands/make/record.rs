@@ -1,4 +1,4 @@
-//! What the steps of `cif make` were made from, in `made.json` beside their results.
+//! Inputs that the steps of `cif make` were made from, in `made.json` beside their results.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -26,7 +26,7 @@ pub(super) struct Record {
 #[derive(Debug, Serialize, Deserialize)]
 struct Step {
     made_from: MadeFrom,
-    /// What was in the place of its result when it began.
+    /// Content of the place of its result when it began.
     before: MadeFrom,
     /// The result as the step left it; `None` until it has ended.
     result: Option<MadeFrom>,
@@ -62,7 +62,7 @@ impl Record {
         Ok(Self { path, steps, lock })
     }
 
-    /// What a step was made from, of which files that have not changed need not be read again.
+    /// Inputs that a step was made from, of which files that have not changed need not be read again.
     pub(super) fn known(&self, step: &str) -> Option<&MadeFrom> {
         self.steps.get(step).map(|step| &step.made_from)
     }
