@@ -328,7 +328,10 @@ fn what_is_not_ours_is_kept() {
     export(&scene, &path, single).unwrap();
     assert!(payloads.join("precious.txt").exists(), "not needed, not ours, not touched");
     export(&scene, &path, ExportOptions { force: true, ..ExportOptions::default() }).unwrap();
-    assert!(!payloads.join("precious.txt").exists() && payloads.join("background.usdc").exists());
+    assert!(payloads.join("precious.txt").exists() && payloads.join("background.usdc").exists());
+    export(&scene, &path, single).unwrap();
+    assert!(payloads.join("precious.txt").exists(), "a folder that holds it stays as it is");
+    fs::remove_file(payloads.join("precious.txt")).unwrap();
     export(&scene, &path, single).unwrap();
     assert!(!payloads.exists(), "payloads that the new stage does not need went with the old one");
     let package = folder.path().join("a.usdz");
