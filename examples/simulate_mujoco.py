@@ -21,27 +21,14 @@ with the simulated motion, Blender included.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from pathlib import Path
 
 import mujoco
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
-from simulated_stage import (
-    Poses,
-    bodies_of,
-    check_colliders,
-    choose,
-    ground_of,
-    is_kinematic,
-    layer_over,
-    lowest,
-    pose_at,
-    save,
-    write_poses,
-)
+from pxr import Sdf, Usd
+from simulated_stage import Poses, arguments, begin, bodies_of, finish, is_kinematic, pose_at
 
 FOLLOWS = 1e-6
 """Largest distance of a mocap body from its track, stage units."""
@@ -49,40 +36,15 @@ FOLLOWS = 1e-6
 
 def main() -> int:
     """Simulate, check, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("stage", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="layer to write, .usda or .usdc")
-    parser.add_argument("--dynamic", action="append", default=[], metavar="LABEL", help="let these fall; globs")
-    parser.add_argument("--frames", type=int, nargs=2, metavar=("FIRST", "LAST"), help="default: all")
-    parser.add_argument("--ground", type=float, help="height of the table (default: the stage's, or found)")
-    parser.add_argument("--force", action="store_true", help="replace the output")
-    options = parser.parse_args()
-    if options.output.exists() and not options.force:
-        sys.exit(f"{options.output}: exists; --force replaces it")
-    if not options.stage.is_file():
-        sys.exit(f"{options.stage}: no such file")
-    layer, stage = layer_over(options.stage, options.output, Path(__file__).name)
-    falling = choose(stage, options.dynamic)
-    if options.dynamic and not falling:
-        sys.exit(f"no instance with a physics variant is called {' or '.join(options.dynamic)}")
-    failed = not check_colliders(stage)
-    up = 1 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else 2
-    ground, has_plane = ground_of(stage, falling, up, options.ground)
-    first, last = options.frames or (int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode()))
-    model, driven = load(stage, None if has_plane else ground, up)
-    recorded, drift = simulate(model, stage, falling, driven, np.arange(first, last + 1))
+    job = begin(arguments(__doc__), Path(__file__).name)
+    model, driven = load(job.stage, job.added_ground, job.up)
+    recorded, drift = simulate(model, job.stage, job.falling, driven, job.frames)
     print(f"kinematic bodies follow their tracks to {drift:.1e}")
-    failed |= drift > FOLLOWS
-    for path, poses in recorded.items():
-        write_poses(stage, stage.GetPrimAtPath(path), poses, first)
-        fell = poses.translations[0][up] - poses.translations[-1][up]
-        low = lowest(stage, path, up, last)
-        mass = float(model.body(str(path)).mass[0])
-        print(f"{path}: {mass:.3f} kg fell by {fell:.4f}, lowest point {low - ground:+.4f} over ground")
-        failed |= not np.isfinite([fell, low]).all()
-    save(layer, options.output)
-    print(f"wrote {options.output}")
-    return int(failed)
+
+    def words(path: Sdf.Path, _: Poses, fall: str) -> str:
+        return f"{float(model.body(str(path)).mass[0]):.3f} kg {fall}"
+
+    return finish(job, recorded, drift <= FOLLOWS, words)
 
 
 def load(stage: Usd.Stage, ground: float | None, up: int) -> tuple[mujoco.MjModel, dict[Sdf.Path, int]]:

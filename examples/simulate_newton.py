@@ -21,7 +21,6 @@ with the simulated motion, Blender included.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -29,19 +28,7 @@ import newton
 import numpy as np
 import warp as wp
 from pxr import Sdf, Usd, UsdGeom
-from simulated_stage import (
-    Poses,
-    bodies_of,
-    check_colliders,
-    choose,
-    ground_of,
-    is_kinematic,
-    layer_over,
-    lowest,
-    pose_at,
-    save,
-    write_poses,
-)
+from simulated_stage import Poses, arguments, begin, bodies_of, finish, is_kinematic, pose_at
 
 STEPS_PER_SECOND = 480
 """Simulation steps; contacts of small things are stiff."""
@@ -53,45 +40,21 @@ FOLLOWS = 1e-4
 
 def main() -> int:
     """Simulate, check, write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("stage", type=Path)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="layer to write, .usda or .usdc")
-    parser.add_argument("--dynamic", action="append", default=[], metavar="LABEL", help="let these fall; globs")
-    parser.add_argument("--frames", type=int, nargs=2, metavar=("FIRST", "LAST"), help="default: all")
-    parser.add_argument("--ground", type=float, help="height of the table (default: found in the background)")
+    parser = arguments(__doc__)
     parser.add_argument(
         "--drop", type=float, default=0.0, help="lift what falls by this much first, stage units"
     )
-    parser.add_argument("--force", action="store_true", help="replace the output")
-    options = parser.parse_args()
-    if options.output.exists() and not options.force:
-        sys.exit(f"{options.output}: exists; --force replaces it")
-    if not options.stage.is_file():
-        sys.exit(f"{options.stage}: no such file")
     wp.config.quiet = True
-    layer, stage = layer_over(options.stage, options.output, Path(__file__).name)
-    falling = choose(stage, options.dynamic)
-    if options.dynamic and not falling:
-        sys.exit(f"no instance with a physics variant is called {' or '.join(options.dynamic)}")
-    failed = not check_colliders(stage)
-    up = 1 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else 2
-    ground, has_plane = ground_of(stage, falling, up, options.ground)
-    first, last = options.frames or (int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode()))
-    recorded, drift = simulate(
-        stage, falling, None if has_plane else ground, up, np.arange(first, last + 1), options.drop
-    )
+    job = begin(parser, Path(__file__).name)
+    recorded, drift = simulate(job.stage, job.falling, job.added_ground, job.up, job.frames, job.options.drop)
     print(f"kinematic bodies follow their tracks to {drift:.1e}")
-    failed |= drift > FOLLOWS
-    for path, poses in recorded.items():
-        write_poses(stage, stage.GetPrimAtPath(path), poses, first)
-        fell = poses.translations[0][up] - poses.translations[-1][up]
-        low = lowest(stage, path, up, last)
-        rest = np.linalg.norm(poses.translations[-1] - poses.translations[-2]) if last > first else 0.0
-        print(f"{path}: fell by {fell:.4f}, lowest point {low - ground:+.4f} over ground, last step {rest:.1e}")
-        failed |= not np.isfinite([fell, low]).all()
-    save(layer, options.output)
-    print(f"wrote {options.output}")
-    return int(failed)
+
+    def words(_: Sdf.Path, poses: Poses, fall: str) -> str:
+        places = poses.translations
+        rest = np.linalg.norm(places[-1] - places[-2]) if len(places) > 1 else 0.0
+        return f"{fall}, last step {rest:.1e}"
+
+    return finish(job, recorded, drift <= FOLLOWS, words)
 
 
 def simulate(

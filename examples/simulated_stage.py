@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import argparse
 import fnmatch
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +25,79 @@ class Poses:
     translations: list[np.ndarray]
     rotations: list[np.ndarray]
     """Quaternions (x, y, z, w), as Newton has them."""
+
+
+@dataclass
+class Job:
+    """A stage with its chosen variants, and what is asked of the simulation."""
+
+    options: argparse.Namespace
+    layer: Sdf.Layer
+    stage: Usd.Stage
+    falling: list[Sdf.Path]
+    up: int
+    """Axis that is up, 1 or 2."""
+    ground: float
+    has_plane: bool
+    """Whether a plane of the stage stands for the ground."""
+    frames: np.ndarray
+    failed: bool
+    """Whether a check has failed."""
+
+    @property
+    def added_ground(self) -> float | None:
+        """Height of the plane that the stage lacks."""
+        return None if self.has_plane else self.ground
+
+
+def arguments(description: str) -> argparse.ArgumentParser:
+    """The options that all simulators take."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("stage", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="layer to write, .usda or .usdc")
+    parser.add_argument("--dynamic", action="append", default=[], metavar="LABEL", help="let these fall; globs")
+    parser.add_argument("--frames", type=int, nargs=2, metavar=("FIRST", "LAST"), help="default: all")
+    parser.add_argument("--ground", type=float, help="height of the table (default: the stage's, or found)")
+    parser.add_argument("--force", action="store_true", help="replace the output")
+    return parser
+
+
+def begin(parser: argparse.ArgumentParser, generator: str) -> Job:
+    """Check the command, open the stage, choose what falls and find the ground."""
+    options = parser.parse_args()
+    if options.output.exists() and not options.force:
+        sys.exit(f"{options.output}: exists; --force replaces it")
+    if not options.stage.is_file():
+        sys.exit(f"{options.stage}: no such file")
+    layer, stage = layer_over(options.stage, options.output, generator)
+    falling = choose(stage, options.dynamic)
+    if options.dynamic and not falling:
+        sys.exit(f"no instance with a physics variant is called {' or '.join(options.dynamic)}")
+    failed = not check_colliders(stage)
+    up = 1 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.y else 2
+    ground, has_plane = ground_of(stage, falling, up, options.ground)
+    first, last = options.frames or (int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode()))
+    frames = np.arange(first, last + 1)
+    return Job(options, layer, stage, falling, up, ground, has_plane, frames, failed)
+
+
+def finish(
+    job: Job, recorded: dict[Sdf.Path, Poses], is_on_track: bool, words: Callable[[Sdf.Path, Poses, str], str]
+) -> int:
+    """Write where everything went, with a line for each that fell; the exit code."""
+    failed = job.failed or not is_on_track
+    for path, poses in recorded.items():
+        write_poses(job.stage, job.stage.GetPrimAtPath(path), poses, int(job.frames[0]))
+        fell = poses.translations[0][job.up] - poses.translations[-1][job.up]
+        low = lowest(job.stage, path, job.up, int(job.frames[-1]))
+        fall = f"fell by {fell:.4f}, lowest point {low - job.ground:+.4f} over ground"
+        print(f"{path}: {words(path, poses, fall)}")
+        failed |= not np.isfinite([fell, low]).all()
+    save(job.layer, job.options.output)
+    print(f"wrote {job.options.output}")
+    return int(failed)
 
 
 def layer_over(base: Path, out: Path, generator: str) -> tuple[Sdf.Layer, Usd.Stage]:

@@ -15,6 +15,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use xxhash_rust::xxh3::{Xxh3, xxh3_128};
 
+use crate::files::listing;
 use crate::{Dataset, PointSource};
 
 /// Bytes that are read at a time.
@@ -76,23 +77,13 @@ impl MadeFrom {
 
     /// Adds the files of a folder and below, by their names behind `kind`; hidden ones, such as caches, do not count.
     pub fn folder(&mut self, kind: &str, folder: &Path, known: Option<&Self>) -> &mut Self {
-        let mut files = Vec::new();
-        let mut open = vec![folder.to_owned()];
-        while let Some(at) = open.pop() {
-            for entry in std::fs::read_dir(at).into_iter().flatten().flatten() {
-                let path = entry.path();
-                if entry.file_name().to_string_lossy().starts_with('.') {
-                    continue;
-                }
-                if path.is_dir() && !path.is_symlink() {
-                    open.push(path);
-                } else {
-                    let name = path.strip_prefix(folder).unwrap_or(&path).display().to_string();
-                    files.push((format!("{kind} {name}"), path));
-                }
-            }
-        }
-        self.files(files, known)
+        // Whoever needs a folder that cannot be read refuses it.
+        let found = listing::below(folder).unwrap_or_default();
+        let named = |path: PathBuf| {
+            let name = path.strip_prefix(folder).unwrap_or(&path).display().to_string();
+            (format!("{kind} {name}"), path)
+        };
+        self.files(found.into_iter().map(named), known)
     }
 
     /// Adds a value.
