@@ -2,7 +2,7 @@
 //! of `cif make`, a run that goes on, or a measurement: it is good for as long as nothing that it was made from differs.
 //!
 //! Files are known by their content (XXH3, 128 bits), which is read only where size or times differ from those that were
-//! seen with it, so that asking again is cheap. That tells apart files that were changed or mixed up, not files that were
+//! seen with it, so that asking again is cheap. That distinguishes files that were changed or mixed up, not files that were
 //! forged.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -195,7 +195,7 @@ impl Stamp {
         if let Some(known) = known.filter(|known| seen.is_some() && known.seen == seen) {
             return known.clone();
         }
-        // What cannot be read is told by whoever needs it.
+        // Whoever needs what cannot be read reports it.
         Self { content: content(path).unwrap_or_default(), seen }
     }
 }

@@ -1,6 +1,6 @@
 //! Which way up the pixels of files lie. Cameras store pictures as their sensor lies and note in EXIF how to turn them:
 //! most programs show them turned, others, COLMAP among them, read them as they are stored. The size of the camera that
-//! belongs to an image tells which of both it is of.
+//! belongs to an image shows which of both it is of.
 
 use cif_geometry::PixelGrid;
 use glam::DVec2;

@@ -35,7 +35,7 @@ fn own_frame(middle: DVec3, size: f64) -> CaptureFrame {
 
 impl Dataset {
     /// Puts cameras and points into a frame of their own where the capture is far from its origin or in units far
-    /// from metres, notes it in [`Dataset::frame`] and tells it. [`Dataset::open`] does it, before points lose precision;
+    /// from metres, notes it in [`Dataset::frame`] and says so. [`Dataset::open`] does it, before points lose precision;
     /// ordinary captures keep their coordinates.
     pub fn enter_own_frame(&mut self) {
         let mut points: Vec<[f64; 3]> =

@@ -705,7 +705,7 @@ fn logarithmic_scales_of_drafts_are_read_or_named() {
     assert!(graph.warnings[0].contains("logarithms"), "{:?}", graph.warnings);
     let scales = graph.nodes[0].splats.scales.as_flattened().iter().zip(splats.scales.as_flattened());
     assert!(scales.into_iter().all(|(a, b)| (a - b).abs() < 1e-5 * b));
-    // All of them above a metre: only the program that wrote them tells.
+    // All of them above a metre: only the program that wrote them shows it.
     let large = [0.5, 1.0, 1.5, 0.5, 1.0, 1.5, 0.5, 1.0, 1.5];
     for (generator, expected) in [
         ("splat-transform 2.6.0", 0.5_f32.exp()),

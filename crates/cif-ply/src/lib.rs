@@ -8,7 +8,7 @@
 //!
 //! PLY knows neither objects nor time: what moves leaves as one moment, or as a numbered sequence of moments, and
 //! objects leave as files of their own. Splats stand in the world as it was captured, or on request turned so that another
-//! axis is up, which a comment tells to readers.
+//! axis is up, which a comment states for readers.
 
 pub mod error;
 pub mod pose;

@@ -133,7 +133,7 @@ fn frame(comments: &[String]) -> Result<CaptureFrame, String> {
 }
 
 /// True for splats that were trained antialiased, as the last comment of Brush (`SplatRenderMode: mip`) or Postshot
-/// (`antialiased 1`) tells; `None` where none does.
+/// (`antialiased 1`) states; `None` where none does.
 fn render_mode(comments: &[String], warnings: &mut Vec<String>) -> Option<bool> {
     let mut antialiased = None;
     for comment in comments {

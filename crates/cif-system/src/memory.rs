@@ -1,6 +1,6 @@
 //! How much memory is free, and whether work fits in it.
 //!
-//! Linux tells it: the memory of the machine that programs can still take without swapping, the limits of the control groups
+//! Linux shows it: the memory of the machine that programs can still take without swapping, the limits of the control groups
 //! of this process (containers, jobs), and its own limit of addresses. Elsewhere nothing is known, and nothing refused.
 //! Sources: `proc_meminfo(5)`, `proc_pid_limits(5)`, the kernel's `cgroup-v2.rst` and `cgroup-v1/memory.rst`.
 

@@ -19,7 +19,7 @@ use crate::{Error, Picture, Tensor};
 const SIDE: u32 = 1024;
 /// Side of the masks that the decoder may start from, where the model does not say.
 const PREVIOUS: usize = 256;
-/// Largest side that is taken at its word: those of pictures. Another one does not fit then, and is told so.
+/// Largest side that is taken at its word: those of pictures. Another one does not fit then, and is refused.
 const MOST_PREVIOUS: usize = 4 * SIDE as usize;
 /// Labels of a box's first and second corner.
 const CORNERS: [i64; 2] = [2, 3];

@@ -47,7 +47,7 @@ pub(crate) fn answer(words: Arguments<'_>) {
     keep_failure(stdout.write_fmt(words));
 }
 
-/// Writes to stderr, of which nobody can be told that it fails.
+/// Writes to stderr, whose failures reach nobody.
 pub(crate) fn message(words: Arguments<'_>) {
     // In one piece, so that lines of threads and of children do not mix.
     let _ = io::stderr().write_all(words.to_string().as_bytes());

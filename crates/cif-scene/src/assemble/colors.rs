@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 /// surfaces seldom pass twice white, and those that count to 255 nearly always do.
 const BRIGHTEST: f32 = 2.0;
 
-/// White of colours that do not say theirs, by the largest of them: 1, 255 or 65535, the latter two told in a warning;
+/// White of colours that do not say theirs, by the largest of them: 1, 255 or 65535, the latter two named in a warning;
 /// `place` names them.
 pub fn color_range(values: impl IntoIterator<Item = f32>, place: &str, warnings: &mut Vec<String>) -> f32 {
     let largest = values.into_iter().fold(0.0, f32::max);

@@ -13,7 +13,7 @@ use crate::{CameraTrack, CaptureFrame};
 /// quarter of a millimetre, so that a few roundings stay inside one. It is reached 2 km from the origin.
 const COARSE_METERS: f64 = 2.5e-4;
 
-/// The origin that coordinates inside a box want, whole units, told in a warning; `None` where single precision holds
+/// The origin that coordinates inside a box want, whole units, named in a warning; `None` where single precision holds
 /// them, or where the box is as large as it is far away.
 pub fn origin_of(bounds: &Bounds, meters_per_unit: f64, warnings: &mut Vec<String>) -> Option<DVec3> {
     let corners = [bounds.low, bounds.high];

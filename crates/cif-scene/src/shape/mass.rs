@@ -35,7 +35,7 @@ const SHEET_SIGMAS: f64 = 2.0;
 
 /// Mass of every collider of a node, kg: the volume that each body fills times `density` (kg/m^3), shared among its
 /// colliders by their volumes. Bodies are the parts of a node, where it has some, else the node. `graph` is that of the
-/// node, and tells its unit.
+/// node, and states its unit.
 #[must_use]
 pub fn masses(graph: &SceneGraph, node: &Node, density: f64) -> Vec<f64> {
     let volumes: Vec<f64> =

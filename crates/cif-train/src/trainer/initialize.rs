@@ -32,7 +32,7 @@ pub(super) fn initial_field(dataset: &Dataset, config: &TrainConfig) -> Result<F
         return Err(TrainError::NoPoints { root: dataset.root.clone() });
     }
     if dataset.times.len() > 1 && config.effects.motion && config.stages.fine > 0 {
-        // The fine stage will make it: settings that cannot work are told before the first step.
+        // The fine stage will make it: settings that cannot work are refused before the first step.
         deformation_shape(dataset, config)?;
     }
     let mut gaussians = Gaussians::from_points(&positions, &colors)?;

@@ -150,7 +150,7 @@ impl<'py> SplatPrim<'py> {
             |value: &Bound<'py, PyAny>| reading.arrays.doubles(value).map(Option::unwrap_or_default);
         let centres = self.read(reading, "positions", &at, doubles)?.unwrap_or_default();
         let bounds = Bounds::around(centres.into_iter().map(DVec3::from_array));
-        // The scene tells of its own origin, of which this becomes a part.
+        // The scene states an origin of its own, of which this becomes a part.
         Ok(origin_of(&bounds, 1.0, &mut Vec::new()).unwrap_or_default())
     }
 

@@ -39,7 +39,7 @@ tolerance are left out. The table tells which motion was chosen, and what it mis
   cif export table.cif table.ply --ply-time 36          or 1.5s, or 50%
   cif export table.cif --ply frames --ply-sequence      a folder has no ending: its flag says the format
   cif export table.cif --report --ground-truth motion.json
-  cif export table.cif table.usda --for mujoco          or newton, isaac, blender, web: --help tells their flags
+  cif export table.cif table.usda --for mujoco          or newton, isaac, blender, web: --help shows their flags
 
 --check reads every file back as `cif import` would and draws it beside the scene, from cameras that
 the scene recorded and, with --capture, from those of held-out images. PSNR of an object is over the

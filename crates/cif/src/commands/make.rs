@@ -35,7 +35,7 @@ Every step is a command of its own, which is shown before it runs, and leaves it
 
 The same command goes on where it stopped, also after Ctrl-C: what is there already is not made again unless something
 that it was made from has changed, be it a file, a setting or the version of cif; then it and all that follows is made
-again, and it says why. made.json tells what each step was made from. A step that needs other options can be run by hand
+again, and it says why. made.json holds what each step was made from. A step that needs other options can be run by hand
 into the same place: what is not as cif make left it is never replaced.
 
   cif make phone.mp4 -o table
@@ -242,7 +242,7 @@ impl Make {
     }
 }
 
-/// True where a result is there and good; tells why it is made again.
+/// True where a result is there and good; says why it is made again.
 fn is_made(state: &State, result: &Path) -> bool {
     if let State::Stale(why) = state {
         crate::messages::note!("{} is made again: {why}", result.display());

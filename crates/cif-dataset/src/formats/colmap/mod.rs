@@ -48,7 +48,7 @@ struct Reconstruction {
     points_path: PathBuf,
 }
 
-/// The model that is read of those that the mapper made, and what is told of the others.
+/// The model that is read of those that the mapper made, and the note on the others.
 pub(crate) struct Chosen {
     pub(crate) folder: PathBuf,
     pub(crate) note: Option<String>,
@@ -72,7 +72,7 @@ fn models(parent: &Path) -> Vec<PathBuf> {
     numbered.into_iter().map(|(_, path)| path).chain(itself).collect()
 }
 
-/// Images of a model; 0 where that cannot be read, which reading it tells.
+/// Images of a model; 0 where that cannot be read, which reading it reports.
 fn registered(folder: &Path) -> u64 {
     let count = if listing::is_there(&folder.join("cameras.bin")) {
         binary::count_images(folder)

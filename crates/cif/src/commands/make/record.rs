@@ -37,7 +37,7 @@ struct Step {
 pub(super) enum State {
     Missing,
     Good,
-    /// Something that it was made from has changed, as the sentence tells; the result is as the step left it.
+    /// Something that it was made from has changed, as the sentence says; the result is as the step left it.
     Stale(String),
 }
 
