@@ -4,7 +4,6 @@
 use super::buffers::{GpuVec, Uniform};
 use super::device::Gpu;
 use super::error::GpuError;
-use super::kernel::Access::{Read, ReadWrite, Uniform as UniformAccess};
 use super::kernel::{Commands, Kernel, Module, Snippet, structures, workgroups};
 use super::layout::Shared;
 use super::rasterizer::{PosedInput, Rasterizer};
@@ -60,7 +59,6 @@ pub const BLEND: Module = Module {
     name: "blend",
     text: include_str!("blend.wgsl"),
     imports: &[CONSTANTS, VIEW, SPLAT, BLEND_CHUNK, TILE_STAGING, TILE_FORWARD, BLEND_VALUES],
-    bindings: &[UniformAccess, Read, Read, Read, UniformAccess, Read, ReadWrite],
     entries: &["blend"],
 };
 
@@ -79,7 +77,6 @@ pub const BLEND_BACKWARD: Module = Module {
         PARTIAL_SUMS,
         VALUES_ONLY,
     ],
-    bindings: &[UniformAccess, Read, Read, Read, UniformAccess, Read, Read, Read, ReadWrite],
     entries: &["blend_backward"],
 };
 
@@ -104,7 +101,6 @@ pub const GATHER_VALUES: Module = Module {
     name: "gather_values",
     text: include_str!("gather_values.wgsl"),
     imports: &[CONSTANTS, NUMBERS, VIEW, SPLAT, BLEND_CHUNK, VALUES_ONLY],
-    bindings: &[UniformAccess, UniformAccess, Read, Read, Read, Read, Read, Read, ReadWrite, ReadWrite],
     entries: &["gather_values"],
 };
 
