@@ -54,7 +54,6 @@ pub mod view;
 pub mod workgroup;
 
 pub use ::wgpu::{BindGroup, SubmissionIndex as Submission};
-pub use blend::BlendWeightGradients;
 pub use buffers::{Arriving, GpuVec, PendingWords, Readback, Recorded, Uniform};
 pub use cache::{BindCache, Place, UniformCache};
 pub use counts::GpuIdentityCounts;
@@ -70,7 +69,9 @@ pub use kernel::{
 };
 pub use layout::{Layout, Member, Shared, WgslType};
 pub use poses::GpuPoses;
-pub use rasterizer::{GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput};
+pub use rasterizer::{
+    BlendWeightGradients, GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput,
+};
 pub use reflection::{Access, Reflection};
 pub use renderer::GpuRenderer;
 pub use sort::{Count, RadixSort, Scan, SortArrays};
