@@ -19,6 +19,7 @@
 //! | [`validation`] | checks of WGSL files without a GPU |
 //! | [`error`] | what can go wrong |
 //! | [`view`] | the view, splats, constants: what all stages share |
+//! | [`table`] | the stages, a row each, with their versions and tests |
 //! | [`stages`] | the WGSL files of rendering |
 //! | [`sort`] | prefix sums and radix sorts |
 //! | [`rasterizer`] | the stages in order, in both directions |
@@ -48,6 +49,7 @@ pub mod renderer;
 pub mod sort;
 pub mod speed;
 pub mod stages;
+pub mod table;
 pub mod testing;
 pub mod validation;
 pub mod view;
@@ -78,40 +80,6 @@ pub use sort::{Count, RadixSort, Scan, SortArrays};
 pub use speed::DeviceSpeed;
 pub use view::{Splat, View};
 pub use workgroup::{Form, SubgroupUse};
-
-/// Every WGSL file of this crate, for the test that validates them.
-pub const MODULES: &[&Module] = &[
-    &stages::PROJECT,
-    &stages::PROJECT_PACKED,
-    &stages::PROJECT_TURNED,
-    &stages::SCAN,
-    &stages::SORT,
-    &stages::BIN,
-    &stages::EMIT,
-    &stages::RANGES,
-    &stages::RASTERIZE,
-    &stages::RASTERIZE_COLOR,
-    &stages::DENSE,
-    &stages::COTANGENTS,
-    &stages::RASTERIZE_BACKWARD,
-    &stages::RASTERIZE_BACKWARD_COLOR,
-    &stages::GATHER_GRADIENTS,
-    &stages::IDENTITY_BACKWARD,
-    &stages::PROJECT_BACKWARD,
-    &stages::PROJECT_BACKWARD_TURNED,
-    &blend::BLEND,
-    &blend::BLEND_BACKWARD,
-    &blend::BLEND_BACKWARD_WEIGHTS,
-    &blend::GATHER_VALUES,
-    &blend::GATHER_VALUES_WEIGHTS,
-    &counts::COUNT_LABELS,
-    &counts::GATHER_COUNTS,
-    &poses::POSES,
-    &poses::POSES_BACKWARD,
-    &poses::POSES_SUM,
-    &workgroup::SELF_CHECK,
-    &speed::SPEED,
-];
 
 /// Every structure that Rust and WGSL share.
 pub const LAYOUTS: &[fn() -> Layout] = &[
