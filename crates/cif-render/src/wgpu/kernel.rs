@@ -10,20 +10,12 @@
 //! that are timed on the device where it has timestamps.
 
 use super::buffers::GpuVec;
-use super::device::Gpu;
+use super::device::{CompiledModule, Gpu};
 use super::error::GpuError;
+use super::form::Form;
 use super::layout::Layout;
 use super::reflection::{Access, Reflection};
-use super::workgroup::Form;
-
-/// Text that modules import.
-#[derive(Clone, Copy, Debug)]
-pub struct Snippet {
-    /// Name after `#import`.
-    pub name: &'static str,
-    /// Makes the text.
-    pub text: fn() -> String,
-}
+pub use super::snippet::Snippet;
 
 /// A WGSL file.
 #[derive(Clone, Copy, Debug)]
@@ -136,10 +128,19 @@ impl Kernel {
         if gpu.constants_in_storage() {
             source = source.replace("var<uniform>", "var<storage, read>");
         }
-        gpu.compiled(module.name, source, |source| Self::compile_source(gpu, module, source))
+        let compiled =
+            gpu.compiled(module.name, source, |source| Self::compile_source(gpu, module, source))?;
+        let CompiledModule { layout, bindings, pipelines } = compiled;
+        let kernel = |(entry, pipeline)| Self {
+            label: format!("{}.{entry}", module.name),
+            pipeline,
+            layout: layout.clone(),
+            bindings,
+        };
+        Ok(module.entries.iter().zip(pipelines).map(kernel).collect())
     }
 
-    fn compile_source(gpu: &Gpu, module: &Module, source: &str) -> Result<Vec<Self>, GpuError> {
+    fn compile_source(gpu: &Gpu, module: &Module, source: &str) -> Result<CompiledModule, GpuError> {
         let rejected = |error: String| GpuError::Rejected(format!("{}.wgsl: {error}", module.name));
         let reflection = Reflection::of_source(source).map_err(rejected)?;
         let device = gpu.device();
@@ -174,11 +175,11 @@ impl Kernel {
             bind_group_layouts: &[Some(&layout)],
             immediate_size: 0,
         });
-        let kernels = module
+        let pipelines = module
             .entries
             .iter()
             .map(|entry| {
-                let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
                     label: Some(entry),
                     layout: Some(&pipeline_layout),
                     module: &shader,
@@ -189,18 +190,16 @@ impl Kernel {
                         ..Default::default()
                     },
                     cache: None,
-                });
-                Self {
-                    label: format!("{}.{entry}", module.name),
-                    pipeline,
-                    layout: layout.clone(),
-                    bindings: reflection.bindings.len(),
-                }
+                })
             })
             .collect();
         match pollster::block_on(scope.pop()) {
             Some(error) => Err(rejected(error.to_string())),
-            None => gpu.check().map(|()| kernels),
+            None => gpu.check().map(|()| CompiledModule {
+                layout,
+                bindings: reflection.bindings.len(),
+                pipelines,
+            }),
         }
     }
 

@@ -4,7 +4,9 @@
 //! |---|---|
 //! | [`device`] | which GPU, what it can do, what went wrong on it |
 //! | [`features`] | optional features, and holding them back |
-//! | [`workgroup`] | what invocations do together, through workgroup memory or by subgroups |
+//! | [`form`] | what invocations do together, through workgroup memory or by subgroups |
+//! | [`workgroup`] | the check of subgroups, by which devices are opened |
+//! | [`snippet`] | text that WGSL files import |
 //! | [`kernel`] | kernels from WGSL files, recorded commands, times on the device |
 //! | [`reflection`] | bindings and entry points of WGSL, as naga finds them |
 //! | [`gaussians`], [`identities`] | Gaussians and their gradients, and identities, on the device |
@@ -38,6 +40,7 @@ pub mod device;
 pub mod error;
 pub mod faults;
 pub mod features;
+pub mod form;
 pub mod gaussians;
 pub mod identities;
 pub mod kernel;
@@ -46,6 +49,7 @@ pub mod poses;
 pub mod rasterizer;
 pub mod reflection;
 pub mod renderer;
+pub mod snippet;
 pub mod sort;
 pub mod speed;
 pub mod stages;
@@ -63,6 +67,7 @@ pub use deform::{DeformationGradients, GpuDeformation};
 pub use device::{AdapterFacts, Gpu};
 pub use error::GpuError;
 pub use features::GpuFeatures;
+pub use form::{Form, SubgroupUse};
 pub use gaussians::GpuGaussians;
 pub use identities::{DeviceIdentities, packed_entries};
 pub use kernel::{
@@ -79,7 +84,6 @@ pub use renderer::GpuRenderer;
 pub use sort::{Count, RadixSort, Scan, SortArrays};
 pub use speed::DeviceSpeed;
 pub use view::{Splat, View};
-pub use workgroup::{Form, SubgroupUse};
 
 /// Every structure that Rust and WGSL share.
 pub const LAYOUTS: &[fn() -> Layout] = &[

@@ -8,10 +8,10 @@ use naga::valid::{Capabilities, ModuleInfo, ShaderStages, SubgroupOperationSet, 
 use naga::{AddressSpace, TypeInner};
 
 use super::device::MOST_UNIFORM_BLOCKS;
+use super::form::Form;
 use super::kernel::Module;
 use super::layout::Layout;
 use super::reflection::{Access, Reflection};
-use super::workgroup::Form;
 
 /// Storage buffers of an entry point in the core of WebGPU.
 const MAX_STORAGE_BUFFERS: usize = 8;

@@ -128,7 +128,7 @@ impl Rasterizer {
     }
 
     /// Makes room for gradients of splats and Gaussians.
-    pub(in crate::wgpu) fn reserve_gradients(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
+    pub(crate) fn reserve_gradients(&mut self, gpu: &Gpu) -> Result<(), GpuError> {
         let n = self.view.gaussians as usize;
         self.arrays.splat_gradients.resize(gpu, 3 * n)?;
         self.gradients.gaussians.geometry.resize(gpu, n)?;

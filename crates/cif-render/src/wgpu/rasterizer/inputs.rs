@@ -38,14 +38,14 @@ impl<'a> From<&'a GpuGaussians> for PosedInput<'a> {
 }
 
 impl<'a> PosedInput<'a> {
-    pub(in crate::wgpu) fn coefficients(self) -> Coefficients<'a> {
+    pub(crate) fn coefficients(self) -> Coefficients<'a> {
         self.turns.map_or(Coefficients::Full(self.sh), |turns| Coefficients::Turned(self.sh, turns))
     }
 }
 
 /// Spherical harmonics at the time of a view.
 #[derive(Clone, Copy, Debug)]
-pub(in crate::wgpu) enum Coefficients<'a> {
+pub(crate) enum Coefficients<'a> {
     /// As in [`GpuGaussians::sh`].
     Full(&'a GpuVec<[f32; SH_FLOATS]>),
     /// As [`crate::wgpu::gaussians::packed_sh`] makes them.

@@ -41,7 +41,7 @@ impl Rasterizer {
     ///
     /// # Panics
     /// As [`Self::project`].
-    pub(in crate::wgpu) fn project_rows(
+    pub(crate) fn project_rows(
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
@@ -160,7 +160,7 @@ impl Rasterizer {
     }
 
     /// Records the gradients of the posed Gaussians, from those of their splats.
-    pub(in crate::wgpu) fn project_backward(
+    pub(crate) fn project_backward(
         &mut self,
         gpu: &Gpu,
         commands: &mut Commands<'_>,
