@@ -6,9 +6,9 @@ use cif_field::{Embedding, Field, Gaussians, Identities, RotationEvidence};
 use cif_geometry::RigidTransform;
 use glam::DVec3;
 
-use crate::build::assignment::Identity;
-use crate::build::frames::Frames;
-use crate::build::sigmoid;
+use crate::from_field::assignment::Identity;
+use crate::from_field::frames::Frames;
+use crate::from_field::sigmoid;
 use crate::graph::{
     Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part, PartsMotion,
     SHARES_PER_SPLAT, Splats,
