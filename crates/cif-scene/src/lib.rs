@@ -13,7 +13,6 @@
 //! | [`from_field::camera_tracks`] | recorded cameras as tracks over time |
 //! | [`motion`] | how well standing still and one rigid body fit a group of Gaussians |
 //! | [`motion_scores`] | how well the motion of a graph follows known surface points |
-//! | [`motion::procrustes`] | robust rigid alignment of two point sets |
 //! | [`motion::parts`] | a few rigid parts, found by clustering the paths of Gaussians |
 //! | [`motion::keys`] | fewer samples of a track inside an error bound |
 //! | [`motion::placement`] | where a node's splats are at any time |

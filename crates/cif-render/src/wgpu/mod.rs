@@ -6,6 +6,7 @@
 //! | [`features`] | optional features, and holding them back |
 //! | [`workgroup`] | what invocations do together, through workgroup memory or by subgroups |
 //! | [`kernel`] | kernels from WGSL files, recorded commands, times on the device |
+//! | [`reflection`] | bindings and entry points of WGSL, as naga finds them |
 //! | [`gaussians`], [`identities`] | Gaussians and their gradients, and identities, on the device |
 //! | [`faults`] | what no optimiser may take |
 //! | [`counts`] | label mass of Gaussians |
@@ -42,6 +43,7 @@ pub mod kernel;
 pub mod layout;
 pub mod poses;
 pub mod rasterizer;
+pub mod reflection;
 pub mod renderer;
 pub mod sort;
 pub mod speed;
@@ -52,7 +54,6 @@ pub mod view;
 pub mod workgroup;
 
 pub use ::wgpu::{BindGroup, SubmissionIndex as Submission};
-pub use blend::BlendWeightGradients;
 pub use buffers::{Arriving, GpuVec, PendingWords, Readback, Recorded, Uniform};
 pub use cache::{BindCache, Place, UniformCache};
 pub use counts::GpuIdentityCounts;
@@ -63,12 +64,15 @@ pub use features::GpuFeatures;
 pub use gaussians::GpuGaussians;
 pub use identities::{DeviceIdentities, packed_entries};
 pub use kernel::{
-    Access, Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Stage, Timestamps, constants,
-    structures, workgroups,
+    Commands, Constant, Kernel, MAX_WORKGROUPS, Module, Snippet, Stage, Timestamps, constants, structures,
+    workgroups,
 };
 pub use layout::{Layout, Member, Shared, WgslType};
 pub use poses::GpuPoses;
-pub use rasterizer::{GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput};
+pub use rasterizer::{
+    BlendWeightGradients, GpuStatistics, LabelInput, PosedGradients, PosedInput, Rasterizer, ViewInput,
+};
+pub use reflection::{Access, Reflection};
 pub use renderer::GpuRenderer;
 pub use sort::{Count, RadixSort, Scan, SortArrays};
 pub use speed::DeviceSpeed;

@@ -6,7 +6,7 @@
 use super::buffers::GpuVec;
 use super::device::Gpu;
 use super::error::GpuError;
-use super::kernel::{Access, Commands, Kernel, Module, Snippet};
+use super::kernel::{Commands, Kernel, Module, Snippet};
 
 /// Means by which the invocations of a workgroup cooperate.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -96,7 +96,6 @@ pub const SELF_CHECK: Module = Module {
     name: "self_check",
     text: include_str!("self_check.wgsl"),
     imports: &[],
-    bindings: &[Access::ReadWrite],
     entries: &["self_check"],
 };
 
