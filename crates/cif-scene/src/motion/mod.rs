@@ -20,7 +20,7 @@ use cif_geometry::{RigidTransform, quaternion};
 use glam::{DMat3, DQuat, DVec3};
 
 use crate::PoseSample;
-use crate::build::frames::Frame;
+use crate::from_field::frames::Frame;
 use crate::joint::ToldParts;
 use crate::motion::keys::one_hemisphere;
 use crate::report::{ResidualStatistics, TimeResidual};

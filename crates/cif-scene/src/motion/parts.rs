@@ -16,7 +16,7 @@ use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use nalgebra::Matrix3;
 use rayon::prelude::*;
 
-use crate::build::frames::Frame;
+use crate::from_field::frames::Frame;
 use crate::motion::{trimmed_rms, vector};
 use crate::shape::proxy::systematic;
 use cif_geometry::align::procrustes::weighted_procrustes;

@@ -7,8 +7,8 @@ use cif_geometry::RigidTransform;
 use cif_geometry::scalar::direct_sigmoid;
 use glam::DVec3;
 
-use crate::build::assignment::Identity;
-use crate::build::frames::Frames;
+use crate::from_field::assignment::Identity;
+use crate::from_field::frames::Frames;
 use crate::graph::{
     Appearance, DenseMotion, IdentityShare, IdentityShares, Motion, Node, NodeKind, Part, PartsMotion,
     SHARES_PER_SPLAT, Splats,
