@@ -107,7 +107,8 @@ use crate::optimiser::Optimiser;
 use crate::phase::Phase;
 use crate::phases::Phases;
 use crate::poses::PoseMoments;
-use crate::progress::{Progress, Stages};
+use crate::progress::Progress;
+use crate::schedule::{Facts, Moment, Stages};
 use crate::stage::Stage;
 use crate::state::State;
 use crate::step::StepLoss;
@@ -357,6 +358,30 @@ impl Trainer {
                 self.state.config.frame_memory_mib
             )));
         }
+    }
+
+    /// A step of a stage (from 1), and of all stages, as the schedule sees it.
+    fn moment(&self, stage: Stage, iteration: u32, total: u64) -> Moment<'_> {
+        let state = &self.state;
+        let facts = Facts {
+            stages: self.stages,
+            sees_changes: self.shows_changes,
+            knows_travelling: state.guidance.knows_what_travels() || state.field.tracks.is_some(),
+            owns_identities: state.value_head().is_none(),
+        };
+        Moment { config: &state.config, stage, iteration, total, facts }
+    }
+
+    /// The step that comes next.
+    fn coming(&self) -> Moment<'_> {
+        let Progress { stage, iteration, total_steps, .. } = self.state.progress;
+        self.moment(stage, iteration + 1, total_steps + 1)
+    }
+
+    /// The step that was done last.
+    fn done(&self) -> Moment<'_> {
+        let Progress { stage, iteration, total_steps, .. } = self.state.progress;
+        self.moment(stage, iteration, total_steps)
     }
 
     /// The field as it is now; its record is up to date once a run has returned.

@@ -34,7 +34,7 @@ impl Trainer {
     fn try_step(&mut self, events: &mut Vec<TrainEvent>) -> Result<StepLoss, TrainError> {
         let start = Instant::now();
         let (stage, iteration) = (self.state.progress.stage, self.state.progress.iteration + 1);
-        if self.judges_sh(stage, iteration) {
+        if self.judges_harmonics() {
             self.fetch()?;
             self.judge_sh(stage, iteration, events)?;
         }
@@ -141,23 +141,17 @@ impl Trainer {
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let iteration = self.state.progress.iteration;
-        let mut due = Due::after(
-            &self.state.config,
-            stage,
-            iteration,
-            self.stages.iterations(&self.state.config, stage),
-        );
-        if self.state.value_head().is_some() {
-            // Identity rows are those of the other head.
-            (due.estimates_identities, due.resamples) = (false, false);
-        }
-        let judges = [self.judges_heads(stage, iteration), self.settles(stage, iteration)];
-        if judges.contains(&true) || due.estimates_identities || self.engine.is_far_ahead() {
+        let due = self.done().all();
+        let falls = |what: Due| due.contains(&what);
+        let judges = [Due::JudgeOutputs, Due::TestStill]
+            .map(|judged| self.state.field.deformation.is_some() && falls(judged));
+        if judges.contains(&true) || falls(Due::EstimateIdentities) || self.engine.is_far_ahead() {
             self.fetch()?;
         }
         if self.state.progress.after_step == Some(AfterStep::Changes) {
             self.rearrange_by_head(stage, iteration, events)?;
-            if due.changes_gaussians() {
+            let changes = [Due::Prune, Due::Add, Due::ResetOpacities, Due::EstimateIdentities, Due::Resample];
+            if changes.into_iter().any(falls) {
                 self.change_gaussians(stage, iteration, &due, events)?;
             }
             self.state.progress.after_step = Some(AfterStep::Heads);
@@ -182,7 +176,7 @@ impl Trainer {
         &mut self,
         stage: Stage,
         iteration: u32,
-        due: &Due,
+        due: &[Due],
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         self.receive(true)?;
@@ -191,7 +185,7 @@ impl Trainer {
             Stage::Instance => self.instance_events(iteration, due, events),
             _ => self.densify(stage, iteration, due, events),
         };
-        let resets_opacities = changed.is_ok().then_some(due.resets_opacities);
+        let resets_opacities = changed.is_ok().then_some(due.contains(&Due::ResetOpacities));
         let taken = self.engine.end_changes(&mut self.state, resets_opacities);
         changed.and(taken)
     }
@@ -219,13 +213,13 @@ impl Trainer {
         &mut self,
         stage: Stage,
         iteration: u32,
-        due: &Due,
+        due: &[Due],
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
         let config = self.state.config.densify.clone();
         let extent = self.state.field.extent;
         let (mut cloned, mut split, mut pruned) = (0, 0, 0);
-        if due.prunes {
+        if due.contains(&Due::Prune) {
             let reset = self.state.progress.opacities_were_reset;
             if let Some(change) =
                 prune(&self.state.field.gaussians, &self.state.statistics, &config, extent, reset)
@@ -237,7 +231,7 @@ impl Trainer {
                 self.rearrange(change);
             }
         }
-        if due.adds {
+        if due.contains(&Due::Add) {
             let mut rng = stream(self.state.config.seed, Purpose::Split, self.state.progress.total_steps);
             let change =
                 add_gaussians(&self.state.field.gaussians, &self.state.statistics, &config, extent, &mut rng);
@@ -247,7 +241,7 @@ impl Trainer {
             }
             self.state.statistics = DensifyStatistics::zeros(self.state.field.gaussians.len());
         }
-        if due.resets_opacities {
+        if due.contains(&Due::ResetOpacities) {
             reset_opacities(&mut self.state.field.gaussians, config.opacity_reset_to);
             self.state.optimiser.of(&OPACITY_LOGITS).reset_all();
             self.state.progress.opacities_were_reset = true;
@@ -277,14 +271,14 @@ impl Trainer {
     fn instance_events(
         &mut self,
         iteration: u32,
-        due: &Due,
+        due: &[Due],
         events: &mut Vec<TrainEvent>,
     ) -> Result<(), TrainError> {
-        if due.estimates_identities {
+        if due.contains(&Due::EstimateIdentities) {
             let event = self.estimate_identities(false)?;
             events.push(event);
         }
-        if !due.resamples {
+        if !due.contains(&Due::Resample) {
             return Ok(());
         }
         let context = ResampleContext {
