@@ -236,7 +236,7 @@ impl Moment<'_> {
     }
 
     /// True of the stages that learn colours alone.
-    fn is_of_colors(&self) -> bool {
+    pub(crate) fn is_of_colors(&self) -> bool {
         matches!(self.stage, Stage::Coarse | Stage::Fine)
     }
 

@@ -93,7 +93,8 @@ use self::saving::Saving;
 use crate::clock::{Clock, Seconds};
 use crate::config::{HeadName, TrainConfig};
 use crate::curve::Curve;
-use crate::densify::DensifyStatistics;
+use crate::density::adaptive::Adaptive;
+use crate::density::{DensifyStatistics, Strategy};
 use crate::engine::Engine;
 use crate::engine::processor::Processor;
 use crate::error::TrainError;
@@ -159,6 +160,8 @@ fn switch_note(dataset: &Dataset, switched: &BTreeMap<usize, BTreeMap<u16, u16>>
 /// Trains one field on one capture.
 pub struct Trainer {
     state: State,
+    /// Adds and removes Gaussians.
+    density: Arc<dyn Strategy>,
     /// Computes the steps.
     engine: Box<dyn Engine>,
     /// Vector instructions of the processor.
@@ -276,6 +279,7 @@ impl Trainer {
         let simd = SimdLevel::Auto;
         Ok(Self {
             stages: Stages { is_dynamic: config.effects.motion && dataset.times.len() > 1, has_instances },
+            density: Arc::new(Adaptive),
             engine: Box::new(Processor::new(simd)),
             simd,
             order: None,
@@ -452,6 +456,12 @@ impl Trainer {
     pub fn set_head(&mut self, head: Arc<dyn Head>) -> Result<(), TrainError> {
         self.state.head = head;
         self.restore_head()
+    }
+
+    /// Adds and removes Gaussians by other rules than [`Adaptive`]. They are not saved with the run: one that is resumed
+    /// is to be given them again.
+    pub fn set_density(&mut self, strategy: Arc<dyn Strategy>) {
+        self.density = strategy;
     }
 
     /// Reads time from another clock; times of the run and its curve follow it.

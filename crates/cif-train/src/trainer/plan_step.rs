@@ -63,8 +63,8 @@ impl Trainer {
     pub(super) fn plan_step(&mut self, stage: Stage, iteration: u32) -> Result<StepPlan, TrainError> {
         let batch = self.state.config.stages.batch;
         let at = self.moment(stage, iteration, self.state.progress.total_steps + 1);
-        let [holds_out, counts_statistics, renormalises] =
-            [Due::HoldOut, Due::CountStatistics, Due::Renormalise].map(|due| at.has(due));
+        let [holds_out, renormalises] = [Due::HoldOut, Due::Renormalise].map(|due| at.has(due));
+        let counts_statistics = at.is_of_colors() && self.density.counts_statistics(&at);
         let mut views = Vec::with_capacity(batch as usize);
         for k in 0..batch {
             let view = self.view_at(stage, u64::from(iteration - 1) * u64::from(batch) + u64::from(k));

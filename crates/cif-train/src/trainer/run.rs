@@ -8,7 +8,7 @@ use super::known::KnownObjects;
 use super::saving::Saving;
 use super::{Trainer, TrainerView, initialize, provenance};
 use crate::curve::MIN_GAP;
-use crate::densify::DensifyStatistics;
+use crate::density::DensifyStatistics;
 use crate::engine::Changed;
 use crate::error::TrainError;
 use crate::events::{Control, Outcome, TrainEvent};

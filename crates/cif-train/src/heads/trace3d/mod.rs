@@ -33,7 +33,7 @@ use self::contrast::{CODE, contrast};
 use super::tensors::{per_gaussian, shared};
 use super::{Head, HeadLoss, HeadTensors, HeadValues, HeadView, Pass, Phase, TrainingViews, ValueHead};
 use crate::config::{HeadName, TrainConfig};
-use crate::densify::{Rearrangement, keep, with_copies};
+use crate::density::{Rearrangement, keep, with_copies};
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
 
