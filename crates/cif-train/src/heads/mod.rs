@@ -51,7 +51,7 @@ pub use self::views::TrainingViews;
 pub use self::vlgs::Vlgs;
 use crate::adam::EPSILON;
 use crate::config::{HeadConfig, HeadName, TrainConfig};
-use crate::densify::Rearrangement;
+use crate::density::Rearrangement;
 use crate::error::TrainError;
 
 /// The head that settings name.

@@ -32,7 +32,7 @@ use self::contrast::{CODE, contrast};
 use super::tensors::{per_gaussian, shared};
 use super::{HeadLoss, HeadTensors, HeadView, Phase, TrainingViews, ValueHead};
 use crate::config::HeadName;
-use crate::densify::{Rearrangement, keep, with_copies};
+use crate::density::{Rearrangement, keep, with_copies};
 use crate::error::TrainError;
 use crate::random::{Purpose, stream};
 
