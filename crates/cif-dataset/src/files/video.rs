@@ -110,7 +110,7 @@ fn frames_with(
         return Err(failed("it holds no frame"));
     }
     let folder = cache.join(&name);
-    scratch.replace(&[(partial, folder.clone())], None).map_err(Error::write(&folder))?;
+    scratch.replace(&[(partial, folder.clone())], &[]).map_err(Error::write(&folder))?;
     numbered(&folder)
 }
 
