@@ -121,11 +121,11 @@ impl Unfinished {
         }
         let mut builder = tempfile::Builder::new();
         builder.prefix(PREFIX).rand_bytes(12);
-        // Temporary files are private by default; the result should have the usual permissions.
-        #[cfg(unix)]
-        builder.permissions(std::os::unix::fs::PermissionsExt::from_mode(0o666));
+        // Temporary files are private by default; the result should have the usual permissions. Errors are those of the
+        // system, for the temporary name says nothing to anybody.
+        let create = |path: &Path| OpenOptions::new().read(true).write(true).create_new(true).open(path);
         loop {
-            let (file, path) = builder.tempfile_in(folder)?.keep().map_err(|error| error.error)?;
+            let (file, path) = builder.make_in(folder, create)?.keep().map_err(|error| error.error)?;
             // Another process may have taken it for a dead one's before it was locked, and removes it. Where the file
             // system has no locks nobody can, and nobody does.
             let taken = matches!(file.try_lock(), Err(fs::TryLockError::WouldBlock));
