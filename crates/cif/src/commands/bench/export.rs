@@ -9,7 +9,7 @@ use cif_scene::{SceneFormat, SceneOptions, Tolerance};
 use clap::Args;
 
 use crate::commands::shared::model_options::ModelOptions;
-use crate::commands::{shared::motion_table, shared::scene};
+use crate::commands::shared::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::FORMATS;
 use crate::messages::note;

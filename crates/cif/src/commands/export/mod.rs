@@ -14,7 +14,7 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::shared::model_options::ModelOptions;
-use super::{shared::motion_table, shared::scene};
+use super::shared::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::FORMATS;
 use crate::ground_truth::{self, MotionError};
