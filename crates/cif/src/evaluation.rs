@@ -10,7 +10,7 @@ use cif_train::metrics::{Evaluation, Scores};
 use serde::Serialize;
 use serde_json::{Value, json};
 
-pub use crate::commands::scene::load_with_head;
+pub use crate::commands::shared::scene::load_with_head;
 use crate::error::Error;
 
 /// Measured motion of a scene.

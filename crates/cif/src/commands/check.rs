@@ -10,7 +10,7 @@ use cif_render::cpu::{IdentityCounts, Renderer, SimdLevel};
 use clap::Args;
 use serde_json::{Value, json};
 
-use super::scene;
+use super::shared::scene;
 use crate::endings;
 use crate::error::Error;
 use crate::output::Outputs;

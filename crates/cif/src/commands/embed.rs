@@ -13,7 +13,7 @@ use cif_vision::{Models, library};
 use clap::Args;
 use serde_json::json;
 
-use super::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, scene};
+use super::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, shared::scene};
 use crate::error::Error;
 use crate::formats;
 use crate::instance_views::{Coverage, cut_out};

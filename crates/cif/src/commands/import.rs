@@ -7,7 +7,7 @@ use clap::Args;
 use serde_json::json;
 
 use super::diff::{cameras, print_objects};
-use super::scene;
+use super::shared::scene;
 use crate::endings;
 use crate::error::Error;
 use crate::formats;

@@ -1,43 +1,24 @@
-//! The subcommands, one file each.
+//! The subcommands, a file or a folder each; `shared` holds what several of them use.
 
-mod asked;
 mod bench;
-mod bench_accuracy;
-mod bench_compare;
-mod bench_export;
-mod bench_hardness;
 mod capture;
 mod check;
 mod completions;
 mod diff;
 mod embed;
 mod eval;
-mod eval_motion;
 mod export;
-mod export_check;
 mod import;
 mod info;
-#[cfg(feature = "wgpu")]
-mod info_gpu;
 mod label;
 mod make;
 mod man;
 mod masks;
-mod model_options;
-mod motion_table;
-mod object_motion;
-mod painter;
 mod plan;
-mod preset;
 mod query;
 mod render;
-mod render_files;
-pub(crate) mod scene;
-mod targets;
+pub(crate) mod shared;
 mod train;
-mod train_budget;
-mod train_report;
-mod trajectories;
 
 use cif_render::cpu::SimdLevel;
 use clap::builder::{EnumValueParser, TypedValueParser};
@@ -322,7 +303,7 @@ impl CaptureOptions {
         Self {
             masks: None,
             no_masks: true,
-            downscale: downscale.or(scene::trained_downscale(field)),
+            downscale: downscale.or(shared::scene::trained_downscale(field)),
             center_principal_point: false,
             layout,
             frames: frames.clone(),

@@ -6,7 +6,7 @@ use std::path::Path;
 use cif_scene::{ObjectQuery, ReadOptions, SceneGraph, SceneOptions, Trajectory, trajectories};
 
 use super::Query;
-use crate::commands::scene;
+use crate::commands::shared::scene;
 use crate::error::Error;
 use crate::formats::{self, Content};
 use crate::messages::outcome;

@@ -10,7 +10,7 @@ use cif_masks::Keyframe;
 use cif_train::Stop;
 use glam::DVec3;
 
-use crate::commands::scene;
+use crate::commands::shared::scene;
 use crate::error::Error;
 use crate::{interrupt, messages, starting_points};
 

@@ -35,7 +35,7 @@ const AXES: [(DVec3, [u8; 3]); 3] =
 
 /// Paths of the centres of all objects.
 #[derive(Debug)]
-pub(super) struct Trajectories<'a> {
+pub(in crate::commands) struct Trajectories<'a> {
     field: &'a Field,
     /// Normalised times, ascending.
     times: Vec<f64>,
@@ -54,7 +54,7 @@ struct Object {
 
 impl<'a> Trajectories<'a> {
     /// Follows the objects of a field through its captured times.
-    pub(super) fn new(field: &'a Field, simd: SimdLevel) -> Self {
+    pub(in crate::commands) fn new(field: &'a Field, simd: SimdLevel) -> Self {
         let captured = &field.timeline.times;
         let count = captured.len().min(MOST_TIMES);
         let times: Vec<f64> =
@@ -79,7 +79,7 @@ impl<'a> Trajectories<'a> {
     }
 
     /// Lines over the view of a camera at a time.
-    pub(super) fn lines(&self, camera: &PinholeCamera, time: f64) -> Vec<Polyline> {
+    pub(in crate::commands) fn lines(&self, camera: &PinholeCamera, time: f64) -> Vec<Polyline> {
         let pixels = |(share, least): (f64, f64)| (share * f64::from(camera.height)).max(least);
         let (width, at_rest) = (pixels(WIDTH), pixels(AT_REST));
         let mut lines = Vec::new();

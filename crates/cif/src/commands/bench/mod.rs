@@ -1,6 +1,11 @@
 //! `cif bench`: what a training step costs, and where; what accuracy costs, of scenes and of exported motion; how
 //! hard captures fare; how the method compares.
 
+mod accuracy;
+mod compare;
+mod export;
+mod hardness;
+
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -18,7 +23,7 @@ use cif_train::{InstancePass, Stage, StepTimes, Stop, TrainConfig, Trainer};
 use clap::{Args, Subcommand, ValueEnum};
 use serde_json::{Map, Value, json};
 
-use super::{CaptureOptions, Simd, print_warnings, scene, train};
+use super::{CaptureOptions, Simd, print_warnings, shared::scene, train};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::report::Report as JsonReport;
@@ -36,10 +41,10 @@ pub(super) struct Bench {
 #[derive(Debug, Subcommand)]
 enum What {
     Step(Step),
-    Export(super::bench_export::BenchExport),
-    Hardness(super::bench_hardness::BenchHardness),
-    Accuracy(super::bench_accuracy::BenchAccuracy),
-    Compare(super::bench_compare::BenchCompare),
+    Export(export::BenchExport),
+    Hardness(hardness::BenchHardness),
+    Accuracy(accuracy::BenchAccuracy),
+    Compare(compare::BenchCompare),
 }
 
 /// Show where the time of a training step goes
@@ -121,10 +126,10 @@ impl From<StageName> for Stage {
 pub(super) fn run(command: &Bench) -> Result<(), Error> {
     match &command.what {
         What::Step(command) => step(command),
-        What::Export(command) => super::bench_export::run(command),
-        What::Hardness(command) => super::bench_hardness::run(command),
-        What::Accuracy(command) => super::bench_accuracy::run(command),
-        What::Compare(command) => super::bench_compare::run(command),
+        What::Export(command) => export::run(command),
+        What::Hardness(command) => hardness::run(command),
+        What::Accuracy(command) => accuracy::run(command),
+        What::Compare(command) => compare::run(command),
     }
 }
 

@@ -24,8 +24,8 @@ use cif_train::{Preset, Stop, SystemClock, TrainConfig, Trainer};
 use clap::Args;
 use serde_json::json;
 
-use super::trajectories::Trajectories;
-use super::{CaptureOptions, eval_motion, print_warnings, train};
+use crate::commands::shared::trajectories::Trajectories;
+use crate::commands::{CaptureOptions, eval::motion, print_warnings, train};
 use crate::error::Error;
 use crate::lock::Lock;
 use crate::pictures::{Picture, instance_picture, rgb_picture};
@@ -566,10 +566,10 @@ impl Bench {
         };
         let mut motion = report::Motion::default();
         if let Some(truth) = self.dataset.motion_truth().map_err(Error::plain)?
-            && let Some(measured) = eval_motion::measure(&field, &self.dataset, &truth)?
+            && let Some(measured) = motion::measure(&field, &self.dataset, &truth)?
         {
             motion.scores = json!(measured);
-            motion.headings = eval_motion::HEADINGS.to_vec();
+            motion.headings = motion::HEADINGS.to_vec();
             motion.rows = measured.rows();
         }
         if let (Some(shown), Some((image, _))) =

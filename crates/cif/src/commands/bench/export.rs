@@ -8,8 +8,8 @@ use cif_scene::report::ReportRow;
 use cif_scene::{SceneFormat, SceneOptions, Tolerance};
 use clap::Args;
 
-use super::model_options::ModelOptions;
-use super::{motion_table, scene};
+use crate::commands::shared::model_options::ModelOptions;
+use crate::commands::shared::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::FORMATS;
 use crate::messages::note;
@@ -94,7 +94,8 @@ fn name_of(tolerance: Tolerance) -> String {
 }
 
 fn print_ladder(rungs: &[Rung]) {
-    let mut table = super::table(["tolerance", "format", "object"].into_iter().chain(motion_table::HEADINGS));
+    let mut table =
+        crate::commands::table(["tolerance", "format", "object"].into_iter().chain(motion_table::HEADINGS));
     for rung in rungs {
         let others =
             rung.files.iter().filter_map(|file| Some((file.format, &file.simplified.as_ref()?.nodes)));
@@ -111,7 +112,7 @@ fn print_ladder(rungs: &[Rung]) {
         }
     }
     println!("{table}\n");
-    let mut table = super::table([
+    let mut table = crate::commands::table([
         "tolerance",
         "static",
         "rigid",

@@ -20,7 +20,7 @@ use cif_train::metrics::mask_ids;
 
 use super::Capture;
 use super::runs::{Bench, id, labels};
-use crate::commands::scene;
+use crate::commands::shared::scene;
 use crate::error::Error;
 use crate::interrupt;
 use crate::pictures::{Picture, rgb_picture, side_by_side};

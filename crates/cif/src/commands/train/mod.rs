@@ -1,5 +1,8 @@
 //! `cif train`: from a capture to a scene.
 
+mod budget;
+mod report;
+
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -13,14 +16,14 @@ use cif_train::{
 use clap::builder::PossibleValue;
 use clap::{Args, ValueEnum};
 
-use super::train_budget::{Goals, Timing};
-use super::{CaptureOptions, Simd, command_line, print_warnings, scene};
+use super::{CaptureOptions, Simd, command_line, print_warnings, shared::scene};
 use crate::destination::{Destination, Existing};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::progress::Progress;
 use crate::settings::Layers;
 use crate::{endings, interrupt, starting_points, training};
+use budget::{Goals, Timing};
 
 /// Train a scene on a capture
 #[derive(Debug, Args)]
@@ -363,7 +366,7 @@ pub(super) fn run(command: &Train) -> Result<(), Error> {
             crate::messages::outcome!("stopped; saved {saved}; {help}");
         }
     }
-    super::train_report::give(&command.report, &command.output, outcome)?;
+    report::give(&command.report, &command.output, outcome)?;
     logged
 }
 

@@ -7,7 +7,7 @@ use cif_render::RenderSettings;
 use cif_scene::CaptureFrame;
 use cif_train::heads::Decoder;
 
-use super::query::code_at;
+use crate::commands::query::code_at;
 use crate::error::Error;
 use crate::messages::note;
 use crate::moment::{Frames, Moment, note_fraction};
@@ -16,7 +16,7 @@ use crate::moment::{Frames, Moment, note_fraction};
 ///
 /// # Errors
 /// When it is missing, truncated or not a scene.
-pub(super) fn load(path: &Path) -> Result<Field, Error> {
+pub(in crate::commands) fn load(path: &Path) -> Result<Field, Error> {
     refuse_folder(path)?;
     Field::load(path).map_err(Error::plain)
 }
@@ -47,7 +47,7 @@ pub fn load_with_head(path: &Path) -> Result<(Field, Option<Decoder>), Error> {
 }
 
 /// The settings that a scene is to be rendered with: those of its training.
-pub(super) fn render_settings(field: &Field) -> RenderSettings {
+pub(in crate::commands) fn render_settings(field: &Field) -> RenderSettings {
     cif_train::metrics::trained_settings(field)
 }
 
@@ -55,13 +55,13 @@ pub(super) fn render_settings(field: &Field) -> RenderSettings {
 ///
 /// # Errors
 /// When what the scene records of it is no frame.
-pub(super) fn frame(field: &Field) -> Result<CaptureFrame, Error> {
+pub(in crate::commands) fn frame(field: &Field) -> Result<CaptureFrame, Error> {
     cif_scene::frame_of(field).map_err(Error::plain)
 }
 
 /// Says where a scene lies in the world of its capture, where that is not at its origin; `notes` tell of formats
 /// whose files do not place it.
-pub(super) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &'static str>) {
+pub(in crate::commands) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &'static str>) {
     if frame.is_identity() {
         return;
     }
@@ -77,7 +77,7 @@ pub(super) fn note_frame(frame: &CaptureFrame, notes: impl IntoIterator<Item = &
 }
 
 /// Image reduction that a scene was trained with.
-pub(super) fn trained_downscale(field: &Field) -> Option<u32> {
+pub(in crate::commands) fn trained_downscale(field: &Field) -> Option<u32> {
     cif_train::metrics::training_config(field)?.downscale
 }
 
@@ -85,7 +85,12 @@ pub(super) fn trained_downscale(field: &Field) -> Option<u32> {
 ///
 /// # Errors
 /// When the scene does not have it.
-pub(super) fn time(field: &Field, place: &str, flag: &str, moment: Moment) -> Result<f64, Error> {
+pub(in crate::commands) fn time(
+    field: &Field,
+    place: &str,
+    flag: &str,
+    moment: Moment,
+) -> Result<f64, Error> {
     note_fraction(flag, moment);
     let times = &field.timeline.times;
     let code = Frames::of(field, place).code(flag, moment)?;

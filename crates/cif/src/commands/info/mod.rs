@@ -1,5 +1,8 @@
 //! `cif info`: what is in a capture or a scene, and what GPUs there are.
 
+#[cfg(feature = "wgpu")]
+mod gpu;
+
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
@@ -14,8 +17,8 @@ use glam::DVec3;
 use serde::Deserialize;
 use serde_json::{Value, json};
 
-use super::object_motion::ObjectMotion;
-use super::{CaptureOptions, scene};
+use super::shared::object_motion::ObjectMotion;
+use super::{CaptureOptions, shared::scene};
 use crate::error::Error;
 use crate::formats;
 use crate::report::OnlyReport;
@@ -43,7 +46,7 @@ pub(super) fn run(command: &Info) -> Result<(), Error> {
     #[cfg(feature = "wgpu")]
     if command.gpu {
         command.report.check([])?;
-        return super::info_gpu::run(&command.report);
+        return gpu::run(&command.report);
     }
     let Some(path) = &command.path else {
         return Err(Error::usage("nothing to tell of", "name a capture or a scene"));

@@ -5,7 +5,7 @@ use std::path::Path;
 use cif_train::Outcome;
 use serde_json::json;
 
-use super::scene;
+use crate::commands::shared::scene;
 use crate::error::Error;
 use crate::report::Report;
 

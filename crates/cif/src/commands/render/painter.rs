@@ -13,7 +13,7 @@ use cif_render::wgpu::{Gpu, GpuError, GpuRenderer};
 use cif_render::{Channels, RenderSettings};
 
 #[cfg(feature = "wgpu")]
-use super::backend::Backend;
+use crate::backend::Backend;
 #[cfg(feature = "wgpu")]
 use crate::error::Error;
 

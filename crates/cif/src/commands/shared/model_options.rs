@@ -8,7 +8,7 @@ use clap::{Args, ValueEnum};
 /// Simplification of motion, and physics for simulators.
 #[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Motion and colliders")]
-pub(super) struct ModelOptions {
+pub(in crate::commands) struct ModelOptions {
     /// Most expensive motion that may be chosen; what it loses is told
     #[arg(long, default_value = "dense", value_name = "MODEL")]
     motion: Motion,
@@ -38,7 +38,12 @@ enum Motion {
 impl ModelOptions {
     /// Options of the scene graph of a field with these.
     /// `hulls` is what is preferred where nobody says how many.
-    pub(super) fn apply(&self, field: &Field, hulls: Option<u16>, options: SceneOptions) -> SceneOptions {
+    pub(in crate::commands) fn apply(
+        &self,
+        field: &Field,
+        hulls: Option<u16>,
+        options: SceneOptions,
+    ) -> SceneOptions {
         let has_physics = training_config(field).is_none_or(|config| config.effects.physics);
         SceneOptions {
             most_expensive_motion: match self.motion {

@@ -1,5 +1,9 @@
 //! `cif export`: a scene as USD, glTF and PLY.
 
+mod check;
+mod preset;
+mod targets;
+
 use std::path::PathBuf;
 
 use cif_dataset::MotionTruth;
@@ -9,11 +13,8 @@ use clap::{ArgGroup, Args};
 use serde::Serialize;
 use serde_json::json;
 
-use super::export_check::{Check, Finding};
-use super::model_options::ModelOptions;
-use super::preset::{Preferred, Preset};
-use super::targets::{FILES, Targets, Writing};
-use super::{motion_table, scene};
+use super::shared::model_options::ModelOptions;
+use super::shared::{motion_table, scene};
 use crate::error::Error;
 use crate::formats::{self, FORMATS};
 use crate::ground_truth::{self, MotionError};
@@ -22,6 +23,9 @@ use crate::messages::note;
 use crate::moment::Frames;
 use crate::output::Outputs;
 use crate::report::Report;
+use check::{Check, Finding};
+use preset::{Preferred, Preset};
+use targets::{FILES, Targets, Writing};
 
 /// Export a scene as USD, glTF or PLY, one prim or node per object
 #[derive(Debug, Args)]

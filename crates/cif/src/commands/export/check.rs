@@ -13,11 +13,11 @@ use cif_train::metrics::round_trip::{HeldOutLoss, Likeness, SharedView, held_out
 use clap::Args;
 use serde_json::{Value, json};
 
-use super::eval::number;
 use super::preset::Preferred;
-use super::query::code_at;
 use super::targets::{Target, Targets, Writing};
-use super::{CaptureOptions, print_misfits, print_warnings, scene};
+use crate::commands::eval::number;
+use crate::commands::query::code_at;
+use crate::commands::{CaptureOptions, print_misfits, print_warnings, shared::scene};
 use crate::error::Error;
 use crate::output::Outputs;
 use crate::{formats, interrupt};
@@ -349,7 +349,7 @@ impl Finding {
 
 fn print_likeness(found: &Likeness, field: &Field) {
     println!("against pictures of the scene, {} views of its cameras:", found.views);
-    let mut table = super::table(["object", "PSNR, dB", "IoU"]);
+    let mut table = crate::commands::table(["object", "PSNR, dB", "IoU"]);
     table.add_row(["all, mean".to_owned(), decibels(found.psnr), number(found.miou, 2)]);
     for object in &found.objects {
         table.add_row([label(field, object.id), decibels(object.psnr), number(object.iou, 2)]);
@@ -359,8 +359,15 @@ fn print_likeness(found: &Likeness, field: &Field) {
 
 fn print_held_out(found: &HeldOutLoss, field: &Field) {
     println!("against {} held-out images:", found.field.frames);
-    let mut table =
-        super::table(["object", "PSNR of scene", "of file", "lost, dB", "IoU of scene", "of file", "lost"]);
+    let mut table = crate::commands::table([
+        "object",
+        "PSNR of scene",
+        "of file",
+        "lost, dB",
+        "IoU of scene",
+        "of file",
+        "lost",
+    ]);
     let mut row = |name: String, psnr: [Option<f64>; 2], iou: [Option<f64>; 2]| {
         let [psnr, iou] =
             [psnr, iou].map(|pair| [number(pair[0], 2), number(pair[1], 2), number(lost(pair), 2)]);

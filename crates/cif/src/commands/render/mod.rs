@@ -1,5 +1,8 @@
 //! `cif render`: pictures of a scene from captured or new views.
 
+mod files;
+mod painter;
+
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
@@ -18,12 +21,8 @@ use cif_train::{Clock, SystemClock};
 use clap::{ArgGroup, Args, ValueEnum};
 
 use super::eval::SplitName;
-use super::painter::Painter;
-#[cfg(feature = "wgpu")]
-use super::painter::Sample;
-use super::render_files::ViewFiles;
-use super::trajectories::Trajectories;
-use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
+use super::shared::trajectories::Trajectories;
+use super::{CaptureOptions, Simd, print_misfits, print_warnings, shared::scene};
 use crate::camera_file::{self, FORMAT_HELP, View};
 use crate::error::Error;
 use crate::messages::outcome;
@@ -31,6 +30,10 @@ use crate::moment::Moment;
 use crate::output::Outputs;
 use crate::report::Report;
 use crate::{endings, interrupt, output};
+use files::ViewFiles;
+use painter::Painter;
+#[cfg(feature = "wgpu")]
+use painter::Sample;
 
 /// Render a scene from captured or new views
 #[derive(Debug, Args)]

@@ -9,7 +9,7 @@ use cif_train::{Stop, TrainConfig};
 use clap::Args;
 use serde_json::json;
 
-use super::{CaptureOptions, print_warnings, train};
+use crate::commands::{CaptureOptions, print_warnings, train};
 use crate::error::Error;
 use crate::report::Report;
 use crate::settings::Layers;
@@ -184,7 +184,7 @@ fn tell(row: &Row) {
 }
 
 fn write_report(command: &BenchHardness, config: &TrainConfig, rows: &[Row]) -> Result<(), Error> {
-    let mut table = super::table([
+    let mut table = crate::commands::table([
         "variant",
         "verdict",
         "PSNR",

@@ -10,7 +10,7 @@ use serde::{Deserialize, Serialize};
 /// Motion of an object.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "model", rename_all = "lowercase")]
-pub(super) enum ObjectMotion {
+pub(in crate::commands) enum ObjectMotion {
     /// Nothing moves it.
     Static,
     /// It moves as one body, by poses over time.
@@ -36,7 +36,7 @@ pub(super) enum ObjectMotion {
 
 /// A part on a joint.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct JointMotion {
+pub(in crate::commands) struct JointMotion {
     joint: JointKind,
     /// Unit direction, world.
     axis: [f64; 3],
@@ -50,7 +50,7 @@ pub(super) struct JointMotion {
 impl ObjectMotion {
     /// Motion of the Gaussians `rows` of a field: that of the recorded motion which most of them follow, else that of
     /// the deformation.
-    pub(super) fn of(field: &Field, rows: &[u32]) -> Self {
+    pub(in crate::commands) fn of(field: &Field, rows: &[u32]) -> Self {
         let joints = joints(field, rows);
         if !joints.is_empty() {
             return Self::Parts { joints };
@@ -124,7 +124,7 @@ fn joints(field: &Field, rows: &[u32]) -> Vec<JointMotion> {
 }
 
 /// The group that more than half of the rows belong to.
-pub(super) fn followed<'a>(field: &'a Field, rows: &[u32]) -> Option<&'a TrackGroup> {
+pub(in crate::commands) fn followed<'a>(field: &'a Field, rows: &[u32]) -> Option<&'a TrackGroup> {
     let groups = &field.tracks.as_ref()?.groups;
     let in_group = |group: &&TrackGroup| {
         let own = rows.iter().filter(|row| group_of(field, **row).is_some_and(|of| std::ptr::eq(of, *group)));

@@ -3,11 +3,11 @@
 use cif_scene::report::ReportRow;
 
 /// Headings of [`cells`].
-pub(super) const HEADINGS: [&str; 10] =
+pub(in crate::commands) const HEADINGS: [&str; 10] =
     ["motion", "parts", "size", "allowed", "error RMS", "decisive", "max", "samples", "KB", "seconds"];
 
 /// Motion of a node: distances in world units, kilobytes of the sampled values, seconds of fitting.
-pub(super) fn cells(row: &ReportRow) -> [String; 10] {
+pub(in crate::commands) fn cells(row: &ReportRow) -> [String; 10] {
     let motion = &row.motion;
     [
         motion.model.to_string(),

@@ -13,7 +13,7 @@ use clap::Args;
 use glam::{DMat3, DQuat, DVec3};
 use serde_json::json;
 
-use super::scene;
+use super::shared::scene;
 use crate::error::Error;
 use crate::formats::Content;
 use crate::moment::{Frames, Interval, Moment, note_fraction};

@@ -25,13 +25,17 @@ const CACHE: &str = ".cif-cache";
 ///
 /// # Errors
 /// When the folder or a file that it names is not there.
-pub(super) fn models(folder: &Path, capture: &Path, cache: Option<PathBuf>) -> Result<Detector, Error> {
+pub(in crate::commands) fn models(
+    folder: &Path,
+    capture: &Path,
+    cache: Option<PathBuf>,
+) -> Result<Detector, Error> {
     let cache = cache.unwrap_or_else(|| capture.join(CACHE));
     Ok(Detector::Models(Box::new(Models::open(folder)?), cache))
 }
 
 /// A scene and the capture whose frames are asked.
-pub(super) struct AskedScene<'a> {
+pub(in crate::commands) struct AskedScene<'a> {
     field: &'a Field,
     dataset: &'a Dataset,
     settings: RenderSettings,
@@ -40,13 +44,13 @@ pub(super) struct AskedScene<'a> {
 
 impl<'a> AskedScene<'a> {
     /// A scene with identity rows, rendered as it was trained.
-    pub(super) fn new(field: &'a Field, dataset: &'a Dataset) -> Self {
+    pub(in crate::commands) fn new(field: &'a Field, dataset: &'a Dataset) -> Self {
         let settings = scene::render_settings(field);
         Self { field, dataset, settings, renderer: Renderer::new(SimdLevel::Auto) }
     }
 
     /// Asks a detector about captured frames.
-    pub(super) fn detect(
+    pub(in crate::commands) fn detect(
         &self,
         detector: &Detector,
         prompt: &str,
@@ -57,20 +61,29 @@ impl<'a> AskedScene<'a> {
     }
 
     /// Instances that lie inside the masks of training frames.
-    pub(super) fn reproject(&mut self, masks: &FoundMasks, selection: Selection) -> Result<Found, Error> {
+    pub(in crate::commands) fn reproject(
+        &mut self,
+        masks: &FoundMasks,
+        selection: Selection,
+    ) -> Result<Found, Error> {
         let Self { field, dataset, settings, renderer } = self;
         mask_query::find(field, dataset, masks, selection, renderer, settings, interrupt::go_on)
     }
 
     /// What [`Self::reproject`] found in the view of a frame, where the foreground is at least `gate`.
-    pub(super) fn reprojected(&mut self, found: &Found, gate: f32, frame: usize) -> PixelGrid<bool> {
+    pub(in crate::commands) fn reprojected(
+        &mut self,
+        found: &Found,
+        gate: f32,
+        frame: usize,
+    ) -> PixelGrid<bool> {
         let Self { field, dataset, settings, renderer } = self;
         let frame = &dataset.frames[frame];
         mask_query::render(field, &found.rows, gate, &frame.camera, frame.time, renderer, settings)
     }
 
     /// Instances that lie inside the mask of the first held-out view as it is rendered, and the boxes there.
-    pub(super) fn group(
+    pub(in crate::commands) fn group(
         &mut self,
         detector: &Detector,
         prompt: &str,
@@ -88,7 +101,7 @@ impl<'a> AskedScene<'a> {
     }
 
     /// What [`Self::group`] found in the view of a frame.
-    pub(super) fn grouped(&mut self, found: &Found, frame: usize) -> PixelGrid<bool> {
+    pub(in crate::commands) fn grouped(&mut self, found: &Found, frame: usize) -> PixelGrid<bool> {
         let Self { field, dataset, settings, renderer } = self;
         let frame = &dataset.frames[frame];
         grouping::render(field, &found.votes, &frame.camera, frame.time, renderer, settings)

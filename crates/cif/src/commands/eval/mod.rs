@@ -1,5 +1,7 @@
 //! `cif eval`: scores a scene on the held-out frames of a capture.
 
+pub(super) mod motion;
+
 use std::path::PathBuf;
 
 use cif_dataset::Split;
@@ -8,8 +10,7 @@ use cif_train::heads::Decoder;
 use cif_train::metrics::{Evaluation, EvaluationError, EvaluationOptions, FrameView, evaluate};
 use clap::{Args, ValueEnum};
 
-use super::eval_motion;
-use super::{CaptureOptions, Simd, print_misfits, print_warnings, scene};
+use super::{CaptureOptions, Simd, print_misfits, print_warnings, shared::scene};
 use crate::error::Error;
 use crate::evaluation::{label_of, report_of};
 use crate::messages::outcome;
@@ -127,7 +128,7 @@ pub(super) fn run(command: &Eval) -> Result<(), Error> {
         }
     })?;
     let motion = match &truth {
-        Some(truth) => eval_motion::measure(&field, &dataset, truth)?,
+        Some(truth) => motion::measure(&field, &dataset, truth)?,
         None => None,
     };
     let labels_by = decoder.as_ref().map(Decoder::name);

@@ -4,7 +4,7 @@ use cif_dataset::{Dataset, MotionTruth};
 use cif_field::Field;
 use cif_scene::motion_scores::MotionErrors;
 
-use super::eval::number;
+use super::number;
 use crate::error::Error;
 use crate::evaluation::{Motion, motion_of};
 
@@ -12,7 +12,7 @@ use crate::evaluation::{Motion, motion_of};
 ///
 /// # Errors
 /// When a mask cannot be decoded, or the field is inconsistent.
-pub(super) fn measure(
+pub(in crate::commands) fn measure(
     field: &Field,
     dataset: &Dataset,
     truth: &MotionTruth,
@@ -22,7 +22,7 @@ pub(super) fn measure(
 }
 
 /// Headings of [`Motion::rows`].
-pub(super) const HEADINGS: [&str; 13] = [
+pub(in crate::commands) const HEADINGS: [&str; 13] = [
     "id",
     "instance",
     "motion",
@@ -40,7 +40,7 @@ pub(super) const HEADINGS: [&str; 13] = [
 
 impl Motion {
     /// A row per instance, then the means.
-    pub(super) fn rows(&self) -> Vec<Vec<String>> {
+    pub(in crate::commands) fn rows(&self) -> Vec<Vec<String>> {
         let mut rows = Vec::new();
         for instance in &self.scores.instances {
             let about = [
@@ -63,8 +63,8 @@ impl Motion {
     }
 
     /// Prints the rows.
-    pub(super) fn print(&self) {
-        let mut table = super::table(HEADINGS);
+    pub(in crate::commands) fn print(&self) {
+        let mut table = crate::commands::table(HEADINGS);
         table.add_rows(self.rows());
         println!("{table}");
         println!("motion of followed points, as exported by default; measured in {:.1} s", self.seconds);

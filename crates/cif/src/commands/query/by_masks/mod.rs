@@ -12,8 +12,10 @@ use cif_vision::grounding::FoundBox;
 use clap::{Args, ValueEnum};
 
 use super::Query;
-use crate::commands::asked::{self, AskedScene};
-use crate::commands::{CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, scene};
+use crate::commands::shared::asked::{self, AskedScene};
+use crate::commands::{
+    CaptureOptions, FrameOptions, LayoutName, print_misfits, print_warnings, shared::scene,
+};
 use crate::detector::Detector;
 use crate::error::Error;
 use crate::formats;
