@@ -33,7 +33,7 @@ BLENDERS := bpy==4.5.15/python3.11 bpy==5.0.1/python3.11 bpy==5.2.3/python3.13 b
 # One interpreter for every build, or PyO3 is built again.
 export PYO3_PYTHON := $(abspath $(BIN)/python)
 
-.PHONY: help build wheel demo plugin stubs test test-wheel test-rust test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
+.PHONY: help build wheel demo plugin stubs docs test test-wheel test-rust test-python test-mujoco test-newton test-validator test-blender test-capture fuzz lint format clean
 
 help:
 	@echo "make build   the command at $(BIN)/cif, from a release wheel"
@@ -46,6 +46,7 @@ help:
 	@echo "make test-validator   NVIDIA's validator on our stages, which is downloaded (50 MB)"
 	@echo "make test-capture   tests of cif capture with pycolmap, which is downloaded (50 MB), and ffmpeg where it is there"
 	@echo "make stubs   docstrings of the Python module into its stub"
+	@echo "make docs    the pages of docs/reference, generated from the code"
 	@echo "make lint    formatting and lints, as in CI"
 	@echo "make format  put the formatting right"
 
@@ -110,10 +111,16 @@ test-wheel: $(VENV)/.tools-$(MATURIN)-$(PYTEST)-$(RUFF)
 	$(TEST_BIN)/python -m pip install --quiet --disable-pip-version-check --force-reinstall --no-deps $(TEST_WHEELS)/*.whl
 
 # What cif-usd writes and reads is tested in a Python that has usd-core.
-test-rust: test-wheel
-	PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
+RUST_TESTS = PYTHONPATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_path("platlib"))') \
 	LD_LIBRARY_PATH=$$($(TEST_BIN)/python -c 'import sysconfig; print(sysconfig.get_config_var("LIBDIR"))') \
 	cargo test --locked --no-fail-fast --features cif-usd/python,cif-vision/onnx
+
+test-rust: test-wheel
+	$(RUST_TESTS)
+
+# The tests that compare docs/reference with the code write it instead.
+docs: test-wheel
+	CIF_WRITE_DOCS=1 $(RUST_TESTS) --test across reference::
 
 test-python: test-wheel
 	$(TEST_BIN)/python -m pytest

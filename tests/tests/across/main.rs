@@ -16,6 +16,7 @@ mod hard_captures;
 mod hard_cases;
 mod objects;
 mod outputs;
+mod reference;
 mod render_memory;
 mod unfinished_capture;
 mod vision;
